@@ -30,7 +30,7 @@ from twin.reality import place as places
 from twin.reality.comparison import align_rigid, matched_poses
 from twin.reality.drawn_place import build
 from twin.reality.lighting import apply_haze
-from twin.reality.place_spec import draw
+from twin.reality.place_sampling import draw
 from twin.reality.rasterizer import Rasterizer
 from twin.reality.trial_place import true_route
 from twin.reality.truth import Truth

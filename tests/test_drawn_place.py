@@ -12,7 +12,8 @@ from twin.reality import filming
 from twin.reality.__main__ import scene_toml
 from twin.reality.drawn_place import build
 from twin.reality.drawn_road import DrawnRoad
-from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, SETTINGS, draw, tasks
+from twin.reality.place_sampling import draw
+from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, SETTINGS, tasks
 from twin.reality.truth import TrueFilm, Truth, fingerprint
 
 NUMBERS = range(1, 201)  # descriptions alone

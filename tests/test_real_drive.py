@@ -283,7 +283,9 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
     assert [film.name for film in (tmp_path / "films").iterdir()] == [f"left_straight_rain_{third}.mp4"]
     after = out.with_name("results_trials.csv").read_text()
     assert after.startswith(before) and after.count("\n") == before.count("\n") + 1
-    with pytest.raises(InputError, match=r"is of \{'place': 0, 'robot': 0.*; this is .*give another --out"):
+    with pytest.raises(
+        InputError, match=r"has trials of \{'place': 0, 'robot': 0.*; this call has .*give another --out"
+    ):
         real_test.run([left], "straight", ["rain"], 4, out, setup=Setup(robot=1))
     out.with_name("results_setup.json").unlink()
     with pytest.raises(InputError, match="was driven in the reality of version 1; this is 2; give another --out"):

@@ -10,10 +10,9 @@
     python -m twin.reality photo --lighting dawn --out dawn.png
 
 `film` writes a scene folder: `scene.toml`, `input/<lighting>.mp4` and `truth/`. `compare` measures a build against that
-truth. `drive` runs the real test. `log` (drive log) and `onboard` (film by the robot's camera) are inputs of
-`twin.align`; `bag` (a robot's recording of a trial) of `twin.trial`; `photo` (the weather of a trial) of
-`twin.relight`. All seeds are fixed in the code, so the
-same command writes the same files.
+truth. `drive` runs the real test. The other verbs write inputs for the twin: `log` a drive log and `onboard` a film by
+the robot's camera, both for `twin.align`; `bag` a robot's recording of a trial, for `twin.trial`; `photo` a photo in
+the weather of a trial, for `twin.relight`. All seeds are fixed in the code, so the same command writes the same files.
 """
 
 import argparse
@@ -37,7 +36,8 @@ from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass
 from twin.reality.lighting import LIGHTINGS, WEATHER
-from twin.reality.place_spec import PlaceSpec, draw, tasks
+from twin.reality.place_sampling import draw
+from twin.reality.place_spec import PlaceSpec, tasks
 from twin.reality.real_test import Setup
 from twin.reality.road_task import RoadTask, read_task
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth
@@ -46,7 +46,7 @@ from twin.scene import SceneDir, require_stage
 TINY = FilmingPlan(
     lightings=("sun", "overcast"), start=24.0, length=12.0, speed=2.0, fps=4, width=320, height=180, samples=2, crf=18
 )
-"""12 m around the start of the turn, for tests."""
+"""A short film of the campus road, 12 m around the start of its turn, for tests."""
 
 
 def _tiny(plan: FilmingPlan) -> FilmingPlan:
@@ -145,7 +145,7 @@ def command(options: argparse.Namespace) -> None:
 
 
 def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
-    """Runs a verb in which a robot drives or looks."""
+    """Runs a verb that needs a robot: log, onboard, bag, photo or drive."""
     days = [f"day_{number}" for number in getattr(options, "day", None) or []]
     if options.command == "log":
         recordings.write_log(options.out, recordings.record_log(options.duration, setup))
@@ -178,7 +178,7 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
 
 
 def _task(given: str, scene: Path | None, place: int) -> str | RoadTask:
-    """The task of a file, brought from its scene's frame into the true one; or the name of a task as it is."""
+    """The task in a JSON file, transformed from its scene's frame into the true one; a name is returned as given."""
     if not given.endswith(".json"):
         return given
     if scene is None:

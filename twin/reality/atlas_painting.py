@@ -15,7 +15,7 @@ _Rgb = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class AtlasColors:
-    """What differs between the atlases of places; the defaults are the campus road's."""
+    """Colors and styles that differ between the atlases of places; the defaults are those of the campus road."""
 
     metals: Mapping[str, _Rgb] = field(
         default_factory=lambda: {
@@ -58,7 +58,7 @@ def to_uint8(image: NDArray) -> NDArray[np.uint8]:
 def paint_atlas(
     rng: Callable[[int], np.random.Generator], names: tuple[str, ...], colors: AtlasColors
 ) -> NDArray[np.float32]:
-    """The image of an atlas; `rng(k)` is the generator of cell k."""
+    """The image of an atlas; `rng(k)` is the random generator of cell k."""
     rows = max(8, -(-len(names) // 8))
     image = np.zeros((rows * ATLAS_CELL, 8 * ATLAS_CELL, 3), np.float32)
     for k, name in enumerate(names):

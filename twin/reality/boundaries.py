@@ -20,7 +20,10 @@ def thickness(kind: str) -> float:
 
 
 def add_boundary(place: KnownPlace, name: str, spec: BoundarySpec, skin: str, stations: Array, lateral: float) -> None:
-    """A boundary of pieces `BAY` long that begin at stations [m], at a lateral [m]; `skin` is its atlas cell."""
+    """Adds a boundary at a lateral [m]: pieces of length `BAY` that begin at the stations [m].
+
+    `skin` is its atlas cell. Bollards stand at the stations, one at each.
+    """
     if not len(stations):
         return
     if spec.kind == "hedge":
@@ -48,7 +51,7 @@ def add_boundary(place: KnownPlace, name: str, spec: BoundarySpec, skin: str, st
 
 
 def _bay(place: KnownPlace, spec: BoundarySpec, skin: str, length: float) -> MeshPart:
-    """One piece with x along the boundary, centered, its foot at z = 0."""
+    """One piece of a boundary: x runs along the boundary from the middle of the piece, and its foot is at z = 0."""
     h, parts = spec.height, []
 
     def bar(x: float, size: tuple[float, float, float], base: float, y: float = 0.0, cell: str = skin) -> None:

@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike
 
 from twin.types import Array
 
-ROAD_HALF_WIDTH = 3.0  # [m] of asphalt, from the center line to the face of the kerb
+ROAD_HALF_WIDTH = 3.0  # [m] width of the asphalt from the center line to the face of the kerb
 KERB_HEIGHT = 0.11  # [m] above the adjacent asphalt
 KERB_WIDTH = 0.16  # [m]
-VERGE_WIDTH = 5.6  # [m] of grass beyond the kerb, part of the road mesh
-PAVEMENT_WIDTH = 1.7  # [m] of slabs along the left kerb
+VERGE_WIDTH = 5.6  # [m] width of the ground from the kerb to the open land; on the left it includes the pavement
+PAVEMENT_WIDTH = 1.7  # [m] width of the slabs along the left kerb
 START, END = -6.0, 88.0  # [m] stations between which the road is paved
-VERGE_SLOPE = 0.025  # of the verges, rising away from the road
+VERGE_SLOPE = 0.025  # slope of the verges, which rise away from the road
 _CROWN = 0.018  # slope of the road from its crown to either side
 _CROWN_ROUNDING = 0.35  # [m] half width of the rounding of the crown
 # Undulation: amplitude [m], wave vector (x, y) [rad/m], phase [rad]. The steepest slope is about 3 %.

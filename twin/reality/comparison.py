@@ -1,8 +1,9 @@
 """Errors of a build against the known truth of a generated scene.
 
 The *twin frame* is the metric frame of the build, the *true frame* that of the generated world. All figures except
-`ate_m` and `scale_error` are measured after a rigid alignment (no scale) of the twin's cameras with the true ones,
-since a robot drives in the twin's metres. Surfaces are compared only where some camera could see them.
+`ate_m`, `ate_max_m` and `scale_error` are measured after a rigid alignment (no scale) of the twin's cameras with the
+true ones, because errors of the twin's scale are errors for a robot, too. Obstacles and meshes are compared only where
+a camera could see them.
 """
 
 from pathlib import Path
@@ -27,26 +28,26 @@ if TYPE_CHECKING:
     from twin.nerf.field import RadianceField
 
 
-_NEAR_ROUTE = 10.0  # [m] from the route within which surfaces are compared
-_MAX_HEIGHT = 3.0  # [m] above the ground up to which obstacles are compared
+_NEAR_ROUTE = 10.0  # [m] from the route; surfaces farther away are not compared
+_MAX_HEIGHT = 3.0  # [m] above the ground; higher points of obstacles are not compared
 _MIN_HEIGHT = 0.15  # [m] above the ground; lower points belong to the ground or a kerb
-_INTRUSION_HEIGHTS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.5)  # [m] above the ground where the corridor must be free
-_RAYS = (96, 54)  # per camera, to find the visible surface
-_MAX_CAMERAS = 48  # that surfaces are observed from
-_MAX_DEPTH = 20.0  # [m] up to which depth is compared
+_INTRUSION_HEIGHTS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.5)  # [m] heights above the ground at which the corridor must be free
+_RAYS = (96, 54)  # columns and rows of rays per camera that find the visible surface
+_MAX_CAMERAS = 48  # number of cameras whose rays find the visible surface
+_MAX_DEPTH = 20.0  # [m] pixels with a larger true depth are not compared
 _MESH_KEYS = (
     *("mesh_accuracy_median_m", "mesh_accuracy_mean_m", "mesh_completeness_mean_m"),
     *("mesh_completeness_5cm", "mesh_completeness_10cm", "mesh_chamfer_m"),
 )
-_MAX_DISTANCE = 1.0  # [m] to which distances are clipped in means
-_VISIBLE_CELL = 0.1  # [m] the visible surface is thinned to one point per cell
+_MAX_DISTANCE = 1.0  # [m] means count larger distances as this one
+_VISIBLE_CELL = 0.1  # [m] side of a cell; the visible surface is thinned to one point per cell
 
 
 def compare(scene: SceneDir) -> dict[str, Any]:
     """Measures a build against its truth and writes `build/truth.json`, which the report reads.
 
     Returns:
-        The written table: that of `measure`, and `of`, the results (digests) of the compared stages.
+        The written table: the entries of `measure`, and `of`, the content digest of each compared stage.
 
     Raises:
         InputError: the scene has no truth, or its mesh stage has not been built.
@@ -65,19 +66,22 @@ def measure(scene: SceneDir) -> dict[str, Any]:
     Returns:
         `figures`, and `camera_errors_m`: position errors after a similarity, as a list per source [m].
 
-        `figures`, lengths [m], angles [°]: `ate_m`, `ate_max_m` (camera positions after a similarity), `scale_error`
-        (the twin's metre over the true one, minus 1), `ate_rigid_m`, `tilt_deg` (of the twin's vertical),
-        `rotation_median_deg`, `ground_median_m`, `ground_p95_m`, `ground_bias_m` (inside the corridor),
+        `figures`, lengths [m], angles [°]: `frames` (their number), `ate_m`, `ate_max_m` (camera positions after a
+        similarity: rms and maximum), `scale_error` (a length in the twin over the true length, minus 1), `ate_rigid_m`,
+        `ate_rigid_max_m` (camera positions after the rigid alignment), `rotation_median_deg`, `tilt_deg` (angle between
+        the twin's vertical and the true one), `ground_median_m`, `ground_p95_m`, `ground_bias_m` (height of the ground
+        inside the corridor: median and 95 % quantile of the absolute error, median of the signed error),
         `obstacle_accuracy_m` (visible surface of the convex parts to the true surface), `obstacle_completeness_m`
-        (true surface to parts), `obstacle_median_m` (the larger of the two), `corridor_intrusions`, `route_median_m`
-        (twin's route to the true center line), `depth_median_m`, `depth_relative` (of the field, up to 20 m).
+        (true surface to parts), `obstacle_median_m` (the larger of the two), `corridor_intrusions` (number of convex
+        parts in the corridor), `route_median_m` (twin's route to the true center line), `depth_median_m`,
+        `depth_relative` (depth of the field, up to a true depth of 20 m).
 
-        For the visual mesh against the true surface, both as far as cameras could see them within 10 m of the route,
-        at any height: `mesh_accuracy_median_m`, `mesh_accuracy_mean_m` (mesh to true surface),
-        `mesh_completeness_mean_m` (true surface to mesh), `mesh_completeness_5cm`, `mesh_completeness_10cm` (fraction
-        of the true surface within that distance of the mesh; the latter also per kind: `_ground`, `_obstacle`,
-        `_foliage`), `mesh_chamfer_m` (half the sum of the two means). Means clip distances at 1 m. A figure is None
-        where its stage produced nothing to measure.
+        The `mesh_*` figures compare the visual mesh with the true surface. Of both, they use the parts that cameras
+        could see within 10 m of the route, at any height: `mesh_accuracy_median_m`, `mesh_accuracy_mean_m` (mesh to
+        true surface), `mesh_completeness_mean_m` (true surface to mesh), `mesh_completeness_5cm`,
+        `mesh_completeness_10cm` (fraction of the true surface within that distance of the mesh; the latter also per
+        kind of object: `_ground`, `_obstacle`, `_foliage`), `mesh_chamfer_m` (half the sum of the two means). Means
+        count distances above 1 m as 1 m. A figure is None where its stage produced nothing to measure.
     """
     truth = Truth.load(scene.truth)
     cameras = Cameras.load(scene.stage("metric"))
@@ -107,8 +111,8 @@ def matched_poses(truth: Truth, cameras: Cameras) -> Array:
 def align_rigid(poses: Array, true_poses: Array) -> Similarity:
     """The rigid transform that best maps camera poses onto the true ones, shapes (n, 4, 4).
 
-    Each camera contributes its center and the tips of its axes, 1 m long: the centers of a straight drive alone do not
-    determine the roll about it.
+    Each camera contributes its center and the tips of its axes, 1 m long: the centers alone do not determine the roll
+    about a straight path.
     """
 
     def tripods(p: Array) -> Array:
@@ -210,7 +214,7 @@ def mesh_quality(to_true: Array, to_mesh: Array) -> dict[str, float]:
         to_true: Distances of mesh points from the true surface [m], shape (n,).
         to_mesh: Distances of true surface points from the mesh [m], shape (m,).
     """
-    # Beyond `_MAX_DISTANCE` the nearest surface is another one, and its distance only measures how empty the place is.
+    # The nearest surface beyond `_MAX_DISTANCE` belongs to another object; its distance says nothing about the build.
     accuracy, completeness = (float(np.minimum(d, _MAX_DISTANCE).mean()) for d in (to_true, to_mesh))
     near = [float((to_mesh <= reach).mean()) for reach in (0.05, 0.1)]
     values = (float(np.median(to_true)), accuracy, completeness, *near, 0.5 * (accuracy + completeness))

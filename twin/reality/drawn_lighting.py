@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 
 from twin.reality import SEED
 from twin.reality.lighting import LIGHTINGS, Lighting, daylight, sky_cube_map
-from twin.reality.place_spec import HorizonSpec, LightSpec, PlaceSpec, Rgb, stream
+from twin.reality.place_sampling import stream
+from twin.reality.place_spec import HorizonSpec, LightSpec, PlaceSpec, Rgb
 from twin.reality.textures import fbm
 from twin.types import Array
 
-_COLUMNS = 4096  # of a skyline around the horizon
+_COLUMNS = 4096  # columns of a skyline, which surrounds the place
 
 
 def place_lightings(spec: PlaceSpec) -> dict[str, Lighting]:
@@ -84,7 +85,7 @@ def place_sky(spec: PlaceSpec, lighting: Lighting) -> NDArray[np.uint8]:
 def skyline(horizon: HorizonSpec, rng: np.random.Generator) -> tuple[Array, Array]:
     """Elevation angle [rad] of the far view around the horizon, and its shade: shapes (columns,) and (512, columns).
 
-    Row r of the shade lies at an elevation of 0.2 r / 511 rad; it is relative to the lighting's skyline color.
+    Row r of the shade lies at an elevation of 0.2 r / 511 rad. The shade is a factor on the lighting's skyline color.
     """
     period = horizon.period / (2 * np.pi) * _COLUMNS
     if horizon.kind == "towers":
@@ -98,7 +99,7 @@ def skyline(horizon: HorizonSpec, rng: np.random.Generator) -> tuple[Array, Arra
     else:
         finest = {"hills": 60.0, "mountains": 6.0}.get(horizon.kind, 2.0)
         ring = fbm(rng, (1, _COLUMNS), max(period, finest), finest, 0.55)[0].astype(float)
-        ring[-200:] += (ring[0] - ring[-1]) * np.linspace(0, 1, 200)  # closes the circle
+        ring[-200:] += (ring[0] - ring[-1]) * np.linspace(0, 1, 200)  # makes both ends of the ring meet
     edge = np.maximum(horizon.height + horizon.roughness * ring, 0.004)
     texture = fbm(rng, (512, _COLUMNS), 40, 2.0, 0.8)
     shade = 1.0 + {"hills": 0.10, "flat": 0.1, "mountains": 0.16}.get(horizon.kind, 0.22) * texture

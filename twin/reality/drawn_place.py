@@ -1,49 +1,41 @@
 """A place built from its description: ground, objects, textures, lightings.
 
-Objects are placed one after the other: what stands on firm ground first (houses, lamps, boundaries), then what finds
-room. A candidate is dropped where its footprint touches the road, the mouth of a side road, the free corridor or an
-earlier footprint.
+Objects are placed one after the other: houses, lamps and boundaries first, then poles, cars, furniture and trees. A
+candidate is dropped if its footprint touches the road, the mouth of a side road, the free corridor or an earlier
+footprint.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twin.reality import SEED, primitives, surfaces
+from twin.reality import SEED, primitives
 from twin.reality import street_furniture as furniture
-from twin.reality.atlas_painting import AtlasColors, paint_atlas, to_uint8
 from twin.reality.boundaries import BAY, add_boundary, thickness
 from twin.reality.drawn_lighting import place_lightings, place_sky
-from twin.reality.drawn_road import DrawnRoad
+from twin.reality.drawn_road import MOUTH_REACH, DrawnRoad
+from twin.reality.drawn_textures import DRAWN_CELLS, drawn_textures
 from twin.reality.houses import House, add_house
-from twin.reality.place_objects import CELLS, Atlas, GroundLayout, KnownPlace, PlaceObject
-from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, BoundarySpec, PlaceSpec, Rgb, draw, stream
+from twin.reality.place_objects import Atlas, GroundLayout, KnownPlace, PlaceObject
+from twin.reality.place_sampling import draw, stream
+from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, PlaceSpec, Rgb
 from twin.reality.plants import add_bare_tree, add_conifer, add_crowned_tree, add_shrub, add_tufts
-from twin.reality.textures import slabs
 from twin.types import Array
 
-_EXTRA_CELLS = (
-    *(f"paint{k}" for k in range(6)),
-    *("boundary_left", "boundary_right", "chimney", "shutter", "cabinet", "stone", "pole", "birch"),
-)
-_ROAD_PIXEL, _VERGE_PIXEL, _LAND_PIXEL, _WALL_PIXEL = 0.0135, 0.022, 0.09, 0.035  # [m]
 _STEP = 0.5  # [m] between vertices along the road
-_LAND_STEP = 1.5  # [m]
-_LAND_MARGIN = 48.0  # [m] of land around the driven line
-_FIELD_MARGIN = 14.0  # [m] of the height field around the driven line
-_MOUTH_REACH = 26.0  # [m] from the road's edge to the end of a side road
+_LAND_STEP = 1.5  # [m] between vertices of the land
+_LAND_MARGIN = 48.0  # [m] width of the land around the road
+_FIELD_MARGIN = 14.0  # [m] width of `GroundLayout.field` around the driven line
 _MIN_GAP = 0.35  # [m] between footprints
 
 
 def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
-    """The place of a description; the result is always the same.
+    """Builds the place of a description; equal arguments give equal places.
 
     Args:
         spec: The description.
-        displaced: The place on another day than the film's: cones, bins, crates and cars stand elsewhere.
+        displaced: True for another day than that of the film: cones, bins, crates and cars have moved.
     """
     road = DrawnRoad(spec)
     stations = np.arange(road.start, road.end + _STEP / 2, _STEP)
@@ -73,12 +65,12 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
     place = KnownPlace(
         road,
         layout,
-        partial(_textures, spec, layout, names),
+        partial(drawn_textures, spec, layout, names),
         place_lightings(spec),
         partial(place_sky, spec),
         number=spec.number,
         seed=(SEED, 100, spec.number, 1000),
-        atlas=Atlas(CELLS + _EXTRA_CELLS),
+        atlas=Atlas(DRAWN_CELLS),
     )
     _add_ground(place, road, stations)
     site = Site(road)
@@ -95,7 +87,7 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
 
 @cache
 def build_number(number: int, displaced: bool = False) -> KnownPlace:
-    """The place of a number from 1 on."""
+    """Builds the drawn place with a number from 1 on."""
     return build(draw(number), displaced)
 
 
@@ -106,7 +98,11 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
     section = road.section
 
     def strip(name: str, texture: str, laterals: Array, lifts: Array | None = None, gaps: int = 0) -> None:
-        """A strip through laterals, left first, at heights above the section or on the ground; open at mouths."""
+        """Adds a strip along the road through laterals, left first.
+
+        It lies on the ground, or `lifts` [m] above the driven line. With `gaps` (1 = left, −1 = right) it is open at
+        the mouths on that side.
+        """
         xy = road.at(stations[None], laterals[:, None])
         z = road.ground_height(xy)
         if lifts is not None:
@@ -123,7 +119,7 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
             part = primitives.MeshPart(part.vertices, part.faces[keep], part.uv)
         place.objects.append(PlaceObject(name, "ground", part, texture))
 
-    inner = 1e-6  # keeps vertices of the road's edges on the road
+    inner = 1e-6  # keeps the vertices at the road's edges on the road
     strip("road", "road", np.linspace(section.left - inner, -section.right + inner, 15))
     for sign, name, edge, side in (
         (1, "left", section.left, section.sides[0]),
@@ -146,7 +142,7 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
         strip(f"verge_{name}", f"verge_{name}", np.sort(across)[::-1], gaps=sign)
     for k, mouth in enumerate(road.line.mouths):
         edge = section.left if mouth.side > 0 else section.right
-        reach = edge + section.kerb_width + np.arange(0.0, _MOUTH_REACH, 0.5)
+        reach = edge + section.kerb_width + np.arange(0.0, MOUTH_REACH, 0.5)
         first = stations[np.argmax(stations + _STEP / 2 > mouth.station - mouth.width / 2)]
         inside = stations[(stations >= first - _STEP) & (stations <= mouth.station + mouth.width / 2 + _STEP)]
         xy = road.at(inside[None], mouth.side * reach[:, None])
@@ -168,7 +164,7 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
     sunk = np.where(along & (away < width - 1.6), 0.5, np.where(along & (away < width + 1.6), 0.12, 0.0))
     for mouth in road.line.mouths:
         near = (np.abs(station - mouth.station) < mouth.width / 2 + 1.6) & (lateral * mouth.side > 0.0)
-        sunk = np.where(near & (away < _MOUTH_REACH), 0.3, sunk)
+        sunk = np.where(near & (away < MOUTH_REACH), 0.3, sunk)
     points = np.concatenate([xy, (road.ground_height(xy) - sunk)[..., None]], -1)
     uv = np.clip(np.stack([(x - x0) / (x1 - x0), (y1 - y) / (y1 - y0)], -1), 0.0, 1.0)
     place.objects.append(PlaceObject("land", "ground", primitives.grid(points, uv), "land"))
@@ -178,7 +174,7 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
 
 
 class Site:
-    """The ground that is taken: the road, its mouths, the free corridor, and footprints of what stands already.
+    """Ground that is occupied: the road, its mouths, the free corridor, and the footprints of objects placed so far.
 
     A footprint is a rectangle: its center [m], half sizes [m] and the direction of its first axis [rad].
     """
@@ -190,7 +186,7 @@ class Site:
     def take(
         self, center: Array, half: tuple[float, float], yaw: float, clear: float = CLEARANCE, gap: float = _MIN_GAP
     ) -> bool:
-        """Takes a footprint if it is free of road and footprints; returns False if it is not.
+        """Occupies a footprint and returns True, or returns False if it is not free.
 
         Args:
             center: x, y [m].
@@ -260,7 +256,7 @@ def _reach(spec: PlaceSpec) -> tuple[float, float]:
 
 
 def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tuple[House, str, Rgb, Rgb]]:
-    """Adds rows of houses; returns, by name, each house with the material and color of its walls and its roof's."""
+    """Adds rows of houses; returns by name the house, the material and color of its walls, and its roof's color."""
     rng, houses = stream(spec.number, "houses", 1), spec.houses
     out: dict[str, tuple[House, str, Rgb, Rgb]] = {}
     first, last = _reach(spec)
@@ -373,7 +369,7 @@ def _scatter(
 def _moved(
     other_day: np.random.Generator | None, place: KnownPlace, site: Site, at: tuple[float, float], radius: float
 ) -> tuple[float, float]:
-    """Where a movable thing stands: as filmed, or up to 1.5 m away along the road where that is free."""
+    """Station and lateral [m] of a movable object: as filmed, or up to 1.5 m along the road on another day."""
     if other_day is None:
         return at
     moved = at[0] + float(other_day.uniform(-1.5, 1.5)), at[1]
@@ -461,7 +457,7 @@ def _add_trees(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
             station = first + (k + float(rng.uniform(0.2, 0.8))) / max(1, count) * (last - first + 8.0)
             beyond = row + float(rng.normal(0.0, 0.15)) if trees.row else float(rng.gamma(2.0, 3.5)) + 0.8
             spots.append((station, side * (_edge(spec, side) + beyond)))
-    for _ in range(14 if spec.setting not in ("town", "works") else 5):  # further off
+    for _ in range(14 if spec.setting not in ("town", "works") else 5):  # farther away from the road
         side = int(rng.choice([-1, 1]))
         spots.append((float(rng.uniform(first, last + 25.0)), side * float(rng.uniform(14.0, 38.0))))
     for k, at in enumerate(spots):
@@ -499,122 +495,6 @@ def _add_tufts(place: KnownPlace, spec: PlaceSpec) -> None:
     for mouth in spec.line.mouths:
         keep &= (np.abs(station - mouth.station) > mouth.width / 2 + 0.2) | (side != mouth.side)
     xy = road.at(station, lateral)
-    keep &= np.abs(road.project(xy)[1]) > 0.5 * edges  # not across the line on the inside of a bend
+    keep &= np.abs(road.project(xy)[1]) > 0.5 * edges  # within a bend, a tuft may lie on another part of the road
     if keep.any():
         add_tufts(place, rng, station[keep], lateral[keep])
-
-
-# ---- textures
-
-_WORDS = ("STOP", "SLOW", "BAKERY", "PARK", "30", "NO ENTRY", "BUS", "SCHOOL", "FARM", "HOTEL", "CAFE", "DEPOT", "EXIT")
-_SIGN_GROUNDS: tuple[Rgb, ...] = (
-    *((0.10, 0.22, 0.55), (0.85, 0.85, 0.82), (0.9, 0.75, 0.1), (0.12, 0.4, 0.2), (0.75, 0.1, 0.1)),
-    *((0.92, 0.9, 0.85), (0.35, 0.2, 0.12), (0.2, 0.2, 0.22)),
-)
-
-
-@cache
-def _atlas_image(spec: PlaceSpec) -> NDArray[np.uint8]:
-    rng = stream(spec.number, "furniture", 3)
-
-    def near(color: Rgb, spread: float = 0.25) -> Rgb:
-        red, green, blue = np.clip(np.array(color) * rng.uniform(1 - spread, 1 + spread, 3), 0.03, 0.9).tolist()
-        return red, green, blue
-
-    defaults = AtlasColors()
-    metals = {name: near(color) for name, color in defaults.metals.items()}
-    metals |= {f"paint{k}": c for k, c in enumerate((spec.furniture.car_colors * 6)[:6])}
-    left, right = spec.boundaries
-    metals |= {"cabinet": near((0.5, 0.53, 0.5), 0.3), "stone": near((0.45, 0.44, 0.42), 0.2)}
-    woods = {"planks": near((0.50, 0.37, 0.24)), "crate": near((0.52, 0.40, 0.27)), "pole": near((0.33, 0.26, 0.2))}
-    woods["shutter"] = near((0.3, 0.34, 0.3), 0.8)
-
-    masonry = {"chimney": near((0.45, 0.3, 0.25), 0.3)}
-
-    def surface(boundary: BoundarySpec, name: str) -> None:
-        material = {"wall": masonry, "mesh": metals, "bollards": metals}.get(boundary.kind, woods)
-        material[name] = boundary.color
-
-    surface(left, "boundary_left")
-    surface(right, "boundary_right")
-    plates = [((0.93, 0.92, 0.88), f"{chr(65 + int(rng.integers(26)))}X {int(rng.integers(100, 999))}") for _ in "12"]
-    signs = [
-        (_SIGN_GROUNDS[int(rng.integers(len(_SIGN_GROUNDS)))], _WORDS[int(rng.integers(len(_WORDS)))]) for _ in range(6)
-    ]
-    color = spec.lamps.color
-    trees = spec.trees
-    dark = trees.greens[0]
-    colors = AtlasColors(
-        metals=metals,
-        woods=woods,
-        masonry=masonry,
-        doors=(near((0.6, 0.42, 0.3), 0.5), near((0.4, 0.5, 0.5), 0.6)),
-        greens=trees.greens,
-        hedge=(0.45 * dark[0], 0.45 * dark[1], 0.45 * dark[2]),
-        barks=(trees.bark, near(trees.bark), near(trees.bark)),
-        lamp=(0.4 + 0.6 * color[0], 0.4 + 0.6 * color[1], 0.4 + 0.6 * color[2]),
-        signs=(*signs, *plates),
-        window=spec.houses.window,
-        frames=np.array([spec.houses.trim]),
-    )
-    return to_uint8(paint_atlas(lambda k: stream(spec.number, "furniture", 4, k), CELLS + _EXTRA_CELLS, colors))
-
-
-def _textures(
-    spec: PlaceSpec, layout: GroundLayout, houses: dict[str, tuple[House, str, Rgb, Rgb]]
-) -> dict[str, NDArray[np.uint8]]:
-    """All textures of a place by name, uint8 RGB."""
-    if spec not in _painted:
-        if len(_painted) > 1:
-            _painted.pop(next(iter(_painted)))
-        _painted[spec] = _paint(spec, layout, houses)
-    return _painted[spec]
-
-
-_painted: dict[PlaceSpec, dict[str, NDArray[np.uint8]]] = {}  # the last two places, for films under several lightings
-
-
-def _paint(
-    spec: PlaceSpec, layout: GroundLayout, houses: dict[str, tuple[House, str, Rgb, Rgb]]
-) -> dict[str, NDArray[np.uint8]]:
-    surface, section = spec.surface, spec.section
-
-    def rng(*key: int) -> np.random.Generator:
-        return stream(spec.number, "surface", *key)
-
-    first, last = layout.stations
-    length = last - first
-    zebras: tuple[float, ...] = ()
-    if "zebra" in surface.markings:
-        zebras = (float(rng(1).uniform(0.2, 0.8)) * spec.line.length - first,)
-    out = {"road": to_uint8(surfaces.road(rng(2), surface, section, length, _ROAD_PIXEL, zebras))}
-    for k, (name, side) in enumerate(zip(("verge_left", "verge_right"), section.sides, strict=True)):
-        shape = (max(8, round(side.width / _VERGE_PIXEL)), round(length / _VERGE_PIXEL))
-        image = surfaces.turf(rng(3, k), surface, shape, _VERGE_PIXEL, side.verge)
-        if side.pavement > 0.0:
-            paved = min(shape[0], round(side.pavement / _VERGE_PIXEL))
-            inner = slice(shape[0] - paved, None) if k == 0 else slice(0, paved)
-            image[inner] = surfaces.paving(rng(4, k), surface, (paved, shape[1]), _VERGE_PIXEL, side.paving)
-        out[name] = to_uint8(image)
-    if section.kerb_height > 0.0:
-        tone = float(rng(5).uniform(0.7, 1.25))
-        stones = (16, round(length / 0.02))
-        out["kerb"] = to_uint8(slabs(rng(6), stones, 0.02, (10.0, float(rng(5).uniform(0.5, 1.2)))) * tone)
-    if spec.line.mouths:
-        plain = replace(surface, markings=(), strip=0.0)
-        half = 0.5 * max(mouth.width for mouth in spec.line.mouths)
-        across = replace(section, left=half, right=half, kerb_height=0.0)
-        out["side_road"] = to_uint8(surfaces.road(rng(7), plain, across, _MOUTH_REACH / 0.25, 0.02))
-    x0, x1, y0, y1 = layout.land
-    kind = {"town": "grass", "works": "gravel", "field": "meadow", "forest": "earth"}.get(spec.setting, "grass")
-    shape = (round((y1 - y0) / _LAND_PIXEL), round((x1 - x0) / _LAND_PIXEL))
-    out["land"] = to_uint8(surfaces.land(rng(8), surface, shape, _LAND_PIXEL, kind))
-    for k, (name, (house, wall, color, tiles)) in enumerate(houses.items()):
-        size = (round((house.eaves + 0.5) / _WALL_PIXEL), round(2 * (house.width + house.depth) / _WALL_PIXEL))
-        paint = stream(spec.number, "houses", 2, k)
-        out[name] = to_uint8(surfaces.wall(paint, wall, color, size, _WALL_PIXEL))
-        ridge, slope = house.roof_size
-        tiled = (max(16, round(slope / 0.045)), round(ridge / 0.045))
-        out[f"{name}_roof"] = to_uint8(surfaces.roof(paint, spec.houses, tiles, tiled, 0.045))
-    out["atlas"] = _atlas_image(spec)
-    return out

@@ -1,5 +1,5 @@
-"""The road of a drawn place (sampled at random, see `place_spec.py`): its driven line in plan, and the height of the
-ground on and around it.
+"""The road of a drawn place (sampled at random, see `place_sampling.py`): its driven line in plan, and the height of
+the ground on and around it.
 
 Along the line, the height follows the drawn grades and a slight unevenness; across the line, it follows the drawn cross
 section. The section ends with the verge, where the ground blends into open land, a smooth surface through the heights
@@ -11,15 +11,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twin.reality.place_spec import GRADE_STEP, RUN_IN, RUN_OUT, Mouth, PlaceSpec, stream
+from twin.reality.place_sampling import stream
+from twin.reality.place_spec import GRADE_STEP, RUN_IN, RUN_OUT, Mouth, PlaceSpec
 from twin.types import Array
 
 _CROWN_ROUNDING = 0.3  # [m] half width of the rounding of a crown
 _BUMP_LENGTHS = (5.0, 20.0)  # [m] wave lengths of the unevenness
-_SWELL_LENGTHS = (25.0, 80.0)  # [m] wave lengths of the land
+_SWELL_LENGTHS = (25.0, 80.0)  # [m] wave lengths of the swells of the land
 _LAND_SAMPLE = 2.0  # [m] between the heights of the line that determine the land
-_LAND_SMOOTHING = 3.0  # [m]
+_LAND_SMOOTHING = 3.0  # [m] length over which these heights are smoothed
 _DROP_LENGTH = 0.8  # [m] over which a kerb drops beside the mouth of a side road
+MOUTH_REACH = 26.0  # [m] from the road's edge to the end of a side road
 _CHUNK = 40_000  # points whose land height is evaluated together
 
 
@@ -92,7 +94,8 @@ class DrawnRoad:
             nearer = (along >= -1e-6) & (along <= length + 1e-6) & (np.abs(lateral) < np.abs(best_lateral))
             best_station = np.where(nearer, self._starts[k] + along, best_station)
             best_lateral = np.where(nearer, lateral, best_lateral)
-        before = (xy[..., 0] <= 0.0) & (np.abs(xy[..., 1]) < np.abs(best_lateral))  # heading 0 before the start
+        # Before its start the line is straight, with heading 0.
+        before = (xy[..., 0] <= 0.0) & (np.abs(xy[..., 1]) < np.abs(best_lateral))
         return np.where(before, xy[..., 0], best_station), np.where(before, xy[..., 1], best_lateral)
 
     # ---- section
@@ -164,7 +167,7 @@ class DrawnRoad:
         return self.at(stations), self.profile(np.clip(stations, self.start, self.end))
 
     def _land(self, xy: Array) -> Array:
-        """Height of the open land [m], shape (n, 2) → (n,): a weighted mean of the line's heights, and swells."""
+        """Height of the open land [m], shape (n, 2) → (n,): a weighted mean of the line's heights, plus swells."""
         points, heights = self._land_samples
         out = np.empty(len(xy))
         for first in range(0, len(xy), _CHUNK):
@@ -184,7 +187,8 @@ class DrawnRoad:
         z = self.profile(np.clip(station, self.start - 5.0, self.end + 5.0)) + self.cross_profile(station, lateral)
         width = np.where(lateral > 0.0, section.sides[0].width, section.sides[1].width)
         share = np.clip((self.edges(lateral) - section.kerb_width - 0.25 * width) / (0.75 * width), 0.0, 1.0)
-        beyond = np.maximum(self.start - 5.0 - station, station - self.end - 5.0)  # the road's ends
+        # Distance past the road's ends [m], minus 5 m.
+        beyond = np.maximum(self.start - 5.0 - station, station - self.end - 5.0)
         share = np.maximum(share, np.clip(beyond / 5.0, 0.0, 1.0))
         share = share * share * (3.0 - 2.0 * share)
         off = share > 0.0

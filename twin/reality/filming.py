@@ -1,7 +1,7 @@
 """Films of the known-truth world: camera trajectory on a cart, exposure, sensor noise and video encoding.
 
-A *film* is a sequence of frames at a fixed rate under one lighting; its poses are the truth. Every film has its own
-speed, lateral wander and shake, so that no two films share a viewpoint.
+A *film* is a sequence of frames at a fixed rate under one lighting; the true pose of every frame is known. Every film
+has its own speed, lateral wander and shake, so that no two films share a viewpoint.
 """
 
 from collections.abc import Iterable
@@ -36,7 +36,7 @@ class FilmingPlan:
     start: float = 0.0
     """Station of the first frame [m]."""
     length: float = 60.0
-    """[m] along the center line."""
+    """Length of the segment along the center line [m]."""
     speed: float = 2.0
     """Mean speed [m/s]."""
     fps: int = 4
@@ -45,7 +45,7 @@ class FilmingPlan:
     samples: int = 2
     """Rays per pixel and axis."""
     oversize: float = 1.0
-    """Factor on the size in which frames are rendered before they are shrunk to the film's."""
+    """Frames are rendered at this factor times the film's size, and then shrunk to it."""
     crf: int = 29
     """Quality of the H.264 film; lower is better."""
     camera_height: float = CAMERA_HEIGHT
@@ -55,7 +55,7 @@ class FilmingPlan:
     fov: float = float(np.deg2rad(85.0))
     """Horizontal field of view [rad]."""
     shake: float = 1.0
-    """Amplitude of the camera's rotations and lifts relative to a cart's."""
+    """Amplitude of the camera's rotations and vertical motion, relative to those on a cart."""
     passes: tuple[PassSpec, ...] = (OUT,)
     """Passes along the road; each is filmed under every lighting."""
 
@@ -70,7 +70,7 @@ class FilmingPlan:
             fps=film.fps,
             width=film.size[0],
             height=film.size[1],
-            samples=1,  # at 1.5 times the size: 2.25 rays per pixel, instead of the 4 of the campus road's films
+            samples=1,  # with this oversize: 2.25 rays per pixel; the campus road's films have 4
             oversize=1.5,
             crf=24,
             camera_height=film.camera_height,
@@ -99,7 +99,7 @@ def film_name(lighting: str, one: PassSpec) -> str:
 
 
 def trajectory(plan: FilmingPlan, route: DrivenLine, film: str, one: PassSpec = OUT) -> tuple[Array, Array]:
-    """Times [s], shape (n,), and camera_to_world (OpenCV axes), shape (n, 4, 4), of one film, by its name."""
+    """Times [s], shape (n,), and camera_to_world (OpenCV axes), shape (n, 4, 4), of the film called `film`."""
     rng = np.random.default_rng([SEED, 11, sum(map(ord, film))])
     speed = plan.speed * rng.uniform(0.93, 1.07)
     frames = round(plan.length / speed * plan.fps) + 1
@@ -166,7 +166,10 @@ class Renderer:
             )
 
     def __call__(self, camera_to_world: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """RGB (h, w, 3) in [0, 1] and z-depth (h, w) [m] (0 = sky, of the first sample) for an OpenCV pose."""
+        """RGB (h, w, 3) in [0, 1] and z-depth (h, w) [m] for an OpenCV pose (4, 4).
+
+        The depth is that of a pixel's first sample; 0 is the sky.
+        """
         pose = opencv_to_mujoco(camera_to_world)
         width, height = self._size
         with wp.ScopedDevice("cpu"):
@@ -186,7 +189,7 @@ class Renderer:
 def sensor_image(
     rng: np.random.Generator, light: NDArray[np.float32], lighting: Lighting, exposure: float
 ) -> NDArray[np.uint8]:
-    """The 8-bit image of a linear RGB image: vignetting, exposure, highlight roll-off and sensor noise."""
+    """Converts linear RGB (h, w, 3) to an 8-bit image: vignetting, exposure, highlight roll-off and sensor noise."""
     height, width = light.shape[:2]
     y, x = np.mgrid[:height, :width]
     radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width / 2) ** 2
@@ -243,7 +246,7 @@ def depth_maps(
 ) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
     """Indices (k,) of about ten frames and their depth maps [m], shape (k, h, w).
 
-    They have a quarter of the film's size, or a third where its height is no multiple of four.
+    The maps have a quarter of the film's size, or a third where its height is no multiple of four.
     """
     part = 4 if plan.height % 4 == 0 else 3
     small = replace(plan, width=plan.width // part, height=plan.height // part, samples=1, oversize=1.0)

@@ -17,7 +17,15 @@ def add_block(
     size: tuple[float, float, float],
     windows: tuple[int, int],
 ) -> None:
-    """A block with a roof slab, windows in `windows` = (per 10 m of wall, floors), sills and doors."""
+    """Adds a block with a roof slab, windows, sills and doors.
+
+    Args:
+        place: The place that it is added to.
+        name: Name of the object and of the texture of its walls.
+        center: x, y [m].
+        size: Width (x), depth (y) and height [m].
+        windows: Windows per 10 m of wall, and number of floors.
+    """
     rng = place.rng(1, len(place.objects))
     width, depth, height = size
     corners = np.array(center) + 0.5 * np.array([[a * width, b * depth] for a in (-1, 1) for b in (-1, 1)])
@@ -63,7 +71,7 @@ def add_block(
     place.objects.append(
         PlaceObject(f"{name}_glass", "obstacle", primitives.join([place.cell(f"window{k}", p) for k, p in panes]))
     )
-    # Windows lit after dark exist twice; the lighting decides which of the two is in the model.
+    # Windows that are lit after dark have a mesh for the day and one for the dark; the lighting selects one of them.
     day = primitives.join([place.cell(f"window{k}", p) for k, p in lit])
     dark = primitives.join([place.cell(f"lit{k % 8}", p) for k, p in lit])
     place.objects.append(PlaceObject(f"{name}_day", "obstacle", day, "windows_by_day"))
@@ -73,7 +81,7 @@ def add_block(
 # ---- houses under pitched roofs
 
 _STOREY = 2.75  # [m]
-_EAVES = 0.45  # [m] that a roof overhangs
+_EAVES = 0.45  # [m] overhang of a roof
 
 
 @dataclass(frozen=True)
@@ -83,13 +91,14 @@ class House:
     center: Array
     """x, y [m]."""
     yaw: float
-    """Of its x axis [rad]."""
+    """Direction of its x axis [rad]."""
     width: float
-    """Along the front [m]."""
+    """Width along the front [m]."""
     depth: float
+    """Depth behind the front [m]."""
     storeys: int
     roof: str
-    """`gable`, `cross_gable`, `hip`, `shed`, `flat`."""
+    """Kind of roof: `gable`, `cross_gable`, `hip`, `shed`, `flat`."""
     pitch: float
     """Slope of the roof [rad]."""
     window: str
@@ -113,7 +122,10 @@ class House:
 
 
 def add_house(place: KnownPlace, name: str, house: House, lit_windows: float) -> None:
-    """A house with the textures `name` (walls) and `name`_roof, windows of which a fraction is lit, and a door."""
+    """Adds a house with doors and windows; its textures are `name` (walls) and `name`_roof.
+
+    `lit_windows` is the fraction of windows that are lit after dark.
+    """
     rng = place.rng(1, len(place.objects))
     w, d = house.width, house.depth
     turn = np.array([[np.cos(house.yaw), -np.sin(house.yaw)], [np.sin(house.yaw), np.cos(house.yaw)]])
@@ -217,7 +229,7 @@ def _roof(house: House, top: float) -> tuple[list[MeshPart], float, list[MeshPar
 def _openings(
     place: KnownPlace, house: House, floor: float, rng: np.random.Generator, lit_windows: float, trim: list[MeshPart]
 ) -> tuple[list[MeshPart], list[tuple[int, MeshPart]]]:
-    """Windows by day, and windows that are lit after dark with their kinds; doors, sills and shutters go to `trim`."""
+    """Windows that stay dark, and (kind, pane) of those lit after dark; adds doors, sills and shutters to `trim`."""
     panes: list[MeshPart] = []
     lit: list[tuple[int, MeshPart]] = []
     wide, tall = {

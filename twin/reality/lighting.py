@@ -1,8 +1,8 @@
 """Lightings of the known-truth world: lights, sky, haze and the camera's exposure under them.
 
-`LIGHTINGS` are those of the films; `WEATHER` are those of the real test, which are never filmed. Colors are display
-values, not radiometric ones: the renderer adds lights linearly and clips at 1, and `filming.py` applies exposure and a
-tone curve.
+`LIGHTINGS` are those of the campus road's films; `WEATHER` are those of the real test, which are never filmed. Colors
+are display values, not radiometric ones: the renderer adds lights linearly and clips at 1, and `filming.py` applies
+exposure and a tone curve.
 """
 
 from dataclasses import dataclass
@@ -47,7 +47,7 @@ class Lighting:
     noise: float = 0.004
     """Sensor noise at mid gray [fraction of full scale]."""
     gain: Color = (1.0, 1.0, 1.0)
-    """White balance."""
+    """White balance: factors on RGB."""
     glow_sun: Color = (0.0, 0.0, 0.0)
     """Brightening of the sky around the first sun."""
     wet: float = 0.0
@@ -128,7 +128,7 @@ def _tree_line(seed: int) -> tuple[NDArray, NDArray]:
     """The skyline of the campus road: a row of trees; see `drawn_lighting.skyline`."""
     still = np.random.default_rng([seed, 7])
     ring = fbm(still, (1, 4096), 300, 3.0, 0.75)[0]
-    ring[-200:] += (ring[0] - ring[-1]) * np.linspace(0, 1, 200)  # closes the circle
+    ring[-200:] += (ring[0] - ring[-1]) * np.linspace(0, 1, 200)  # makes both ends of the ring meet
     return 0.075 + 0.028 * ring, 1.0 + 0.22 * fbm(still, (512, 4096), 40, 2.0, 0.8)
 
 
@@ -137,7 +137,7 @@ def sky_cube_map(
 ) -> NDArray[np.uint8]:
     """A cube map for MuJoCo's skybox: six stacked faces, shape (6 · width, width, 3) uint8.
 
-    The clouds differ per lighting; the skyline (see `drawn_lighting.skyline`) is the same in all.
+    The clouds differ per lighting; the skyline (see `drawn_lighting.skyline`) is the same under all lightings.
     """
     t, s = np.meshgrid(np.arange(width), np.arange(width), indexing="ij")
     a, b = (2 * (s + 0.5) / width - 1), (2 * (t + 0.5) / width - 1)
@@ -174,9 +174,9 @@ def sky_cube_map(
     return (np.clip(out, 0.0, 1.0) * 255 + 0.5).astype(np.uint8).reshape(6 * width, width, 3)
 
 
-_HAZE_HEIGHT = 25.0  # [m] over which haze thins out to 1/e
-_FORWARD_SCATTER = 0.35  # excess of the haze's brightness towards the sun
-_SKY = 400.0  # [m] length of a ray through haze to the sky
+_HAZE_HEIGHT = 25.0  # [m] height over which the density of haze falls to 1/e
+_FORWARD_SCATTER = 0.35  # relative excess of the haze's brightness in the direction of the sun
+_SKY = 400.0  # [m] length of the ray through haze in pixels of the sky
 
 
 def apply_haze(
@@ -187,14 +187,14 @@ def apply_haze(
     lighting: Lighting,
     ground: float,
 ) -> NDArray[np.float32]:
-    """An image with haze, whose extinction falls exponentially with height and which is brighter towards the sun.
+    """Adds haze to an image: its extinction falls exponentially with height, and it is brighter towards the sun.
 
     Args:
         light: Linear RGB, shape (h, w, 3).
         depth: z-depth [m], 0 = sky, shape (h, w).
         rays: Rays of the pixels at z = 1 in the camera, shape (h, w, 3).
         camera_to_world: OpenCV axes, shape (4, 4).
-        lighting: `visibility` is the haze's at the ground; its color is that of the horizon.
+        lighting: Its `visibility` applies at the ground; its `horizon` is the color of the haze.
         ground: Height of the ground [m].
     """
     if np.isinf(lighting.visibility):
@@ -202,11 +202,12 @@ def apply_haze(
     world = rays @ camera_to_world[:3, :3].T
     per_depth = np.linalg.norm(rays, axis=-1)
     length = np.where(depth > 0.0, depth * per_depth, _SKY)
-    # A ray below the ground would gain without bound.
+    # Below the ground, the extinction along a ray would grow without bound.
     rise = np.clip(world[..., 2] / per_depth * length / _HAZE_HEIGHT, -3.0, 60.0)
     start = np.exp(-max(float(camera_to_world[2, 3]) - ground, 0.0) / _HAZE_HEIGHT)
     level = np.abs(rise) < 1e-4
-    mean = np.where(level, 1.0, -np.expm1(-rise) / np.where(level, 1.0, rise))  # of exp(−h) over heights 0 to `rise`
+    # Mean of exp(−h) over h from 0 to `rise`.
+    mean = np.where(level, 1.0, -np.expm1(-rise) / np.where(level, 1.0, rise))
     through = np.exp(-length / lighting.visibility * start * mean)[..., None]
     toward = -np.asarray(lighting.suns[0][0]) / np.linalg.norm(lighting.suns[0][0])
     facing = np.clip((world * toward).sum(-1) / per_depth, 0.0, 1.0)
@@ -256,7 +257,7 @@ _HIGH_SUN, _LOW_SUN = (
     np.array([1.0, 0.60, 0.34]),
 )  # colors of a high sun and of one at the horizon
 _REDDENING_ANGLE = 14.0  # [°] of elevation over which the red of a low sun falls to 1/e
-_MEAN_BRIGHTNESS = 0.3  # mean of an image that automatic exposure aims at
+_MEAN_BRIGHTNESS = 0.3  # mean value of an image at which automatic exposure aims
 
 
 def _day(number: int) -> Lighting:
@@ -295,9 +296,9 @@ def daylight(
     """The lighting of a day; its colors follow from sun, clouds and haze.
 
     Args:
-        name: Of the lighting.
-        elevation: Of the sun [°].
-        azimuth: Of the sun [rad].
+        name: Name of the lighting.
+        elevation: Elevation of the sun [°].
+        azimuth: Azimuth of the sun, counterclockwise from +x [rad].
         clouds: Cloud cover, 0 to 1; above 0.8 the sun casts no shadow.
         veil: Thickness of high cloud in front of the sun, 0 to 1.
         visibility: Distance at which haze transmits 1/e of the light [m].
@@ -429,12 +430,12 @@ WEATHER: dict[str, Lighting] = {
         *(_day(number) for number in range(1, 1 + _DAYS)),
     )
 }
-"""Lightings of the real test by name: five stated ones and 15 random days.
+"""Lightings of the real test by name: five designed ones and 15 random days.
 
-None is filmed; a build sees at most a photo of one. The sun stands elsewhere than in any film, its light has other
-colors, and the air may be hazy or the ground wet. A trial adds only a drift of the camera's exposure.
+None is filmed; a build sees at most a photo of one. The sun's position and color differ from those in every film, and
+the air may be hazy or the ground wet.
 
-The five stated ones were used during development, and `twin.env.domain_randomization.KNOWN_WEATHER_FRACTION` was
+The five designed ones were used during development, and `twin.env.domain_randomization.KNOWN_WEATHER_FRACTION` was
 measured on images of these and of days 1 to 5, so only days 6 to 15 took no part in any choice.
 """
 
@@ -455,7 +456,7 @@ def weather(name: str) -> Lighting:
 
 
 def weather_index(name: str) -> int:
-    """A number of its own for every weather: its place in `WEATHER`, and so on for further days."""
+    """Unique number of a weather: its index in `WEATHER`; days beyond those continue the count."""
     weather(name)
     if name in WEATHER:
         return list(WEATHER).index(name)

@@ -1,7 +1,7 @@
-"""The campus road, place 0, in which the demo was filmed: a place of our own making.
+"""The campus road, place 0: the designed place in which the demo was filmed.
 
-Tables state where its objects stand, by station and lateral [m], and what differs between objects of a kind. Solid
-objects stay outside ±1.6 m of the center line.
+Tables give the station and lateral [m] of every object, and the properties that differ between objects of a kind.
+Solid objects stay outside ±1.6 m of the center line.
 """
 
 import numpy as np
@@ -28,7 +28,7 @@ from twin.reality.street_furniture import (
 # ---- street furniture
 
 _LAMPS = ((2.0, 3.75), (15.0, -3.75), (28.0, 3.75), (40.0, 3.9), (51.0, -3.75), (63.0, 3.75), (76.0, -3.75))
-_SIGNS = (  # last: rotation from facing the traffic [rad]
+_SIGNS = (  # station, lateral [m], rotation from facing the traffic [rad]
     *((6.0, -3.7, 0.1), (11.0, 3.6, -0.2), (20.0, -3.8, 0.0), (27.5, -4.0, 0.5), (33.0, 4.6, -0.4)),
     *((37.5, 4.4, -0.9), (46.0, 3.7, 0.0), (55.0, -3.7, 0.2), (67.0, -3.7, 0.0), (72.0, 3.8, 0.1)),
 )
@@ -41,11 +41,11 @@ _BINS = (
     *((10.9, 4.6, "green"), (17.5, -3.9, "dark"), (38.7, 5.2, "blue")),
     *((58.6, 4.6, "green"), (48.5, 4.4, "red")),
 )
-_CRATES = (  # last: side [m]
+_CRATES = (  # station, lateral, side [m]
     *((18.5, -5.0, 1.1), (18.6, -6.3, 0.9), (29.5, -5.6, 1.2)),
     *((45.5, 6.5, 1.0), (54.0, -5.3, 1.15), (65.0, -4.9, 1.0)),
 )
-_MIN_LATERAL = 2.15  # [m] closest that a displaced object comes to the center line
+_MIN_LATERAL = 2.15  # [m] displaced objects come no closer to the center line than this, unless they already were
 _CARS = ((31.2, -5.2, "white"), (12.6, -4.9, "blue"), (66.0, 5.4, "red"))
 
 
@@ -66,7 +66,7 @@ def _add_street_furniture(place: KnownPlace, rng: np.random.Generator | None = N
         add_crate(place, k, *_displaced(rng, station, lateral, 0.5, 0.2), side)
     for k, (station, lateral, skin) in enumerate(_CARS):
         add_car(place, k, *_displaced(rng, station, lateral, 1.5, 0.1), skin)
-    for k, lateral in enumerate((-2.0, 0.0, 2.0)):  # the road ends here
+    for k, lateral in enumerate((-2.0, 0.0, 2.0)):  # barriers across the end of the road
         foot, yaw = place.spot(END - 3.0, lateral), place.heading(END) + np.pi / 2
         part = place.cell("barrier", primitives.box((1.8, 0.12, 1.0)).moved(foot, yaw))
         solid = Solid("box", foot + up(0.5), (0.9, 0.06, 0.5), yaw)
@@ -76,7 +76,10 @@ def _add_street_furniture(place: KnownPlace, rng: np.random.Generator | None = N
 def _displaced(
     rng: np.random.Generator | None, station: float, lateral: float, along: float, across: float
 ) -> tuple[float, float]:
-    """Station and lateral displaced by at most `along` and `across` [m]; the lateral stays beyond `_MIN_LATERAL`."""
+    """Station and lateral, displaced by at most `along` and `across` [m].
+
+    The object comes no closer to the center line than `_MIN_LATERAL`, or than it already was.
+    """
     if rng is None:
         return station, lateral
     station += rng.uniform(-along, along)
@@ -108,7 +111,8 @@ _TREES = (  # station, lateral, height, crown radius [m]
 )
 
 
-_HEDGES = ((0.0, 11.0, -7.6), (18.0, 30.0, 7.9), (46.0, 60.0, 7.6), (46.5, 58.0, -7.4))  # from, to, lateral [m]
+# First station, last station, lateral [m].
+_HEDGES = ((0.0, 11.0, -7.6), (18.0, 30.0, 7.9), (46.0, 60.0, 7.6), (46.5, 58.0, -7.4))
 _TUFTS = 5200
 _TUFT_STATIONS = (START, 75.0)  # [m]
 
@@ -148,11 +152,11 @@ _LAYOUT = GroundLayout(
 
 
 def build(route: RoadLine | None = None, displaced: bool = False) -> KnownPlace:
-    """The campus road; the result is always the same.
+    """Builds the campus road; equal arguments give equal places.
 
     Args:
         route: Center line; the default road where None.
-        displaced: The place on another day than the film's: cones, bins, crates and cars stand elsewhere.
+        displaced: True for another day than that of the film: cones, bins, crates and cars have moved.
     """
     place = KnownPlace(
         route or RoadLine(), _LAYOUT, campus_textures, LIGHTINGS, lambda lighting: sky_cube_map(lighting, SEED)
@@ -166,7 +170,10 @@ def build(route: RoadLine | None = None, displaced: bool = False) -> KnownPlace:
 
 
 def _road_strip(route: DrivenLine, laterals: list[float], heights: list[float] | None, step: float) -> MeshPart:
-    """A strip along the road through laterals [m], left first, at heights above the undulation [m] or on the ground."""
+    """A strip along the road through laterals [m], left first, with vertices `step` [m] apart along the road.
+
+    Its heights are above the undulation [m]; None puts it on the ground.
+    """
     stations = np.arange(roads.START, roads.END + step / 2, step)
     across = np.asarray(laterals, float)
     xy = route.at(stations[None], across[:, None])

@@ -1,7 +1,7 @@
 """Data of a place: its objects with their collision shapes, its textures and its lightings.
 
 The kind of an object is `ground` (driven or walked on), `obstacle` (solid), `foliage` (not solid) or `detail` (too
-small to matter). Stations and laterals are those of `centerline.py`.
+small to matter). Stations and laterals are defined in `centerline.py`.
 """
 
 from collections.abc import Callable, Mapping
@@ -52,7 +52,7 @@ class Atlas:
     """A texture of square cells with names, in 8 columns and at least as many rows."""
 
     names: tuple[str, ...] = CELLS
-    """Row by row."""
+    """Names of the cells, row by row."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -70,7 +70,7 @@ class Atlas:
 
 @dataclass(frozen=True)
 class GroundLayout:
-    """Where the ground textures and the collision geometry of a place lie."""
+    """Extents of the ground textures of a place, and of the area around its driven line."""
 
     stations: tuple[float, float]
     """First and last station of the road mesh [m]."""
@@ -79,7 +79,7 @@ class GroundLayout:
     land: tuple[float, float, float, float]
     """x and y range of the texture `land` [m]."""
     field: tuple[tuple[float, float], tuple[float, float]]
-    """Lowest and highest x, y [m] of the height field that robots drive on."""
+    """Lowest and highest x, y [m] of the area around the driven line, in which drawn places have cast shadows."""
     wet: tuple[str, ...]
     """Textures that rain darkens."""
 
@@ -110,7 +110,7 @@ class PlaceObject:
 
 @dataclass
 class KnownPlace:
-    """A whole place: its road, its objects, and all that a picture of it needs."""
+    """A whole place: its road, its objects, and the textures, lightings and sky that render it."""
 
     route: DrivenLine
     layout: GroundLayout
@@ -122,7 +122,7 @@ class KnownPlace:
     """Returns the cube map of the sky under a lighting; see `lighting.sky_cube_map`."""
     number: int = 0
     seed: tuple[int, ...] = (SEED,)
-    """Of the details of its objects."""
+    """Seed of the details of its objects."""
     atlas: Atlas = field(default_factory=Atlas)
     objects: list[PlaceObject] = field(default_factory=list)
     lamp_heads: list[Array] = field(default_factory=list)

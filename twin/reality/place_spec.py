@@ -1,38 +1,19 @@
-"""Descriptions of places: plain numbers and names, drawn from a place's number.
-
-`draw(number)` returns the description of a place from number 1 on; place 0 is the campus road of `place.py`, which is
-a table of its own. Every aspect of a place (its line, its surface, its trees, ...) has its own random stream,
-`np.random.default_rng([SEED, 100, number, index of the aspect])`, so a change of one aspect leaves the others as they
-are. Aspects share only the *setting*, such as `village`, which decides what is likely.
+"""Descriptions of places: plain numbers and names; `place_sampling.py` draws them, `drawn_place.py` builds them.
 
 The *driven line* is the line that the first film follows and that the robot's tasks lie on. Stations and laterals are
 relative to it; the road need not be symmetrical about it.
 """
 
-import colorsys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
 
-from twin.errors import InputError
-from twin.reality import SEED
-
 Rgb = tuple[float, float, float]
-T = TypeVar("T")
 
 SETTINGS = ("town", "suburb", "village", "works", "park", "forest", "field")
-_ASPECTS = (
-    *("setting", "line", "section", "surface", "markings", "houses", "boundaries", "trees", "furniture", "cars"),
-    *("lamps", "horizon", "weather", "film"),
-)
-"""The aspects in the order of their streams; new ones go to the end."""
-
-FREE_HALF_WIDTH = 1.5  # [m] of the corridor along the driven line in which nothing solid stands
+FREE_HALF_WIDTH = 1.5  # [m] half width of the corridor along the driven line that is free of solid objects
 CLEARANCE = 0.15  # [m] between solid objects and the corridor, the road and each other
-MAX_FRAMES = 420  # of all films of a place together
 
 
 @dataclass(frozen=True)
@@ -50,7 +31,7 @@ class Mouth:
     """A side road that opens onto the road, at right angles to it."""
 
     station: float
-    """Of its middle [m]."""
+    """Station of its middle [m]."""
     side: int
     """1 = left, −1 = right."""
     width: float
@@ -65,7 +46,7 @@ class LineSpec:
     length: float
     """Driven length [m]; the pieces go on beyond it, and before the start the line is straight."""
     grades: tuple[float, ...]
-    """Slopes along the line at stations `GRADE_STEP` apart, from 0; smooth between them, constant beyond."""
+    """Slopes along the line at stations 0, `GRADE_STEP`, ...; linear between these, constant beyond."""
     bumps: float
     """Standard deviation of the unevenness along the road [m]."""
     mouths: tuple[Mouth, ...]
@@ -80,7 +61,7 @@ RUN_IN = 8.0  # [m] of road before the start
 
 @dataclass(frozen=True)
 class Side:
-    """What lies beside the road on one side, from its edge outwards."""
+    """The ground beside the road on one side, from the kerb outwards: a pavement, then a verge."""
 
     pavement: float
     """Width of the pavement [m]; 0 for none."""
@@ -145,7 +126,7 @@ class SurfaceSpec:
     bare: float
     """Fraction of bare earth in the grass, 0 to 1."""
     markings: tuple[str, ...]
-    """Of `centre`, `dashes`, `edges`, `zebra`, `arrows`."""
+    """Any of `centre`, `dashes`, `edges`, `zebra`, `arrows`."""
     paint: Rgb
     wear: float
     """Wear of the markings, 0 to 1."""
@@ -162,7 +143,7 @@ class HousesSpec:
     front: tuple[float, float]
     """Range of the width along the road [m]."""
     storeys: tuple[int, int]
-    """Least and most."""
+    """Least and largest number of storeys."""
     roofs: tuple[str, ...]
     """Kinds to choose from: `gable`, `cross_gable` (gable to the road), `hip`, `flat`, `shed`."""
     pitch: float
@@ -170,7 +151,7 @@ class HousesSpec:
     walls: tuple[str, ...]
     """Materials to choose from: `bricks`, `plaster`, `boards`, `stone`, `sheet`, `panels`."""
     colors: tuple[Rgb, ...]
-    """Of walls."""
+    """Colors of walls."""
     roof_colors: tuple[Rgb, ...]
     window: str
     """`cross`, `casement`, `sash`, `ribbon`, `shutters`."""
@@ -180,7 +161,7 @@ class HousesSpec:
 
 @dataclass(frozen=True)
 class BoundarySpec:
-    """What encloses the ground beside the road on one side."""
+    """The boundary along the road on one side, such as a hedge or a fence."""
 
     kind: str
     """`none`, `hedge`, `picket`, `rails`, `mesh`, `wall`, `boards`, `bollards`."""
@@ -190,7 +171,7 @@ class BoundarySpec:
     covered: float
     """Fraction of the length that it covers."""
     distance: float
-    """From the road's edge [m]."""
+    """Distance from the road's edge [m]."""
 
 
 @dataclass(frozen=True)
@@ -200,9 +181,9 @@ class TreesSpec:
     density: float
     """Trees per 100 m and side."""
     kinds: tuple[str, ...]
-    """To choose from: `broadleaf`, `slender`, `conifer`, `bare`, `birch`, `shrub`."""
+    """Kinds to choose from: `broadleaf`, `slender`, `conifer`, `bare`, `birch`, `shrub`."""
     height: tuple[float, float]
-    """Range [m]."""
+    """Range of the height [m]."""
     greens: tuple[Rgb, Rgb, Rgb, Rgb]
     """Colors of leaves."""
     bark: Rgb
@@ -214,7 +195,7 @@ class TreesSpec:
 
 @dataclass(frozen=True)
 class FurnitureSpec:
-    """Small things beside the road, per 100 m of road."""
+    """Small objects and cars beside the road; amounts are expected numbers per 100 m of road."""
 
     signs: float
     bins: float
@@ -275,9 +256,9 @@ class LightSpec:
     name: str
     """`sun`, `overcast`, `low_sun`, `dusk`, `night`."""
     elevation: float
-    """Of the sun [°]."""
+    """Elevation of the sun, or of the moon at night [°]."""
     azimuth: float
-    """Of the sun, counterclockwise from the start of the driven line [°]."""
+    """Its azimuth, counterclockwise from the direction of the driven line's start [°]."""
     clouds: float
     """Cloud cover, 0 to 1."""
     haze: float
@@ -291,9 +272,9 @@ class PassSpec:
     """One pass along the road; every pass is a film of its own."""
 
     name: str
-    """`out`, `back`, `again`, `lane`; other than `out`, it is appended to the film's name."""
+    """`out`, `back`, `again` or `lane`; the last three are appended to the film's name."""
     lateral: float
-    """Of the camera's path [m]."""
+    """Lateral of the camera's path [m]."""
     backwards: bool
 
 
@@ -310,15 +291,15 @@ class FilmSpec:
     spacing: float
     """Distance between frames [m]; equals speed / fps."""
     camera_height: float
-    """[m], the truth."""
+    """True height of the camera above the ground [m]."""
     stated_height: float
     """The height written into `scene.toml` [m]."""
     height_tolerance: float
     """Standard deviation of the error of the stated height [m]."""
     pitch: float
-    """Downwards [rad]."""
+    """Pitch of the camera, downwards [rad]."""
     fov: float
-    """Horizontal [rad]."""
+    """Horizontal field of view [rad]."""
     size: tuple[int, int]
     """Width, height [px]."""
     shake: float
@@ -329,7 +310,7 @@ class FilmSpec:
 
 @dataclass(frozen=True)
 class PlaceSpec:
-    """A place by its number."""
+    """The description of a place."""
 
     number: int
     setting: str
@@ -345,51 +326,16 @@ class PlaceSpec:
     lamps: LampsSpec
     horizon: HorizonSpec
     lights: tuple[LightSpec, ...]
-    """Lightings of the films, by day first."""
+    """Lightings of the films, those by day first."""
     film: FilmSpec
 
 
-def stream(number: int, aspect: str, *more: int) -> np.random.Generator:
-    """The random generator of one aspect of a place; `more` tells several of one aspect apart."""
-    return np.random.default_rng([SEED, 100, number, _ASPECTS.index(aspect), *more])
-
-
-def draw(number: int) -> PlaceSpec:
-    """The description of a place, always the same for a number.
-
-    Raises:
-        InputError: `number` < 1; place 0 has no description of this kind.
-    """
-    if number < 1:
-        raise InputError(f"place {number}: drawn places have the numbers from 1 on")
-    setting = _pick(stream(number, "setting"), dict(zip(SETTINGS, (3, 4, 4, 2, 2, 2, 3), strict=True)))
-    section = _section(stream(number, "section"), setting)
-    line = _line(stream(number, "line"), setting, section)
-    surface = _surface(stream(number, "surface"), stream(number, "markings"), setting, section)
-    lamps = _lamps(stream(number, "lamps"), setting)
-    lights = _lights(stream(number, "weather"), lamps)
-    return PlaceSpec(
-        number,
-        setting,
-        line,
-        _fitted(section, line),
-        surface,
-        _houses(stream(number, "houses"), setting),
-        _boundaries(stream(number, "boundaries"), setting, section),
-        _trees(stream(number, "trees"), setting, surface.grass),
-        _furniture(stream(number, "furniture"), stream(number, "cars"), setting),
-        lamps,
-        _horizon(stream(number, "horizon"), setting),
-        lights,
-        _film(stream(number, "film"), line, section, len(lights)),
-    )
-
-
 def tasks(line: LineSpec) -> dict[str, tuple[float, float]]:
-    """The stretches of a driven line that a robot may be given, by name: start and length [m].
+    """The tasks on a driven line, by name: start station and length of a segment [m].
 
-    They are `straight`, `right_turn`, `left_turn`, `s_bend`, `junction`, `slope` and `whole`, as far as the line has
-    them. They end 4 % before the line does, because a twin's route may be shorter than the truth.
+    `whole` is always there; `straight`, `right_turn`, `left_turn`, `s_bend`, `junction` and `slope` if the line has
+    such a segment. All end before the last 4 % and 0.5 m of the line, because a twin's route may be shorter than the
+    true one.
     """
     end = 0.96 * line.length - 0.5
     found: dict[str, tuple[float, float]] = {}
@@ -416,472 +362,3 @@ def tasks(line: LineSpec) -> dict[str, tuple[float, float]]:
     if steep:
         add("slope", steep[0] - 10.0, steep[0] + 10.0, 12.0)
     return found | {"whole": (0.0, round(end, 2))}
-
-
-# ---- aspects
-
-
-def _pick(rng: np.random.Generator, weights: Mapping[T, float]) -> T:
-    """A key of a table of weights."""
-    share = np.array(list(weights.values()), float)
-    return list(weights)[int(rng.choice(len(share), p=share / share.sum()))]
-
-
-def _subset(rng: np.random.Generator, items: tuple[T, ...], least: int, most: int) -> tuple[T, ...]:
-    """Between `least` and `most` of some items, without repetition."""
-    count = min(len(items), int(rng.integers(least, most + 1)))
-    return tuple(items[k] for k in rng.permutation(len(items))[:count])
-
-
-def _shade(rng: np.random.Generator, base: Rgb, spread: float) -> Rgb:
-    """A color near another: brightness and hue vary by about `spread`."""
-    red, green, blue = np.clip(
-        np.array(base) * rng.uniform(1.0 - spread, 1.0 + spread) + rng.normal(0.0, 0.2 * spread, 3), 0.03, 0.93
-    ).tolist()
-    return red, green, blue
-
-
-def _hsv(hue: float, saturation: float, value: float) -> Rgb:
-    """RGB of a hue in turns, saturation and value in [0, 1]."""
-    return colorsys.hsv_to_rgb(hue, saturation, value)
-
-
-def _section(rng: np.random.Generator, setting: str) -> SectionSpec:
-    streets = {"town": (5.0, 7.0), "suburb": (4.5, 6.5), "village": (3.5, 6.0), "works": (5.5, 7.0)}
-    width = float(rng.uniform(*streets.get(setting, (2.5, 5.0))))
-    lane = width >= 5.0 and rng.random() < 0.5  # driven in the right-hand lane, else in the middle
-    right = 0.5 * width if not lane else max(1.5, 0.28 * width)
-    kerbed = rng.random() < {"town": 0.95, "suburb": 0.8, "village": 0.45, "works": 0.6, "park": 0.3}.get(setting, 0.0)
-    paved = {"town": 0.95, "suburb": 0.7, "village": 0.4, "works": 0.35, "park": 0.15}.get(setting, 0.0)
-    verges = {
-        "town": {"grass": 1.0, "gravel": 1.0, "earth": 0.7},
-        "works": {"gravel": 2.0, "earth": 1.5, "grass": 1.0},
-        "forest": {"earth": 2.0, "meadow": 1.0, "grass": 0.6},
-        "field": {"meadow": 2.5, "earth": 1.0, "grass": 1.0},
-    }.get(setting, {"grass": 3.0, "meadow": 1.0, "gravel": 0.4})
-    sides = []
-    for _ in range(2):
-        has = rng.random() < paved
-        pavement = float(rng.uniform(1.2, 2.6))
-        paving = _pick(rng, {"slabs": 2.0, "pavers": 2.0, "asphalt": 1.5, "gravel": 0.5})
-        verge, room, slope = _pick(rng, verges), float(rng.uniform(1.5, 5.0)), float(rng.uniform(-0.04, 0.07))
-        pavement *= has
-        sides.append(Side(pavement, paving, verge, pavement + room, slope if not has else 0.02))
-    shape = _pick(rng, {"crown": 2.0, "camber": 1.0})
-    fall = float(rng.uniform(0.005, 0.04))
-    if shape == "camber" and rng.random() < 0.5:
-        fall = -fall
-    kerb_height, kerb_width = float(rng.uniform(0.03, 0.15)), float(rng.uniform(0.10, 0.30))
-    return SectionSpec(
-        width - right, right, shape, fall, kerb_height * kerbed, kerb_width * kerbed, (sides[0], sides[1])
-    )
-
-
-def _fitted(section: SectionSpec, line: LineSpec) -> SectionSpec:
-    """The section with verges that end before the center of the tightest bend on their side."""
-    sides = []
-    for side, edge, sign in zip(section.sides, (section.left, section.right), (1.0, -1.0), strict=True):
-        tight = [1.0 / abs(piece.curvature) for piece in line.pieces if sign * piece.curvature > 0.0]
-        width = min(side.width, min(tight, default=np.inf) - edge - section.kerb_width - 0.35)
-        sides.append(Side(min(side.pavement, 0.75 * width), side.paving, side.verge, width, side.slope))
-    return SectionSpec(
-        section.left,
-        section.right,
-        section.shape,
-        section.crossfall,
-        section.kerb_height,
-        section.kerb_width,
-        (sides[0], sides[1]),
-    )
-
-
-_SEPARATION = 28.0  # [m] between stretches of the line that are more than twice as far apart along it
-
-
-def _line(rng: np.random.Generator, setting: str, section: SectionSpec) -> LineSpec:
-    length = float(rng.uniform(42.0, 85.0))
-    while True:  # until the line keeps clear of itself
-        pieces = _pieces(rng, setting, section, length + RUN_OUT)
-        if _keeps_clear(pieces):
-            break
-    hilly = rng.random() < 0.65
-    count = int(np.ceil((length + RUN_OUT) / GRADE_STEP)) + 1
-    steepest = float(rng.uniform(0.02, 0.08)) * hilly
-    base = rng.normal(0.0, 1.0, count) + rng.normal(0.0, 1.2)
-    grades = steepest * np.clip(base / 1.5, -1.0, 1.0)
-    bumps = float(rng.uniform(0.003, 0.012))
-    mouths: list[Mouth] = []
-    stations = np.cumsum([0.0, *(piece.length for piece in pieces)])
-    for piece, start in zip(pieces, stations, strict=False):
-        width, side = float(rng.uniform(2.8, 6.0)), int(rng.choice([-1, 1]))
-        offset, wanted = float(rng.uniform(0.0, 1.0)), rng.random() < (0.25 if setting in ("forest", "field") else 0.5)
-        room = min(piece.length, length - float(start)) - width - 4.0
-        if piece.curvature == 0.0 and wanted and room > 0.0 and len(mouths) < 2:
-            mouths.append(Mouth(round(float(start) + 2.0 + width / 2 + offset * room, 2), side, width))
-    relief = float(rng.uniform(0.0, 0.35 if setting in ("town", "works") else 1.4))
-    return LineSpec(pieces, round(length, 2), tuple(grades.tolist()), bumps, tuple(mouths), relief)
-
-
-def _pieces(rng: np.random.Generator, setting: str, section: SectionSpec, length: float) -> tuple[Piece, ...]:
-    """Straights and bends up to a total length [m]; S-bends have no straight between their bends."""
-    pieces: list[Piece] = []
-    bendy = {"town": 0.6, "works": 0.6}.get(setting, 1.0)
-    straight = rng.random() < 0.75
-    left = bool(rng.random() < 0.5)
-    total = 0.0
-    while total < length:
-        if straight:
-            piece = Piece(float(rng.uniform(6.0, 34.0)), 0.0)
-        else:
-            least = max(6.0, (section.left if left else section.right) + section.kerb_width + 2.2)
-            radius = float(np.exp(rng.uniform(np.log(least), np.log(40.0))))
-            angle = np.deg2rad(rng.uniform(20.0, 100.0)) * bendy
-            piece = Piece(min(radius * float(angle), 45.0), (1.0 if left else -1.0) / radius)
-        last = straight
-        straight = rng.random() < 0.55 if not last else False  # a bend may follow a bend, then to the other side
-        if not last:
-            left = not left if not straight else bool(rng.random() < 0.5)
-        pieces.append(piece)
-        total += piece.length
-    return tuple(pieces)
-
-
-def _keeps_clear(pieces: tuple[Piece, ...]) -> bool:
-    """True if no stretch of the line comes near another."""
-    heading, point, points = 0.0, np.zeros(2), []
-    for piece in pieces:
-        count = max(1, round(piece.length))
-        for _ in range(count):
-            heading += 0.5 * piece.curvature * piece.length / count
-            point = point + piece.length / count * np.array([np.cos(heading), np.sin(heading)])
-            heading += 0.5 * piece.curvature * piece.length / count
-            points.append(point)
-    xy = np.array(points)
-    apart = np.abs(np.subtract.outer(np.arange(len(xy)), np.arange(len(xy)))) > 2.0 * _SEPARATION
-    distance = np.linalg.norm(xy[:, None] - xy[None], axis=-1)
-    return bool((distance[apart] > _SEPARATION).all())
-
-
-def _surface(rng: np.random.Generator, paint: np.random.Generator, setting: str, section: SectionSpec) -> SurfaceSpec:
-    kinds = {
-        "town": {"asphalt": 3.0, "pavers": 2.0, "concrete": 0.5},
-        "suburb": {"asphalt": 4.0, "concrete": 1.0, "pavers": 1.0},
-        "village": {"asphalt": 3.0, "pavers": 1.5, "gravel": 0.5},
-        "works": {"concrete": 3.0, "asphalt": 2.0, "pavers": 0.5},
-        "park": {"gravel": 2.0, "asphalt": 1.5, "pavers": 1.0},
-        "forest": {"gravel": 2.5, "asphalt": 1.5},
-        "field": {"gravel": 2.0, "asphalt": 1.5, "concrete": 1.2},
-    }[setting]
-    kind = _pick(rng, kinds)
-    level = float(rng.uniform(*{"asphalt": (0.20, 0.46), "concrete": (0.46, 0.66)}.get(kind, (0.34, 0.6))))
-    hue = {"asphalt": (1.0, 1.0, 1.02), "concrete": (1.02, 1.0, 0.94)}.get(kind)
-    if hue is None:
-        hue = _pick(
-            rng,
-            {(1.0, 0.99, 0.97): 2.0, (1.14, 0.97, 0.78): 1.5, (1.28, 0.88, 0.72): 1.0, (1.07, 1.02, 0.88): 1.5},
-        )
-    tone = _shade(rng, (level * hue[0], level * hue[1], level * hue[2]), 0.05)
-    unit = (float(rng.uniform(0.10, 0.24)), float(rng.uniform(0.10, 0.30)))
-    if kind == "concrete":
-        unit = (section.width / int(rng.integers(1, 3)), float(rng.uniform(2.5, 6.0)))
-    age = float(rng.uniform(0.0, 1.0))
-    narrow = kind in ("gravel", "concrete") and section.width < 4.2 and section.left == section.right
-    patched = {"asphalt": 0.7, "concrete": 0.15, "pavers": 0.1}.get(kind, 0.0)
-    green = _hsv(float(rng.uniform(0.13, 0.27)), float(rng.uniform(0.25, 0.60)), float(rng.uniform(0.28, 0.54)))
-    earth = _hsv(float(rng.uniform(0.06, 0.12)), float(rng.uniform(0.2, 0.5)), float(rng.uniform(0.30, 0.54)))
-    bare = float(rng.uniform(0.0, 0.5)) ** 1.5
-    coarse, cracks = float(rng.uniform(0.5, 1.3)), 1.6 * age * float(rng.uniform(0.2, 1.0))
-    covers = float(rng.uniform(9.0, 30.0)) * (rng.random() < 0.8)
-    litter = float(rng.uniform(0.5, 14.0)) * (2.0 if setting in ("forest", "park") else 1.0)
-    strip = float(rng.uniform(0.5, 0.9)) * (rng.random() < 0.6)
-    drained = section.kerb_height > 0.0
-    markings: list[str] = []
-    marked = {"town": 0.75, "suburb": 0.45, "village": 0.35, "works": 0.6, "field": 0.35, "forest": 0.25}
-    if kind in ("asphalt", "concrete") and paint.random() < marked.get(setting, 0.2):
-        if section.width > 4.4:
-            markings.append(_pick(paint, {"dashes": 3.0, "centre": 1.0}))
-        if paint.random() < 0.5:
-            markings.append("edges")
-        if setting in ("town", "suburb", "village") and paint.random() < 0.6:
-            markings.append("zebra")
-        if setting in ("town", "works") and paint.random() < 0.4:
-            markings.append("arrows")
-    color = _pick(paint, {(0.84, 0.83, 0.79): 4.0, (0.86, 0.66, 0.16): 1.0})
-    return SurfaceSpec(
-        kind,
-        tone,
-        coarse,
-        patched * age * float(rng.uniform(0.3, 1.0)),
-        cracks * (kind in ("asphalt", "concrete")),
-        covers * (drained or kind == "asphalt") * (kind != "gravel"),
-        litter,
-        strip * narrow,
-        unit,
-        green,
-        earth,
-        bare,
-        tuple(markings),
-        color,
-        float(paint.uniform(0.0, 0.7)),
-    )
-
-
-_WALL_COLORS: dict[str, tuple[Rgb, ...]] = {
-    "bricks": ((0.50, 0.25, 0.18), (0.62, 0.36, 0.24), (0.42, 0.22, 0.19), (0.66, 0.52, 0.38), (0.38, 0.34, 0.32)),
-    "plaster": (
-        *((0.82, 0.78, 0.68), (0.78, 0.66, 0.46), (0.74, 0.74, 0.72), (0.68, 0.48, 0.38), (0.56, 0.64, 0.66)),
-        *((0.72, 0.56, 0.52), (0.60, 0.66, 0.52), (0.84, 0.82, 0.80), (0.80, 0.70, 0.38)),
-    ),
-    "boards": ((0.42, 0.16, 0.12), (0.78, 0.76, 0.70), (0.34, 0.28, 0.22), (0.36, 0.44, 0.46), (0.62, 0.56, 0.34)),
-    "stone": ((0.50, 0.47, 0.42), (0.58, 0.53, 0.44), (0.40, 0.39, 0.39)),
-    "sheet": ((0.52, 0.56, 0.60), (0.30, 0.38, 0.48), (0.66, 0.66, 0.63), (0.42, 0.48, 0.40), (0.60, 0.34, 0.24)),
-    "panels": ((0.60, 0.59, 0.57), (0.70, 0.68, 0.62), (0.48, 0.50, 0.53)),
-}
-
-
-def _houses(rng: np.random.Generator, setting: str) -> HousesSpec:
-    density, setback, front, storeys = {
-        "town": ((4.0, 6.5), (0.0, 2.5), (9.0, 19.0), (2, 5)),
-        "suburb": ((2.6, 4.6), (2.0, 7.0), (8.0, 13.0), (1, 2)),
-        "village": ((1.8, 4.2), (0.3, 6.0), (8.0, 15.0), (1, 3)),
-        "works": ((1.5, 3.2), (2.0, 8.0), (14.0, 32.0), (1, 2)),
-        "park": ((0.0, 0.7), (6.0, 14.0), (6.0, 12.0), (1, 2)),
-        "forest": ((0.0, 0.3), (5.0, 12.0), (5.0, 10.0), (1, 1)),
-        "field": ((0.0, 0.5), (8.0, 24.0), (8.0, 22.0), (1, 2)),
-    }[setting]
-    materials = {
-        "town": ("bricks", "plaster", "plaster", "panels", "stone"),
-        "works": ("sheet", "panels", "bricks"),
-        "forest": ("boards", "stone"),
-        "field": ("boards", "bricks", "sheet", "plaster"),
-    }.get(setting, ("bricks", "plaster", "boards", "stone", "plaster"))
-    walls = tuple(dict.fromkeys(_subset(rng, materials, 1, 3)))
-    palette = tuple(color for wall in walls for color in _WALL_COLORS[wall])
-    colors = tuple(_shade(rng, color, 0.14) for color in _subset(rng, palette, 2, 5))
-    roofs = {
-        "town": ("flat", "gable", "hip", "flat"),
-        "works": ("flat", "shed", "gable"),
-        "field": ("gable", "shed"),
-        "forest": ("gable", "shed"),
-    }.get(setting, ("gable", "cross_gable", "hip", "gable", "flat"))
-    tiles = ((0.50, 0.24, 0.17), (0.34, 0.20, 0.17), (0.28, 0.29, 0.31), (0.42, 0.37, 0.31), (0.24, 0.30, 0.27))
-    return HousesSpec(
-        float(rng.uniform(*density)),
-        setback,
-        front,
-        storeys,
-        tuple(dict.fromkeys(_subset(rng, roofs, 1, 3))),
-        float(np.deg2rad(rng.uniform(18.0, 52.0))),
-        walls,
-        colors,
-        tuple(_shade(rng, color, 0.15) for color in _subset(rng, tiles, 1, 3)),
-        _pick(rng, {"cross": 1.0, "casement": 1.0, "sash": 1.0, "ribbon": 1.0, "shutters": 1.0}),
-        _pick(rng, {(0.86, 0.86, 0.84): 3.0, (0.30, 0.22, 0.15): 1.0, (0.22, 0.27, 0.25): 1.0, (0.5, 0.5, 0.5): 1.0}),
-    )
-
-
-def _boundaries(rng: np.random.Generator, setting: str, section: SectionSpec) -> tuple[BoundarySpec, BoundarySpec]:
-    kinds = {
-        "town": {"none": 4.0, "wall": 1.0, "bollards": 2.0, "rails": 0.5},
-        "suburb": {"hedge": 3.0, "picket": 2.0, "wall": 1.5, "boards": 1.5, "mesh": 1.0, "none": 1.0},
-        "village": {"hedge": 2.0, "picket": 1.5, "wall": 2.0, "rails": 1.0, "none": 1.5},
-        "works": {"mesh": 4.0, "wall": 1.0, "none": 1.5, "rails": 0.5},
-        "park": {"none": 3.0, "hedge": 1.5, "rails": 1.0, "bollards": 1.0},
-        "forest": {"none": 5.0, "rails": 0.7, "mesh": 0.3},
-        "field": {"none": 3.5, "rails": 1.5, "mesh": 1.0, "hedge": 0.7},
-    }[setting]
-    out = []
-    for side in section.sides:
-        kind = _pick(rng, kinds)
-        height = float(rng.uniform(0.6, 1.9))
-        if kind in ("picket", "bollards", "rails"):
-            height = min(height, 1.25)
-        wood = _hsv(float(rng.uniform(0.04, 0.12)), float(rng.uniform(0.1, 0.6)), float(rng.uniform(0.25, 0.85)))
-        stone = _hsv(float(rng.uniform(0.03, 0.14)), float(rng.uniform(0.05, 0.45)), float(rng.uniform(0.35, 0.8)))
-        zinc = _hsv(float(rng.uniform(0.25, 0.6)), float(rng.uniform(0.0, 0.35)), float(rng.uniform(0.25, 0.6)))
-        color = {"wall": stone, "mesh": zinc, "bollards": zinc}.get(kind, wood)
-        beyond = float(rng.uniform(0.1, 1.6))
-        distance = section.kerb_width + side.pavement + beyond
-        if kind == "bollards":
-            distance = section.kerb_width + 0.35
-        out.append(BoundarySpec(kind, height, color, float(rng.uniform(0.45, 0.95)), distance))
-    return out[0], out[1]
-
-
-def _trees(rng: np.random.Generator, setting: str, grass: Rgb) -> TreesSpec:
-    density = {
-        "town": (0.0, 4.0),
-        "suburb": (1.0, 6.0),
-        "village": (1.0, 5.0),
-        "works": (0.0, 2.5),
-        "park": (5.0, 11.0),
-        "forest": (14.0, 22.0),
-        "field": (0.0, 2.5),
-    }[setting]
-    kinds: tuple[str, ...] = ("broadleaf", "slender", "conifer", "bare", "birch", "shrub")
-    if setting == "forest":
-        kinds = _pick(rng, {("conifer",): 1.0, ("conifer", "birch"): 1.0, ("broadleaf", "shrub", "birch"): 1.0})
-    else:
-        kinds = _subset(rng, kinds, 1, 3)
-    hue, value = float(rng.uniform(0.13, 0.33)), float(rng.uniform(0.26, 0.50))
-    if rng.random() < 0.18:  # autumn
-        hue = float(rng.uniform(0.06, 0.13))
-    greens = tuple(
-        _hsv(
-            float(np.clip(hue + rng.normal(0.0, 0.025), 0.03, 0.40)),
-            float(rng.uniform(0.3, 0.65)),
-            float(np.clip(value + rng.normal(0.0, 0.05), 0.16, 0.6)),
-        )
-        for _ in range(4)
-    )
-    low = float(rng.uniform(3.0, 6.5))
-    bark = _hsv(float(rng.uniform(0.04, 0.1)), float(rng.uniform(0.1, 0.5)), float(rng.uniform(0.18, 0.5)))
-    tufts = {"town": (0.0, 20.0), "works": (0.0, 30.0), "field": (40.0, 120.0), "forest": (30.0, 90.0)}
-    return TreesSpec(
-        float(rng.uniform(*density)),
-        kinds,
-        (low, low + float(rng.uniform(1.0, 6.0))),
-        (greens[0], greens[1], greens[2], greens[3]),
-        bark,
-        bool(rng.random() < (0.7 if setting in ("town", "park", "village") else 0.35)),
-        float(rng.uniform(*tufts.get(setting, (10.0, 80.0)))),
-    )
-
-
-def _furniture(rng: np.random.Generator, cars: np.random.Generator, setting: str) -> FurnitureSpec:
-    # Upper bounds per 100 m: signs, bins, benches, bollards, cones, crates, cabinets, stones, cars.
-    bounds = {
-        "town": (9.0, 5.0, 4.0, 8.0, 4.0, 1.0, 4.0, 0.0, 9.0),
-        "suburb": (5.0, 6.0, 1.0, 2.0, 2.0, 1.0, 3.0, 3.0, 7.0),
-        "village": (6.0, 4.0, 3.0, 4.0, 2.0, 3.0, 2.0, 4.0, 5.0),
-        "works": (5.0, 4.0, 0.0, 8.0, 9.0, 9.0, 4.0, 2.0, 7.0),
-        "park": (3.0, 5.0, 8.0, 5.0, 0.0, 0.0, 1.0, 5.0, 1.0),
-        "forest": (1.5, 0.5, 1.0, 0.5, 0.0, 1.5, 0.0, 7.0, 0.7),
-        "field": (1.5, 0.0, 0.5, 1.5, 0.5, 1.5, 0.5, 5.0, 0.7),
-    }[setting]
-    amounts = [float(most * rng.uniform(0.0, 1.0)) for most in bounds]
-    if rng.random() < 0.15:  # almost nothing
-        amounts = [0.2 * amount for amount in amounts]
-    paints = (
-        *((0.80, 0.80, 0.79), (0.10, 0.10, 0.11), (0.50, 0.52, 0.54), (0.30, 0.31, 0.33), (0.12, 0.22, 0.46)),
-        *((0.55, 0.08, 0.08), (0.14, 0.28, 0.20), (0.72, 0.62, 0.20), (0.60, 0.54, 0.44), (0.36, 0.50, 0.60)),
-        *((0.66, 0.34, 0.10), (0.32, 0.16, 0.30)),
-    )
-    signs, bins, benches, bollards, cones, crates, cabinets, stones, parked = amounts
-    return FurnitureSpec(
-        signs=signs,
-        bins=bins,
-        benches=benches,
-        bollards=bollards,
-        cones=cones,
-        crates=crates,
-        cabinets=cabinets,
-        stones=stones,
-        poles=bool(rng.random() < {"town": 0.05, "works": 0.3, "forest": 0.1}.get(setting, 0.3)),
-        cars=parked,
-        car_colors=tuple(_shade(cars, color, 0.2) for color in _subset(cars, paints, 4, 6)),
-        vans=float(cars.uniform(0.0, 0.6)),
-    )
-
-
-def _lamps(rng: np.random.Generator, setting: str) -> LampsSpec:
-    lit = {"town": 0.95, "suburb": 0.85, "village": 0.75, "works": 0.7, "park": 0.55, "forest": 0.1}.get(setting, 0.08)
-    kind = _pick(rng, {"arm": 3.0, "post_top": 2.0, "double": 1.0, "lantern": 1.5})
-    if rng.random() > lit:
-        kind = "none"
-    height = float(rng.uniform(*{"arm": (4.5, 7.5), "double": (5.5, 8.0)}.get(kind, (2.8, 4.5))))
-    color = _pick(rng, {(1.0, 0.80, 0.50): 2.0, (1.0, 0.66, 0.32): 1.0, (1.0, 0.95, 0.86): 1.5, (0.86, 0.93, 1.0): 1.0})
-    broken = float(rng.uniform(0.1, 0.4)) * (rng.random() < 0.35)
-    spacing, side = 3.0 * height + float(rng.uniform(0.0, 8.0)), int(rng.choice([-1, 0, 1]))
-    return LampsSpec(kind, spacing, height, side, color, broken, float(rng.uniform(0.15, 0.7)))
-
-
-def _horizon(rng: np.random.Generator, setting: str) -> HorizonSpec:
-    kind = _pick(
-        rng,
-        {
-            "town": {"towers": 3.0, "trees": 1.0, "hills": 1.0},
-            "works": {"towers": 2.0, "flat": 1.0, "trees": 1.0},
-            "forest": {"trees": 3.0, "mountains": 1.0},
-            "field": {"flat": 1.5, "hills": 2.0, "mountains": 1.0, "trees": 1.0},
-        }.get(setting, {"trees": 2.0, "hills": 2.0, "mountains": 1.0, "flat": 0.5, "towers": 0.7}),
-    )
-    height, roughness, period = {
-        "hills": ((0.05, 0.16), (0.015, 0.04), (0.5, 1.6)),
-        "trees": ((0.05, 0.11), (0.012, 0.03), (0.1, 0.5)),
-        "towers": ((0.05, 0.12), (0.03, 0.09), (0.04, 0.12)),
-        "flat": ((0.01, 0.02), (0.002, 0.005), (0.1, 0.4)),
-        "mountains": ((0.12, 0.26), (0.04, 0.10), (0.4, 1.2)),
-    }[kind]
-    far = float(rng.uniform(0.0, 1.0))  # the farther, the paler and bluer
-    pale = {"trees": 0.3, "flat": 0.6}.get(kind, 0.95) * far
-    base = np.array([0.95, 0.95, 0.85]) * rng.uniform(0.75, 1.15, 3)
-    red, green, blue = ((1.0 - pale) * base + pale * np.array([1.75, 1.72, 1.95])).tolist()
-    elevation, deviation, widest = (float(rng.uniform(*span)) for span in (height, roughness, period))
-    return HorizonSpec(kind, elevation, deviation, widest, (red, green, blue))
-
-
-def _lights(rng: np.random.Generator, lamps: LampsSpec) -> tuple[LightSpec, ...]:
-    count = _pick(rng, {1: 1.0, 2: 1.5, 3: 1.5})
-    by_day = {"sun": 3.0, "overcast": 2.0, "low_sun": 1.5}
-    after = {"dusk": 1.0, "night": 2.5 if lamps.kind != "none" else 0.8}
-    names = [_pick(rng, by_day)]
-    while len(names) < count:
-        name = _pick(rng, by_day | after)
-        if name not in names:
-            names.append(name)
-    order = ("sun", "low_sun", "overcast", "dusk", "night")
-    out = []
-    for name in sorted(names, key=order.index):
-        height = {"sun": (22.0, 62.0), "low_sun": (9.0, 20.0), "dusk": (3.0, 9.0)}.get(name, (25.0, 60.0))
-        clouds = {"overcast": (0.88, 1.0), "sun": (0.05, 0.6), "night": (0.1, 0.9)}.get(name, (0.1, 0.7))
-        elevation, azimuth, cover = (float(rng.uniform(*span)) for span in (height, (0.0, 360.0), clouds))
-        hazy, thick = rng.random() < 0.25, float(np.exp(rng.uniform(np.log(120.0), np.log(500.0))))
-        warmth = float(rng.normal(0.0, 0.02))
-        out.append(LightSpec(name, elevation, azimuth, cover, thick if hazy else float("inf"), warmth))
-    return tuple(out)
-
-
-_SIZES = {(480, 270): 1.0, (640, 360): 2.0, (960, 540): 1.5, (1280, 720): 1.0}
-
-
-def _film(rng: np.random.Generator, line: LineSpec, section: SectionSpec, lightings: int) -> FilmSpec:
-    carrier = _pick(rng, {"phone": 2.0, "cart": 1.0, "mast": 1.5})
-    height = float(rng.uniform(*{"phone": (1.2, 1.7), "cart": (0.7, 1.4)}.get(carrier, (0.4, 1.1))))
-    tolerance = float(rng.uniform(*{"phone": (0.02, 0.05)}.get(carrier, (0.004, 0.015))))
-    stated = round(height + float(np.clip(rng.normal(), -2.0, 2.0)) * tolerance, 2)
-    lane = section.left - section.right
-    kinds = {"one": 3.0, "there_and_back": 1.5, "two": 1.0, "lane": 1.5 if lane > 1.0 else 0.0}
-    passes = [PassSpec("out", 0.0, False)]
-    match _pick(rng, kinds):
-        case "there_and_back":
-            back = min(lane, section.left - 1.2) if lane > 1.0 else 0.0
-            passes.append(PassSpec("back", back, True))
-        case "two":
-            passes.append(PassSpec("again", float(rng.uniform(-0.3, 0.3)), False))
-        case "lane":
-            passes.append(PassSpec("lane", min(lane, section.left - 1.2), False))
-    speed = float(rng.uniform(*{"phone": (0.9, 1.8), "cart": (1.0, 3.6)}.get(carrier, (0.6, 2.4))))
-    spacing = float(np.exp(rng.uniform(np.log(0.3), np.log(min(2.0, speed)))))
-    spacing = max(spacing, line.length * len(passes) * lightings / MAX_FRAMES)
-    fps = int(np.clip(round(speed / spacing), np.ceil(speed / 2.0), np.floor(speed / 0.3)))
-    size = _pick(rng, _SIZES)
-    fov = float(np.deg2rad(rng.uniform(55.0, 95.0)))
-    pitch = float(np.deg2rad(rng.uniform(2.0, 14.0)))
-    shake = float(rng.uniform(*{"phone": (1.8, 3.2), "cart": (0.7, 1.3)}.get(carrier, (0.4, 1.6))))
-    calibrated = carrier != "phone" and rng.random() < 0.75
-    return FilmSpec(
-        carrier,
-        tuple(passes),
-        speed,
-        fps,
-        speed / fps,
-        height,
-        stated,
-        tolerance,
-        pitch,
-        fov,
-        size,
-        shake,
-        bool(calibrated),
-    )

@@ -41,7 +41,7 @@ def add_tree(place: KnownPlace, k: int, station: float, lateral: float, height: 
 
 
 def add_hedge(place: KnownPlace, k: int, stations: Array, lateral: float) -> None:
-    """A hedge of pieces 1 m long that begin at stations [m]."""
+    """Adds a hedge of pieces 1 m long that begin at stations [m]."""
     rng = place.rng(3, k)
     core, solids, centers = [], [], []
     for station in stations:
@@ -82,7 +82,7 @@ def add_tufts(place: KnownPlace, rng: np.random.Generator, station: Array, later
 def add_crowned_tree(
     place: KnownPlace, k: int, spot: tuple[float, float], height: float, crown: float, slender: float, skin: str
 ) -> None:
-    """A broadleaf tree at a station and lateral [m]; a crown of `slender` 1 is round, of 2 twice as high as wide."""
+    """Adds a broadleaf tree at a station and lateral [m]; the larger `slender`, the higher its crown for its width."""
     rng = place.rng(2, k)
     foot = place.spot(*spot)
     lean = np.append(rng.normal(0, 0.03 * height, 2), 0.0)
@@ -111,7 +111,7 @@ def add_crowned_tree(
 
 
 def add_conifer(place: KnownPlace, k: int, spot: tuple[float, float], height: float, skin: str) -> None:
-    """A conifer: whorls of drooping boughs that shorten towards the tip."""
+    """Adds a conifer: whorls of drooping boughs that shorten towards the tip."""
     rng = place.rng(2, k)
     foot = place.spot(*spot)
     thick, width = 0.02 * height, height * float(rng.uniform(0.16, 0.28))
@@ -127,7 +127,7 @@ def add_conifer(place: KnownPlace, k: int, spot: tuple[float, float], height: fl
 
 
 def add_bare_tree(place: KnownPlace, k: int, spot: tuple[float, float], height: float) -> None:
-    """A tree without leaves: branches that fork three times."""
+    """Adds a tree without leaves, whose branches fork three times."""
     rng = place.rng(2, k)
     foot = place.spot(*spot)
     wood: list[MeshPart] = []
@@ -151,7 +151,7 @@ def add_bare_tree(place: KnownPlace, k: int, spot: tuple[float, float], height: 
 
 
 def add_shrub(place: KnownPlace, k: int, spot: tuple[float, float], height: float, skin: str) -> None:
-    """A shrub, solid in its middle."""
+    """Adds a shrub; only its middle is solid."""
     rng = place.rng(2, k)
     foot = place.spot(*spot)
     ball = rng.normal(size=(650, 3))
@@ -175,7 +175,7 @@ def _grow(
     crown: float,
     skin: str,
 ) -> None:
-    """Adds the wood with its trunk's collision shape (height `stem`, `radius` [m]), and the leaves."""
+    """Adds the wood of a plant with the trunk's collision shape (height `stem`, `radius` [m]), and its leaves."""
     centers = centers[centers[:, 2] > foot[2] + 0.1]
     trunk = Solid("cylinder", foot + up(0.5 * stem), (radius * 1.1, 0.5 * stem + 0.1, 0.0))
     bark = "birch" if skin == "leaf3" and place.atlas.names[-1] == "birch" else f"bark{k % 3}"

@@ -46,7 +46,7 @@ def join(parts: list[MeshPart]) -> MeshPart:
 def grid(points: Array, uv: Array) -> MeshPart:
     """A surface through a lattice of points, shapes (rows, columns, 3) and (rows, columns, 2).
 
-    It faces up if rows run across a road from its left edge and columns along it.
+    It faces up if rows run across a road from its left edge and columns along the road.
     """
     rows, columns = points.shape[:2]
     i = np.arange(rows * columns).reshape(rows, columns)
@@ -62,7 +62,7 @@ def quad(corners: Array) -> MeshPart:
 
 
 def box(size: tuple[float, float, float], base: float = 0.0) -> MeshPart:
-    """A box of full sizes (x, y, z) on z = `base`; each face shows the whole texture."""
+    """A box with full sizes (x, y, z), its bottom at z = `base`; each face shows the whole texture."""
     x, y, z0, z1 = size[0] / 2, size[1] / 2, base, base + size[2]
     ring = [(-x, -y), (x, -y), (x, y), (-x, y)]
     sides = []
@@ -139,11 +139,12 @@ def leaves(
 ) -> MeshPart:
     """Foliage: small bent rhombi around centers, shape (n, 3), with gaps between them.
 
-    Each leaf shows a window of the texture, `uv_size` wide, placed from left to right by `light` in [0, 1], shape (n,).
+    Each leaf shows a window of the texture that is `uv_size` wide. `light` in [0, 1], shape (n,), places the window
+    between the left and the right edge, up to a random shift.
     """
     n = len(centers)
     long, short = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
-    long[:, 2] *= 0.6  # leaves hang rather flat
+    long[:, 2] *= 0.6  # most leaves are closer to horizontal than to vertical
     long /= np.linalg.norm(long, axis=1, keepdims=True)
     short -= (short * long).sum(1, keepdims=True) * long
     short /= np.linalg.norm(short, axis=1, keepdims=True)

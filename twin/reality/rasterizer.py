@@ -1,8 +1,8 @@
 """A CPU rasterizer for the images of the robot's camera in the known-truth world: small images in a few milliseconds.
 
 The static world is flattened once into triangles, mip-mapped textures, lights and a shadow map. An image takes two
-passes over 2 × 2 samples per pixel: the nearest triangle, then its color, shaded like `filming.Renderer` with textures
-averaged over the footprint of a sample.
+passes over 2 × 2 samples per pixel: the first finds the nearest triangle, the second computes its color. Shading is
+that of `filming.Renderer`, but textures are averaged over the footprint of a sample.
 
 A ray through a sample has direction d with z = 1 in the camera frame. With corners a, b, c in that frame, it hits the
 triangle if d · (b × c), d · (c × a), d · (a × b) have the sign of det = a · (b × c); they are proportional to the
@@ -28,8 +28,8 @@ from twin.warp_runtime import wp
 # ---- model to arrays
 
 _MAX_LEVELS = 6
-_MIN_SIDE = 8  # [px] of a mip level
-_SMOOTH_COSINE = 0.8  # between vertex and face normal, above which the vertex normal is used, as in MuJoCo
+_MIN_SIDE = 8  # [px] least side of a mip level
+_SMOOTH_COSINE = 0.8  # vertex normals with a smaller cosine to the face normal are not used, as in MuJoCo
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class FlatScene:
     textures: NDArray[np.int32]
     """Texture indices, shape (m,)."""
     emissions: Array32
-    """Shape (m,)."""
+    """Emission of the triangles' materials, shape (m,)."""
     texels: NDArray[np.uint8]
     """RGB of all mip levels of all textures, row by row, shape (bytes,)."""
     mip_levels: NDArray[np.int32]
@@ -53,13 +53,13 @@ class FlatScene:
     sky: int
     """Texture index of the sky's cube map."""
     ambient: Array32
-    """Shape (3,)."""
+    """Color of the ambient light, shape (3,)."""
     sun_directions: Array32
     """Unit ray directions of the directional lights, shape (k, 3)."""
     sun_colors: Array32
-    """Shape (k, 3)."""
+    """Colors of the directional lights, shape (k, 3)."""
     sun_shadows: NDArray[np.bool_]
-    """True for those that cast shadows, shape (k,)."""
+    """True for directional lights that cast shadows, shape (k,)."""
     lamps: Array32
     """Position [m] and color of the spot lights, which shine straight down, shape (l, 2, 3)."""
     lamp_falloff: Array32
@@ -152,7 +152,7 @@ _MAX_BIAS = 12.0  # [texels] bound of the bias against self-shadowing
 
 @wp.struct
 class ShadowMap:
-    """Orthographic depth map along a directional light: axes, origin [m] and depths along `ray` [m]."""
+    """Orthographic depth map along the light `sun`: axes, origin [m], and depths along `ray` [m]."""
 
     sun: int
     right: wp.vec3
@@ -255,7 +255,7 @@ _UNBOUNDED = 1.0e30  # [samples]
 _NO_TRIANGLE = 1 << 62
 _DEPTH_STEPS = 1.0e5  # [1/m] resolution of a key's depth
 _INDEX_BITS = 20
-_MAX_TAPS = 6  # lookups along a footprint's longer axis
+_MAX_TAPS = 6  # most texture lookups along a footprint's longer axis
 
 
 @wp.kernel
@@ -289,7 +289,7 @@ def _rasterize(
     height: int,
     nearest_keys: wp.array[wp.int64],
 ):
-    """Stores the nearest triangle of every sample as one key: depth, then index."""
+    """Stores the nearest triangle of every sample as a key: the high bits are its depth, the low bits its index."""
     i = wp.tid()
     a, b, c = to_camera * (corners[i, 0] - eye), to_camera * (corners[i, 1] - eye), to_camera * (corners[i, 2] - eye)
     if a[2] < _NEAR and b[2] < _NEAR and c[2] < _NEAR:
@@ -352,7 +352,10 @@ def _sample_texture(
     uv_step_x: wp.vec2,
     uv_step_y: wp.vec2,
 ):
-    """Mean color over the footprint spanned by two uv steps: taps along its longer axis, mip level by its shorter."""
+    """Mean color over the footprint that two uv steps span.
+
+    Lookups are spread along its longer axis; its shorter axis determines the mip level.
+    """
     base = mip_levels[texture, 0]
     size = wp.vec2(float(base[1]), float(base[2]))
     dx, dy = wp.length(wp.cw_mul(uv_step_x, size)), wp.length(wp.cw_mul(uv_step_y, size))
@@ -417,7 +420,7 @@ def _shade(
     rgb: wp.array2d[wp.vec3],
     depth: wp.array2d[float],
 ):
-    """Writes the mean color of a pixel's samples and the z-depth of its first (0 = sky)."""
+    """Writes the mean color of a pixel's samples and the z-depth of the first one (0 = sky)."""
     py, px = wp.tid()
     to_world = wp.transpose(to_camera)
     total = wp.vec3(0.0, 0.0, 0.0)
@@ -492,7 +495,7 @@ class Rasterizer:
             model: Compiled `true_world.world_spec`.
             intrinsics: fx, fy, cx, cy [px], shape (4,).
             size: Width, height of the image [px].
-            shadow_range: Box in which the sun casts shadows [m].
+            shadow_range: Box in which the sun casts shadows, lowest and highest corner [m].
         """
         flat: FlatScene = flatten(model)
         if len(flat.corners) >= 1 << _INDEX_BITS:
@@ -522,7 +525,10 @@ class Rasterizer:
             ]
 
     def __call__(self, camera_to_world: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """RGB (h, w, 3) in [0, 1] and z-depth (h, w) [m] (0 = sky, of the first sample) for an OpenCV pose (4, 4)."""
+        """RGB (h, w, 3) in [0, 1] and z-depth (h, w) [m] for an OpenCV pose (4, 4).
+
+        The depth is that of a pixel's first sample; 0 is the sky.
+        """
         to_camera = wp.mat33(camera_to_world[:3, :3].T.astype(np.float32))
         eye = wp.vec3(*camera_to_world[:3, 3].tolist())
         width, height = self._size

@@ -1,10 +1,10 @@
-"""The front camera of the robot of the real test, by number: its seat, and all that stands between light and picture.
+"""The front camera of the robot of the real test, by number: its extrinsics, and all effects between light and picture.
 
-A picture is made in the order of nature. *Air*: haze by the length of each ray and by height (`lighting.py`).
-*Shutter*: rows are read one after another while the robot moves, and each is open for a while. *Lens*: dirt,
-vignetting, bloom around what is brighter than the sensor takes. *Exposure*: a second-order automatic exposure that sees
-the last pictures, lags and overshoots. *White balance* drifts over seconds. *Sensor*: noise, a response curve of its
-own. *Compression*: JPEG. The light comes from `rasterizer.py`.
+The light comes from `rasterizer.py`. *Haze* depends on the length of a ray and on height (`lighting.py`). *Shutter*:
+rows are read one after another while the robot moves, and each is exposed for some time. *Lens*: dirt, vignetting, and
+bloom around light beyond the sensor's range. *Exposure*: a second-order automatic exposure, which lags behind the
+brightness of the pictures and overshoots. *White balance* drifts over seconds. *Sensor*: noise and a response curve.
+*Compression*: JPEG.
 """
 
 from dataclasses import dataclass
@@ -26,71 +26,71 @@ from twin.types import Array, Array32, Image
 
 # ---- one camera's numbers
 
-_SEAT = (0.36, 0.0, 0.6)  # [m] forward, left and up from the base on the ground, as on the drawing
-_PITCH = 5.0  # [°] downwards, as on the drawing
+_SEAT = (0.36, 0.0, 0.6)  # [m] nominal position: forward, left and up from the base on the ground
+_PITCH = 5.0  # [°] nominal pitch, downwards
 
 
 @dataclass(frozen=True)
 class HiddenCamera:
-    """The numbers of one camera."""
+    """The parameters of one camera."""
 
     number: int
 
-    # Seat.
+    # Extrinsics and intrinsics.
     shift_forward: float
-    """Distance of the lens ahead of where the drawing has it [m]."""
+    """Forward offset of the lens from its nominal position [m]."""
     shift_left: float
-    """[m]"""
+    """Offset to the left [m]."""
     shift_up: float
-    """[m]"""
+    """Upward offset [m]."""
     turn_right: float
-    """Rotation about the camera's axis to the right, in addition to the drawing's pitch [°]."""
+    """Rotation about the camera's rightward axis, in addition to the nominal pitch [°]."""
     turn_up: float
-    """[°]"""
+    """Rotation about its upward axis [°]."""
     turn_back: float
-    """[°]"""
+    """Rotation about its backward axis [°]."""
     zoom: float
     """Focal length relative to the nominal one."""
     center_x: float
-    """Offset of the principal point, as a fraction of the width."""
+    """Offset of the principal point to the right, as a fraction of the width."""
     center_y: float
-    """As a fraction of the width."""
+    """Offset of the principal point downwards, also as a fraction of the width."""
 
     # Time.
     latency: float
-    """From the middle of the exposure to the policy's receipt [s]."""
+    """Time from the middle of the readout until the policy receives the picture [s]."""
     readout: float
-    """From the first row to the last [s]."""
+    """Time from the readout of the first row to that of the last one [s]."""
     shutter: float
-    """Time that a row is open by day [s]."""
+    """Time for which a row is exposed by day [s]."""
 
     # Exposure and color.
     exposure_target: float
-    """Mean brightness that automatic exposure aims at."""
+    """Mean brightness at which automatic exposure aims."""
     exposure_range: float
-    """Largest deviation of its logarithm from the weather's usual exposure."""
+    """Largest deviation of the logarithm of the exposure from that of the lighting's usual exposure."""
     exposure_rate: float
     """Natural frequency of automatic exposure [rad/s]."""
     exposure_damping: float
-    """Damping ratio; below 1 it overshoots."""
+    """Damping ratio of automatic exposure, which overshoots below 1."""
     white_drift: float
-    """Standard deviation of the logarithm of red's and blue's gain."""
+    """Standard deviation of the logarithms of the gains of red and blue."""
     gamma: float
-    """Exponent of the response curve's middle."""
+    """Exponent of the response curve."""
     contrast: float
-    """Strength of its S around middle gray."""
+    """Strength of the S shape of the response curve around middle gray."""
 
     # Lens and sensor.
     vignetting: float
-    """Loss of light at half a width from the center."""
+    """Fraction of light lost at half a width from the center."""
     bloom: float
-    """Fraction of the light beyond the sensor's range that spreads."""
+    """Factor on the light that spreads from where it exceeds the sensor's range."""
     dirt: float
     """Largest opacity of the spots on the lens."""
     spots: float
     """Number of spots, rounded down."""
     noise: float
-    """Noise relative to that of the weather's films."""
+    """Noise relative to `Lighting.noise`."""
     quality: float
     """JPEG quality, rounded down."""
 
@@ -128,11 +128,11 @@ TRAINED: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("shift_forward", "shift_left", "shift_up"), (-0.02, 0.02)),
     **dict.fromkeys(("turn_right", "turn_up", "turn_back"), (-1.0, 1.0)),
 }
-"""Ranges that training randomises by default; a test holds these to the twin's values."""
+"""Ranges that training randomizes by default; a test compares them with the twin's values."""
 
 
 def draw_camera(number: int) -> HiddenCamera:
-    """The camera of a number, always the same. Camera 0 takes the demo's pictures; it lies within `TRAINED`.
+    """The camera with a number, always the same. Camera 0 takes the demo's pictures; it lies within `TRAINED`.
 
     Raises:
         InputError: a negative number.
@@ -157,7 +157,7 @@ def native_size() -> tuple[int, int]:
 def intrinsics_of(camera: HiddenCamera, size: tuple[int, int]) -> Array:
     """fx, fy, cx, cy of the camera for pictures of a size (width, height) [px], shape (4,).
 
-    Another aspect ratio than the native one crops or extends the height about its middle.
+    If the aspect ratio is not the native one, the height is cropped or extended about its middle.
     """
     film = FilmingPlan()
     scale = size[0] / film.width
@@ -168,7 +168,7 @@ def intrinsics_of(camera: HiddenCamera, size: tuple[int, int]) -> Array:
 
 
 def camera_to_base(camera: HiddenCamera) -> Array:
-    """Pose of the camera in the base on the ground (axes forward, left, up), OpenCV axes, shape (4, 4)."""
+    """Pose of the camera (OpenCV axes) in the frame of the base on the ground (forward, left, up), shape (4, 4)."""
     pitch = np.deg2rad(_PITCH)
     # Columns: right, down, forward.
     nominal = np.array([[0.0, -np.sin(pitch), np.cos(pitch)], [-1.0, 0.0, 0.0], [0.0, -np.cos(pitch), -np.sin(pitch)]])
@@ -183,11 +183,11 @@ def camera_to_base(camera: HiddenCamera) -> Array:
 
 # ---- lens, exposure and sensor
 
-_SKY_DISTANCE = 1.0e4  # [m] depth of the sky for the motion of pixels
-_OPEN_SAMPLES = 3  # instants that a row's exposure is the mean of
-_DRIFT_TIME, _DRIFT_STEP, _DRIFT_END = 14.0, 0.2, 900.0  # [s] of the white balance
-_FULL = 0.92  # of the sensor's range; light beyond it blooms
-_DARK = 1.5  # exposures of a lighting above which the shutter is open longer
+_SKY_DISTANCE = 1.0e4  # [m] assumed depth of the sky, for the motion of its pixels
+_OPEN_SAMPLES = 3  # instants over which a row's exposure is averaged
+_DRIFT_TIME, _DRIFT_STEP, _DRIFT_END = 14.0, 0.2, 900.0  # [s] drift of the white balance: period, step, end
+_FULL = 0.92  # fraction of the sensor's range; brighter light blooms
+_DARK = 1.5  # lightings with a larger `exposure` double the time for which a row is exposed
 
 
 def response(signal: Array32, gamma: float, contrast: float) -> Array32:
@@ -206,17 +206,17 @@ class AutoExposure:
     """A second-order loop on the logarithm of the exposure: e'' = ω² (target − e) − 2 ζ ω e'."""
 
     def __init__(self, camera: HiddenCamera, start: float) -> None:
-        """`start`: mean brightness of the first scene at the weather's usual exposure."""
+        """`start` is the mean brightness of the first picture at the lighting's usual exposure."""
         self._camera = camera
         self.value = float(np.clip(self._wanted(start), -camera.exposure_range, camera.exposure_range))
-        """Logarithm of the exposure against the weather's usual one."""
+        """Logarithm of the exposure, relative to the lighting's usual one."""
         self._rate, self._time = 0.0, 0.0
 
     def _wanted(self, brightness: float) -> float:
         return float(np.log(self._camera.exposure_target / max(brightness, 1e-3)))
 
     def see(self, brightness: float, time: float) -> None:
-        """Takes the mean brightness of a picture at the weather's usual exposure, at a time [s]."""
+        """Takes the mean brightness of a picture at the lighting's usual exposure, at a time [s]."""
         c, steps = self._camera, max(1, round((time - self._time) / 0.01))
         dt, self._time = (time - self._time) / steps, time
         wanted = float(np.clip(self._wanted(brightness), -c.exposure_range, c.exposure_range))
@@ -239,8 +239,8 @@ class RealCamera:
     ) -> None:
         """
         Args:
-            rasterizer: Renders the place under the lighting with `intrinsics_of` the camera at this size.
-            lighting: Exposure, noise and haze.
+            rasterizer: Renders the place under the lighting, with `intrinsics_of(camera, size)`.
+            lighting: Gives exposure, white balance, noise and haze.
             camera: The camera.
             size: Width, height [px].
             rng: Random generator of the trial.
@@ -282,7 +282,7 @@ class RealCamera:
             pose: camera_to_world in the middle of the readout.
             motion: Rotation vector [rad] and translation [m] of the camera over the readout, in its axes, shape (6,).
             ground: Height of the ground below [m].
-            time: [s].
+            time: Time since the start of the trial [s].
         """
         camera, lighting = self.camera, self._lighting
         light = apply_haze(light, depth, self._rays, pose, lighting, ground)
@@ -305,7 +305,7 @@ class RealCamera:
         return compressed(out, int(camera.quality))
 
     def _glare(self, light: Array32) -> Array32:
-        """The light beyond the sensor's range, spread over near and far."""
+        """The light beyond the sensor's range, spread by a narrow and a wide Gaussian."""
         over = np.maximum(light - _FULL, 0.0) * 3.0
         near, far = (0.012 * self._size[0], 0.05 * self._size[0])
         return np.asarray(0.6 * cv2.GaussianBlur(over, (0, 0), near) + 0.4 * cv2.GaussianBlur(over, (0, 0), far))
@@ -313,8 +313,9 @@ class RealCamera:
     def _read(self, light: Array32, depth: Array32, motion: Array) -> Array32:
         """Rolling shutter and motion blur: every row as the camera saw it at its own time.
 
-        A point at X in the camera in the middle of the readout lies at X − f (ω × X + t) for a camera that has moved by
-        the fraction f of the motion (ω, t); so a row's pixel shows the middle's pixel of X + f (ω × X + t).
+        A point has the camera coordinates X in the middle of the readout, and X − f (ω × X + t) after the camera has
+        moved by the fraction f of its motion (ω, t). So a pixel in a row that is read then, with the point X on its ray
+        at its depth, takes the color at the projection of X + f (ω × X + t) in the picture of the middle.
         """
         if not np.any(motion):
             return light
@@ -343,7 +344,7 @@ def motion_between(before: Array, after: Array, middle: Array) -> Array:
 
 
 def dirt_mask(camera: HiddenCamera, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Opacity of the dirt on the lens, shape (h, w, 1); the same at any size."""
+    """Opacity of the dirt on the lens, shape (h, w, 1); its spots scale with the size of the picture."""
     width, height = size
     rng = np.random.default_rng([SEED, 202, camera.number])
     y, x = np.mgrid[:height, :width].astype(np.float32) / width

@@ -1,7 +1,7 @@
-"""The judge of a trial on the road: off the road, touched, stuck, at the goal, out of time, rolled over.
+"""The judge of a trial on the road: decides when it ends, and its cause, such as goal, collision or timeout.
 
-It knows the task's numbers and what it sees of the robot, and shares no code with the twin's `RewardAndTermination`. A
-test compares both on a thousand paths.
+It uses the task's numbers and the robot's position, tilt and contact, and shares no code with the twin's
+`RewardAndTermination`. A test compares both on a thousand paths.
 """
 
 from bisect import bisect_left, bisect_right
@@ -9,11 +9,11 @@ from math import hypot
 
 from twin.reality.road_task import RoadTask
 
-_BEHIND, _AHEAD = 1.5, 4.0  # [m] of the line in which the nearest point is sought around the last one
+_BEHIND, _AHEAD = 1.5, 4.0  # [m] of the line around the last nearest point, in which the next one is searched
 
 
 class RealJudge:
-    """Follows one trial."""
+    """Follows one trial at a time."""
 
     def __init__(self, task: RoadTask) -> None:
         self._task = task
@@ -25,19 +25,19 @@ class RealJudge:
         self.cause = ""
         """Cause of the trial's end, one of `twin.config.CAUSES`; empty while it goes on."""
         self.station, self.offset = self._task.start, 0.0
-        """Station of the nearest point of the line, and the distance from it, left positive [m]."""
+        """Station of the nearest point of the line, and the distance from that point, positive to its left [m]."""
         self._locate(x, y)
         self._rested, self._since = (x, y), 0.0
 
     def see(self, x: float, y: float, tilt: float, touched: bool, time: float) -> str:
-        """Looks at the robot once per control step; returns the cause.
+        """Takes the robot's state once per control step; returns the cause of the trial's end, empty while it goes on.
 
         Args:
-            x: [m].
-            y: [m].
-            tilt: [rad].
-            touched: True if it touched an object since the last look.
-            time: Since the start [s].
+            x: Position of the base [m].
+            y: Position of the base [m].
+            tilt: Angle between the robot's and the world's up axes [rad].
+            touched: True if the robot has touched an object.
+            time: Time since the start [s].
         """
         task = self._task
         self._locate(x, y)

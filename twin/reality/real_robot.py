@@ -1,9 +1,9 @@
-"""The robot of the real test: a Husky by number, in equations of its own, without MuJoCo.
+"""The robot of the real test: a Husky by number, with equations of motion of its own, without MuJoCo.
 
 The chassis is a rigid body with three degrees of freedom in the plane of the ground beneath it. Each of four tires has
-its own load and its own slip; the two tires of a side turn together, behind one motor with gear. Height, pitch and roll
-follow the ground under the tires as a lightly damped oscillator, which bumps and the road's texture excite: at 1 m/s
-the ground changes over tenths of a second, a bounce on the tires over hundredths.
+its own load and its own slip; one geared motor drives the two tires of a side. Height, pitch and roll follow the ground
+under the tires as lightly damped oscillators, which bumps and the road's texture excite: at 1 m/s the ground changes
+over tenths of a second, and a bounce on the tires takes hundredths.
 
 Tire: the averaged lumped LuGre model (Canudas de Wit, Tsiotras, Velenis, Basset, Gissinger 2003, Vehicle System
 Dynamics 39(3)) in its anisotropic planar form (Velenis, Tsiotras, Canudas de Wit, Sorine 2005, same journal 43(1)). For
@@ -13,15 +13,17 @@ speed u = |r ω| and the patch's length L:
     dz_i/dt = v_i − (σ₀ |M v| / (μ_i² g) + κ₀ u / L) z_i,    |M v| = √((μ_x v_x)² + (μ_y v_y)²)
     F_i = −(σ₀ z_i + σ₁ dz_i/dt) N,    κ₀ = 7/6 (Deur 2001, IFAC Workshop Advances in Automotive Control)
 
-with g = 1 + (s − 1) exp(−√(|v| / v_s)), Stribeck's excess s of static over sliding friction. In steady sliding the
-force is that of Coulomb's ellipse; a rolling tire creeps in proportion to its force; at rest it holds like a spring.
+with g = 1 + (s − 1) exp(−√(|v| / v_s)), where s is the ratio of static to sliding friction (Stribeck). In steady
+sliding the force lies on Coulomb's friction ellipse; a rolling tire creeps in proportion to its force; a tire at rest
+holds like a spring.
 
-Loads: on four equal springs the weight, the load transfer of acceleration (h ΣF/L along, h ΣF/B across) and the warp of
-the ground under the four tires superpose. Motor: torque k i, current i = (U − k ω) / R within its limit; U is at most
-the battery's voltage, which sags by its resistance times the current drawn. A velocity loop (PI) per side sets U; above
-it a controller turns commands into the two speeds. Both have their own clock, whose period jitters.
+Loads: the tires are four equal springs. A tire's load is the sum of its parts of the weight, of the load transfer of
+acceleration (h ΣF/L along, h ΣF/B across) and of the warp of the ground under the four tires. Motor: torque k i,
+current i = (U − k ω) / R within its limit; U is at most the battery's voltage, which sags by its resistance times the
+current drawn. A velocity loop (PI) per side sets U; a controller turns commands into the target speeds of both loops.
+Controller and loops have their own clocks, whose periods jitter.
 
-`RANGES` are the ranges of drawn robots; `TRAINED` are those that the twin's training randomises, as facts about it.
+`RANGES` are the ranges of drawn robots; `TRAINED` is a copy of the ranges that the twin's training randomizes.
 """
 
 from collections import deque
@@ -40,28 +42,28 @@ from twin.types import Array
 _EMPTY_MASS = 56.582  # [kg]
 _WHEELBASE, _TRACK, _RADIUS = 0.512, 0.5708, 0.1651  # [m]
 _EMPTY_HEIGHT = 0.18  # [m] of the empty robot's center of mass above the ground
-_EMPTY_YAW_INERTIA = 4.0  # [kg m²] of chassis and wheels: 2.03 and 4 × 2.64 kg at 0.38 m, and the tires' own
+_EMPTY_YAW_INERTIA = 4.0  # [kg m²]: chassis 2.03, four wheels of 2.64 kg at 0.38 m, and the wheels' own inertia
 _WHEEL_INERTIA = 0.0441  # [kg m²]
 _GEAR = 79.0
 _MULTIPLIER = 1.875  # Clearpath's wheel_separation_multiplier
 _MAX_SPEED, _MAX_YAW_RATE = 1.0, 2.0  # [m/s], [rad/s]
 _MAX_ACCELERATION, _MAX_YAW_ACCELERATION = 3.0, 6.0  # [m/s²], [rad/s²]
 FOOTPRINT = (0.9874, 0.6851)  # [m] length over the bumpers, width over the tires
-_LOW, _HIGH = 0.03, 0.40  # [m] above the ground between which the robot hits an object
+_LOW, _HIGH = 0.03, 0.40  # [m] heights above the ground between which the robot can hit an object
 
 _GRAVITY = 9.81
 _STEP = 0.002  # [s]
 _GROUND_STEPS = 10  # steps between two samples of the ground: 2 cm at 1 m/s
 _KAPPA = 7.0 / 6.0
 _STRIBECK_SPEED = 0.1  # [m/s]
-_LOAD_LAG = 0.03  # [s] in which loads follow the forces
-_HISTORY = 2.0  # [s] of poses that a delayed camera may ask for
+_LOAD_LAG = 0.03  # [s] time constant with which loads follow the forces
+_HISTORY = 2.0  # [s] for which poses are kept, since the camera asks for past ones
 _TIRES = ((1, 1, 0), (1, -1, 1), (-1, 1, 0), (-1, -1, 1))  # front or rear, left or right, index of the side
 
 
 @dataclass(frozen=True)
 class HiddenRobot:
-    """The numbers of one robot."""
+    """The parameters of one robot."""
 
     number: int = 0
 
@@ -69,11 +71,11 @@ class HiddenRobot:
     payload: float = 10.0
     """Mass on the top plate [kg]."""
     payload_height: float = 0.45
-    """Height of its center above the ground [m]."""
+    """Height of the payload's center above the ground [m]."""
     center_forward: float = -0.02
     """Center of mass, ahead of the middle between the axles [m]."""
     center_left: float = 0.0
-    """[m]"""
+    """Center of mass, to the left of that point [m]."""
 
     # Tires.
     friction: float = 0.7
@@ -117,7 +119,7 @@ class HiddenRobot:
     rotor_inertia: float = 0.3
     """Inertia of motor and gear, at the wheels of a side [kg m²]."""
     battery_voltage: float = 25.0
-    """Without load [V]."""
+    """Voltage without load [V]."""
     battery_resistance: float = 0.08
     """[Ω]"""
 
@@ -137,7 +139,7 @@ class HiddenRobot:
     deadband: float = 0.01
     """Speed of a side below which the controller commands standstill [m/s]."""
     command_latency: float = 0.05
-    """From a command to its arrival at the controller [s]."""
+    """Time from sending a command to its arrival at the controller [s]."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -186,13 +188,13 @@ TRAINED: dict[str, tuple[float, float]] = {
     "wheel_radius": (0.98, 1.02),
     "wheel_difference": (-0.006, 0.006),
 }
-"""Ranges that training randomises by default, for the published robot; a test holds these to the twin's values."""
+"""Ranges that training randomizes by default, for the published robot; a test compares them with the twin's values."""
 
 _CONTROLLERS = ((0.1, 0.25), (0.05, 0.5), (0.02, 0.5))  # period, timeout [s] of Clearpath's configurations
 
 
 def draw_robot(number: int) -> HiddenRobot:
-    """The robot of a number, always the same. Robot 0 drives the demo's trials; it lies within `TRAINED`.
+    """The robot with a number, always the same. Robot 0 drives the demo's trials; it lies within `TRAINED`.
 
     Raises:
         InputError: a negative number.
@@ -228,11 +230,11 @@ class RealRobot:
         self.set_pose(0.0, 0.0, 0.0, np.random.default_rng(0))
 
     def set_pose(self, x: float, y: float, yaw: float, rng: np.random.Generator) -> None:
-        """Puts the robot at rest at a base position [m] and yaw [rad], at time 0; `rng` is that of jitter and shake."""
+        """Puts the robot at rest at a base position [m] and yaw [rad], at time 0; jitter and shake use `rng`."""
         r = self.robot
         self._rng = rng
         self._x, self._y, self._yaw = x, y, yaw
-        self._vx = self._vy = self._rate = 0.0  # of the center of mass, in the robot's axes
+        self._vx = self._vy = self._rate = 0.0  # velocity and yaw rate of the center of mass, in the robot's axes
         self._wheel = [0.0, 0.0]  # [rad/s] per side
         self._z = [[0.0, 0.0] for _ in _TIRES]
         self._force = [0.0, 0.0]  # lagged sum of the tires' forces
@@ -247,7 +249,7 @@ class RealRobot:
         self._next_loop = float(rng.uniform(0.0, r.loop_period))
         self._last_control, self._last_loop = 0.0, 0.0
         self.touched = False
-        """True where the robot has touched an object since `set_pose`."""
+        """True if the robot has touched an object since `set_pose`."""
         self._sample_ground()
         self._attitude = [*self._rest]  # height [m], pitch up, roll right [rad] of the chassis
         self._attitude_rate = [0.0, 0.0, 0.0]
@@ -295,7 +297,7 @@ class RealRobot:
     # ---- control
 
     def _control(self) -> None:
-        """The controller: limits of speed and acceleration, the two sides' speeds, deadband and timeout."""
+        """Runs the controller: timeout, limits of speed and acceleration, speeds of both sides, deadband."""
         r = self.robot
         elapsed = self._time - self._last_control
         self._last_control = self._time
@@ -319,7 +321,7 @@ class RealRobot:
             self._target[i] = 0.0 if abs(speed) < r.deadband else speed / _RADIUS
 
     def _velocity_loop(self) -> None:
-        """PI of both sides, with the battery's sagging voltage as the limit, beyond which the integral stops."""
+        """Runs the PI loops of both sides; the battery's voltage limits them, and their integrals stop there."""
         r = self.robot
         elapsed = self._time - self._last_loop
         self._last_loop = self._time
@@ -337,7 +339,7 @@ class RealRobot:
     # ---- motion
 
     def _advance(self) -> None:
-        """One step of tires, wheels and body; semi-implicit: bristles first, then the forces that they give."""
+        """Advances tires, wheels and body by a semi-implicit step: first the bristles, then the forces they exert."""
         r = self.robot
         mass, vx, vy, rate = self._mass, self._vx, self._vy, self._rate
         _, pitch, roll = self._rest
@@ -378,7 +380,7 @@ class RealRobot:
             current = (self._voltage[side] - gain * spin) / r.resistance
             current = min(max(current, -r.current_limit), r.current_limit)
             self._current[side] = current
-            # Gear and tires at rest hold up to their friction, so it may stop a wheel and not turn it back.
+            # Friction of gear and tires may stop a wheel; it cannot reverse the wheel.
             free = spin + _STEP * (gain * current + side_torque[side]) / self._side_inertia
             held = _STEP * (r.gear_friction + resisting[side]) / self._side_inertia
             self._wheel[side] = copysign(max(abs(free) - held, 0.0), free)
@@ -418,11 +420,11 @@ class RealRobot:
             low = self._rest[0]
             self.touched = self._solids.hit(self._x, self._y, self._yaw, low + _LOW, low + _HIGH)
 
-    # ---- what others see
+    # ---- observations
 
     @property
     def time(self) -> float:
-        """Since `set_pose` [s]."""
+        """Time since `set_pose` [s]."""
         return self._time
 
     @property
@@ -437,7 +439,7 @@ class RealRobot:
 
     @property
     def wheel_speeds(self) -> tuple[float, float]:
-        """Encoders of the left and right side [rad/s]."""
+        """Wheel speeds that the encoders of the left and right side measure [rad/s]."""
         return self._wheel[0], self._wheel[1]
 
     @property
@@ -457,7 +459,7 @@ class RealRobot:
         return self._current[0], self._current[1]
 
     def base_to_world(self, at: float) -> Array:
-        """Pose of the base at a past time [s], but not before the start; axes forward, left, up, shape (4, 4)."""
+        """Pose of the base (4, 4), axes forward, left, up, at a past time [s], or the nearest one that is kept."""
         return pose_matrix(self._pose_at(at))
 
     def _pose_at(self, at: float) -> tuple[float, ...]:
@@ -528,10 +530,10 @@ def follow(line: Array, pose: tuple[float, float, float], station: float, speed:
     """Yaw rate [rad/s] that steers a base at x, y, yaw towards the line (m, 2): pure pursuit.
 
     Args:
-        line: [m].
-        pose: x, y [m], yaw [rad].
-        station: Of the nearest point of the line [m].
-        speed: [m/s].
+        line: Points (x, y) of the line [m], shape (m, 2).
+        pose: x, y [m], yaw [rad] of the base.
+        station: Station of the nearest point of the line [m].
+        speed: Speed of the robot [m/s].
         most: Bound of the yaw rate [rad/s].
     """
     ahead = 0.6 + 0.6 * speed

@@ -1,16 +1,16 @@
 """The real test: a policy file drives a robot on the true road, in weather that was never filmed.
 
-A policy receives images only, and its file is the only input from the training side; a task may be one that the twin
-wrote as JSON. Robot, camera, haze and judge are equations of their own (`real_robot.py`, `real_camera.py`,
-`lighting.py`, `real_judge.py`), the renderer is `rasterizer.py`. Of the twin only the loader of policy files and the
-format of tables are used. Places, days, robots and cameras have numbers; the values of a robot or camera that lie
-outside the ranges of training stand in the results (`outside_training`).
+A policy receives images only. Its file is the only input from the training side, except that a task may be one that
+the twin wrote as JSON. Robot, camera, haze and judge are implemented independently of the twin (`real_robot.py`,
+`real_camera.py`, `lighting.py`, `real_judge.py`); the renderer is `rasterizer.py`. The twin supplies only the loader of
+policy files and the format of tables. Places, days, robots and cameras have numbers; the results list those values of
+the robot and the camera that lie outside the ranges of training (`outside_training`).
 
 The k-th trial in a weather has the same seed for every policy, hence the same start, shake and noise, so that policies
 can be compared in pairs.
 
-Up to version 1 the robot, its controller, the camera's effects, the haze and the rules were the twin's own. Tables of
-that time can be read and reported on, not continued. Two constants of the twin were measured on its images
+In version 1 the robot, its controller, the camera's effects, the haze and the rules were the twin's own. Tables of that
+version can be read and reported on, but not continued. Two constants of the twin were measured on images of this world
 (`twin.env.domain_randomization.KNOWN_WEATHER_FRACTION`, `twin.env.irradiance.GROUND_ALBEDO`).
 """
 
@@ -41,10 +41,10 @@ from twin.runtime import bar, exclusive_lock
 from twin.types import Image
 
 TASKS = ("straight", "right_turn")
-"""Tasks of place 0 that the demo's figures are of."""
+"""Tasks of place 0 on which the demo's figures are measured."""
 assert set(TASKS) <= set(CAMPUS_TASKS)
 
-_FIRST_SEED = 7_000_000  # of the first trial
+_FIRST_SEED = 7_000_000  # seed of the first trial
 _SEEDS_PER_LIGHTING = 10_000  # upper bound of trials per policy and lighting
 _FILM_SCALE = 4  # enlargement of images in a film
 _START, _ROBOT, _CAMERA = range(3)  # random streams of a trial
@@ -52,7 +52,7 @@ _START, _ROBOT, _CAMERA = range(3)  # random streams of a trial
 
 @dataclass(frozen=True)
 class Setup:
-    """Where and with what trials are driven, by number."""
+    """Numbers of the place, the robot and the camera of trials."""
 
     place: int = 0
     robot: int = 0
@@ -64,7 +64,7 @@ class Setup:
 
     @property
     def outside(self) -> list[str]:
-        """The robot's and camera's values outside what training samples: name, value and that range."""
+        """Values of robot and camera outside the ranges of training, each as a text: name, value and range."""
         drawn = ((draw_robot(self.robot), robot_ranges), (draw_camera(self.camera), camera_ranges))
         return [
             f"{name} {getattr(one, name):.4g} ({low:.4g} to {high:.4g})"
@@ -96,7 +96,7 @@ def load_policy_file(path: Path) -> Policy:
 
 @lru_cache(maxsize=8)
 def rasterizer(lighting: str, intrinsics: tuple[float, ...], size: tuple[int, int], number: int) -> Rasterizer:
-    """Renders a place in a weather of the real test; see `Rasterizer`."""
+    """The `Rasterizer` of a place in a weather of the real test."""
     place = place_on_test_day(number)
     model = true_world.world_spec(weather(lighting), place).compile()
     return Rasterizer(model, np.array(intrinsics), size, shadow_range(place))
@@ -133,7 +133,7 @@ class RealTest:
         return RealCamera(raster, weather(lighting), self.camera, self.size, np.random.default_rng([seed, _CAMERA]))
 
     def step(self, v: float, yaw_rate: float) -> None:
-        """One control step under a command [m/s], [rad/s], within the task's limits, and the judge's look at it."""
+        """Drives one control step under a command [m/s], [rad/s], clipped to the task's limits, and asks the judge."""
         robot, task = self.robot, self.task
         robot.command(min(max(v, 0.0), task.speed), min(max(yaw_rate, -task.yaw_rate), task.yaw_rate))
         robot.step(task.control_timestep)
@@ -165,7 +165,7 @@ class RealTest:
 
 
 def task_for(policy: Policy, task: str | RoadTask, place: int) -> RoadTask:
-    """A task, or that of a name in a place, for a policy's speed and timing.
+    """The given task, or the place's task of that name, for a policy's speed limits and control step.
 
     Raises:
         InputError: no such task, or one with another control step than the policy's.
@@ -176,7 +176,7 @@ def task_for(policy: Policy, task: str | RoadTask, place: int) -> RoadTask:
     if task.control_timestep != c.control_timestep:
         raise InputError(
             f"task {task.name!r} has a control step of {task.control_timestep:g} s, policy {policy.name} one of "
-            f"{c.control_timestep:g} s; write the task's control_timestep anew, or give another policy"
+            f"{c.control_timestep:g} s; change the task's control_timestep, or give another policy"
         )
     return task
 
@@ -202,7 +202,7 @@ def run(
             `<name>_policies.json` the digests of the policy files, `<name>_setup.json` place, robot and camera.
         twin_lighting: Value of the column of this name in new rows.
         films: Folder for a film of every trial, by the robot's camera.
-        setup: Place, robot and camera; a table is of one.
+        setup: Place, robot and camera, the same in all rows of a table.
 
     Returns:
         All trials of the table, including those of earlier calls.
@@ -226,7 +226,7 @@ def run(
         for policy in {one.name: one for one in loaded}.values():
             test = RealTest(task_for(policy, task, setup.place), setup, policy.size)
             for lighting in dict.fromkeys(lightings):
-                # Each weather has its own seeds; shared ones would repeat the same ten starts in every weather.
+                # Each weather has its own seeds: with shared ones, the starts in all weathers would be the same.
                 first = _FIRST_SEED + _SEEDS_PER_LIGHTING * weather_index(lighting)
                 seeds = [first + k for k in range(trials)]
                 missing = [seed for seed in seeds if (policy.name, test.task.name, lighting, seed) not in known]
@@ -241,13 +241,13 @@ def run(
 
 
 def _check_setup(setup: Setup, table: Path, record: Path) -> None:
-    """Records what a table is of. Raises InputError if it is of something else, or of an earlier version's reality."""
+    """Records the setup of a table. Raises InputError if the table has another setup or version of this world."""
     given = {**asdict(setup), "version": REALITY_VERSION}
     if record.exists():
         with wrap_read_errors(record, "give another --out"):
             known = {name: read_json(record)[name] for name in given}
         if known != given:
-            raise InputError(f"{table} is of {known}; this is {given}; give another --out")
+            raise InputError(f"{table} has trials of {known}; this call has {given}; give another --out")
     elif table.exists():
         raise InputError(
             f"{table} was driven in the reality of version 1; this is {REALITY_VERSION}; give another --out"
@@ -286,7 +286,8 @@ def _check_policy_digests(policies: Sequence[Policy], paths: Sequence[Path], rec
             sums = dict(read_json(record))
     for policy, path in zip(policies, paths, strict=True):
         folder = path.parent if path.name == JSON else path
-        digest = digest_file(folder / JSON if folder.is_dir() else folder)  # it contains the digest of the weights
+        # policy.json contains the digest of the weights.
+        digest = digest_file(folder / JSON if folder.is_dir() else folder)
         if sums.setdefault(policy.name, digest) != digest:
             raise InputError(
                 f"{path}: {record} has another file under the name {policy.name!r}; give another --out, or rename "

@@ -1,4 +1,4 @@
-"""Recordings of a robot of the real test, without poses of its camera.
+"""Recordings by a robot of the real test; they contain no poses of its camera.
 
 A film of a drive along the filmed road, in a filmed lighting, lets `twin.align` estimate the camera's extrinsics. A
 photo in the weather of a trial lets `twin.relight` fit its lighting. A drive log lets `twin.align` identify the robot.
@@ -31,14 +31,14 @@ LIGHTING = "overcast"
 
 _STATIONS = (4.0, 30.0)  # [m] along the road
 _SPEED = 0.6  # [m/s]
-_WEAVE_AMPLITUDE, _WEAVE_PERIOD = 0.5, 11.0  # [m] to either side, [m] along the road; the weaving makes it turn
+_WEAVE_AMPLITUDE, _WEAVE_PERIOD = 0.5, 11.0  # [m] to either side, [m] along the road; weaving makes the robot turn
 _LATERAL_GAIN, _HEADING_GAIN = 0.8, 1.5  # [rad/m], [1/s]
 _FPS = 4
 _CONTROL_STEP = 0.05  # [s]
 
 
 def write_film(path: Path, setup: Setup) -> None:
-    """Drives the robot down the road and writes a film by its camera, 4 frames per second as the robot is slow.
+    """Drives the robot down the road and writes a film by its camera, at 4 frames per second.
 
     Raises:
         InputError: `path` does not end in .mp4, or is a folder.
@@ -124,8 +124,9 @@ _MAX_TRIES = 40
 def record_log(duration: float, setup: Setup) -> dict[str, Array]:
     """A drive log of `duration` [s] on the straight segment: columns by name, each of shape (rows,).
 
-    Random joystick commands drive forwards, backwards and turning, never off the asphalt. The log has commands, wheel
-    encoders, an IMU and surveyed poses in the frame of the first one, with the noise of such instruments.
+    Random joystick commands drive the robot forwards, backwards and through turns, but keep it on the asphalt. The log
+    has commands, wheel encoders, an IMU and surveyed poses in the frame of the first one, with the noise of such
+    instruments.
     """
     if not duration >= 10.0:
         raise InputError(f"duration = {duration:g} s; expected at least 10")

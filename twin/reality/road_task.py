@@ -1,8 +1,8 @@
 """The task of a trial: a line on the road, its width, start, goal and limits, as numbers.
 
-The twin writes a task as JSON (`twin export SCENE --task NAME --task-file FILE`); `read_task` reads it and brings it
-from the scene's frame into the true one. Where no twin was built, `task_of_place` states a place's tasks on its filmed
-path with the default rules. *Station*: arc length along the line [m].
+The twin writes a task as JSON (`twin export SCENE --task NAME --task-file FILE`); `read_task` reads it and transforms
+it from the scene's frame into the true one. Without a twin, `task_of_place` gives a place's tasks on its filmed path,
+with the default rules. *Station*: arc length along the line [m].
 """
 
 from dataclasses import dataclass
@@ -17,16 +17,17 @@ from twin.errors import InputError, short_repr
 from twin.files import read_json, wrap_read_errors
 from twin.geometry.poses import Similarity
 from twin.reality.filming import FilmingPlan
-from twin.reality.place_spec import draw, tasks
+from twin.reality.place_sampling import draw
+from twin.reality.place_spec import tasks
 from twin.reality.trial_place import place_on_test_day, true_route
 from twin.types import Array
 
 CAMPUS_TASKS = {"straight": (0.0, 30.0), "right_turn": (0.25, 60.0), "route": (0.0, 60.349)}
-"""Start and length [m] of the tasks of place 0, by name; a test holds them to what the twin finds on the same line."""
+"""Start and length [m] of the tasks of place 0, by name; a test compares them with those that the twin finds."""
 
 _WRITE = "write one: python -m twin.export SCENE --task NAME --task-file FILE"
 _HALF_WIDTH = 1.0  # [m]
-_BUMPER = 0.5  # [m] ahead of the base
+_BUMPER = 0.5  # [m] distance of the bumper ahead of the base
 _STUCK = (0.1, 5.0)  # [m], [s]
 _MAX_TILT = radians(60.0)
 _START_OFFSET, _START_HEADING = 0.3, radians(10.0)  # [m], [rad]
@@ -39,7 +40,7 @@ class RoadTask:
 
     name: str
     line: Array
-    """In driving order [m], shape (m, 2)."""
+    """Points (x, y) in driving order [m], shape (m, 2)."""
     half_width: float
     """Largest distance of the base from the line [m]."""
     start: float
@@ -53,7 +54,7 @@ class RoadTask:
     time_limit: float
     """[s]"""
     stuck: tuple[float, float]
-    """A robot is stuck that moves by less than this distance [m] in this time [s]."""
+    """A robot that moves by less than this distance [m] in this time [s] is stuck."""
     max_tilt: float
     """Tilt beyond which the robot has rolled over [rad]."""
     speed: float
@@ -108,7 +109,7 @@ def read_task(path: Path, to_truth: Similarity | None = None) -> RoadTask:
     """Reads a task that the twin wrote; `to_truth` maps the scene's frame to the true one.
 
     Raises:
-        InputError: no such file, another format, or impossible numbers.
+        InputError: no such file, a file of another format, or impossible numbers.
     """
     table = read_json(path)
     if not isinstance(table, dict) or (table.get("format"), table.get("version")) != ("twin task", 1):

@@ -1,8 +1,8 @@
 """A ROS 2 bag of one trial of the real test, as a real Husky would record it, for `twin.trial`.
 
-The robot runs `twin_policy`'s pilot on JPEG pictures of its camera, or, without a policy, follows the line. The
-bag has those pictures, camera_info, commands, and poses such as RTK gives them, in a frame of their own. Recording goes
-on for a moment after the trial's end.
+The robot runs `twin_policy`'s pilot on JPEG pictures of its camera; without a policy, it follows the line. The bag has
+those pictures, camera_info, commands, and poses as accurate as those of RTK, in a frame of their own. Recording
+continues for a moment after the trial's end.
 """
 
 import contextlib
@@ -29,12 +29,12 @@ from twin_policy import Camera, CompressedPicture, Limits, OnnxPolicy, Pilot
 
 _START = 1_700_000_000  # [s] time of the first trial
 _APART = 400  # [s] between the starts of two trials
-_WEATHERS, MOST_SEED = 1000, 999  # upper bounds, so that ROS's seconds of 32 bits suffice
-_WIDTH = 640  # [px] of the camera's stream
-_QUALITY = 92  # of JPEG
+_WEATHERS, MOST_SEED = 1000, 999  # upper bounds; times must fit into ROS's 32-bit seconds
+_WIDTH = 640  # [px] width of the camera's stream
+_QUALITY = 92  # JPEG quality
 _POSITION_NOISE, _YAW_NOISE = 0.01, 0.003  # [m], [rad]
-_FRAME = (0.7, 251.0, -38.0)  # yaw [rad], x, y [m] of the scene in the poses' frame
-_AFTER = 1.5  # [s] recorded after the end
+_FRAME = (0.7, 251.0, -38.0)  # yaw [rad], x, y [m] of the true frame in the poses' frame
+_AFTER = 1.5  # [s] recorded after the end of the trial
 _TOPICS = {
     "picture": ("/sensors/camera_0/color/compressed", "sensor_msgs/msg/CompressedImage"),
     "camera": ("/sensors/camera_0/color/camera_info", "sensor_msgs/msg/CameraInfo"),
@@ -50,10 +50,10 @@ def write_robot_bag(
 
     Args:
         path: Folder of the bag to write.
-        policy: A policy folder with policy.onnx; None: the robot follows the line.
+        policy: A policy folder with policy.onnx; if None, the robot follows the line.
         task: Name of one of the place's tasks.
         lighting: See `twin.reality.lighting.weather`.
-        seed: Of all randomness.
+        seed: Seed of all randomness.
         setup: Place, robot and camera.
 
     Raises:
@@ -93,7 +93,7 @@ def write_robot_bag(
     path.parent.mkdir(parents=True, exist_ok=True)
     limit = round(test.task.time_limit / timestep) + left
     with contextlib.ExitStack() as stack:
-        unfinished = stack.enter_context(contextlib.ExitStack())  # what Ctrl-C leaves behind is no bag
+        unfinished = stack.enter_context(contextlib.ExitStack())  # removes an interrupted bag
         unfinished.callback(remove, path)
         writer = stack.enter_context(Writer(path, version=9, storage_plugin=StoragePlugin.MCAP))
         progress = stack.enter_context(bar("trial", limit, "step"))
@@ -166,7 +166,7 @@ class BagMessages:
         model: str = "plumb_bob",
         distortion: Sequence[float] = (0.0,) * 5,
     ) -> Any:
-        """`intrinsics` fx, fy, cx, cy [px] from the corner of the first pixel; ROS counts from its center."""
+        """`intrinsics` fx, fy, cx, cy [px]; cx, cy from the corner of the first pixel, but in ROS from its center."""
         fx, fy, cx, cy = intrinsics
         k = np.array([fx, 0, cx - 0.5, 0, fy, cy - 0.5, 0, 0, 1.0])
         p = np.array([fx, 0, cx - 0.5, 0, 0, fy, cy - 0.5, 0, 0, 0, 1.0, 0])
@@ -177,7 +177,7 @@ class BagMessages:
         )
 
     def odometry(self, base_to_world: Array, stamp: int) -> Any:
-        """A pose of the base (4, 4)."""
+        """A message with a pose of the base (4, 4)."""
         quaternion = Rotation.from_matrix(base_to_world[:3, :3]).as_quat().tolist()
         point = self.types["geometry_msgs/msg/Point"](*base_to_world[:3, 3].tolist())
         pose = self.types["geometry_msgs/msg/Pose"](point, self.types["geometry_msgs/msg/Quaternion"](*quaternion))
@@ -189,7 +189,7 @@ class BagMessages:
         )
 
     def command(self, v: float, yaw_rate: float, stamp: int) -> Any:
-        """v [m/s], yaw rate [rad/s]."""
+        """A message with the command v [m/s], yaw rate [rad/s]."""
         return self.types["geometry_msgs/msg/TwistStamped"](self.header(stamp, "base_link"), self._twist(v, yaw_rate))
 
     def _twist(self, v: float, yaw_rate: float) -> Any:

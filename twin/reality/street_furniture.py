@@ -42,7 +42,7 @@ def add_lamp_post(
     arms: tuple[float, ...] = (1.5,),
     shines: bool = True,
 ) -> None:
-    """A lamp post with a head at the end of each arm [m]; arms reach towards the road, negative ones away from it."""
+    """Adds a lamp post with a head at the end of each arm [m]; arms reach towards the road, negative ones outwards."""
     foot = place.spot(station, lateral)
     top = foot + up(height)
     parts = [
@@ -67,7 +67,7 @@ def add_lamp_post(
 def add_lantern(
     place: KnownPlace, k: int, station: float, lateral: float, height: float, shape: str, shines: bool
 ) -> None:
-    """A lamp on top of its post: `post_top` is a disc under a hat, `lantern` a glass box that widens upwards."""
+    """Adds a lamp on top of a post: `post_top` is a disc under a hat, `lantern` a glass box that widens upwards."""
     foot = place.spot(station, lateral)
     top = foot + up(height)
     parts = [place.cell("dark", primitives.tube(foot - up(0.1), top, 0.07, 0.045, 10))]
@@ -102,11 +102,14 @@ def _add_lamp(
 def add_sign(
     place: KnownPlace, k: int, station: float, lateral: float, turn: float, size: tuple[float, float, float]
 ) -> None:
-    """A sign turned by `turn` [rad] from facing the traffic; `size` is its width and the heights of its edges [m]."""
+    """Adds a sign turned by `turn` [rad] from facing the traffic.
+
+    `size` is its width and the heights of its lower and upper edge [m].
+    """
     foot = place.spot(station, lateral)
     yaw = place.heading(station) + turn
     c, s = np.cos(yaw), np.sin(yaw)
-    across = np.array([s, -c])  # left to right as the reader sees it
+    across = np.array([s, -c])  # from the left to the right as a reader sees them
     wide, low, high = size
     face = foot[:2] - 0.05 * np.array([c, s])
     left, right = face - across * wide / 2, face + across * wide / 2
@@ -169,7 +172,7 @@ def add_bin(place: KnownPlace, k: int, station: float, lateral: float, skin: str
 
 # ---- furniture of drawn places
 
-# Side views of vehicles, front to the right: body and windows as corners (x, z) in units of length and height.
+# Length, width, height [m]; side views of body and windows as corners (x, z) in units of length and height, x ahead.
 _VEHICLES: dict[str, tuple[tuple[float, float, float], list[tuple[float, float]], list[tuple[float, float]]]] = {
     "hatchback": (
         (3.9, 1.72, 1.48),
@@ -202,7 +205,7 @@ def vehicle_size(kind: str) -> tuple[float, float]:
 
 
 def add_vehicle(place: KnownPlace, k: int, station: float, lateral: float, turn: float, kind: str, skin: str) -> None:
-    """A parked vehicle."""
+    """Adds a parked vehicle."""
     (length, width, height), body, cabin = _VEHICLES[kind]
     foot, yaw = place.spot(station, lateral), place.heading(station) + turn
     ahead = np.array([np.cos(yaw), np.sin(yaw)])
@@ -245,7 +248,7 @@ def add_vehicle(place: KnownPlace, k: int, station: float, lateral: float, turn:
 def add_post(
     place: KnownPlace, name: str, station: float, lateral: float, height: float, radius: float, skin: str
 ) -> None:
-    """An upright post: a bollard, or a pole for wires."""
+    """Adds an upright post: a bollard, or from 2 m of height a pole for wires."""
     foot = place.spot(station, lateral)
     parts = [place.cell(skin, primitives.tube(foot - up(0.2), foot + up(height), radius, 0.8 * radius, 10))]
     if height < 2.0:
@@ -259,7 +262,7 @@ def add_post(
 
 
 def add_wires(place: KnownPlace, name: str, feet: list[tuple[float, float]], height: float) -> None:
-    """Three sagging wires along poles at stations and laterals [m]."""
+    """Adds three sagging wires along poles at stations and laterals [m]."""
     parts = []
     share = np.linspace(0.0, 1.0, 9)
     for (s0, l0), (s1, l1) in pairwise(feet):
@@ -273,7 +276,7 @@ def add_wires(place: KnownPlace, name: str, feet: list[tuple[float, float]], hei
 
 
 def add_cabinet(place: KnownPlace, k: int, station: float, lateral: float, size: tuple[float, float, float]) -> None:
-    """A cabinet of the power or telephone company."""
+    """Adds a utility cabinet."""
     foot, yaw = place.spot(station, lateral) - up(0.1), place.heading(station)
     base = place.cell("tank", primitives.box((size[0] + 0.06, size[1] + 0.06, 0.2)).moved(foot, yaw))
     box = place.cell("cabinet", primitives.box(size, 0.2).moved(foot, yaw))
@@ -282,7 +285,7 @@ def add_cabinet(place: KnownPlace, k: int, station: float, lateral: float, size:
 
 
 def add_stone(place: KnownPlace, k: int, station: float, lateral: float, radius: float) -> None:
-    """A boulder."""
+    """Adds a boulder."""
     rng = place.rng(9, k)
     foot = place.spot(station, lateral)
     angle, rise = np.meshgrid(np.linspace(0, 2 * np.pi, 11), np.linspace(0.5 * np.pi, -0.3, 6))

@@ -98,7 +98,7 @@ def _slab_field(
 ) -> None:
     """Divides a surface into slabs of (across, along) [m] with random tones and joints `gap` [m] wide.
 
-    `bond` 0: joints in line; 1: rows across the road shifted by half a slab; 2: rows along it shifted.
+    `bond` 0: joints in line; 1: rows across the road shifted by half a slab; 2: rows along the road shifted.
     """
     rows, columns = image.shape[:2]
     r, c = np.arange(rows)[:, None] * pixel / unit[0], np.arange(columns)[None] * pixel / unit[1]
@@ -242,7 +242,7 @@ def turf(rng: np.random.Generator, surface: SurfaceSpec, shape: tuple[int, int],
 
 
 def land(rng: np.random.Generator, surface: SurfaceSpec, shape: tuple[int, int], pixel: float, kind: str) -> Array32:
-    """The land around: turf, and in the open also fields of other colors."""
+    """The land around the road: turf, and for `meadow` also fields of different tints, some with furrows."""
     image = turf(rng, surface, shape, pixel, kind)
     if kind == "meadow":
         sites = np.stack([rng.uniform(0, shape[0], 14), rng.uniform(0, shape[1], 14)], -1)

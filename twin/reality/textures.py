@@ -65,7 +65,7 @@ def speckle(rng: np.random.Generator, image: NDArray, count: int, sizes: tuple[f
 
 
 def grains(rng: np.random.Generator, image: Array32, share: float, colors: NDArray) -> None:
-    """Colors a fraction `share` of single texels in place, as the stones of asphalt."""
+    """Colors a fraction `share` of single texels in place, like the stones in asphalt."""
     hit = rng.random(image.shape[:2]) < share
     shade = rng.uniform(0.75, 1.15, (int(hit.sum()), 1))
     image[hit] = 0.35 * image[hit] + 0.65 * colors[rng.integers(0, len(colors), int(hit.sum()))] * shade
@@ -214,7 +214,7 @@ def slabs(rng: np.random.Generator, shape: tuple[int, int], pixel: float, slab: 
 
 
 def kerb(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Array32:
-    """Kerb stones 0.9 m long, rows across the profile and columns along it."""
+    """Kerb stones 0.9 m long, with rows across the profile of the kerb and columns along the kerb."""
     return slabs(rng, shape, pixel, (10.0, 0.9)) * np.float32(0.95)
 
 
@@ -246,7 +246,7 @@ def plaster(
 
 
 def weathered(image: Array32, pixel: float) -> Array32:
-    """The wall texture darkened towards foot and eaves, where less sky is visible."""
+    """A wall's texture, darkened towards its foot and its eaves, where less sky is visible."""
     up = (image.shape[0] - np.arange(image.shape[0]))[:, None, None] * pixel
     down = image.shape[0] * pixel - up
     return (image * (1.0 - 0.35 * np.exp(-up / 0.6) - 0.30 * np.exp(-down / 0.5))).astype(np.float32)
@@ -369,6 +369,6 @@ def stripes(
 
 
 def resized(image: Array32, shape: tuple[int, int], smooth: bool = True) -> Array32:
-    """The image scaled to (rows, columns), with cubic or linear interpolation."""
+    """The image scaled to (rows, columns), with cubic (`smooth`) or linear interpolation."""
     how = cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR
     return cv2.resize(image, shape[::-1], interpolation=how).astype(np.float32)

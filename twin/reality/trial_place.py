@@ -1,4 +1,4 @@
-"""The place of a number on the day of the trials: small objects have moved since the film."""
+"""The place with a number on the day of the trials: cones, bins, crates and cars have moved since the film."""
 
 from functools import cache
 
@@ -19,7 +19,7 @@ _LENGTH_TOLERANCE = 0.98  # fraction of the longest path; the first film above i
 def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) -> Array:
     """The route: the filmed path on the true ground [m], shape (m, 3).
 
-    As in a build, the first film within 2 % of the longest gives the path.
+    As in a build, the route is the path of the first film whose length is within 2 % of the longest.
     """
     plan, line = plan or FilmingPlan(), line or RoadLine()
     paths = [smooth_path(trajectory(plan, line, lighting)[1][:, :3, 3]) for lighting in plan.lightings]
@@ -30,7 +30,7 @@ def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) 
 
 @cache
 def place_on_test_day(number: int = 0) -> KnownPlace:
-    """The place of a number on the day of the trials, after small objects have moved."""
+    """The place with a number on the day of the trials, when some objects have moved since the film."""
     return build_number(number, displaced=True) if number else places.build(displaced=True)
 
 

@@ -1,4 +1,4 @@
-"""The known-truth world as a MuJoCo model of visual geoms, which is filmed; nothing in it collides."""
+"""The known-truth world as a MuJoCo model for rendering: it has visual geoms only, and nothing in it collides."""
 
 import mujoco
 import numpy as np
@@ -14,7 +14,7 @@ from twin.types import Array
 # ---- ambient occlusion of the ground
 
 _SKY_RAYS = 48
-_OCCLUDER_REACH = 7.0  # [m] within which objects occlude the sky
+_OCCLUDER_REACH = 7.0  # [m] objects farther away do not occlude the sky
 _OCCLUSION_STEP = 0.3  # [m] between points of the map
 
 
@@ -22,7 +22,8 @@ def sky_visibility(place: KnownPlace, points: Array) -> Array:
     """Fraction of the cosine-weighted sky that objects nearby leave visible from points (..., 3), shape (...)."""
     part = primitives.join([t.part for t in place.objects if t.kind in ("obstacle", "foliage")])
     k = np.arange(_SKY_RAYS) + 0.5
-    angle, sine = k * np.pi * (3.0 - np.sqrt(5.0)), np.sqrt(k / _SKY_RAYS)  # Malley: a uniform disc lifted to the dome
+    # Malley's method: points that fill a disc uniformly are projected up to the hemisphere.
+    angle, sine = k * np.pi * (3.0 - np.sqrt(5.0)), np.sqrt(k / _SKY_RAYS)
     rays = np.stack([sine * np.cos(angle), sine * np.sin(angle), np.sqrt(1.0 - sine**2)], 1)
     flat = points.reshape(-1, 3) + up(0.02)
     return Surface(part.vertices, part.faces).openness(flat, rays, _OCCLUDER_REACH).reshape(points.shape[:-1])

@@ -1,6 +1,7 @@
-"""Ground truth of a generated scene: poses, some depth maps, and the geometry, rebuilt from its parameters.
+"""Ground truth of a generated scene: poses, some depth maps, and the geometry, which is rebuilt from its parameters.
 
-`python -m twin.reality film` writes it to `<scene>/truth`; only `twin/reality/comparison.py` and tests may read it.
+`python -m twin.reality film` writes it to `<scene>/truth`. A build must not read it; `twin/reality/comparison.py`,
+`python -m twin.reality drive`, benchmarks and tests do.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -21,10 +22,11 @@ from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import CAMERA_HEIGHT
 from twin.reality.place_objects import KnownPlace
-from twin.reality.place_spec import FREE_HALF_WIDTH, draw
+from twin.reality.place_sampling import draw
+from twin.reality.place_spec import FREE_HALF_WIDTH
 from twin.types import Array
 
-HALF_WIDTH = FREE_HALF_WIDTH  # [m] of the free corridor around the route
+HALF_WIDTH = FREE_HALF_WIDTH  # [m] half width of the free corridor around the route
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Truth:
     number: int = 0
     """Number of the place."""
     lightings: dict[str, str] = field(default_factory=dict)
-    """Lighting of every film that is not named after its lighting."""
+    """Lighting of each film by source name; a film that is missing here is named after its lighting."""
     camera_height: float = CAMERA_HEIGHT
     """Mean height of the lens above the ground [m]."""
 
