@@ -92,7 +92,6 @@ def trained(scene: Path, name: str, steps: int, *options: str) -> int:
     return train.main([str(scene), *common, "--run", name, "--steps", str(steps), *options])
 
 
-@pytest.mark.slow
 def test_a_run_gets_the_tests_and_a_film_and_continues(scene, stand_in):
     assert trained(scene, "logged", 8, "--wandb", "team/roads") == 0
     folder, (run,) = scene / "runs" / "logged", stand_in.runs
