@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from pyarrow import parquet
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_model, save_model
 from torch import nn
 
 from twin.report.video_writer import read_frames
@@ -25,27 +25,20 @@ STACK = 4  # pictures that a policy sees, the newest last
 
 
 def network() -> nn.Module:
-    layers = [
-        nn.Conv2d(3 * STACK, 32, 5, 4),
-        nn.ReLU(),
-        nn.Conv2d(32, 32, 3, 2),
-        nn.ReLU(),
-        nn.AdaptiveAvgPool2d((4, 8)),
-    ]
-    return nn.Sequential(*layers, nn.Flatten(), nn.Linear(1024, 64), nn.ReLU(), nn.Linear(64, 2), nn.Tanh())
+    eyes = [nn.Conv2d(3 * STACK, 32, 5, 4), nn.ReLU(), nn.Conv2d(32, 32, 3, 2), nn.ReLU(), nn.AdaptiveAvgPool2d((4, 8))]
+    return nn.Sequential(*eyes, nn.Flatten(), nn.Linear(1024, 64), nn.ReLU(), nn.Linear(64, 2), nn.Tanh())
 
 
 @functools.cache
-def _trained() -> nn.Module:
-    model = network()
-    model.load_state_dict(load_file(WEIGHTS))
-    return model.eval()
+def trained() -> nn.Module:
+    load_model(model := network(), WEIGHTS)
+    return model
 
 
 @torch.no_grad()
 def act(pixels: np.ndarray) -> np.ndarray:
     """Action in [-1, 1] of the speed and the yaw rate, from pictures (12, height, width)."""
-    return _trained()(torch.as_tensor(pixels[None]).float() / 255.0 - 0.5)[0].numpy()
+    return trained()(torch.as_tensor(pixels[None]).float() / 255.0 - 0.5)[0].numpy()
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -59,24 +52,23 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error(f"{given.dataset}: its actions are {list(ranges)}; expected speed and yaw rate")
     low, high = torch.tensor(list(ranges.values())).T
     rows = parquet.read_table(given.dataset / "data/chunk-000/file-000.parquet").to_pydict()
-    films = sorted((given.dataset / "videos/observation.images.front").glob("chunk-*/*.mp4"))
+    films = sorted(given.dataset.glob("videos/observation.images.front/chunk-*/*.mp4"))
     pictures = torch.as_tensor(np.concatenate([list(read_frames(film)) for film in films])).permute(0, 3, 1, 2)
     actions = 2.0 * (torch.tensor(rows["action"]) - low) / (high - low) - 1.0
-    index, frame = torch.arange(len(actions)), torch.tensor(rows["frame_index"])
+    frame = torch.tensor(rows["frame_index"])
     model, generator = network(), torch.Generator().manual_seed(0)
     optimizer = torch.optim.Adam(model.parameters(), 1e-3)
     for step in range(given.steps):
         some = torch.randint(len(actions), (64,), generator=generator)
         # At its start a drive has the first picture several times, as in the environment.
-        back = [index[some] - torch.minimum(frame[some], torch.tensor(k)) for k in reversed(range(STACK))]
-        seen = torch.cat([pictures[one] for one in back], 1).float() / 255.0 - 0.5
-        loss = (model(seen) - actions[some]).square().mean()
+        stack = [pictures[some - frame[some].clamp(max=back)] for back in reversed(range(STACK))]
+        loss = (model(torch.cat(stack, 1).float() / 255.0 - 0.5) - actions[some]).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         if step % 200 == 0 or step == given.steps - 1:
             print(f"step {step}: mean squared error {loss.item():.4f}")
-    save_file(model.state_dict(), WEIGHTS)
+    save_model(model, WEIGHTS)
 
 
 if __name__ == "__main__":

@@ -1,43 +1,38 @@
-"""SAC in one file, with nothing but torch and Gymnasium: python examples/sac.py scenes/demo --steps 20000
+"""SAC in one file, in the manner of CleanRL: python examples/sac.py scenes/demo --steps 20000
 
 The algorithm is that of Haarnoja et al., arXiv 1812.05905, with one convolutional encoder that the critics train.
+Network layers, distribution and replay buffer are those of stable-baselines3: pip install 'twin[learn]'
 """
 
 import argparse
-import copy
+from copy import deepcopy
 
 import gymnasium
 import numpy as np
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import save_model
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+from stable_baselines3.common.torch_layers import NatureCNN, create_mlp
+from stable_baselines3.common.utils import polyak_update
 from torch import nn
-from torch.nn import functional
 
 
 class Agent(nn.Module):
-    def __init__(self, channels: int, actions: int) -> None:
+    def __init__(self, space: gymnasium.spaces.Box, actions: int) -> None:
         super().__init__()
-        layers = [
-            nn.Conv2d(channels, 32, 4, 4),
-            nn.ReLU(),
-            nn.Conv2d(32, 32, 3, 2),
-            nn.ReLU(),
-            nn.AdaptiveAvgPool2d((4, 8)),
-        ]
-        self.encoder = nn.Sequential(*layers, nn.Flatten(), nn.Linear(1024, 64), nn.LayerNorm(64), nn.Tanh())
-        self.actor = nn.Sequential(nn.Linear(64, 256), nn.ReLU(), nn.Linear(256, 2 * actions))
-        self.critics = nn.ModuleList(
-            nn.Sequential(nn.Linear(64 + actions, 256), nn.ReLU(), nn.Linear(256, 1)) for _ in range(2)
-        )
-        self.log_alpha = nn.Parameter(torch.tensor(-2.0))
+        self.encoder = nn.Sequential(NatureCNN(space, 64), nn.LayerNorm(64), nn.Tanh())
+        self.actor = nn.Sequential(*create_mlp(64, 2 * actions, [256]))
+        self.critics = nn.ModuleList(nn.Sequential(*create_mlp(64 + actions, 1, [256])) for _ in range(2))
+        self.log_alpha, self.squashed = nn.Parameter(torch.tensor(-2.0)), SquashedDiagGaussianDistribution(actions)
+
+    def see(self, pictures: np.ndarray | torch.Tensor) -> torch.Tensor:
+        return self.encoder(torch.as_tensor(pictures).float() / 255.0)
 
     def act(self, seen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Sampled actions in (-1, 1) and their log probabilities, from encoded pictures."""
         mean, deviation = self.actor(seen).chunk(2, -1)
-        normal = torch.distributions.Normal(mean, deviation.clamp(-5, 1).exp())
-        raw = normal.rsample()
-        squash = 2.0 * (np.log(2.0) - raw - functional.softplus(-2.0 * raw))
-        return raw.tanh(), (normal.log_prob(raw) - squash).sum(-1)
+        action, log_probability = self.squashed.log_prob_from_params(mean, deviation.clamp(-5, 1))
+        return action, log_probability[:, None]
 
     def values(self, seen: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         return torch.cat([critic(torch.cat([seen, action], -1)) for critic in self.critics], -1)
@@ -55,61 +50,45 @@ def main(arguments: list[str] | None = None) -> None:
 
     rewards = {"progress": 1.0, "cross_track": -0.1}
     world = gymnasium.make("twin:twin/Drive-v0", scene=given.scene, task=given.task, rewards=rewards)
-    shape, size = world.observation_space.shape, world.action_space.shape[0]
-    agent = Agent(shape[0], size)
-    target = copy.deepcopy(agent)
-    train_critics = torch.optim.Adam([*agent.encoder.parameters(), *agent.critics.parameters()], 3e-4)
-    train_actor = torch.optim.Adam([*agent.actor.parameters(), agent.log_alpha], 3e-4)
-    kept = min(given.steps, 5_000)  # 1.7 GB of pictures
-    seen, then = (np.zeros((kept, *shape), np.uint8) for _ in range(2))
-    acted, earned, ended = np.zeros((kept, size), np.float32), np.zeros(kept, np.float32), np.zeros(kept, np.float32)
-    rng = np.random.default_rng(0)
-
-    def pictures(batch: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(batch).float() / 255.0 - 0.5
-
+    space, size = world.observation_space, world.action_space.shape[0]
+    agent = Agent(space, size)
+    target = deepcopy(agent)
+    critics = torch.optim.Adam([*agent.encoder.parameters(), *agent.critics.parameters()], 3e-4)
+    actor = torch.optim.Adam([*agent.actor.parameters(), agent.log_alpha], 3e-4)
+    buffer = ReplayBuffer(min(given.steps, 5_000), space, world.action_space, handle_timeout_termination=False)
     picture, _ = world.reset(seed=0)
-    goals = episodes = 0
+    world.action_space.seed(0)
     for step in range(given.steps):
-        if step < given.warmup:
-            action = rng.uniform(-1, 1, size).astype(np.float32)
-        else:
-            with torch.no_grad():
-                action = agent.act(agent.encoder(pictures(picture[None])))[0][0].numpy()
+        with torch.no_grad():
+            action = agent.act(agent.see(picture[None]))[0][0].numpy()
+        action = world.action_space.sample() if step < given.warmup else action
         following, reward, terminated, truncated, info = world.step(action)
-        k = step % kept
-        seen[k], then[k], acted[k], earned[k], ended[k] = picture, following, action, reward, terminated
+        buffer.add(picture, following, action, reward, terminated, [info])
         picture = following
         if terminated or truncated:
-            episodes, goals = episodes + 1, goals + info["is_success"]
-            print(f"step {step + 1}: {info['cause']} after {info['progress']:.1f} m; {goals} of {episodes} at the goal")
+            print(f"step {step + 1}: {info['cause']} after {info['progress']:.1f} m")
             picture, _ = world.reset()
         if step < given.warmup:
             continue
 
-        some = rng.integers(0, min(step + 1, kept), given.batch)
-        action_batch, reward_batch, over = (torch.as_tensor(x[some]) for x in (acted, earned, ended))
+        batch = buffer.sample(given.batch)
+        alpha = agent.log_alpha.exp().detach()
         with torch.no_grad():
-            later = target.encoder(pictures(then[some]))
-            next_action, log_probability = agent.act(agent.encoder(pictures(then[some])))
-            best = target.values(later, next_action).min(-1).values - agent.log_alpha.exp() * log_probability
-            wanted = reward_batch + 0.99 * (1 - over) * best
-        encoded = agent.encoder(pictures(seen[some]))
-        train_critics.zero_grad()
-        functional.mse_loss(agent.values(encoded, action_batch), wanted[:, None].expand(-1, 2)).backward()
-        train_critics.step()
-        chosen, log_probability = agent.act(encoded.detach())
-        alpha = agent.log_alpha.exp()
-        value = agent.values(encoded.detach(), chosen).min(-1).values
-        train_actor.zero_grad()
-        (
-            (alpha.detach() * log_probability - value).mean() - (alpha * (log_probability.detach() - size)).mean()
-        ).backward()
-        train_actor.step()
-        with torch.no_grad():
-            for slow, fast in zip(target.parameters(), agent.parameters(), strict=True):
-                slow.lerp_(fast, 0.01)
-    save_file(agent.state_dict(), given.out)
+            action, log_probability = agent.act(agent.see(batch.next_observations))
+            best = target.values(target.see(batch.next_observations), action).min(-1, True).values
+            wanted = batch.rewards + 0.99 * (1 - batch.dones) * (best - alpha * log_probability)
+        seen = agent.see(batch.observations)
+        critics.zero_grad()
+        (agent.values(seen, batch.actions) - wanted).square().mean().backward()
+        critics.step()
+        action, log_probability = agent.act(seen.detach())
+        value = agent.values(seen.detach(), action).min(-1, True).values
+        entropy_loss = -(agent.log_alpha.exp() * (log_probability.detach() - size)).mean()
+        actor.zero_grad()
+        ((alpha * log_probability - value).mean() + entropy_loss).backward()
+        actor.step()
+        polyak_update(agent.parameters(), target.parameters(), 0.01)
+    save_model(agent, given.out)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ def test_sac_learns(scene, tmp_path, capsys):
     root, out = str(scene), tmp_path / "sac.safetensors"
     options = ["--task", "ahead", "--steps", "120", "--warmup", "100", "--batch", "8", "--out", str(out)]
     example("sac").main([root, *options])
-    assert "at the goal" in capsys.readouterr().out and out.exists()
+    assert " after " in capsys.readouterr().out and out.exists()
 
 
 def test_imitation_drives_as_it_was_shown(scene, tmp_path, monkeypatch, capsys):

@@ -21,7 +21,7 @@ from twin.errors import InputError
 from twin.evaluation.trials import Cell, read_results, read_trials
 from twin.learn.policy import Control, load_policy, save_policy
 from twin.learn.policy_network import Architecture
-from twin.report.video_writer import video_info
+from twin.report.video_writer import read_frames, video_info
 from twin.sysid.trial_recording import fit_frame, read_trial
 
 STEP = 100_000_000  # [ns]
@@ -93,6 +93,96 @@ def test_a_bag_of_an_episode_is_judged_as_the_episode_was(place, tmp_path, name,
     assert figures["pictures"]["psnr_median"] > 33.0 and figures["pictures"]["lighting"] == "day"
     film = video_info(scene / "trials" / "monday" / "trial.mp4")
     assert film["fps"] == 10.0 and film["frames"] >= steps
+
+
+def test_bags_become_a_dataset_with_what_the_robot_saw_and_was_told(place, tmp_path, capsys):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
+    scene, drives = place
+    bags, out = [str(bag_of(drives[name], tmp_path / name)) for name in ("ahead", "left")], tmp_path / "drives"
+    given = ["--policy", "ahead", "--task", "ahead", "--lighting", "monday", "--frame", "scene", "--lerobot", str(out)]
+    assert trial.main([str(scene), *bags, *given]) == 0
+    counts = [drives[name][-1].message[2] for name in ("ahead", "left")]
+    assert f"2 drives, 1 to the goal, {sum(counts)} frames: {out}" in capsys.readouterr().out
+    rows = parquet.read_table(out / "data/chunk-000/file-000.parquet").to_pydict()
+    sent = [_column(drives[name], "/cmd_vel", lambda m: (m.twist.linear.x, m.twist.angular.z)) for name in drives]
+    np.testing.assert_allclose(rows["action"], np.concatenate(sent), atol=1e-6)
+    where = [
+        _column(drives[name], "/odom", lambda m: (m.pose.pose.position.x, m.pose.pose.position.y))[:-1]
+        for name in drives
+    ]
+    np.testing.assert_allclose(np.array(rows["observation.environment_state"])[:, :2], np.concatenate(where), atol=1e-5)
+    for (start, end), places in zip(((0, counts[0]), (counts[0], sum(counts))), where, strict=True):
+        moved = np.linalg.norm(places[2:] - places[:-2], axis=1) / 0.2
+        np.testing.assert_allclose(np.array(rows["observation.state"])[start + 2 : end, 0], moved, atol=0.02)
+    assert np.flatnonzero(rows["next.success"]).tolist() == [counts[0] - 1]
+    last = np.flatnonzero(rows["next.done"])
+    assert last.tolist() == [counts[0] - 1, sum(counts) - 1]
+    np.testing.assert_allclose(np.array(rows["next.reward"])[last], [0.1, -5.0], atol=1e-6)
+    episodes = parquet.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
+    assert episodes["twin.cause"] == ["goal", "out_of_bounds"] and episodes["twin.lighting"] == ["monday"] * 2
+    for k, name in enumerate(drives):
+        saw = [one.message for one in drives[name] if one.topic == "/camera/image"]
+        saw = [one.data.reshape(one.height, one.step)[:, : 3 * one.width].reshape(one.height, -1, 3) for one in saw]
+        frames = list(read_frames(out / f"videos/observation.images.front/chunk-000/file-{k:03d}.mp4"))
+        assert len(frames) == counts[k]
+        error = _luma_error(frames, saw)
+        # The codec halves the resolution of colors, which are strong here. A frame's neighbors are twice as far off.
+        assert error < 4.0 and error < 0.6 * min(_luma_error(frames, saw[1:]), _luma_error(frames[1:], saw))
+    assert not (scene / "real.csv").exists()
+
+
+def test_a_drive_by_hand_needs_no_policy_and_no_outcome(place, tmp_path):
+    pytest.importorskip("pyarrow", reason="needs pyarrow")
+    scene, drives = place
+    cut = [one for one in drives["ahead"] if one.topic and one.stamp < START + 20 * STEP]
+    fast = [command(0.5, 0.1, one.stamp + STEP // 2) for one in cut if one.topic == "/cmd_vel"]
+    few = [one for one in fast if one.stamp < START + 10 * STEP]  # then the operator lets go
+    given = [one for one in cut if one.topic != "/cmd_vel"]
+    bag = write(tmp_path / "by_hand", [*given, *few, *[command(0.3, -0.1, one.stamp + 7) for one in few]])
+    (drive,) = trial.record_dataset(scene, [bag], tmp_path / "drives", "ahead", frame="scene")
+    assert drive.cause == "" and not drive.success
+    np.testing.assert_allclose(drive.actions[:9], np.tile([0.4, 0.0], (9, 1)))
+    np.testing.assert_allclose(drive.actions[10:14], np.tile([0.3, -0.1], (4, 1)))
+    assert not drive.actions[16:].any()
+    info = json.loads((tmp_path / "drives/meta/info.json").read_text())
+    assert info["features"]["observation.images.front"]["shape"] == [90, 160, 3]
+    assert info["twin"]["action_range"] == {"linear_velocity": [0.0, 1.0], "angular_velocity": [-1.0, 1.0]}
+    (drive,) = trial.record_dataset(scene, [bag], tmp_path / "hit", "ahead", cause="collision", frame="scene")
+    assert drive.cause == "collision" and drive.rewards[-1] == -4.0
+    gap = [one for one in cut if "image" not in one.topic or not START + STEP < one.stamp < START + 9 * STEP]
+    with pytest.raises(
+        InputError, match=r"/camera/image has no picture within 0\.7 s of 0\.8 s after the first command"
+    ):
+        trial.record_dataset(scene, [write(tmp_path / "gap", gap)], tmp_path / "none", "ahead", frame="scene")
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (
+            ["a", "b", "--policy", "ahead", "--lighting", "day"],
+            "2 bags: a bag is a trial; several are for --lerobot DIR",
+        ),
+        (["a", "--lighting", "day"], "a trial needs --policy; without a policy, --lerobot DIR records"),
+        (["a", "--policy", "ahead"], "a trial needs --lighting"),
+        (["a", "b", "--lerobot", "out", "--cause", "stuck"], "--cause stuck is of one bag; there are 2"),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused_in_one_line(place, options, words, capsys):
+    assert trial.main([str(place[0]), *options, "--task", "ahead", "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+
+
+def _luma_error(shown: list[np.ndarray], wanted: list[np.ndarray]) -> float:
+    """Mean difference of brightness, picture by picture."""
+    pairs = zip(shown, wanted, strict=False)
+    return float(np.mean([np.abs((a.astype(float) - b) @ [0.299, 0.587, 0.114]).mean() for a, b in pairs]))
+
+
+def _column(messages: list[Recorded], topic: str, value) -> np.ndarray:
+    return np.array([value(one.message) for one in messages if one.topic == topic])
 
 
 def test_trials_add_up_and_a_bag_counts_once(place, tmp_path):

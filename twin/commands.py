@@ -410,6 +410,12 @@ def _train(parser: argparse.ArgumentParser) -> None:
         default=None,
         help="critics receive the robot's pose in training (the default); the policy never does",
     )
+    parser.add_argument(
+        "--wandb",
+        metavar="PROJECT",
+        help="log to this project of Weights & Biases, or ENTITY/PROJECT: numbers, and at the end a film of the kept "
+        "policy (pip install 'twin[wandb]')",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
 
@@ -444,10 +450,10 @@ def _trial(parser: argparse.ArgumentParser) -> None:
         "found by their types."
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("bag", type=Path, help="the recording of one trial")
-    parser.add_argument("--policy", required=True, help="the policy that drove: a run, a checkpoint or an ONNX file")
+    parser.add_argument("bag", type=Path, nargs="+", help="the recording of one trial; with --lerobot, of any drives")
+    parser.add_argument("--policy", help="the policy that drove: a run, a checkpoint or an ONNX file")
     parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument("--lighting", required=True, metavar="NAME", help="name of the day or light for real.csv")
+    parser.add_argument("--lighting", metavar="NAME", help="name of the day or light for real.csv")
     parser.add_argument("--twin-lighting", metavar="NAME", help="the twin's lighting to compare with; default: NAME")
     parser.add_argument(
         "--cause",
@@ -460,6 +466,12 @@ def _trial(parser: argparse.ArgumentParser) -> None:
         choices=("pictures", "scene"),
         default="pictures",
         help="pictures: locate them to place the poses in the scene; scene: the poses are in its frame",
+    )
+    parser.add_argument(
+        "--lerobot",
+        type=Path,
+        metavar="DIR",
+        help="write the bags as a LeRobot dataset instead, by a policy or by hand (pip install 'twin[lerobot]')",
     )
     for name, what in (
         ("image", "pictures"),

@@ -126,7 +126,7 @@ def record_dataset(
         InputError: as `film`, or `out` exists, or pyarrow is not installed.
     """
     from twin.env.episode import record_episode
-    from twin.report.drive_dataset import DriveDataset, require_pyarrow
+    from twin.report.drive_dataset import DriveDataset, drive_instruction, require_pyarrow
 
     if episodes < 1:
         raise InputError(f"--episodes {episodes}: expected 1 or more")
@@ -140,7 +140,7 @@ def record_dataset(
     actions = {
         name: (float(low), float(high)) for name, low, high in zip(names, spec.minimum, spec.maximum, strict=True)
     }
-    words = f"Drive along the road of {scene.scene.root.resolve().name}: {task.replace('_', ' ')}."
+    words = drive_instruction(scene.scene.root, task)
     pictures: list[np.ndarray] = []
     motion: list[tuple[float, float]] = []
 
@@ -200,8 +200,9 @@ def command(given: argparse.Namespace) -> None:
             raise InputError("--rerun is of one drive; --lerobot records several: give one of them")
         drives = record_dataset(given.scene, given.lerobot, given.episodes, *driven, given.trust, **options)
         if not given.quiet:
-            frames, goals = sum(len(one.times) - 1 for one in drives), sum(one.success for one in drives)
-            print(f"{len(drives)} drives, {goals} to the goal, {frames} frames: {given.lerobot}")
+            from twin.report.drive_dataset import drives_summary
+
+            print(drives_summary(drives, given.lerobot))
         return
     if given.episodes != 1:
         raise InputError(f"--episodes {given.episodes}: a film shows one drive; several are for --lerobot DIR")

@@ -12,13 +12,18 @@ import argparse
 import dataclasses
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from twin import commands, runtime
+from twin.config import Condition
+from twin.env.domain_randomization import condition_options
 from twin.errors import InputError
 from twin.evaluation.statistics import wilson
+from twin.evaluation.training_curves import write_success_curve
+from twin.film import film
 from twin.loading import Twin, load_writable
 from twin.runtime import exclusive_lock
 from twin.scene import require_stage, run_folder
@@ -29,7 +34,6 @@ if TYPE_CHECKING:
 
 def command(given: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
-    from twin.evaluation.training_curves import write_success_curve
     from twin.learn.train_config import PRESETS, TrainConfig
     from twin.report.policy_card import write_policy_cards
 
@@ -40,7 +44,7 @@ def command(given: argparse.Namespace) -> None:
     folder = run_folder(twin.scene, given.run)
     require_stage(twin.scene, "mjcf")  # before the run's folder is created
     with exclusive_lock(folder.with_name(f".{folder.name}.lock"), f"{folder} is being trained"):
-        choice = _train(twin, folder, config, given.processes)
+        choice = _train(twin, folder, config, given.processes, given.wandb)
     picture = write_success_curve(folder)
     write_policy_cards(twin.scene, [given.run])
     if not given.quiet:
@@ -67,14 +71,24 @@ def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
     return [*lines, f"Success during the training: {picture}"]
 
 
-def _train(twin: Twin, folder: Path, config: "TrainConfig", processes: int | None) -> dict[str, Any]:
-    """Trains with progress bars; returns the contents of `choice.json`."""
+def _train(
+    twin: Twin, folder: Path, config: "TrainConfig", processes: int | None, project: str | None
+) -> dict[str, Any]:
+    """Trains with progress bars; returns the contents of `choice.json`. `project` is one of Weights & Biases."""
     try:
-        from twin.learn.selection import train_until_learnt
+        from twin.learn.selection import earlier_choice, train_until_learnt
+        from twin.learn.training import prepare_folder
+        from twin.learn.wandb_run import wandb_run
     except ImportError as error:
         raise InputError(f"training needs more: pip install .[learn] ({error})") from None
 
-    with runtime.bar("train, at most", config.steps, "step") as bar:
+    if choice := earlier_choice(twin, folder, config):
+        return choice
+    if project:
+        prepare_folder(folder)
+    settings = {"scene": twin.scene.root.resolve().name, **dataclasses.asdict(config)}
+    logging = wandb_run(project, folder, settings) if project else nullcontext()
+    with logging as log, runtime.bar("train, at most", config.steps, "step") as bar:
 
         def watch(steps: int, recent: Sequence[bool]) -> None:
             if not bar.n:  # steps of earlier calls do not count in the rate
@@ -84,7 +98,14 @@ def _train(twin: Twin, folder: Path, config: "TrainConfig", processes: int | Non
                 low, high = wilson(sum(recent), len(recent))
                 bar.set_postfix_str(f"success {sum(recent)}/{len(recent)} ({low:.2f} to {high:.2f})", refresh=False)
 
-        return train_until_learnt(twin, folder, config, watch, processes)
+        choice = train_until_learnt(twin, folder, config, watch, processes, [log] if log else [])
+        if log:
+            chosen, path = choice["chosen"], folder / "drive.mp4"
+            options = condition_options(Condition.parse(chosen["condition"]))
+            _, episode = film(twin.scene.root, config.task, folder.name, config.seed, path, **options)
+            caption = f"step {chosen['step']:,}, {episode.lighting}: {episode.cause or 'cut off'}"
+            log.show(choice["steps"], write_success_curve(folder), path, caption)
+        return choice
 
 
 main = partial(commands.main, "train")

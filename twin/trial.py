@@ -10,10 +10,15 @@ not show a collision; `--cause collision` states that the recording ends with on
 the twin's robot ends from the real one under the same commands, how similar the pictures are, and whether the policy
 gives the recorded commands for the recorded pictures. The trial is counted in `real.csv`, and listed with its cause in
 `real_trials.csv` beside it.
+
+    python -m twin.trial scenes/my_road monday_1.mcap monday_2.mcap --task straight --lerobot drives
+
+`--lerobot` writes recordings, also of drives by hand, as a dataset to learn from instead; see `record_dataset`.
 """
 
 import argparse
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,17 +26,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from twin import commands, runtime
 from twin.assets.ground import Ground
 from twin.capture.camera_models import Lens
 from twin.capture.localize import register_film
-from twin.config import Condition
+from twin.config import TWIST, Condition
+from twin.env.episode import Episode
 from twin.env.suite import EnvFactory
 from twin.errors import InputError
 from twin.evaluation.trial_judge import JudgedTrial, TrialViews, judge, replay, view
 from twin.evaluation.trials import Trial, read_counts, read_trials, tally, write_real_trials
-from twin.files import write_json
+from twin.files import new_folder, require_absent, write_json
 from twin.learn.policy import Policy, find_policy, load_policy
 from twin.loading import Twin, load_scene
 from twin.robot import PixelCamera
@@ -46,6 +53,10 @@ _LOCATED = 24  # pictures that are located in the scene
 _MOVING = 0.02  # [m/s], [rad/s]: the first faster command starts the trial
 _ANSWER = 300_000_000  # [ns] longest time from a picture to the command that follows from it
 _SAME = 1e-3  # [m/s], [rad/s] below which two commands are the same
+_SPEED_SPAN = 0.2  # [s] over which a speed is taken from poses, before the instant, so that it shows no later command
+_MAX_GAP = (
+    0.5  # [s] without a picture that a dataset may have; a command is in force for so long (Clearpath's, on ROS 2)
+)
 _START_OFFSET, _START_HEADING = 0.3, 10.0  # [m], [°] within which trials in the twin start
 
 
@@ -90,14 +101,10 @@ def record_trial(
         raise InputError(f"{root}: has no field to compare pictures with; build it")
     name = Condition.parse(compared).lighting
     chosen = name if name in factory.field.lightings else None
-    rectify = _rectifier(recording, policy, factory, bag)
-
-    moving = np.flatnonzero(np.abs(recording.commands).max(1, initial=0.0) > _MOVING)
-    if not len(moving):
-        raise InputError(f"{bag}: no command on {recording.topics['commands']} moves the robot; record the whole trial")
-    begin = int(recording.command_times[moving[0]])
+    rectify = _rectifier(recording, policy, factory)
+    begin = _begin(recording)
     fit = _frame(recording, scene, factory, begin) if frame == FIT else FrameFit(0.0, np.zeros(2))
-    trial = _with_cause(_judge(recording, factory, fit, begin, bag), cause, bag)
+    trial = _with_cause(_judge(recording, factory, fit, begin), cause, bag)
     end = begin + round(float(trial.times[-1]) * 1e9)
 
     since = np.asarray((recording.command_times - begin) * 1e-9, np.float64)
@@ -137,6 +144,145 @@ def record_trial(
     return row, figures, folder
 
 
+def record_dataset(
+    root: Path,
+    bags: Sequence[Path],
+    out: Path,
+    task: str,
+    policy_name: str | None = None,
+    lighting: str = "",
+    cause: str | None = None,
+    frame: str = FIT,
+    topics: dict[str, str] | None = None,
+) -> list[Episode]:
+    """Writes drives on the road as a LeRobot dataset, see `twin.report.drive_dataset`; returns them as episodes.
+
+    A frame has the newest picture, as a policy would see it; speed and yaw rate by the poses before it; and the mean of
+    the commands until the next frame. Poses and the twin's rules give the rest.
+
+    Args:
+        root, task, frame, topics: See `record_trial`.
+        bags: One drive each, by a policy or by hand.
+        out: The dataset's folder; must not exist.
+        policy_name: The policy whose camera and period the frames have; None: those of the scene's environments.
+        lighting: Name of the day or light in the dataset's table of drives.
+        cause: The operator's verdict on the end of the recording, if there is one bag.
+
+    Raises:
+        InputError: as `record_trial`, but a drive needs no outcome; `out` exists, or pyarrow is not installed.
+    """
+    from twin.report.drive_dataset import DriveDataset, drive_instruction, require_pyarrow
+
+    if cause and len(bags) > 1:
+        raise InputError(f"--cause {cause} is of one bag; there are {len(bags)}")
+    require_pyarrow()
+    require_absent(out)
+    scene = load_scene(root)
+    policy = load_policy(find_policy(root, policy_name)) if policy_name else None
+    seen = policy.options() if policy else {}
+    factory = EnvFactory.open(scene, task, {**seen, "action": TWIST, "pixels": False})
+    options = factory.options
+    physics, driving = factory.make_env(0)
+    limits, ground = driving.action_spec(physics), Ground.load(require_stage(scene.scene, "mesh"))
+    names = ("linear_velocity", "angular_velocity")
+    ranges = {n: (float(a), float(b)) for n, a, b in zip(names, limits.minimum, limits.maximum, strict=True)}
+    words = drive_instruction(scene.scene.root, task)
+    drives = []
+    with new_folder(out) as folder:
+        dataset = DriveDataset(folder, options.size, options.control_timestep, ranges, words)
+        for bag in bags:
+            recording = read_trial(bag, topics)
+            rectify, begin = _rectifier(recording, policy, factory), _begin(recording)
+            fit = _frame(recording, scene, factory, begin) if frame == FIT else FrameFit(0.0, np.zeros(2))
+            trial = _judge(recording, factory, fit, begin)
+            rewards = trial.rewards.copy()
+            if cause:
+                trial = _with_cause(trial, cause, bag)
+                rewards[-1] = getattr(options.rewards, cause)
+            stamps = begin + np.round(trial.times * 1e9).astype(np.int64)
+            motion = _motion(recording, stamps)
+            base_to_world = np.tile(np.eye(4), (len(stamps), 1, 1))
+            base_to_world[:, :3, :3] = Rotation.from_euler("z", trial.poses[:, 2:]).as_matrix()
+            base_to_world[:, :2, 3] = trial.poses[:, :2]
+            base_to_world[:, 2, 3] = ground.at(trial.poses[:, :2])
+            drives.append(
+                Episode(
+                    times=trial.times,
+                    base_to_world=base_to_world,
+                    qpos=np.zeros((len(stamps), 0)),  # the simulator's, which a robot does not have
+                    actions=_actions(recording, stamps, options.control_timestep),
+                    rewards=rewards,
+                    speed=motion[:, 0],
+                    cross_track=trial.cross_track,
+                    progress=trial.progress,
+                    trust=np.full(len(stamps), np.nan),
+                    cause=trial.cause,
+                    touched=(),
+                    task=factory.segment.name,
+                    lighting=lighting,
+                    seed=begin // 10**6,  # as in `real_trials.csv`
+                    randomisation={},
+                    obstacles=(),
+                )
+            )
+            dataset.add(drives[-1], _pictures_at(recording, rectify, stamps), motion)
+        dataset.finish()
+    return drives
+
+
+def _begin(recording: TrialRecording) -> int:
+    """Time of the first command that moves the robot [ns], which starts the trial."""
+    moving = np.flatnonzero(np.abs(recording.commands).max(1, initial=0.0) > _MOVING)
+    if not len(moving):
+        topic = recording.topics["commands"]
+        raise InputError(f"{recording.path}: no command on {topic} moves the robot; record the whole trial")
+    return int(recording.command_times[moving[0]])
+
+
+def _motion(recording: TrialRecording, stamps: NDArray[np.int64]) -> Array:
+    """Speed along the heading [m/s] and yaw rate [rad/s] over the last `_SPEED_SPAN`, shape (k, 2)."""
+    now, before = (recording.poses_at(one) for one in (stamps, stamps - round(_SPEED_SPAN * 1e9)))
+    (x, y, turn), yaw = ((now - before) / _SPEED_SPAN).T, (now[:, 2] + before[:, 2]) / 2.0
+    return np.column_stack([x * np.cos(yaw) + y * np.sin(yaw), turn])
+
+
+def _actions(recording: TrialRecording, stamps: NDArray[np.int64], period: float) -> Array:
+    """The commands in force in the step after each instant, v [m/s] and ω [rad/s], shape (k, 2); the last is zero.
+
+    It is their mean; if there is none, the one before, unless the robot has stopped for want of commands.
+    """
+    actions = np.zeros((len(stamps), 2))
+    ends = np.searchsorted(recording.command_times, stamps + round(period * 1e9))
+    for k, (start, end) in enumerate(zip(np.searchsorted(recording.command_times, stamps), ends, strict=True)):
+        if end > start:
+            actions[k] = recording.commands[start:end].mean(0)
+        elif start and stamps[k] - recording.command_times[start - 1] < _MAX_GAP * 1e9:
+            actions[k] = recording.commands[start - 1]
+    actions[-1] = 0.0
+    return actions
+
+
+def _pictures_at(recording: TrialRecording, rectify: Rectifier, stamps: NDArray[np.int64]) -> list[Image]:
+    """The newest picture (h, w, 3) at each instant. Raises InputError: there is none that is recent."""
+    newest = np.maximum(0, np.searchsorted(recording.shutter, stamps, side="right") - 1)
+    ages = np.abs(stamps - recording.shutter[newest]) * 1e-9
+    if ages.max() > _MAX_GAP:
+        at = float((stamps[ages.argmax()] - stamps[0]) * 1e-9)
+        raise InputError(
+            f"{recording.path}: {recording.topics['pictures']} has no picture within {ages.max():.1f} s of {at:.1f} s "
+            f"after the first command; expected one every {_MAX_GAP:g} s at least"
+        )
+    pictures: dict[int, Image] = {}
+    with runtime.bar("pictures", len(np.unique(newest)), "picture") as progress:
+        for stamp, picture in recording.pictures(recording.shutter[np.unique(newest)]):
+            try:
+                pictures[stamp] = rectify(picture.decode())
+            except PictureError as error:
+                raise InputError(f"{recording.path}: {recording.topics['pictures']}: {error}") from None
+            progress.update()
+    return [pictures[int(stamp)] for stamp in recording.shutter[newest]]
+
+
 def _key(trial: Trial) -> tuple[str, str, str, int]:
     return trial.policy, trial.task, trial.lighting, trial.seed
 
@@ -155,14 +301,15 @@ def _known_trials(table: Path, out: Path) -> list[Trial]:
     return known
 
 
-def _rectifier(recording: TrialRecording, policy: Policy, factory: EnvFactory, bag: Path) -> Rectifier:
-    """From the robot's camera to the policy's."""
-    own = policy.trained.get("camera") or factory.world.camera.resized(policy.size).intrinsics
+def _rectifier(recording: TrialRecording, policy: Policy | None, factory: EnvFactory) -> Rectifier:
+    """From the robot's camera to the policy's, else to that of the scene's environments."""
+    size = factory.options.size
+    own = (policy and policy.trained.get("camera")) or factory.world.camera.resized(size).intrinsics
     try:
         fx, fy, cx, cy = map(float, own)
-        return Rectifier(recording.camera, Camera(policy.size, (fx, fy, cx, cy)))
+        return Rectifier(recording.camera, Camera(size, (fx, fy, cx, cy)))
     except (PictureError, TypeError, ValueError) as error:
-        raise InputError(f"{bag}: {error}") from None
+        raise InputError(f"{recording.path}: {error}") from None
 
 
 def _frame(recording: TrialRecording, scene: Twin, factory: EnvFactory, begin: int) -> FrameFit:
@@ -189,15 +336,16 @@ def _frame(recording: TrialRecording, scene: Twin, factory: EnvFactory, begin: i
     return fit_frame(recording.poses_at(times), np.array(located).reshape(-1, 3), str(recording.path))
 
 
-def _judge(recording: TrialRecording, factory: EnvFactory, fit: FrameFit, begin: int, bag: Path) -> JudgedTrial:
+def _judge(recording: TrialRecording, factory: EnvFactory, fit: FrameFit, begin: int) -> JudgedTrial:
     """The trial from its first command to its outcome or the recording's end."""
     period = factory.options.control_timestep
     left = (int(recording.pose_times[-1]) - begin) * 1e-9
     steps = int(left / period + 1e-6)
     if begin < recording.pose_times[0] or steps < 1:
         raise InputError(
-            f"{bag}: {recording.topics['poses']} has poses from {(int(recording.pose_times[0]) - begin) * 1e-9:.1f} "
-            f"to {left:.1f} s after the first command; expected the whole trial"
+            f"{recording.path}: {recording.topics['poses']} has poses from "
+            f"{(int(recording.pose_times[0]) - begin) * 1e-9:.1f} to {left:.1f} s after the first "
+            "command; expected the whole trial"
         )
     times = np.arange(steps + 1) * np.float64(period)
     stamps = begin + np.round(times * 1e9).astype(np.int64)
@@ -368,10 +516,26 @@ def command(options: argparse.Namespace) -> None:
         "poses": options.poses,
         "commands": options.commands,
     }
+    topics = {kind: topic for kind, topic in names.items() if topic}
+    if options.lerobot:
+        drives = record_dataset(
+            *(options.scene, options.bag, options.lerobot, options.task, options.policy, options.lighting or ""),
+            *(options.cause, options.frame, topics),
+        )
+        if not options.quiet:
+            from twin.report.drive_dataset import drives_summary
+
+            print(drives_summary(drives, options.lerobot))
+        return
+    if len(options.bag) > 1:
+        raise InputError(f"{len(options.bag)} bags: a bag is a trial; several are for --lerobot DIR")
+    for name in ("policy", "lighting"):
+        if not getattr(options, name):
+            raise InputError(f"a trial needs --{name}; without a policy, --lerobot DIR records drives to learn from")
     row, figures, folder = record_trial(
-        *(options.scene, options.bag, options.policy, options.task, options.lighting, options.out),
+        *(options.scene, options.bag[0], options.policy, options.task, options.lighting, options.out),
         *(options.twin_lighting, options.cause, options.frame),
-        {kind: topic for kind, topic in names.items() if topic},
+        topics,
     )
     if not options.quiet:
         print(summary(row, figures))

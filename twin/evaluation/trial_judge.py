@@ -37,6 +37,9 @@ class JudgedTrial:
     """One of `twin.config.CAUSES`; empty if the recording ends before an outcome."""
     start_heading: float
     """Yaw against the route at the start [rad]."""
+    rewards: Array
+    """Reward of the step that ended at each instant, by the environment's terms without steering; the first is zero.
+    Shape (k,)."""
 
 
 def judge(factory: EnvFactory, times: Array, poses: Array, uprightness: Array) -> JudgedTrial:
@@ -50,19 +53,20 @@ def judge(factory: EnvFactory, times: Array, poses: Array, uprightness: Array) -
     """
     rules = RewardAndTermination(factory.world, factory.segment, factory.options)
     rules.begin([0], np.array([factory.segment.start]), poses[:1, :2])
-    cross, foot, cause = [float(rules.cross_track[0])], [float(rules.foot[0])], ""
+    cross, foot, rewards, cause = [float(rules.cross_track[0])], [float(rules.foot[0])], [0.0], ""
     for i in range(1, len(times)):
         still = np.zeros(1), np.zeros(1), uprightness[i : i + 1], np.zeros(1, bool)
         rules.evaluate([0], Motion(poses[i : i + 1], *still, times[i : i + 1]))
         cross.append(float(rules.cross_track[0]))
         foot.append(float(rules.foot[0]))
+        rewards.append(float(rules.reward([0])[0]))
         cause = rules.cause(0)
         if cause:
             break
     k = len(cross)
     heading = float(heading_error(poses[0, 2], float(heading_at(factory.world.route[:, :2], foot[0]))))
     progress = np.array(foot) - factory.segment.start
-    return JudgedTrial(times[:k], poses[:k], np.array(cross), progress, cause, heading)
+    return JudgedTrial(times[:k], poses[:k], np.array(cross), progress, cause, heading, np.array(rewards))
 
 
 def replay(factory: EnvFactory, start: Array, times: Array, command_times: Array, commands: Array) -> Array:

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.logger import KVWriter
 
 from twin import runtime
 from twin.config import HELD_OUT, Condition
@@ -115,22 +116,36 @@ def next_segment(config: TrainConfig, tests: Sequence[PolicyTest]) -> Segment:
     return Segment(due, None) if due < config.steps else Segment(config.steps, None, ALL_STEPS)
 
 
+def earlier_choice(twin: Twin, folder: Path, config: TrainConfig) -> dict[str, Any] | None:
+    """The choice of an ended training, as `train_until_learnt` returns it; None: it is to be trained (on).
+
+    Raises InputError: an existing run has another configuration or is damaged.
+    """
+    if has_state(folder / "state"):
+        check_same(folder, run_settings(twin, config))
+    before = read_choice(folder)
+    ended = before and (before["reached"] or config.steps <= before["most"]) and config.success <= before["success"]
+    return before if ended else None
+
+
 def train_until_learnt(
-    twin: Twin, folder: Path, config: TrainConfig, watch: Watch | None = None, processes: int | None = None
+    twin: Twin,
+    folder: Path,
+    config: TrainConfig,
+    watch: Watch | None = None,
+    processes: int | None = None,
+    writers: Sequence[KVWriter] = (),
 ) -> dict[str, Any]:
     """Trains and tests until the training ends (see the module), and keeps the best policy as the run's.
 
     An earlier choice is returned as it is unless `config` asks for more steps or more success. A killed call goes on.
-    Arguments and errors are those of `train`.
+    Arguments and errors are those of `train`; `writers` also receive the tests' scores, as `tests/...`.
 
     Returns:
         The contents of `choice.json`: steps; the asked success and whether it is reached; why the training ended; the
         tests; `chosen`, the last word, with its condition; and a sentence on where and why episodes failed.
     """
-    if has_state(folder / "state"):
-        check_same(folder, run_settings(twin, config))
-    before = read_choice(folder)
-    if before and (before["reached"] or config.steps <= before["most"]) and config.success <= before["success"]:
+    if before := earlier_choice(twin, folder, config):
         return before
     tests = read_tests(folder)
     planned: list[Segment] = []
@@ -139,13 +154,16 @@ def train_until_learnt(
         if planned and step >= planned[-1].until:
             with runtime.bar(f"test at {step:,}", _TEST_EPISODES, "episode") as bar:
                 tests.append(_test(config, step, lambda seeds: drive(_checkpoint(folder, step), seeds, bar.update)))
+            scores = {"success": tests[-1].rate, "progress": tests[-1].progress, "reward": tests[-1].reward}
+            for writer in writers:
+                writer.write({f"tests/{name}": value for name, value in scores.items()}, {}, step)
             if planned[-1].why:
                 return None
             write_json(folder / TESTS_FILE, [asdict(one) for one in tests])
         planned.append(next_segment(config, tests))
         return planned[-1]
 
-    train(twin, folder, config, watch, processes, referee)
+    train(twin, folder, config, watch, processes, referee, writers)
     return _choose(twin, folder, config, tests, planned[-1].why, processes)
 
 

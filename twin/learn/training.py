@@ -19,6 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import KVWriter, configure
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from twin import runtime
@@ -81,6 +82,7 @@ class Segment:
 Referee = Callable[[int, Drive], Segment | None]
 """Returns the segment that follows when so many steps are done, or None to end the training; may drive policies."""
 
+_NO_CURVES = ("step", "seed", "lighting", "cause")  # columns
 _FINAL_RATE = 0.1  # of the learning rate, at the end
 # A seed derives from the run's seed, this number (`selection.py` has another) and the number of resumptions, so that no
 # random stream is used twice.
@@ -120,6 +122,7 @@ def train(
     watch: Watch | None = None,
     processes: int | None = None,
     referee: Referee | None = None,
+    writers: Sequence[KVWriter] = (),
 ) -> None:
     """Trains a policy, or resumes a training that was stopped or killed.
 
@@ -129,6 +132,7 @@ def train(
         config: Must equal that of an existing run, except for `steps` and `success`.
         processes: See `make_vector_env`; the number does not change the result.
         referee: Plans the training; by default it is one segment of `config.steps`.
+        writers: Receive what goes to `tensorboard/`, `episodes.csv` and `log.csv`, too.
 
     Raises:
         InputError: an existing run has another configuration or is damaged, the folder is not empty and not a run, or
@@ -143,14 +147,14 @@ def train(
         if not pictures.exists():
             raise InputError(f"{pictures} is missing; train anew under another name")
     else:
-        _check_run(folder)
-        (folder / "state").mkdir(parents=True, exist_ok=True)
+        prepare_folder(folder)
         for stale in (folder / "episodes.csv", folder / "log.csv", pictures):
             stale.unlink(missing_ok=True)
         shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     vec_env = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, **config.options())
     with closing(PreprocessedVecEnv(vec_env, config.pool)) as envs:
         model = _model(envs, config, pictures)
+        model.logger.output_formats.extend(writers)
         before: dict[str, Any] = load_state(folder / "state", model) if resume else {"wall": 0.0, "resumed": -1}
         resumed = before["resumed"] + 1
         seeds = np.random.SeedSequence([config.seed, resumed, _TRAINING_STREAM])
@@ -165,7 +169,7 @@ def train(
         with stop_noted() as stop:
             camera = twin.world().camera.resized(config.architecture.size)
             origin = {"scene": twin.scene.root.resolve().name, "camera": list(camera.intrinsics)}
-            recorder = _RunRecorder(folder, config, settings, origin, before["wall"], resumed, watch, stop)
+            recorder = _RunRecorder(folder, config, settings, origin, before["wall"], resumed, watch, stop, writers)
 
             def drive(policy: Path, seeds: Sequence[int], on_episode: Callable[[], object]) -> list[EpisodeResult]:
                 if stop.number:
@@ -257,10 +261,10 @@ def cycle_rate(config: TrainConfig, step: int) -> float:
     return config.learning_rate * (_FINAL_RATE + (1.0 - _FINAL_RATE) * min(1.0, 2.0 * left))
 
 
-def _check_run(folder: Path) -> None:
-    """Raises InputError if a folder is neither empty nor a run, as a training deletes and replaces files.
+def prepare_folder(folder: Path) -> None:
+    """Creates a run's folder, with `state` in it, by which runs are recognized.
 
-    A run has a folder `state`, which a training creates first.
+    Raises InputError if there is a folder that is neither empty nor a run, as a training deletes and replaces files.
     """
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise InputError(f"{folder} is not a folder; move it away, or give another --run")
@@ -268,6 +272,7 @@ def _check_run(folder: Path) -> None:
         raise InputError(
             f"{folder} is not a training run (it has no folder state); move it away, or give another --run"
         )
+    (folder / "state").mkdir(parents=True, exist_ok=True)
 
 
 def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
@@ -310,13 +315,14 @@ class _RunRecorder(BaseCallback):
         resumed: int,
         watch: Watch | None,
         stop: StopNotice,
+        writers: Sequence[KVWriter],
     ) -> None:
         """`origin`: name of the scene, and intrinsics fx, fy, cx, cy [px] of the pictures."""
         super().__init__()
         self.model: PixelSAC
         self._folder, self._config, self._settings, self._origin = folder, config, settings, origin
         self._wall, self._resumed, self._started = wall, resumed, time.monotonic()
-        self._watch, self._stop = watch, stop
+        self._watch, self._stop, self._writers = watch, stop, writers
 
     @property
     def wall(self) -> float:
@@ -349,7 +355,7 @@ class _RunRecorder(BaseCallback):
             head = (self.model.num_timesteps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"])
             outcome = (int(info["is_success"]), info["cause"], f"{info['progress']:.2f}", episode["l"])
             rows.append((*head, *outcome, f"{episode['r']:.3f}", f"{info['start']:.2f}"))
-        _append(self._folder / "episodes.csv", rows)
+        self._append("episodes", TRAINING_EPISODE_COLUMNS, rows)
         if self._watch:
             self._watch(self.model.num_timesteps, self._recent)
         return True
@@ -372,10 +378,21 @@ class _RunRecorder(BaseCallback):
             round(runtime.resident_memory() / 2**20),
             *(f"{logged.get(f'train/{name}', float('nan')):.4g}" for name in ("ent_coef", "value")),
         )
-        _append(self._folder / "log.csv", [row])
+        self._append("log", LOG_COLUMNS, [row])
         self._save_policy(self._folder)
         save_state(self._folder / "state", model, {"wall": self.wall, "resumed": self._resumed})
         self._saved = model.num_timesteps
+
+    def _append(self, table: str, columns: tuple[str, ...], rows: list[tuple]) -> None:
+        """Adds rows to a table of the run, and their numbers to the writers, as `<table>/<column>`."""
+        if not rows:
+            return
+        with (self._folder / f"{table}.csv").open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows(rows)
+        for row, writer in product(rows, self._writers):
+            named = dict(zip(columns, row, strict=True))
+            numbers = {f"{table}/{name}": float(named[name]) for name in columns if name not in _NO_CURVES}
+            writer.write(numbers, {}, named["step"])
 
     def _checkpoint(self) -> None:
         """Saves a checkpoint if one is due."""
@@ -390,12 +407,6 @@ class _RunRecorder(BaseCallback):
         trained |= {name: getattr(c, name) for name in ("task", "observe", "lighting", "seed")}
         trained["step"] = self.model.num_timesteps
         save_policy(folder, c.architecture, c.control, actor_weights(self.model, c.architecture), trained)
-
-
-def _append(path: Path, rows: list[tuple]) -> None:
-    if rows:
-        with path.open("a", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> list[bool]:

@@ -209,6 +209,17 @@ class DriveDataset:
         )
 
 
+def drive_instruction(scene: Path, task: str) -> str:
+    """A task in a scene's folder, in words."""
+    return f"Drive along the road of {scene.resolve().name}: {task.replace('_', ' ')}."
+
+
+def drives_summary(drives: Sequence[Episode], folder: Path) -> str:
+    """One line on the drives of a dataset."""
+    frames, goals = sum(len(one.times) - 1 for one in drives), sum(one.success for one in drives)
+    return f"{len(drives)} drives, {goals} to the goal, {frames} frames: {folder}"
+
+
 def require_pyarrow() -> None:
     """Raises InputError where pyarrow, which writes the tables, is not installed."""
     try:
