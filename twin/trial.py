@@ -54,9 +54,7 @@ _MOVING = 0.02  # [m/s], [rad/s]: the first faster command starts the trial
 _ANSWER = 300_000_000  # [ns] longest time from a picture to the command that follows from it
 _SAME = 1e-3  # [m/s], [rad/s] below which two commands are the same
 _SPEED_SPAN = 0.2  # [s] over which a speed is taken from poses, before the instant, so that it shows no later command
-_MAX_GAP = (
-    0.5  # [s] without a picture that a dataset may have; a command is in force for so long (Clearpath's, on ROS 2)
-)
+_MAX_GAP = 0.5  # [s] that a dataset may be without a picture, and that a command is in force (Clearpath's, on ROS 2)
 _START_OFFSET, _START_HEADING = 0.3, 10.0  # [m], [°] within which trials in the twin start
 
 
