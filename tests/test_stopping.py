@@ -183,6 +183,23 @@ def test_ignored_signals_stay_ignored():
         signal.signal(signal.SIGHUP, before)
 
 
+def test_a_killed_child_with_a_bar_leaks_nothing(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import multiprocessing, os, signal\n"
+        "from twin import runtime\n"
+        "def work():\n"
+        "    with runtime.bar('work', 2):\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "if __name__ == '__main__':\n"
+        "    child = multiprocessing.get_context('spawn').Process(target=work)\n"
+        "    child.start(), child.join()\n"
+        "    raise SystemExit(child.exitcode + 9)\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
+    assert done.returncode == 0 and "leaked" not in done.stderr, done.stderr
+
+
 def test_colmap_keeps_our_signal_handlers(tmp_path):
     script = (
         "import os, signal, twin.capture.formats, twin.capture.matching;"

@@ -59,6 +59,10 @@ def set_stage(stage: BuildStage | None) -> None:
     _stage = stage
 
 
+# tqdm's own lock has a semaphore of the system, of which Python warns when a child process with a bar is killed.
+tqdm.set_lock(threading.RLock())
+
+
 class _Bar(tqdm):
     """A progress bar that also shows the time left of the whole build."""
 
