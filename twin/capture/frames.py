@@ -82,7 +82,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
 
 def detect_kind(path: Path) -> str:
-    """The kind of a source by its files, one of `twin.config.KINDS`. Raises InputError for none of them."""
+    """Detects a source's kind, one of `twin.config.KINDS`, from its files. Raises InputError if it has none."""
     folder = is_folder(path, "check path = in scene.toml (it is relative to the scene folder)")
     if is_bag(path):
         return "bag"
@@ -102,7 +102,9 @@ def detect_kind(path: Path) -> str:
 
 
 def source_files(path: Path, kind: str, images: Path | None = None) -> list[Path]:
-    """All files read for a source except masks of `scene.toml`; for a damaged set, those that can be determined.
+    """All files that are read for a source, except the masks given in `scene.toml`.
+
+    For a damaged set, these are the files that can be determined.
 
     `kind` may be auto; `images` is the separate image folder of a posed set. Raises InputError if `path` is no source.
     """
@@ -134,7 +136,7 @@ def source_names(paths: list[str]) -> list[str]:
 
 
 def held_out_frames(count: int, every: int, source: int) -> NDArray[np.bool_]:
-    """Mask (count,) of a source's held-out frames: every n-th, never the first or last, at least one of three or more.
+    """Mask (count,) of a source's held-out frames: one in `every`, not the first or last, at least one if `count` ≥ 3.
 
     The offset depends on the source's number, so that the same place is not held out under all lightings.
     """
