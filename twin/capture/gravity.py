@@ -2,9 +2,9 @@
 
 *Up* is the unit normal of the ground. Three kinds of evidence are combined, weighted by their uncertainties: the
 *right* axes of the cameras (horizontal if the camera is upright, at any pitch), the *path* (parallel to the ground if
-the camera has a constant height) and the *road* (points of the layer below the path). A straight path does not constrain
-the rotation about itself; a path with turns constrains both angles. Camber limits the evidence of a road to about a
-degree. The *drop* of a point is its depth below the horizontally nearest camera; its *offset* is the horizontal
+the camera has a constant height) and the *road* (points of the layer below the path). A straight path does not
+constrain the rotation about itself; a path with turns constrains both angles. Camber limits the evidence of a road to
+about a degree. The *drop* of a point is its depth below the horizontally nearest camera; its *offset* is the horizontal
 distance from that camera.
 """
 
