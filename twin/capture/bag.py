@@ -1,8 +1,8 @@
 """Reads robots' recordings (bags) with `rosbags` (the extra `ros`; no ROS installation is needed).
 
-A bag is the folder of a ROS 2 bag (MCAP or SQLite), one of its .mcap or .db3 files, or a .bag file of ROS 1. Messages
-are deserialized with the standard definitions of their types. The definitions inside the bag are not used, because
-`rosbags` would generate code from them. Messages are streamed; memory holds one chunk of the file.
+A bag is the folder of a ROS 2 recording (MCAP or SQLite), one of its .mcap or .db3 files, or a .bag file of ROS 1.
+Messages are deserialized with the standard definitions of their types. The definitions inside the bag are not used,
+because `rosbags` would generate code from them. Messages are streamed; memory holds one chunk of the file.
 
 Topics are found by message type:
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 METADATA = "metadata.yaml"
-"""File that a ROS 2 bag's folder contains."""
+"""The file by which a folder is recognized as a ROS 2 bag."""
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, FIX = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/NavSatFix"
 ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
@@ -51,10 +51,12 @@ FROM_WHEELS = ("platform", "wheel", "velocity_controller")
 """A topic with one of these words in its name is taken for odometry computed from the wheels."""
 MIN_POSES = 10
 """Topics with fewer poses, such as those that an operator clicks on a map, are used only if there are no others."""
-_OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")  # a topic named so is used only if it is given
-_CLOCK = 1_000_000_000  # [ns] largest median difference between recording and header times of one clock
-_MAX_METADATA = 16 << 20  # [bytes] of metadata.yaml
-_MAX_CHUNK = 1 << 30  # [bytes] of an uncompressed MCAP chunk
+# A topic with one of these words in its name is used for pictures only if it is given explicitly.
+_OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")
+# Headers whose times differ more from the recording times, in the median, have another clock [ns].
+_CLOCK = 1_000_000_000
+_MAX_METADATA = 16 << 20  # [bytes] largest accepted metadata.yaml
+_MAX_CHUNK = 1 << 30  # [bytes] largest accepted MCAP chunk, uncompressed
 
 
 def is_bag(path: Path) -> bool:
@@ -163,7 +165,7 @@ def messages_by_topic(connections: Iterable[Any], types: Sequence[str]) -> dict[
 
 
 def picture_topics(connections: Iterable[Any]) -> list[str]:
-    """The topics with pictures, sorted by decreasing number of messages; see `_OTHER_IMAGES`."""
+    """The topics with pictures, except those of `_OTHER_IMAGES`, sorted by decreasing number of messages."""
     counts = messages_by_topic(connections, (RAW, COMPRESSED))
     good = [topic for topic in counts if not any(word in topic for word in _OTHER_IMAGES)]
     return sorted(good, key=lambda topic: (counts[topic], topic), reverse=True)
@@ -200,7 +202,7 @@ def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYP
     for kind in kinds:
         types = TYPES[kind]
         found = [c for c in connections if c.msgtype in types and c.msgcount]
-        if kind == "commands":  # prefer the input of the velocity controller to inputs of the multiplexer
+        if kind == "commands":  # prefer the velocity controller's input to the multiplexer's inputs
             found.sort(key=lambda c: (not c.topic.endswith("cmd_vel"), -c.msgcount))
         elif kind == "poses":
             found.sort(key=lambda c: (c.msgcount < MIN_POSES, is_from_wheels(c.topic), -c.msgcount))

@@ -1,9 +1,9 @@
 """Reads the film in a robot's bag, with the camera's calibration, positions and pose on the robot.
 
-A picture's *stamp* is its time by `message_times`. Pictures are left out unless their stamp is later than those of all
-pictures before. A *fix* is a satellite position. The *seat* is the camera's pose on the robot: the transform in
-`/tf_static` from the frame named in the pictures' headers to `base_link`. Odometry gives the positions of the lens, in
-the odometry's own frame.
+A picture's *stamp* is its time as selected by `message_times`. A picture is left out if its stamp is not later than the
+stamps of all earlier pictures. A *fix* is a satellite position. The *seat* is the camera's pose on the robot: the
+transform in `/tf_static` from the frame named in the pictures' headers to `base_link`. Odometry gives the positions of
+the lens, in the odometry's own frame.
 """
 
 from array import array
@@ -45,8 +45,8 @@ from twin.types import Array, Image
 _MAX_UNORDERED = 0.02  # largest fraction of pictures that are left out because of their stamps
 _MAX_FIX_GAP, _MAX_POSE_GAP = 2.5, 0.5  # [s] between two fixes or poses; there is no interpolation across longer gaps
 _BASE, _GROUND = "base_link", "base_footprint"
-_MAX_FRAMES = 10_000  # of coordinates read from /tf_static
-_MAX_PIXELS = 1 << 28  # size of a compressed picture
+_MAX_FRAMES = 10_000  # largest number of coordinate frames read from /tf_static
+_MAX_PIXELS = 1 << 28  # largest accepted size of a compressed picture
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,9 @@ class CameraSeat:
     offset: tuple[float, float]
     """Distance of the lens forward and to the left of `base_link` [m]."""
     yaw: float
-    """Angle of the view to the left [°]."""
+    """Angle of the viewing direction to the left of straight ahead [°]."""
     pitch: float
-    """Angle of the view downward [°]."""
+    """Angle of the viewing direction below the horizontal [°]."""
     roll: float
     """Angle by which the camera leans to its right [°]."""
 
@@ -73,7 +73,7 @@ class BagContents:
 
     path: Path
     topics: dict[str, str]
-    """Content → topic. Keys: pictures, and those of camera, fixes, odometry and transforms that the bag has."""
+    """Content → topic. The contents are pictures and, if the bag has them, camera, fixes, odometry and transforms."""
     other_pictures: tuple[str, ...]
     """Other topics with pictures, which are not used."""
     encoding: str
@@ -208,7 +208,7 @@ def _values(kind: str, message: Any) -> tuple[float, ...]:
 def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Positions and stamps of the pictures whose stamp is later than all stamps before.
 
-    Raises InputError if more than `_MAX_UNORDERED` of the pictures, and more than one, have no such stamp.
+    One picture, or a fraction of `_MAX_UNORDERED`, may have an earlier stamp. Raises InputError if more have one.
     """
     latest = np.maximum.accumulate(times)
     late = np.append(False, times[1:] <= latest[:-1])
@@ -381,7 +381,7 @@ def _pose_in_base(transforms: dict[str, tuple[str, Array]], frame: str) -> Array
         seen.add(name)
         name, step = transforms[name][0], transforms[name][1]
         pose = step @ pose
-    if abs(pose[2, 2]) > abs(pose[2, 1]):  # z is vertical, so x is forward and y left: no optical frame
+    if abs(pose[2, 2]) > abs(pose[2, 1]):  # z is vertical: x is forward and y left, unlike in optical frames
         pose[:3, :3] = pose[:3, :3] @ CAMERA_AHEAD
     return pose
 

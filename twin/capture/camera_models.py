@@ -131,7 +131,7 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
 
 
 def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """True if the aspects of two sizes (width, height) [px] agree to 1 %, or but for a side rounded to whole pixels."""
+    """True if the aspects of two sizes (width, height) [px] agree to 1 %, or to a side's rounding to whole pixels."""
     error = abs(a[0] * b[1] - a[1] * b[0])
     return error <= max(_MAX_ASPECT_ERROR * a[0] * b[1], a[0], a[1], b[0], b[1])
 
@@ -140,9 +140,10 @@ def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
 
 
 def undistortion(lens: Lens) -> tuple[Lens, PixelMap | None]:
-    """The pinhole lens that replaces a lens at the same size, and its pixel map; None if the distortion is negligible.
+    """The pinhole lens that replaces a lens at the same size, and its pixel map.
 
-    Raises InputError: the distortion is so strong that no pinhole view fits into the raw image.
+    The map is None if the distortion is negligible. Raises InputError: the distortion is so strong that no pinhole view
+    fits into the raw image.
     """
     pinhole = _fitted_pinhole(lens)
     if lens.camera.is_undistorted() or _max_displacement(lens, pinhole) < _NEGLIGIBLE_DISTORTION:

@@ -1,4 +1,4 @@
-"""Sources of a capture and their kept frames: the data used while reading, and those that stage `capture` stores.
+"""Data of a capture's sources and kept frames, as used while reading and as stored by stage `capture`.
 
 A *mask* marks the pixels of a frame that all later stages ignore: 0 = ignore, any other value = use.
 """
@@ -29,9 +29,9 @@ from twin.files import (
 from twin.geometry.images import decode_image, write_image
 from twin.types import Array, Image
 
-QUEUE_SIZE = 4  # most images that are decoded or encoded in the background; bounds the memory
+QUEUE_SIZE = 4  # images that may be decoded or encoded in the background at once; bounds the memory
 NO_GPS = (math.nan, math.nan, math.nan)
-_LOSSY_THRESHOLD = 63  # [gray levels] up to which a JPEG mask counts as 0, since compression changes its zeros
+_LOSSY_THRESHOLD = 63  # JPEG mask values up to this one count as 0, since compression changes zeros
 _ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "source_index": ((), "i"),
     "times": ((), "f"),
@@ -200,7 +200,7 @@ class KeptFrames:
 
 
 class FrameWriter:
-    """Encodes and writes a source's frames and masks in threads; errors are raised at the next frame or at the end."""
+    """Encodes and writes a source's frames and masks in threads; errors are raised at a later frame or at the end."""
 
     def __init__(self, out: Path, name: str) -> None:
         self._images, self._masks = out / "images" / name, out / "masks" / name

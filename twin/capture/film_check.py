@@ -22,11 +22,13 @@ _SAMPLES = 60
 _WIDTH = 320  # [px] to which frames are scaled down for the check
 _MIN_SIDE = 640  # [px] smallest good length of the longer side
 _DARK = 35.0  # [gray levels] smallest good median brightness
-_CLIPPED, _CLIPPED_SHARE = 250, 0.15  # [gray levels] of a clipped pixel; largest good share of such pixels
-_BLURRED, _BLURRED_SHARE = 0.35, 0.3  # of the 90 % quantile of sharpness; largest good share of frames below that
+# Gray level from which a pixel is clipped; largest good share of clipped pixels.
+_CLIPPED, _CLIPPED_SHARE = 250, 0.15
+# Fraction of the 90 % quantile of sharpness below which a frame is blurred; largest good share of blurred frames.
+_BLURRED, _BLURRED_SHARE = 0.35, 0.3
 _EXPOSURE_RANGE = 2.0  # largest good ratio of the 95 % to the 5 % quantile of brightness
 _TINT_RANGE = 1.3  # largest good ratio of the same quantiles of red over blue
-_GAP = 0.5  # [s] longest time without a picture that is not reported
+_GAP = 0.5  # [s] shorter times without a picture are not reported
 _UNEVEN = 1.5  # largest good ratio of the 95 % quantile to the median of the time between frames
 _MIN_TRUSTED = 8  # fewest samples from which shares and quantiles are computed
 
@@ -72,7 +74,7 @@ def _timing_notes(timing: FilmTiming) -> list[str]:
 
 
 def _samples(path: Path, skip: Literal["NONKEY", "DEFAULT"]) -> list[av.VideoFrame]:
-    """Frames spread over the film, fewer than twice `_SAMPLES`; skipping `NONKEY` decodes only key frames."""
+    """Frames spread over the film, fewer than twice `_SAMPLES`; with `skip` = NONKEY only key frames."""
     found: list[av.VideoFrame] = []
     every = 1
     with av.open(str(path)) as container:

@@ -31,10 +31,10 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".p
 _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _MODEL_NAMES = {int(pycolmap.CameraModelId.__members__[name]): name for name in CAMERA_MODELS}
 _CURE = "export the model again"
-_MAX_POSE_VALUE = 1e9  # of the numbers in a COLMAP pose
-_MAX_CAMERA_VALUE = 1e12  # of a camera's numbers in `transforms.json`
-_MAX_COORDINATE = 1e9  # of a camera center in `transforms.json`
-_RIGID_TOLERANCE = 1e-2  # largest entry of RᵀR − 1; rounded numbers cause smaller ones
+_MAX_POSE_VALUE = 1e9  # upper limit of the numbers in a COLMAP pose
+_MAX_CAMERA_VALUE = 1e12  # upper limit of a camera's numbers in `transforms.json`
+_MAX_COORDINATE = 1e9  # upper limit of a camera center's coordinates in `transforms.json`
+_RIGID_TOLERANCE = 1e-2  # largest accepted entry of RᵀR − 1; rounding in the file causes smaller ones
 
 
 # ---- COLMAP models
@@ -252,7 +252,7 @@ def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageS
         if file is None:
             missing += 1
             continue
-        world = opencv_to_mujoco(to_original @ pose)  # from OpenGL to OpenCV axes: the flip is its own inverse
+        world = opencv_to_mujoco(to_original @ pose)  # this flip of axes also converts OpenGL to OpenCV
         world[:3, 3] /= scale
         if not np.abs(world[:3, 3]).max() < _MAX_COORDINATE:
             raise InputError(f"{where}: transform_matrix lies too far away; export the file again")
@@ -375,14 +375,14 @@ def _rigid_pose(value: Any, where: str) -> Array:
 
 
 def _undo_world_transform(table: dict[str, Any], path: Path) -> tuple[Array, float]:
-    """Undoes nerfstudio's transform of the world: a rigid transform (4, 4), and a divisor of the positions after it."""
+    """The inverse of nerfstudio's transform of the world: a rigid transform (4, 4), then a divisor of positions."""
     to_original = np.eye(4)
     if "applied_transform" in table:
         to_original = inverse_pose(_rigid_pose(table["applied_transform"], f"{path}: applied_transform"))
     scale = table.get("applied_scale", 1.0)
     if not _is_number(scale, _MAX_CAMERA_VALUE) or scale <= 1 / _MAX_CAMERA_VALUE:
         raise InputError(f"{path}: applied_scale = {short_repr(scale)}; expected a positive number")
-    # nerfstudio scales after it moves, x' = s (R x + t), so the translation of the inverse is scaled too.
+    # nerfstudio scales after the rigid transform, x' = s (R x + t), so the translation of the inverse is scaled too.
     to_original[:3, 3] *= scale
     return to_original, float(scale)
 

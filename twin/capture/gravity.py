@@ -3,9 +3,9 @@
 *Up* is the unit normal of the ground. Three kinds of evidence are combined, weighted by their uncertainties: the
 *right* axes of the cameras (horizontal if the camera is upright, at any pitch), the *path* (parallel to the ground if
 the camera has a constant height) and the *road* (points of the layer below the path). A straight path does not
-constrain the rotation about itself; a path with turns constrains both angles. Camber limits the evidence of a road to
-about a degree. The *drop* of a point is its depth below the horizontally nearest camera; its *offset* is the horizontal
-distance from that camera.
+constrain the rotation of up about the path; a path with turns constrains both angles. Camber limits the evidence of a
+road to about a degree. The *drop* of a point is its depth below the horizontally nearest camera; its *offset* is the
+horizontal distance from that camera.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ _LAYER = 0.06  # half thickness of the road layer [fraction of the drop], for un
 _MAX_TILT = np.radians(25.0)  # largest angle between the road's normal and the cameras' mean up axis [rad]
 MIN_ROAD_POINTS = 20  # road points needed for a reliable road
 _REACHES = (1.0, 2.0, 4.0, 8.0)  # largest offsets [drops] of the points of the road layer, tried in this order
-_MIN_CAMERA_FRACTION = 0.2  # fraction of the cameras that must have road points below them for heights per camera
+_MIN_CAMERA_FRACTION = 0.2  # heights per camera need road points below at least this fraction of cameras
 _DEEPER_THAN = 1.25  # [drops] from which points are far below a layer
 _MAX_DEEPER_FRACTION = 0.1
 """A layer is not the ground if the number of points far below it exceeds this fraction of its own points: ground
@@ -105,9 +105,9 @@ def find_road(points: Array, centers: Array, up: Array) -> Road | None:
 
     The support of a layer at drop h is the number of points within ±6 % of h whose offset is below h. Such points are
     seen more than 45° below the horizon. The road is the lowest layer with at least half of the best support, since
-    nothing solid lies below a road. A layer with many points far below it is no road; it occurs when the camera circles
-    an object. If no layer has enough points, as on a road without texture, larger offsets are tried, where the verges
-    are. If none of them has enough, the best supported layer is returned.
+    nothing solid lies below a road. A layer with many points far below it is no road; such a layer occurs when the
+    camera circles an object. If no layer has enough points, as on a road without texture, larger offsets are tried,
+    where the verges are. If none of them has enough, the best supported layer is returned.
     """
     if not len(points):
         return None

@@ -29,7 +29,7 @@ _WHITE = 203.0  # [cd/m²] diffuse white
 _PEAK, _SYSTEM_GAMMA = 1000.0, 1.2  # peak [cd/m²] and gamma of the display assumed for HLG
 _HLG = (0.17883277, 0.28466892, 0.55991073)  # a, b, c of BT.2100
 _PQ = (2610 / 16384, 2523 / 4096 * 128, 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32)  # m1, m2, c1, c2, c3
-_LUMINANCE = np.array([0.2627, 0.6780, 0.0593], np.float32)  # of red, green and blue of BT.2020
+_LUMINANCE = np.array([0.2627, 0.6780, 0.0593], np.float32)  # weights of BT.2020's red, green and blue
 _TO_BT709 = np.array(
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
 )  # BT.2087

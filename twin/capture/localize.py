@@ -37,15 +37,15 @@ _FIRST_FRAMES = 48  # scene frames matched first, evenly spaced over all films
 _BEST_FRAMES = 4  # of these, the frames with the most matches; their neighbors are matched next
 _NEIGHBOR_FRAMES = 8  # neighbors of each best frame that are matched, under any lighting
 _TRACKING_FRAMES = 12  # scene frames near the film's last localized frame that are matched first
-_TRUSTED_FRAMES = 24  # frames with the most matches; matches in other frames are mostly wrong and unused
+_TRUSTED_FRAMES = 24  # frames with the most matches; matches in other frames are mostly wrong and are not used
 _RATIO = 0.8  # largest ratio of the best to the second best distance, Lowe 2004
-_LANDMARK_RADIUS = 1.5  # [px] from the projection of a sparse point
-_INLIER_TOLERANCE = 0.006  # [longer sides]
+_LANDMARK_RADIUS = 1.5  # [px] largest distance from the projection of a sparse point
+_INLIER_TOLERANCE = 0.006  # [longer sides] largest residual of an inlier
 _ESTIMATED = "estimated"
 _DISTORTION_INLIERS = 100  # inliers needed to separate distortion from noise
 _LENS_SWITCH_RATIO = 1.25  # a later candidate lens must give this many times the inliers of an earlier one
 _ROBUST_SCALE = 0.0015  # [longer sides] residual from which the robust loss reduces the weight of an inlier
-_MAX_FOCAL_ERROR = 0.02  # relative standard error
+_MAX_FOCAL_ERROR = 0.02  # largest accepted relative standard error
 _MAX_ITERATIONS = 12  # of the parabola fit
 _FOCAL_STEPS = np.array([0.98, 0.99, 1.0, 1.01, 1.02])  # relative focal lengths of the parabola fit
 
@@ -313,8 +313,8 @@ def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, 
 
     Each frame is first matched with scene frames near the previous localized frame; if that fails, the whole scene is
     searched. The focal length is estimated per frame. With its median all frames are localized again, and a joint fit
-    to all inliers gives the final value. The
-    principal point is assumed at the center. Frames are RGB (h, w, 3), in order, of one camera without distortion.
+    to all inliers gives the final value. The principal point is assumed at the center. Frames are RGB (h, w, 3), in
+    order, of one camera without distortion.
 
     Raises InputError: no frame could be localized, or the focal length is not determined.
     """

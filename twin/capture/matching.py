@@ -26,7 +26,7 @@ from twin.types import Array
 Pair = tuple[int, int]
 
 SEQUENCE_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-"""Distances [frames] of the pairs in time within a source: dense for neighbors, long ones against drift."""
+"""Distances [frames] of sequence pairs within a source: short ones for neighbors, long ones against drift."""
 _WORDS = 32
 _SAMPLES_PER_FRAME = 150
 _PROBES_PER_SOURCE = 20
@@ -164,10 +164,10 @@ def expanded_pairs(
 def near_pairs(
     camera_to_world: Array, frames: NDArray[np.int64], tried: set[Pair], reach: float, most: int
 ) -> set[Pair]:
-    """Pairs of each camera with at most `most` nearest cameras within `reach`, in directions of view within 60°.
+    """Pairs of each camera with up to `most` of the nearest cameras in `reach` with a viewing direction within 60°.
 
-    Poses (k, 4, 4) belong to the frames (k,); `reach` is in their unit. A tried pair excludes all pairs
-    whose two frames are each within two frames of those of the tried pair.
+    Poses (k, 4, 4) belong to the frames (k,); `reach` is in their unit. No pair is returned whose two frames are each
+    at most two frames away from those of a tried pair.
     """
     centers, forward = camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
     offsets = list(itertools.product(_CROSS_OFFSETS, _CROSS_OFFSETS))
@@ -204,7 +204,7 @@ class Matcher:
         return {int(image): frame for frame, image in enumerate(self.image_ids)}
 
     def extract(self, most: int, max_size: int) -> None:
-        """Extracts at most `most` SIFT features per frame, on unmasked pixels of images scaled to `max_size` [px].
+        """Extracts at most `most` SIFT features per frame, on unmasked pixels of images scaled down to `max_size` [px].
 
         Raises InputError: the frames of a source have too little texture.
         """

@@ -2,7 +2,7 @@
 
 z points up along the ground's normal; z = 0 is the ground. The origin is on the ground below the first camera. x is the
 initial driving direction, or east if the scale comes from GPS. With metric.up = "poses" the given poses' axes and
-horizontal origin are kept. `gravity.py` estimates up and the road, `scale.py` the scale.
+horizontal origin are kept. `gravity.py` estimates up and the road; `scale.py` estimates the scale.
 """
 
 from pathlib import Path
@@ -133,7 +133,7 @@ def _level_frame(cameras: Cameras, up: Array, level: float, scale: float, east: 
 
 
 def _driving_direction(cameras: Cameras, up: Array) -> Array:
-    """Horizontal direction of the first part of the first source's path, or of the first view if the camera stands."""
+    """Horizontal direction of the first part of the first source's path; without motion, that of the first view."""
     centers = cameras.positions[np.array(cameras.sources) == cameras.sources[0]]
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centers, axis=0), axis=1))])
     end = int(np.searchsorted(along, max(_INITIAL_FRACTION * along[-1], 1e-12)))

@@ -23,7 +23,7 @@ _SCALE_OPTIONS = (
 )
 _PIXEL_ERROR = 1.0  # [px] standard deviation of a point marked by hand
 _GPS_TRIALS = 400
-_STRETCH = 2.0  # [m] of odometry that are compared with the cameras' path; over this length heading hardly drifts
+_STRETCH = 2.0  # [m] length of odometry compared with the cameras' path; heading hardly drifts within it
 _STRAIGHT = 0.7  # smallest ratio of end-to-end distance to length of a compared stretch
 _MIN_STRETCHES = 5
 _MAX_STRETCH_SPREAD = 0.3  # largest relative spread of the stretches' scales
@@ -70,7 +70,7 @@ def combine_scales(scales: dict[str, Scale]) -> Scale:
 
     If the scales differ by more than their uncertainties explain, the combined uncertainty grows by the Birge ratio
     (Birge 1932). A scale with uncertainty 0, from poses that are given as metric, is used unchanged. The notes of all
-    scales are merged. Several scales add the notes `scales`, which holds each scale relative to the result, and
+    scales are merged. If there are several, the notes also contain `scales`, each scale relative to the result, and
     `scale_disagreement`, the largest difference between two scales in standard deviations.
     """
     names = list(scales)
@@ -104,8 +104,8 @@ def scale_from_height(
     """Scale from the known height of the cameras above the road; `points` (m, 3) are all sparse points.
 
     `own` holds the camera height of each source [m]; a source with 0 uses that of `metric`. The uncertainty combines
-    four errors: of the measured height, of its repetition along the path, of the up direction, and of the ground, whose
-    height may differ between the left and the right of the path. Raises InputError without a road.
+    four errors: of the measured height, of its repetition along the path, of the up direction, and of the assumption
+    that the ground is level across the path. Raises InputError without a road.
     """
     if road is None:
         raise InputError(
@@ -179,7 +179,7 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
 
     `ground_level` is the height of the ground along `up` in the reconstruction's unit.
 
-    Raises InputError: unknown frame, a point outside its image, no distance, or rays that do not meet.
+    Raises InputError: an unknown frame, a point outside its image, no positive distance, or rays that do not meet.
     """
     if not distance.metres > 0:
         raise InputError(f"metric.distance.metres = {distance.metres}; expected the metres between the points a and b")
@@ -261,8 +261,8 @@ def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generat
     """Scale and horizontal east axis (3,) from GPS positions by a robust similarity fit in the horizontal plane.
 
     Altitudes are not used: they are several times less accurate than positions, and up is known already. `gps` (n, 3)
-    holds latitude [°], longitude [°] and altitude [m] per camera center, NaN where unknown. `rng` draws the
-    pairs of cameras for the first fits.
+    holds latitude [°], longitude [°] and altitude [m] per camera center, NaN where unknown. `rng` draws the pairs of
+    cameras for the first fits.
 
     Raises InputError: fewer than 3 positions, or positions that do not spread beyond their own error.
     """
@@ -308,7 +308,7 @@ def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generat
             f"metric.gps: positions fit within {np.median(residual):.1f} m but spread over {extent:.1f} m only; film "
             "a longer way, or give the scale another way"
         )
-    # The fit rotates the plane's axes to east and north, so its conjugate rotates east to the plane's axes.
+    # The fit rotates the plane's axes to east and north, so its conjugate is the east axis in the plane.
     rotation = fit / abs(fit)
     east = first * rotation.real - second * rotation.imag
     notes = {

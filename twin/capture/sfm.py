@@ -39,14 +39,14 @@ from twin.scene import SceneDir
 from twin.types import Array
 
 _MAX_THREADS = 16
-_MAX_POINT_ERROR = 20.0  # [px] of used points; those moved behind a camera by bundle adjustment have far larger errors
+_MAX_POINT_ERROR = 20.0  # [px] limit for points; those that bundle adjustment moved behind a camera exceed it by far
 _MIN_FRAMES = 3
 _PROBE_INLIERS = 25
 _NEAR_STEPS = 3.0  # distance [median steps] up to which cameras that were never matched are matched in the second round
 _NEAR_PAIRS = 4
 _POSED_PAIRS = 10
 _REMAPPING_FRACTION = 0.05  # newly verified pairs [fraction of all] from which the second round maps again
-_TRACKS_PER_VIEW = 300  # used in the first solution, to save 40 % of the time; retriangulation adds the others
+_TRACKS_PER_VIEW = 300  # point tracks in the first solution, to save 40 % of the time; retriangulation adds others
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
 _MIN_ANGLE = 0.5  # [°] smallest angle between the rays to a point
 _LOSS_SCALE = 0.5  # [px] scale of the Cauchy loss in the last bundle adjustment

@@ -1,4 +1,4 @@
-"""Reads films in one pass with little memory: decodes and rotates (by the display matrix) frames, and selects some.
+"""Reads films in one pass with little memory: decodes frames, rotates them by the display matrix and selects some.
 
 A *film* is a video file, or the pictures of a bag (`bag_film.py`). A *slot* is one of n equal time spans of a film;
 the sharpest frame of each slot is its *candidate*. A candidate in which the image hardly moved since the last kept
@@ -39,7 +39,7 @@ _STILL_DIFFERENCE = 1.5  # [gray levels after contrast stretching] below it two 
 BLANK_STD = 2.0  # an image with a smaller standard deviation of its brightness [gray levels] counts as blank
 _LUMA_FIRST = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 _DEINTERLACE = "mode=send_frame:parity=auto:deint=interlaced"
-_MIN_DECODED_FRACTION = 0.98  # of the frames declared by the container; below it the user gets a note
+_MIN_DECODED_FRACTION = 0.98  # of the declared frames; if fewer can be decoded, the user gets a note
 
 
 # ---- sharpness and motion, on small gray images (uint8, shape (h, w)) so that a frame takes about a millisecond
@@ -164,7 +164,7 @@ def frame_index(time: float | None, timing: FilmTiming, last: int) -> int:
 
 
 def slot_of(index: int, time: float, timing: FilmTiming, slots: int) -> int:
-    """The slot of a frame. Slots have equal durations; but if there are as many as frames, each frame has its own."""
+    """The slot of a frame. Slots have equal durations; if there are as many slots as frames, each frame has its own."""
     if slots >= len(timing.times):
         return index
     # Half a frame interval is added so that rounding of time stamps never moves a frame across the border of a slot.
