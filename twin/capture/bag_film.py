@@ -1,9 +1,9 @@
 """Reads the film in a robot's bag, with the camera's calibration, positions and pose on the robot.
 
-A picture's *stamp* is its time as selected by `message_times`. A picture is left out if its stamp is not later than the
-stamps of all earlier pictures. A *fix* is a satellite position. The *seat* is the camera's pose on the robot: the
-transform in `/tf_static` from the frame named in the pictures' headers to `base_link`. Odometry gives the positions of
-the lens, in the odometry's own frame.
+A picture's *stamp* is its time as selected by `message_times`. Only pictures with a later stamp than all pictures
+before them are used. A *fix* is a satellite position. The *seat* is the camera's pose on the robot: the transform in
+`/tf_static` from the frame named in the pictures' headers to `base_link`. Odometry gives the positions of the lens, in
+the odometry's own frame.
 """
 
 from array import array
@@ -208,7 +208,7 @@ def _values(kind: str, message: Any) -> tuple[float, ...]:
 def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Positions and stamps of the pictures whose stamp is later than all stamps before.
 
-    One picture, or a fraction of `_MAX_UNORDERED`, may have an earlier stamp. Raises InputError if more have one.
+    One other picture, or a fraction of `_MAX_UNORDERED`, is allowed. Raises InputError if there are more.
     """
     latest = np.maximum.accumulate(times)
     late = np.append(False, times[1:] <= latest[:-1])

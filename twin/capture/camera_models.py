@@ -131,7 +131,7 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
 
 
 def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """True if the aspects of two sizes (width, height) [px] agree to 1 %, or to a side's rounding to whole pixels."""
+    """True if two sizes (width, height) [px] have the same aspect, to 1 % or to one pixel of a side."""
     error = abs(a[0] * b[1] - a[1] * b[0])
     return error <= max(_MAX_ASPECT_ERROR * a[0] * b[1], a[0], a[1], b[0], b[1])
 
