@@ -1,7 +1,7 @@
-"""From films and photos to metric cameras.
+"""Computes metric camera poses from films and photos.
 
-pycolmap is imported here, before any module of this package, to restore our signal handlers afterwards: those of
-COLMAP's log library would answer SIGTERM with a C++ stack trace.
+The import of pycolmap replaces our signal handlers by those of COLMAP's log library, which answer SIGTERM with a C++
+stack trace. So pycolmap is imported here, before any module of this package, and our handlers are restored.
 """
 
 from twin.runtime import signals_kept

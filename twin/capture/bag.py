@@ -1,13 +1,20 @@
-"""Robots' recordings (bags), read with `rosbags` (the extra `ros`; no ROS installation is needed).
+"""Reads robots' recordings (bags) with `rosbags` (the extra `ros`; no ROS installation is needed).
 
-A bag is the folder of a ROS 2 bag (MCAP or SQLite), one of its .mcap or .db3 files, or a .bag file of ROS 1. Messages
-are deserialized by the standard definitions of their types: definitions inside the bag, from which `rosbags` would
-generate code, are not used. Messages are streamed; memory holds one chunk of the file.
+A bag is the folder of a ROS 2 recording (MCAP or SQLite), one of its .mcap or .db3 files, or a .bag file of ROS 1.
+Messages are deserialized with the standard definitions of their types. The definitions inside the bag are not used,
+because `rosbags` would generate code from them. Messages are streamed; memory holds one chunk of the file.
 
-Topics are found by message type: geometry_msgs/Twist or TwistStamped for commands; sensor_msgs/JointState, with joints
-named like a Husky's wheels, for wheel speeds; nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped
-for poses, preferably without a word of `FROM_WHEELS` in the topic's name; sensor_msgs/Imu for accelerations; Image or
-CompressedImage for pictures, and the CameraInfo whose name shares most with theirs. Times are nanoseconds.
+Topics are found by message type:
+
+- commands: geometry_msgs/Twist or TwistStamped
+- wheel speeds: sensor_msgs/JointState, with joints named like a Husky's wheels
+- poses: nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped; topics with a word of `FROM_WHEELS`
+  in their name are used only if there are no others
+- accelerations: sensor_msgs/Imu
+- pictures: sensor_msgs/Image or CompressedImage
+- calibration: the sensor_msgs/CameraInfo topic that shares the most leading parts of its name with the pictures' topic
+
+Times are nanoseconds.
 """
 
 import contextlib
@@ -29,7 +36,7 @@ if TYPE_CHECKING:
 
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 METADATA = "metadata.yaml"
-"""The file that makes a folder a ROS 2 bag."""
+"""The file by which a folder is recognized as a ROS 2 bag."""
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, FIX = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/NavSatFix"
 ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
@@ -41,17 +48,19 @@ TYPES = {
 }
 """Message types of each kind of topic."""
 FROM_WHEELS = ("platform", "wheel", "velocity_controller")
-"""Words in names of topics whose odometry comes from the wheels."""
+"""A topic with one of these words in its name is taken for odometry computed from the wheels."""
 MIN_POSES = 10
-"""Topics with fewer poses are taken only where there are no others; such are those of an operator's clicks."""
-_OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")  # words in names of other images' topics
-_CLOCK = 1_000_000_000  # [ns] by which the headers' clock may differ from the bag's
-_MAX_METADATA = 16 << 20  # [bytes]
-_MAX_CHUNK = 1 << 30  # [bytes] of an MCAP chunk, unpacked
+"""Topics with fewer poses, such as those that an operator clicks on a map, are used only if there are no others."""
+# A topic with one of these words in its name is used for pictures only if it is given explicitly.
+_OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")
+# Headers whose times differ more from the recording times, in the median, have another clock [ns].
+_CLOCK = 1_000_000_000
+_MAX_METADATA = 16 << 20  # [bytes] largest accepted metadata.yaml
+_MAX_CHUNK = 1 << 30  # [bytes] largest accepted MCAP chunk, uncompressed
 
 
 def is_bag(path: Path) -> bool:
-    """True for the folder of a ROS 2 bag, and for an existing file named like a bag's."""
+    """True for the folder of a ROS 2 bag, and for an existing file with a suffix of `BAG_SUFFIXES`."""
     return (path.suffix.lower() in BAG_SUFFIXES and is_file(path)) or is_file(path / METADATA)
 
 
@@ -66,12 +75,12 @@ class Bag:
     def __init__(self, path: Path, reader: Any, deserialize: Callable[[bytes, str], Any], cure: str) -> None:
         self._path, self._reader, self._deserialize, self._cure = path, reader, deserialize, cure
         self.connections: list[Any] = list(reader.connections)
-        """Of rosbags, with `topic`, `msgtype` and `msgcount`; a topic may have several."""
+        """rosbags' connections, with `topic`, `msgtype` and `msgcount`; a topic may have several connections."""
         self.begin = int(reader.start_time)
         """Time of the first message [ns]."""
 
     def messages(self, connections: Sequence[Any]) -> Iterator[tuple[Any, int, Any]]:
-        """Yields connection, time of recording [ns] and message. Raises InputError: a damaged bag."""
+        """Yields connection, recording time [ns] and message. Raises InputError if the bag is damaged."""
         if not connections:
             return
         with _wrap_errors(self._path, self._cure):
@@ -85,7 +94,10 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path, cure: str = "record it anew") -> Iterator[Bag]:
-    """Opens a bag. Raises InputError: rosbags is not installed, no bag, or a damaged one; `cure` ends the message."""
+    """Opens a bag.
+
+    Raises InputError: rosbags is not installed, or the path is no bag or a damaged one; `cure` ends the message.
+    """
     try:
         from rosbags import rosbag1, rosbag2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -112,7 +124,7 @@ def open_bag(path: Path, cure: str = "record it anew") -> Iterator[Bag]:
 
 
 def _check_chunks(reader: Any) -> None:
-    """Refuses MCAP chunks that would not fit into memory."""
+    """Raises ValueError for MCAP chunks that would take too much memory."""
     storages = getattr(reader.storage, "storages", [reader.storage])
     chunks = [chunk for storage in storages for chunk in getattr(storage, "chunks", ())]
     largest = max((chunk.uncompressed_size for chunk in chunks), default=0)
@@ -126,7 +138,7 @@ def _wrap_errors(path: Path, cure: str) -> Iterator[None]:
         yield
     except (InputError, GeneratorExit):
         raise
-    except Exception as error:  # of the reader: not a bag, a damaged one, unknown messages
+    except Exception as error:  # from rosbags: not a bag, a damaged bag, or unknown messages
         if "end magic" in str(error) or "seems to be empty" in str(error):
             cure = "the recording was cut off: repair it by `mcap recover`, or " + cure
         elif "not indexed" in str(error):
@@ -139,12 +151,12 @@ def _wrap_errors(path: Path, cure: str) -> Iterator[None]:
 
 
 def topic_names(connections: Iterable[Any]) -> str:
-    """The names of the topics, for a message."""
+    """The topics' names for an error message."""
     return ", ".join(sorted({one.topic for one in connections})) or "none"
 
 
 def messages_by_topic(connections: Iterable[Any], types: Sequence[str]) -> dict[str, int]:
-    """The number of messages of each topic that has some and whose type is one of `types`."""
+    """Topic → number of messages, for topics that have messages and one of the message types `types`."""
     counts: dict[str, int] = {}
     for one in connections:
         if one.msgtype in types and one.msgcount:
@@ -153,14 +165,14 @@ def messages_by_topic(connections: Iterable[Any], types: Sequence[str]) -> dict[
 
 
 def picture_topics(connections: Iterable[Any]) -> list[str]:
-    """The topics with pictures, those with most messages first."""
+    """The topics with pictures, except those of `_OTHER_IMAGES`, sorted by decreasing number of messages."""
     counts = messages_by_topic(connections, (RAW, COMPRESSED))
     good = [topic for topic in counts if not any(word in topic for word in _OTHER_IMAGES)]
     return sorted(good, key=lambda topic: (counts[topic], topic), reverse=True)
 
 
 def choose_pictures(connections: Sequence[Any], path: Path, topic: str = "") -> str:
-    """The topic of the pictures: the given one, or the one with most messages. Raises InputError: there is none."""
+    """The topic of the pictures: the given one, or the one with most messages. Raises InputError if there is none."""
     if topic:
         if topic not in messages_by_topic(connections, (RAW, COMPRESSED)):
             have = join_names(picture_topics(connections), most=12)
@@ -173,24 +185,24 @@ def choose_pictures(connections: Sequence[Any], path: Path, topic: str = "") -> 
 
 
 def choose_camera_info(connections: Iterable[Any], pictures: str) -> str | None:
-    """The CameraInfo whose topic shares most leading parts with that of the pictures; None if there is none."""
+    """The CameraInfo topic that shares the most leading parts with the pictures' topic; None without a CameraInfo."""
     found = messages_by_topic(connections, (CAMERA_INFO,))
     return max(found, key=lambda topic: _common(topic, pictures), default=None)
 
 
 def _common(one: str, other: str) -> int:
-    """Number of leading parts that two topics share."""
+    """Number of leading parts, separated by slashes, that two topics share."""
     pairs = list(zip(one.split("/"), other.split("/"), strict=False))
     return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
 
 
 def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYPES)) -> dict[str, Any]:
-    """The connection of each kind, a key of `TYPES`. Raises InputError: a kind other than imu has none."""
+    """The best connection of each kind, a key of `TYPES`. Raises InputError if a kind other than imu has none."""
     chosen = {}
     for kind in kinds:
         types = TYPES[kind]
         found = [c for c in connections if c.msgtype in types and c.msgcount]
-        if kind == "commands":  # prefer the controller's input to the multiplexer's
+        if kind == "commands":  # prefer the velocity controller's input to the multiplexer's inputs
             found.sort(key=lambda c: (not c.topic.endswith("cmd_vel"), -c.msgcount))
         elif kind == "poses":
             found.sort(key=lambda c: (c.msgcount < MIN_POSES, is_from_wheels(c.topic), -c.msgcount))
@@ -206,7 +218,7 @@ def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYP
 
 
 def is_from_wheels(topic: str) -> bool:
-    """True for a topic named like odometry from the wheels."""
+    """True for a topic whose name contains a word of `FROM_WHEELS`."""
     return any(word in topic for word in FROM_WHEELS)
 
 
@@ -223,15 +235,15 @@ def picture_of(message: Any) -> "RawPicture | CompressedPicture":
 
 
 def header_time(message: Any) -> int:
-    """The stamp of a message's header [ns]; 0 without one."""
+    """The stamp of a message's header [ns]; 0 for a message without it."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return stamp.sec * 10**9 + stamp.nanosec if stamp is not None else 0
 
 
 def message_times(times: NDArray[np.int64], topic: str, path: Path) -> NDArray[np.int64]:
-    """Times of a topic's messages [ns] from those of headers and of recording, (n, 2).
+    """Times of a topic's messages [ns], shape (n,), from their header and recording times, shape (n, 2).
 
-    They are those of the headers; where these have another clock than the bag, or none, those of recording.
+    The header times are used, or the recording times if the headers have no times or times of another clock.
     """
     header, recorded = times.reshape(-1, 2).T
     if not header.any():
@@ -243,7 +255,7 @@ def message_times(times: NDArray[np.int64], topic: str, path: Path) -> NDArray[n
 
 
 def fix_of(message: Any) -> tuple[float, float, float]:
-    """Latitude [°], longitude [°], altitude [m] of a NavSatFix; NaN without a fix."""
+    """Latitude [°], longitude [°], altitude [m] of a NavSatFix; NaN if the receiver had no fix."""
     good = message.status.status >= 0
     return (message.latitude, message.longitude, message.altitude) if good else (np.nan,) * 3
 
@@ -271,4 +283,4 @@ def _imu(message: Any) -> tuple[float, ...]:
 
 
 VALUES: dict[str, Callable[[Any], Any]] = {"commands": _twist, "wheels": _wheels, "poses": _pose, "imu": _imu}
-"""Functions from a message of each kind to its numbers: v, ω; wheel speeds; x, y, yaw; accelerations."""
+"""Kind → function that extracts a message's numbers: v, ω; wheel speeds per side; x, y, yaw; accelerations in x, y."""

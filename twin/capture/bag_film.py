@@ -1,8 +1,9 @@
-"""The film in a robot's bag, with what the bag says of its camera: calibration, positions and seat on the robot.
+"""Reads the film in a robot's bag, with the camera's calibration, positions and pose on the robot.
 
-A picture's *stamp* is its header's. Pictures whose stamp is not after that of an earlier one are left out. A *fix* is a
-position by satellites. The *seat* is the camera's pose on the robot by `/tf_static`, from the frame in the pictures'
-headers to `base_link`. Positions by odometry are those of the lens, in the frame of the odometry.
+A picture's *stamp* is its time as selected by `message_times`. Only pictures with a later stamp than all pictures
+before them are used. A *fix* is a satellite position. The *seat* is the camera's pose on the robot: the transform in
+`/tf_static` from the frame named in the pictures' headers to `base_link`. Odometry gives the positions of the lens, in
+the odometry's own frame.
 """
 
 from array import array
@@ -41,11 +42,11 @@ from twin.errors import InputError
 from twin.robot import BASE_HEIGHT, CAMERA_AHEAD
 from twin.types import Array, Image
 
-_MAX_UNORDERED = 0.02  # fraction of pictures that may be left out for their stamps
-_MAX_FIX_GAP, _MAX_POSE_GAP = 2.5, 0.5  # [s] between two fixes or poses; longer ones are not interpolated
+_MAX_UNORDERED = 0.02  # largest fraction of pictures that are left out because of their stamps
+_MAX_FIX_GAP, _MAX_POSE_GAP = 2.5, 0.5  # [s] between two fixes or poses; there is no interpolation across longer gaps
 _BASE, _GROUND = "base_link", "base_footprint"
-_MAX_FRAMES = 10_000  # of /tf_static
-_MAX_PIXELS = 1 << 28  # of a compressed picture
+_MAX_FRAMES = 10_000  # largest number of coordinate frames read from /tf_static
+_MAX_PIXELS = 1 << 28  # largest accepted size of a compressed picture
 
 
 @dataclass(frozen=True)
@@ -53,62 +54,62 @@ class CameraSeat:
     """A camera's pose on the robot."""
 
     height: float
-    """Of the lens above flat ground [m]."""
+    """Height of the lens above flat ground [m]."""
     ground_known: bool
-    """False: the bag has no `base_footprint`, and `base_link` is taken to be as high as a Husky's."""
+    """False if the bag has no `base_footprint`; `base_link` is then assumed to be as high as on a Husky."""
     offset: tuple[float, float]
-    """Forward and left of `base_link` [m]."""
+    """Distance of the lens forward and to the left of `base_link` [m]."""
     yaw: float
-    """To the left [°]."""
+    """Angle of the viewing direction to the left of straight ahead [°]."""
     pitch: float
-    """Downward [°]."""
+    """Angle of the viewing direction below the horizontal [°]."""
     roll: float
-    """Leaning to the right [°]."""
+    """Angle by which the camera leans to its right [°]."""
 
 
 @dataclass(frozen=True)
 class BagContents:
-    """What a bag has for a scene."""
+    """The contents of a bag that a scene uses."""
 
     path: Path
     topics: dict[str, str]
-    """Topics by what they hold: pictures, and, where there are any, camera, fixes, odometry, transforms."""
+    """Content → topic. The contents are pictures and, if the bag has them, camera, fixes, odometry and transforms."""
     other_pictures: tuple[str, ...]
-    """Topics with pictures that were not chosen."""
+    """Other topics with pictures, which are not used."""
     encoding: str
     size: tuple[int, int]
     """Width, height of the first picture [px]."""
     recorded: int
-    """Number of pictures that the bag promises."""
+    """Number of pictures according to the bag's index."""
     stamps: NDArray[np.int64]
-    """Of the pictures that are used, increasing [ns], shape (n,)."""
+    """Stamps of the pictures that are used, increasing [ns], shape (n,)."""
     position: NDArray[np.int64]
-    """Their positions among the topic's messages, shape (n,)."""
+    """Positions of these pictures among the topic's messages, shape (n,)."""
     lens: Lens | None
-    """The calibration; None without a usable one."""
+    """The calibrated lens; None without a usable calibration."""
     lens_note: str
-    """Where the calibration is from, or why there is none."""
+    """Source of the calibration, or the reason why there is none."""
     fix_times: NDArray[np.int64]
-    """[ns], increasing, shape (f,)."""
+    """Times of the fixes [ns], increasing, shape (f,)."""
     fixes: Array
     """Latitude [°], longitude [°], altitude [m], shape (f, 3); NaN without a fix."""
     odometry_times: NDArray[np.int64]
-    """[ns], increasing, shape (p,)."""
+    """Times of the odometry [ns], increasing, shape (p,)."""
     odometry: Array
     """Positions of the lens [m], shape (p, 3)."""
     seat: CameraSeat | None
 
     @property
     def duration(self) -> float:
-        """Of the film [s]."""
+        """Time from the first to the last picture [s]."""
         return float((self.stamps[-1] - self.stamps[0]) * 1e-9)
 
     def fixes_at(self, times: Array) -> Array:
-        """Fixes at times [s] after the first picture, shape (k, 3); NaN where there is none near."""
+        """Interpolated fixes at times [s] after the first picture, shape (k, 3); NaN in gaps and outside the fixes."""
         return _interpolated(times, self.stamps[0], self.fix_times, self.fixes, _MAX_FIX_GAP)
 
     def odometry_at(self, times: Array) -> Array:
-        """Positions of the lens by odometry at times [s] after the first picture, shape (k, 3); NaN as above."""
+        """Lens positions by odometry at times [s] after the first picture, shape (k, 3); NaN as in `fixes_at`."""
         return _interpolated(times, self.stamps[0], self.odometry_times, self.odometry, _MAX_POSE_GAP)
 
     def film(self) -> Film:
@@ -118,23 +119,23 @@ class BagContents:
 
 
 class _Rows:
-    """Numbers of a topic's messages, as compact as they are many."""
+    """Numbers of a topic's messages, in compact arrays because there may be many."""
 
     def __init__(self) -> None:
-        self.times = array("q")  # of header and recording [ns], per message
+        self.times = array("q")  # header and recording time [ns] of each message
         self.values = array("d")
 
 
 def read_contents(path: Path, topic: str = "") -> BagContents:
-    """Reads all of a bag that is no picture, and the pictures' stamps.
+    """Reads the calibration, positions and seat in a bag, and the pictures' stamps; decodes only the first picture.
 
     Args:
         path: See `twin.capture.bag`.
-        topic: Of the pictures; empty: the one with most of them.
+        topic: Topic of the pictures; empty for the topic with the most pictures.
 
     Raises:
-        InputError: no bag or a damaged one, no pictures, an unknown encoding, a camera model that is not supported, or
-            stamps out of order.
+        InputError: the path is no bag or a damaged one, or the bag has no pictures, an unknown encoding, an unsupported
+            camera model, or stamps out of order.
     """
     with open_bag(path) as bag:
         topics = _topics(bag.connections, path, topic)
@@ -193,7 +194,7 @@ def _topics(connections: list[Any], path: Path, topic: str) -> dict[str, str]:
 
 
 def _values(kind: str, message: Any) -> tuple[float, ...]:
-    """Of a message: a fix; or position and quaternion of a pose."""
+    """A message's numbers: the fix, or position and quaternion of the pose; none for a picture."""
     if kind == "fixes":
         return fix_of(message)
     if kind == "odometry":
@@ -205,7 +206,10 @@ def _values(kind: str, message: Any) -> tuple[float, ...]:
 
 
 def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Positions and stamps of the pictures whose stamp is after all earlier ones. Raises InputError: many are not."""
+    """Positions and stamps of the pictures whose stamp is later than all stamps before.
+
+    One other picture, or a fraction of `_MAX_UNORDERED`, is allowed. Raises InputError if there are more.
+    """
     latest = np.maximum.accumulate(times)
     late = np.append(False, times[1:] <= latest[:-1])
     if late.sum() > max(1.0, _MAX_UNORDERED * len(times)):
@@ -219,7 +223,7 @@ def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], N
 
 
 def _table(rows: _Rows | None, times: NDArray[np.int64] | None, width: int) -> tuple[NDArray[np.int64], Array]:
-    """Times in order and the values of a topic's messages, shape (n, width)."""
+    """Increasing times (n,) and values (n, width) of a topic's messages; n is 0 without a topic."""
     if rows is None or times is None:
         return np.zeros(0, np.int64), np.zeros((0, width))
     times, index = np.unique(times, return_index=True)
@@ -227,7 +231,10 @@ def _table(rows: _Rows | None, times: NDArray[np.int64] | None, width: int) -> t
 
 
 def _interpolated(times: Array, first: int, knots: NDArray[np.int64], values: Array, max_gap: float) -> Array:
-    """Values (k, c) at times [s] after `first` [ns] between the knots [ns]; NaN outside, and in gaps [s]."""
+    """Values (k, c) at times [s] after `first` [ns], interpolated linearly between the knots [ns].
+
+    NaN outside the knots and in gaps longer than `max_gap` [s].
+    """
     out = np.full((len(times), values.shape[1]), np.nan)
     if len(knots) < 2:
         return out
@@ -244,7 +251,7 @@ def _interpolated(times: Array, first: int, knots: NDArray[np.int64], values: Ar
 
 
 def _decoded(picture: Any, where: str) -> Image:
-    """RGB (h, w, 3) of a picture. Raises InputError."""
+    """RGB (h, w, 3) of a picture. Raises InputError if it cannot be decoded."""
     from twin_policy import PictureError
 
     try:
@@ -254,7 +261,10 @@ def _decoded(picture: Any, where: str) -> Image:
 
 
 def _checked(picture: Any) -> Any:
-    """The picture. Raises PictureError for a compressed one that would fill the memory, before it is decoded."""
+    """The picture itself, unchanged.
+
+    Raises PictureError, without decoding, for a compressed picture of unknown format or of more than `_MAX_PIXELS`.
+    """
     from io import BytesIO
 
     from PIL import Image as Pillow
@@ -274,7 +284,7 @@ def _checked(picture: Any) -> Any:
 
 
 def _decode(contents: BagContents, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:
-    """Yields time [s] and frame of the pictures; damaged ones are counted and left out."""
+    """Yields time [s] and frame of each picture; omits and counts damaged ones. Raises InputError if all are."""
     topic, used, shown = contents.topics["pictures"], iter(contents.position.tolist()), 0
     where = f"{contents.path}: {topic}"
     wanted, problem = next(used, None), None
@@ -300,12 +310,12 @@ def _decode(contents: BagContents, count: FilmStatistics) -> Iterator[tuple[floa
 
 
 def lens_of(info: Any, rectified: bool, where: str) -> Lens:
-    """The lens of a CameraInfo. Raises InputError: an unknown model, or values that no camera has.
+    """The lens of a CameraInfo. Raises InputError for an unknown camera model or implausible values.
 
     Args:
         info: sensor_msgs/CameraInfo of ROS 1 or 2.
-        rectified: The pictures are rectified, so that the camera is the matrix P.
-        where: Begins the messages.
+        rectified: True if the pictures are rectified; the matrix P then gives the intrinsics.
+        where: Beginning of the error messages.
     """
     from twin_policy import Camera, PictureError
 
@@ -319,13 +329,13 @@ def lens_of(info: Any, rectified: bool, where: str) -> Lens:
         return checked_lens("PINHOLE", camera.intrinsics, width, height, where)
     if camera.model == "equidistant":
         return checked_lens("OPENCV_FISHEYE", (*camera.intrinsics, *d[:4]), width, height, where)
-    if any(d[4:]):  # k3, and k4 to k6 of rational_polynomial; COLMAP has the same order
+    if any(d[4:]):  # k3, and k4 to k6 of rational_polynomial, in COLMAP's order
         return checked_lens("FULL_OPENCV", (*camera.intrinsics, *d), width, height, where)
     return checked_lens("OPENCV", (*camera.intrinsics, *d[:4]), width, height, where)
 
 
 def _lens(info: Any, topics: dict[str, str], frame: str, size: tuple[int, int], path: Path) -> tuple[Lens | None, str]:
-    """The calibration and a note on it."""
+    """The calibrated lens, or None, and a note on its source or on why it is missing."""
     if info is None:
         return None, f"no {CAMERA_INFO}; the camera is calibrated from the film"
     topic = topics["camera"]
@@ -349,7 +359,7 @@ def _lens(info: Any, topics: dict[str, str], frame: str, size: tuple[int, int], 
 
 
 def _add_transforms(transforms: dict[str, tuple[str, Array]], message: Any) -> None:
-    """Adds the transforms of a message: parent and child_to_parent (4, 4) by child."""
+    """Adds a message's transforms to the dictionary child frame → (parent frame, child_to_parent (4, 4))."""
     for one in message.transforms:
         if len(transforms) >= _MAX_FRAMES:
             return
@@ -371,7 +381,7 @@ def _pose_in_base(transforms: dict[str, tuple[str, Array]], frame: str) -> Array
         seen.add(name)
         name, step = transforms[name][0], transforms[name][1]
         pose = step @ pose
-    if abs(pose[2, 2]) > abs(pose[2, 1]):  # the frame's z is vertical: x forward, y left, not an optical frame
+    if abs(pose[2, 2]) > abs(pose[2, 1]):  # z is vertical: x is forward and y left, unlike in optical frames
         pose[:3, :3] = pose[:3, :3] @ CAMERA_AHEAD
     return pose
 
@@ -392,12 +402,12 @@ def _seat(camera_to_base: Array | None, transforms: dict[str, tuple[str, Array]]
 
 
 def _is_named(frame: str, name: str) -> bool:
-    """True for a frame of this name, with or without a prefix."""
+    """True if the frame has this name, with or without a prefix that ends with a slash."""
     return frame.rpartition("/")[2] == name
 
 
 def _lens_positions(poses: Array, arm: Array) -> Array:
-    """Positions of the lens (p, 3) from positions and quaternions of the base (p, 7) and the lens in the base (3,)."""
+    """Positions of the lens (p, 3) from base positions and quaternions (p, 7) and the lens in the base frame (3,)."""
     good = np.isfinite(poses).all(1) & (np.linalg.norm(poses[:, 3:], axis=1) > 0.5)
     out = np.full((len(poses), 3), np.nan)
     if good.any():

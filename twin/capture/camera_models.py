@@ -36,7 +36,7 @@ _MAX_SIDE = 1_000_000  # [px]
 
 
 def camera_to_world(camera_from_world: pycolmap.Rigid3d) -> Array:
-    """The pose (4, 4) of a COLMAP pose, which maps the other way."""
+    """camera_to_world (4, 4) from a COLMAP pose, which maps from world to camera."""
     return inverse_pose(np.vstack([camera_from_world.matrix(), [0.0, 0.0, 0.0, 1.0]]))
 
 
@@ -45,7 +45,7 @@ def camera_to_world(camera_from_world: pycolmap.Rigid3d) -> Array:
 
 @dataclass(frozen=True)
 class Lens:
-    """A COLMAP camera model, its parameters in COLMAP's order, and the image size they are for [px]."""
+    """A COLMAP camera model with its parameters in COLMAP's order, and the image size [px] to which they apply."""
 
     model: str
     params: tuple[float, ...]
@@ -64,7 +64,7 @@ class Lens:
 
     @property
     def distortion(self) -> tuple[float, ...]:
-        """The parameters beyond focal length and principal point."""
+        """The parameters other than focal length and principal point."""
         return tuple(self.params[i] for i in self.camera.extra_params_idxs())
 
     @property
@@ -91,12 +91,12 @@ class Lens:
         return Lens(self.model, tuple(float(p) for p in camera.params), width, height)
 
     def fits(self, width: int, height: int) -> bool:
-        """True if an image of this size can be a scaled image of this lens: the aspect agrees to 1 %."""
+        """True if an image of this size [px] can be a resized image of this lens: see `same_aspect`."""
         return same_aspect((width, height), (self.width, self.height))
 
 
 def lens_from_json(entry: dict[str, Any]) -> Lens:
-    """The lens whose `vars` were stored as JSON."""
+    """The lens from its attributes as JSON, as `vars(lens)` gives them."""
     return Lens(entry["model"], tuple(entry["params"]), entry["width"], entry["height"])
 
 
@@ -131,7 +131,7 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
 
 
 def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """True if two sizes (width, height) [px] have the same aspect to 1 % or a rounded pixel."""
+    """True if two sizes (width, height) [px] have the same aspect, to 1 % or to one pixel of a side."""
     error = abs(a[0] * b[1] - a[1] * b[0])
     return error <= max(_MAX_ASPECT_ERROR * a[0] * b[1], a[0], a[1], b[0], b[1])
 
@@ -140,9 +140,10 @@ def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
 
 
 def undistortion(lens: Lens) -> tuple[Lens, PixelMap | None]:
-    """The pinhole lens that replaces a lens at the same size, and the map of its pixels, None if nothing moves.
+    """The pinhole lens that replaces a lens at the same size, and its pixel map.
 
-    Raises InputError: the distortion is so strong that no pinhole view fits into the raw image.
+    The map is None if the distortion is negligible. Raises InputError: the distortion is so strong that no pinhole view
+    fits into the raw image.
     """
     pinhole = _fitted_pinhole(lens)
     if lens.camera.is_undistorted() or _max_displacement(lens, pinhole) < _NEGLIGIBLE_DISTORTION:
@@ -163,7 +164,7 @@ def undistorted(image: Image, lens: Lens, nearest: bool = False) -> tuple[Image,
 
 
 def write_pinhole_image(raw: Path, target: Path, pixel_map: PixelMap | None, mask: bool = False) -> None:
-    """Writes one image or mask without distortion; without a pixel map the file is hard-linked or copied."""
+    """Writes one image or mask without distortion; hard-links or copies the file if there is no pixel map."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if pixel_map is None:
         try:

@@ -1,4 +1,4 @@
-"""The sources of a capture and their kept frames: while they are read, and as stage `capture` stores them.
+"""Data of a capture's sources and kept frames, as used while reading and as stored by stage `capture`.
 
 A *mask* marks the pixels of a frame that all later stages ignore: 0 = ignore, any other value = use.
 """
@@ -29,9 +29,9 @@ from twin.files import (
 from twin.geometry.images import decode_image, write_image
 from twin.types import Array, Image
 
-QUEUE_SIZE = 4  # images decoded or encoded in the background; bounds the memory
+QUEUE_SIZE = 4  # images that may be decoded or encoded in the background at once; bounds the memory
 NO_GPS = (math.nan, math.nan, math.nan)
-_LOSSY_THRESHOLD = 63  # compression changes the zeros of a JPEG mask
+_LOSSY_THRESHOLD = 63  # JPEG mask values up to this one count as 0, since compression changes zeros
 _ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "source_index": ((), "i"),
     "times": ((), "f"),
@@ -49,7 +49,7 @@ _ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """One source after capture. Its frames share one camera, except posed input with one camera per image."""
+    """One source after capture. Its frames share one camera, unless posed input has one camera per image."""
 
     name: str  # unique folder name of the source
     lighting: str
@@ -60,7 +60,7 @@ class SourceInfo:
     camera_params: tuple[float, ...]
     """Calibration or focal length prior [px], at the size of the kept frames; empty if unknown."""
     calibrated: bool  # true if `camera_params` are a given calibration, which stays fixed
-    camera_height: float  # lens above ground [m]; 0 = not given
+    camera_height: float  # height of the lens above the ground [m]; 0 = not given
 
 
 @dataclass(frozen=True)
@@ -71,16 +71,16 @@ class Capture:
     names: tuple[str, ...]
     """`<source>/<six digits>`; the image is `images/<name>.png` in the stage folder, its mask `masks/<name>.png`."""
     source_index: NDArray[np.int64]  # shape (n,)
-    times: Array  # time within the source [s]; the index for photos without a clock. Shape (n,)
+    times: Array  # time within the source [s]; for photos without known times, their index. Shape (n,)
     held_out: NDArray[np.bool_]  # true for test frames, which are never trained on. Shape (n,)
     gps: Array  # latitude [°], longitude [°], altitude [m]; NaN where unknown. Shape (n, 3)
     camera_to_world: Array | None = None
     """Poses given with the input (OpenCV axes), shape (n, 4, 4); None unless all sources have them."""
     intrinsics: Array | None = None
-    """fx, fy, cx, cy [px] per frame of posed input at the kept size, shape (n, 4); `SourceInfo` has the distortion."""
+    """fx, fy, cx, cy [px] per frame of posed input, at the kept size, shape (n, 4); distortion is in `SourceInfo`."""
     odometry: Array | None = None
-    """Positions of the lens by a bag's odometry [m], in a frame per source, shape (n, 3), NaN where unknown; None
-    without a bag that has any."""
+    """Positions of the lens by a bag's odometry [m], shape (n, 3), NaN where unknown. Each source has its own
+    coordinate frame. None if no bag has odometry."""
 
     def save(self, folder: Path) -> None:
         """Writes `capture.json` and `capture.npz`."""
@@ -109,7 +109,7 @@ class Capture:
 def read_mask(path: Path, width: int, height: int) -> Image:
     """Reads a mask at a frame's size: 0 or 255, shape (height, width).
 
-    Raises InputError: unreadable, of another aspect than the frame, or all pixels ignored.
+    Raises InputError: the mask is unreadable, has another aspect than the frame, or ignores all pixels.
     """
     mask = decode_image(path, cv2.IMREAD_GRAYSCALE, "write the mask again as an 8-bit PNG")
     if not same_aspect((mask.shape[1], mask.shape[0]), (width, height)):
@@ -139,7 +139,7 @@ class SourceTask:
 
     @property
     def segments(self) -> tuple[tuple[float, ...], ...]:
-        """Segments of the source to use, [from, to] each [s]; empty for all of it."""
+        """The segments of the source that are used, each [from, to] [s]; empty for the whole source."""
         return self.source.keep or self.config.keep
 
     def given_lens(self, native: tuple[int, int]) -> Lens | None:
@@ -161,13 +161,13 @@ class SourceTask:
         return lens
 
     def info(self, size: tuple[int, int], lens: Lens | None, calibrated: bool) -> SourceInfo:
-        """The `SourceInfo` for a frame size [px]; SIMPLE_RADIAL, which fits most cameras, if the lens is unknown."""
+        """The `SourceInfo` for a frame size [px]; an unknown lens gets SIMPLE_RADIAL, which fits most cameras."""
         model, params = (lens.model, lens.params) if lens else ("SIMPLE_RADIAL", ())
         height = self.source.camera_height
         return SourceInfo(self.name, self.lighting, self.kind, *size, model, params, calibrated, height)
 
     def mask(self, keys: tuple[str, ...], width: int, height: int) -> Image | None:
-        """The mask (height, width) of a frame, whose file may be named by any of the keys; None if it has none."""
+        """The mask (height, width) of a frame, or None; in a mask folder, its file is named like one of the keys."""
         path = self.masks
         if path and path.is_dir():
             files = (path / f"{key}{suffix}" for key in keys for suffix in (".png", ".jpg", ".PNG", ".JPG"))
@@ -175,7 +175,7 @@ class SourceTask:
         return read_mask(path, width, height) if path else None
 
     def check_masked(self, unmasked: int, count: int) -> None:
-        """Reports frames without a mask. Raises InputError if the mask folder fits none of the `count` frames."""
+        """Reports that `unmasked` of `count` frames have no mask. Raises InputError if no frame has one."""
         if self.masks and unmasked == count:
             raise InputError(
                 f"{self.masks}: no mask here is named like a frame; "
@@ -196,11 +196,11 @@ class KeptFrames:
     metrics: dict[str, Any]
     poses: list[Array]  # camera_to_world (4, 4) per frame; empty for a source without poses
     intrinsics: list[Array]  # fx, fy, cx, cy [px] at the kept size per pose
-    odometry: list[tuple[float, float, float]] | None = None  # of a bag
+    odometry: list[tuple[float, float, float]] | None = None  # positions of the lens [m] in a bag, else None
 
 
 class FrameWriter:
-    """Encodes and writes a source's frames and masks in threads; errors are raised at the next frame or at the end."""
+    """Encodes and writes a source's frames and masks in threads; errors are raised at a later frame or at the end."""
 
     def __init__(self, out: Path, name: str) -> None:
         self._images, self._masks = out / "images" / name, out / "masks" / name

@@ -1,7 +1,7 @@
-"""Looks at a film before the build: what of it costs quality, and how to film better.
+"""Checks a film before the build: finds defects that reduce the twin's quality, and says how to film better.
 
-Key frames spread over the film are decoded, or if there are few, other frames, too; timing comes from all packets. What
-a file does not show is not judged: stabilization leaves no trace in it, nor does a rolling shutter.
+Key frames spread over the film are decoded; if these are too few, other frames are decoded, too. The timing comes from
+all packets. Stabilization and rolling shutter are not checked, because they leave no trace in the file.
 """
 
 import contextlib
@@ -19,20 +19,22 @@ from twin.geometry.images import resize
 from twin.types import Array
 
 _SAMPLES = 60
-_WIDTH = 320  # [px] at which frames are compared
-_MIN_SIDE = 640  # [px] of the longer side
-_DARK = 35.0  # [gray levels] median brightness
-_CLIPPED, _CLIPPED_SHARE = 250, 0.15  # [gray levels], share of the pixels at or above
-_BLURRED, _BLURRED_SHARE = 0.35, 0.3  # of the film's own sharpest tenth; share of the frames below
-_EXPOSURE_RANGE = 2.0  # ratio of the 95 % and 5 % quantiles of brightness
-_TINT_RANGE = 1.3  # the same of red over blue
-_GAP = 0.5  # [s] without a picture
-_UNEVEN = 1.5  # ratio of the 95 % quantile and the median of the time between frames
-_MIN_TRUSTED = 8  # samples that shares and quantiles are computed from
+_WIDTH = 320  # [px] to which frames are scaled down for the check
+_MIN_SIDE = 640  # [px] smallest good length of the longer side
+_DARK = 35.0  # [gray levels] smallest good median brightness
+# Gray level from which a pixel is clipped; largest good share of clipped pixels.
+_CLIPPED, _CLIPPED_SHARE = 250, 0.15
+# Fraction of the 90 % quantile of sharpness below which a frame is blurred; largest good share of blurred frames.
+_BLURRED, _BLURRED_SHARE = 0.35, 0.3
+_EXPOSURE_RANGE = 2.0  # largest good ratio of the 95 % to the 5 % quantile of brightness
+_TINT_RANGE = 1.3  # largest good ratio of the same quantiles of red over blue
+_GAP = 0.5  # [s] shorter times without a picture are not reported
+_UNEVEN = 1.5  # largest good ratio of the 95 % quantile to the median of the time between frames
+_MIN_TRUSTED = 8  # fewest samples from which shares and quantiles are computed
 
 
 def check_film(path: Path) -> list[str]:
-    """Sentences about what is wrong with a film, each with its cure; empty if nothing is.
+    """One sentence per defect of a film, each with its cure; empty without defects.
 
     Raises InputError: see `probe`.
     """
@@ -72,14 +74,14 @@ def _timing_notes(timing: FilmTiming) -> list[str]:
 
 
 def _samples(path: Path, skip: Literal["NONKEY", "DEFAULT"]) -> list[av.VideoFrame]:
-    """At most twice `_SAMPLES` frames spread over the film; with `NONKEY` key frames only."""
+    """Frames spread over the film, fewer than twice `_SAMPLES`; with `skip` = NONKEY only key frames."""
     found: list[av.VideoFrame] = []
     every = 1
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         stream.codec_context.skip_frame = skip
         stream.thread_type = "AUTO"
-        with contextlib.suppress(av.error.FFmpegError):  # what comes before the damage is enough for a look
+        with contextlib.suppress(av.error.FFmpegError):  # the frames before the damage suffice for the check
             for number, frame in enumerate(container.decode(stream)):
                 if number % every == 0:
                     found.append(frame)

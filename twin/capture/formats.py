@@ -1,10 +1,10 @@
-"""Readers of image sets with their cameras and poses: plain folders, COLMAP models, `transforms.json`.
+"""Readers of image sets: plain folders without poses, and COLMAP models and `transforms.json` with cameras and poses.
 
-A COLMAP *model* is the folder with the files `cameras` and `images`; a *workspace* has it under `sparse/0`. Its points
-are not read. `transforms.json` has two variants: nerfstudio names the camera model and may have moved the world
-(`applied_transform`), instant-ngp may give only an angle of view and file names without suffix. Both use OpenGL camera
-axes (y up, looking along −z); poses here have OpenCV axes. nerfstudio's transform of the world is undone, so that
-sources posed by one reconstruction share its world.
+A COLMAP *model* is the folder with the files `cameras` and `images`; a *workspace* has a model under `sparse/0`. The
+points of a model are not read. `transforms.json` has two variants. nerfstudio's names the camera model and may have
+transformed the world (`applied_transform`); instant-ngp's may give only an angle of view and file names without suffix.
+Both use OpenGL camera axes (y up, looking along −z); poses here have OpenCV axes. nerfstudio's transform of the world
+is undone, so that all sources posed by one reconstruction are in the same world coordinates.
 """
 
 import math
@@ -31,16 +31,16 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".p
 _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _MODEL_NAMES = {int(pycolmap.CameraModelId.__members__[name]): name for name in CAMERA_MODELS}
 _CURE = "export the model again"
-_MAX_POSE_VALUE = 1e9  # of a COLMAP pose
-_MAX_CAMERA_VALUE = 1e12  # of a camera in `transforms.json`
-_MAX_COORDINATE = 1e9  # of a camera center in `transforms.json`
-_RIGID_TOLERANCE = 1e-2  # on the entries of RᵀR − 1; files with rounded numbers stay below
+_MAX_POSE_VALUE = 1e9  # upper limit of the numbers in a COLMAP pose
+_MAX_CAMERA_VALUE = 1e12  # upper limit of a camera's numbers in `transforms.json`
+_MAX_COORDINATE = 1e9  # upper limit of a camera center's coordinates in `transforms.json`
+_RIGID_TOLERANCE = 1e-2  # largest accepted entry of RᵀR − 1; rounding in the file causes smaller ones
 
 
 # ---- COLMAP models
 #
-# Parsed here, because pycolmap's reader also demands the files of points and loads them, accepts cameras.bin cut off,
-# gives no file and line of a damaged text, and may abort the process.
+# pycolmap's reader is not used: it needs the points' files and loads them, accepts a truncated cameras.bin, does not
+# name file and line of damaged text, and may abort the process.
 
 
 def find_model(folder: Path) -> Path | None:
@@ -114,7 +114,7 @@ def _images_txt(path: Path) -> list[tuple[str, int, Array]]:
             raise InputError(
                 f"{path}: line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line[:60]!r}"
             ) from None
-        next(lines, None)  # its points, perhaps an empty line
+        next(lines, None)  # skips the line of the image's points, which may be empty
     return images
 
 
@@ -171,12 +171,12 @@ def _images_bin(path: Path) -> list[tuple[str, int, Array]]:
 
 @dataclass(frozen=True)
 class ImageSet:
-    """n image files in natural order of their names, posed or not."""
+    """n image files in natural order of their names, with or without poses."""
 
     paths: tuple[Path, ...]
     lenses: tuple[Lens, ...] | None = None  # one per image, at the size given in the file; None without cameras
     camera_to_world: Array | None = None  # OpenCV axes, shape (n, 4, 4); None without poses
-    masks: tuple[Path | None, ...] | None = None  # one per image, as listed by the set
+    masks: tuple[Path | None, ...] | None = None  # file or None per image; None if the set lists no masks
     missing: int = 0  # number of listed images that do not exist
 
 
@@ -196,10 +196,10 @@ def read_image_folder(folder: Path) -> ImageSet:
 
 
 def read_colmap(folder: Path, images: Path | None = None) -> ImageSet:
-    """The registered images of a COLMAP model or workspace that exist as files.
+    """The registered images of a COLMAP model or workspace; images without a file are left out and counted.
 
-    The image folder is by default searched for in and above the model. Raises InputError: no model, damaged files, no
-    image found.
+    Without `images`, the image folder is searched for in and above the model. Raises InputError: no model, damaged
+    files, no image found.
     """
     model = find_model(folder) if folder.is_dir() else None
     if model is None:
@@ -224,9 +224,9 @@ def read_colmap(folder: Path, images: Path | None = None) -> ImageSet:
 
 
 def read_transforms(path: Path, images: Path | None = None) -> ImageSet:
-    """The images of a `transforms.json`, or of the folder that holds it, that exist as files.
+    """The images of a `transforms.json`, or of the one in a folder; images without a file are left out and counted.
 
-    By default their paths are relative to the JSON file.
+    The images are searched for in the folder `images`; without it, by their paths relative to the JSON file.
 
     Raises InputError: wrong JSON, a missing or impossible entry, a pose that is not rigid, no image found.
     """
@@ -252,7 +252,7 @@ def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageS
         if file is None:
             missing += 1
             continue
-        world = opencv_to_mujoco(to_original @ pose)  # the flip between OpenGL and OpenCV axes is self-inverse
+        world = opencv_to_mujoco(to_original @ pose)  # this flip of axes also converts OpenGL to OpenCV
         world[:3, 3] /= scale
         if not np.abs(world[:3, 3]).max() < _MAX_COORDINATE:
             raise InputError(f"{where}: transform_matrix lies too far away; export the file again")
@@ -375,14 +375,14 @@ def _rigid_pose(value: Any, where: str) -> Array:
 
 
 def _undo_world_transform(table: dict[str, Any], path: Path) -> tuple[Array, float]:
-    """The rigid transform, and then the divisor of positions, that undo nerfstudio's transform of the world."""
+    """The inverse of nerfstudio's transform of the world: a rigid transform (4, 4), then a divisor of positions."""
     to_original = np.eye(4)
     if "applied_transform" in table:
         to_original = inverse_pose(_rigid_pose(table["applied_transform"], f"{path}: applied_transform"))
     scale = table.get("applied_scale", 1.0)
     if not _is_number(scale, _MAX_CAMERA_VALUE) or scale <= 1 / _MAX_CAMERA_VALUE:
         raise InputError(f"{path}: applied_scale = {short_repr(scale)}; expected a positive number")
-    # nerfstudio scales after it moves, x' = s (R x + t), so the translation of the inverse is scaled too.
+    # nerfstudio scales after the rigid transform, x' = s (R x + t), so the translation of the inverse is scaled too.
     to_original[:3, 3] *= scale
     return to_original, float(scale)
 

@@ -2,8 +2,7 @@
 
 A *source* is one input under one lighting; its *kind* is video, bag, images, colmap or transforms. A *kept* frame is
 upright and scaled to `capture.max_size`, and still has the lens's distortion. Its name is `<source>/<index>`, where the
-index is its position in the film or in the natural order of the image set: it does not depend on which other frames are
-kept.
+index is its position in the film or in the natural order of the image set, whichever other frames are kept.
 *Held-out* frames are never trained on.
 """
 
@@ -82,7 +81,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
 
 def detect_kind(path: Path) -> str:
-    """The kind of a source by its files, one of `twin.config.KINDS`. Raises InputError for none of them."""
+    """Detects a source's kind, one of `twin.config.KINDS`, from its files. Raises InputError if it has none."""
     folder = is_folder(path, "check path = in scene.toml (it is relative to the scene folder)")
     if is_bag(path):
         return "bag"
@@ -102,7 +101,9 @@ def detect_kind(path: Path) -> str:
 
 
 def source_files(path: Path, kind: str, images: Path | None = None) -> list[Path]:
-    """All files read for a source except masks of `scene.toml`; for a damaged set, those that can be determined.
+    """All files that are read for a source, except the masks given in `scene.toml`.
+
+    For a damaged set, these are the files that can be determined.
 
     `kind` may be auto; `images` is the separate image folder of a posed set. Raises InputError if `path` is no source.
     """
@@ -134,7 +135,7 @@ def source_names(paths: list[str]) -> list[str]:
 
 
 def held_out_frames(count: int, every: int, source: int) -> NDArray[np.bool_]:
-    """Mask (count,) of a source's held-out frames: every n-th, never the first or last, at least one of three or more.
+    """Mask (count,) of a source's held-out frames: one in `every`, not the first or last, at least one if `count` ≥ 3.
 
     The offset depends on the source's number, so that the same place is not held out under all lightings.
     """

@@ -1,10 +1,11 @@
 """Estimates the up direction and the road below the cameras, in the unit of the poses (no metric scale is needed).
 
-*Up* is the unit normal of the ground. Three kinds of evidence are combined by their uncertainties: the *right* axes of
-the cameras (level in an upright camera at any pitch), the *path* (parallel to the ground for a camera at constant
-height) and the *road* (points of the layer below the path). A straight path does not constrain the roll about itself, a
-turning path constrains both angles; the camber of roads limits their evidence to about a degree. The *drop* of a point
-is its depth below the nearest camera of the path, its *offset* the horizontal distance from that camera.
+*Up* is the unit normal of the ground. Three kinds of evidence are combined, weighted by their uncertainties: the
+*right* axes of the cameras (horizontal if the camera is upright, at any pitch), the *path* (parallel to the ground if
+the camera has a constant height) and the *road* (points of the layer below the path). A straight path does not
+constrain the rotation of up about the path; a path with turns constrains both angles. Camber limits the evidence of a
+road to about a degree. The *drop* of a point is its depth below the horizontally nearest camera; its *offset* is the
+horizontal distance from that camera.
 """
 
 from dataclasses import dataclass
@@ -21,19 +22,20 @@ _SIGMA_ROAD = np.radians(1.0)  # [rad] camber of roads
 _SIGMA_PATH = np.radians(0.3)  # [rad] slope of a path relative to the ground
 _PATH_SAMPLES = 3.0  # independent heights along a path; far fewer than its frames, since its undulation is smooth
 _MIN_VARIANCE_RATIO = 10.0
-"""An axis of the path is evidence only if the variance along it exceeds that of the undulation by this factor ..."""
+"""A principal axis of points constrains up only if the variance along it is more than this multiple of the smallest."""
 _MIN_WIDTH = 0.05
-"""... and its extent this fraction of the length: a straight path undulates as much vertically as sideways."""
+"""An axis of the path constrains up only if the path's standard deviation along it is more than this fraction of the
+largest one. A path that is narrower is straight, and undulates as much vertically as sideways."""
 _UNDULATION = 0.003  # lower bound of a path's undulation [fraction of its length]
-_LAYER = 0.06  # half thickness of the road layer [fraction of the drop]: undulation, camber and noise
+_LAYER = 0.06  # half thickness of the road layer [fraction of the drop], for undulation, camber and noise
 _MAX_TILT = np.radians(25.0)  # largest angle between the road's normal and the cameras' mean up axis [rad]
 MIN_ROAD_POINTS = 20  # road points needed for a reliable road
 _REACHES = (1.0, 2.0, 4.0, 8.0)  # largest offsets [drops] of the points of the road layer, tried in this order
-_MIN_CAMERA_FRACTION = 0.2  # fraction of the cameras that must have road points below them for heights per camera
-_DEEPER_THAN = 1.25  # [drops]
+_MIN_CAMERA_FRACTION = 0.2  # heights per camera need road points below at least this fraction of cameras
+_DEEPER_THAN = 1.25  # [drops] from which points are far below a layer
 _MAX_DEEPER_FRACTION = 0.1
-"""A layer is not the ground if the number of points far below it exceeds this fraction of its own: ground hides what
-lies below it."""
+"""A layer is not the ground if the number of points far below it exceeds this fraction of its own points: ground
+hides what lies below it."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def up_from_path(camera_to_world: Array) -> tuple[Array, Array]:
 
 def _solve_up(evidence: Array, prior_up: Array) -> tuple[Array, float]:
     """The unit vector that minimizes the error under evidence and a weak prior, and its standard deviation [rad]."""
-    # Weak, since cameras may be pitched by 10° and more: it decides only what the evidence leaves open.
+    # The prior is weak, since cameras may be pitched by 10° and more: it decides only where there is no evidence.
     prior = (np.eye(3) - np.outer(prior_up, prior_up)) / np.radians(15.0) ** 2
     values, vectors = np.linalg.eigh(evidence + prior)
     up = vectors[:, 0] * (1.0 if vectors[:, 0] @ prior_up >= 0 else -1.0)
@@ -101,11 +103,11 @@ def below_path(points: Array, centers: Array, up: Array) -> tuple[NDArray[np.int
 def find_road(points: Array, centers: Array, up: Array) -> Road | None:
     """The lowest well-supported layer of points below a path, or None.
 
-    The support of a layer at drop h is the number of points within ±6 % of h whose offset is below h, that is, more
-    than 45° below the horizon. The road is the lowest layer with at least half of the best support, since nothing solid
-    lies below a road. A layer above many points is no road: the camera circled an object. A road without texture has no
-    points, so the search goes on to larger offsets, where the verges are. If no layer has enough points, the best
-    supported one is returned.
+    The support of a layer at drop h is the number of points within ±6 % of h whose offset is below h. Such points are
+    seen more than 45° below the horizon. The road is the lowest layer with at least half of the best support, since
+    nothing solid lies below a road. A layer with many points far below it is no road; such a layer occurs when the
+    camera circles an object. If no layer has enough points, as on a road without texture, larger offsets are tried,
+    where the verges are. If none of them has enough, the best supported layer is returned.
     """
     if not len(points):
         return None

@@ -1,16 +1,16 @@
-"""HDR films of phones and cameras as SDR pictures: HLG and PQ of ITU-R BT.2100, to the colors of BT.709.
+"""Converts HDR films of phones and cameras (HLG and PQ of ITU-R BT.2100) to SDR pictures with the colors of BT.709.
 
 A frame's signal is converted to display light, the light that a screen of 1,000 cd/m² shows, as BT.2100 defines it:
 
     HLG: E = inverse OETF of the signal, L = 1000 Yˢ^0.2 E with Yˢ the luminance of E (OOTF, system gamma 1.2)
     PQ:  L = EOTF of the signal
 
-Diffuse white is 203 cd/m² in both (BT.2408). x = L / 203 goes from the primaries of BT.2020 to those of BT.709
-(BT.2087), highlights are compressed, and the SDR signal is x^(1/2.4), the inverse of BT.1886:
+Diffuse white is 203 cd/m² in both (BT.2408). x = L / 203 is converted from the primaries of BT.2020 to those
+of BT.709 (BT.2087). Then highlights are compressed, and the SDR signal is x^(1/2.4), the inverse of BT.1886:
 
     x → x up to 0.8;   x → 0.8 + 0.2 tanh((x − 0.8) / 0.2) above
 
-All is the same for every frame, so exposure does not depend on what a frame shows.
+The conversion is the same for every frame, so the exposure does not depend on a frame's content.
 """
 
 from functools import lru_cache
@@ -26,18 +26,18 @@ HLG, PQ = 18, 16
 NAMES = {HLG: "HLG", PQ: "PQ"}
 
 _WHITE = 203.0  # [cd/m²] diffuse white
-_PEAK, _SYSTEM_GAMMA = 1000.0, 1.2  # of the display that HLG is shown on, [cd/m²]
+_PEAK, _SYSTEM_GAMMA = 1000.0, 1.2  # peak [cd/m²] and gamma of the display assumed for HLG
 _HLG = (0.17883277, 0.28466892, 0.55991073)  # a, b, c of BT.2100
 _PQ = (2610 / 16384, 2523 / 4096 * 128, 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32)  # m1, m2, c1, c2, c3
-_LUMINANCE = np.array([0.2627, 0.6780, 0.0593], np.float32)  # of the primaries of BT.2020
+_LUMINANCE = np.array([0.2627, 0.6780, 0.0593], np.float32)  # weights of BT.2020's red, green and blue
 _TO_BT709 = np.array(
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
 )  # BT.2087
 _KNEE = 0.8
 _DISPLAY_GAMMA = 2.4
 _MATRICES = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593), 10: (0.2627, 0.0593)}
-"""Weights of red and blue in the luma, by matrix coefficients of H.273; BT.2020's for unspecified ones."""
-_LEVELS = 4096  # of tables over [0, 1]
+"""Matrix coefficients (H.273) → weights of red and blue in the luma; BT.2020's weights are used for all others."""
+_LEVELS = 4096  # number of entries of a table over [0, 1]
 
 
 def hdr_transfer(frame: av.VideoFrame) -> int | None:
@@ -84,8 +84,8 @@ def _light_table(transfer: int) -> Array32:
 
 @lru_cache
 def _display_table() -> Array32:
-    """SDR signal, 0 to 255, of light from 0 to 1."""
-    # The table is over the square root of light, so that it is as fine in the dark as it needs to be.
+    """SDR signal from 0 to 255 for light from 0 to 1."""
+    # The table is indexed by the square root of light, which gives finer steps to dark colors.
     root = np.linspace(0.0, 1.0, _LEVELS)
     return (255.0 * root ** (2.0 / _DISPLAY_GAMMA)).astype(np.float32)
 

@@ -33,19 +33,19 @@ MIN_INLIERS = 25
 _MAX_SIZE = 1280  # [px] longer side of the image from which features are extracted
 _GUESSED_FOCAL = 1.2  # [longer sides]
 _FEATURES = 4000
-_FIRST_FRAMES = 48  # matched first, evenly spaced over all films
-_BEST_FRAMES = 4  # whose neighbors are matched next
-_NEIGHBOR_FRAMES = 8  # per best frame, under any lighting
+_FIRST_FRAMES = 48  # scene frames matched first, evenly spaced over all films
+_BEST_FRAMES = 4  # of these, the frames with the most matches; their neighbors are matched next
+_NEIGHBOR_FRAMES = 8  # neighbors of each best frame that are matched, under any lighting
 _TRACKING_FRAMES = 12  # scene frames near the film's last localized frame that are matched first
-_TRUSTED_FRAMES = 24  # with the most matches; matches in other frames are chance
-_RATIO = 0.8  # of the best to the second best distance, Lowe 2004
-_LANDMARK_RADIUS = 1.5  # [px] from the projection of a sparse point
-_INLIER_TOLERANCE = 0.006  # [longer sides]
+_TRUSTED_FRAMES = 24  # frames with the most matches; matches in other frames are mostly wrong and are not used
+_RATIO = 0.8  # largest ratio of the best to the second best distance, Lowe 2004
+_LANDMARK_RADIUS = 1.5  # [px] largest distance from the projection of a sparse point
+_INLIER_TOLERANCE = 0.006  # [longer sides] largest residual of an inlier
 _ESTIMATED = "estimated"
-_DISTORTION_INLIERS = 100  # needed to separate distortion from noise
+_DISTORTION_INLIERS = 100  # inliers needed to separate distortion from noise
 _LENS_SWITCH_RATIO = 1.25  # a later candidate lens must give this many times the inliers of an earlier one
 _ROBUST_SCALE = 0.0015  # [longer sides] residual from which the robust loss reduces the weight of an inlier
-_MAX_FOCAL_ERROR = 0.02  # relative standard error
+_MAX_FOCAL_ERROR = 0.02  # largest accepted relative standard error
 _MAX_ITERATIONS = 12  # of the parabola fit
 _FOCAL_STEPS = np.array([0.98, 0.99, 1.0, 1.01, 1.02])  # relative focal lengths of the parabola fit
 
@@ -140,7 +140,7 @@ class LocalizationMap:
         return positions, values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
 
     def matches(self, descriptors: NDArray[np.float32], i: int) -> NDArray[np.int64]:
-        """Matches of a photo with frame i, see `match_frame`."""
+        """Matches of a photo, given by its descriptors (k, 128), with frame i, see `match_frame`."""
         if i not in self._features:
             self._features[i] = self.features(self.cameras.image_path(i))
         return match_frame(*self._features[i], descriptors, self.cameras, self.points, i)
@@ -192,7 +192,7 @@ class _LocalizedFrame:
     image: Array  # inliers in the image [px], shape (m, 2)
     points: Array  # inliers in the scene [m], shape (m, 3)
     camera_from_world: pycolmap.Rigid3d
-    lens: Lens  # estimated from this image alone, where it was free
+    lens: Lens  # given, or estimated from this image alone
 
     def residuals(self, lens: Lens) -> Array:
         """Reprojection errors of the inliers under a lens [px], shape (m, 2)."""
@@ -218,7 +218,7 @@ def _localize(
     refine_focal: bool,
     distortion: bool = False,
 ) -> _LocalizedFrame | None:
-    """The pose with the most inliers among matches (k, 2) and (k, 3), refined; None without a pose.
+    """The refined pose with the most inliers among matched pixels (k, 2) and scene points (k, 3); None without a pose.
 
     `estimate_focal` lets RANSAC vary the focal length; `distortion` refines the distortion if the inliers suffice.
     """
@@ -311,9 +311,10 @@ class FilmRegistration:
 def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, seed: int = 0) -> FilmRegistration:
     """Localizes the frames of a film in a scene and, without a given lens, estimates their focal length.
 
-    Each frame is matched near the previous localized frame first, then everywhere. The focal length is estimated per
-    frame; with its median all frames are localized again, and a joint fit to all inliers gives the final value. The
-    principal point is assumed at the center. Frames are RGB (h, w, 3), in order, of one camera without distortion.
+    Each frame is first matched with scene frames near the previous localized frame; if that fails, the whole scene is
+    searched. The focal length is estimated per frame. With its median all frames are localized again, and a joint fit
+    to all inliers gives the final value. The principal point is assumed at the center. Frames are RGB (h, w, 3), in
+    order, of one camera without distortion.
 
     Raises InputError: no frame could be localized, or the focal length is not determined.
     """
@@ -388,7 +389,7 @@ def solve_film(job: dict[str, Any], work: Path) -> None:
 def _film_matches(
     scene_map: LocalizationMap, descriptors: NDArray[np.float32], last: _LocalizedFrame | None
 ) -> Iterator[list[NDArray[np.int64]]]:
-    """Matches of a film's frame near the last localized frame, if there is one, then those of a search everywhere."""
+    """Yields matches of a film's frame: those near the last localized frame, if any, then those of the whole scene."""
     if last:
         position = camera_to_world(last.camera_from_world)[None, :3, 3]
         near = sorted(scene_map.nearest_frames(position, _TRACKING_FRAMES))
@@ -402,7 +403,7 @@ def _localize_frame(image: Array, points: Array, lens: Lens, seed: int, free_foc
 
 
 def _shared_focal(frames: Sequence[_LocalizedFrame], lens: Lens) -> tuple[float, float]:
-    """The focal length that minimizes the robust cost over all frames, by a parabola, and its standard error [px].
+    """The focal length that minimizes the robust cost over all frames, and its standard error [px], from a parabola.
 
     Each frame counts as a single (x, y) measurement, because its inliers' errors are correlated.
     """
@@ -414,7 +415,7 @@ def _shared_focal(frames: Sequence[_LocalizedFrame], lens: Lens) -> tuple[float,
             residuals = [frame.refined(trial).residuals(trial) for frame in frames]
             costs[i] = np.mean([robust_scale**2 * np.log1p((e**2).sum(1) / robust_scale**2).mean() for e in residuals])
         curve, lowest = np.polyfit(focals - center, costs, 2), int(costs.argmin())
-        if lowest != len(_FOCAL_STEPS) // 2:  # far off the robust cost is nearly flat, so no parabola fits yet
+        if lowest != len(_FOCAL_STEPS) // 2:  # far from the minimum, the robust cost is no parabola but nearly flat
             center = float(focals[lowest])
             continue
         if curve[0] > 0.0:

@@ -26,7 +26,7 @@ from twin.types import Array
 Pair = tuple[int, int]
 
 SEQUENCE_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-"""Steps in time matched within a source: dense for neighbors, long ones against drift along a drive."""
+"""Distances [frames] of sequence pairs within a source: short ones for neighbors, long ones against drift."""
 _WORDS = 32
 _SAMPLES_PER_FRAME = 150
 _PROBES_PER_SOURCE = 20
@@ -101,8 +101,8 @@ def _nearest_words(features: NDArray[np.float32], words: NDArray[np.float32]) ->
 def probe_pairs(source_index: NDArray[np.int64], signatures: Array) -> set[Pair]:
     """Pairs of distant frames that may show the same place, across sources and where a source returns to a place.
 
-    Each probed frame is paired with the frame equally far along every other source and the three most similar ones
-    there, and within its source with the two most similar ones beyond the sequence steps.
+    Each probed frame is paired with four frames of every later source: the frame equally far along it, and the three
+    most similar frames. Within its own source, it is paired with the two most similar frames beyond the sequence steps.
     """
     similarity = signatures @ signatures.T
     groups = frames_by_source(source_index)
@@ -127,8 +127,8 @@ def expanded_pairs(
 
     Across two sources, the best match of each probed frame is an anchor. Between anchors the position along the other
     source is interpolated, so that films of different speeds are paired frame by frame. With fewer than two anchors the
-    frames are paired by equal fractions of the sources' lengths. `inliers` holds the verified matches per pair; a probe
-    is verified with `min_inliers` of them.
+    frames are paired by equal fractions of the sources' lengths. `inliers` holds the number of verified matches per
+    pair; a probe with at least `min_inliers` of them counts as verified.
     """
     groups = frames_by_source(source_index)
     position = np.concatenate([np.arange(len(frames)) for frames in groups])
@@ -152,7 +152,7 @@ def expanded_pairs(
         if len(best) >= 2:
             anchors = sorted(best)
             counterpart = np.interp(k, anchors, [best[p][1] for p in anchors])
-            # np.interp is constant beyond the outermost anchors; there the mean ratio of the sources is used.
+            # np.interp is constant beyond the outermost anchors; there the ratio of the sources' lengths is the slope.
             counterpart += pace * (np.minimum(k - anchors[0], 0) + np.maximum(k - anchors[-1], 0))
         else:
             counterpart, offsets = k * (len(second) - 1) / max(len(first) - 1, 1), _BLIND_OFFSETS
@@ -164,10 +164,10 @@ def expanded_pairs(
 def near_pairs(
     camera_to_world: Array, frames: NDArray[np.int64], tried: set[Pair], reach: float, most: int
 ) -> set[Pair]:
-    """At most `most` pairs per camera of the nearest cameras within `reach` that look the same way (within 60°).
+    """Pairs of each camera with up to `most` of the nearest cameras in `reach` with a viewing direction within 60°.
 
-    Poses (k, 4, 4) belong to the frames (k,); `reach` is in their unit. A tried pair excludes all pairs up to two
-    frames off at both ends.
+    Poses (k, 4, 4) belong to the frames (k,); `reach` is in their unit. No pair is returned whose two frames are each
+    at most two frames away from those of a tried pair.
     """
     centers, forward = camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
     offsets = list(itertools.product(_CROSS_OFFSETS, _CROSS_OFFSETS))
@@ -204,7 +204,7 @@ class Matcher:
         return {int(image): frame for frame, image in enumerate(self.image_ids)}
 
     def extract(self, most: int, max_size: int) -> None:
-        """Extracts at most `most` SIFT features per frame outside the masks, at images of at most `max_size` [px].
+        """Extracts at most `most` SIFT features per frame, on unmasked pixels of images scaled down to `max_size` [px].
 
         Raises InputError: the frames of a source have too little texture.
         """
@@ -281,7 +281,7 @@ def open_database(capture: Capture, stage: Path, work: Path, free_focal: bool, t
         mode = pycolmap.CameraMode.PER_IMAGE if camera_per_image else pycolmap.CameraMode.SINGLE
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = "PINHOLE"
-        # Imported before the extraction of features, so that ids follow the order of frames, not of threads.
+        # Importing the images before feature extraction makes their ids follow the order of frames, not of threads.
         pycolmap.import_images(path, images, mode, [f"{capture.names[i]}.png" for i in frames], reader)
         with pycolmap.Database.open(path) as database:
             done = set()

@@ -2,7 +2,7 @@
 
 z points up along the ground's normal; z = 0 is the ground. The origin is on the ground below the first camera. x is the
 initial driving direction, or east if the scale comes from GPS. With metric.up = "poses" the given poses' axes and
-horizontal origin are kept. `gravity.py` estimates up and the road, `scale.py` the scale.
+horizontal origin are kept. `gravity.py` estimates up and the road; `scale.py` estimates the scale.
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ from twin.scene import SceneDir
 from twin.types import Array
 
 _INITIAL_FRACTION = 0.08
-"""The initial driving direction is that of the first part of the first source's path [fraction of its length]."""
+"""First part of the first source's path that gives the initial driving direction [fraction of the path's length]."""
 _FLOOR_QUANTILE = 0.02  # without a road the floor is at this quantile of the points' heights
 
 
@@ -40,7 +40,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
     Returns the content of `metric.json`, see `_metrics`.
 
-    Raises InputError: no scale given, or the data lack the evidence for it.
+    Raises InputError: no scale is given, or the data do not determine it.
     """
     cameras, points = Cameras.load(scene.stage("cameras")), SparsePoints.load(scene.stage("cameras"))
     capture = Capture.load(scene.stage("capture"))
@@ -133,7 +133,7 @@ def _level_frame(cameras: Cameras, up: Array, level: float, scale: float, east: 
 
 
 def _driving_direction(cameras: Cameras, up: Array) -> Array:
-    """Horizontal direction of the first part of the first source's path; of its first view if it stands still."""
+    """Horizontal direction of the first part of the first source's path; without motion, that of the first view."""
     centers = cameras.positions[np.array(cameras.sources) == cameras.sources[0]]
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centers, axis=0), axis=1))])
     end = int(np.searchsorted(along, max(_INITIAL_FRACTION * along[-1], 1e-12)))

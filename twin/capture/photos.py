@@ -31,7 +31,7 @@ from twin.types import Array, Image
 
 _FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # [mm]
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
-_MAX_FOCAL_SPREAD = 0.05  # relative; photos of one source that differ more were zoomed
+_MAX_FOCAL_SPREAD = 0.05  # relative; a source's photos whose focal lengths differ more were zoomed
 
 
 # ---- EXIF
@@ -74,8 +74,8 @@ def read_exif(path: Path) -> PhotoExif:
 def focal_from_exif(photo: Any, width: int, height: int) -> float | None:
     """Focal length over the image's longer side from the Exif block of a header, or None.
 
-    It is computed from the 35 mm equivalent, which compares diagonals (CIPA DCG-001), or else from focal length and
-    sensor resolution.
+    It is computed from the 35 mm equivalent, which is defined by the image diagonal (CIPA DCG-001), or else from focal
+    length and sensor resolution.
     """
     longer, diagonal = max(width, height), math.hypot(width, height)
     equivalent = _finite(photo.get(ExifTags.Base.FocalLengthIn35mmFilm))
@@ -154,7 +154,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
     lenses = images.lenses
     if lenses and (given := task.given_lens((lenses[0].width, lenses[0].height))):
         lenses = (given,) * len(lenses)
-    # With several distortions no model of the source has them all, so each image is undistorted here.
+    # A source has one camera model, so images with different distortions are undistorted here.
     several = lenses is not None and len({(lens.model, lens.distortion) for lens in lenses}) > 1
     flatten = several and any(lens.is_distorted for lens in lenses or ())
     available = _in_kept_segments(task, images)
@@ -271,7 +271,7 @@ def load_photo(path: Path, lens: Lens | None) -> tuple[Image, PhotoExif]:
     The lens of a posed image usually describes the stored image, so a posed image is rotated upright only if the stored
     image does not fit its lens.
 
-    Raises InputError: missing, empty, truncated or undecodable, or of another aspect than its lens.
+    Raises InputError: the file is missing, empty, truncated or undecodable, or its aspect differs from its lens's.
     """
     stored = _stored_size(path)
     exif = read_exif(path)
@@ -298,7 +298,7 @@ def _stored_size(path: Path) -> tuple[int, int] | None:
         stored = photo.size
         if photo.format in ("JPEG", "MPO"):
             try:
-                photo.draft("L", (stored[0] // 8, stored[1] // 8))  # cheap, yet reads to the end
+                photo.draft("L", (stored[0] // 8, stored[1] // 8))  # cheap at this size, but reads the whole file
                 photo.load()
             except DECODE_ERRORS:
                 count = path.stat().st_size
@@ -307,7 +307,7 @@ def _stored_size(path: Path) -> tuple[int, int] | None:
 
 
 def photo_times(clock: list[float | None], index: list[int]) -> list[float]:
-    """Times since the first photo [s] if all are known and rise strictly; else the indices."""
+    """Times since the first photo [s] if all are known and rise strictly; otherwise the photos' indices."""
     if _strictly_rising(clock):
         known = [t for t in clock if t is not None]
         return [t - known[0] for t in known]

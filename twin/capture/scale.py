@@ -21,14 +21,14 @@ _SCALE_OPTIONS = (
     "between them), metric.gps = true (positions in EXIF or a bag), metric.odometry = true (a bag's), [metric.marker] "
     "(a printed ArUco or AprilTag marker), or metric.poses_are_metric = true"
 )
-_PIXEL_ERROR = 1.0  # [px] of a point marked by hand
+_PIXEL_ERROR = 1.0  # [px] standard deviation of a point marked by hand
 _GPS_TRIALS = 400
-_STRETCH = 2.0  # [m] of odometry that is compared with the path of the cameras: its heading hardly drifts within it
-_STRAIGHT = 0.7  # a stretch whose ends are nearer than this fraction of its length is not compared
+_STRETCH = 2.0  # [m] length of odometry compared with the cameras' path; heading hardly drifts within it
+_STRAIGHT = 0.7  # smallest ratio of end-to-end distance to length of a compared stretch
 _MIN_STRETCHES = 5
-_MAX_STRETCH_SPREAD = 0.3  # relative
-_MIN_SIDE = 10  # road points on either side of the path for a comparison of the two
-_MIN_ANGLE = np.radians(2.0)  # [rad] between the rays of two frames to a marker
+_MAX_STRETCH_SPREAD = 0.3  # largest relative spread of the stretches' scales
+_MIN_SIDE = 10  # road points needed on each side of the path to compare the two sides
+_MIN_ANGLE = np.radians(2.0)  # [rad] needed between the rays of two frames to a marker
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,12 @@ def select_scale_sources(metric: MetricConfig, source_heights: dict[str, float])
 
 
 def combine_scales(scales: dict[str, Scale]) -> Scale:
-    """The mean of independent scales in the logarithm, weighted by their variances.
+    """The geometric mean of independent scales, weighted by their inverse relative variances.
 
-    Where they differ by more than their uncertainties explain, the combined uncertainty grows by the Birge ratio
-    (Birge 1932). A scale without uncertainty, of poses that are given as metric, is taken as it is. The notes of the
-    sources are merged; for several sources, `scales` holds each one relative to the result, and
-    `scale_disagreement` the largest difference of two in standard deviations.
+    If the scales differ by more than their uncertainties explain, the combined uncertainty grows by the Birge ratio
+    (Birge 1932). A scale with uncertainty 0, from poses that are given as metric, is used unchanged. The notes of all
+    scales are merged. If there are several, the notes also contain `scales`, each scale relative to the result, and
+    `scale_disagreement`, the largest difference between two scales in standard deviations.
     """
     names = list(scales)
     notes: dict[str, Any] = {}
@@ -103,9 +103,9 @@ def scale_from_height(
 ) -> Scale:
     """Scale from the known height of the cameras above the road; `points` (m, 3) are all sparse points.
 
-    `own` holds the height by source [m], 0 where that of `metric` holds. The uncertainty has the error of the height as
-    measured, how well it repeats along the path, the tilt, and how far the ground on the left differs from that on
-    the right. Raises InputError without a road.
+    `own` holds the camera height of each source [m]; a source with 0 uses that of `metric`. The uncertainty combines
+    four errors: of the measured height, of its repetition along the path, of the up direction, and of the assumption
+    that the ground is level across the path. Raises InputError without a road.
     """
     if road is None:
         raise InputError(
@@ -126,7 +126,7 @@ def scale_from_height(
             height = float(np.median(measured))
             spread = 1.4826 * float(np.median(np.abs(measured - height)))
             count = len(measured)
-        else:  # too few points below this path: use the road as a whole
+        else:  # too few points below this path; the whole road is used
             height, spread, count = road.drop, road.spread, 1
         scales.append(true_height / height)
         measurement.append(metric.camera_height_tolerance / true_height)
@@ -137,10 +137,10 @@ def scale_from_height(
     value = float(np.average(scales, weights=weights))
     layer = road.spread / road.drop / np.sqrt(len(road.points))
     between = float(np.std(scales) / value) if len(scales) > 1 else 0.0
-    # Few points, or only points of the verge, give at best 5 %: a kerb is a tenth of the usual height.
+    # Few points, or points on the verge only, add an error of 5 %: a kerb is a tenth of the usual camera height.
     few = 0.0 if road.reliable else 0.05
     repeat = np.average(np.square(sigmas), weights=weights) + layer**2 + between**2 + few**2
-    # One person measures all heights with one method, so their errors are common.
+    # One person measures all heights with one method, so averaging does not reduce their error.
     tape = float(np.average(measurement, weights=weights))
     tilt, sides = _ground_errors(cameras, up, on_road, road.drop)
     sigma = float(np.sqrt(repeat + tape**2 + tilt**2 + sides**2))
@@ -158,10 +158,10 @@ def scale_from_height(
 
 
 def _ground_errors(cameras: Cameras, up: Gravity, road: Array, drop: float) -> tuple[float, float]:
-    """Relative errors of the height of cameras above road points (k, 3): by the tilt, and by camber or a kerb.
+    """Relative errors of the cameras' height above road points (k, 3): by a tilt of up, and by camber or a kerb.
 
-    The tilt moves the height by the mean horizontal offset of the points. Half the difference between the heights above
-    the points to the left and to the right of the path shows whether the ground is level across it.
+    A tilt changes the height by its angle times the mean horizontal offset of the points. The second error is half the
+    difference between the heights above the points to the left and to the right of the path.
     """
     nearest, height, _ = below_path(road, cameras.positions, up.direction)
     away = road - cameras.positions[nearest]
@@ -175,11 +175,11 @@ def _ground_errors(cameras: Cameras, up: Gravity, road: Array, drop: float) -> t
 
 
 def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distance: DistanceConfig) -> Scale:
-    """Scale from two marked points [px of the pinhole images], both triangulated from two frames or on the ground.
+    """Scale from two marked points [px of the pinhole images], triangulated from two frames or assumed on the ground.
 
     `ground_level` is the height of the ground along `up` in the reconstruction's unit.
 
-    Raises InputError: unknown frame, a point outside its image, no distance, or rays that do not meet.
+    Raises InputError: an unknown frame, a point outside its image, no positive distance, or rays that do not meet.
     """
     if not distance.metres > 0:
         raise InputError(f"metric.distance.metres = {distance.metres}; expected the metres between the points a and b")
@@ -244,7 +244,7 @@ def _on_ground(origin: Array, direction: Array, up: Array, level: float) -> Arra
 
 
 def _meeting_point(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
-    """The point nearest to two rays, shape (3,); NaN if they are parallel or it lies behind a camera."""
+    """The point nearest to two rays, shape (3,); NaN if the rays are parallel or the point lies behind a camera."""
     (o1, d1), (o2, d2) = first, second
     along, _, rank, _ = np.linalg.lstsq(np.stack([d1, -d2], 1), o2 - o1, rcond=1e-9)
     if rank < 2 or np.any(along <= 0):
@@ -261,7 +261,8 @@ def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generat
     """Scale and horizontal east axis (3,) from GPS positions by a robust similarity fit in the horizontal plane.
 
     Altitudes are not used: they are several times less accurate than positions, and up is known already. `gps` (n, 3)
-    holds latitude [°], longitude [°] and altitude [m] per camera center, NaN where unknown; `rng` samples the trials.
+    holds latitude [°], longitude [°] and altitude [m] per camera center, NaN where unknown. `rng` draws the pairs of
+    cameras for the first fits.
 
     Raises InputError: fewer than 3 positions, or positions that do not spread beyond their own error.
     """
@@ -300,14 +301,14 @@ def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generat
         inliers = again
     residual = np.abs(target - offset - fit * source)[inliers]
     extent = float(np.std(source[inliers]) * abs(fit))
-    # GPS errors drift, so neighboring frames share them: about three frames count as one independent position.
+    # Neighboring frames share the drifting GPS error: about three frames count as one independent position.
     sigma = float(np.sqrt(np.mean(residual**2) / 2) / (extent * np.sqrt(max(inliers.sum() / 3.0, 1.0))))
     if not np.isfinite(sigma) or sigma > 0.3:
         raise InputError(
             f"metric.gps: positions fit within {np.median(residual):.1f} m but spread over {extent:.1f} m only; film "
             "a longer way, or give the scale another way"
         )
-    # The fit rotates the plane's first axis to a direction in east-north; east in the plane is the conjugate.
+    # The fit rotates the plane's axes to east and north, so its conjugate is the east axis in the plane.
     rotation = fit / abs(fit)
     east = first * rotation.real - second * rotation.imag
     notes = {
@@ -319,11 +320,11 @@ def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generat
 
 
 def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> Scale:
-    """Scale from positions of the cameras by odometry [m], in a frame per source, shape (n, 3), NaN where unknown.
+    """Scale from the cameras' positions by odometry [m], in one frame per source, shape (n, 3), NaN where unknown.
 
-    Odometry drifts in heading, that of a skid-steered robot's wheels most, but its lengths are good to a few percent.
-    So the distances between the ends of stretches of `_STRETCH` are compared, whose directions do not matter. Their
-    common error is `tolerance`, a relative standard deviation; how well the stretches agree adds to it.
+    The heading of odometry drifts, most for the wheels of a skid-steered robot, but its lengths are right to a few
+    percent. So the distance between the ends of each stretch of `_STRETCH` is compared, whatever its direction.
+    `tolerance` is the relative standard deviation of the error that all stretches share; their spread adds to it.
 
     Raises InputError: too few stretches, or stretches that contradict each other.
     """
@@ -354,7 +355,7 @@ def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> 
         )
     inliers = np.abs(logs - middle) <= max(3.0 * spread, 1e-3)
     value = float(np.exp(np.average(logs[inliers], weights=weights[inliers])))
-    # Slip and errors of the reconstruction are shared by neighboring stretches: about three count as one.
+    # Neighboring stretches share slip and reconstruction errors: about three count as one independent stretch.
     repeat = spread / np.sqrt(max(inliers.sum() / 3.0, 1.0))
     notes = {
         "odometry_stretches": len(ratios),
@@ -366,7 +367,10 @@ def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> 
 
 
 def _stretches(positions: Array) -> list[tuple[int, int]]:
-    """First and last index of consecutive stretches of `_STRETCH` or more between known positions (n, 3) in order."""
+    """First and last indices of consecutive stretches of length `_STRETCH` or more along positions (n, 3) in order.
+
+    Stretches contain no unknown position; winding ones are left out, see `_STRAIGHT`.
+    """
     out, first, way = [], 0, 0.0
     for last in range(1, len(positions)):
         step = float(np.linalg.norm(positions[last] - positions[last - 1]))
@@ -384,7 +388,7 @@ def _stretches(positions: Array) -> list[tuple[int, int]]:
 def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
     """Scale from a printed square marker (ArUco or AprilTag) in the scene, whose corners are triangulated.
 
-    Raises InputError: unknown family, no size, or not visible from two directions.
+    Raises InputError: unknown family or number, no size, a marker not seen from two directions, or unequal sides.
     """
     families = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
     if marker.family not in families:
@@ -402,7 +406,7 @@ def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
         gray = cv2.cvtColor(read_image(cameras.image_path(i)), cv2.COLOR_RGB2GRAY)
         found, ids, _ = detector.detectMarkers(gray)
         hits = [k for k, value in enumerate(np.ravel(ids) if ids is not None else []) if int(value) == marker.id]
-        if len(hits) == 1:  # with two markers of the same number in one image neither is used
+        if len(hits) == 1:  # two markers of this number in one image are both ignored
             frames.append(i)
             # OpenCV's pixel coordinates start at the center of the first pixel, ours at its corner.
             corners.append(np.asarray(found[hits[0]], np.float64).reshape(4, 2) + 0.5)
@@ -430,7 +434,7 @@ def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
 def _triangulate(pixels: Array, camera_to_world: Array, intrinsics: Array) -> Array:
     """Triangulates the point (3,) observed at `pixels` (n, 2), one per view.
 
-    Linear (Hartley & Zisserman 2004, sec. 12.2), then Gauss-Newton on the reprojection error.
+    A linear solution (Hartley & Zisserman 2004, sec. 12.2) is refined by Gauss-Newton on the reprojection error.
     """
     world_to_camera = inverse_pose(camera_to_world)
     rotation, translation = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]

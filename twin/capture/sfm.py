@@ -39,16 +39,16 @@ from twin.scene import SceneDir
 from twin.types import Array
 
 _MAX_THREADS = 16
-_MAX_POINT_ERROR = 20.0  # [px] points that bundle adjustment moved behind a camera exceed it by far
+_MAX_POINT_ERROR = 20.0  # [px] limit for points; those that bundle adjustment moved behind a camera exceed it by far
 _MIN_FRAMES = 3
 _PROBE_INLIERS = 25
 _NEAR_STEPS = 3.0  # distance [median steps] up to which cameras that were never matched are matched in the second round
 _NEAR_PAIRS = 4
 _POSED_PAIRS = 10
 _REMAPPING_FRACTION = 0.05  # newly verified pairs [fraction of all] from which the second round maps again
-_TRACKS_PER_VIEW = 300  # for the first solution; retriangulation adds the others. Saves 40 % of the time
+_TRACKS_PER_VIEW = 300  # point tracks in the first solution, to save 40 % of the time; retriangulation adds others
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
-_MIN_ANGLE = 0.5  # [°] between the rays to a point
+_MIN_ANGLE = 0.5  # [°] smallest angle between the rays to a point
 _LOSS_SCALE = 0.5  # [px] scale of the Cauchy loss in the last bundle adjustment
 _REFINEMENTS = 30
 
@@ -61,7 +61,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
     Returns metrics, see `_metrics`.
 
-    Raises InputError: no texture, no overlap, or fewer frames registered than `cameras.min_registered`.
+    Raises InputError: too little texture or overlap, or a smaller fraction registered than `cameras.min_registered`.
     """
     stage, settings = scene.stage("capture"), config.cameras
     capture = Capture.load(stage)
@@ -130,7 +130,7 @@ def _write_images(
     intrinsics, sizes = np.zeros((len(frames), 4)), np.zeros((len(frames), 2), np.int64)
     lens: Lens | None = None
     for k, i in enumerate(runtime.track(frames, "pinhole images", unit="frame")):
-        if lens != lenses[k]:  # the frames of a source, mostly of one lens, follow each other
+        if lens != lenses[k]:  # frames are sorted by source, and most sources have one lens
             lens = lenses[k]
             pinhole, pixel_map = undistortion(lens)
         intrinsics[k], sizes[k] = pinhole.intrinsics, (lens.width, lens.height)
@@ -334,7 +334,7 @@ class _Mapper:
         return options
 
     def refine(self, model: pycolmap.Reconstruction) -> None:
-        """A last bundle adjustment with a more robust loss than COLMAP's, since dark frames have many bad observations.
+        """Runs a last bundle adjustment, with a more robust loss than COLMAP's: dark frames have many bad observations.
 
         The known cameras are reset to their given calibration and kept constant.
         """

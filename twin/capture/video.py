@@ -1,10 +1,10 @@
-"""Films: decoding of video files, rotation (display matrix) and frame selection, in one pass with little memory.
+"""Reads films in one pass with little memory: decodes frames, rotates them by the display matrix and selects some.
 
-A *film* is a video file, or the pictures of a bag (`bag_film.py`). A *slot* is one of n equal time spans of it; the
-sharpest frame of each slot is its *candidate*. A candidate that hardly moved since the last kept frame is a *duplicate*
-and is dropped. A frame's *index* is its position in the film, counted from 0 in order of presentation; its *time* [s]
-is measured from the first frame. If only *segments* of the film are kept, the slots divide these segments as if the
-rest were cut out; indices and times remain those of the whole film.
+A *film* is a video file, or the pictures of a bag (`bag_film.py`). A *slot* is one of n equal time spans of a film;
+the sharpest frame of each slot is its *candidate*. A candidate in which the image hardly moved since the last kept
+frame is a *duplicate* and is dropped. A frame's *index* is its position in the film, counted from 0 in order of
+presentation; its *time* [s] is measured from the first frame. If only *segments* of the film are kept, the slots divide
+these segments as if the rest were cut out; indices and times remain those of the whole film.
 """
 
 import contextlib
@@ -35,11 +35,11 @@ SHARPNESS_WIDTH = 640  # [px] image width at which sharpness is measured; at ful
 _CORNERS = 200
 _MIN_TRACKED = 12  # corners needed to judge the motion of the whole image
 _MAX_RETURN_ERROR = 0.5  # [px] largest forward-backward tracking error
-_STILL_DIFFERENCE = 1.5  # [gray levels after contrast stretching] below it two texture-free frames are equal
+_STILL_DIFFERENCE = 1.5  # [gray levels after contrast stretching] below it two frames without texture count as equal
 BLANK_STD = 2.0  # an image with a smaller standard deviation of its brightness [gray levels] counts as blank
 _LUMA_FIRST = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 _DEINTERLACE = "mode=send_frame:parity=auto:deint=interlaced"
-_MIN_DECODED_FRACTION = 0.98  # of the frames declared by the container; below it the user gets a note
+_MIN_DECODED_FRACTION = 0.98  # of the declared frames; if fewer can be decoded, the user gets a note
 
 
 # ---- sharpness and motion, on small gray images (uint8, shape (h, w)) so that a frame takes about a millisecond
@@ -94,7 +94,7 @@ def is_static(
 def _contrast_stretched(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The image with its contrast stretched to the whole range, so that night frames have corners too."""
     low, high = np.percentile(gray[::2, ::2], (1.0, 99.0))
-    gain = 255.0 / max(high - low, 16.0)  # bounded: a blank frame has only noise
+    gain = 255.0 / max(high - low, 16.0)  # bounded, so that the noise of a blank frame is hardly amplified
     return np.clip((gray.astype(np.float32) - low) * gain, 0, 255).astype(np.uint8)
 
 
@@ -116,7 +116,7 @@ class FilmTiming:
 
     @property
     def duration(self) -> float:
-        """From the first frame to the end of the last [s]."""
+        """Time from the first frame to the end of the last one [s]."""
         return float(self.times[-1] + self.interval)
 
 
@@ -130,7 +130,7 @@ def probe(path: Path) -> FilmTiming:
     try:
         with av.open(str(path)) as container:
             stream = _video_stream(container, path)
-            with contextlib.suppress(av.error.FFmpegError):  # a truncated file has packets up to its end
+            with contextlib.suppress(av.error.FFmpegError):  # the packets before the end of a truncated file suffice
                 for packet in container.demux(stream):
                     stamp = packet.pts if packet.pts is not None else packet.dts
                     if stamp is not None and not packet.is_discard:
@@ -154,7 +154,7 @@ def probe(path: Path) -> FilmTiming:
 
 
 def frame_index(time: float | None, timing: FilmTiming, last: int) -> int:
-    """A decoded frame's index from its time [s], always above the `last` one; damaged frames leave gaps."""
+    """Index of a decoded frame from its time [s], always above the index `last`; damaged frames leave gaps."""
     if time is None:
         return last + 1
     right = min(int(np.searchsorted(timing.times, time)), len(timing.times) - 1)
@@ -164,7 +164,7 @@ def frame_index(time: float | None, timing: FilmTiming, last: int) -> int:
 
 
 def slot_of(index: int, time: float, timing: FilmTiming, slots: int) -> int:
-    """The slot of a frame: one of equal durations, or its own with as many slots as frames."""
+    """The slot of a frame. Slots have equal durations; if there are as many slots as frames, each frame has its own."""
     if slots >= len(timing.times):
         return index
     # Half a frame interval is added so that rounding of time stamps never moves a frame across the border of a slot.
@@ -175,7 +175,7 @@ def in_segments(times: Array, segments: tuple[tuple[float, ...], ...]) -> NDArra
     """Mask of the times (n,) [s] inside any of the segments [from, to]; all true without segments."""
     if not segments:
         return np.ones(len(times), bool)
-    # Matroska rounds its time stamps to milliseconds, an error of at most half of one.
+    # Matroska rounds its time stamps to milliseconds, so they are wrong by at most 0.5 ms.
     return np.any([(times >= start - 5e-4) & (times <= end + 5e-4) for start, end in segments], axis=0)
 
 
@@ -223,7 +223,7 @@ class Film:
     path: Path
     timing: FilmTiming
     decode: Callable[[FilmStatistics], Iterator[tuple[float | None, av.VideoFrame]]]
-    """Yields the undamaged frames in order, each after its time stamp [s] or None; counts the damaged ones."""
+    """Yields a tuple per undamaged frame in order: its time stamp [s] or None, and the frame. Counts damaged frames."""
 
 
 def video_film(path: Path) -> Film:
@@ -262,7 +262,7 @@ def read_film(
     `count` is filled while reading. `mask_of` maps a frame's index, kept width and kept height to its mask or None.
     `segments` are [from, to] each [s]; empty for the whole film.
 
-    Raises InputError: unreadable, fewer than two frames, or only blank frames.
+    Raises InputError: the film is unreadable, or has fewer than two frames or only blank ones.
     """
     last_small: Image | None = None
     for candidate in _sharpest_per_slot(film, config, count, segments):
@@ -360,9 +360,9 @@ def damage_note(path: Path, count: FilmStatistics) -> str | None:
 
 
 def decode(path: Path, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:
-    """Yields a film's undamaged frames from front to back, each after its time stamp in the stream [s] or None.
+    """Yields a tuple per undamaged frame of a film, in order: its time stamp in the stream [s] or None, and the frame.
 
-    Interlaced frames are deinterlaced: both fields would show the scene at two instants.
+    Interlaced frames are deinterlaced, because their two fields show the scene at different instants.
     """
     graph: av.filter.Graph | None = None
     for stamp, frame in _intact_frames(path, count):
@@ -383,7 +383,7 @@ def decode(path: Path, count: FilmStatistics) -> Iterator[tuple[float | None, av
 
 
 def _deinterlacer(frame: av.VideoFrame) -> av.filter.Graph:
-    """A filter from interlaced frames like this one to as many progressive ones; progressive ones pass unchanged."""
+    """A filter that makes a progressive frame of each interlaced frame, and passes progressive frames unchanged."""
     graph = av.filter.Graph()
     base = frame.time_base or Fraction(1, 1000)
     source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=base)
@@ -392,7 +392,7 @@ def _deinterlacer(frame: av.VideoFrame) -> av.filter.Graph:
 
 
 def _pulled(graph: av.filter.Graph) -> Iterator[tuple[float | None, av.VideoFrame]]:
-    """The frames that a filter has ready."""
+    """Yields the frames that a filter has ready, each with its time [s] or None."""
     with contextlib.suppress(av.error.BlockingIOError, av.error.EOFError):
         while True:
             frame = graph.pull()
@@ -403,8 +403,8 @@ def _pulled(graph: av.filter.Graph) -> Iterator[tuple[float | None, av.VideoFram
 def _intact_frames(path: Path, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:
     """Frames that are not damaged, and do not depend on damaged ones.
 
-    A decoder conceals a damaged frame by a guess and predicts later frames from it. Therefore all frames from the
-    damage to the next key frame are skipped, and the B frames before it that depend on it.
+    A decoder conceals a damaged frame by a guess and predicts later frames from it. Therefore all frames from a
+    damaged one to the next key frame are skipped, and so are the B frames that precede and depend on the damaged one.
     """
     with av.open(str(path)) as container:
         stream = _video_stream(container, path)

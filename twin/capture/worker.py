@@ -4,7 +4,7 @@ The parent starts the *worker*, `python -m twin.capture.worker MODULE:FUNCTION J
 *job*, a dictionary in the file JOB, and the folder of that file. The parent shows the worker's progress and turns an
 abort into an error with a cure. A *message* is one line of JSON on the worker's standard output: {"bar": name,
 "total": n} starts a progress bar, {"step": n} advances it, {"say": text} prints a line, {"error": text} reports bad
-input. COLMAP's own log comes on standard error and goes to a file.
+input. COLMAP writes its own log to standard error; the parent copies it to a file.
 """
 
 import contextlib
@@ -58,12 +58,12 @@ def run_worker(solve: Callable[[dict[str, Any], Path], None], job: dict[str, Any
     job_file.write_text(json.dumps(job), encoding="utf-8")
     process = subprocess.Popen(
         [sys.executable, "-m", "twin.capture.worker", f"{solve.__module__}:{solve.__qualname__}", str(job_file)],
-        stdin=subprocess.PIPE,  # closes when this process dies, whatever the cause; the worker then ends, too
+        stdin=subprocess.PIPE,  # this pipe closes whenever the parent dies; the worker then ends, too
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         errors="replace",
-        process_group=0,  # signals from the terminal reach only this process
+        process_group=0,  # signals from the terminal reach only the parent
         env=child_environment(),
     )
     assert process.stdout and process.stderr
@@ -144,7 +144,7 @@ def _keep_log(stream: IO[str], path: Path, bars: _ProgressBars, recent: deque[st
         for line in stream:
             recent.append(line.rstrip("\n"))
             bars.log(line)
-            with contextlib.suppress(OSError):  # on a full disk the worker fails by itself
+            with contextlib.suppress(OSError):  # on a full disk the worker itself fails
                 log.write(line.encode())
 
 
@@ -173,7 +173,7 @@ def main(function: str, job_file: str) -> int:
 
 
 def _exit_with_parent() -> None:
-    """Ends this process when its standard input closes, as it does when the parent dies, even by kill -9."""
+    """Ends this process when its standard input closes, which also happens when the parent is killed."""
     with contextlib.suppress(OSError, ValueError):
         while os.read(0, 1024):
             pass
