@@ -217,9 +217,8 @@ def _draw_passes(axes: Axes, passes: Sequence[FilmedPass]) -> None:
     for k, one in enumerate(passes):
         color = SERIES[k % len(SERIES)]
         axes.plot(*one.path.T, color=color, lw=0.9, ls=(0, (4, 2)), zorder=3)
-        at = one.path[
-            len(one.path) * (k + 1) // (len(passes) + 1)
-        ]  # passes may coincide, so each name is at another share
+        # Passes may coincide, so each name is at another share of its pass.
+        at = one.path[len(one.path) * (k + 1) // (len(passes) + 1)]
         box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
         axes.annotate(
             one.name, at, xytext=(4, -9), textcoords="offset points", fontsize=7, color=color, bbox=box, zorder=6

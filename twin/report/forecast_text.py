@@ -20,9 +20,7 @@ from twin.report.html import Caution, Verdict
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
 """Rank correlations from which on twin and road rank policies alike, or roughly alike."""
 SMALL_REGRET = 0.05
-_SMALL_GAP = (
-    0.1  # a reliable order is good news if it holds from this difference of twin scores on, or from a smaller one
-)
+_SMALL_GAP = 0.1  # a reliable order is good news only if it starts at this difference of twin scores, or below
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
@@ -66,7 +64,7 @@ CSV_COLUMNS = (
     *("predicted", "predicted_low", "predicted_high", "trained", "trained_low", "trained_high"),
 )
 
-_RELIABLE = 0.95  # the twin's order may be believed if the road has the same in at least this share of pairs
+_RELIABLE = 0.95  # the twin's order may be believed if the road confirms it in at least this share of pairs
 _ENOUGH_PAIRS = 10  # fewer pairs confirm no order
 _POSSIBLY_BEST = 0.05  # policies with at least this probability of being the best are worth further trials
 _TRIALS_NEEDED = (
