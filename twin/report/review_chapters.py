@@ -165,8 +165,8 @@ def appearance_of_frame(cameras: Cameras, i: int) -> str:
     """Appearance of frame i, as a lighting for the field.
 
     A training frame has its own embedding. A held-out frame gets the embedding interpolated between the training frames
-    before and after it in its film, because light and exposure drift during a film and are not what is compared. At an
-    end of the film, it gets the embedding of the only neighbor.
+    before and after it in its film, because light and exposure drift during a film, and this drift is not to be
+    compared. At an end of the film, it gets the embedding of its only neighbor.
     """
     if not cameras.held_out[i]:
         return cameras.names[i]
