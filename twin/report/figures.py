@@ -312,7 +312,7 @@ _LETTER_WIDTH, _LABEL_HEIGHT = 0.075, 0.35  # [in] width of a letter; height of 
 _MAX_HORIZONTAL_LETTERS = 3  # longer column names are set vertically
 _MIN_ALPHA, _MAX_ALPHA = 0.08, 0.58  # opacity at strength 0 and 1; text is legible in light and dark mode
 _CELL_HALF_SIZE = np.array([0.48, 0.46])  # in units of the cell spacing
-_MIN_FONT, _MAX_FONT = 4.5, 7.0  # [pt]; smaller texts are left out
+_MIN_FONT, _MAX_FONT = 4.5, 7.0  # [pt]; texts smaller than `_MIN_FONT` are left out
 _DIGIT_WIDTH = 0.8  # width of a digit with its gap, in units of the font size
 
 

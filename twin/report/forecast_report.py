@@ -56,8 +56,8 @@ _SQUARE_SIZE = 4.6  # [in]
 def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "success in the twin") -> Figure:
     """Success rates of the driven candidates on the road (vertical) and in `field` (horizontal), colored by task.
 
-    `field` is the attribute "twin" or "corrected" (predicted from the other candidates), `label` the label of its axis.
-    On the diagonal both rates are equal.
+    `field` is the attribute "twin" or "corrected" (predicted from the other candidates), and `label` is the label
+    of its axis. On the diagonal both rates are equal.
     """
     figure, axes = new_figure(_SQUARE_SIZE)
     axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)

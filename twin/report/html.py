@@ -1,4 +1,4 @@
-"""Content shared by the reports, number formatting, and the Jinja environment of their pages.
+"""Parts that the reports share: their content, number formatting, and the Jinja environment of their pages.
 
 A report consists of sections with verdicts, facts and cautions; numbers that a stage did not report are "not measured".
 A summary repeats the headlines and cautions of the sections, so it is never more favorable than they are. The templates
@@ -107,7 +107,10 @@ def duration(seconds: Any) -> str:
 
 
 def flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:
-    """Lists the numbers and words of a JSON value with their dotted paths; of long or nested lists only the length."""
+    """Lists the numbers and words of a JSON value with their dotted paths.
+
+    For a long or nested list, only its length is listed.
+    """
     if isinstance(value, dict):
         return [
             row for key, below in value.items() for row in flatten(below, f"{prefix}.{key}" if prefix else str(key))

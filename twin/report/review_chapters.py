@@ -1,4 +1,4 @@
-"""Chapters of the review video: real against rendered frames, changing light, and the drive.
+"""Chapters of the review video: comparison of real and rendered frames, changing light, and the drive.
 
 A `Studio` does the work that all chapters share: it renders the field, counts renders, and saves pictures for the page.
 """
@@ -165,8 +165,8 @@ def appearance_of_frame(cameras: Cameras, i: int) -> str:
     """Appearance of frame i, as a lighting for the field.
 
     A training frame has its own embedding. A held-out frame gets the embedding interpolated between the training frames
-    before and after it in its film, because light and exposure drift during a film, and this drift is not to be
-    compared. At an end of the film, it gets the embedding of its only neighbor.
+    before and after it in its film, so that the drift of light and exposure during a film does not count as an error.
+    At an end of the film, it gets the embedding of its only neighbor.
     """
     if not cameras.held_out[i]:
         return cameras.names[i]
@@ -191,8 +191,8 @@ COMPARISON_STRIP = (0.3, 0.42, 0.28)  # shares of the strip: depth, map, facts
 LIGHTING_STRIP = (0.62, 0.38)  # shares of the strip: slider, map
 _CARD_SECONDS = 2.5
 _COMPARISON_SECONDS = 0.6
-_HOLD_SECONDS = 0.8  # [s] for which a filmed lighting is shown before it blends into the next
-_ROW_HEIGHT = 240  # [px] of the pictures for the page
+_HOLD_SECONDS = 0.8  # [s] for which a filmed lighting is shown without interpolation
+_ROW_HEIGHT = 240  # [px] height of the page's row of lightings
 
 
 def write_title_card(studio: Studio, title: str, lines: list[str], seconds: float = _CARD_SECONDS) -> None:

@@ -1,6 +1,6 @@
 """Stage `review`: the review video, metrics of a scripted drive, and pictures for the report page.
 
-The video has up to three chapters: real against rendered frames; changing light, if there are several lightings; and
+The video has up to three chapters: real and rendered frames; changing light, if there are several lightings; and
 the Husky driven along the route by a scripted follower, if there is a route.
 """
 
@@ -174,7 +174,7 @@ def _write_chapters(
 
 
 def _compare_geometry(studio: Studio, scene: SceneDir, world: World, drive: RecordedDrive) -> dict[str, Any] | None:
-    """Compares visual with collision geometry and saves pictures; None without ground in the mesh stage."""
+    """Compares visual with collision geometry and saves pictures; returns None if the mesh stage has no ground."""
     folder = scene.stage("mesh")
     if not (folder / "ground.npz").exists():
         return None

@@ -1,8 +1,9 @@
 """The summary of a validation, and `validation.html`: how often policies reach the goal, and why they fail.
 
 `results` is the content of `summary.json`: the result of `summarize`, and entries that `twin.validate` adds. Paired
-episodes share lighting and seed; the exact McNemar test compares the numbers of episodes in which only one of two
-policies succeeded. Videos are files beside the page; their posters are embedded in the page.
+episodes share lighting and seed. For two policies, the exact McNemar test compares the number of episodes in which only
+the first succeeded with the number in which only the second did. Videos are files beside the page; their posters are
+embedded in the page.
 """
 
 from collections import Counter
@@ -284,7 +285,7 @@ _FAILURE_LOOKS = {  # cause → color and hatching
 
 
 def rate_figure(cells: Sequence[dict[str, Any]]) -> Figure:
-    """Success in the cells of a task with intervals: one row per policy, one color per lighting."""
+    """Success rates on a task with intervals: one row per policy, one color per lighting."""
     rates: dict[str, list[tuple[str, float, float, float]]] = {}
     for c in cells:
         rates.setdefault(c["lighting"], []).append((c["policy"], c["rate"], c["low"], c["high"]))
@@ -293,7 +294,7 @@ def rate_figure(cells: Sequence[dict[str, Any]]) -> Figure:
 
 
 def rate_heatmap(cells: Sequence[dict[str, Any]], trained: Mapping[str, float | None]) -> Figure:
-    """Success in the cells of a task in percent: one row per policy, one column per lighting.
+    """Success rates on a task [%]: one row per policy, one column per lighting.
 
     The first columns are the rate in training, if any is known, and the mean over the lightings in which all policies
     drove.

@@ -1,4 +1,4 @@
-"""Layout of the videos' frames, and drawing on them: a header, two *panels* side by side, and a *strip* below.
+"""Layout of video frames (a header, two *panels* side by side, and a *strip* below them), and drawing on them.
 
 Pictures are RGB uint8, shape (height, width, 3). A *box* is x, y, width, height [px] within the canvas. Functions that
 take a canvas draw in place.
@@ -42,7 +42,7 @@ NEAREST_DEPTH, FARTHEST_DEPTH = 1.0, 60.0  # [m], ends of the depth color scale
 
 @functools.cache
 def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans as shipped with matplotlib, so that videos look the same on machines without fonts."""
+    """The DejaVu Sans font that matplotlib contains, so that videos look the same on all machines."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size)
 
@@ -119,7 +119,7 @@ def colored(name: str, shares: NDArray) -> Image:
 
 
 def fit(picture: NDArray, size: tuple[int, int]) -> Image:
-    """Scales a picture into `size` (width, height), centered, keeping its aspect."""
+    """Scales a picture to fit into `size` (width, height) with its aspect kept, and centers it."""
     if picture.dtype != np.uint8:
         picture = to_uint8(picture)
     width, height = size
@@ -292,7 +292,7 @@ _LINE_HEIGHT = 30  # [px] height of a line of text above or below a panel
 
 
 def scale_bar(width: int, ramp: Image, labels: list[tuple[float, str]]) -> Image:
-    """A color bar with labels at shares of its length; labels without room are left out."""
+    """Draws a color bar with labels at shares of its length; labels that would overlap others are left out."""
     out = np.full((2 * _LINE_HEIGHT - 10, width, 3), BACKGROUND, np.uint8)
     bar = ramp.shape[1]
     left = (width - bar) // 2

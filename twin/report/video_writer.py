@@ -1,7 +1,7 @@
 """Writes and reads H.264 mp4 videos with PyAV; needs no display and no system codec.
 
-Frames are RGB uint8, shape (height, width, 3). Videos are yuv420p in BT.709, which every browser plays, and have
-even sides. A video's index is stored first, so that playback starts before the download ends.
+Frames are RGB uint8, shape (height, width, 3). Videos are yuv420p in BT.709, which every browser plays. Their width
+and height are even. Their index is stored first, so that playback starts before the download ends.
 """
 
 import io
@@ -18,7 +18,7 @@ from PIL import Image
 
 _BT709 = 1  # number of BT.709 in ITU-T H.273, for matrix, primaries and transfer
 _LIMITED_RANGE = 1  # AVCOL_RANGE_MPEG
-_THREADS = 4  # x264 threads; fixed, because the encoded bytes depend on the number of threads
+_THREADS = 4  # threads of x264, a fixed number because the encoded bytes depend on it
 
 
 def even(size: int) -> int:

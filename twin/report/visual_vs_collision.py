@@ -126,7 +126,7 @@ def compare_geometry(
           and not higher above the ground than the highest part.
         - `median_m`, `p90_m`: |gap| of these pixels.
         - `ground_median_m`, `ground_p95_m`: height difference of visible ground and collision ground in the corridor.
-        - `standing_median_m`: distance of visible obstacles from the nearest collision geometry.
+        - `standing_median_m`: median distance of visible obstacles from the nearest collision geometry.
         - `leak_share`: share of the points on visible obstacles further than `LARGE_ERROR` from collision geometry.
         - `ghost_share`: share of the points on parts in view further than `LARGE_ERROR` from visible geometry.
         - `corridor_leak_m`, `corridor_ghost_m`: largest visual-only and collision-only difference in the corridor.
