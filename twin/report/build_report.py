@@ -1,7 +1,7 @@
 """Writes `report.html`: what a build did, how good the result is, and how to improve it.
 
-The page is self-contained except for the review video beside it. Pictures and figures come from the stage folders, text
-from `twin.report.build_sections`.
+The page is self-contained except for the review video beside it. Pictures come from the stage folders. Figures show
+data from these folders and from the report. The text comes from `twin.report.build_sections`.
 """
 
 import shlex
@@ -22,7 +22,7 @@ from twin.report.video_layout import load_footprints
 from twin.scene import SceneDir, stage_result
 
 _MAX_REPROJECTION = 4.0  # [px] right end of the histogram
-_MAX_TRACK_LENGTH = 30.0  # frames, right end of the histogram
+_MAX_TRACK_LENGTH = 30.0  # [frames] right end of the histogram
 
 
 def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
@@ -36,7 +36,7 @@ def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
 
 
 def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
-    """Maps of the reconstruction and of the drivable ground."""
+    """Map of the reconstruction, and map of the ground's height with the solid parts."""
     folder, mesh = scene.stage("metric"), scene.stage("mesh")
     if not (folder / "cameras.npz").exists():
         return []
@@ -100,7 +100,7 @@ def _field_charts(report: dict[str, Any]) -> list[Chart]:
 
 
 def _drive_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
-    """Curves along the drive, and along the films where the truth is known."""
+    """Curves along the drive and, if the build was compared with ground truth, along the films."""
     out = []
     along_route = "distance along the route [m]"
     trace = pick(report, "review.trace")
@@ -137,7 +137,8 @@ def load_truth_comparison(scene: SceneDir) -> dict[str, Any] | None:
     """Loads the comparison of this build with ground truth, written by `python -m twin.reality compare`.
 
     Returns:
-        `figures` (see `twin.reality.comparison`) and `camera_errors_m` by source [m]; None if this build has none.
+        `figures` (see `twin.reality.comparison`), and `camera_errors_m`, a list per source [m]; None if this build was
+        not compared.
     """
     if not scene.truth_json.exists():
         return None
@@ -147,7 +148,7 @@ def load_truth_comparison(scene: SceneDir) -> dict[str, Any] | None:
             not scene.stage(name).exists() or stage_result(scene, name) != result
             for name, result in compared["of"].items()
         ):
-            return None  # it belongs to an earlier build
+            return None  # the comparison belongs to an earlier build
         return compared
 
 
@@ -159,7 +160,7 @@ def write_page(scene: SceneDir, report: dict[str, Any]) -> None:
 
     Args:
         scene: Source of pictures and figures; missing ones are left out.
-        report: As in `report.json`; missing numbers are shown as not measured.
+        report: The content of `report.json`; missing numbers are shown as not measured.
     """
     write_text(scene.report_html, page(scene, report))
 
@@ -176,7 +177,7 @@ def page(scene: SceneDir, report: dict[str, Any]) -> str:
         kicker=_kicker(report),
         headlines=headline_sections(report),
         has_video=(scene.stage("review") / "review.mp4").exists() or scene.review_mp4.exists(),
-        poster=data_url(posters[-1]) if posters else None,  # the last one shows the drive, if there is one
+        poster=data_url(posters[-1]) if posters else None,  # if there is a drive, the last poster shows it
         headings={s.name: s.title for s in shown} | {"costs": "Costs", "next": "What to do next"},
         shown=[
             {
@@ -210,7 +211,7 @@ def _kicker(report: dict[str, Any]) -> str:
 
 
 def _pictures(scene: SceneDir) -> list[Picture]:
-    """Pictures of the review stage."""
+    """Pictures for the page, which the review stage saved."""
     folder = scene.stage("review")
     if not (folder / "review.json").exists():
         return []
@@ -239,7 +240,7 @@ def _gibibytes(size: Any) -> float | None:
 
 
 def _next_steps(scene: SceneDir, report: dict[str, Any]) -> list[tuple[str, list[str]]]:
-    """What to do after a build: texts with their commands."""
+    """Next steps after a build: texts with their commands."""
     root, wrong = scene.root, sum(len(section.cautions) for section in sections(report))
     build = command("build", root)
     first = "Watch the video and look at the pictures above: is this the place that you filmed?"

@@ -1,4 +1,4 @@
-"""Sections of the build report: for each stage what was done, its numbers, and cautions with their cures.
+"""Sections of the build report: a description of each stage, its numbers, and cautions with their cures.
 
 `sections` is the only source of headlines and cautions for the page, `report.json` and the printed summary.
 """
@@ -22,10 +22,10 @@ from twin.report.html import (
 )
 from twin.report.visual_vs_collision import LARGE_ERROR, MAX_DEPTH
 
-_MIN_REGISTERED = 0.9  # share of frames
+_MIN_REGISTERED = 0.9  # share of frames; if fewer were placed, there is a caution
 _LARGE_SCALE_UNCERTAINTY = 0.03  # relative
 _LOW_PSNR = 18.0  # [dB]
-_FEW_HELD_OUT = 3  # frames per lighting
+_FEW_HELD_OUT = 3  # frames per lighting; fewer get a caution
 _LOW_LIGHTING_AGREEMENT = 0.7  # share of places; 0.5 is chance
 _LARGE_MEMORY = 4.0  # [GiB]
 
@@ -42,7 +42,7 @@ _SCALE_SOURCES = {
 Row = tuple[str, str, str, str]
 """Path of a number in the report, its name, its format, and its meaning."""
 Limit = tuple[str, float, str, str]
-"""Path of a number in the report, its limit, the caution if the number is beyond it, and the cure."""
+"""Path of a number in the report, its limit, the caution if its magnitude exceeds the limit, and the cure."""
 
 
 def _facts(report: dict[str, Any], *rows: Row) -> list[Fact]:
@@ -50,7 +50,10 @@ def _facts(report: dict[str, Any], *rows: Row) -> list[Fact]:
 
 
 def _above(report: dict[str, Any], *limits: Limit) -> list[Caution]:
-    """Cautions of the numbers whose magnitude is above their limit; the text formats number and limit."""
+    """Cautions about the numbers whose magnitude exceeds their limit.
+
+    Each caution's text is a format string for the number's magnitude and the limit.
+    """
     found = [(_numeric(pick(report, path)), limit, what, cure) for path, limit, what, cure in limits]
     return [
         Caution(what.format(abs(x), limit), cure) for x, limit, what, cure in found if x is not None and abs(x) > limit
@@ -147,7 +150,7 @@ def cameras_section(report: dict[str, Any]) -> Section:
 
 
 def _first_present(table: dict[str, Any], *keys: str) -> Any:
-    """The value of the first key that is present."""
+    """Value of the first key whose value is not None; None if there is no such key."""
     return next((table[key] for key in keys if table.get(key) is not None), None)
 
 
@@ -163,7 +166,7 @@ def _focal_text(value: Any) -> str:
 
 
 def _scale_facts(scales: Any) -> list[Fact]:
-    """Each of several sources of scale, compared with the combined scale."""
+    """Facts that compare the scale from each source with the combined scale."""
     facts = []
     for name, one in scales.items() if isinstance(scales, dict) else ():
         relative, sigma = (_numeric(pick(one, key)) for key in ("relative", "uncertainty"))
@@ -259,7 +262,7 @@ def field_section(report: dict[str, Any]) -> Section:
 
 
 def cross_lighting_facts(report: dict[str, Any]) -> tuple[list[Fact], list[Caution]]:
-    """Facts and cautions on rendering places in a lighting they were not filmed in (`twin.nerf.evaluate`)."""
+    """Facts and cautions on rendering places in a lighting in which they were not filmed (`twin.nerf.evaluate`)."""
     cross = pick(report, "field.cross_lighting") or {}
     follows, own, shown = (numbers(cross.get(key)) for key in ("colour_follows", "to_filmed_rms", "to_shown_rms"))
     facts, cautions = [], []
@@ -329,7 +332,7 @@ def mesh_section(report: dict[str, Any]) -> Section:
 
 
 def _route_choice(report: dict[str, Any]) -> str:
-    """The passes that the route follows, and how many there are."""
+    """Text on the origin of the route: passes that it follows, way points, or the filmed path."""
     route = pick(report, "mesh.route")
     if not isinstance(route, dict) or not route.get("passes"):
         return "the filmed path"
@@ -421,7 +424,7 @@ SECTIONS: dict[str, Callable[[dict[str, Any]], Section]] = {
 
 
 def geometry_section(report: dict[str, Any]) -> Section:
-    """Visual against collision geometry (`twin.report.visual_vs_collision`); part of the review stage."""
+    """Comparison of visual and collision geometry by the review stage (`twin.report.visual_vs_collision`)."""
     name, title = "seen_touched", "Visual and collision geometry"
     found = pick(report, name)
     if not isinstance(found, dict):
@@ -571,7 +574,7 @@ def sections(report: dict[str, Any]) -> list[Section]:
 
 
 def headline_sections(report: dict[str, Any]) -> list[Section]:
-    """Sections that have a headline: the drive first, because it is the purpose of the twin, then in page order."""
+    """Sections that have a headline: the review first, because the twin is made for driving; then in page order."""
     with_headline = [section for section in sections(report) if section.headline]
     return sorted(with_headline, key=lambda section: section.name != "review")
 

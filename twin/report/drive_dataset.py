@@ -1,8 +1,8 @@
-"""Drives as a LeRobot dataset (version 3.0), from which imitation and offline reinforcement learning start.
+"""Writes drives as a LeRobot dataset (version 3.0), for imitation learning and offline reinforcement learning.
 
-One film and one row of `meta/episodes` per drive; all frames in one table. A frame has the picture that the robot saw,
-its motion, the action that followed, and what came of it. The format is that of huggingface.co/docs/lerobot,
-"LeRobotDataset v3.0".
+Each drive has one video and one row in `meta/episodes`; one table contains the frames of all drives. A frame has the
+robot's picture, its motion and pose, the action that followed, and the reward and outcome of that action. The format is
+described at huggingface.co/docs/lerobot under "LeRobotDataset v3.0".
 """
 
 import json
@@ -28,7 +28,7 @@ CAMERA = "observation.images.front"
 """Key of the robot's pictures."""
 
 _CRF = 18
-_CHUNK = 1000  # films per folder
+_CHUNK = 1000  # videos per folder
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 _MOTION = ("linear_velocity", "angular_velocity")
 _PLACE = ("x", "y", "yaw", "cross_track", "progress")
@@ -37,10 +37,11 @@ _INDICES = ("frame_index", "episode_index", "index", "task_index")
 
 @dataclass
 class DriveDataset:
-    """Collects drives in a folder; `finish` makes the dataset complete.
+    """Collects drives in a folder; `finish` completes the dataset.
 
     Raises:
-        InputError: the frame rate is no whole number, or the size of the pictures is odd; video needs both.
+        InputError: pyarrow is not installed, the frame rate [1/s] is not a whole number, or the pictures' width or
+            height is odd (videos need even ones).
     """
 
     folder: Path
@@ -51,7 +52,7 @@ class DriveDataset:
     actions: Mapping[str, tuple[float, float]]
     """Components of an action, each with its lowest and highest value in the environment."""
     instruction: str
-    """The task in words, which language-conditioned policies receive."""
+    """The task in words, for language-conditioned policies."""
     _rows: list[dict[str, NDArray]] = field(default_factory=list)
     _episodes: list[dict[str, Any]] = field(default_factory=list)
     _stats: list[dict[str, dict[str, Array]]] = field(default_factory=list)
@@ -67,11 +68,11 @@ class DriveDataset:
             raise InputError(f"size {self.size[0]}×{self.size[1]}: a dataset's films need even sides")
 
     def add(self, episode: Episode, pictures: Sequence[NDArray[np.uint8]], motion: Array) -> None:
-        """Adds a drive of k instants.
+        """Adds a drive that was recorded at k instants.
 
         Args:
             episode: The drive. Its last instant has no action, so the dataset gets k − 1 frames.
-            pictures: What the robot saw at each instant, k times (height, width, 3).
+            pictures: The robot's picture at each instant, k arrays of shape (height, width, 3).
             motion: Speed [m/s] and yaw rate [rad/s] at each instant, shape (k, 2).
         """
         number, count = len(self._episodes), len(episode.times) - 1
@@ -127,7 +128,7 @@ class DriveDataset:
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
-        """The dataset's columns: type, shape and names."""
+        """Name of each of the dataset's columns → its type, its shape, and the names of its components."""
         width, height = self.size
         video = {
             "video.height": height,
@@ -210,18 +211,18 @@ class DriveDataset:
 
 
 def drive_instruction(scene: Path, task: str) -> str:
-    """A task in a scene's folder, in words."""
+    """Instruction in words for a task in a scene; `scene` is the scene's folder."""
     return f"Drive along the road of {scene.resolve().name}: {task.replace('_', ' ')}."
 
 
 def drives_summary(drives: Sequence[Episode], folder: Path) -> str:
-    """One line on the drives of a dataset."""
+    """Summary of a dataset's drives in one line."""
     frames, goals = sum(len(one.times) - 1 for one in drives), sum(one.success for one in drives)
     return f"{len(drives)} drives, {goals} to the goal, {frames} frames: {folder}"
 
 
 def require_pyarrow() -> None:
-    """Raises InputError where pyarrow, which writes the tables, is not installed."""
+    """Raises InputError if pyarrow, which writes the tables, is not installed."""
     try:
         import pyarrow  # noqa: F401
     except ModuleNotFoundError:
@@ -229,13 +230,13 @@ def require_pyarrow() -> None:
 
 
 def _statistics(values: NDArray) -> dict[str, Array]:
-    """Statistics of a column (k,) or (k, n) as LeRobot has them, each of shape (n,)."""
+    """LeRobot's statistics of a column of shape (k,) or (k, n); all but `count` have shape (n,), or (1,) for (k,)."""
     table = values.reshape(len(values), -1).astype(np.float64)
     return _summary(table.min(0), table.max(0), table.mean(0), table.std(0), len(table))
 
 
 def _colors(pictures: Sequence[NDArray[np.uint8]]) -> dict[str, Array]:
-    """Statistics of the colors in [0, 1], each of shape (3, 1, 1)."""
+    """LeRobot's statistics of the pictures' colors, scaled to [0, 1]; all but `count` have shape (3, 1, 1)."""
     counts = np.array([[np.bincount(one[..., c].ravel(), minlength=256) for c in range(3)] for one in pictures]).sum(0)
     levels, share = np.arange(256) / 255.0, counts / counts.sum(1, keepdims=True)
     mean = share @ levels
@@ -250,7 +251,7 @@ def _summary(low: Array, high: Array, mean: Array, deviation: Array, count: int)
 
 
 def _merged(stats: list[dict[str, Array]]) -> dict[str, Array]:
-    """Statistics of several drives together."""
+    """Combines the statistics of several drives."""
     counts = np.array([one["count"][0] for one in stats], float)
     means, deviations = (np.stack([one[kind] for one in stats]) for kind in ("mean", "std"))
     weights = (counts / counts.sum()).reshape(-1, *[1] * (means.ndim - 1))
@@ -261,7 +262,7 @@ def _merged(stats: list[dict[str, Array]]) -> dict[str, Array]:
 
 
 def _task_table(tasks: list[str]) -> "pyarrow.Table":
-    """Tasks as pandas writes a frame whose index is the task in words; LeRobot reads it with pandas."""
+    """Table of tasks with pandas' metadata, which make the task's text the index when LeRobot reads it with pandas."""
     import pyarrow as pa
 
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})

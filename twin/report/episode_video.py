@@ -33,7 +33,7 @@ from twin.report.video_writer import VideoWriter, frame_indices
 from twin.runtime import bar
 from twin.types import Array, Image
 
-_STRIP_SHARES = (0.42, 0.34, 0.24)  # of the strip: map, curves, facts
+_STRIP_SHARES = (0.42, 0.34, 0.24)  # shares of the strip's width: map, curves, facts
 _FINAL_HOLD = 2.0  # [s] for which the last frame is held
 _CRF = 22
 CAUSE_TEXT = {
@@ -121,9 +121,10 @@ def write_episode_video(
 def draw_curves(
     canvas: Image, box: Box, rows: Sequence[tuple[str, Array, Color]], times: Array, now: int, size: int
 ) -> None:
-    """Draws curves over time [s] into a box, one above the other, up to index `now`, each on a fixed scale.
+    """Draws curves over `times` [s], shape (k,), into a box, one above the other, up to index `now`.
 
-    `rows` contains name, values (k,) and color of each curve.
+    `rows` contains name, values (k,) and color of each curve. A curve's scale covers all its values, so it is the same
+    in all frames of a video.
     """
     x, y, width, height = box
     canvas[y : y + height, x : x + width] = PANEL_BACKGROUND

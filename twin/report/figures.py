@@ -1,7 +1,8 @@
 """Figures of the reports, drawn by matplotlib without a display.
 
 `svg` turns a figure into inline SVG whose colors are CSS variables of the page (light and dark mode). Points and height
-fields are rasterized inside it, since thousands of SVG paths are slow. Heatmaps show tables with many rows and columns.
+fields are rasterized inside the SVG, because browsers draw thousands of SVG paths slowly. Heatmaps show tables with
+many rows and columns.
 """
 
 import hashlib
@@ -24,19 +25,19 @@ from twin.config import RANDOMIZED, Condition
 from twin.geometry.passes import FilmedPass
 from twin.types import Array
 
-# Placeholder colors, used by nothing else; `svg` replaces them by the page's CSS variables.
+# Placeholder colors that occur nowhere else in a figure; `svg` replaces them by the page's CSS variables.
 INK, MUTED, LINE, CARD = "#0a0b01", "#0a0b02", "#0a0b03", "#0a0b04"
 SERIES = ("#0a0b11", "#0a0b12", "#0a0b13", "#0a0b14", "#0a0b15", "#0a0b16")
 MARKERS = ("o", "s", "D", "^", "v", "P")
-"""Marker of each series: colors alone do not reach every reader."""
+"""Marker of each series, for readers who cannot distinguish the colors."""
 _DASHES = ("-", "-.", ":")
 _VARIABLES = {INK: "--ink", MUTED: "--muted", LINE: "--line", CARD: "--card"}
 _VARIABLES |= {color: f"--c{i + 1}" for i, color in enumerate(SERIES)}
 
-_WIDTH = 4.8  # [in]; 8.5 pt text stays legible where the figure is as wide as a phone's screen
+_WIDTH = 4.8  # [in]; 8.5 pt text is legible even if a figure of this width is scaled to a phone's screen
 _RASTER_DPI = 200
 _MAX_POINTS = 20_000  # per map
-_LEGEND_LETTERS = 55  # per row of a legend; a marker counts as four
+_LEGEND_LETTERS = 55  # letters per row of a legend; a marker counts as four letters
 _STYLE: dict[str, Any] = {
     "font.size": 8.5,
     "font.family": "sans-serif",
@@ -62,16 +63,16 @@ _STYLE: dict[str, Any] = {
     "lines.linewidth": 1.6,
     "svg.fonttype": "none",
     "svg.hashsalt": "twin",  # deterministic ids: the same numbers give the same SVG
-    # Names come from the user's files; a dollar sign is no math mode.
+    # Names come from the user's files, so a dollar sign must not start a formula.
     "text.parse_math": False,
 }
 styled = matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]
-"""Decorator of functions that draw: text, lines and ticks get the common style when they are created."""
+"""Decorator for functions that draw. It applies the common style, which matplotlib reads as it creates each element."""
 
 
 @styled
 def svg(figure: Figure) -> str:
-    """Returns a figure as an inline SVG element with CSS color variables and ids that no other figure shares."""
+    """Returns a figure as an inline SVG element with CSS color variables and ids that are unique to the figure."""
     buffer = io.BytesIO()
     FigureCanvasSVG(figure)
     no_metadata = {"Date": None, "Creator": None}
@@ -80,9 +81,9 @@ def svg(figure: Figure) -> str:
     )  # fmt: skip
     text = buffer.getvalue().decode()
     text = text[text.index("<svg") :]
-    # The style element would apply to the whole page, which has the same rule.
+    # The style element would apply to the whole page, which has the same rule already.
     text = re.sub(r"<(metadata|style)\b.*?</\1>", "", text, flags=re.DOTALL)
-    # HTML parsers know the namespaces; without them the page contains no URL.
+    # HTML parsers do not need the namespaces, and without them the page contains no URL.
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
     for color, variable in _VARIABLES.items():
         text = text.replace(color, f"var({variable})")
@@ -98,14 +99,14 @@ def svg(figure: Figure) -> str:
 
 @styled
 def new_figure(height: float, width: float = _WIDTH) -> tuple[Figure, Axes]:
-    """A figure of a size [in], with axes."""
+    """Returns a figure of the given size [in], and its axes."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.add_subplot()
 
 
 @styled
 def add_legend(figure: Figure) -> None:
-    """Adds a legend of the first axes below the figure, in as many columns as fit."""
+    """Adds a legend for the first axes below the figure, in as many columns as fit."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
     fitting = max(1, _LEGEND_LETTERS // (max(map(len, labels)) + 4))
     figure.legend(handles, labels, loc="outside lower center", ncols=min(fitting, len(labels)))
@@ -115,7 +116,7 @@ def add_legend(figure: Figure) -> None:
 
 
 def _map_axes(low: Array, high: Array) -> tuple[Figure, Axes]:
-    """Axes in meters with equal aspect for the rectangle from `low` to `high`."""
+    """Returns a figure and its axes in meters with equal aspect, for the rectangle from `low` to `high`."""
     extent = np.maximum(high - low, 1.0)
     figure, axes = new_figure(float(np.clip(_WIDTH * extent[1] / extent[0], 1.6, 5.6)) + 0.7)
     axes.set_aspect("equal")
@@ -124,7 +125,7 @@ def _map_axes(low: Array, high: Array) -> tuple[Figure, Axes]:
 
 
 def map_bounds(path: Array, margin: float = 8.0) -> tuple[Array, Array]:
-    """Lower and upper corner [m] of a path (n, 2) with a margin."""
+    """Lower and upper corner [m] of the bounding box of a path (n, 2), widened by a margin."""
     return path.min(0) - margin, path.max(0) + margin
 
 
@@ -147,10 +148,10 @@ def place_map(
     half_width: float = 0.0,
     passes: Sequence[FilmedPass] = (),
 ) -> Figure:
-    """Map of sparse points, cameras by source (held-out ones hollow), and route with corridor [m].
+    """Map [m] of the sparse points, the cameras by source (held-out ones hollow), and the route with its corridor.
 
     Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (m, 3), `route` (k, 2).
-    Several passes of one source are drawn as lines with their names.
+    If a source has several passes, all passes are drawn as lines with their names.
     """
     low, high = map_bounds(positions[:, :2] if route is None else np.concatenate([positions[:, :2], route]))
     figure, axes = _map_axes(low, high)
@@ -210,13 +211,14 @@ def ground_map(ground: Ground, path: Array, route: Array | None, half_width: flo
 
 
 def _draw_passes(axes: Axes, passes: Sequence[FilmedPass]) -> None:
-    """Lines and names of passes, if some source has several; a cross marks where a film jumps or turns."""
+    """Draws passes with their names, if a source has several. A cross marks a pass that ends before its film does."""
     if len(passes) == len({one.source for one in passes}):
         return
     for k, one in enumerate(passes):
         color = SERIES[k % len(SERIES)]
         axes.plot(*one.path.T, color=color, lw=0.9, ls=(0, (4, 2)), zorder=3)
-        at = one.path[len(one.path) * (k + 1) // (len(passes) + 1)]  # passes may lie on each other, names may not
+        # Passes may coincide, so each name is at another share of its pass.
+        at = one.path[len(one.path) * (k + 1) // (len(passes) + 1)]
         box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
         axes.annotate(
             one.name, at, xytext=(4, -9), textcoords="offset points", fontsize=7, color=color, bbox=box, zorder=6
@@ -249,7 +251,10 @@ def curve_chart(
     limit: float | None = None,
     lowest: float | None = None,
 ) -> Figure:
-    """Curves by name, each from x (n,) and y (n,), with dashed lines at ± `limit`; the y axis starts at `lowest`."""
+    """Chart of named curves, each given by x (n,) and y (n,).
+
+    Dashed lines mark ± `limit`; the y axis starts at `lowest`.
+    """
     figure, axes = new_figure(2.2)
     for i, (name, (x, y)) in enumerate(curves.items()):
         axes.plot(x, y, _DASHES[i % len(_DASHES)], color=SERIES[i % len(SERIES)], label=name, lw=1.3)
@@ -281,7 +286,7 @@ def bar_chart(values: dict[str, float], counts: dict[str, int], unit: str, label
 def histogram(values: NDArray, label: str, counted: str, highest: float, integer: bool = False) -> Figure:
     """Histogram of nonnegative values (n,) with their median; values above `highest` are counted in the last bin.
 
-    `counted` names what has a value; `integer` uses one bin per integer.
+    `counted` is the label of the vertical axis. If `integer` is True, each integer has its own bin.
     """
     figure, axes = new_figure(1.9)
     edges = np.arange(np.floor(highest) + 2) - 0.5 if integer else np.linspace(0.0, highest, 41)
@@ -303,12 +308,12 @@ HALF_WIDTH, FULL_WIDTH = 4.8, 7.2
 """Figure widths [in] for half and for the full width of the page."""
 
 _ROW_HEIGHT = 0.28  # [in] per row
-_LETTER_WIDTH, _LABEL_HEIGHT = 0.075, 0.35  # [in] per letter of a name; for the axis label
+_LETTER_WIDTH, _LABEL_HEIGHT = 0.075, 0.35  # [in] width of a letter; height of the axis label
 _MAX_HORIZONTAL_LETTERS = 3  # longer column names are set vertically
-_MIN_ALPHA, _MAX_ALPHA = 0.08, 0.58  # of strength 0 and 1; keeps text legible in light and dark mode
+_MIN_ALPHA, _MAX_ALPHA = 0.08, 0.58  # opacity at strength 0 and 1; text is legible in light and dark mode
 _CELL_HALF_SIZE = np.array([0.48, 0.46])  # in units of the cell spacing
-_MIN_FONT, _MAX_FONT = 4.5, 7.0  # [pt]; smaller texts are left out
-_DIGIT_WIDTH = 0.8  # including its gap, in units of the font size
+_MIN_FONT, _MAX_FONT = 4.5, 7.0  # [pt]; texts smaller than `_MIN_FONT` are left out
+_DIGIT_WIDTH = 0.8  # width of a digit with its gap, in units of the font size
 
 
 @styled
@@ -323,10 +328,10 @@ def heatmap(
     """A table of colored cells, the first row at the top.
 
     Args:
-        strength: Color depth in [−1, 1], its sign selects one of two colors; NaN leaves a cell empty. Shape (n, m).
-        rows: Row names, n.
-        columns: Column names, m; long ones are set vertically.
-        texts: Cell texts, shape (n, m); left out where they would be too small.
+        strength: Color strength in [−1, 1], shape (n, m). The sign selects one of two colors; NaN leaves a cell empty.
+        rows: n row names.
+        columns: m column names; all are set vertically if one of them is long.
+        texts: Cell texts, shape (n, m); all are left out if they would be too small.
         label: Label of the column axis.
         width: `HALF_WIDTH` or `FULL_WIDTH`.
     """
@@ -348,7 +353,7 @@ def heatmap(
         axes.annotate(text, (column, row), ha="center", va="center", fontsize=size, color=INK)
     axes.set_yticks(range(len(rows)), list(rows))
     axes.set_xticks(range(len(columns)), list(columns), rotation=90 if upright else 0)
-    axes.xaxis.tick_top()  # a long figure is read from the top
+    axes.xaxis.tick_top()  # readers of a long figure start at the top
     axes.xaxis.set_label_position("top")
     axes.spines["bottom"].set_visible(False)
     axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5), xlabel=label)
@@ -356,7 +361,7 @@ def heatmap(
 
 
 def matrix(values: Mapping[tuple[str, str], float | None], rows: Sequence[str], columns: Sequence[str]) -> Array:
-    """Values by row and column, shape (n, m); NaN where there is none."""
+    """Values by row and column, shape (n, m); NaN where there is no value."""
     return np.array([[values.get((row, column)) for column in columns] for row in rows], float)
 
 
@@ -365,7 +370,7 @@ def percent_texts(rate: Array) -> NDArray[np.str_]:
 
 
 def difference_texts(difference: Array, certain: Array) -> NDArray[np.str_]:
-    """Signed whole numbers; in parentheses where the difference is not `certain`, same shape, 0 or ±1."""
+    """Formats differences as signed whole numbers, in parentheses where `certain` (same shape) is 0."""
     texts = np.array([[f"{each:+.0f}".replace("-", "−") if each else "0" for each in row] for row in difference])
     return np.where(certain == 0.0, np.char.add(np.char.add("(", texts), ")"), texts)
 
@@ -375,7 +380,7 @@ def difference_texts(difference: Array, certain: Array) -> NDArray[np.str_]:
 RATE_AXIS: dict[str, Any] = {"xlim": (-0.04, 1.04), "xticks": (0.0, 0.25, 0.5, 0.75, 1.0)}
 """Limits and ticks of a horizontal axis of rates."""
 
-_RATE_SPACING = 0.18  # between the rates of a policy, in units of the distance of two policies
+_RATE_SPACING = 0.18  # distance between the rates of a policy, in units of the distance between two policies
 _RATE_HEIGHT = 0.17  # [in] per rate of a policy
 _MAX_NAME_LENGTH = 26  # characters of a name
 
@@ -407,7 +412,10 @@ def shorten_name(name: str) -> str:
 
 
 def lighting_labels(lightings: Sequence[str]) -> tuple[list[str], str]:
-    """Column names of lightings without a suffix common to all, and an axis label that names that suffix."""
+    """Returns column names of lightings, and an axis label.
+
+    If all lightings are randomized, the label says so instead of the names; otherwise it is empty.
+    """
     conditions = [Condition.parse(name) for name in lightings]
     common = all(one.randomised for one in conditions)
     names = [shorten_name(one.lighting if common else str(one)) for one in conditions]

@@ -1,4 +1,4 @@
-"""The forecast's page: `forecast.html` with its figures; its words come from `twin.report.forecast_text`."""
+"""Writes the forecast's page, `forecast.html`, with its figures; its text comes from `twin.report.forecast_text`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,15 +48,16 @@ from twin.report.html import MAX_TABLE_ROWS, Chart, command, render
 # ---- figures
 
 _MAX_LABELS = 3  # named points per figure
-_LABEL_SIZE = (0.5, 0.06)  # width and height of a name, in axis units
+_LABEL_SIZE = (0.5, 0.06)  # assumed width and height of a name, in axis units
 _SQUARE_SIZE = 4.6  # [in]
 
 
 @styled
 def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "success in the twin") -> Figure:
-    """Real rate of every driven candidate over its rate in `field`, colored by task; on the diagonal they are equal.
+    """Success rates of the driven candidates on the road (vertical) and in `field` (horizontal), colored by task.
 
-    `field` of the candidate is "twin" or "corrected" (predicted from the other candidates); `label` names it.
+    `field` is the attribute "twin" or "corrected" (predicted from the other candidates), and `label` is the label
+    of its axis. On the diagonal both rates are equal.
     """
     figure, axes = new_figure(_SQUARE_SIZE)
     axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
@@ -80,7 +81,7 @@ def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "su
 
 
 def _error_bars(estimates: Sequence[Estimate]) -> tuple[np.ndarray, np.ndarray]:
-    """Values (n,), and lengths of the intervals below and above, shape (2, n)."""
+    """Values, shape (n,), and the lengths of their intervals below and above the value, shape (2, n)."""
     value, low, high = np.array([_interval(e) for e in estimates]).T
     return value, np.maximum([value - low, high - value], 0.0)
 
@@ -91,7 +92,7 @@ def _interval(e: Estimate) -> tuple[float, float, float]:
 
 
 def _label_outliers(axes: Axes, points: list[tuple[str, float, float]]) -> None:
-    """Names the points farthest from the diagonal, where names do not overlap."""
+    """Writes names beside the points (name, x, y) farthest from the diagonal, at most `_MAX_LABELS` without overlap."""
     named: list[tuple[float, float]] = []
     width, height = _LABEL_SIZE
     for name, x, y in sorted(points, key=lambda p: -abs(p[2] - p[1])):
@@ -106,7 +107,10 @@ def _label_outliers(axes: Axes, points: list[tuple[str, float, float]]) -> None:
 
 @styled
 def calibration_chart(group: Agreement) -> Figure:
-    """Success rate on the road of cells by the twin's predicted probability; areas show the number of trials."""
+    """Success rate on the road over the probability that the twin predicts, one point per bin of this probability.
+
+    The area of a point shows the number of trials in the bin.
+    """
     figure, axes = new_figure(_SQUARE_SIZE)
     axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
     limits, ticks = RATE_AXIS.values()
@@ -148,7 +152,7 @@ def _rate_heatmap(candidates: Sequence[Candidate], rates: dict[tuple[str, str], 
 
 
 def difference_heatmap(candidates: Sequence[Candidate], pairs: Sequence[CellPair]) -> Figure:
-    """Road minus twin in percentage points; in parentheses and pale where it is within chance."""
+    """Success rate on the road minus that in the twin [percentage points]; in parentheses and pale if within chance."""
     policies = [c.policy for c in candidates if c.driven]
     lightings = list(dict.fromkeys(pair.lighting for pair in pairs))
     bias = matrix({(pair.policy, pair.lighting): pair.bias.value for pair in pairs}, policies, lightings)
@@ -163,12 +167,12 @@ def difference_heatmap(candidates: Sequence[Candidate], pairs: Sequence[CellPair
 
 
 def write_forecast_page(forecast: Forecast, folder: Path) -> None:
-    """Writes `forecast.html`, atomically; `folder` is in the scene's folder."""
+    """Writes `forecast.html`, atomically; `folder` lies directly in the scene's folder."""
     write_text(folder / "forecast.html", forecast_page(forecast, folder.parent))
 
 
 def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
-    """The whole page; `root` is the scene's folder in the commands to type."""
+    """The HTML of the page; `root` is the scene's folder, for the commands that the page shows."""
     policies = len({c.policy for c in forecast.candidates})
     tasks = f"{len(forecast.tasks)} tasks" if len(forecast.tasks) > 1 else "one task"
     measured = [group for group in forecast.groups if not group.missing]
@@ -239,7 +243,7 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
 
 
 def _task(forecast: Forecast, task: str) -> dict[str, Any]:
-    """Candidates and charts of a task."""
+    """A task's candidates and charts, for the page's template."""
     mine, pairs = forecast.candidates_of(task), [pair for pair in forecast.pairs if pair.task == task]
     columns = {"in the twin": "twin", "on the road": "real", "road, predicted": "corrected"}
     rates = {

@@ -1,7 +1,7 @@
-"""The forecast in words: verdicts, limitations, next trials, the printed summary, and `forecast.csv`.
+"""The text of the forecast (verdicts, limitations, next trials, the printed summary), and the table `forecast.csv`.
 
-They answer how well the twin predicts the road, which policy is best, and how certain that is; the numbers come from
-`twin.evaluation.forecasting`.
+The text says how well the twin predicts the road, which policy is best, and how certain these answers are. The numbers
+come from `twin.evaluation.forecasting`.
 """
 
 import textwrap
@@ -18,9 +18,9 @@ from twin.evaluation.trials import csv_text
 from twin.report.html import Caution, Verdict
 
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
-"""Rank correlations above which twin and road rank policies alike, or roughly alike."""
+"""Rank correlations from which on twin and road rank policies alike, or roughly alike."""
 SMALL_REGRET = 0.05
-_SMALL_GAP = 0.1  # largest difference of twin scores at which a reliable order is good news
+_SMALL_GAP = 0.1  # a reliable order is good news only if it starts at this difference of twin scores, or below
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
@@ -53,7 +53,10 @@ INTERVALS_NOTE = (
     "one training, or more trials on the same day, hardly do. No interval is given where there are too few of them for "
     "a reliable one."
 )
-"""Note wherever intervals of the agreement of twin and road are shown; coverage: `benchmarks/intervals.py`."""
+"""Note that accompanies all intervals of the agreement of twin and road.
+
+`benchmarks/intervals.py` measures the coverage of these intervals.
+"""
 
 CSV_COLUMNS = (
     *("task", "policy", "twin", "twin_low", "twin_high", "twin_trials", "rank", "rank_low", "rank_high"),
@@ -61,8 +64,8 @@ CSV_COLUMNS = (
     *("predicted", "predicted_low", "predicted_high", "trained", "trained_low", "trained_high"),
 )
 
-_RELIABLE = 0.95  # least share of pairs in the road's order for which the twin's order may be believed
-_ENOUGH_PAIRS = 10
+_RELIABLE = 0.95  # the twin's order may be believed if the road confirms it in at least this share of pairs
+_ENOUGH_PAIRS = 10  # fewer pairs confirm no order
 _POSSIBLY_BEST = 0.05  # policies with at least this probability of being the best are worth further trials
 _TRIALS_NEEDED = (
     f"drive {MIN_POLICIES} policies or more of different quality, {MIN_TRIALS} times or more under each lighting; "
@@ -92,7 +95,7 @@ def percentage_points(share: float) -> str:
 
 
 def format_probability(probability: float) -> str:
-    """Formats an estimated probability in percent; never as 0% or 100%."""
+    """Formats an estimated probability in percent; below 0.5% as <1%, above 99.5% as >99%."""
     if probability > 0.995:
         return ">99%"
     return "<1%" if probability < 0.005 else f"{probability:.0%}"
@@ -102,11 +105,11 @@ def format_probability(probability: float) -> str:
 
 
 def verdicts(forecast: Forecast) -> list[Verdict]:
-    """The headlines."""
+    """The headlines of the forecast."""
     leaders = [_leader(forecast, task) for task in forecast.tasks]
     if not forecast.groups:
         return [Verdict("Nothing is known yet about the road: no real trials were given.", "mixed"), *leaders]
-    group = forecast.groups[-1]  # of all tasks, or of the only one
+    group = forecast.groups[-1]  # the group of all tasks, or of the only task
     if group.missing:
         first = f"Too few real trials to measure how well the twin predicts the road: {group.missing[0]}."
         return [Verdict(first, "bad"), *leaders]
@@ -114,7 +117,7 @@ def verdicts(forecast: Forecast) -> list[Verdict]:
 
 
 def believable(group: Agreement) -> Verdict:
-    """One sentence: which differences in the twin the road has confirmed, and which not."""
+    """Verdict on how far the scores of two policies in the twin must differ for the road to confirm their order."""
     pairs = [(it.low, it.pairs, it.right) for it in group.ordered]
     many, days = _count(group.trainings, "training"), _count(group.days, "day")
     where = f"measured on {days} and {many}"
@@ -158,7 +161,7 @@ def _agreement(group: Agreement) -> Verdict:
     text = f"The twin {how} these {group.policies} {what} as the road does: Spearman {format_estimate(rank)} {where}."
     if rank.no_interval:
         text = f"{text.removesuffix('.')}; {rank.no_interval}."
-    # Without a narrow interval a high value is no good news.
+    # A high value is good news only if its interval excludes poor correlations.
     return Verdict(text, "mixed" if mood == "good" and (rank.low or 0.0) < FAIR_CORRELATION else mood)
 
 
@@ -186,7 +189,10 @@ def _bias(group: Agreement) -> Verdict:
 
 
 def _skill(group: Agreement) -> list[Verdict]:
-    """The verdict on whether the twin predicts single days better than a guess without it; none without scores."""
+    """Verdict: does the twin predict single days better than the mean of the other policies does?
+
+    Empty if the scores are missing.
+    """
     gains = {it.predictor: it.gain for it in group.scores}
     gain = gains.get(OTHERS)
     if gain is None or gain.value is None:
@@ -297,7 +303,7 @@ def next_trials(forecast: Forecast) -> list[str]:
 
 
 def allocation_text(allocation: TrialAllocation) -> str:
-    """How many more real trials settle the best policy and the order."""
+    """Numbers of further real trials that find the best policy, and the order of all policies, as text."""
     if allocation.policies < 2:
         return f"{allocation.task}: one policy; there is nothing to rank."
 
@@ -346,7 +352,7 @@ def summary_text(forecast: Forecast) -> str:
 
 
 def _score_lines(group: Agreement) -> list[str]:
-    """Scores of the predictors of a group's cells."""
+    """Lines of a table with the scores of each predictor, over the cells of a group."""
     width = max(len(it.predictor) for it in group.scores)
     row = f"  {{:<{width}}}  {{:<7}}  {{:<7}}  {{}}".format
     lines = [row(f"{group.task}: scores, 0 is best", "Brier", "log", "the twin's log score is better by")]
@@ -357,7 +363,7 @@ def _score_lines(group: Agreement) -> list[str]:
 
 
 def candidates_csv(forecast: Forecast) -> str:
-    """`forecast.csv`: one row per candidate; empty cells where there is no number."""
+    """`forecast.csv`: one row per candidate; a cell is empty if its number is missing."""
     rows = []
     for c in forecast.candidates:
         numbers = [

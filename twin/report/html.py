@@ -1,8 +1,8 @@
-"""Content shared by the reports, number formatting, and the Jinja environment of their pages.
+"""Parts that the reports share: their content, number formatting, and the Jinja environment of their pages.
 
 A report consists of sections with verdicts, facts and cautions; numbers that a stage did not report are "not measured".
-Summaries repeat the headlines and cautions of sections, so that a summary never sounds better than its sections. The
-pages are `templates/*.html`; every text in them is escaped unless it is `Markup`.
+A summary repeats the headlines and cautions of the sections, so it is never more favorable than they are. The templates
+of the pages are `templates/*.html`; they escape every text unless it is `Markup`.
 """
 
 import base64
@@ -26,7 +26,7 @@ MOOD_WORDS = {"good": "good", "mixed": "caution", "bad": "bad", "plain": ""}
 
 @dataclass(frozen=True)
 class Verdict:
-    """A finding in one sentence for newcomers, with its mood: good news or bad."""
+    """A finding in one sentence for newcomers, and its mood: how good or bad the finding is."""
 
     text: str
     mood: str = "plain"
@@ -58,7 +58,7 @@ class Section:
     """A stage of the build, or a topic beside the stages, in the report."""
 
     name: str
-    """Stage name, as in `report.json`; or "seen_touched", "truth", "costs"."""
+    """Name of the stage or topic, as in `report.json`; the topics are "seen_touched", "truth" and "costs"."""
     title: str
     done: str
     """Description of what the stage did, for newcomers."""
@@ -71,7 +71,10 @@ class Section:
 
     @property
     def headline(self) -> Verdict | None:
-        """The verdict, or the title if there are cautions only; cautions lower its mood to mixed at best."""
+        """The verdict; without one, the title if there are cautions, else None.
+
+        If there are cautions, the mood is "mixed", or "bad" if the verdict's mood is "bad".
+        """
         if not self.cautions:
             return self.verdict
         if self.verdict is None:
@@ -104,7 +107,10 @@ def duration(seconds: Any) -> str:
 
 
 def flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:
-    """Lists the numbers and words of a JSON value with their dotted paths; long lists are only counted."""
+    """Lists the numbers and words of a JSON value with their dotted paths.
+
+    For a long or nested list, only its length is listed.
+    """
     if isinstance(value, dict):
         return [
             row for key, below in value.items() for row in flatten(below, f"{prefix}.{key}" if prefix else str(key))
@@ -154,9 +160,9 @@ def follower_verdict(report: dict[str, Any]) -> Verdict:
 # ---- HTML
 
 MAX_TABLE_ROWS = 24
-"""Longer tables are collapsed, below a figure of the same data."""
+"""Tables with more rows are collapsed; a figure above them shows the same data."""
 
-_STRIP_ASPECT = 2.4  # pictures of a larger width / height span the page
+_STRIP_ASPECT = 2.4  # pictures with a larger width / height span the page
 
 
 @dataclass(frozen=True)
@@ -213,5 +219,5 @@ _TEMPLATES.globals |= {"MAX_TABLE_ROWS": MAX_TABLE_ROWS, "NOT_MEASURED": NOT_MEA
 
 
 def render(template: str, **data: Any) -> str:
-    """Returns a whole page; `template` is a file in `templates/`. Missing data is an error."""
+    """Returns a whole page; `template` is a file in `templates/`. Raises jinja2.UndefinedError if data is missing."""
     return _TEMPLATES.get_template(template).render(data)

@@ -1,8 +1,8 @@
-"""Policy cards: `README.md` in a run's folder, with front matter as model hubs read it.
+"""Policy cards: a `README.md` in the folder of each run, with front matter in the format of model hubs.
 
-A card says what a policy was trained on, how often it reached the goal in the twin, lighting by lighting, and on the
-real road. Every number is read from the records of `twin train`, `twin validate` and `twin forecast`, which write the
-card anew; what was not measured is said to be missing.
+A card says how a policy was trained, and how often it reached the goal in the twin under each lighting and on the real
+road. Every number comes from the records of `twin train`, `twin validate` and `twin forecast`; each of these commands
+writes the card again. The card names measurements that are missing.
 """
 
 import json
@@ -25,9 +25,10 @@ _CHOICE = "choice.json"
 
 
 def write_policy_cards(scene: SceneDir, runs: Iterable[str]) -> list[Path]:
-    """Writes the cards of runs; names that are no run of the scene, such as `module:function`, have none.
+    """Writes the cards of runs and returns their paths.
 
-    Raises InputError: a damaged record.
+    Names that are not a run of the scene, such as `module:function`, are skipped. Raises InputError if a record is
+    damaged.
     """
     cells = tally(read_trials(scene.episodes_csv)) if exists(scene.episodes_csv) else []
     forecast = Forecast.load(scene.forecast) if exists(scene.forecast / "forecast.json") else None
@@ -37,7 +38,7 @@ def write_policy_cards(scene: SceneDir, runs: Iterable[str]) -> list[Path]:
         folder = scene.root / "runs" / run
         if not _is_run(folder):
             continue
-        # A run that was trained further is another policy than the validated one.
+        # If the run was trained further after its validation, the results are those of an earlier policy.
         same = digest_file(folder / JSON) == digests.get(run)
         mine = [cell for cell in cells if same and cell.policy == run]
         known = [one for one in forecast.candidates if same and one.policy == run] if forecast else []
@@ -99,12 +100,12 @@ def card(policy: Policy, folder: Path, cells: Sequence[Cell], known: Sequence[Ca
 def _is_run(folder: Path) -> bool:
     try:
         return exists(folder / JSON)
-    except InputError:  # an impossible name, as tables may contain any
+    except InputError:  # not a valid name of a file; tables may contain any name
         return False
 
 
 def _front_matter(policy: Policy, cells: Sequence[Cell]) -> str:
-    """YAML as model hubs read it; strings and numbers are those of JSON, which YAML includes."""
+    """YAML front matter in the format of model hubs; strings and numbers are written as JSON, which is valid YAML."""
     lines = ["---", "library_name: twin", "pipeline_tag: reinforcement-learning"]
     lines += [f"tags: {json.dumps(['robotics', 'mujoco', 'husky', 'sac', 'navigation'])}"]
     if cells:
@@ -121,14 +122,14 @@ def _front_matter(policy: Policy, cells: Sequence[Cell]) -> str:
 
 
 def _selection(folder: Path) -> list[str]:
-    """How the policy was selected, and its success in episodes after that."""
+    """Lines on how the policy was selected, and on its success in fresh episodes."""
     if not exists(folder / _CHOICE):
         return []
     with wrap_read_errors(folder / _CHOICE, "delete it, and the best policy is selected again"):
         choice = read_json(folder / _CHOICE)
         last, count = choice["chosen"], len(choice["candidates"])
         measured = rate_summary(int(last["successes"]), int(last["trials"]))
-        under = f" under `{last['condition']}`" if "condition" in last else ""  # which older runs do not say
+        under = f" under `{last['condition']}`" if "condition" in last else ""  # older runs store no condition
     return [
         "",
         f"Selected among {count} tested checkpoints. In fresh episodes{under} it reached the goal "

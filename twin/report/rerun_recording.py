@@ -1,10 +1,12 @@
-"""A drive as a recording of Rerun (rerun.io): pictures, poses, commands, trust and rewards on one timeline of seconds.
+"""Writes a drive as a recording for Rerun (rerun.io): pictures, poses, commands, trust and rewards on one timeline [s].
 
-world/route, world/corridor, world/goal   lines and a point of the place
+world/route, world/corridor, world/goal   the route and the corridor's edges as lines, the goal as a point
 world/driven                              the robot's path so far
-world/robot                               its pose and size; world/robot/camera: the front camera with its pictures
+world/robot                               the robot's pose and size
+world/robot/camera                        the front camera with its pictures
 world/obstacles                           positions of the obstacles
-speed/..., yaw_rate/...                   wanted by the driver, and driven
+speed/wanted, yaw_rate/wanted             commands of the driver
+speed/driven, yaw_rate/driven             motion of the robot
 cross_track, progress, trust, reward      one curve each
 events                                    lighting, randomization, and how the drive ended
 """
@@ -37,7 +39,7 @@ _OBSTACLE_COLOR = 0xBA68C8FF
 
 
 def require_rerun() -> None:
-    """Raises InputError: rerun-sdk is not installed."""
+    """Raises InputError if rerun-sdk is not installed."""
     try:
         import rerun  # noqa: F401
     except ImportError:
@@ -58,11 +60,11 @@ def write_rerun_recording(
     """Writes a drive of k instants as an `.rrd` file.
 
     Args:
-        path: The file.
+        path: The `.rrd` file.
         episode: The drive.
-        pictures: What the robot saw at each instant, k times (height, width, 3).
+        pictures: The robot's picture at each instant, k arrays of shape (height, width, 3).
         motion: Speed [m/s] and yaw rate [rad/s] at each instant, shape (k, 2).
-        commands: Speed and yaw rate wanted at each instant, shape (k, 2).
+        commands: Commanded speed [m/s] and yaw rate [rad/s] at each instant, shape (k, 2).
         camera_to_base: Pose of the front camera, OpenCV axes, shape (4, 4).
         world: The world of the episode.
         half_width: Half width of the corridor [m].

@@ -1,6 +1,6 @@
-"""Chapters of the review video: real against rendered frames, changing light, and the drive.
+"""Chapters of the review video: comparison of real and rendered frames, changing light, and the drive.
 
-A `Studio` has what all chapters share: it renders the field, counts renders, and saves pictures for the page.
+A `Studio` does the work that all chapters share: it renders the field, counts renders, and saves pictures for the page.
 """
 
 import math
@@ -58,7 +58,7 @@ from twin.types import Array, Image
 
 # ---- studio
 
-_PICTURE_WIDTH = 1000  # [px] maximum, of pictures for the page
+_PICTURE_WIDTH = 1000  # [px] greatest width of pictures for the page
 _PICTURE_QUALITY = 82
 
 
@@ -75,9 +75,9 @@ class Studio:
     out: Path
     render_width: int
     path: Array
-    """Path on the map: the route, or the camera positions of the longest source [m], shape (n, 2)."""
+    """Path on the map [m], shape (n, 2): the route; if there is none, the camera positions of the longest source."""
     pictures: list[dict[str, str]] = with_default(default_factory=list)
-    """File within the stage folder, section and caption of each picture for the page."""
+    """Pictures for the page, each with its file within the stage folder, its section and its caption."""
     renders: int = 0
     render_seconds: float = 0.0
 
@@ -88,10 +88,10 @@ class Studio:
     def render(
         self, camera_to_world: Array, intrinsics: Array, size: tuple[int, int], lighting: str, width: int | None = None
     ) -> Rendering:
-        """Renders one view of the field, shapes (1, h, w, ...).
+        """Renders one view of the field; the arrays of the result have shapes (1, h, w, ...).
 
-        `intrinsics` are fx, fy, cx, cy [px] at `size`. The view has the same aspect and a longer side of `width` [px],
-        by default `render_width`.
+        `intrinsics` are fx, fy, cx, cy [px] for a picture of `size`. The view has the aspect of `size`, and its longer
+        side is `width` [px], by default `render_width`.
         """
         shrink = (width or self.render_width) / max(size)
         small = (even(round(size[0] * shrink)), even(round(size[1] * shrink)))
@@ -109,7 +109,7 @@ class Studio:
         return self.render(cameras.camera_to_world[i], cameras.intrinsics[i], size, light, width)
 
     def real_frame(self, i: int) -> Image:
-        """The undistorted frame i, with its masked part grayed out."""
+        """The undistorted frame i, with its masked part in gray stripes."""
         image = read_image(self.cameras.image_path(i))
         mask = self.cameras.mask_path(i)
         return image if mask is None else gray_out(image, read_image(mask)[..., 0] == 0)
@@ -139,7 +139,7 @@ def gray_out(image: Image, ignored: NDArray[np.bool_]) -> Image:
 
 
 def evenly_spaced(indices: Sequence[int] | NDArray, count: int) -> list[int]:
-    """At most `count` of the indices, evenly spaced, including the first and the last."""
+    """At most `count` indices, evenly spaced, with the first and the last; if `count` is 1, the middle one."""
     if count >= len(indices):
         return [int(i) for i in indices]
     if count <= 1:
@@ -148,7 +148,7 @@ def evenly_spaced(indices: Sequence[int] | NDArray, count: int) -> list[int]:
 
 
 def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
-    """Frames of a lighting along its longest source, in order, half of them held out if there are enough."""
+    """At most `count` frames of a lighting's longest source, in order; half of them held out if there are enough."""
     of_lighting = [i for i, name in enumerate(cameras.lightings) if name == lighting]
     sources = [cameras.sources[i] for i in of_lighting]
     if not sources:
@@ -164,8 +164,9 @@ def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
 def appearance_of_frame(cameras: Cameras, i: int) -> str:
     """Appearance of frame i, as a lighting for the field.
 
-    A trained frame has its own embedding. A held-out frame gets the interpolation of the trained frames before and
-    after it in its film, because light and exposure drift and are not part of the evaluation.
+    A training frame has its own embedding. A held-out frame gets the embedding interpolated between the training frames
+    before and after it in its film, so that the drift of light and exposure during a film does not count as an error.
+    At an end of the film, it gets the embedding of its only neighbor.
     """
     if not cameras.held_out[i]:
         return cameras.names[i]
@@ -187,11 +188,11 @@ PANEL_SIZE = 320  # [px] longer side of each panel and of the render
 MAX_ERROR = 0.3  # share of full brightness at the end of the color scale
 _DEPTH_TICKS = (2.0, 5.0, 10.0, 25.0)  # [m] between the ends of the depth scale
 COMPARISON_STRIP = (0.3, 0.42, 0.28)  # shares of the strip: depth, map, facts
-LIGHTING_STRIP = (0.62, 0.38)  # slider, map
+LIGHTING_STRIP = (0.62, 0.38)  # shares of the strip: slider, map
 _CARD_SECONDS = 2.5
 _COMPARISON_SECONDS = 0.6
-_HOLD_SECONDS = 0.8  # for which an unmixed lighting is shown
-_ROW_HEIGHT = 240  # [px] of the pictures for the page
+_HOLD_SECONDS = 0.8  # [s] for which a filmed lighting is shown without interpolation
+_ROW_HEIGHT = 240  # [px] height of the page's row of lightings
 
 
 def write_title_card(studio: Studio, title: str, lines: list[str], seconds: float = _CARD_SECONDS) -> None:
@@ -199,13 +200,13 @@ def write_title_card(studio: Studio, title: str, lines: list[str], seconds: floa
 
 
 def comparison_frames(studio: Studio, budget: int) -> dict[str, list[int]]:
-    """Frames of chapter 1 by lighting, for at most `budget` renders (one more per lighting goes to the page)."""
+    """Frames of chapter 1 by lighting, for `budget` renders, of which one per lighting is for the page."""
     share = max(1, budget // max(1, len(studio.field.lightings)) - 1)
     return {name: frames_to_compare(studio.cameras, name, share) for name in studio.field.lightings}
 
 
 def write_comparison_chapter(studio: Studio, map_view: MapView, chosen: dict[str, list[int]], progress: tqdm) -> None:
-    """Chapter 1: real frame, render and depth. The middle held-out frame of each lighting goes to the page, too."""
+    """Chapter 1: real frame, render and depth. The middle held-out frame of each lighting is also shown on the page."""
     write_title_card(
         studio,
         "1  The film and its twin",
@@ -270,7 +271,7 @@ def _comparison_canvas(
 
 
 def comparison_row(studio: Studio, i: int) -> tuple[Image, float]:
-    """Real frame, render, depth and error of frame i with their scales, and its PSNR [dB].
+    """Returns the panels of frame i in a row (real frame, render, depth, error), and the PSNR of the render [dB].
 
     The render uses the lighting's trained embedding; nothing is fitted to the frame. The error is the mean over the
     channels of |render − film|, as a share of full brightness.
@@ -281,7 +282,7 @@ def comparison_row(studio: Studio, i: int) -> tuple[Image, float]:
     height, width = depth.shape[:2]
     film = resize(read_image(cameras.image_path(i)), width, height) / 255.0
     path = cameras.mask_path(i)
-    # A pixel of the resized mask is valid only if all its source pixels are.
+    # A pixel of the resized mask is valid only if all the pixels that it covers are valid.
     mask = None if path is None else resize((read_image(path)[..., 0] > 0).astype(np.float32), width, height) > 0.999
     score = psnr(rgb, film, mask)
     error = error_colors(np.abs(rgb - film).mean(-1), mask)
@@ -304,7 +305,10 @@ def comparison_row(studio: Studio, i: int) -> tuple[Image, float]:
 
 
 def error_colors(error: NDArray, mask: NDArray[np.bool_] | None = None) -> Image:
-    """Colors of an error, shape (h, w), as a share of full brightness: dark is small; masked pixels are gray."""
+    """Colors of an error, shape (h, w), given as a share of full brightness.
+
+    Small errors are dark. Pixels where `mask` is False are gray.
+    """
     colors = colored("viridis", np.clip(error / MAX_ERROR, 0.0, 1.0))
     if mask is not None:
         colors[~mask] = MUTED
@@ -318,7 +322,7 @@ def map_with_pose(map_view: MapView, pose: NDArray[np.float64], dots: NDArray[np
 
 
 def lighting_steps(lightings: int, budget: int) -> int:
-    """Number of views from one lighting to the next within the budget, which includes the final view."""
+    """Number of views per transition between two lightings, at least 2; the budget also includes the final view."""
     return max(2, (budget - 1) // max(1, lightings - 1))
 
 
@@ -380,8 +384,8 @@ T = TypeVar("T")
 
 DRIVE_STRIP = (0.62, 0.38)  # shares of the strip: map, facts
 _MAX_DRIVE_SECONDS = 14.0  # [s] in the video; longer drives are sped up
-_CROSSFADE_SHARE = 0.25  # share of a lighting's route segment that blends into the next
-_CONTROL_RATE = 10  # control steps per second of a FollowedDrive
+_CROSSFADE_SHARE = 0.25  # the last share of a lighting's route segment, in which it blends into the next lighting
+_CONTROL_RATE = 10  # control steps per second of a RecordedDrive
 
 
 def smoothed_speed(drive: RecordedDrive) -> Array:
@@ -394,7 +398,7 @@ def smoothed_speed(drive: RecordedDrive) -> Array:
 
 
 def lighting_at(lightings: tuple[str, ...], share: float) -> tuple[str, str]:
-    """Lighting at a share of the route, which is divided evenly: name for the field, and label for readers."""
+    """Lighting at a share of the route: name for the field, and label for viewers; all lightings get equal segments."""
     index = min(int(share * len(lightings)), len(lightings) - 1)
     within = share * len(lightings) - index
     if index == len(lightings) - 1 or within <= 1.0 - _CROSSFADE_SHARE:
@@ -405,14 +409,14 @@ def lighting_at(lightings: tuple[str, ...], share: float) -> tuple[str, str]:
 
 
 def frame_timing(drive: RecordedDrive, fps: int) -> tuple[int, int]:
-    """Control steps per picture, and video frames per picture, for a drive of at most `_MAX_DRIVE_SECONDS`."""
+    """Control steps per picture, and video frames per picture, so that the video takes `_MAX_DRIVE_SECONDS` at most."""
     speedup = max(1.0, float(drive.times[-1]) / _MAX_DRIVE_SECONDS)
     every = max(1, math.ceil(speedup * _CONTROL_RATE / fps - 1e-9))
     return every, max(1, int(fps * every / (_CONTROL_RATE * speedup) + 1e-9))
 
 
 def rendered_instants(instants: list[T], budget: int) -> list[T]:
-    """Instants that get a new view of the field within the budget; the others repeat the last view."""
+    """At most `budget` of the instants, for which the field is rendered; at the others, the last view is repeated."""
     return instants[:: max(1, -(-len(instants) // max(1, budget)))]
 
 

@@ -1,6 +1,6 @@
 """Stage `review`: the review video, metrics of a scripted drive, and pictures for the report page.
 
-The video has up to three chapters: real against rendered frames; changing light, if there are several lightings; and
+The video has up to three chapters: real and rendered frames; changing light, if there are several lightings; and
 the Husky driven along the route by a scripted follower, if there is a route.
 """
 
@@ -71,9 +71,9 @@ from twin.types import Array, Image
 Shot = tuple[Array | None, Array]
 """A robot configuration (MuJoCo's qpos; None for the initial one) and a camera pose (OpenCV)."""
 
-_RENDER_SHARES = (0.25, 0.2, 0.55)  # of `review.renders` per chapter
+_RENDER_SHARES = (0.25, 0.2, 0.55)  # shares of `review.renders` for the chapters
 _PREFETCH_BYTES = 64 * 2**20  # [bytes] of prefetched MuJoCo pictures
-_GAP_ROWS = 3  # views whose gap is shown
+_GAP_ROWS = 3  # views for which the page shows the gap between visual and collision geometry
 _CRF = 24  # about 5 MB for the demo's video
 _MOOD_COLORS = {"good": GREEN, "mixed": AMBER, "bad": RED, "plain": AMBER}
 
@@ -87,15 +87,15 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         out: Receives `review.mp4`, `review.json` and `pictures/*.jpg`.
 
     Returns:
-        Metrics for the report: `follower` (None without a route; `not_applicable` then contains the reason),
-        `seen_touched` (see `twin.report.visual_vs_collision.compare_geometry`), `frames`, `duration_s`, `renders`,
-        `render_seconds_per_frame`.
+        Metrics for the report: `follower` (None without a route; `not_applicable` then contains the reason), `frames`,
+        `duration_s`, `renders`, `render_seconds_per_frame`. With a route also `trust` (see `trust_metrics`), `trace`
+        (see `drive_trace`) and `seen_touched` (see `twin.report.visual_vs_collision.compare_geometry`).
     """
     return write_review_video(scene, config, out, BakedField.load(scene.stage("field")))
 
 
 def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: RenderableField) -> dict[str, Any]:
-    """`run` with any field."""
+    """Does the work of `run` with any field."""
     cameras = Cameras.load(scene.stage("metric"))
     world = World.load(scene.stage("mjcf")) if config.mjcf.route and scene.has_route else None
     drive = follow_route(world, HuskyPhysics(world.model(), world.robot), config.review.speed) if world else None
@@ -122,7 +122,7 @@ def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: R
     metrics |= {"trace": drive_trace(drive)} if drive else {}
     if world and drive:
         metrics["seen_touched"] = _compare_geometry(studio, scene, world, drive)
-    # The file contains no times, so that the same build writes the same bytes.
+    # The file contains no run times, so that the same build writes the same bytes.
     write_json(out / "review.json", metrics | {"pictures": studio.pictures})
     return metrics | {"render_seconds_per_frame": studio.render_seconds / max(1, studio.renders)}
 
@@ -174,7 +174,7 @@ def _write_chapters(
 
 
 def _compare_geometry(studio: Studio, scene: SceneDir, world: World, drive: RecordedDrive) -> dict[str, Any] | None:
-    """Compares visual with collision geometry and saves pictures; None without ground in the mesh stage."""
+    """Compares visual with collision geometry and saves pictures; returns None if the mesh stage has no ground."""
     folder = scene.stage("mesh")
     if not (folder / "ground.npz").exists():
         return None
@@ -197,7 +197,7 @@ def _scene_shots(studio: Studio, scene: SceneDir, world: World | None) -> tuple[
 
 
 def load_ground_and_parts(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
-    """Ground and outlines of low parts of the mesh stage, for the map."""
+    """Ground of the mesh stage (None if there is none), and outlines of its low parts, for the map."""
     folder = scene.stage("mesh")
     ground = Ground.load(folder) if (folder / "ground.npz").exists() else None
     return ground, load_footprints(folder / "parts.npz", ground)
@@ -248,12 +248,12 @@ def drive_trace(drive: RecordedDrive) -> dict[str, list[float]]:
 # ---- shots of the MuJoCo scene
 
 
-_OVERVIEW_BEHIND, _OVERVIEW_ABOVE, _OVERVIEW_AHEAD = 9.0, 7.0, 10.0  # [m] camera position and look-at point
-_OVERVIEW_POSITIONS = (0.0, 0.45)  # of the overview, as shares of the route length
+_OVERVIEW_BEHIND, _OVERVIEW_ABOVE, _OVERVIEW_AHEAD = 9.0, 7.0, 10.0  # [m] camera behind and above, look-at point ahead
+_OVERVIEW_POSITIONS = (0.0, 0.45)  # of the overviews, as shares of the route's length
 
 
 def overview_pose(route: Array, s: float) -> Array:
-    """Camera pose behind and above the point at arc length s [m] of a route (m, 3), looking along it."""
+    """Camera pose behind and above the point at arc length s [m] of a route (m, 3); it looks along the route."""
     ahead, here = point_at(route, s + _OVERVIEW_AHEAD), point_at(route, s)
     if np.linalg.norm((ahead - here)[:2]) < 1e-6:  # at the end of the route: use its last heading
         here = point_at(route, s - 1.0)
@@ -263,25 +263,25 @@ def overview_pose(route: Array, s: float) -> Array:
 
 
 def route_shots(route: Array) -> list[Shot]:
-    """Shots of the scene from above the route's start and from further along; the robot is at its initial pose."""
+    """Overview shots at the route's start and further along the route; the robot is at its initial pose."""
     length = float(arc_lengths(route)[-1])
     return [(None, overview_pose(route, share * length)) for share in _OVERVIEW_POSITIONS]
 
 
 def camera_shots(cameras: Cameras) -> list[Shot]:
-    """Shots from two of the filmed cameras, for a scene without a route."""
+    """Shots from the camera poses of two filmed frames, for a scene without a route."""
     n = len(cameras)
     return [(None, cameras.camera_to_world[i]) for i in dict.fromkeys((n // 4, 3 * n // 4))]
 
 
 def chase_shots(drive: RecordedDrive, every: int) -> list[Shot]:
-    """Shots of a drive from behind, every `every` control steps and at the last one."""
+    """Shots from behind the driving robot, one every `every` control steps and one at the last step."""
     poses = chase_poses(drive.base_to_world)
     return [(drive.qpos[i], poses[i]) for i in frame_indices(len(drive.times), every)]
 
 
 def render_shots(world: World, shots: list[Shot], size: tuple[int, int]) -> Iterator[Image]:
-    """Renders shots in order. All share one camera, because building it takes seconds."""
+    """Renders shots in order. All use one renderer, because creating it takes seconds."""
     if not shots:
         return
     camera = SceneCamera(world, size)
@@ -295,16 +295,16 @@ def render_shots(world: World, shots: list[Shot], size: tuple[int, int]) -> Iter
 # ---- map of the trust estimate
 
 _TRUST_STEP = 1.5  # [m] along the route
-_OFFSETS = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # lateral, in half widths of the corridor, left positive
+_OFFSETS = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # lateral, left positive, in corridor half widths
 _TRUST_SIZE = (80, 45)  # [px] of the rendered views
 _BATCH = 32
 _LOW_TRUST = 0.5  # views below this count as untrusted
-_CELL = (18, 16)  # [px] minimum width, height
-_MARGIN_ROWS, _MARGIN_RIGHT = 26, 40  # [px] above and below; at the right, for the last label
+_CELL = (18, 16)  # [px] width of a cell if there are 40 columns, height of a cell
+_MARGIN_ROWS, _MARGIN_RIGHT = 26, 40  # [px] margin above and below; margin at the right, for the last label
 
 
 def trust_grid(field: RenderableField, cameras: Cameras, world: World) -> tuple[Array, Array, Array]:
-    """Estimates the trust of front camera views that look along the route.
+    """Estimates the trust in views of the front camera that look along the route, from the route and from beside it.
 
     Returns:
         Arc lengths [m], shape (k,); lateral offsets, left positive [m], shape (m,); trust in [0, 1], shape (m, k).
@@ -338,7 +338,7 @@ def trust_metrics(s: Array, offsets: Array, trust: Array) -> dict[str, Any]:
 
 
 def trust_picture(s: Array, offsets: Array, trust: Array) -> Image:
-    """Draws the trust grid: arc length to the right, left of the route at the top, bright is trusted."""
+    """Draws the trust grid: arc length increases to the right, the route's left is at the top, high trust is bright."""
     wide, high = max(2, _CELL[0] * 40 // max(len(s), 1)), _CELL[1]
     body = cv2.resize(
         colored("viridis", trust[::-1]), (wide * len(s), high * len(offsets)), interpolation=cv2.INTER_NEAREST
@@ -358,14 +358,14 @@ def trust_picture(s: Array, offsets: Array, trust: Array) -> Image:
 
 T = TypeVar("T")
 
-_POLL_INTERVAL = 0.2  # [s] between checks whether the reader has stopped
+_POLL_INTERVAL = 0.2  # [s] between checks whether the `with` block was left
 
 
 class Prefetcher(Generic[T]):
-    """Iterates over `items`, which a thread computes up to `depth` items ahead from entering the block on.
+    """Iterates over `items`, which a thread computes up to `depth` items ahead.
 
-    Warp kernels release the GIL, so this uses a second core. An exception in the thread is raised at the next item.
-    Leaving the block stops the thread.
+    The thread starts when the `with` block is entered, and stops when the block is left. Warp kernels release the GIL,
+    so the thread uses a second core. If computing an item fails, the iteration raises the exception at that item.
     """
 
     def __init__(self, items: Iterator[T], depth: int):
@@ -381,7 +381,7 @@ class Prefetcher(Generic[T]):
                 if self._stop.is_set():
                     return
             self._put((False, None))
-        except BaseException as error:  # raised again in the reader
+        except BaseException as error:  # the iteration raises it again
             self._put((False, error))
 
     def _put(self, entry: tuple[bool, T | BaseException | None]) -> None:

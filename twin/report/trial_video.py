@@ -1,4 +1,7 @@
-"""Video of a trial on the road: the robot's picture beside the twin's from the same pose, map, curves and outcome."""
+"""Video of a trial on the road, with a map, curves and the outcome.
+
+The robot's picture is shown beside the twin's picture from the same pose.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,10 +28,10 @@ from twin.report.video_writer import VideoWriter
 from twin.runtime import bar
 from twin.types import Array, Image
 
-_STRIP_SHARES = (0.42, 0.34, 0.24)  # of the strip: map, curves, facts
+_STRIP_SHARES = (0.42, 0.34, 0.24)  # shares of the strip's width: map, curves, facts
 _FINAL_HOLD = 2.0  # [s] for which the last frame is held
 _CRF = 22
-_WIDTH = 480  # [px] of a panel
+_WIDTH = 480  # [px] width of a panel
 
 
 def write_trial_video(
@@ -44,15 +47,15 @@ def write_trial_video(
     ground_and_parts: tuple[Ground | None, list[Array]],
     title: str,
 ) -> None:
-    """Writes a trial as an mp4, in real time.
+    """Writes a trial as an mp4 that plays in real time.
 
     Args:
         path: The mp4.
         trial: The judged trial.
-        replayed: Poses of the twin's robot under the same commands (k, 3), at the trial's times.
-        pictures: The robot's pictures, as the policy saw them, uint8 (h, w, 3).
-        times: Of the pictures [s] since the trial's start.
-        views: The twin's pictures.
+        replayed: Poses (x, y, yaw) of the twin's robot under the same commands, at the trial's times, shape (k, 3).
+        pictures: n pictures of the robot's camera, as the policy saw them, uint8, shape (h, w, 3).
+        times: Times of the pictures since the trial's start [s], shape (n,).
+        views: The twin's pictures from the same poses.
         world: The scene's world.
         half_width: Half width of the corridor [m].
         segment: Arc lengths of the task's start and end on the route [m].

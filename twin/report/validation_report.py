@@ -1,8 +1,9 @@
 """The summary of a validation, and `validation.html`: how often policies reach the goal, and why they fail.
 
 `results` is the content of `summary.json`: the result of `summarize`, and entries that `twin.validate` adds. Paired
-episodes share lighting and seed; the exact McNemar test compares the numbers of episodes in which only one of two
-policies succeeded. Videos are stored beside the page, their posters inside it.
+episodes share lighting and seed. For two policies, the exact McNemar test compares the number of episodes in which only
+the first succeeded with the number in which only the second did. Videos are files beside the page; their posters are
+embedded in the page.
 """
 
 from collections import Counter
@@ -50,7 +51,7 @@ from twin.scene import SceneDir
 MAX_P_VALUE = 0.1
 """Paired differences with a larger p-value are reported as within chance."""
 FEW_EPISODES = 30
-"""Number of episodes in a cell below which a caution about wide intervals is given."""
+"""A cell with fewer episodes gets a caution about wide intervals."""
 TRUSTED = 0.8
 """Episodes with a lower mean trust of their pictures are counted separately."""
 FAILURES = {
@@ -66,7 +67,7 @@ LIGHTING_SETS = {
     TRAINING: "another light for every episode, sampled from those used in training",
     ANY: "another light for every episode, sampled from all that could have been filmed",
 }
-"""Lightings that are sets → their meaning."""
+"""Name of a set of lightings → its meaning."""
 
 _GOOD_RATE, _MIXED_RATE = 0.9, 0.5
 
@@ -93,7 +94,7 @@ def summarize(trials: Sequence[Trial]) -> dict[str, Any]:
 
 
 def compare_pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """Compares every two policies on the episodes that both drove, if there are any."""
+    """Compares every two policies of a task on the episodes that both drove; leaves out pairs without such episodes."""
     by_policy: dict[tuple[str, str], dict[tuple[str, int], bool]] = {}
     for t in trials:
         by_policy.setdefault((t.task, t.policy), {})[t.lighting, t.seed] = t.success
@@ -112,7 +113,7 @@ def compare_pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
 
 
 def typical_episode(trials: Sequence[Trial]) -> Trial:
-    """The episode with the median progress; the upper one of an even number."""
+    """The episode with the median progress; if the number of episodes is even, the upper of the two in the middle."""
     return sorted(trials, key=lambda t: t.progress)[len(trials) // 2]
 
 
@@ -175,7 +176,7 @@ def p_value_text(p: float) -> str:
 
 
 def verdicts(results: dict[str, Any]) -> list[Verdict]:
-    """The headlines: the best policy of every task and its worst lighting."""
+    """The headlines: the best policy of every task with its worst lighting, and the number of untrusted episodes."""
     out = [_task_verdict(task, [c for c in results["cells"] if c["task"] == task]) for task in tasks(results)]
     low, of = (sum(c[k]["trials"] for c in results["cells"]) for k in ("low_trust", "trusted"))
     if low:
@@ -188,7 +189,7 @@ def _task_verdict(task: str, cells: list[dict[str, Any]]) -> Verdict:
     lightings: dict[str, set[str]] = {}
     for c in cells:
         lightings.setdefault(c["policy"], set()).add(c["lighting"])
-    # Only lightings in which all policies drove compare them fairly.
+    # Policies are compared only in lightings in which all of them drove.
     common = set.intersection(*lightings.values())
     if not common:
         return Verdict(f"On {task} no lighting was used for all policies: there is no best one.", "mixed")
@@ -242,7 +243,7 @@ def tasks(results: dict[str, Any]) -> list[str]:
 
 
 def summary_lines(results: dict[str, Any]) -> list[str]:
-    """The printed summary."""
+    """Lines of the printed summary."""
     out = []
     wide, light = (max((len(c[key]) for c in results["cells"]), default=0) for key in ("policy", "lighting"))
     for c in results["cells"]:
@@ -273,7 +274,7 @@ def summary_lines(results: dict[str, Any]) -> list[str]:
 MAX_PLOTTED_LIGHTINGS = 4
 """Largest number of lightings whose rates are plotted with intervals; more are shown as a heatmap."""
 
-_BIN = 2.0  # [m] bin of the route in the failure histogram
+_BIN = 2.0  # [m] width of the failure histogram's bins along the route
 _FAILURE_LOOKS = {  # cause → color and hatching
     "collision": ("#d62728", ""),
     "out_of_bounds": ("#ff7f0e", "//"),
@@ -284,7 +285,7 @@ _FAILURE_LOOKS = {  # cause → color and hatching
 
 
 def rate_figure(cells: Sequence[dict[str, Any]]) -> Figure:
-    """Success in the cells of a task with intervals: one row per policy, one color per lighting."""
+    """Success rates on a task with intervals: one row per policy, one color per lighting."""
     rates: dict[str, list[tuple[str, float, float, float]]] = {}
     for c in cells:
         rates.setdefault(c["lighting"], []).append((c["policy"], c["rate"], c["low"], c["high"]))
@@ -293,7 +294,7 @@ def rate_figure(cells: Sequence[dict[str, Any]]) -> Figure:
 
 
 def rate_heatmap(cells: Sequence[dict[str, Any]], trained: Mapping[str, float | None]) -> Figure:
-    """Success in the cells of a task in percent: one row per policy, one column per lighting.
+    """Success rates on a task [%]: one row per policy, one column per lighting.
 
     The first columns are the rate in training, if any is known, and the mean over the lightings in which all policies
     drove.
@@ -313,8 +314,9 @@ def rate_heatmap(cells: Sequence[dict[str, Any]], trained: Mapping[str, float | 
 def pair_heatmap(pairs: Sequence[dict[str, Any]]) -> Figure:
     """Paired comparisons of a task's policies: the row's policy is better (blue), worse (red), or within chance (pale).
 
-    A cell's number is how many more of the shared episodes the row's policy succeeded in, in parentheses if that is
-    within chance. Rows are sorted by significant wins minus losses; columns have the same order.
+    A cell's number is the number of shared episodes in which only the row's policy succeeded, minus the number in which
+    only the column's policy did. It is in parentheses if the difference is within chance. Rows are sorted by
+    significant wins minus losses; columns have the same order.
     """
     policies = list(dict.fromkeys(p[key] for p in pairs for key in ("a", "b")))
     ahead, surely = (np.full((len(policies), len(policies)), np.nan) for _ in range(2))
@@ -333,7 +335,10 @@ def pair_heatmap(pairs: Sequence[dict[str, Any]]) -> Figure:
 
 @styled
 def training_figure(steps: NDArray[np.int64], success: NDArray[np.int64], saved: Sequence[int]) -> Figure:
-    """Success (0 or 1, shape (n,)) over ascending training steps with its interval; `saved` steps are dashed lines."""
+    """Success rate over training steps, with its interval; dashed lines mark the `saved` steps.
+
+    `steps` (ascending) and `success` (0 or 1) have one value per episode, shape (n,).
+    """
     figure, axes = new_figure(2.2)
     plot_success_curve(axes, steps, success, SERIES[0])
     for one in saved:
@@ -345,7 +350,10 @@ def training_figure(steps: NDArray[np.int64], success: NDArray[np.int64], saved:
 
 
 def failure_map(path: Path, trials: Sequence[Trial], world: World, segment: tuple[float, float]) -> None:
-    """Plots where on the route the failed episodes of a task ended; `segment` is the task on the route [m]."""
+    """Plots the places on the route where failed episodes of a task ended, as a picture at `path`.
+
+    `segment` contains the arc lengths of the task's start and end on the route [m].
+    """
     start, end = segment
     line = point_at(world.route[:, :2], np.append(np.arange(start, end, 0.5), end))
     edges = np.arange(0.0, end - start + _BIN, _BIN)
@@ -384,7 +392,7 @@ def failure_map(path: Path, trials: Sequence[Trial], world: World, segment: tupl
 
 @dataclass(frozen=True)
 class TrainingCurve:
-    """Success over the training of a run."""
+    """Success of the episodes of a training run."""
 
     run: str
     steps: NDArray[np.int64]
@@ -400,7 +408,7 @@ def write_validation_page(scene: SceneDir, results: dict[str, Any], curves: Sequ
 
 
 def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: Sequence[TrainingCurve]) -> str:
-    """The whole page of a scene; `folder` contains the maps and videos."""
+    """The HTML of the page of a scene; `folder` contains the maps and videos."""
     cells, curves = results["cells"], [curve for curve in curves if len(curve.steps)]
     policies, lights = (dict.fromkeys(c[key] for c in cells) for key in ("policy", "lighting"))
     headings = {
@@ -450,7 +458,7 @@ def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: S
 
 
 def _task(results: dict[str, Any], task: str) -> dict[str, Any]:
-    """Cells, pairs and charts of a task."""
+    """A task's cells, pairs and charts, for the page's template."""
     mine, pairs = ([it for it in results[key] if it["task"] == task] for key in ("cells", "pairs"))
     least, most = min(c["trials"] for c in mine), max(c["trials"] for c in mine)
     each = f"n = {least} per light" if least == most else f"n = {least} to {most} per light"
@@ -482,7 +490,7 @@ def _training_chart(results: dict[str, Any], curve: TrainingCurve) -> Chart:
 
 
 def _next_steps(results: dict[str, Any], root: Path) -> list[tuple[str, list[str]]]:
-    """What to do after a validation: texts with their commands."""
+    """Next steps after a validation: texts with their commands."""
     policies = list(dict.fromkeys((c["policy"], c["task"]) for c in results["cells"]))
     rows = [(policy, task, "LIGHT", "TRIALS", "SUCCESSES") for policy, task in policies[:2]]
     table = csv_text(("policy", "task", "lighting", "trials", "successes"), rows).splitlines()

@@ -1,4 +1,4 @@
-"""Frame layout of the review video and drawing on it: a header, two *panels* side by side, and a *strip* below.
+"""Layout of video frames (a header, two *panels* side by side, and a *strip* below them), and drawing on them.
 
 Pictures are RGB uint8, shape (height, width, 3). A *box* is x, y, width, height [px] within the canvas. Functions that
 take a canvas draw in place.
@@ -42,7 +42,7 @@ NEAREST_DEPTH, FARTHEST_DEPTH = 1.0, 60.0  # [m], ends of the depth color scale
 
 @functools.cache
 def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans as shipped with matplotlib, so that videos look the same on machines without fonts."""
+    """The DejaVu Sans font that matplotlib contains, so that videos look the same on all machines."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size)
 
@@ -52,7 +52,7 @@ def text_width(text: str, size: int, bold: bool = False) -> int:
 
 
 def shorten(text: str, width: int, size: int, bold: bool = False) -> str:
-    """Cuts text wider than `width` [px], with an ellipsis."""
+    """Shortens text that is wider than `width` [px], and ends it with an ellipsis."""
     if text_width(text, size, bold) <= width:
         return text
     while text and text_width(text + "…", size, bold) > width:
@@ -61,7 +61,7 @@ def shorten(text: str, width: int, size: int, bold: bool = False) -> str:
 
 
 def wrap(text: str, width: int, size: int, bold: bool = False) -> list[str]:
-    """Breaks text into lines of at most `width` [px]; cuts single words that are wider."""
+    """Breaks text into lines of at most `width` [px]; shortens single words that are wider."""
     lines: list[str] = []
     for word in text.split():
         if lines and text_width(f"{lines[-1]} {word}", size, bold) <= width:
@@ -74,14 +74,14 @@ def wrap(text: str, width: int, size: int, bold: bool = False) -> list[str]:
 def draw_text(
     canvas: Image, text: str, x: int, y: int, size: int, color: Color = INK, bold: bool = False, align: str = "left"
 ) -> None:
-    """Draws one line with its top at y; x is its left end, middle or right end, by `align`."""
+    """Draws one line with its top at y; `align` ("left", "middle" or "right") says which of its points is at x."""
     width, height = text_width(text, size, bold) + 2, round(size * 1.35)
     x -= {"left": 0, "middle": width // 2, "right": width}[align]
     left, top = max(x, 0), max(y, 0)
     right, bottom = min(x + width, canvas.shape[1]), min(y + height, canvas.shape[0])
     if right <= left or bottom <= top:
         return
-    # Only the patch under the text goes through PIL, which would copy the whole canvas for every label.
+    # PIL copies the picture that it draws on, so it gets only the patch under the text.
     patch = PILImage.fromarray(canvas[top:bottom, left:right])
     ImageDraw.Draw(patch).text((x - left, y - top), text, font=font(size, bold), fill=color)
     canvas[top:bottom, left:right] = np.asarray(patch)
@@ -119,7 +119,7 @@ def colored(name: str, shares: NDArray) -> Image:
 
 
 def fit(picture: NDArray, size: tuple[int, int]) -> Image:
-    """Scales a picture into `size` (width, height), centered, keeping its aspect."""
+    """Scales a picture to fit into `size` (width, height) with its aspect kept, and centers it."""
     if picture.dtype != np.uint8:
         picture = to_uint8(picture)
     width, height = size
@@ -159,7 +159,7 @@ class FrameLayout:
 
     @staticmethod
     def for_pictures(width: int, aspect: float) -> "FrameLayout":
-        """Layout with panels `width` wide for pictures of height / width = `aspect`, clipped to [0.4, 1]."""
+        """Layout for pictures of height / width = `aspect`, clipped to [0.4, 1]; panels are `width` [px] wide."""
         return FrameLayout((even(max(width, 160)), even(round(max(width, 160) * float(np.clip(aspect, 0.4, 1.0))))))
 
     @property
@@ -265,7 +265,7 @@ def draw_depth_legend(canvas: Image, box: Box, size: int) -> None:
 
 
 def draw_slider(canvas: Image, box: Box, lightings: tuple[str, ...], at: float, size: int) -> None:
-    """A slider with a stop per lighting and a knob at `at`, in stops."""
+    """Draws a slider with a stop per lighting; the knob is at `at`: 0 is the first stop, 1 the second, and so on."""
     x, y, width, height = box
     canvas[y : y + height, x : x + width] = PANEL_BACKGROUND
     left, right, middle = x + round(0.08 * width), x + round(0.92 * width), y + height // 2
@@ -287,17 +287,17 @@ def draw_slider(canvas: Image, box: Box, lightings: tuple[str, ...], at: float, 
 # ---- rows of panels
 
 _GAP = 6  # [px] between panels
-_TEXT = 15  # [px]
-_LINE_HEIGHT = 30  # [px] height of the lines above and below a panel
+_TEXT = 15  # [px] text size
+_LINE_HEIGHT = 30  # [px] height of a line of text above or below a panel
 
 
 def scale_bar(width: int, ramp: Image, labels: list[tuple[float, str]]) -> Image:
-    """A color bar with labels at shares of its length; labels without room are left out."""
+    """Draws a color bar with labels at shares of its length; labels that would overlap others are left out."""
     out = np.full((2 * _LINE_HEIGHT - 10, width, 3), BACKGROUND, np.uint8)
     bar = ramp.shape[1]
     left = (width - bar) // 2
     out[8:18, left : left + bar] = ramp[:1]
-    free = left  # the next label must start right of this
+    free = left  # the next label must start to the right of this
     last = width - text_width(labels[-1][1], _TEXT) - 2 * _GAP  # left end of the last label
     for k, (share, text) in enumerate(labels):
         at, half = left + round(share * (bar - 1)), text_width(text, _TEXT) // 2
@@ -324,7 +324,7 @@ def titled_panel(picture: Image, title: str, note: str, below: Image) -> Image:
     if note and free > 20:
         draw_text(head, shorten(note, free, _TEXT), width - 4, 5, _TEXT, MUTED, align="right")
     body = picture.copy()
-    body[[0, -1]] = PANEL_BACKGROUND  # an edge for pictures as dark as the background
+    body[[0, -1]] = PANEL_BACKGROUND  # marks the edge of pictures as dark as the background
     return np.concatenate([head, body, below])
 
 
@@ -380,7 +380,7 @@ def load_footprints(path: Path, ground: Ground | None) -> list[Array]:
 
 
 def map_rotation(path: Array) -> Array:
-    """Rotation (2, 2) that aligns the longest extent of a path (n, 2) with +x, its start at the left."""
+    """Rotation, shape (2, 2), that turns the longest extent of a path (n, 2) to the x axis, its start at the left."""
     centered = path - path.mean(0)
     axis = np.linalg.svd(centered, full_matrices=False)[2][0] if len(path) > 1 else np.array([1.0, 0.0])
     if (path[-1] - path[0]) @ axis < 0:
@@ -435,9 +435,9 @@ class MapView:
     def with_marker(
         self, position: Array, heading: Array, trail: Array | None = None, dots: Array | None = None
     ) -> Image:
-        """Returns a copy with an arrow at a position along a heading, both of shape (≥2,).
+        """Returns a copy of the picture with an arrow at `position` [m] in direction `heading`, both of shape (≥2,).
 
-        `trail` (n, 2) is drawn as a line, `dots` (n, 2) as dots [m].
+        `trail` [m], shape (n, 2), is drawn as a line, and `dots` [m], shape (n, 2), as dots.
         """
         out = self.picture.copy()
         if trail is not None and len(trail) > 1:
@@ -458,12 +458,12 @@ class MapView:
 
 
 def _map_transform(path: Array, size: tuple[int, int]) -> Array:
-    """Affine map (2, 3) that shows the rotated path with `_MAP_MARGIN` around it as large as possible."""
+    """Affine map from [m] to [px], shape (2, 3), that fits the rotated path with a margin into `size`."""
     turn = map_rotation(path)
     turned = path @ turn.T
     low, high = turned.min(0) - _MAP_MARGIN, turned.max(0) + _MAP_MARGIN
     scale = min(size[0] / (high[0] - low[0]), size[1] / (high[1] - low[1]))
-    flip = np.diag([1.0, -1.0])  # rows count downwards
+    flip = np.diag([1.0, -1.0])  # rows of a picture count downwards
     center = (low + high) / 2
     linear = scale * flip @ turn
     return np.column_stack([linear, np.array(size) / 2 - scale * flip @ center])

@@ -1,7 +1,7 @@
 """Writes and reads H.264 mp4 videos with PyAV; needs no display and no system codec.
 
-Frames are RGB uint8, shape (height, width, 3). Videos are yuv420p in BT.709 (every browser plays it), have even sides,
-and store their index first, so that playback starts before the download ends.
+Frames are RGB uint8, shape (height, width, 3). Videos are yuv420p in BT.709, which every browser plays. Their width
+and height are even. Their index is stored first, so that playback starts before the download ends.
 """
 
 import io
@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-_BT709 = 1  # ITU-T H.273: matrix, primaries and transfer all number BT.709 as 1
+_BT709 = 1  # number of BT.709 in ITU-T H.273, for matrix, primaries and transfer
 _LIMITED_RANGE = 1  # AVCOL_RANGE_MPEG
-_THREADS = 4  # x264 threads; fixed, because the encoded bytes depend on the number of threads
+_THREADS = 4  # threads of x264, a fixed number because the encoded bytes depend on it
 
 
 def even(size: int) -> int:
@@ -98,7 +98,7 @@ class VideoWriter:
 
 
 def frame_indices(count: int, every: int) -> list[int]:
-    """Every `every`-th of `count` indices, and the last one."""
+    """Every `every`-th index from 0 on, and the last one, `count` − 1; `count` is at least 1."""
     indices = list(range(0, count, every))
     return indices if indices[-1] == count - 1 else [*indices, count - 1]
 

@@ -1,11 +1,15 @@
 """Compares the visual geometry (radiance field) with the collision geometry along a drive of the robot's camera.
 
-*Gap*: z-depth of the collision geometry less that of the field along a pixel's ray. Visual-only ("leak" in the report's
-keys) is visible without collision geometry, collision-only ("ghost") is the opposite. Their size is, on the ground, the
-height difference (along a low ray, a centimeter of height would be decimeters), and elsewhere the distance to the
-nearest surface of the other geometry. Frames are matched within a film, so the field's depth is determined only where
-one film shows a place from two directions. Elsewhere (mainly just ahead of a drive's first frame) it may differ from
-build to build; collision-only there is reported separately as `unfilmed_ghost_m`.
+*Gap*: z-depth of the collision geometry minus that of the field, along a pixel's ray. *Visual-only* geometry ("leak" in
+the report's keys) is visible but cannot be collided with. *Collision-only* geometry ("ghost") can be collided with but
+is not visible. On the ground, differences are measured as heights, since along a ray at a low angle a centimeter of
+height becomes decimeters. For obstacles, they are distances to the nearest surface of the other geometry. In the
+corridor, visual-only geometry is measured by its height above the collision ground, and collision-only parts by their
+gap.
+
+Frames are matched within a film, so the field's depth is determined only where one film shows a place from two
+directions. Elsewhere (mainly just ahead of a drive's first frame) the depth may differ from build to build.
+Collision-only geometry there is reported separately, as `unfilmed_ghost_m`.
 """
 
 from collections.abc import Callable
@@ -41,29 +45,29 @@ VIEW_SPACING = 2.0  # [m] of the drive between two views
 MAX_DEPTH = 10.0  # [m] maximum compared depth
 LARGE_ERROR = 0.2  # [m]; larger differences are counted or get a caution
 
-_MIN_OPACITY = 0.5  # below, the field is considered empty
+_MIN_OPACITY = 0.5  # pixels of lower opacity count as empty
 _THINNING_CELL = 0.05  # [m]; point clouds are thinned to one point per cell
 _MIN_OBSTACLE_HEIGHT = 0.2  # [m] above the ground
 _ROUTE_STEP = 0.05  # [m]
-_BIN = 1.0  # [m] bin of the route, for the figure
-_MIN_PARALLAX = 1.0  # [°] between two viewing directions of a film that determine the depth of a point
+_BIN = 1.0  # [m] of the route per bin of the figure
+_MIN_PARALLAX = 1.0  # [°] smallest angle between two viewing directions that determine the depth of a point
 
 
 @dataclass(frozen=True)
 class GeometryViews:
-    """n views of both geometries. z-depths [m], FAR where nothing is hit, shape (n, height, width)."""
+    """n views of both geometries. Depths are z-depths [m], FAR where nothing is hit, shape (n, height, width)."""
 
     camera_to_world: Array
     """Shape (n, 4, 4)."""
     visual_depth: Array
     collision_depth: Array
     is_ground: NDArray[np.bool_]
-    """Pixels whose first collision geometry is the ground, shape (n, height, width)."""
+    """True for pixels whose ray first hits the ground of the collision geometry, shape (n, height, width)."""
     rgb: NDArray[np.float32]
     """Colors of the field, shape (n, height, width, 3)."""
 
     def points(self, depth: Array, intrinsics: Array) -> Array:
-        """Points on the pixels' rays at z-depths, shape (n, height, width, 3)."""
+        """Points at the given z-depths on the pixels' rays, shape (n, height, width, 3)."""
         rays = unproject(pixel_grid(*CAMERA_SIZE), intrinsics)
         turned = np.einsum("nhwi,nji->nhwj", rays * depth[..., None], self.camera_to_world[:, :3, :3])
         return turned + self.camera_to_world[:, None, None, :3, 3]
@@ -116,13 +120,19 @@ def compare_geometry(
     Held-out cameras do not count as filmed, because the field was not trained on them.
 
     Returns:
-        Lengths in [m]: `median_m`, `p90_m` (|gap| of pixels with visible geometry below the parts' greatest height, up
-        to `MAX_DEPTH`), `ground_median_m`, `ground_p95_m` (height of the visible ground over the collision ground, in
-        the corridor), `standing_median_m` (visible obstacles to the nearest collision geometry), `leak_share` (of
-        visible obstacles, further than `LARGE_ERROR` from collision geometry), `ghost_share` (of hit parts, as far from
-        visible geometry), `corridor_leak_m`, `corridor_ghost_m` (maxima), `unfilmed_ghost_m` (maximum where no film
-        shows the corridor from two directions), and `along`, the maxima per meter of the route. Every collision-only
-        point of the corridor counts for either `corridor_ghost_m` or `unfilmed_ghost_m`.
+        Lengths are in [m]; a median, quantile or share of no points is None.
+
+        - `views`, `pixels`: numbers of views and of compared pixels. Their visible geometry is closer than `MAX_DEPTH`
+          and not higher above the ground than the highest part.
+        - `median_m`, `p90_m`: |gap| of these pixels.
+        - `ground_median_m`, `ground_p95_m`: height difference of visible ground and collision ground in the corridor.
+        - `standing_median_m`: median distance of visible obstacles from the nearest collision geometry.
+        - `leak_share`: share of the points on visible obstacles further than `LARGE_ERROR` from collision geometry.
+        - `ghost_share`: share of the points on parts in view further than `LARGE_ERROR` from visible geometry.
+        - `corridor_leak_m`, `corridor_ghost_m`: largest visual-only and collision-only difference in the corridor.
+        - `unfilmed_ghost_m`: largest collision-only difference where no film shows the corridor from two directions.
+          These points do not count for `corridor_ghost_m`.
+        - `along`: per meter of the route, the maxima `leak_m` and `ghost_m`, and the median `ground_m`.
     """
     visual = views.points(views.visual_depth, world.intrinsics)
     collision = views.points(views.collision_depth, world.intrinsics)
@@ -140,7 +150,7 @@ def compare_geometry(
 
     hit_station, hit = _in_corridor(world, collision, views.collision_depth < MAX_DEPTH)
     hit &= collision[..., 2] - np.where(hit, ground.at(collision[..., :2]), 0.0) < HEADROOM
-    # For the ground the height difference, for a part the distance along the ray.
+    # Size of collision-only geometry: the height difference on the ground, the gap on a part.
     depth_below = np.where(np.isfinite(height), -np.minimum(height, 0.0), FAR)
     behind = np.where(views.visual_depth > views.collision_depth, np.where(views.is_ground, depth_below, gap), 0.0)
     filmed = _depth_determined(cameras, collision, hit)
@@ -169,21 +179,26 @@ def compare_geometry(
 
 
 def _in_corridor(world: World, points: Array, among: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-    """Stations [m] of points (..., 3), and which of them lie in the corridor between the route's ends."""
+    """Stations (arc lengths on the route) [m] of points (..., 3), and a mask of those in the corridor.
+
+    Only the points selected by the mask `among` are looked up; the others have station −1. The corridor ends at the
+    route's ends.
+    """
     length = float(arc_lengths(world.route)[-1])
     stations = np.arange(0.0, length + _ROUTE_STEP, _ROUTE_STEP)
     distance, index = cKDTree(point_at(world.route[:, :2], stations)).query(points[among][:, :2])
     station, inside = np.full(among.shape, -1.0), np.zeros(among.shape, bool)
     station[among] = stations[index]
-    # Points beyond an end have that end as their nearest point.
+    # Points beyond an end of the route have that end as their nearest point, so they are excluded.
     inside[among] = (distance <= world.half_width) & (index > 0) & (index < len(stations) - 2)
     return station, inside
 
 
 def _depth_determined(cameras: Cameras, points: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Points (..., 3) of those `among` that two training frames of a film show from `_MIN_PARALLAX` apart or more.
+    """Mask of those points (..., 3) of `among` that a film shows from directions at least `_MIN_PARALLAX` apart.
 
-    Occlusions and masks are ignored.
+    Only training frames count, and each is compared with the first one that shows the point. Occlusions and image masks
+    are ignored.
     """
     selected = points[among]
     found = np.zeros(len(selected), bool)
@@ -196,7 +211,7 @@ def _depth_determined(cameras: Cameras, points: Array, among: NDArray[np.bool_])
             shown = left[(depth > 0.0) & (pixels >= 0.0).all(1) & (pixels <= cameras.sizes[i]).all(1)]
             ray = cameras.positions[i] - selected[shown]
             ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-            # Chord lengths, because the arc cosine is imprecise for small angles. NaN (not yet shown) is false.
+            # Compares chords, because the arc cosine is imprecise for small angles; False where `first` is NaN.
             found[shown] = np.linalg.norm(ray - first[shown], axis=1) >= 2.0 * np.sin(np.radians(_MIN_PARALLAX) / 2.0)
             new = np.isnan(first[shown, 0])
             first[shown[new]] = ray[new]
@@ -223,7 +238,7 @@ def _quantile(values: Array, share: float) -> float | None:
 
 
 def _by_bin(edges: Array, station: Array, values: Array, reduce: Callable[[Array], Any], empty: float | None) -> list:
-    """Reduces the values at stations [m] to one per bin of the route."""
+    """Reduces the values at stations [m] to one per bin of the route; bins without values get `empty`."""
     which = np.clip(np.digitize(station, edges) - 1, 0, len(edges) - 2)
     found = [values[which == k] for k in range(len(edges) - 1)]
     return [round(float(reduce(v)), 4) if len(v) else empty for v in found]
@@ -232,7 +247,7 @@ def _by_bin(edges: Array, station: Array, values: Array, reduce: Callable[[Array
 # ---- picture
 
 _MAX_GAP = 0.3  # [m] at the ends of the color scale
-_PANEL_WIDTH = 320  # [px] of a panel
+_PANEL_WIDTH = 320  # [px] width of a panel
 
 
 def gap_row(views: GeometryViews, k: int) -> Image:
