@@ -318,7 +318,8 @@ class Compositor:
         # Warp's default device is global to the process, and worker threads change it.
         wp.set_device("cpu")
         count = min(max_envs, available_cores()) if field.device == "cpu" else 1
-        # Not created in threads: Warp compiles kernels at their first use. On a GPU, all threads share one CUDA stream.
+        # On a GPU, all threads would share one CUDA stream, so there is one worker. Workers are created here, not in
+        # threads, since Warp compiles kernels at their first use.
         self._workers = [_CompositorWorker(model, field, self._camera, size) for _ in range(count)]
         self._pool = ThreadPoolExecutor(count) if count > 1 else None
         self._shadows = ContactShadows(model, self._workers[0].renderer.geoms)

@@ -71,7 +71,7 @@ class Controller:
     def phase(self) -> float:
         """Time of the first update [s]; the others follow periodically.
 
-        It is such that a command given at time 0 arrives at an update.
+        It is chosen so that a command given at time 0 arrives at an update.
         """
         period = self.params.timing.period
         phase = self.params.command_latency % period

@@ -3,8 +3,8 @@
 The randomized quantities are the robot's tire friction, payload, latency, camera pose and wheels; fog, directional
 relighting and cast shadows of the pictures (see `weather.py`); and distractor objects beside the corridor. `Ranges`
 states the bounds; a `RandomizationSample` has the values of one episode, each uniform in its range and independent of
-the others. With `Ranges.hold_known`, measured parameters of the robot are not sampled, and the weather of a day with a
-photo is sampled less.
+the others. With `Ranges.hold_known`, measured parameters of the robot are not sampled, and the weather is randomized
+less when a photo of the day is available.
 """
 
 from dataclasses import asdict, dataclass, fields, replace
@@ -23,7 +23,7 @@ PAYLOAD = "payload"
 """Name of a body on the top plate; its mass is zero until an episode sets a payload."""
 
 VERSION = 4
-"""Version of the effects of a sample. Raise it when one sample gives other fog, relighting, shadows or distractors."""
+"""Version of a sample's effects. Raise it if the same sample gives different fog, relighting, shadows, distractors."""
 
 KNOWN_WEATHER_FRACTION = 0.6
 """Fraction of the sun and shadow randomization kept when a photo of the day is available.
@@ -120,7 +120,7 @@ class Ranges:
         """These ranges for a scene's robot. With `hold_known`, measured parameters are held at the robot's values.
 
         A parameter counts as measured if `robot.toml` or `[robot]` gives a value other than the published one. Real
-        trials use one robot; success rates over many sampled robots would measure robustness, not success on that one.
+        trials use one robot; success rates over many sampled robots would measure robustness, not its success.
         """
         if not self.hold_known:
             return self
@@ -176,7 +176,7 @@ overestimate success on the road."""
 
 
 def measured_parameters(robot: HuskyParams) -> list[str]:
-    """Names of the parameters that need not be sampled, since they differ from the published robot's."""
+    """Names of the measured parameters: those whose values differ from the published robot's."""
     published = HuskyParams()
     return [name for name in _RANGES_BY_PARAMETER if getattr(robot, name) != getattr(published, name)]
 

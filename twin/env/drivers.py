@@ -44,7 +44,7 @@ _SEARCH_WINDOW = (1.0, 3.0)  # [m] of route behind and ahead of the last foot po
 
 @dataclass(frozen=True)
 class RecordedDrive:
-    """A recorded drive of k instants, one per control step of 0.1 s; the first one is at rest at the start."""
+    """A recorded drive of k instants, one per control step of 0.1 s; at the first one, the robot rests at the start."""
 
     times: Array
     """[s], shape (k,)."""
@@ -161,7 +161,7 @@ def follow_route(
 
 
 def _outcome(world: World, pose: Array, s: float, length: float, error: float, touched: set[str], late: bool) -> str:
-    """The drive's outcome; empty while it goes on."""
+    """The drive's outcome; empty while the drive goes on."""
     if touched:
         return "touched"
     # A route may also pass near its goal long before its end; that is no success.

@@ -20,7 +20,7 @@ _ARRAY_FIELDS = ("times", "base_to_world", "qpos", "actions", "rewards", "speed"
 
 @dataclass(frozen=True)
 class Episode:
-    """A recorded episode of k instants, one per control step; the first one is at rest at the start."""
+    """A recorded episode of k instants, one per control step; at the first one, the robot rests at its start."""
 
     times: Array
     """[s], shape (k,)."""

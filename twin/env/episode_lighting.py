@@ -31,7 +31,8 @@ VERSION = 2
 _SEED = 20_240_315  # random seed of the anchors; constant, so that all runs with a build have the same sets
 _POOL_SIZE = 200  # random lightings among which anchors are chosen
 _EXTRA_ANCHORS = 8  # number of anchors besides the filmed lightings
-_MARGIN = 1.25  # least ratio of distances: to the other set's nearest anchor, over that to its own set's
+# A lighting of a set is more than this many times as far from the other set's nearest anchor as from its own set's.
+_MARGIN = 1.25
 _MAX_TRIES = 60  # proposals per sample; about one in ten is near the chosen anchor
 
 

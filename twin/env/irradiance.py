@@ -37,16 +37,16 @@ curve of a film (exponent 1 / 2.2) shows as 0.37. With 0.38 (12 %), obstacles at
 `benchmarks/overlay.py` (6 dB better than unshaded). So that benchmark is no independent test of this value."""
 
 SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-"""Horizontal directions that light is resolved into, shape (4, 3)."""
+"""Horizontal directions; the light is split into parts from each of them, shape (4, 3)."""
 
 _CAMERA_HEIGHT, _CAMERA_PITCH = 1.0, 8.0  # [m], [°] height and downward pitch of the views from which probes are taken
 _CAMERA_STEP = 2.0  # [m] along the route, between two views
 _VIEW_SIZE, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
 _MAX_GROUND_DEPTH, _MAX_DEPTH = 7.0, 12.0  # [m] largest z-depth of ground probes and of all probes
-_GROUND_TOLERANCE = 0.12  # [m] above or below the route; ground probes are closer, plus 5 % of the distance to it
+_GROUND_TOLERANCE = 0.12  # [m] ground probes are at most this far above or below the route, plus 5 % of their distance
 _MIN_UPRIGHT_HEIGHT = 0.3  # [m] above the ground; only probes higher than this count as upright
 _MAX_GROUND_PROBES, _MAX_UPRIGHT_PROBES = 3000, 1500
-_KERNEL_STD = 1.5  # [m] of the ground probes' weights around a position
+_KERNEL_STD = 1.5  # [m] standard deviation of the Gaussian weights of ground probes around a position
 _BOUNCE = 0.25  # radiosity of the ground over that of the sky, in the mean of the filmed lightings
 _UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky; facing up it is 1
 _MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # limits of the sun's share of light and of its elevation's cotangent
@@ -70,7 +70,7 @@ class Irradiance:
     proportional: Array
     """Part of the light proportional to the ground irradiance, as a factor of it; rows as in `constant`, (5, 3)."""
     _cache: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
-    """Ground irradiance at recent positions; most objects stand still."""
+    """Cached ground irradiance at recent positions, since most objects stand still."""
 
     def ground(self, xy: Array) -> Array:
         """Ground irradiance at positions (n, 2) [m], shape (n, 3)."""
@@ -143,7 +143,7 @@ class IrradianceEstimator:
         names = baked.lightings
         grounds = [self._ground.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
         uprights = [self._upright.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
-        # Lightings are scaled to one brightness of the ground before their mean is taken.
+        # Lightings are scaled to the same brightness of the ground before their mean is taken.
         mean_ground = np.mean([colors / colors.mean(0) for colors in grounds], 0)
         self._mean = np.mean([c / ground.mean(0) for c, ground in zip(uprights, grounds, strict=True)], 0)
         # Irradiance of the mean lighting at the upright probes.
@@ -296,9 +296,9 @@ the sun's disk and halo, and for the error of the estimated direction."""
 _FILL = 0.85  # fraction of a box's sides that an obstacle really fills
 _SKY_LOSS_BELOW = 0.75  # fraction of the sky's light lost straight below an obstacle, which does not fill its box
 _SKY_REACH = 1.2  # [m] an obstacle's side hides part of the sky from ground up to this distance
-_MAX_SHADOW = 4.0  # [m] length of a shadow behind the foot
-_SHADOW_TOLERANCE = 0.15  # [m] above or below the foot within which a surface counts as ground
-_MAX_DISTANCE = 25.0  # [m] from the camera, beyond which shadows are not drawn
+_MAX_SHADOW = 4.0  # [m] largest length of a shadow behind the foot
+_SHADOW_TOLERANCE = 0.15  # [m] surfaces at most this far above or below the foot count as ground
+_MAX_DISTANCE = 25.0  # [m] shadows further from the camera than this are not drawn
 
 
 class ContactShadows:

@@ -43,9 +43,9 @@ class Rewards:
     progress: float = 0.0
     """Reward per meter along the route; backward motion counts negative."""
     cross_track: float = 0.0
-    """Factor of a reward per step: distance from the route as a fraction of the corridor's half width, at most 1."""
+    """Reward per step at or beyond the corridor's edge; within it, proportional to the distance from the route."""
     steering: float = 0.0
-    """Factor of a reward per step: (commanded yaw rate / largest yaw rate)²."""
+    """Reward per step at the largest yaw rate; proportional to the square of the commanded yaw rate."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Options:
     randomise: Ranges | None = None
     """Ranges of robot, weather and distractor objects; True: the default ones; None or False: no randomization."""
     device: str = CPU
-    """cpu, or cuda: fields are rendered and vector environments stepped on the GPU."""
+    """cpu or cuda; with cuda, fields are rendered and vector environments stepped on the GPU."""
 
 
 # ---- checks

@@ -136,7 +136,7 @@ def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
         InputError: see `EnvFactory.open`.
     """
     world, config = twin.world(), load_config(twin.scene.config_file)
-    ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # of training and of evaluation
+    ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # those of training and of evaluation
     randomization = {"version": VERSION, "ranges": ranges} if condition.randomised else {}
     photos = [
         path for name in condition.lighting.split(":") if (path := twin.scene.lightings / f"{name}.json").exists()
@@ -227,8 +227,8 @@ _REACH = 1.5  # [m] reach of a robot beyond the corridor's edge: its half length
 def episode_spec(world: World, start: float, end: float, half_width: float, visuals: bool = False) -> mujoco.MjSpec:
     """Returns the model of episodes between two arc lengths [m] of a scene's route.
 
-    An episode ends when the robot leaves the corridor, so parts beyond its reach are never touched. Removing them
-    changes no result and saves a fifth of the physics' time and most of its memory.
+    An episode ends when the robot leaves the corridor, so parts beyond the robot's reach are never touched. Removing
+    them changes no result and saves a fifth of the physics' time and most of its memory.
 
     Args:
         world: The scene.

@@ -95,7 +95,7 @@ class RewardAndTermination:
         self._cause = np.zeros(count, int)
         self._route = world.route[:, :2]
         self._previous_foot, self._steering = np.zeros(count), np.zeros(count)
-        # Position and time at which each robot last had moved by STUCK_DISTANCE.
+        # Position and time of each robot when it had last moved by STUCK_DISTANCE.
         self._anchor, self._anchor_time = np.zeros((count, 2)), np.zeros(count)
         terms = options.rewards
         speed, yaw_rate = (_STATE_MARGIN * x for x in (world.robot.max_wheel_speed, world.robot.max_yaw_rate))
@@ -222,7 +222,7 @@ class DrivePhysics(dm_mujoco.Physics):
         with self.check_invalid_state():
             self.robot.step(nstep * self.timestep())
 
-    # Quantities of `HuskyPhysics`; the camera's pose is that of the newest image.
+    # Quantities of `HuskyPhysics`; the camera's pose is the one from which the newest image is taken.
     planar_pose = property(attrgetter("robot.planar_pose"))
     base_to_world = property(attrgetter("robot.base_to_world"))
     delayed_data = property(attrgetter("robot.delayed_data"))

@@ -22,7 +22,7 @@ SKY_OPACITY = 0.5
 _PER_TURN = 10.0  # [m]: a right angle counts as 10 m, as in `geometry.cameras.nearest_frame`
 _NEAR, _FAR = 1.0, 5.0  # [m]
 _SKY_WEIGHT = 5.0
-_CANDIDATES = 32  # nearest filmed frames that are compared
+_CANDIDATES = 32  # number of nearest filmed frames that are compared
 
 
 class Trust:

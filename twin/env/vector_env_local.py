@@ -203,7 +203,7 @@ def mixture_text(embedding: Array32, filmed: Lightings) -> str:
     from scipy.optimize import nnls  # slow to import
 
     vectors = filmed.vectors.astype(np.float64)
-    sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # weight of the equation: the fractions add up to 1
+    sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # weight of the equation: fractions add up to 1
     equations = np.vstack([vectors.T, np.full(len(vectors), sum_weight)])
     parts, _ = nnls(equations, np.append(embedding, sum_weight))
     order = np.argsort(-parts, kind="stable")
