@@ -10,8 +10,8 @@ from twin.types import Array, Array32
 
 _VIBRATION_TIME = 0.05  # [s] correlation time of the vibration
 _DRIFT_TIME = 5.0  # [s] correlation time of the exposure
-_MAX_SHUTTER = 0.5  # fraction of the time between two pictures that the shutter can be open
-_KNEE = 0.75  # film colors above it are compressed towards 1
+_MAX_SHUTTER = 0.5  # largest fraction of the time between two pictures for which the shutter is open
+_KNEE = 0.75  # film colors above this value are compressed towards 1
 
 
 @dataclass(frozen=True)
@@ -19,11 +19,11 @@ class CameraOptions:
     """Strength of a camera's imperfections."""
 
     vibration: float = 0.0
-    """Standard deviation of the camera's direction about each of its axes [°]."""
+    """Standard deviation of the camera's rotation about each of its axes [°]."""
     exposure: float = 0.0
     """Standard deviation of the logarithm of the exposure, which drifts over seconds."""
     shutter: float = 0.0
-    """Time the shutter is open [s]."""
+    """Time for which the shutter is open [s]."""
     blur_samples: int = 5
     """Number of pictures that are averaged for motion blur."""
 
@@ -38,7 +38,10 @@ class CameraNoise:
         self._last: tuple[float, Array] | None = None
 
     def perturb_pose(self, camera_to_world: Array, time: float) -> Array:
-        """The pose with vibration at a time [s] of the episode, shape (4, 4). Times must not decrease."""
+        """Returns a pose with vibration added, shape (4, 4).
+
+        `time` is the time of the episode [s]; it must not decrease from one call to the next.
+        """
         step = np.inf if self._time is None else max(time - self._time, 0.0)
         self._time = time
         # Ornstein-Uhlenbeck process, exact for any step.
@@ -54,7 +57,7 @@ class CameraNoise:
         return out
 
     def apply(self, rgb: Array32, depth: Array32, pose: Array, time: float, rays: Array, intrinsics: Array) -> Array32:
-        """The picture with motion blur and exposure drift.
+        """Returns the picture with motion blur and exposure drift.
 
         Args:
             rgb: Sharp picture, shape (height, width, 3).
@@ -76,9 +79,9 @@ class CameraNoise:
 def motion_blur(
     rgb: Array32, depth: Array32, pose: Array, before: Array, share: float, rays: Array, intrinsics: Array, samples: int
 ) -> Array32:
-    """Mean of a picture over the last `share` of the motion from the pose `before` to `pose`, in a static world.
+    """Returns a picture averaged over the last fraction `share` of the camera's motion from `before` to `pose`.
 
-    Shapes and units as in `CameraNoise.apply`.
+    The world is assumed to be static. Shapes and units as in `CameraNoise.apply`.
     """
     to_before = inverse_pose(before) @ pose
     points = (rays * depth[..., None]) @ to_before[:3, :3].T + to_before[:3, 3]
@@ -89,13 +92,13 @@ def motion_blur(
     flow = np.where(points[..., 2:] > 0.0, there - here, 0.0)
     out = np.zeros_like(rgb)
     for back in np.linspace(0.0, share, samples):
-        # OpenCV counts pixels from the center of the first one.
+        # In OpenCV, the center of the first pixel has the coordinate 0.
         at = (here + back * flow - 0.5).astype(np.float32)
         out += cv2.remap(rgb, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return out / np.float32(samples)
 
 
 def soft_clip(rgb: Array32) -> Array32:
-    """Film colors in [0, 1], with a shoulder above `_KNEE` instead of a hard cut."""
+    """Returns film colors of at most 1: values above `_KNEE` are compressed smoothly instead of clipped."""
     over = np.maximum(rgb - _KNEE, 0.0)
     return np.minimum(rgb, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))

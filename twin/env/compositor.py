@@ -1,8 +1,9 @@
 """Compositor: a radiance field rendered with obstacles, other robots and the robot's own body in it.
 
-Objects are shaded with the field's irradiance and throw contact shadows. For every pixel that an object covers, the
-field is marched a second time up to the object's depth, so that leaves and the like stay in front, and the object is
-blended in with the remaining transmittance. Uncovered pixels, and uncovered parts of pixels at edges, show the field.
+Objects are shaded with the field's irradiance and throw contact shadows. In every pixel that an object covers,
+the field is rendered a second time, only up to the object's depth. The object is blended in behind this foreground with
+the remaining transmittance, so leaves in front of it hide it. Uncovered pixels, and uncovered parts of pixels at edges,
+show the field.
 """
 
 import threading
@@ -32,8 +33,8 @@ from twin.warp_runtime import wp
 
 # ---- objects
 
-_NEAR_PLANE = 0.02  # [m] z-depth before which nothing is drawn
-_SMALL_MASK = 800  # [px] smaller masks are supersampled everywhere: finding the edges costs more than it saves
+_NEAR_PLANE = 0.02  # [m] geoms that lie entirely nearer than this z-depth are not drawn
+_SMALL_MASK = 800  # [px] masks up to this size are supersampled everywhere: finding edges would cost more time
 _SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] offsets of the samples at edges
 
 
@@ -46,23 +47,24 @@ class RenderedObjects:
     coverage: Array32
     """Fraction of a pixel that objects cover."""
     rgb: Array32
-    """Shaded color in film colors; 0 where nothing covers the pixel."""
+    """Shaded film color; 0 where no object covers the pixel."""
     depth: Array32
-    """z-depth of the covered part [m]; 0 where nothing covers the pixel."""
+    """z-depth of the covered part [m]; 0 where no object covers the pixel."""
 
 
 class ObjectRenderer:
-    """Draws obstacles and robots of one model, one env at a time. Not for two threads at once.
+    """Draws obstacles and robots of one model, one env at a time. Not thread-safe.
 
-    It casts rays into a model of these geoms alone, for pixels that some geom's bounding box covers: one per pixel, and
-    four at edges, for smooth outlines. That model is lit such that the drawn color encodes the surface's normal. An
-    object's shaded color is its own color times the irradiance of the normal.
+    It casts rays into a second model that has only these geoms, through the pixels that the geoms' bounding boxes may
+    cover: one ray per pixel, and four at edges, for smooth outlines. The lights of the second model are chosen so that
+    the color a ray returns encodes the surface's normal. An object's shaded color is its own color times the irradiance
+    of the normal.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: int, size: tuple[int, int]):
         """
         Args:
-            model: Its geoms of the obstacles' group and of the robot's visual group are drawn.
+            model: Its geoms in the obstacles' group and in the robot's visual group are drawn.
             camera: Index of the camera in the model.
             size: Width, height of the picture [px].
         """
@@ -83,7 +85,7 @@ class ObjectRenderer:
             return
         small = _geoms_only_model(model, self.geoms)
         self._offset, self._turn = _mesh_frames(small)
-        # Distances are cut off at a multiple of the model's extent.
+        # Distances are cut off at `zfar` times the model's extent, here 10 km.
         small.stat.extent, small.vis.map.zfar = 1.0, 1.0e4
         width, height = size
         data = mujoco.MjData(small)
@@ -98,19 +100,19 @@ class ObjectRenderer:
             enable_specular=False,
             enable_emission=False,
         )
-        self._cast(self._rays(pixel_grid(2, 2).reshape(-1, 2)))  # compiles
+        self._cast(self._rays(pixel_grid(2, 2).reshape(-1, 2)))  # compiles the kernels
         pixels = pixel_grid(*size).reshape(-1, 2)
         self._center_rays = self._rays(pixels)
         self._subpixel_rays = np.stack([self._rays(pixels + offset) for offset in _SUBPIXELS], 1)
 
     def visible_mask(self, data: mujoco.MjData, pose: Array) -> NDArray[np.bool_] | None:
-        """Pixels that some geom may cover from an OpenCV pose, shape (height, width); None if no geom is in view."""
+        """Pixels that geoms may cover, shape (height, width), seen from an OpenCV pose; None if no geom is in view."""
         if len(self.geoms) == 0:
             return None
         turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         middles = data.geom_xpos[self.geoms] - pose[:3, 3] + np.einsum("nij,nj->ni", turns, self._centers)
         planes = self._planes @ pose[:3, :3].T
-        # Distance that a box reaches into a half space: its center, plus its half sides projected onto the normal.
+        # Reach of a box into a half space: position of its center along the normal, plus projection of its half sides.
         reach = middles @ planes.T + np.einsum("npj,nj->np", np.abs(planes @ turns), self._halves)
         reach[:, -1] -= _NEAR_PLANE
         seen = np.flatnonzero((reach > 0.0).all(1))
@@ -137,7 +139,7 @@ class ObjectRenderer:
     ) -> RenderedObjects | None:
         """Draws the pixels of a mask from `visible_mask`; None if no geom covers them.
 
-        `irradiance` shades the objects; None: their own plain colors.
+        Objects are shaded with `irradiance`; if it is None, they have their own, unshaded colors.
         """
         turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         camera = opencv_to_mujoco(pose)
@@ -180,9 +182,12 @@ class ObjectRenderer:
         return mujoco_rays(unproject(pixels, self._intrinsics))
 
     def _cast(self, rays: Array32) -> tuple[NDArray[np.int32], Array32, Array32]:
-        """Drawn geom (−1: none), unit normal and z-depth [m] (0: none) that rays (n, 3) hit."""
+        """Casts rays (n, 3).
+
+        Returns the drawn geom that each ray hits (−1: none), the unit normal and the z-depth [m] (0: none).
+        """
         count, most = len(rays), self._caster.max_rays
-        if count > most:  # more edges than fit: in batches
+        if count > most:  # more rays than fit into one cast
             parts = [self._cast(rays[k : k + most]) for k in range(0, count, most)]
             geom, normals, depth = (np.concatenate(part) for part in zip(*parts, strict=True))
             return geom, normals, depth
@@ -195,7 +200,7 @@ class ObjectRenderer:
     def _shader(
         self, data: mujoco.MjData, irradiance: Irradiance | None
     ) -> Callable[[NDArray[np.int32], Array32], Array32]:
-        """A function from drawn geoms (n,) and normals (n, 3) to colors (n, 3), 0 where the geom is −1."""
+        """Returns a function from drawn geoms (n,) and normals (n, 3) to colors (n, 3), 0 where the geom is −1."""
         ground = irradiance.ground(data.xpos[self._bodies, :2]) if irradiance else None
 
         def shade(geom: NDArray[np.int32], normals: Array32) -> Array32:
@@ -220,7 +225,7 @@ def _geom_rgba(model: mujoco.MjModel) -> Array:
 
 
 def _geoms_only_model(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> mujoco.MjModel:
-    """A model of these geoms alone, in its world body, with a camera; lit so that colors are (1 + normal) / 2."""
+    """Returns a model that has only these geoms, and a camera; its lights give a surface the color (1 + normal) / 2."""
     spec = mujoco.MjSpec()
     spec.visual.headlight.active = 0
     meshes: set[int] = set()
@@ -240,7 +245,7 @@ def _geoms_only_model(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> mujoco
             spec.worldbody.add_light(
                 type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
                 dir=-sign * direction,
-                diffuse=0.5 * sign * direction,  # negative from the opposite side
+                diffuse=0.5 * sign * direction,  # the light from the opposite side is negative
                 ambient=(0.5, 0.5, 0.5) if axis == 0 and sign > 0 else (0, 0, 0),
                 specular=(0, 0, 0),
                 castshadow=False,
@@ -257,7 +262,10 @@ def _copy_mesh(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: int) -> None:
 
 
 def _mesh_frames(small: mujoco.MjModel) -> tuple[Array, Array]:
-    """Position and rotation of each geom in its mesh's original frame, as MuJoCo moves meshes to their inertial one."""
+    """Position (n, 3) and rotation (n, 3, 3) of each geom's frame in the frame that its mesh had before compilation.
+
+    They differ because MuJoCo moves a mesh to its inertial frame.
+    """
     turns = np.empty((small.ngeom, 9))
     for i in range(small.ngeom):
         mujoco.mju_quat2Mat(turns[i], small.geom_quat[i])
@@ -265,7 +273,7 @@ def _mesh_frames(small: mujoco.MjModel) -> tuple[Array, Array]:
 
 
 def _edge_mask(ids: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Pixels with a neighbor of another id."""
+    """Pixels that have a neighbor with another id."""
     edge = np.zeros(ids.shape, bool)
     across, down = ids[:, 1:] != ids[:, :-1], ids[1:] != ids[:-1]
     edge[:, 1:] |= across
@@ -279,12 +287,12 @@ def _edge_mask(ids: NDArray[np.int32]) -> NDArray[np.bool_]:
 
 Lighting = str | NDArray
 
-_WINDOW_STEP = 32  # [px] windows of the second march come in multiples of this, so that few sizes occur
-_MAX_WINDOWS = 16  # sizes of windows whose render targets are kept; pictures of 160×90 px have no more than 15
+_WINDOW_STEP = 32  # [px] sides of foreground windows are multiples of this, so that few sizes occur
+_MAX_WINDOWS = 16  # number of window sizes whose render targets are kept; pictures of 160×90 px have at most 15
 
 
 class Compositor:
-    """Renders a camera of the envs of one model."""
+    """Renders the pictures of one camera in envs that share a model."""
 
     def __init__(
         self,
@@ -297,11 +305,11 @@ class Compositor:
     ):
         """
         Args:
-            model: A model with that camera, compiled after `add_obstacles` (which may add none).
-            field: The place.
+            model: A model that has the camera, compiled after `add_obstacles` was called (even without obstacles).
+            field: Radiance field of the place.
             size: Width, height of the pictures [px].
             max_envs: Largest number of envs per call.
-            shaded: False draws obstacles in their own plain colors, for comparison.
+            shaded: False draws obstacles in their own, unshaded colors, for comparison.
             camera: Name of the camera.
         """
         self.size, self.max_envs, self._field = size, max_envs, field
@@ -310,7 +318,8 @@ class Compositor:
         # Warp's default device is global to the process, and worker threads change it.
         wp.set_device("cpu")
         count = min(max_envs, available_cores()) if field.device == "cpu" else 1
-        # In sequence, as Warp compiles kernels at their first use. On a GPU all threads share one CUDA stream.
+        # On a GPU, all threads would share one CUDA stream, so there is one worker. Workers are created here, not in
+        # threads, since Warp compiles kernels at their first use.
         self._workers = [_CompositorWorker(model, field, self._camera, size) for _ in range(count)]
         self._pool = ThreadPoolExecutor(count) if count > 1 else None
         self._shadows = ContactShadows(model, self._workers[0].renderer.geoms)
@@ -329,7 +338,7 @@ class Compositor:
 
         Args:
             datas: State of every env, with poses of geoms and cameras (after `mj_kinematics` and `mj_camlight`).
-            lighting: As for `BakedField.render`: one, or one per env.
+            lighting: One lighting, or one per env, as in `BakedField.render`.
             noise: Camera imperfections of each env; None: perfect cameras.
             weather: Weather of each env; None: that of the film.
 
@@ -343,7 +352,7 @@ class Compositor:
         out = self._field.render(Viewpoints.of(poses, self.intrinsics, self.size), lighting)
         lightings: list[Lighting] = [lighting] * len(datas) if one else list(lighting)  # type: ignore[list-item]
 
-        todo = iter(range(len(datas)))  # shared: each idle worker takes the next env
+        todo = iter(range(len(datas)))  # shared by the workers: an idle one takes the next env
 
         def composite_all(worker: _CompositorWorker) -> None:
             for k in todo:
@@ -380,7 +389,7 @@ class Compositor:
         if not self._shaded:
             return None
         with self._lock:
-            if self._estimator is None:  # no obstacles, but the robot sees itself
+            if self._estimator is None:  # there are no obstacles, but the robot's own body is in view
                 self._estimator = IrradianceEstimator(self._field, self._route)
         return self._estimator.estimate(lighting)
 
@@ -399,7 +408,7 @@ class _CompositorWorker:
         across, down = (-(-n // _WINDOW_STEP) * _WINDOW_STEP for n in (width, height))
         stop = np.zeros((1, down, across), np.float32)
         stop[0, :height, :width] = drawn.depth
-        # One per window size, since a field keeps render targets of few sizes.
+        # One copy of the field per window size, since a field keeps render targets of few sizes.
         if (across, down) not in self._fields:
             self._fields[across, down] = self._field.single_threaded()
             if len(self._fields) > _MAX_WINDOWS:
@@ -416,7 +425,7 @@ def composite(out: Rendering, inner: tuple, drawn: RenderedObjects, front: Rende
 
     Args:
         out: Rendering of the field alone.
-        inner: Index of the window in its arrays.
+        inner: Index that selects the window in the arrays of `out`.
         drawn: Objects in the window.
         front: The field up to `drawn.depth`, with colors not premultiplied, arrays (height, width).
     """

@@ -1,10 +1,11 @@
 """The Husky's wheel controller: turns commands into wheel speeds, for one robot or for many at once.
 
-A *command* is forward speed v [m/s] and yaw rate ω [rad/s]. The controller runs periodically and takes the newest
-command that has arrived, `command_latency` after it was given; without one for its time-out it stops (by default 10 Hz
-and 0.25 s, see `twin.robot.CONTROLLERS`). It limits v and ω, then their change per period, converts them to the speeds
-of the two sides, and scales both down if one exceeds `max_wheel_speed`. This reproduces Clearpath's: ROS's
-diff_drive_controller with its speed limiter, then husky_hardware's limit.
+A *command* is forward speed v [m/s] and yaw rate ω [rad/s]. A command arrives `command_latency` after it was given.
+The controller runs periodically and uses the newest command that has arrived; if that one is older than its time-out,
+the controller stops the robot (by default 10 Hz and 0.25 s, see `twin.robot.CONTROLLERS`). It limits v and ω, then
+their change per period, converts them to the speeds of the two sides, and scales both down if one exceeds
+`max_wheel_speed`. This reproduces Clearpath's controller: ROS's diff_drive_controller with its speed limiter, then
+husky_hardware's limit.
 """
 
 from collections import deque
@@ -23,7 +24,7 @@ CONTROL_PERIOD = 0.1
 COMMAND_TIMEOUT = min(timing.timeout for timing in CONTROLLERS.values())
 """Longest time between two commands [s]: the shortest time-out of all controllers."""
 
-_TIME_TOLERANCE = 1e-9  # [s] below which two times are equal
+_TIME_TOLERANCE = 1e-9  # [s] times that differ by less count as equal
 
 
 def limit_command(command: Array, previous: Array, params: HuskyParams, period: float = CONTROL_PERIOD) -> Array:
@@ -42,7 +43,7 @@ def limit_change(wanted: Array, previous: Array, step: Array) -> Array:
 
 
 def limit_sides(sides: Array, limit: float) -> Array:
-    """Returns the speeds of both sides, shape (..., 2), scaled down alike if one exceeds the limit."""
+    """Returns the speeds of both sides, shape (..., 2), both scaled down by one factor if one exceeds the limit."""
     return sides / np.maximum(1.0, np.abs(sides).max(-1, keepdims=True) / limit)
 
 
@@ -68,7 +69,10 @@ class Controller:
 
     @property
     def phase(self) -> float:
-        """Time of the first update [s]; others follow periodically. A command given at time 0 arrives at an update."""
+        """Time of the first update [s]; the others follow periodically.
+
+        It is chosen so that a command given at time 0 arrives at an update.
+        """
         period = self.params.timing.period
         phase = self.params.command_latency % period
         return 0.0 if phase > period - _TIME_TOLERANCE else phase
@@ -79,7 +83,7 @@ class Controller:
         return self._limited.copy()
 
     def command(self, time: float, v: float, yaw_rate: float) -> None:
-        """Gives a command at a time [s]."""
+        """Gives the controller a command at a time [s]; it arrives `command_latency` later."""
         self._pending.append((time + self.params.command_latency, np.array([v, yaw_rate], float)))
 
     def update(self, time: float) -> Array:
@@ -116,7 +120,7 @@ class SubstepSchedules:
 
 
 class VectorController:
-    """Controllers of n robots that differ only in `command_latency`; computes what `HuskyPhysics.schedule` does."""
+    """Controllers of n robots that differ only in `command_latency`; gives the results of `HuskyPhysics.schedule`."""
 
     def __init__(self, params: HuskyParams, count: int, period: float, timestep: float, check_steps: int) -> None:
         """
@@ -124,7 +128,7 @@ class VectorController:
             params: Shared by all robots.
             count: Number of robots n.
             period: Time between two commands [s].
-            timestep: Of the physics [s].
+            timestep: Duration of a physics substep [s].
             check_steps: Substeps between two contact checks.
         """
         self._params, self.timestep, self._check_steps = params, timestep, check_steps
@@ -141,7 +145,8 @@ class VectorController:
     def begin(self, which: NDArray[np.int64], latency: Array, steps_to_update: NDArray[np.int64]) -> None:
         """Resets k robots to rest, without pending commands.
 
-        `latency` is their `command_latency` [s], `steps_to_update` the substeps until their first update, shape (k,).
+        `latency` is their `command_latency` [s]; `steps_to_update` is the number of substeps until their first update.
+        Both have shape (k,).
         """
         self._latency[which], self._steps_to_update[which], self.time[which] = latency, steps_to_update, 0.0
         missing = int(np.ceil(self._latency.max() / self._period)) + 2 - len(self._commands)

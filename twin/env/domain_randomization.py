@@ -1,9 +1,10 @@
 """Domain randomization: the robot, the weather and distractor objects differ from episode to episode.
 
-Randomized are the robot's tire friction, payload, latency, camera pose and wheels; fog, directional relighting and cast
-shadows of the pictures (see `weather.py`); and distractor objects beside the corridor. `Ranges` states the bounds; a
-`RandomizationSample` is one episode's values, each uniform in its range and independent of the others. Parameters that
-were measured, and the weather of a photo, need not be sampled: see `Ranges.hold_known`.
+The randomized quantities are the robot's tire friction, payload, latency, camera pose and wheels; fog, directional
+relighting and cast shadows of the pictures (see `weather.py`); and distractor objects beside the corridor. `Ranges`
+states the bounds; a `RandomizationSample` has the values of one episode, each uniform in its range and independent of
+the others. With `Ranges.hold_known`, measured parameters of the robot are not sampled, and the weather is randomized
+less when a photo of the day is available.
 """
 
 from dataclasses import asdict, dataclass, fields, replace
@@ -22,21 +23,22 @@ PAYLOAD = "payload"
 """Name of a body on the top plate; its mass is zero until an episode sets a payload."""
 
 VERSION = 4
-"""Version of what a sample does. Raise it when fog, relighting, shadows or distractors of the same sample change."""
+"""Version of a sample's effects. Raise it if the same sample gives different fog, relighting, shadows, distractors."""
 
 KNOWN_WEATHER_FRACTION = 0.6
 """Fraction of the sun and shadow randomization kept when a photo of the day is available.
 
 Measured by `benchmarks/day.py` with the twelve finished policies that are forecast on the known-truth world, on ten of
-its days (the five stated weathers and days 1 to 5, not 6 to 15): a forecast for these is not independent of it. The
-benchmark measures how much the policies' steering changes from the twin, under a photo's appearance and fog, to the
-pictures of that day. That change is 0.8 (0.6 to 0.96) times the change that the full randomization causes. Relative to
-the change caused with this fraction, it is 1.1 (0.8 to 1.4) times in the part that is constant over a day, and 1.2 (1.0
-to 1.4) times in the part that varies along the route."""
+its days: the five stated weathers and days 1 to 5, not 6 to 15. So a forecast for these policies and days is not
+independent of this value. The benchmark compares the policies' steering on two sets of pictures: those of the twin
+with a photo's appearance and fog, and those of the photo's day. The difference is 0.8 (0.6 to 0.96) times the change
+that the full randomization causes. Relative to the change that the randomization with this fraction causes, it is 1.1
+(0.8 to 1.4) times in the part that is constant over a day, and 1.2 (1.0 to 1.4) times in the part that varies along the
+route."""
 
-_PAYLOAD_SIDE = 0.3  # [m] of the cube whose inertia the payload gets
+_PAYLOAD_SIDE = 0.3  # [m] the payload has the inertia of a cube with this side
 _TIRE_SUFFIX = "_tyre"
-_PER_AXIS = ("camera_shift", "camera_turn")  # sampled for each axis, and may be held at a value per axis
+_PER_AXIS = ("camera_shift", "camera_turn")  # sampled for each axis; each axis may be held at a value of its own
 _MAX_BOUND = 1e6
 _ABOVE_ZERO = float(np.nextafter(0.0, 1.0))
 _BOUNDS = {
@@ -45,7 +47,7 @@ _BOUNDS = {
     "bystanders": (0.0, _MAX_BOUND),
     "wheel_difference": (-0.5, 0.5),
 }
-"""Allowed values of ranges; others are within ±`_MAX_BOUND`."""
+"""Allowed values of ranges; ranges that are not listed must be within ±`_MAX_BOUND`."""
 _RANGES_BY_PARAMETER = {
     "friction": ("friction",),
     "center_of_mass": ("payload",),
@@ -55,8 +57,9 @@ _RANGES_BY_PARAMETER = {
     "camera_height": ("camera_shift",),
     "camera_yaw": ("camera_turn",),
 }
-"""Ranges held fixed when a parameter of `HuskyParams` was measured. The yaw comes from a film by the camera itself,
-which determines pitch and roll as well. With a measured height, the whole offset of the camera is taken as exact."""
+"""Ranges held fixed when a parameter of `HuskyParams` was measured. The camera's yaw is measured from a film by the
+camera itself, which also determines pitch and roll. With a measured height, the camera's whole offset counts as exact.
+"""
 _MODEL_FIELDS = ("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "bvh_aabb", "cam_pos", "cam_quat")
 
 
@@ -75,9 +78,9 @@ class Ranges:
     camera_turn: Range = (-1.0, 1.0)
     """Rotation of the front camera about each of its axes [°]."""
     wheel_radius: Range = (0.98, 1.02)
-    """Wheel radius, as a factor of the robot's own; the controller does not know it."""
+    """Wheel radius, as a factor of the robot's own; the controller always uses the nominal radius."""
     wheel_difference: Range = (-0.006, 0.006)
-    """Relative excess of the right wheels' radius over the left wheels'; without visual feedback the robot drifts."""
+    """Right minus left wheel radius, relative to their mean; it makes the robot drift without visual feedback."""
     extinction: Range = (0.0, 0.05)
     """Extinction of the fog [1/m], added to the film's; 0.05 is a visibility of 60 m."""
     airlight: Range = (0.85, 1.15)
@@ -117,7 +120,7 @@ class Ranges:
         """These ranges for a scene's robot. With `hold_known`, measured parameters are held at the robot's values.
 
         A parameter counts as measured if `robot.toml` or `[robot]` gives a value other than the published one. Real
-        trials are driven by one robot; rates over many robots would measure robustness, not success on that robot.
+        trials use one robot; success rates over many sampled robots would measure robustness, not its success.
         """
         if not self.hold_known:
             return self
@@ -173,7 +176,7 @@ overestimate success on the road."""
 
 
 def measured_parameters(robot: HuskyParams) -> list[str]:
-    """Names of the `HuskyParams` that differ from the published robot's, and so need not be sampled."""
+    """Names of the measured parameters: those whose values differ from the published robot's."""
     published = HuskyParams()
     return [name for name in _RANGES_BY_PARAMETER if getattr(robot, name) != getattr(published, name)]
 
@@ -184,7 +187,7 @@ def condition_options(condition: Condition) -> dict[str, Any]:
 
 
 class NominalModel:
-    """The unrandomized model fields, from which samples are applied to copies of the model."""
+    """The model's fields without randomization; `apply` writes the fields of a sample to a copy of the model."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         """`model` is the compiled `episode_spec`."""
@@ -204,7 +207,7 @@ class NominalModel:
         model.geom_friction[tires, 0] = nominal["geom_friction"][tires, 0] * sample.friction
         radius = sample.wheel_radius * (1.0 + np.where(self._right, 0.5, -0.5) * sample.wheel_difference)
         model.geom_size[tires] = nominal["geom_size"][tires] * np.stack([radius, np.ones_like(radius), radius], 1)
-        # MuJoCo's bounds of a geom may be too large, but never too small.
+        # MuJoCo's bounds of a geom may be larger than the geom, but not smaller.
         scale = max(1.0, float(radius.max()))
         model.geom_rbound[tires] = nominal["geom_rbound"][tires] * scale
         model.geom_aabb[tires] = nominal["geom_aabb"][tires] * scale

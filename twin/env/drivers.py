@@ -1,12 +1,12 @@
 """Drivers: they convert poses or images to commands or actions.
 
 `PurePursuit` (Coulter 1992) follows a route from poses alone; `follow_route` records such a drive, without images and
-without dm_control. It steers on the circle through a point of the route ahead. A skid-steered robot turns faster or
-slower than commanded, by a factor that depends on ground and load: the gain of the commanded yaw rate follows the
-measured ratio.
+without dm_control. `PurePursuit` steers along a circle through a point of the route ahead. A skid-steered robot turns
+faster or slower than commanded, by a factor that depends on ground and load. So the yaw rate is multiplied by a gain
+that follows the measured ratio of commanded to achieved curvature.
 
 The *drivers of an environment* receive it and its newest `dm_env.TimeStep`, and return an action within its
-`action_spec`. Those that use poses serve as references; a policy uses images only.
+`action_spec`. Drivers that use poses serve as references; a policy uses images only.
 """
 
 import importlib
@@ -38,13 +38,13 @@ GOAL_RADIUS = 1.0  # [m]
 _LOOKAHEAD = 1.0  # [m] along the route
 _GAIN_RATE = 0.15  # fraction of the gain's error corrected per control step
 _GAIN_RANGE = (0.5, 2.5)
-_GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; below this the ratio is noise
-_SEARCH_WINDOW = (1.0, 3.0)  # [m] behind and ahead of the last foot point
+_GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; at smaller yaw rates the measured ratio is noise
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] of route behind and ahead of the last foot point
 
 
 @dataclass(frozen=True)
 class RecordedDrive:
-    """A recorded drive of k instants, one per control step of 0.1 s, the first at rest at the start."""
+    """A recorded drive of k instants, one per control step of 0.1 s; at the first one, the robot rests at the start."""
 
     times: Array
     """[s], shape (k,)."""
@@ -57,11 +57,11 @@ class RecordedDrive:
     commands: Array
     """v [m/s], ω [rad/s] commanded at each instant (the last row is zero), shape (k, 2)."""
     cross_track: Array
-    """Distance from the route, left positive [m], shape (k,)."""
+    """Signed distance from the route, positive to the left [m], shape (k,)."""
     progress: Array
     """Arc length of the nearest point of the route [m], shape (k,)."""
     touched: tuple[str, ...]
-    """Names of the touched geoms, without the ground, sorted."""
+    """Sorted names of the touched geoms; the ground is not among them."""
     outcome: str
     """goal, touched, off_corridor or timeout."""
 
@@ -161,10 +161,10 @@ def follow_route(
 
 
 def _outcome(world: World, pose: Array, s: float, length: float, error: float, touched: set[str], late: bool) -> str:
-    """The drive's outcome; empty while it goes on."""
+    """The drive's outcome; empty while the drive goes on."""
     if touched:
         return "touched"
-    # A route may pass its goal long before its end.
+    # A route may also pass near its goal long before its end; that is no success.
     if np.linalg.norm(pose[:2] - world.goal[:2]) < GOAL_RADIUS and s > length - 2 * GOAL_RADIUS:
         return "goal"
     if error > world.half_width:
@@ -181,7 +181,7 @@ def _pursuit_target(route: Array, s: float, length: float) -> Array:
 
 
 def _updated_gain(gain: float, previous: Array, pose: Array, command: tuple[float, float]) -> float:
-    """The gain moved towards the ratio of commanded to achieved curvature, which differs from 1 for skid steering."""
+    """Moves the gain towards the ratio of commanded to achieved curvature, which is not 1 for skid steering."""
     turned = float(heading_error(pose[2], previous[2])) / CONTROL_PERIOD
     moved = float(np.linalg.norm(pose[:2] - previous[:2])) / CONTROL_PERIOD
     v, yaw_rate = command
@@ -224,7 +224,7 @@ class BlindDriver:
 
 
 class PolicyDriver:
-    """Drives by a policy."""
+    """Takes its actions from a policy that receives the images."""
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
@@ -247,7 +247,7 @@ def find_callable(name: str) -> Policy:
     """Imports the callable `module:function`; the search path includes the working folder.
 
     Raises:
-        InputError: the import failed, or it is not callable.
+        InputError: the import fails, or the imported object is not callable.
     """
     module, _, function = name.partition(":")
     if not (module and function):

@@ -20,7 +20,7 @@ _ARRAY_FIELDS = ("times", "base_to_world", "qpos", "actions", "rewards", "speed"
 
 @dataclass(frozen=True)
 class Episode:
-    """k instants, one per control step, the first at rest at the start."""
+    """A recorded episode of k instants, one per control step; at the first one, the robot rests at its start."""
 
     times: Array
     """[s], shape (k,)."""
@@ -29,13 +29,13 @@ class Episode:
     qpos: Array
     """MuJoCo's positions, shape (k, nq)."""
     actions: Array
-    """Action at each instant in the units of the action spec; the last row is zero. Shape (k, actions)."""
+    """Action at each instant in the units of the action spec, shape (k, actions); the last row is zero."""
     rewards: Array
-    """Reward of the step that ended at each instant; the first is zero. Shape (k,)."""
+    """Reward of the step that ended at each instant, shape (k,); the first is zero."""
     speed: Array
     """[m/s], shape (k,)."""
     cross_track: Array
-    """Distance from the route, left positive [m], shape (k,)."""
+    """Signed distance from the route, positive to the left [m], shape (k,)."""
     progress: Array
     """Distance along the route segment [m], shape (k,)."""
     trust: Array
@@ -80,7 +80,7 @@ def record_episode(
     on_step: Callable[[dm_env.TimeStep], None] | None = None,
     max_steps: int | None = None,
 ) -> Episode:
-    """Drives one episode.
+    """Drives and records one episode.
 
     Args:
         environment: See `twin.load`.

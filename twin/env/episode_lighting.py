@@ -1,14 +1,14 @@
 """Lighting of an episode: sampling of appearance embeddings. The option `lighting` is one of
 
-    "sun"                a lighting by its name, or a frame's (`sun/000012`)
+    "sun"                a lighting by its name, or that of a frame (`sun/000012`)
     "sun:night:0.3"      a mixture: 30 % of the way from sun to night
     ("sun", "night")     one of these, sampled for every episode; each may be a mixture
-    "any"                sampled by `field.sample_lighting`: any that could have been filmed
+    "any"                any lighting that could have been filmed, sampled by `field.sample_lighting`
     "training"           sampled from the training set
     "held-out"           sampled from the held-out set
 
-With drift, an episode begins in one lighting, which changes over the drift's duration into another one, sampled in the
-same way.
+With drift, the lighting of an episode changes over the drift's duration into a second one, which is sampled in the same
+way; if a single lighting is named, the second one is another filmed lighting.
 """
 
 from collections.abc import Sequence
@@ -26,13 +26,14 @@ from twin.nerf.fog import Fog, mixed
 from twin.types import Array32
 
 VERSION = 2
-"""Version of the sampling from a set. Raise it when the same generator yields other lightings."""
+"""Version of the sampling from a set. Raise it when the same random generator gives other lightings."""
 
-_SEED = 20_240_315  # of the anchors; constant, so that every run on a build has the same sets
+_SEED = 20_240_315  # random seed of the anchors; constant, so that all runs with a build have the same sets
 _POOL_SIZE = 200  # random lightings among which anchors are chosen
-_EXTRA_ANCHORS = 8  # besides the filmed lightings
-_MARGIN = 1.25  # the other set's nearest anchor must be this many times as far as that of the lighting's set
-_MAX_TRIES = 60  # proposals per sample, of which about every tenth is near the chosen anchor
+_EXTRA_ANCHORS = 8  # number of anchors besides the filmed lightings
+# A lighting of a set is more than this many times as far from the other set's nearest anchor as from its own set's.
+_MARGIN = 1.25
+_MAX_TRIES = 60  # proposals per sample; about one in ten is near the chosen anchor
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class EpisodeLighting:
     fog: Fog | None = None
     """Fog at the beginning, if fitted to a photo; None: the film's."""
     end_fog: Fog | None = None
-    """The same after `duration`."""
+    """Fog after `duration`, if fitted to a photo; None: the film's."""
 
     def at(self, time: float) -> Array32:
         """The embedding after `time` [s], shape (dim,)."""
@@ -80,18 +81,18 @@ class Anchors:
 
 
 class LightingSets:
-    """Training and held-out lightings of one field: disjoint regions of the space of lightings, whatever the seed.
+    """Training and held-out lightings of one field: disjoint regions of the space of lightings, the same for all seeds.
 
     The distance of two lightings is the rms difference of the probes' colors (see `nerf/appearance_prior.py`). The
     filmed lightings are the first anchors and belong to the training set. Further anchors are chosen among random
-    lightings of a fixed seed, each as far as possible from those before; the first, third, fifth and so on are held
-    out. A lighting belongs to the set of its nearest anchor, or to neither if an anchor of the other set is nearly as
-    near. All anchors of a set are sampled equally often, since night would be rare otherwise.
+    lightings of a fixed seed, each as far as possible from the anchors before it; the first, third, fifth and so on of
+    these are held out. A lighting belongs to the set of its nearest anchor, or to no set if an anchor of the other set
+    is nearly as near. All anchors of a set are sampled equally often, since night would be rare otherwise.
     """
 
     def __init__(self, field: BakedField) -> None:
         self.field = field
-        # Photos added later must not move the sets, or a lighting used for training could become held out.
+        # Photos added later must not move the sets: a lighting used for training could become held out.
         self._filmed = field.lightings_by_name.filmed()
 
     @cached_property
@@ -115,7 +116,7 @@ class LightingSets:
         """A random lighting of a set, shape (dim,): near one of its anchors, which are equally likely.
 
         Raises:
-            InputError: none is found.
+            InputError: no lighting of the set is found.
         """
         own = np.flatnonzero(self.anchors.held_out == (which == HELD_OUT))
         anchor = int(rng.choice(own))
@@ -131,7 +132,7 @@ class LightingSets:
         )
 
     def set_and_anchor(self, embedding: Array32) -> tuple[str | None, int]:
-        """The set of a lighting (dim,), `TRAINING`, `HELD_OUT` or None, and the index of its nearest anchor."""
+        """Set of a lighting (dim,) (`TRAINING`, `HELD_OUT`, or None), and index of the anchor nearest to it."""
         distance = _distance(self.anchors.probe_colors, self._probe_colors(embedding))
         held_out, nearest = self.anchors.held_out, int(distance.argmin())
         to_training, to_held_out = float(distance[~held_out].min()), float(distance[held_out].min())
@@ -162,7 +163,7 @@ def sample_lighting(
     A single named lighting drifts into another filmed one.
 
     Raises:
-        InputError: an unknown lighting, or none that fits.
+        InputError: a lighting is unknown, or none is found.
     """
     name, start, fog = _sample_one(lighting, sets, rng)
     if not drift:

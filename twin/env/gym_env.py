@@ -4,15 +4,17 @@
     gymnasium.make_vec("twin:twin/Drive-v0", 8, vectorization_mode="vector_entry_point", scene="scenes/demo")
 
 `twin:` makes Gymnasium import `twin`, which registers the environment; new processes, such as those of
-stable-baselines3's SubprocVecEnv, need this.
+stable-baselines3's SubprocVecEnv, need this prefix.
 
-Actions in [-1, 1] span the action range of the dm_control environment. Observations are images, uint8, shape
-(3 · stack, height, width), the newest three channels last; with `pixels=False` the privileged state, float32, see
-`RewardAndTermination.state`, clipped to the bounds of the observation space. With the option `state` they are a dict of
-both, `pixels` and `state`. `info` contains `cause` (of the episode's
-end, or empty), `is_success`, `progress` [m], `start` [m] (offset of the start along the route segment), `cross_track`
-[m], `lighting`, `trust`, `randomisation`, `episode_seed`, `speed` [m/s] and `touched`. `lighting` is the episode's: its
-name, or for a sampled one the set and the nearest mixture of filmed lightings, `training: sun 0.62, night 0.38`.
+Actions in [-1, 1] span the action range of the dm_control environment. Observations are images: uint8, shape
+(3 · stack, height, width), the newest three channels last. With `pixels=False`, they are the privileged state of
+`RewardAndTermination.state`: float32, clipped to the bounds of the observation space. With the option `state`, they are
+a dict of images (`pixels`) and numbers (`state`).
+
+`info` contains `cause` (why the episode ended; empty before its end), `is_success`, `progress` [m], `start` [m] (offset
+of the start along the route segment), `cross_track` [m], `lighting`, `trust`, `randomisation`, `episode_seed`, `speed`
+[m/s] and `touched`. `lighting` is the name of the episode's lighting; if it was sampled, the name of the set and the
+nearest mixture of filmed lightings: `training: sun 0.62, night 0.38`.
 """
 
 from collections.abc import Sequence
@@ -64,14 +66,14 @@ def observations(envs: LocalVectorEnv | ProcessVectorEnv) -> NDArray | dict[str,
 
 
 def of_one(observations: NDArray | dict[str, NDArray], i: int) -> NDArray | dict[str, NDArray]:
-    """Environment i's part of observations."""
+    """The observation of environment i."""
     if isinstance(observations, dict):
         return {name: values[i] for name, values in observations.items()}
     return observations[i]
 
 
 def _info(envs: LocalVectorEnv | ProcessVectorEnv, i: int) -> dict[str, Any]:
-    """Environment i's info with the sampled lighting in place of its name in tables."""
+    """Info of environment i; `lighting` is the sampled lighting, if there is one, instead of the name in tables."""
     info = envs.info(i)
     return info | {"lighting": info.pop("sampled_lighting")} if "sampled_lighting" in info else info
 
@@ -83,7 +85,7 @@ def _check_render_mode(render_mode: str | None) -> str | None:
 
 
 def _check_view(size: Any, view: str, pixels: bool) -> tuple[int, int] | None:
-    """Returns the size of rendered pictures; None: pictures of the observation are shown."""
+    """Returns the size of rendered pictures; None if the observation's own images are shown."""
     if view not in (ROBOT, CHASE):
         raise InputError(f"render_view = {short_repr(view)}; expected {ROBOT!r} or {CHASE!r}")
     if size is None:
@@ -157,9 +159,10 @@ class DriveEnv(gymnasium.Env):
     def render(self) -> NDArray | None:
         """A picture, uint8 (height, width, 3).
 
-        By default it is the newest image of the observation; None without pixels. With `render_size`, it is the robot's
-        view at that instant, with the episode's lighting, obstacles and weather, but without camera noise. The chase
-        view shows the present. Rendering changes no observation and no random draw.
+        By default it is the newest image of the observation; None without pixels. With `render_size`, the same view is
+        rendered at that size, with the episode's lighting, obstacles and weather, but without camera noise. The chase
+        view shows the robot's present pose, even if the camera has a latency. Rendering changes no observation and no
+        random draw.
         """
         if self.render_mode is None:
             return None
@@ -182,7 +185,7 @@ class DriveEnv(gymnasium.Env):
 
     @property
     def _local(self) -> LocalVectorEnv:
-        assert isinstance(self.vector_env, LocalVectorEnv)  # as a single environment is
+        assert isinstance(self.vector_env, LocalVectorEnv)  # `make_vector_env` returns one for one environment
         return self.vector_env
 
     def close(self) -> None:
@@ -190,8 +193,8 @@ class DriveEnv(gymnasium.Env):
 
 
 class DriveVectorEnv(VectorEnv):
-    """n environments. One whose episode ends is reset in the same step; its last observation and info are in
-    `final_obs` and `final_info`."""
+    """n environments. An environment whose episode ends is reset in the same step; the last observation and info of the
+    ended episode are in `final_obs` and `final_info`."""
 
     metadata = {**DriveEnv.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
@@ -215,7 +218,7 @@ class DriveVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Resets all environments; a single seed gives environment i the seed + i."""
+        """Resets all environments; if `seed` is one number, environment i gets `seed` + i."""
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
         for i, one in enumerate(seeds or ()):
             if one is not None:

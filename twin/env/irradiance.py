@@ -37,22 +37,22 @@ curve of a film (exponent 1 / 2.2) shows as 0.37. With 0.38 (12 %), obstacles at
 `benchmarks/overlay.py` (6 dB better than unshaded). So that benchmark is no independent test of this value."""
 
 SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-"""Horizontal directions that light is resolved into, shape (4, 3)."""
+"""Horizontal directions; the light is split into parts from each of them, shape (4, 3)."""
 
-_CAMERA_HEIGHT, _CAMERA_PITCH = 1.0, 8.0  # [m], [°] of the views that probes are taken from
-_CAMERA_STEP = 2.0  # [m] along the route
+_CAMERA_HEIGHT, _CAMERA_PITCH = 1.0, 8.0  # [m], [°] height and downward pitch of the views from which probes are taken
+_CAMERA_STEP = 2.0  # [m] along the route, between two views
 _VIEW_SIZE, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
-_MAX_GROUND_DEPTH, _MAX_DEPTH = 7.0, 12.0  # [m] up to which probes are taken
-_GROUND_TOLERANCE = 0.12  # [m] from the ground
+_MAX_GROUND_DEPTH, _MAX_DEPTH = 7.0, 12.0  # [m] largest z-depth of ground probes and of all probes
+_GROUND_TOLERANCE = 0.12  # [m] ground probes are at most this far above or below the route, plus 5 % of their distance
 _MIN_UPRIGHT_HEIGHT = 0.3  # [m] above the ground; only probes higher than this count as upright
 _MAX_GROUND_PROBES, _MAX_UPRIGHT_PROBES = 3000, 1500
-_KERNEL_STD = 1.5  # [m] of the ground probes' weights around a position
+_KERNEL_STD = 1.5  # [m] standard deviation of the Gaussian weights of ground probes around a position
 _BOUNCE = 0.25  # radiosity of the ground over that of the sky, in the mean of the filmed lightings
 _UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky; facing up it is 1
 _MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # limits of the sun's share of light and of its elevation's cotangent
 _MIN_COLOR = 0.02  # a probe whose mean color is darker is not used
-_MAX_BRIGHTNESS = 1.5  # times the ground's brightest: brighter surfaces emit light
-_NEIGHBORS = 8  # ground probes around an upright one
+_MAX_BRIGHTNESS = 1.5  # times the brightest ground irradiance; brighter probes are not used, since they emit light
+_NEIGHBORS = 8  # number of ground probes that give the ground irradiance at an upright one
 _MIN_PROBES = 50  # fewer on the ground are an error; with fewer upright ones, a uniform sky is assumed
 _LIGHTINGS_CACHED, _POSITIONS_CACHED = 64, 1000
 
@@ -64,13 +64,13 @@ class Irradiance:
     xy: Array
     """Positions of the ground probes [m], shape (k, 2)."""
     up: Array
-    """Ground irradiance at them, shape (k, 3)."""
+    """Ground irradiance at these positions, shape (k, 3)."""
     constant: Array
     """Constant part of the light: on normals that do not face up (row 0), and from `SIDE_DIRECTIONS`, shape (5, 3)."""
     proportional: Array
     """Part of the light proportional to the ground irradiance, as a factor of it; rows as in `constant`, (5, 3)."""
     _cache: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
-    """Ground irradiance at recent positions; most objects stand still."""
+    """Cached ground irradiance at recent positions, since most objects stand still."""
 
     def ground(self, xy: Array) -> Array:
         """Ground irradiance at positions (n, 2) [m], shape (n, 3)."""
@@ -143,7 +143,7 @@ class IrradianceEstimator:
         names = baked.lightings
         grounds = [self._ground.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
         uprights = [self._upright.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
-        # Lightings are scaled to one brightness of the ground before their mean is taken.
+        # Lightings are scaled to the same brightness of the ground before their mean is taken.
         mean_ground = np.mean([colors / colors.mean(0) for colors in grounds], 0)
         self._mean = np.mean([c / ground.mean(0) for c, ground in zip(uprights, grounds, strict=True)], 0)
         # Irradiance of the mean lighting at the upright probes.
@@ -152,7 +152,7 @@ class IrradianceEstimator:
         self._rows = _basis(self._upright.normals)
 
     def estimate(self, lighting: str | NDArray) -> Irradiance:
-        """The irradiance of a lighting, by name or embedding (dim,). The last ones are cached."""
+        """The irradiance of a lighting, by name or embedding (dim,). Recent estimates are cached."""
         embedding = self._field.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
         key = embedding.tobytes()
         with self._lock:
@@ -178,7 +178,7 @@ class IrradianceEstimator:
         for c in range(3):
             usable = (self._mean[:, c] > _MIN_COLOR) & (seen[:, c] < _MAX_BRIGHTNESS * up[:, c].max())
             rows = np.concatenate([self._rows, self._rows * ground[:, c : c + 1]], 1)[usable]
-            # The normal equations have the same minimum as all the rows.
+            # The Cholesky factor of the normal equations replaces the many rows; the minimum is the same.
             square = np.linalg.cholesky(rows.T @ rows + 1e-6 * len(rows) * np.eye(10))
             found[:, c], _ = nnls(square.T, np.linalg.solve(square, rows.T @ sides[usable, c]))
         return Irradiance(self._xy, up, found[:5], found[5:])
@@ -204,7 +204,7 @@ class _SurfacePoints:
 
 
 def _surface_points(field: BakedField, route: Array) -> _SurfacePoints:
-    """Surface points in views of the field from along the route, without pixels at depth edges."""
+    """Surface points in views of the field along the route; pixels at depth edges are left out."""
     width, height = _VIEW_SIZE
     poses = []
     for s in np.arange(0.0, arc_lengths(route)[-1], _CAMERA_STEP):
@@ -291,22 +291,22 @@ BOX_CORNERS = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).resha
 """Corners of a box around the origin, in half sides, shape (8, 3)."""
 
 _PENUMBRA = 0.03, 0.10
-"""Half width of the penumbra at the foot [m], and its growth per metre behind the foot; covers the sun's disk and halo,
-and the error of the estimated direction."""
+"""Half width of the penumbra at the foot [m], and its growth per meter behind the foot. They account for the size of
+the sun's disk and halo, and for the error of the estimated direction."""
 _FILL = 0.85  # fraction of a box's sides that an obstacle really fills
 _SKY_LOSS_BELOW = 0.75  # fraction of the sky's light lost straight below an obstacle, which does not fill its box
-_SKY_REACH = 1.2  # [m] from an obstacle's side up to which it hides the sky
-_MAX_SHADOW = 4.0  # [m] length of a shadow behind the foot
-_SHADOW_TOLERANCE = 0.15  # [m] above or below the foot within which a surface counts as ground
-_MAX_DISTANCE = 25.0  # [m] from the camera, beyond which shadows are not drawn
+_SKY_REACH = 1.2  # [m] an obstacle's side hides part of the sky from ground up to this distance
+_MAX_SHADOW = 4.0  # [m] largest length of a shadow behind the foot
+_SHADOW_TOLERANCE = 0.15  # [m] surfaces at most this far above or below the foot count as ground
+_MAX_DISTANCE = 25.0  # [m] shadows further from the camera than this are not drawn
 
 
 class ContactShadows:
     """Soft shadows of a model's obstacles on the reconstructed ground.
 
     The light is that of a uniform sky and one sun, whose direction and share `Irradiance.sun` estimates. The ground
-    beside an obstacle loses the part of the sky that the obstacle hides; the ground behind it loses the sun within the
-    obstacle's outline, with a penumbra that widens with the distance. An obstacle is approximated by two upright boxes,
+    beside an obstacle loses the part of the sky that the obstacle hides; the ground behind it loses the sunlight within
+    the obstacle's shadow, whose penumbra widens with the distance. An obstacle is approximated by two upright boxes,
     around its lower and its upper geoms.
     """
 
@@ -336,7 +336,7 @@ class ContactShadows:
             rays: Rays of the pixels in the camera frame, with z = 1, shape (height, width, 3).
             pose: camera_to_world, OpenCV axes, shape (4, 4).
             data: Poses of the bodies.
-            irradiance: Of the lighting.
+            irradiance: Irradiance under the lighting.
         """
         for body, boxes in self._boxes.items():
             foot = data.xpos[body]
@@ -374,7 +374,7 @@ def _light_loss(boxes: Array, points: Array, turn: Array, share: float, sun: Arr
     hidden = np.zeros(len(points))
     for low, high in boxes:
         center, half = 0.5 * (low + high)[:2], 0.5 * _FILL * (high - low)[:2]
-        # Sky, weighted with the cosine: an endless wall hides half of it; a box hides less, by its width and height.
+        # Sky, weighted with the cosine: an endless wall hides half of it, a box less, depending on its size.
         gap = np.linalg.norm(np.maximum(np.abs(local - center) - half, 0.0), axis=1)
         wide = np.arctan2(float(half.mean()), gap) / np.pi
         gap2 = gap**2 + 1e-6

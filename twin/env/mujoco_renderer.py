@@ -1,7 +1,7 @@
 """Pictures of a MuJoCo scene by `mujoco_warp`'s ray caster on the CPU, without OpenGL.
 
-`SceneRenderer` shows the scene to the front camera as MuJoCo itself does, the standard pipeline that a radiance field
-is compared with. `SceneCamera` shows it from free poses, with the convex collision parts half transparent over the
+`SceneRenderer` renders the front camera's view with MuJoCo's own shading: the standard pipeline that radiance fields
+are compared with. `SceneCamera` renders from free poses, with the convex collision parts half transparent over the
 visual geometry; the *chase camera* follows the robot from behind and above.
 """
 
@@ -34,7 +34,8 @@ from twin.warp_runtime import wp
 FRONT_CAMERA = "front"
 """Name of the policy's camera in a model."""
 
-_POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")  # that a picture depends on
+# Poses that a picture depends on.
+_POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")
 _SCENE_SETTINGS: dict[str, Any] = {  # collision parts are not drawn
     "enabled_geom_groups": [0, 1, 2, OBSTACLE_GROUP],
     "render_skybox": True,
@@ -42,7 +43,7 @@ _SCENE_SETTINGS: dict[str, Any] = {  # collision parts are not drawn
     "enable_backface_culling": False,
 }
 _SPLAT_SETTINGS = _SCENE_SETTINGS | {"enabled_geom_groups": [GROUND_GROUP, 1, OBSTACLE_GROUP]}  # no visual mesh
-_GROUND_BELOW_SPLATS = 0.15  # [m] by which the ground is drawn lower, to show only where there are no splats
+_GROUND_BELOW_SPLATS = 0.15  # [m] the ground is drawn this much lower, so that it shows only between splats
 
 
 def camera_intrinsics(model: mujoco.MjModel, camera: int, size: tuple[int, int]) -> Array:
@@ -65,10 +66,10 @@ def camera_poses(datas: Sequence[mujoco.MjData], camera: int, noise: Sequence[Ca
 
 
 class RayCaster:
-    """`mujoco_warp`'s ray caster for one model on the CPU, with free rays. Not for two threads at once."""
+    """`mujoco_warp`'s ray caster for one model on the CPU, for rays that the caller chooses. Not thread-safe."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, **context: Any) -> None:
-        """`data` is a state after `mj_forward`; `context` has arguments of `mujoco_warp.create_render_context`."""
+        """`data` is a state after `mj_forward`; `context` is passed to `mujoco_warp.create_render_context`."""
         import mujoco_warp as mjw  # slow to import
 
         self._mjw = mjw
@@ -88,11 +89,11 @@ class RayCaster:
     def set_rays(self, rays: Array32) -> None:
         """Sets the unit rays (k, 3) in MuJoCo's camera axes; k is at most `max_rays`."""
         self._context.ray.numpy()[: len(rays)] = rays
-        # The context has rays of a whole picture; only the first `total_rays` are cast.
+        # The context has room for the rays of a whole picture; only the first `total_rays` are cast.
         self._context.total_rays = len(rays)
 
     def cast(self) -> tuple[Array32, Array32]:
-        """Casts the rays. Colors (k, 3) in [0, 255] and z-depth (k,) [m], 0 where nothing is hit."""
+        """Casts the rays; returns colors (k, 3) in [0, 255] and z-depth (k,) [m], 0 where nothing is hit."""
         with wp.ScopedDevice("cpu"):
             self._mjw.render(self._model, self._data, self._context)
         count = self._context.total_rays
@@ -101,7 +102,7 @@ class RayCaster:
         return rgb, self._context.depth_data.numpy()[0, :count].copy()
 
     def hit_geoms(self) -> NDArray[np.int32]:
-        """Geom that each ray of the last cast hit, −1 for none, shape (k,); needs `render_seg=True`."""
+        """Index of the geom that each ray of the last cast hit, −1 for none, shape (k,); needs `render_seg=True`."""
         return self._context.seg_data.numpy()[0, : self._context.total_rays, 0].copy()
 
 
@@ -115,17 +116,17 @@ def mujoco_rays(rays: Array) -> Array32:
 
 
 class SceneRenderer:
-    """Renders envs as MuJoCo shows them to their front cameras; has the interface of `Compositor`.
+    """Renders the front cameras' views with MuJoCo's own shading; has the interface of `Compositor`.
 
-    It draws obstacles and the robot under the model's own lights, and as the place either the visual mesh in its filmed
-    colors with the ground, or Gaussian splats, which hide what lies behind them and are hidden by what is before them;
-    the ground is then seen through their gaps.
+    Obstacles and the robot are lit by the model's own lights. The place is drawn either as the visual mesh in its
+    filmed colors with the ground, or as Gaussian splats. Splats and geoms occlude each other, and the ground shows
+    through the gaps between splats.
     """
 
     def __init__(
         self, model: mujoco.MjModel, size: tuple[int, int], max_envs: int, splats: Gaussians | None = None
     ) -> None:
-        """`model` has the visuals that `episode_spec` keeps; other arguments as of `Compositor`."""
+        """`model` is from `episode_spec` with visuals; splats replace its visual mesh; the rest as in `Compositor`."""
         self.size = size
         self._camera = model.camera(FRONT_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
@@ -134,7 +135,7 @@ class SceneRenderer:
         model.geom_group[camera_mount_geoms(model, self._camera)] = ROBOT_COLLISION_GROUP  # not drawn
         if splats is not None:
             model.geom_pos[model.geom("ground").id, 2] -= _GROUND_BELOW_SPLATS
-        # One after the other, as Warp compiles kernels at their first use.
+        # Created one after the other, since Warp compiles kernels at their first use.
         threads = min(max_envs, available_cores())
         settings = _SCENE_SETTINGS if splats is None else _SPLAT_SETTINGS | splats.render_settings()
         self._workers = [_SceneWorker(model, size, self._rays, settings) for _ in range(threads)]
@@ -189,7 +190,7 @@ class _SceneWorker:
             **settings,
         )
         self._caster.set_rays(mujoco_rays(rays))
-        self.render(self._data, camera_pose(self._data, self._camera))  # compiles
+        self.render(self._data, camera_pose(self._data, self._camera))  # compiles the kernels
 
     def render(self, data: mujoco.MjData, pose: Array) -> tuple[Array32, Array32]:
         """Colors (height, width, 3) in [0, 1] and z-depth (height, width) [m], 0 for sky, from an OpenCV pose."""
@@ -213,7 +214,7 @@ _SMOOTHING = 0.15  # low-pass gain of the camera heading per control step (0.1 s
 _PART_GROUPS = [3]
 _PART_ALPHA = 0.45
 _EDGE_RGB = (20, 20, 30)
-_OCCLUSION_TOLERANCE = 0.6  # [m] behind the visible surface, up to which a part counts as visible
+_OCCLUSION_TOLERANCE = 0.6  # [m] a part at most this far behind the visible surface is drawn, too
 
 
 class SceneCamera:
@@ -274,7 +275,7 @@ class SceneCamera:
 def blend_parts(rgb: Image, depth: NDArray, part_rgb: Image, part_depth: NDArray, identity: NDArray) -> Image:
     """Blends visible collision parts, with outlines, over a picture (h, w, 3); z-depths [m] have shape (h, w).
 
-    `depth` is 0 where nothing is hit; `identity` is the id of the visible part, −1 for none.
+    `depth` is 0 where nothing is hit; `identity` is the id of the nearest part, −1 for none.
     """
     visible = (identity >= 0) & ((depth <= 0) | (part_depth <= depth + _OCCLUSION_TOLERANCE))
     edge = np.zeros_like(visible)

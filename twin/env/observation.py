@@ -1,10 +1,10 @@
-"""Pixel observations of n envs: one renderer call for all, and frame stacks, the newest frame last.
+"""Pixel observations of n envs: one call of the renderer gives the images of all envs, which are kept in frame stacks.
 
-At the beginning of an episode its first frame fills the stack.
+The newest frame of a stack is the last. At the beginning of an episode, its first frame fills the stack.
 """
 
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
-# (inside kernels, Warp's own types hold, which mypy does not know)
+# (kernels use Warp's own types, which mypy does not know)
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -44,8 +44,8 @@ class PixelObserver:
         Args:
             renderer: Renders the envs.
             field: Contains the lightings; None: MuJoCo renders the mesh, or splats, under its own lights.
-            trust: From the filmed frames.
-            options: Of the envs.
+            trust: Computes the trust of images from the filmed frames.
+            options: Options of the envs.
             envs: Physics and task of every env.
         """
         self._renderer, self.options, self.envs = renderer, options, list(envs)
@@ -76,7 +76,7 @@ class PixelObserver:
             self._add_frames(which, fill=True)
 
     def set_lighting(self, i: int, lighting: EpisodeLighting, fill: bool) -> None:
-        """Replaces the lighting of env i's episode from the next frame on; `fill` renders its frame stack again."""
+        """Replaces the lighting of env i's episode from the next frame on; `fill` also renews the whole frame stack."""
         self.lightings[i] = lighting
         self._begin_weather(i)
         if fill:
@@ -98,7 +98,7 @@ class PixelObserver:
             self._add_frames(which, fill=False)
 
     def info(self, i: int) -> dict[str, Any]:
-        """Entries of env i's info: `lighting`, by its name in tables, and `trust`."""
+        """Entries of env i's info: `lighting` (the name used in tables) and `trust`."""
         lighting = self.lightings[i]
         name = str(Condition(lighting.name, bool(self.options.randomise))) if lighting else ""
         return {"lighting": name, "trust": float(self.trust[i])}
@@ -163,9 +163,10 @@ def _push_frames(
 
 
 class GpuPixelObserver(PixelObserver):
-    """Renders n envs and keeps their frame stacks on the field's device, for policies that learn there.
+    """Renders n envs and keeps their frame stacks on the field's device, for policies that are trained there.
 
-    It shows the field alone. Obstacles, weather and camera noise need `PixelObserver`, which composites on the host.
+    Its images show only the field. Obstacles, weather and camera noise need `PixelObserver`, which composites on the
+    host.
     """
 
     def __init__(
@@ -184,13 +185,13 @@ class GpuPixelObserver(PixelObserver):
 
     @property
     def stacks(self) -> Image:  # type: ignore[override]
-        """A copy on the host, shape (n, stack, 3, height, width)."""
+        """A copy of the stacks on the host, shape (n, stack, 3, height, width)."""
         n, stack, channels, _ = self._stacks.shape
         width, height = self.options.size
         return self._stacks.numpy().reshape(n, stack, channels, height, width).copy()
 
     def tensor(self) -> "torch.Tensor":
-        """The stacks on the device, uint8 (n, 3 · stack, height, width); overwritten by the next step."""
+        """The stacks on the device, uint8 (n, 3 · stack, height, width); the next step overwrites them."""
         import torch  # noqa: F401, as Warp's conversion needs it
 
         width, height = self.options.size

@@ -1,7 +1,8 @@
-"""Obstacle geometry: plain primitives and hulls in plain colors, without mesh or texture files.
+"""Obstacle geometry: primitives and convex hulls in uniform colors, without mesh or texture files.
 
-An obstacle's frame: x to its front, y to its left, z up, origin on the ground below its center. Its geoms are in group
-`OBSTACLE_GROUP`, both visible and solid; collision-only geoms are in the robot's collision group.
+In an obstacle's frame, x points to its front, y to its left and z up; the origin is on the ground below its center. Its
+geoms are in group `OBSTACLE_GROUP` and are both visible and solid; collision-only geoms are in the robot's collision
+group.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +37,7 @@ _STEEL, _RED, _LAMP = (0.50, 0.51, 0.53), (0.60, 0.08, 0.06), (0.88, 0.87, 0.80)
 
 
 class ObstacleModel:
-    """Adds geoms to one body, all in one group, and either all solid or all visual-only."""
+    """Adds geoms to one body. All are in one group, and either all are solid or all are visual-only."""
 
     def __init__(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, group: int = OBSTACLE_GROUP, solid: bool = True):
         """Geoms are named `<body>_<number>`; with `solid=False` they have no contacts."""

@@ -1,9 +1,9 @@
-"""Obstacles on the route: added to a model before it is compiled, sampled per episode, moved during simulation.
+"""Obstacles on the route: they are added to a model before it is compiled, sampled per episode, moved in simulation.
 
-*Station* is the arc length on the route [m], *lateral* the distance from it, left positive [m]. An obstacle is a mocap
-body `obstacle_<name>`, which no force moves; its geoms are `obstacle_<name>_<number>`. One model serves many episodes:
-`place` sets the poses of an episode's obstacles and parks the others far below the ground. The model stores the route
-as the numeric `obstacle_route`.
+*Station* is the arc length on the route [m], *lateral* the signed distance from it, positive to the left [m]. An
+obstacle is a mocap body `obstacle_<name>`, which forces do not move; its geoms are `obstacle_<name>_<number>`. One
+model serves many episodes: `place` sets the poses of an episode's obstacles and parks the others far below the ground.
+The model stores the route as the numeric `obstacle_route`.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,14 +26,14 @@ STATIC_KINDS = ("cone", "box", "bollard")
 _ROUTE_NUMERIC = "obstacle_route"
 _PARKED_HEIGHT = -100.0  # [m], far below the ground
 _ROBOT_HALF_WIDTH = 0.34  # [m]
-_CLEARANCE = 0.15  # [m] between a passing robot and a random obstacle
-_RANDOM_MARGIN = 0.5  # [m] beyond the corridor's edge, up to which random obstacles stand
-_MAX_TRIES = 20  # samples of a distractor object's position
+_CLEARANCE = 0.15  # [m] gap between a random obstacle and a robot that passes it within the corridor
+_RANDOM_MARGIN = 0.5  # [m] random obstacles stand at most this far beyond the corridor's edge
+_MAX_TRIES = 20  # samples of a distractor object's position, after which it is left out
 _ROBOT_RADIUS = 0.6  # [m] from its base to the farthest corner
-_DISTRACTOR_STRIP = 2.5  # [m] beside the corridor, where distractor objects stand
+_DISTRACTOR_STRIP = 2.5  # [m] width of the strip beside the corridor where distractor objects stand
 _FREE_ENDS = (4.0, 3.0)  # [m] at the route's start and end without random obstacles
-_SPACING = 4.0  # [m] along the route between random obstacles, where the route is long enough
-_SINK_DEPTH = 0.01  # [m] into the ground, to avoid a visible gap below
+_SPACING = 4.0  # [m] along the route between random obstacles; less on routes that are too short for it
+_SINK_DEPTH = 0.01  # [m] obstacles are sunk this far into the ground, to avoid a visible gap below
 
 
 def body_name(obstacle: ObstacleConfig, number: int) -> str:
@@ -42,10 +42,10 @@ def body_name(obstacle: ObstacleConfig, number: int) -> str:
 
 
 def add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[ObstacleConfig], world: World) -> None:
-    """Adds the bodies of obstacles to a scene, parked; `place` moves them in the compiled model.
+    """Adds the bodies of obstacles to a scene, below the ground; `place` moves them in the compiled model.
 
     Raises:
-        InputError: an unknown kind, or two obstacles of one name.
+        InputError: a kind is unknown, or two obstacles have the same name.
     """
     names = [body_name(one, k) for k, one in enumerate(obstacles)]
     if len(set(names)) < len(names):
@@ -60,7 +60,7 @@ def add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[ObstacleConfig], worl
 
 
 def place(obstacles: Sequence[ObstacleConfig], data: mujoco.MjData, time: float) -> None:
-    """Sets the mocap poses of an episode's obstacles at a time [s], and parks the model's other obstacles.
+    """Sets the mocap poses of an episode's obstacles at a time [s], and parks all others in the model.
 
     Call it before every step if an obstacle moves, and once after each `mj_resetData`, which parks all of them.
 
@@ -135,10 +135,10 @@ def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
 def random_obstacles(
     world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
 ) -> tuple[ObstacleConfig, ...]:
-    """Samples static obstacles `random_<number>` along the route, with spacing, and room to pass within the corridor.
+    """Samples static obstacles `random_<number>` along the route, with gaps, and room to pass within the corridor.
 
     Raises:
-        InputError: the route is too short for that many.
+        InputError: the route is too short for `count` obstacles.
     """
     length = float(arc_lengths(world.route)[-1])
     room = length - sum(_FREE_ENDS)
@@ -164,7 +164,7 @@ def random_distractors(
 ) -> tuple[ObstacleConfig, ...]:
     """Samples distractor objects beside the corridor, out of reach of a robot within it.
 
-    Names as of `random_obstacles`. A winding route may leave room for fewer than `count`.
+    They are named as in `random_obstacles`. A winding route may leave room for fewer than `count`.
     """
     route, out = world.route[:, :2], []
     length = float(arc_lengths(world.route)[-1])
@@ -174,7 +174,7 @@ def random_distractors(
         for _ in range(_MAX_TRIES):
             station = float(rng.uniform(0.0, length))
             lateral = float(rng.uniform(nearest, nearest + _DISTRACTOR_STRIP) * rng.choice([-1.0, 1.0]))
-            # Inside a bend, a point beside one part of the route may lie on another.
+            # In a bend, a point beside one part of the route may lie on another part.
             if np.linalg.norm(route - _route_point(route, station, lateral), axis=1).min() >= nearest:
                 out.append(ObstacleConfig(f"random_{k}", kind, station, lateral, float(rng.uniform(-180.0, 180.0))))
                 break
@@ -183,14 +183,14 @@ def random_distractors(
 
 # ---- obstacles of an episode
 
-_COLOR_SEED = 7  # of distractor objects
+_COLOR_SEED = 7  # random seed of the distractor objects' colors
 _ROUTE_STEP = 0.25  # [m] between points of a segment's route
 
 
 class EpisodeObstacles:
-    """Obstacles of a task's episodes: given ones, random ones along the segment, and distractor objects.
+    """Obstacles of a task's episodes: configured ones, random ones along the segment, and distractor objects.
 
-    A compiled model cannot gain bodies, so it contains a *pool* with the largest number of every kind.
+    No bodies can be added to a compiled model, so it contains a *pool* with the largest number of every kind.
     """
 
     def __init__(
@@ -200,7 +200,7 @@ class EpisodeObstacles:
         Args:
             wanted: Number of random obstacles per episode, or the obstacles of all episodes.
             world: Contains route and corridor.
-            segment: Random obstacles stand on it.
+            segment: Route segment along which random obstacles stand.
             beside: Largest number of distractor objects.
         """
         self._count = wanted if isinstance(wanted, int) else 0
@@ -230,7 +230,7 @@ class EpisodeObstacles:
     def _from_pool(
         self, sampled: Sequence[ObstacleConfig], member: Callable[[str, int], ObstacleConfig]
     ) -> list[ObstacleConfig]:
-        """Members of the pool at the poses of sampled obstacles."""
+        """Returns members of the pool, moved to the poses of sampled obstacles."""
         out: list[ObstacleConfig] = []
         for one in sampled:
             mine = member(one.kind, sum(other.kind == one.kind for other in out))
@@ -247,7 +247,7 @@ def _static_obstacle(kind: str, number: int) -> ObstacleConfig:
 
 
 class ObstacleMotion:
-    """Moves an episode's obstacles; for `HuskyPhysics.move_obstacles`."""
+    """Moves an episode's obstacles; used as `HuskyPhysics.move_obstacles`."""
 
     def __init__(self, obstacles: Sequence[ObstacleConfig], data: mujoco.MjData) -> None:
         self.obstacles, self._data = tuple(obstacles), data

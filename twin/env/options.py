@@ -30,7 +30,7 @@ CPU, CUDA = "cpu", "cuda"
 
 @dataclass(frozen=True)
 class Rewards:
-    """Reward terms. The last step of an episode earns the term of its cause; the goal earns `step` as well."""
+    """Reward terms. The last step gets the term named after the cause of the episode's end; the goal, also `step`."""
 
     step: float = 0.1
     """Reward of each step that does not end the episode."""
@@ -43,9 +43,9 @@ class Rewards:
     progress: float = 0.0
     """Reward per meter along the route; backward motion counts negative."""
     cross_track: float = 0.0
-    """Reward per step, times the distance from the route as a fraction of the corridor's half width."""
+    """Reward per step at or beyond the corridor's edge; within it, proportional to the distance from the route."""
     steering: float = 0.0
-    """Reward per step, times the square of the commanded yaw rate as a fraction of the largest."""
+    """Reward per step at the largest yaw rate; proportional to the square of the commanded yaw rate."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Options:
     stack: int = 4
     """Number of images in an observation, the newest last."""
     pixels: bool = True
-    """Observe images; otherwise the state of `RewardAndTermination.state`, which needs no field."""
+    """True: images are observed; False: the state of `RewardAndTermination.state`, which needs no field."""
     state: str | None = None
     """Numbers observed besides the images: `odometry` (speed [m/s], yaw rate [rad/s]), `privileged` (the state of
     `RewardAndTermination.state`, which needs the map), or None."""
@@ -79,24 +79,24 @@ class Options:
     start_heading: float = 10.0
     """The start's heading relative to the route is uniform within ± this [°]."""
     start_along: float = 0.0
-    """Half of the episodes start further along, uniform up to this fraction of the route segment."""
+    """Half of the episodes start further along the route segment, by a uniform fraction of it between 0 and this."""
     observe: str = NERF
-    """nerf: images of the field; simulator: MuJoCo's images of the extracted mesh, under MuJoCo's lights; splats: of a
-    file's Gaussian splats, with obstacles and robot under MuJoCo's lights."""
+    """nerf: images of the field; simulator: MuJoCo's images of the extracted mesh, under MuJoCo's lights; splats:
+    MuJoCo's images of a file's Gaussian splats, with obstacles and robot under MuJoCo's lights."""
     splats: str | Path | None = None
-    """A 3DGS .ply in the scene's frame (meters, z up), for `observe="splats"`; its lighting is the only one."""
+    """A 3DGS .ply in the scene's frame (meters, z up), for `observe="splats"`; all episodes have its lighting."""
     lighting: str | Sequence[str] = TRAINING
-    """See `episode_lighting.py`."""
+    """Lighting of the episodes; see `episode_lighting.py`."""
     lighting_drift: bool = False
     """The lighting changes during an episode."""
     obstacles: str | int | Sequence[ObstacleConfig] = "scene"
-    """`scene`: those of scene.toml; a number: that many static ones, sampled per episode; a list: exactly these."""
+    """`scene`: the obstacles of scene.toml; a number: that many static ones, sampled per episode; a list: these."""
     camera: CameraOptions | None = None
     """Camera noise: vibration, exposure, blur. None: no noise."""
     randomise: Ranges | None = None
     """Ranges of robot, weather and distractor objects; True: the default ones; None or False: no randomization."""
     device: str = CPU
-    """cpu or cuda, which renders fields and steps vector environments on the GPU."""
+    """cpu or cuda; with cuda, fields are rendered and vector environments stepped on the GPU."""
 
 
 # ---- checks
@@ -104,7 +104,7 @@ class Options:
 _MAX_NUMBER, _MAX_SIDE, _MAX_STACK, _MAX_OBSTACLES = 1e6, 4096, 64, 1000
 
 Check = tuple[Callable[[Any], bool], str]
-"""A test of whether a value is valid, and the expectation that an error states."""
+"""A function that returns True for valid values, and the text that an error gives as the expectation."""
 
 
 def _is_number(value: Any) -> bool:
@@ -193,7 +193,7 @@ def parse_options(given: dict[str, Any]) -> Options:
     """Returns options from keywords.
 
     Raises:
-        InputError: unknown keyword, or a value of the wrong type or out of range.
+        InputError: a keyword is unknown, or a value has the wrong type or is out of range.
     """
     given = dict(given)
     if isinstance(given.get("randomise"), bool):
@@ -216,7 +216,7 @@ def parse_options(given: dict[str, Any]) -> Options:
 
 
 def state_size(options: Options) -> int:
-    """Number of components of the privileged state, from the first on, that are observed besides images."""
+    """Number of components of the privileged state, counted from the first, that are observed besides images."""
     return {None: 0, ODOMETRY: 2}.get(options.state, sum(STATE_SIZES.values()))
 
 
@@ -241,7 +241,7 @@ def check_actions(actions: Any, shape: tuple[int, ...]) -> Array:
     """Returns actions as float64.
 
     Raises:
-        ValueError: wrong shape, not real numbers (booleans are not accepted), or not finite.
+        ValueError: the shape is wrong, or the values are not finite real numbers (booleans are not accepted).
     """
     try:
         given = np.asarray(actions)

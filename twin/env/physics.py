@@ -1,9 +1,9 @@
 """Physics of the Husky, driven by commands: forward speed v [m/s] and yaw rate ω [rad/s].
 
 A *control step* is the time between two commands, usually 0.1 s, and consists of many MuJoCo substeps. Contacts
-are checked several times within it, so that a short graze is not missed. *Touched* geoms are in contact with the robot;
-the ground does not count. A command reaches the controller after `command_latency`. The newest image is
-`camera_latency` old: it shows robot and obstacles as they were then.
+are checked several times within it, so that short contacts are not missed. *Touched* geoms are geoms in contact with
+the robot; the ground is not one of them. A command reaches the controller after `command_latency`. The newest image is
+`camera_latency` old: it shows robot and obstacles at the time when it was taken.
 """
 
 from bisect import bisect_right
@@ -19,11 +19,11 @@ from twin.mjcf.scene_xml import rest_pose
 from twin.robot import GEAR_RATIO, SIDES, WHEELS, HuskyParams
 from twin.types import Array
 
-TIME_TOLERANCE = 1e-6  # [s] below which two times of the simulation are equal, despite rounding
+TIME_TOLERANCE = 1e-6  # [s] simulation times that differ by less count as equal, because of rounding
 
 _CHECK_PERIOD = 0.01  # [s] between two contact checks, which also record all poses
-_SETTLE_TIME = 0.3  # [s] on the ground after `set_pose`
-_RAY_START = 50.0  # [m] above the ground's highest point
+_SETTLE_TIME = 0.3  # [s] simulated in `set_pose`, for the robot to settle on the ground
+_RAY_START = 50.0  # [m] height above the ground's origin from which rays find the ground's height
 
 
 class _Snapshot(NamedTuple):
@@ -39,16 +39,16 @@ class HuskyPhysics:
     """Steps one Husky in one model."""
 
     move_obstacles: Callable[[float], None] | None = None
-    """Sets the poses of moving obstacles; called before substeps with the time [s] at which they end."""
+    """Sets the poses of moving obstacles; called before a run of substeps with the time [s] at which it ends."""
 
     def __init__(
         self, model: mujoco.MjModel, params: HuskyParams | None = None, data: mujoco.MjData | None = None
     ) -> None:
         """
         Args:
-            model: A model with `add_husky`; its keyframe `spawn`, if any, is the start.
-            params: The robot in the model; None: the published one.
-            data: Stepped from its present state; None: new data, at the start.
+            model: A model that contains the Husky of `add_husky`; its keyframe `spawn`, if any, is the start.
+            params: Parameters of the robot in the model; None: the published ones.
+            data: State to step, from its present values on; None: a new one, at the start.
         """
         self.model = model
         self.params = params or HuskyParams()
@@ -84,7 +84,7 @@ class HuskyPhysics:
         self.begin()
 
     def set_pose(self, x: float, y: float, yaw: float) -> None:
-        """Sets the robot at rest, settled on the ground, at x, y [m] and yaw [rad]; sets the time to 0."""
+        """Sets the robot at rest on the ground at x, y [m] and yaw [rad], lets it settle, and sets the time to 0."""
         position, quaternion = rest_pose(self._ground_height, np.array([x, y]), yaw)
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:3], self.data.qpos[3:7] = position, quaternion
@@ -136,8 +136,8 @@ class HuskyPhysics:
     def schedule(self, period: float) -> list[tuple[int, Array]]:
         """Runs the controller for the next `period` [s].
 
-        Returns segments that end with a contact check or an update of the controller: their numbers of substeps, and
-        speeds of the left and right wheels [rad/s], shape (2,).
+        Returns the segments in order: the number of substeps and the speeds of the left and right wheels [rad/s], shape
+        (2,), of each. A segment ends at a contact check, at an update of the controller, or at the end of the period.
         """
         out, time = [], self.time
         left = round(period / self.model.opt.timestep)
@@ -157,7 +157,7 @@ class HuskyPhysics:
 
         Args:
             touched: Geoms touched during the last control step.
-            snapshots: Time [s], `qpos`, `mocap_pos`, `mocap_quat` of the last contact checks, for a delayed camera.
+            snapshots: Time [s], `qpos`, `mocap_pos`, `mocap_quat` of the last contact checks, for delayed cameras.
         """
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
@@ -268,7 +268,7 @@ class HuskyPhysics:
 
     @property
     def motor_torque(self) -> Array:
-        """Torque of the left and right side at the wheels [N m], shape (2,)."""
+        """Torques at the wheels of the left and right side [N m], shape (2,)."""
         return self.data.actuator_force[self.actuators].copy()
 
     @property

@@ -1,7 +1,7 @@
 """Tasks of a scene: segments of its route, each between two arc lengths.
 
-The *standard tasks* of DriveEnv-NeRF, `straight` (30 m) and `right_turn` (60 m), are located on the route by shape.
-`[[task]]` entries of `scene.toml` define further ones, and `route` is the whole route.
+The *standard tasks* of DriveEnv-NeRF are `straight` (30 m) and `right_turn` (60 m): segments of the route that have the
+right length and turn. `[[task]]` entries of `scene.toml` define further tasks, and `route` is the whole route.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from twin.types import Array
 
 @dataclass(frozen=True)
 class RouteSegment:
-    """A named part of the route; an episode drives it."""
+    """A named part of the route, along which episodes drive."""
 
     name: str
     start: float
@@ -33,8 +33,8 @@ class RouteSegment:
 @dataclass(frozen=True)
 class _StandardTask:
     length: float  # [m]
-    turn: tuple[float, float]  # range of the total turn [rad], left positive
-    max_excursion: float  # [rad] by which the heading may leave the range between its first and last value
+    turn: tuple[float, float]  # lowest and highest total turn [rad], positive to the left
+    max_excursion: float  # [rad] the heading may leave the range between its first and last value by this much
 
 
 _STANDARD_SPECS = {
@@ -52,7 +52,7 @@ def find_task(name: str, world: World, configured: tuple[TaskConfig, ...] = ()) 
     """Returns the route segment of a task.
 
     Raises:
-        InputError: no such task, or no such segment on the route; lists the tasks that exist.
+        InputError: there is no such task, or no such segment on the route; the error lists the tasks that exist.
     """
     found = scene_tasks(world, configured)
     if name in found:
@@ -95,7 +95,7 @@ def scene_tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[s
 
 
 def _fitting_starts(route: Array, standard: _StandardTask, length: float) -> Array:
-    """Arc lengths [m] at which a segment of this length fits; best first: most of the turn in the segment's middle."""
+    """Arc lengths [m] at which a fitting segment of this length starts, the one whose turn is most central first."""
     total = float(arc_lengths(route)[-1])
     s = np.append(np.arange(0.0, total, _STEP), total)
     heading = np.unwrap(heading_at(route, s))

@@ -1,7 +1,7 @@
 """`twin.load`: a task in a built scene as a dm_control environment.
 
 `EnvFactory` reads the scene once and makes any number of environments. `episode_spec` makes their model: ground, robot,
-and the solid parts within the robot's reach. `DriveEnvironment` adds images to physics and task.
+and the collision parts within the robot's reach. `DriveEnvironment` adds image observations to physics and task.
 """
 
 import copy
@@ -53,7 +53,7 @@ class EnvFactory:
     obstacles: EpisodeObstacles
     model: mujoco.MjModel
     field: BakedField | None
-    """None if no images are rendered from it."""
+    """Radiance field; None if no images are rendered from it."""
     trust: Trust | None
 
     @staticmethod
@@ -61,7 +61,7 @@ class EnvFactory:
         """Reads a built scene.
 
         Raises:
-            InputError: the scene is not built or has no route, no such task or lighting, or invalid options.
+            InputError: the scene is not built, or has no route or no such task or lighting, or an option is invalid.
         """
         parsed = parse_options(options)
         twin = scene if isinstance(scene, Twin) else load_scene(scene)
@@ -88,13 +88,13 @@ class EnvFactory:
     def make_env(
         self, seed: int | None, evaluator: tuple[RewardAndTermination, int] | None = None
     ) -> tuple[DrivePhysics, DriveTask]:
-        """Returns physics, with a copy of the model, and task of a new environment; arguments as of `DriveTask`."""
+        """Returns physics, with a copy of the model, and task of a new environment; arguments as in `DriveTask`."""
         physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
         return physics, DriveTask(self.world, self.segment, self.options, self.obstacles, self.model, seed, evaluator)
 
     @property
     def _field_only(self) -> bool:
-        """True if nothing is added to the field's images: no object, weather or noise, and no part of the robot."""
+        """True if images show only the field: no object, no part of the robot, no weather and no camera noise."""
         lighting = self.options.lighting
         names = (lighting,) if isinstance(lighting, str) else tuple(lighting)
         fogs = [self.field.fog(name) for name in names] if self.field else []
@@ -128,14 +128,15 @@ class EnvFactory:
 def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
     """Returns a digest of everything that determines an episode, except for seed and driver.
 
-    It covers the field, the MJCF scene with its robot, the task's route segment, the obstacles of `scene.toml`, photo
-    lightings that the condition names, the version of lighting sets, and the randomization of a randomized condition.
+    It covers the field, the MJCF scene with its robot, the task's route segment, the obstacles of `scene.toml`, and the
+    photo lightings that the condition names; for conditions that sample them, also the version of the lighting sets and
+    the randomization.
 
     Raises:
         InputError: see `EnvFactory.open`.
     """
     world, config = twin.world(), load_config(twin.scene.config_file)
-    ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # of training and of evaluation
+    ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # those of training and of evaluation
     randomization = {"version": VERSION, "ranges": ranges} if condition.randomised else {}
     photos = [
         path for name in condition.lighting.split(":") if (path := twin.scene.lightings / f"{name}.json").exists()
@@ -156,7 +157,7 @@ def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
 class DriveEnvironment(control.Environment):
     """An environment with image observations: `pixels`, uint8, shape (stack, height, width, 3), the newest last.
 
-    With the option `state`, `state` is observed, too, float32, shape (k,).
+    With the option `state`, there is also the observation `state`, float32, shape (k,).
     """
 
     def __init__(self, physics: DrivePhysics, task: DriveTask, pixels: PixelObserver) -> None:
@@ -220,21 +221,21 @@ def load(
 
 # ---- model of an episode
 
-_REACH = 1.5  # [m] beyond the corridor's edge: the robot's half length plus its motion in a control step
+_REACH = 1.5  # [m] reach of a robot beyond the corridor's edge: its half length plus its motion in a control step
 
 
 def episode_spec(world: World, start: float, end: float, half_width: float, visuals: bool = False) -> mujoco.MjSpec:
     """Returns the model of episodes between two arc lengths [m] of a scene's route.
 
-    An episode ends when the robot leaves the corridor, so parts beyond its reach are never touched. Removing them
-    changes no result and saves a fifth of the physics' time and most of its memory.
+    An episode ends when the robot leaves the corridor, so parts beyond the robot's reach are never touched. Removing
+    them changes no result and saves a fifth of the physics' time and most of its memory.
 
     Args:
         world: The scene.
         start: Arc length of the start [m].
         end: Arc length of the end [m].
         half_width: Half width of the corridor [m].
-        visuals: Keep the visual mesh and textures, which only MuJoCo's renderer needs.
+        visuals: True keeps the visual mesh and textures, which only MuJoCo's renderer needs.
     """
     tree = ElementTree.parse(world.model_path)
     root, assets = tree.getroot(), world.folder / "assets"
@@ -246,7 +247,7 @@ def episode_spec(world: World, start: float, end: float, half_width: float, visu
         center, radius = _bounding_sphere(assets / f"{geom.get('mesh')}.obj")
         return line.query(center[:2])[0] - radius <= half_width + _REACH
 
-    # Removed from the XML, as removing from a compiled MjSpec takes milliseconds per part.
+    # Parts are removed from the XML, since removing one from an MjSpec takes milliseconds.
     worldbody, kept = root.find("worldbody"), root.find("asset")
     assert worldbody is not None and kept is not None
     for geom in [g for g in worldbody.findall("geom") if g.get("type") == "mesh" and not wanted(g)]:

@@ -1,9 +1,9 @@
 """Driving along a route segment in dm_control: physics and task, with start, state, reward and termination; no images.
 
-An *episode* starts at rest near the segment's start and ends with one of `CAUSES`. The discount at the end is 0; at a
-timeout it is 1, as the episode is only truncated. An episode's seed determines all its randomness. Start, robot,
-lighting, obstacles, camera and weather have separate generators: changing one leaves the others unchanged, so policies
-can be compared on the same episodes.
+In an *episode*, the robot starts at rest near the segment's start; the episode ends with one of `CAUSES`. The discount
+at the end is 0, except at a timeout: it is 1 there, since the episode is only truncated. An episode's seed determines
+all its randomness. Start, robot, lighting, obstacles, camera and weather have separate generators: changing one leaves
+the others unchanged, so policies can be compared on the same episodes.
 """
 
 import sys
@@ -46,12 +46,12 @@ except ModuleNotFoundError as error:
 EnvIndices = Sequence[int] | NDArray[np.int64]
 
 _CODES = {cause: code for code, cause in enumerate(CAUSES, 1)}  # 0: the episode goes on
-BUMPER_OFFSET = 0.5  # [m] ahead of the base
-_SEARCH_WINDOW = (1.0, 3.0)  # [m] behind and ahead of the last foot
+BUMPER_OFFSET = 0.5  # [m] the bumper is this far ahead of the base; at the goal, the bumper reaches the segment's end
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] of route behind and ahead of the last foot
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
-STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: stuck if it moves less than this distance in this time
+STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, in multiples of the controller's own limits
-_LOOKAHEADS = (1.0, 2.0, 4.0)  # [m] along the route, at which the state contains the change of heading
+_LOOKAHEADS = (1.0, 2.0, 4.0)  # [m] along the route; the state contains the change of heading up to these points
 
 
 # ---- reward and termination of n drives at once
@@ -64,7 +64,7 @@ class Motion:
     pose: Array
     """x, y [m] and yaw [rad] of the bases, shape (k, 3)."""
     speed: Array
-    """Along the heading [m/s], shape (k,)."""
+    """Speed along the heading [m/s], shape (k,)."""
     yaw_rate: Array
     """[rad/s], shape (k,)."""
     uprightness: Array
@@ -72,7 +72,7 @@ class Motion:
     touched: NDArray[np.bool_]
     """True where the robot touched anything but the ground during the step, shape (k,)."""
     time: Array
-    """Since the start of the episodes [s], shape (k,)."""
+    """Time since the start of the episodes [s], shape (k,)."""
 
 
 class RewardAndTermination:
@@ -91,15 +91,15 @@ class RewardAndTermination:
         self.time_limit = options.time_limit or 2.0 * segment.length / options.speed
         """[s]"""
         self.foot, self.cross_track = np.zeros(count), np.zeros(count)
-        """Arc length and distance from the route, left positive [m], shape (n,)."""
+        """Arc length of the foot, and signed distance from the route, positive to the left [m], shape (n,)."""
         self._cause = np.zeros(count, int)
         self._route = world.route[:, :2]
         self._previous_foot, self._steering = np.zeros(count), np.zeros(count)
-        # Position and time of the last movement by STUCK_DISTANCE.
+        # Position and time of each robot when it had last moved by STUCK_DISTANCE.
         self._anchor, self._anchor_time = np.zeros((count, 2)), np.zeros(count)
         terms = options.rewards
         speed, yaw_rate = (_STATE_MARGIN * x for x in (world.robot.max_wheel_speed, world.robot.max_yaw_rate))
-        # An episode ends at most one control step after the robot left the corridor, which bounds the distance.
+        # The distance is bounded: an episode ends at most one control step after the robot leaves the corridor.
         cross_track = max(self.half_width, options.start_offset) + speed * options.control_timestep
         high = np.array([speed, yaw_rate, cross_track, *[np.pi] * 4], np.float32)
         self.state_bounds = np.stack([-high, high])
@@ -125,7 +125,7 @@ class RewardAndTermination:
         moved = np.linalg.norm(position - self._anchor[which], axis=-1) > STUCK_DISTANCE
         self._anchor[which] = np.where(moved[:, None], position, self._anchor[which])
         self._anchor_time[which] = np.where(moved, motion.time, self._anchor_time[which])
-        conditions = {  # the first that holds takes precedence
+        conditions = {  # if several hold, the first is the cause
             "rollover": motion.uprightness < ROLLOVER_COSINE,
             "collision": motion.touched,
             "out_of_bounds": np.abs(cross) > self.half_width,
@@ -155,10 +155,11 @@ class RewardAndTermination:
     def state(self, which: EnvIndices, motion: Motion) -> NDArray[np.float32]:
         """Returns the privileged state of a driver that knows the map, shape (k, 7).
 
-        `speed` [m/s], `yaw_rate` [rad/s], `cross_track` [m] left positive, `heading_error` [rad] of the robot against
-        the route, `turns` [rad]: change of the route's heading 1, 2 and 4 m ahead.
+        Its components are `speed` [m/s], `yaw_rate` [rad/s], `cross_track` [m] (positive to the left), `heading_error`
+        [rad] (the robot's heading minus the route's) and `turns` [rad] (changes of the route's heading until 1, 2 and
+        4 m ahead).
 
-        The state is clipped to `state_bounds`, which matters only if the robot moves ten times as fast as its
+        The state is clipped to `state_bounds`. This has an effect only if the robot moves ten times as fast as its
         controller allows, as in a fall.
         """
         foot = self.foot[which]
@@ -182,14 +183,14 @@ class DrivePhysics(dm_mujoco.Physics):
 
     @staticmethod
     def of(model: mujoco.MjModel, params: HuskyParams) -> "DrivePhysics":
-        """Returns physics that steps this model, without a copy, which `episode_spec` made for the robot."""
+        """Returns physics that steps this model, not a copy; `episode_spec` made it for this robot."""
         physics = DrivePhysics(wrapper.MjData(wrapper.MjModel(model)))
         physics.set_robot(params)
         return physics
 
     def _reload_from_data(self, data: Any) -> None:
         mujoco.mj_forward(data.model.ptr, data.ptr)
-        # Before super(), which ends with `after_reset`.
+        # Set before super() is called, since that ends with `after_reset`.
         self.robot = HuskyPhysics(data.model.ptr, self._params, data.ptr)
         super()._reload_from_data(data)
 
@@ -217,11 +218,11 @@ class DrivePhysics(dm_mujoco.Physics):
         self.robot.begin()
 
     def step(self, nstep: int = 1) -> None:
-        """Runs `nstep` substeps, the time between two commands."""
+        """Runs `nstep` substeps, which last from one command to the next."""
         with self.check_invalid_state():
             self.robot.step(nstep * self.timestep())
 
-    # Quantities of `HuskyPhysics`; the camera's pose is that of the newest image.
+    # Quantities of `HuskyPhysics`; the camera's pose is the one from which the newest image is taken.
     planar_pose = property(attrgetter("robot.planar_pose"))
     base_to_world = property(attrgetter("robot.base_to_world"))
     delayed_data = property(attrgetter("robot.delayed_data"))
@@ -255,9 +256,9 @@ class DriveTask(control.Task):
         Args:
             world: Route, corridor and robot.
             segment: Route segment to drive.
-            options: Of the environment.
-            obstacles: Samples an episode's obstacles; the model contains its pool.
-            model: The unmodified compiled model; physics steps a copy.
+            options: Options of the environment.
+            obstacles: Samples an episode's obstacles; its pool is in the model.
+            model: The compiled model before randomization; physics steps a copy.
             seed: Seed of the sequence of episodes; None: unpredictable.
             evaluator: Reward and termination of many drives, and the index of this drive; None: its own.
         """
@@ -277,7 +278,7 @@ class DriveTask(control.Task):
         self._start_station = segment.start
 
     def seed(self, seed: int | None) -> None:
-        """Starts another sequence of episodes."""
+        """Starts a new sequence of episodes."""
         self._rng = np.random.default_rng(seed)
 
     def set_weather(self, sample: RandomizationSample) -> None:
@@ -314,7 +315,7 @@ class DriveTask(control.Task):
         self._evaluator.begin([self._index], np.array([self._start_station]), physics.planar_pose[None, :2])
 
     def before_step(self, action: Any, physics: DrivePhysics) -> None:
-        """Raises ValueError: not a valid action; the episode is unchanged."""
+        """Raises ValueError: the action is invalid; the episode is unchanged."""
         width = 1 if self.options.action == STEERING else 2
         commands = self.commands(check_actions(action, (width,))[None])
         self._evaluator.set_steering([self._index], commands[:, 1])
@@ -366,7 +367,7 @@ class DriveTask(control.Task):
 
     @property
     def cross_track(self) -> float:
-        """Distance from the route [m], left positive."""
+        """Signed distance from the route, positive to the left [m]."""
         return float(self._evaluator.cross_track[self._index])
 
     @property
@@ -386,7 +387,7 @@ class DriveTask(control.Task):
         return self.episode_info(physics.speed, physics.touched)
 
     def episode_info(self, speed: float, touched: Sequence[str]) -> dict[str, Any]:
-        """Returns the same info for a given speed [m/s] and touched geoms."""
+        """Returns the episode's info so far, for a speed [m/s] and touched geoms computed elsewhere."""
         return {
             "cause": self.cause,
             "is_success": self.cause == "goal",

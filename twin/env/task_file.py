@@ -1,8 +1,9 @@
-"""A task as a JSON file, for judges that share no code with this package: line, width, limits, start.
+"""A task as a JSON file: line, width, limits, start. Programs that share no code with this package can read it.
 
     {"format": "twin task", "version": 1, "name": "straight", "line": [[x, y, z], ...], "half_width": 1.0, ...}
 
-The rules are those of `twin.env.task.RewardAndTermination`, as numbers, so that another judge needs none of its code.
+The rules are those of `twin.env.task.RewardAndTermination`, as numbers, so that other programs can evaluate drives
+without its code.
 """
 
 import math
@@ -21,11 +22,11 @@ FORMAT, VERSION = "twin task", 1
 def task_table(world: World, segment: RouteSegment, options: Options) -> dict[str, Any]:
     """The contents of the file, in the scene's frame (z up), meters, seconds, radians.
 
-    `line` (m, 3) is on the ground, in driving order; a *station* is an arc length along it, of which height takes no
-    part. Trials start at the station `start`, up to `offset` beside the line and `heading` off its direction. They
-    succeed at the station `goal`, and end without success where the base is further than `half_width` from the line,
-    touches an object, tilts by more than `max_tilt`, after `time_limit`, or where it moves by less than
-    `stuck.distance` in `stuck.time`. Commands come every `control_timestep` and are bounded by `limits`.
+    `line` (m, 3) is on the ground, in driving order; a *station* is a horizontal arc length along it. Trials start at
+    the station `start`, up to `offset` beside the line and turned by up to `heading` from its direction. They succeed
+    at the station `goal`. They end without success when the base is further than `half_width` from the line, when the
+    robot touches an object, tilts by more than `max_tilt` or moves by less than `stuck.distance` in `stuck.time`, and
+    after `time_limit`. Commands come every `control_timestep` and are bounded by `limits`.
     """
     rules = RewardAndTermination(world, segment, options)
     return {

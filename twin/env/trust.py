@@ -3,8 +3,8 @@ the completeness of the reconstruction in view.
 
 The trust of a picture is the smallest of three numbers in [0, 1]:
 
-*pose*: the offset to the most similar filmed frame, which is its distance [m] plus `_PER_TURN` metres per unit of
-1 − cos of the angle between the optical axes; 1 up to `_NEAR`, 0 from `_FAR` on, linear in between;
+*pose*: 1 if the offset to the most similar filmed frame is at most `_NEAR`, 0 if it is at least `_FAR`, linear in
+between; the offset is the distance [m] plus `_PER_TURN` · (1 − cos of the angle between the optical axes);
 *opacity*: the mean opacity of the lower half of the picture, where only ground and objects should be;
 *sky in the road*: 1 minus `_SKY_WEIGHT` times the fraction of that half whose opacity is below `SKY_OPACITY`.
 """
@@ -22,7 +22,7 @@ SKY_OPACITY = 0.5
 _PER_TURN = 10.0  # [m]: a right angle counts as 10 m, as in `geometry.cameras.nearest_frame`
 _NEAR, _FAR = 1.0, 5.0  # [m]
 _SKY_WEIGHT = 5.0
-_CANDIDATES = 32  # nearest filmed frames that are compared
+_CANDIDATES = 32  # number of nearest filmed frames that are compared
 
 
 class Trust:
@@ -48,6 +48,6 @@ class Trust:
         return self.from_opacity(camera_to_world, lower.mean((1, 2)), (lower < SKY_OPACITY).mean((1, 2)))
 
     def from_opacity(self, camera_to_world: Array, mean_opacity: Array, sky_share: Array) -> Array:
-        """Trust from the lower half's mean opacity and its fraction of sky pixels, each shape (n,)."""
+        """Trust of pictures whose lower half has a mean opacity and a fraction of sky pixels, each shape (n,)."""
         near_film = np.clip((_FAR - self.offset(camera_to_world)) / (_FAR - _NEAR), 0.0, 1.0)
         return np.minimum(np.minimum(near_film, mean_opacity), np.clip(1.0 - _SKY_WEIGHT * sky_share, 0.0, 1.0))

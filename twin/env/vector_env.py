@@ -1,8 +1,8 @@
 """Vector environments: `make_vector_env` steps n environments in one process, in several processes, or on a GPU.
 
 Much of a step is Python (visibility, contacts, reward), which the interpreter's lock confines to one core per process.
-So a `ProcessVectorEnv` starts *child* processes. Each child has a `LocalVectorEnv` and executes its parent's requests,
-which are exchanged as pickles over a socket. The number of processes does not change any result.
+So a `ProcessVectorEnv` starts *child* processes. Each child has a `LocalVectorEnv` and executes its parent's requests.
+Requests and replies are sent as pickles over a socket. The number of processes does not change any result.
 """
 
 import contextlib
@@ -33,9 +33,9 @@ from twin.errors import InputError
 from twin.loading import Twin
 from twin.runtime import available_cores
 
-_MIN_ENVS, _MAX_PROCESSES = 2, 8  # defaults: least environments per process; most processes, since each takes memory
-_CHILD_CODE = "from twin.env.vector_env import serve; serve()"  # not -m: classes would be pickled as those of __main__
-_PARENT_CHECK_PERIOD = 2.0  # [s] between two checks that the parent runs
+_MIN_ENVS, _MAX_PROCESSES = 2, 8  # by default: fewest environments per process; most processes (each takes memory)
+_CHILD_CODE = "from twin.env.vector_env import serve; serve()"  # not -m, which would pickle classes as part of __main__
+_PARENT_CHECK_PERIOD = 2.0  # [s] between two checks whether the parent still runs
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class StepMessage:
     """A child's reply to `begin` and `step` for k environments."""
 
     images: NDArray[np.uint8] | None
-    """The newest image of each, shape (k, 3, height, width)."""
+    """The newest image of each environment, shape (k, 3, height, width)."""
     trust: NDArray[np.float64]
     states: NDArray[np.float32]
     infos: list[dict[str, Any]]
@@ -72,7 +72,7 @@ class ProcessVectorEnv:
         seeds: Sequence[int | None],
         processes: int,
     ) -> None:
-        """Arguments as of `make_vector_env`; `processes` is at most the number of environments."""
+        """Arguments as in `make_vector_env`; `processes` is at most the number of environments."""
         self.options, self.processes, count = parse_options(options), processes, len(seeds)
         parts = np.array_split(np.arange(count), processes)
         self._location = [(c, k) for c, part in enumerate(parts) for k in range(len(part))]
@@ -82,7 +82,7 @@ class ProcessVectorEnv:
         try:
             for _ in parts:
                 self._children.append(_Child(max(1, available_cores() // processes)))
-            quiet = [runtime.is_quiet() or c > 0 for c in range(processes)]  # only one shows progress
+            quiet = [runtime.is_quiet() or c > 0 for c in range(processes)]  # only the first child shows progress
             mine = [[seeds[i] for i in part] for part in parts]
             opened = self._request({c: ("open", quiet[c], scene, task, options, mine[c]) for c in range(processes)})
         except BaseException:
@@ -94,7 +94,7 @@ class ProcessVectorEnv:
         self.pixels = StackedImages(np.zeros(shape, np.uint8), np.zeros(count)) if self.options.pixels else None
         self._states = np.zeros((count, self.state_size), np.float32)
         self._infos: list[dict[str, Any] | None] = [None] * count
-        """The last received info; None where it may have changed since."""
+        """The info last received from each environment; None if it may have changed since."""
 
     def __len__(self) -> int:
         return len(self._location)
@@ -146,7 +146,7 @@ class ProcessVectorEnv:
         self._end()
 
     def _split(self, some: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64], list[int]]]:
-        """Yields each child that has some of these environments, their positions in `some`, and their indices there."""
+        """Yields each child that has some of these environments, their positions in `some`, and their indices in it."""
         locations = np.array([self._location[i] for i in some.tolist()]).reshape(-1, 2)
         for c in np.unique(locations[:, 0]).tolist():
             at = np.flatnonzero(locations[:, 0] == c)
@@ -168,8 +168,8 @@ class ProcessVectorEnv:
             try:
                 for c, message in messages.items():
                     self._children[c].send(message)
-                replies = {c: self._children[c].receive() for c in requests}  # of all, even if one failed
-            except BaseException:  # some requests may be sent, or replies pending
+                replies = {c: self._children[c].receive() for c in requests}  # all, even if one is an error
+            except BaseException:  # some requests may have been sent, and replies may be pending
                 self.close()
                 raise
         for error, _ in replies.values():
@@ -196,12 +196,12 @@ class _Child:
         path = os.pathsep.join(str(folder or Path.cwd()) for folder in sys.path)
         with theirs:
             self.process = subprocess.Popen(
-                # -P: imports are those of this process, not modules of the current folder.
+                # -P: the child imports what this process imports, not modules in the current folder.
                 [sys.executable, "-P", "-c", _CHILD_CODE, *map(str, (theirs.fileno(), os.getpid(), share))],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(),),
-                process_group=0,  # Ctrl-C reaches only the parent, which may save first
+                process_group=0,  # Ctrl-C reaches only the parent, which can then save its state
                 env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": str(share)},
             )
 
@@ -221,7 +221,7 @@ class _Child:
 
 
 def _kill(children: list[_Child]) -> None:
-    """Kills children, which have nothing to save."""
+    """Kills child processes; they have nothing to save."""
     for child in children:
         child.pipe.close()
         child.process.kill()
@@ -237,12 +237,12 @@ def serialize(value: Any) -> bytes:
 
 
 class VectorEnvServer:
-    """Executes requests: name and arguments of a method of this class or of its `LocalVectorEnv`."""
+    """Executes requests. A request is the name and arguments of a method of this class or of its `LocalVectorEnv`."""
 
     envs: LocalVectorEnv
 
     def answer(self, request: bytes) -> bytes:
-        """Executes a request and returns an exception or None, and the result."""
+        """Executes a pickled request; returns a pickled pair: an exception or None, and the result."""
         try:
             method, *args, kwargs = pickle.loads(request)
             owner = self if method in ("open", "begin", "step") else self.envs
@@ -251,7 +251,7 @@ class VectorEnvServer:
             error.add_note(f"in a process of the vector environment:\n{traceback.format_exc()}")
             with contextlib.suppress(Exception):
                 reply = serialize((error, None))
-                pickle.loads(reply)  # fails for some exceptions
+                pickle.loads(reply)  # some exceptions cannot be unpickled
                 return reply
             return serialize((RuntimeError(error.__notes__[-1]), None))
 
@@ -278,21 +278,21 @@ class VectorEnvServer:
 
 
 def serve() -> None:
-    """Serves a parent's requests; the arguments of the process are socket, process id of the parent, and cores."""
+    """Serves a parent's requests; arguments of the process: socket, process id of the parent, number of cores."""
     socket, parent, share = map(int, sys.argv[1:])
     os.set_inheritable(socket, False)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # may reach all processes; the parent saves first and ends this one
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it may reach all processes; the parent saves, then ends this one
     runtime.limit_cores(share)
     server = VectorEnvServer()
-    with Connection(socket) as pipe, contextlib.suppress(EOFError, OSError):  # the parent closed it
+    with Connection(socket) as pipe, contextlib.suppress(EOFError, OSError):  # the parent closed the pipe
         while True:
             while not pipe.poll(_PARENT_CHECK_PERIOD):
-                if os.getppid() != parent:  # ended, though a process that it forked may keep the socket open
+                if os.getppid() != parent:  # the parent ended; a process that it forked may keep the socket open
                     return
             pipe.send_bytes(server.answer(pipe.recv_bytes()))
 
 
-# ---- the choice between them
+# ---- choice of the vector environment
 
 
 def make_vector_env(
@@ -309,10 +309,10 @@ def make_vector_env(
         task: See `twin.load`.
         options: See `twin.env.options.Options`.
         seeds: Seed of each environment's sequence of episodes; None: unpredictable.
-        processes: Number of processes on a CPU; None: one per core, at most 8, with at least two environments in each.
+        processes: Number of processes on a CPU; None: one per core, but at most 8, with at least two environments each.
 
     Raises:
-        InputError: see `EnvFactory.open`; or `processes` is below 1.
+        InputError: as in `EnvFactory.open`; also if `processes` is below 1.
     """
     if processes is not None and processes < 1:
         raise InputError(f"processes = {processes}; expected at least 1")

@@ -1,12 +1,12 @@
 """Vector environment on a GPU: `mujoco_warp` steps all environments at once.
 
-Episodes start on the host, one by one. Then reward and termination are computed for all environments together, and
-images that show the field alone stay on the device (`GpuPixelObserver`). Tests use a CPU device, where this is slower
-than MuJoCo.
+Episodes are started on the host, one by one. After each step, reward and termination are computed for all environments
+together. Images that show only the field stay on the device (`GpuPixelObserver`). Tests run this code on the CPU, where
+it is slower than MuJoCo.
 """
 
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
-# (inside kernels, Warp's own types hold, which mypy does not know)
+# (kernels use Warp's own types, which mypy does not know)
 
 from collections.abc import Sequence
 from typing import Any
@@ -36,7 +36,7 @@ _RANDOMIZED_FIELDS = (
 _UPLOADED_FIELDS = ("qpos", "qvel", "act", "qacc_warmstart")
 _STATE_FIELDS = (*_UPLOADED_FIELDS, "ctrl", "sensordata", "actuator_force")
 
-_MAX_CONTACTS, _MAX_ROWS = 96, 384  # capacity per environment; the demo needs a third
+_MAX_CONTACTS, _MAX_ROWS = 96, 384  # capacity per environment; the demo scene needs a third of it
 _OVERFLOWS = mjw.OverflowType.NEFC | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE | mjw.OverflowType.CCD
 
 
@@ -68,7 +68,7 @@ def _record_positions(
     qpos: wp.array2d(dtype=float),
     history: wp.array3d(dtype=float),
 ):
-    """Records positions at the end of each segment: the last substep of a segment writes last."""
+    """Records positions at the end of each segment: each substep overwrites those of the substep before it."""
     env, i = wp.tid()
     history[segment[k, env], env, i] = qpos[env, i]
 
@@ -84,7 +84,7 @@ def _mark_contacts(
     is_collidable: wp.array(dtype=int),
     touched: wp.array2d(dtype=int),
 ):
-    """Marks both geoms of contacts between the robot and collidable geoms, if substep k ends a segment."""
+    """Marks both geoms of each contact between the robot and a collidable geom, if substep k ends a segment."""
     contact = wp.tid()
     if contact >= count[0]:
         return
@@ -102,8 +102,8 @@ class GpuSimulation:
     The state (positions, velocities, the solver's last accelerations) is kept in arrays over all environments. A
     control step uploads it, runs the substeps under the controllers' schedules, and downloads it with the touched
     geoms. The environments' own `MjData` are updated only by `sync`, which takes far longer. The device computes in
-    single precision with another solver: episodes resemble those of MuJoCo but are not bit-identical, and on a GPU the
-    varying order of contacts makes them not repeatable.
+    single precision with another solver: episodes resemble those of MuJoCo but are not bit-identical. On a GPU they are
+    not repeatable either, since the order of contacts varies.
     """
 
     def __init__(self, envs: Sequence[DrivePhysics], period: float, device: str) -> None:
@@ -117,10 +117,10 @@ class GpuSimulation:
         self._state = {name: np.stack([getattr(env.robot.data, name) for env in envs]) for name in _STATE_FIELDS}
         self._stale = np.zeros(n, bool)
         self._touched = np.zeros((n, model.ngeom), bool)
-        self._moving = np.zeros(n, bool)  # True if an obstacle moves
+        self._moving = np.zeros(n, bool)  # True for environments in which an obstacle moves
         mocap = [np.stack([getattr(env.robot.data, name) for env in envs]) for name in ("mocap_pos", "mocap_quat")]
-        self._mocap = [np.tile(values, (max_segments, 1, 1, 1)) for values in mocap]  # at the end of each segment
-        # Snapshots of the last contact checks, the newest last, from which the delayed camera poses follow.
+        self._mocap = [np.tile(values, (max_segments, 1, 1, 1)) for values in mocap]  # poses at the end of each segment
+        # Snapshots of the last contact checks, the newest last; they give the delayed camera poses.
         latency = self._params.camera_latency
         kept = max_segments * (int(np.ceil(latency / period)) + 2) if latency else 0
         self._snapshot_times = np.full((kept, n), np.inf)
@@ -131,7 +131,7 @@ class GpuSimulation:
         self._camera, self._actuators = model.camera("front").id, robot.actuators
         with wp.ScopedDevice(device):
             self._model = mjw.put_model(model, batch_sizes=dict.fromkeys(_RANDOMIZED_FIELDS, n))
-            self._model.opt.warn_overflow = 0  # kernels would print warnings; `_download` raises an error
+            self._model.opt.warn_overflow = 0  # no warnings by kernels: `_download` raises an error
             if device != "cpu":
                 self._model.opt.graph_conditional = wp.is_conditional_graph_supported()
             self._data = mjw.make_data(model, nworld=n, nconmax=_MAX_CONTACTS, njmax=_MAX_ROWS)
@@ -146,14 +146,14 @@ class GpuSimulation:
             self._upload()
             self._graph: Any = None
             if device != "cpu":
-                # Captured now, while nothing else uses the GPU; the first run compiles the kernels.
+                # The graph is captured now, while nothing else uses the GPU; the first run compiles the kernels.
                 self._advance()
                 with wp.ScopedCapture() as capture:
                     self._advance()
                 self._graph = capture.graph
 
     def begin(self, which: Indices) -> None:
-        """Uploads the models and states of environments whose episodes have just begun."""
+        """Takes over the models and states of environments whose episodes have just begun."""
         if not len(which):
             return
         robots = [self._envs[i].robot for i in which]
@@ -180,11 +180,11 @@ class GpuSimulation:
         self._controllers.begin(which, latency, np.array([robot.steps_to_update for robot in robots]))
 
     def step(self, which: Indices, commands: Array) -> None:
-        """Runs a control step of k environments under commands, v [m/s] and ω [rad/s], shape (k, 2).
+        """Runs a control step of k environments with commands v [m/s] and ω [rad/s], shape (k, 2).
 
         Raises:
-            RuntimeError: more contacts than the capacity.
-            PhysicsError: dm_control's; positions or velocities diverged.
+            RuntimeError: there are more contacts or constraint rows than the capacity.
+            PhysicsError (of dm_control): positions or velocities are not finite.
         """
         schedules = self._controllers.schedules(which, commands)
         self._move_obstacles(which, schedules)
@@ -216,7 +216,7 @@ class GpuSimulation:
         return tuple(sorted(model.geom(k).name for k in np.flatnonzero(self._touched[i])))
 
     def camera_poses(self, which: Indices) -> tuple[Array, Array]:
-        """Front camera poses, OpenCV axes, shape (k, 4, 4), and times [s], shape (k,), of the newest images."""
+        """Front cameras' poses (OpenCV axes), shape (k, 4, 4), and times [s], shape (k,), of the newest images."""
         qpos, time = self._state["qpos"][which, :7], self._controllers.time[which]
         if len(self._snapshot_times):
             qpos, time = self._delayed_base_poses(which)
@@ -247,7 +247,7 @@ class GpuSimulation:
         time = self._controllers.time[which] - self._params.camera_latency
         row = np.arange(len(which))
         past = times <= time + TIME_TOLERANCE
-        past[np.argmin(times, 0), row] = True  # the oldest snapshot, if all are newer than the image
+        past[np.argmin(times, 0), row] = True  # use the oldest snapshot if all are newer than the image
         first = np.argmax(np.where(past, times, -np.inf), 0)
         coming = np.where(past, np.inf, times)
         last = np.argmin(coming, 0)
@@ -319,15 +319,15 @@ class GpuSimulation:
 
 
 def _rotation_matrices(quaternions: Array) -> Array:
-    """Rotation matrices (k, 3, 3) of quaternions w, x, y, z, shape (k, 4), of any length."""
+    """Rotation matrices (k, 3, 3) of quaternions w, x, y, z, shape (k, 4), which need not be unit quaternions."""
     return Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
 
 
 class GpuVectorEnv(LocalVectorEnv):
-    """n environments of one scene and task that `mujoco_warp` steps."""
+    """n environments of one scene and task, stepped by `mujoco_warp`."""
 
     def __init__(self, factory: EnvFactory, seeds: Sequence[int | None], device: str) -> None:
-        """`seeds` as of `LocalVectorEnv`; `device`: Warp's name of the device."""
+        """`seeds` as in `LocalVectorEnv`; `device`: Warp's name of the device."""
         self._evaluator = RewardAndTermination(factory.world, factory.segment, factory.options, len(seeds))
         self._speed = np.zeros(len(seeds))
         super().__init__(factory, seeds)
@@ -340,7 +340,7 @@ class GpuVectorEnv(LocalVectorEnv):
 
     @property
     def physics(self) -> list[DrivePhysics]:
-        """Present physics of every environment; the access synchronizes them, which takes long."""
+        """Present physics of every environment. Reading this property calls `sync` first, which takes long."""
         self._simulation.sync(np.arange(len(self)))
         return self._physics
 
@@ -365,7 +365,7 @@ class GpuVectorEnv(LocalVectorEnv):
         self._evaluator.evaluate(some, motion)
         self._store(some, motion)
         if self.pixels and not isinstance(self.pixels, GpuPixelObserver):
-            self._simulation.sync(some)  # the host renders the objects in view
+            self._simulation.sync(some)  # `PixelObserver` reads the state on the host
         return StepResult(self._evaluator.reward(some), *self._evaluator.ended(some))
 
     def _store(self, which: NDArray[np.int64], motion: Motion) -> None:

@@ -1,8 +1,9 @@
 """Vector environment in one process: physics on a thread pool, images of all environments in one call of the renderer.
 
-Each environment has its own model and sequence of episodes, and is stepped by the code of `twin.load`: on a CPU it is
-bit-identical to a single environment. Threads are used because `mujoco.batch.Batch` supports neither contact checks nor
-a controller between substeps. See `vector_env.py` for several processes and `vector_env_gpu.py` for a GPU.
+Each environment has its own model and sequence of episodes, and is stepped by the same code as an environment of
+`twin.load`: on a CPU, their results are bit-identical. Threads are used because `mujoco.batch.Batch` supports neither
+contact checks nor a controller between substeps. See `vector_env.py` for several processes and `vector_env_gpu.py` for
+a GPU.
 """
 
 import dataclasses
@@ -34,9 +35,9 @@ class StepResult:
 
     reward: Array
     terminated: NDArray[np.bool_]
-    """The episode ended by success or failure."""
+    """True where the episode ended by success or failure."""
     truncated: NDArray[np.bool_]
-    """The episode ended at the time limit."""
+    """True where the episode ended at the time limit."""
 
     @property
     def over(self) -> NDArray[np.bool_]:
@@ -51,7 +52,7 @@ class LocalVectorEnv:
         envs = self._make_envs(factory, seeds)
         self.factory = factory
         self._mixtures: list[tuple[EpisodeLighting, str] | None] = [None] * len(envs)
-        """The last lighting of each environment and the text of its mixture."""
+        """Last lighting of each environment, with the text of its mixture."""
         self._physics, self.tasks = [p for p, _ in envs], [t for _, t in envs]
         self.pixels = factory.make_observer(envs)
         self.options = factory.options
@@ -85,7 +86,7 @@ class LocalVectorEnv:
         return sum(int(np.prod(spec.shape)) for spec in self._environments[0].observation_spec().values())
 
     def seed(self, i: int, seed: int | None) -> None:
-        """Starts another sequence of episodes in environment i, from its next episode on."""
+        """Starts a new sequence of episodes in environment i, from its next episode on."""
         self.tasks[i].seed(seed)
 
     def begin(self, which: Sequence[int]) -> None:
@@ -99,14 +100,14 @@ class LocalVectorEnv:
         """Runs one control step of environments whose episodes are not over.
 
         Args:
-            actions: Actions in [-1, 1], which spans the range of `action_spec`; shape (k, action_size).
-            which: Indices of k environments; None: all. The result has their order.
+            actions: Actions in [-1, 1], scaled to the range of `action_spec`; shape (k, action_size).
+            which: Indices of k environments; None: all. The result is in this order.
 
         Raises:
             ValueError: invalid actions; the episodes are unchanged.
         """
         which = range(len(self)) if which is None else which
-        # In float64, as a driver of one environment computes it.
+        # Computed in float64, as by a driver of a single environment.
         given = check_actions(actions, (len(which), self.action_size))
         wanted = self._low + (np.clip(given, -1.0, 1.0) + 1.0) / 2.0 * (self._high - self._low)
         out = self._advance(wanted, which)
@@ -130,15 +131,15 @@ class LocalVectorEnv:
     def state(self, i: int) -> NDArray[np.float32]:
         """Present privileged state of environment i, see `DriveTask.get_observation`; shape (k,).
 
-        It is newer than the newest image if the camera has a latency.
+        If the camera has a latency, this state is newer than the newest image.
         """
         return self._states[i].copy()
 
     def info(self, i: int) -> dict[str, Any]:
         """Info of environment i's episode so far, JSON-able.
 
-        With images, `lighting` is the condition's name in tables, such as `training`, and `sampled_lighting` appends
-        the sampled mixture: `training: sun 0.62, night 0.38`, see `mixture_text`.
+        With images, `lighting` is the condition's name in tables, such as `training`; `sampled_lighting` is that name
+        followed by the sampled mixture: `training: sun 0.62, night 0.38`, see `mixture_text`.
         """
         return self.tasks[i].info(self._physics[i]) | self._pixel_info(i)
 
@@ -149,7 +150,7 @@ class LocalVectorEnv:
         return info | {"sampled_lighting": info["lighting"] + (self._mixture(i, lighting) if lighting else "")}
 
     def _mixture(self, i: int, lighting: EpisodeLighting) -> str:
-        """The part of environment i's `sampled_lighting` after the name; empty for a named lighting."""
+        """The text after the name in environment i's `sampled_lighting`; empty if the lighting was not sampled."""
         known, field = self._mixtures[i], self.factory.field
         if known is not None and known[0] is lighting:
             return known[1]
@@ -162,7 +163,7 @@ class LocalVectorEnv:
         return text
 
     def make_view(self, size: tuple[int, int]) -> PixelObserver:
-        """Returns an observer that renders the present episodes at another size (width, height), without camera noise.
+        """Returns an observer that renders current episodes at another size (width, height), without camera noise.
 
         Its stacks have one image. It changes neither the observations nor any random draw; `pixels` must exist.
         """
@@ -196,13 +197,13 @@ class LocalVectorEnv:
 def mixture_text(embedding: Array32, filmed: Lightings) -> str:
     """Text of the mixture of filmed lightings that is nearest to an embedding (dim,), such as `sun 0.62, night 0.38`.
 
-    The parts are nonnegative and add up to 1; those below 0.005 are omitted. A sampled embedding also has a deviation
-    like that of a single frame, which the text omits.
+    The fractions are nonnegative and add up to 1; those below 0.005 are omitted. A sampled embedding also deviates from
+    the mixture, as the embedding of a single frame does; the text omits this deviation.
     """
     from scipy.optimize import nnls  # slow to import
 
     vectors = filmed.vectors.astype(np.float64)
-    sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # of the equation that the parts add up to 1
+    sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # weight of the equation: fractions add up to 1
     equations = np.vstack([vectors.T, np.full(len(vectors), sum_weight)])
     parts, _ = nnls(equations, np.append(embedding, sum_weight))
     order = np.argsort(-parts, kind="stable")

@@ -1,6 +1,6 @@
 """Weather randomization of pictures: directional relighting, cast shadows, and fog from a photo or a sample.
 
-All three modify a picture by its depth; the field itself is not changed.
+All three modify a rendered picture with the help of its depth; the field itself is not changed.
 """
 
 import cv2
@@ -13,8 +13,8 @@ from twin.types import Array, Array32
 
 # ---- fog
 
-_HORIZON_DISTANCE = 40.0  # [m] beyond it, pixels have nearly the horizon's color
-_MIN_HORIZON_SHARE = 0.01  # fraction of a picture that must be beyond this depth to determine the horizon's color
+_HORIZON_DISTANCE = 40.0  # [m] pixels beyond this depth have nearly the horizon's color
+_MIN_HORIZON_SHARE = 0.01  # fraction of pixels that must be beyond `_HORIZON_DISTANCE` to give the horizon's color
 
 
 class FogSample:
@@ -24,12 +24,12 @@ class FogSample:
     """
 
     def __init__(self, extinction: float, airlight: float = 1.0) -> None:
-        """`extinction` is in [1/m], `airlight` a factor of the horizon's brightness."""
+        """`extinction` is in [1/m]; `airlight` is the fog's brightness as a factor of the horizon's."""
         self._extinction, self._gain = extinction, np.float32(airlight)
         self._fog: Fog | None = None
 
     def apply(self, rgb: Array32, distance: Array32) -> Array32:
-        """The picture (height, width, 3) seen through the fog; distance along the rays [m], shape (height, width)."""
+        """Adds the fog to a picture (height, width, 3); `distance` is along the rays [m], shape (height, width)."""
         if self._fog is None:
             horizon = _horizon_color(rgb, np.minimum(distance, np.float32(REACH)))
             red, green, blue = np.minimum(self._gain * horizon, np.float32(1.0)).tolist()
@@ -38,7 +38,7 @@ class FogSample:
 
 
 def _horizon_color(rgb: Array32, distance: Array32) -> Array32:
-    """Mean color of far pixels, shape (3,); of the upper third of the picture if too few are far."""
+    """Mean color of far pixels or, if there are too few, of the upper third of the picture, shape (3,)."""
     far = distance > _HORIZON_DISTANCE
     if far.mean() < _MIN_HORIZON_SHARE:
         far = np.zeros_like(far)
@@ -49,27 +49,28 @@ def _horizon_color(rgb: Array32, distance: Array32) -> Array32:
 # ---- directional relighting
 
 RELIGHT_REACH = 40.0  # [m] depth beyond which normals are not used
-_NEAR = 25.0  # [m] depth up to which nothing counts as far
-_WARMTH = (0.0, 0.5)  # fraction of the gain by which red has more, and blue less, than green
+_NEAR = 25.0  # [m] up to this depth, surfaces are relit by their normals alone
+_WARMTH = (0.0, 0.5)  # range of the fraction by which red has more gain than green, and blue less
 _SKY, _TINT = 0.6, 0.15  # standard deviations of the sky's brightness and color, as fractions of the strength
-_HEIGHT_RAMP = (-0.4, 0.0)  # [m] above the lens: no relighting up to the first, full relighting from the second on
+_HEIGHT_RAMP = (-0.4, 0.0)  # [m] above the lens: no relighting below the first height, full relighting above the second
 _SMOOTHING = 3  # [px] side of the window over which points are averaged before normals are computed
 
 
 class DirectionalRelighting:
     """Brightens surfaces that face a hypothetical sun and darkens the others, for one episode.
 
-    A surface of normal n under a sun in direction s gets the gain exp(strength · (n · s − s_z)), more of it in red than
-    in blue, as a low sun is warm. Horizontal ground keeps its brightness. Normals come from the picture's depth, and
-    are inaccurate within three pixels of an outline. Surfaces more than 0.4 m below the lens, curbs included, are not
-    relit, as a field's ground is rough; those above the lens get the full gain. Far surfaces and the sky get one gain
-    of random brightness and color, higher towards the sun; the two blend between 25 and 40 m.
+    A surface with normal n under a sun in direction s gets the gain exp(strength · (n · s − s_z)). The strength is
+    higher in red than in blue, since the light of a low sun is warm. Horizontal ground keeps its brightness. Normals
+    come from the picture's depth, and are inaccurate within three pixels of an outline. Surfaces more than 0.4 m below
+    the lens, curbs included, are not relit, since a field's ground is rough; surfaces above the lens get the full gain.
+    Far surfaces and the sky get a gain of random brightness and color that does not depend on normals and is higher
+    towards the sun. The two gains blend between 25 and 40 m.
     """
 
     def __init__(self, strength: float, sun: Array, rng: np.random.Generator) -> None:
         """
         Args:
-            strength: With 0.7, a front that faces a sun 15° high gets 1.6 times as bright, one turned away 0.4 times.
+            strength: With 0.7 and a sun 15° high, a wall facing it gets 1.6 times as bright, the opposite 0.4 times.
             sun: Unit vector towards the sun, shape (3,).
             rng: Random generator of the episode.
         """
@@ -80,7 +81,7 @@ class DirectionalRelighting:
         self._sky_gain = (strength * sky).astype(np.float32)
 
     def apply(self, rgb: Array32, depth: Array32, points: Array32) -> Array32:
-        """The relit picture. `rgb` and `points` have shape (height, width, 3), `depth` is z-depth [m].
+        """Returns the relit picture. `rgb` and `points` have shape (height, width, 3), `depth` is z-depth [m].
 
         `points` are surface points relative to the camera in world axes [m], no deeper than `RELIGHT_REACH`.
         """
@@ -96,7 +97,7 @@ class DirectionalRelighting:
 
 
 def _normals(points: Array32) -> Array32:
-    """Unit normals towards the camera of the surface through points around it, shape (height, width, 3)."""
+    """Unit normals, towards the camera, of the surface through points relative to it, shape (height, width, 3)."""
     smooth = cv2.blur(points, (_SMOOTHING, _SMOOTHING), borderType=cv2.BORDER_REPLICATE)
     down, across = np.gradient(smooth, axis=(0, 1))
     normal = np.cross(down, across)
@@ -106,23 +107,25 @@ def _normals(points: Array32) -> Array32:
 
 # ---- cast shadows
 
-_SIDE = 256  # texels of a pattern, which is periodic
-_TEXEL = 0.1  # [m] across the sun's direction
-_PATCH_RADIUS = (0.4, 2.0)  # [m] smallest and largest
-_LEAF_RADIUS = 0.15  # [m] of the holes in dappled patches
-_PATCH_COVER = (0.2, 0.6)  # fraction of the plane that patches darken
-_HOUSES, _HOUSE_SIDE = (1, 4), (3.0, 12.0)  # count, last excluded; [m] sides, before a low sun stretches them
-_POSTS, _POST_WIDTH, _POST_LENGTH = (0, 8), (0.1, 0.5), (2.0, 10.0)  # count; [m] width and length
+_SIDE = 256  # side of a pattern in texels; patterns are periodic
+_TEXEL = 0.1  # [m] side of a texel, measured across the sun's direction
+_PATCH_RADIUS = (0.4, 2.0)  # [m] smallest and largest radius of patches
+_LEAF_RADIUS = 0.15  # [m] radius of the spots in dappled patches
+_PATCH_COVER = (0.2, 0.6)  # smallest and largest fraction of the plane that patches darken
+# Ranges of counts (without their ends), and of sizes [m] before a low sun stretches the pattern.
+_HOUSES, _HOUSE_SIDE = (1, 4), (3.0, 12.0)
+_POSTS, _POST_WIDTH, _POST_LENGTH = (0, 8), (0.1, 0.5), (2.0, 10.0)
 _OVERSAMPLING = 4  # resolution factor at which solid shadows are drawn, for smooth edges
-_SHADOW_TINT = np.array([1.0, 0.95, 0.85], np.float32)  # a shadow keeps the sky's light, which is bluer
+_SHADOW_TINT = np.array([1.0, 0.95, 0.85], np.float32)  # blue loses less: a shadow keeps the sky's bluer light
 
 
 class CastShadows:
     """Random cast shadows that were not filmed, fixed in the world, for one episode.
 
     A periodic pattern in the plane z = 0 is projected along the rays of the episode's sun onto ground, curbs and walls.
-    It consists of patches, some of them dappled as under leaves; of solids with straight edges, as of houses and posts,
-    which a policy can mistake for curbs and lines; or of both. A lower sun makes it longer.
+    It consists of patches, which may be dappled like shadows of leaves, of shadows with straight edges like those of
+    houses and posts, or of both. A policy can mistake straight edges for curbs and lines. A lower sun stretches the
+    pattern.
     """
 
     def __init__(self, strength: float, sun: Array, rng: np.random.Generator) -> None:
@@ -144,7 +147,7 @@ class CastShadows:
             self._pattern = np.maximum(self._pattern, _solid_shadows(rng))
 
     def apply(self, rgb: Array32, depth: Array32, points: Array) -> Array32:
-        """The picture with the shadows. Arguments as of `DirectionalRelighting.apply`, but points in the world."""
+        """Returns the picture with shadows. Arguments as in `DirectionalRelighting.apply`, but points in the world."""
         flat = points[..., :2] - points[..., 2:] * self._slant
         across, down = np.moveaxis(flat @ self._to_texel.T % _SIDE, -1, 0).astype(np.float32)
         dark = cv2.remap(self._pattern, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).astype(np.float32)
@@ -153,14 +156,14 @@ class CastShadows:
 
 
 def _solid_shadows(rng: np.random.Generator) -> Array32:
-    """Pattern, 1 in the dark, of houses at random angles and posts along the sun's direction; shape (side, side)."""
+    """Shadows of houses at random angles and of posts along the sun's direction, 1 in the dark, shape (side, side)."""
     side = _SIDE * _OVERSAMPLING
     canvas = np.zeros((side, side), np.uint8)
     houses = [(rng.uniform(*_HOUSE_SIDE, 2), rng.uniform(0.0, np.pi)) for _ in range(rng.integers(*_HOUSES))]
     posts = [((rng.uniform(*_POST_LENGTH), rng.uniform(*_POST_WIDTH)), 0.0) for _ in range(rng.integers(*_POSTS))]
     for size, turn in houses + posts:
         middle = rng.uniform(0.0, side, 2)
-        for x in (-side, 0, side):  # repeats without a seam
+        for x in (-side, 0, side):  # drawn nine times, so that the pattern repeats without a seam
             for y in (-side, 0, side):
                 wide, high = (extent / _TEXEL * _OVERSAMPLING for extent in size)
                 box = ((middle[0] + x, middle[1] + y), (wide, high), np.rad2deg(turn))
@@ -169,18 +172,18 @@ def _solid_shadows(rng: np.random.Generator) -> Array32:
 
 
 def _patches(rng: np.random.Generator, radius: float, cover: float) -> Array32:
-    """Pattern, 1 in the dark, of patches of about a radius [texels] that cover a fraction of it; shape (side, side)."""
-    # Smoothed on a torus, so that it repeats without a seam.
+    """Patches of about a radius [texels] that cover a fraction `cover`, 1 in the dark, shape (side, side)."""
+    # The smoothing is periodic, so that the pattern repeats without a seam.
     frequency = np.fft.fftfreq(_SIDE)[:, None] ** 2 + np.fft.rfftfreq(_SIDE) ** 2
     smooth = np.exp(-2.0 * (np.pi * radius) ** 2 * frequency)
     noise = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(_SIDE, _SIDE))) * smooth, (_SIDE, _SIDE))
     noise /= noise.std()
-    # An edge as wide as a third of the patch's radius is as soft as the shadow of a tree some metres away.
+    # Edges as wide as a third of a patch's radius are as soft as those of a tree's shadow some meters away.
     edge = 0.15
     return np.clip((noise - np.quantile(noise, 1.0 - cover)) / edge + 0.5, 0.0, 1.0).astype(np.float32)
 
 
-# ---- all of an episode
+# ---- weather of an episode
 
 _SUN_ELEVATION = (10.0, 55.0)  # [°]
 
@@ -190,18 +193,18 @@ class Weather:
 
     def __init__(self, sample: RandomizationSample, rng: np.random.Generator, fog: Fog | None = None) -> None:
         self.fog = fog
-        """Current fog of the episode's lighting, where a photo determines it; None: that of the film."""
+        """Current fog of the episode's lighting, if fitted to a photo; None: the film's."""
         elevation, azimuth = np.deg2rad(rng.uniform(*_SUN_ELEVATION)), rng.uniform(0.0, 2.0 * np.pi)
         level = np.cos(elevation)
         sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
-        # Separate random streams, so that each is the same with or without the other.
+        # Separate random streams, so that relighting and shadows do not depend on each other's presence.
         relighting_rng, shadow_rng = rng.spawn(2)
         self._relighting = DirectionalRelighting(sample.sunlight, sun, relighting_rng) if sample.sunlight else None
         self._shadows = CastShadows(sample.shade, sun, shadow_rng) if sample.shade else None
         self._sampled_fog = FogSample(sample.extinction, sample.airlight) if sample.extinction else None
 
     def apply(self, rgb: Array32, depth: Array32, rays: NDArray, pose: NDArray) -> Array32:
-        """The picture in this weather.
+        """Returns a picture in this weather.
 
         Args:
             rgb: Shape (height, width, 3).
