@@ -276,6 +276,20 @@ def test_parts_out_of_reach_change_no_result(tmp_path):
     np.testing.assert_array_equal(whole.data.qpos, small.data.qpos)
 
 
+def test_the_robot_stands_on_a_hundred_meters_of_relief(tmp_path):
+    physics = HuskyPhysics(tiny_world(tmp_path).model())
+    model, points = physics.model, np.array([[0.0, 0.1], [2.0, -0.2]])
+    model.hfield_data[:] = np.linspace(0.4, 0.8, len(model.hfield_data))
+    low = physics._ground_height(points)
+    model.hfield_size[0, 2] = 150.0
+    high = physics._ground_height(points)
+    base = float(model.geom("ground").pos[2])
+    assert (high > base + 50.0).all()
+    model.hfield_size[0, 2] = 1.0
+    np.testing.assert_allclose(high - base, 150.0 * (physics._ground_height(points) - base), rtol=1e-3)
+    assert (low < high).all()
+
+
 def test_parts_within_reach_stay(tmp_path):
     """Everything whose distance from the corridor is less than the robot's length."""
     world = tiny_world(tmp_path)

@@ -29,6 +29,7 @@ from twin.report.forecast_text import (
     STATISTICS,
     candidates_csv,
     format_estimate,
+    format_probability,
     limitations,
     next_trials,
     summary_text,
@@ -572,3 +573,8 @@ def test_numbers_are_shown_with_their_interval() -> None:
     assert format_estimate(Estimate(-0.104, -0.2, 0.001, 12), percent=True) == "−10% (−20% to 0%)"
     assert format_estimate(Estimate(-0.001, None, None, 1), percent=True) == "0%"
     assert format_estimate(Estimate(missing="too few")) == "–"
+
+
+def test_a_probability_is_never_rounded_to_certainty():
+    said = [format_probability(p) for p in (0.0, 0.005, 0.0051, 0.5, 0.9949, 0.995, 1.0)]
+    assert said == ["<1%", "<1%", "1%", "50%", "99%", ">99%", ">99%"]

@@ -23,7 +23,7 @@ TIME_TOLERANCE = 1e-6  # [s] simulation times that differ by less count as equal
 
 _CHECK_PERIOD = 0.01  # [s] between two contact checks, which also record all poses
 _SETTLE_TIME = 0.3  # [s] simulated in `set_pose`, for the robot to settle on the ground
-_RAY_START = 50.0  # [m] height above the ground's origin from which rays find the ground's height
+_RAY_START = 50.0  # [m] smallest height above the ground's origin from which rays find the ground's height
 
 
 class _Snapshot(NamedTuple):
@@ -105,7 +105,8 @@ class HuskyPhysics:
         self._snapshots = [self._snapshot()]
 
     def _ground_height(self, xy: Array) -> Array:
-        top = self.model.geom_pos[self._ground, 2] + _RAY_START
+        relief = self.model.hfield_size[self.model.geom_dataid[self._ground], 2]
+        top = self.model.geom_pos[self._ground, 2] + max(_RAY_START, relief + 1.0)
         down = np.array([0.0, 0.0, -1.0])
         return np.array(
             [

@@ -95,10 +95,10 @@ def percentage_points(share: float) -> str:
 
 
 def format_probability(probability: float) -> str:
-    """Formats an estimated probability in percent; below 0.5% as <1%, above 99.5% as >99%."""
-    if probability > 0.995:
+    """Formats an estimated probability in percent; up to 0.5% as <1%, from 99.5% as >99%."""
+    if probability >= 0.995:
         return ">99%"
-    return "<1%" if probability < 0.005 else f"{probability:.0%}"
+    return "<1%" if probability <= 0.005 else f"{probability:.0%}"
 
 
 # ---- verdicts
