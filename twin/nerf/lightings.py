@@ -74,7 +74,7 @@ class Lightings:
         return mixed(self.fog(mixture[0]), self.fog(mixture[1]), mixture[2]) if mixture else None
 
     def sample(self, rng: np.random.Generator) -> Array32:
-        """Samples the embedding (dim,) of a plausible lighting; raises InputError without probes or if it finds none."""
+        """Samples the embedding (dim,) of a plausible lighting. Raises InputError without probes or success."""
         return self.prior.sample(rng)
 
     @cached_property

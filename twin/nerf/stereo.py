@@ -145,7 +145,7 @@ def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[Depth
 def choose_sources(cameras: Cameras, intrinsics: Array, depth: Array) -> list[NDArray[np.int32]]:
     """Up to four sources of every frame, best first, rated by their views of points around the frame's median depth.
 
-    `intrinsics` are fx, fy, cx, cy [px] of the scaled images, shape (n, 4); `depth` is the median depth [m], shape (n,).
+    `intrinsics` are fx, fy, cx, cy [px] of the scaled images, shape (n, 4); `depth` is the median depth [m], (n,).
     """
     n = len(cameras)
     positions, world_to_camera = cameras.positions, inverse_pose(cameras.camera_to_world)
