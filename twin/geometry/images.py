@@ -29,7 +29,7 @@ HEIF_SUFFIXES = (".heic", ".heif")
 """Suffixes of photos from phones; reading them needs the extra `heif`."""
 _HEIF = "HEIF"  # Pillow's name of the format
 _CURE = "replace or remove it"
-warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # a warning from half of MAX_PIXELS on
+warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # from half of MAX_PIXELS on
 warnings.filterwarnings("ignore", module="PIL")  # warnings of flawed headers, whose values count as unknown
 
 

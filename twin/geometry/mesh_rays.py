@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from twin.types import Array
 from twin.warp_runtime import wp
 
-_FAR = 1.0e3  # [m]
+_FAR = 1.0e3  # [m] greatest distance of a query
 
 
 @wp.kernel

@@ -1,4 +1,4 @@
-"""Passes: the stretches of a filmed path that a robot can drive in one go.
+"""Passes: the segments of a filmed path that a robot can drive without interruption.
 
 A film may go down a road twice, come back in the other lane, drive laps, stop, back up, or be cut. Its path is divided
 at *jumps* (a cut, or frames that lie far apart), at *turns* (the camera comes back the way it came) and at *laps* (it
@@ -21,9 +21,9 @@ from twin.geometry.poses import rotation_angle
 from twin.types import Array
 
 SPACING = 0.25  # [m] between the points of a path
-_SMOOTHING = 0.5  # [m] standard deviation; moves a 5 m turn by 0.5²/(2·5) = 2.5 cm
+_SMOOTHING = 0.5  # [m] standard deviation of the smoothing; it moves a turn of 5 m radius by 0.5²/(2·5) = 2.5 cm
 _STATIONARY_RADIUS = 0.4  # [m] motion within this radius counts as standing or rocking
-_DEPARTURE_RADIUS = 1.6  # [m] beyond this the camera has left: a later return is another pass
+_DEPARTURE_RADIUS = 1.6  # [m] beyond this radius the camera has left, and a later return is another pass
 _JUMP_RATIO = 8.0  # [typical steps] least length of a jump; uneven frame intervals and sudden starts stay below 4
 _MIN_JUMP = 5.0  # [m] least length of a jump
 _LONG_JUMP, _LONG_RATIO = 12.0, 3.0  # [m], [typical steps]; a step longer than both is a jump in any case
@@ -34,7 +34,7 @@ _ALONGSIDE = 0.5  # [m] greatest offset, along the path, of the point that it re
 _PARALLEL = np.cos(np.deg2rad(40.0))  # cosine of the greatest angle between a path and the part that it retraces
 _MIN_RETRACE = 1.5  # [m] shorter retraces are noise
 _MIN_LAP = 12.0  # [m] a path that goes the same way again has driven at least this far
-_MAX_U_TURN = 25.0  # [m] a longer way round is a loop at the end of the road and stays in the pass
+_MAX_U_TURN = 25.0  # [m] a longer turn is a loop at the end of the road and stays in the pass
 _MIN_PASS = 1.0  # [m] shorter passes are dropped
 _CHORD = 1.0  # [m] length over which headings are measured
 _MIN_PATH_FRAMES = 6
@@ -254,7 +254,7 @@ def path_length(path: Array) -> float:
 
 
 def path_directions(path: Array, chord: float = _CHORD) -> Array:
-    """Unit directions at the points of a path, of the chord around each, shape (m, 2)."""
+    """Unit direction of the chord around each point of a path, shape (m, 2)."""
     reach = max(round(chord / 2 / SPACING), 1)
     at = np.arange(len(path))
     along = path[np.minimum(at + reach, len(path) - 1)] - path[np.maximum(at - reach, 0)]
@@ -262,7 +262,7 @@ def path_directions(path: Array, chord: float = _CHORD) -> Array:
 
 
 def smooth_line(corners: Sequence[Array] | Array) -> Array:
-    """A path (m, 2) along a polyline (n ≥ 2, 2), its corners rounded as those of a filmed path."""
+    """A path (m, 2) along a polyline (n ≥ 2, 2), with corners rounded like those of a filmed path."""
     return resample(_smooth(resample(np.asarray(corners, float), curved=False), _SMOOTHING / SPACING), curved=False)
 
 

@@ -24,7 +24,7 @@ _BEYOND = 3.0  # [m] least length that a continuation adds
 _AGREE = np.cos(np.deg2rad(40.0))  # least cosine between the headings of joined passes
 _BLEND = 3.0  # [m] before and after a join over which the line goes from one pass to the other
 _MAX_FOLD = np.cos(np.deg2rad(120.0))  # cosine of the greatest change of heading over `_FOLD_CHORD`
-_FOLD_CHORD = 2.0  # [m]
+_FOLD_CHORD = 2.0  # [m] length along the line between the headings that are compared
 _OFF_FILM = 1.0  # [m] largest distance of a line through way points from the filmed paths
 
 
@@ -115,7 +115,7 @@ def _longest_line(passes: list[FilmedPass], max_gap: float) -> tuple[Array, tupl
 
 
 def _continued(line: Array, path: Array, max_gap: float) -> Array | None:
-    """A line extended by a path; None unless the path passes the line's end or starts ahead of it."""
+    """A line extended by a path; None unless the path passes close to its end or starts ahead of it."""
     if len(line) < 3 or len(path) < 3:
         return None
     end, ahead = line[-1], path_directions(line)[-1]

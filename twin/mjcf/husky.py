@@ -65,7 +65,7 @@ def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
     """Sets the time step, the solver options that skid steering needs, and the softness of the ground."""
     params = params or HuskyParams()
     spec.option.timestep = TIMESTEP
-    # Euler and RK4 are unstable with a stiff speed servo; implicitfast adds its damping to the mass matrix.
+    # Euler and RK4 are unstable with a stiff speed servo; implicitfast adds the servo's damping to the mass matrix.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # The pyramidal cone gives the right track ratio, but a torque that is 21 % too low.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -90,7 +90,7 @@ class WrongOption:
 
 
 def check(model: mujoco.MjModel) -> list[WrongOption]:
-    """The options of a model with a Husky in it that are wrong for skidding; empty if all are right.
+    """Options of a model with a Husky that are wrong for skid steering; empty if all are right.
 
     When a robot is attached to a scene, MuJoCo keeps the options of the scene, and the scene's ground can override the
     contact parameters of the tires.
@@ -274,7 +274,7 @@ def _add_wheel(base: mujoco.MjsBody, name: str, index: int, params: HuskyParams)
         rgba=(0.2, 0.2, 0.8, 0.4),
         condim=6,
         priority=1,
-        # A rolling friction coefficient [m] over the radius is Crr.
+        # MuJoCo's rolling friction [m] is the rolling resistance coefficient times the radius.
         friction=(params.friction, params.spin_friction, max(params.rolling_resistance * radius, 1e-5)),
         solimp=_WHEEL_SOLIMP,
         solref=_WHEEL_SOLREF,

@@ -41,9 +41,9 @@ from twin.scene import SceneDir
 from twin.types import Array
 
 _HFIELD_BASE = 1.0  # [m] thickness of solid ground below the lowest point, against tunneling
-_GROUND_OVERLAP = 0.15  # [m] up to this height above it, the height field and its texture replace the visual mesh
-_SETTLE_TIME = 2.0  # [s]
-_MIN_ROUTE = 2.0  # [m]
+_GROUND_OVERLAP = 0.15  # [m] up to this height above the height field, the visual mesh is left out
+_SETTLE_TIME = 2.0  # [s] simulated time in which the robot comes to rest before its state is stored
+_MIN_ROUTE = 2.0  # [m] least length of a route
 _SITE_SPACING = 1.0  # [m] between sites along the route
 
 
@@ -395,9 +395,10 @@ _CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
 
 
 def check_portable(folder: Path, built: mujoco.MjModel) -> dict[str, Any]:
-    """Loads a moved copy of the scene in plain MuJoCo and compares its robot's motion with the compiled model `built`.
+    """Loads a moved copy of the scene in plain MuJoCo and compares its robot's motion with that in the model `built`.
 
-    Returns metrics for the report; `spawn_drift_m` is the creep of the parked robot in 0.4 s (soft tires on a slope).
+    Returns metrics for the report; `spawn_drift_m` is the creep of the parked robot in 0.4 s, due to soft tires on a
+    slope.
 
     Raises:
         RuntimeError: the copy is a different model or its robot moves differently, which is a bug.

@@ -24,10 +24,10 @@ from twin.runtime import bar
 from twin.warp_runtime import wp
 
 _SHARDS = 4
-_RAYS = 4096  # per step of fine-tuning
+_RAYS = 4096  # rays per step of fine-tuning
 _VIEWS = 64  # greatest number of training views, evenly spaced, in which surfaces are searched
 _VIEW_WIDTH = 112  # [px] width of these views
-_SAMPLES = 24  # per ray
+_SAMPLES = 24  # samples per ray
 _MIN_WEIGHT = 0.004  # a sample with a greater compositing weight lies on a surface
 _MIN_CELL = 0.03  # [m] least side of near cells
 _COARSENING = 1.15  # least factor by which cells grow per attempt

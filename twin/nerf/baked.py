@@ -84,7 +84,7 @@ def brick_indices(layout: BrickLayout, near: NDArray, far: NDArray) -> tuple[NDA
 
 
 def _density_codes(samples: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Reorders density bytes of bricks (s, 729) as `bricks.DENSITIES` says, shape (s · 810 + 8,)."""
+    """Density bytes of bricks (s, 729) in the order that is described at `bricks.DENSITIES`, shape (s · 810 + 8,)."""
     cube = samples.reshape(-1, *[CORNERS] * 3)
     halves = np.stack([cube[..., :HALF_CORNERS], cube[..., HALF_CORNERS - 1 :]], 2)
     return np.concatenate([halves.ravel(), np.zeros(8, np.uint8)])  # padding, as the march reads eight bytes at a time
@@ -105,7 +105,7 @@ def _stored_skips(index: NDArray[np.int32], distance: NDArray[np.uint8]) -> tupl
 
 
 def skip_distances(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str, NDArray[np.uint8]]:
-    """Skip distances of all blocks of the near and the far grid, as arrays `near_leap` and `far_leap`.
+    """Skip distances (see `kernels/march.py`) of all blocks of both grids, as arrays `near_leap` and `far_leap`.
 
     A block is occupied if a cell with the density of one of the block's samples blocks more than `_MAX_EMPTY_OPACITY`.
     """
@@ -272,7 +272,7 @@ def detail_grid(detail: Detail, device: str) -> Any:
 # ---- field
 
 _FORMAT = 2
-_MAX_TARGETS = 4  # kept render targets; a vector env needs one for all its envs and one for those being reset
+_MAX_TARGETS = 4  # kept render targets at most; a vector env uses one for all its envs and one for those in reset
 
 
 class BakedField:

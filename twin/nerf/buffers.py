@@ -1,4 +1,6 @@
-"""Devices, threads, layout and arrays of a radiance field; terms as in `kernels/space.py` and `kernels/sampler.py`.
+"""Devices, threads, layout and arrays of a radiance field.
+
+The terms are defined in `kernels/space.py` and `kernels/sampler.py`.
 
 Warp runs a CPU launch on one thread. As Warp and torch release the interpreter lock while they compute, two Python
 threads keep two cores busy. A batch is divided into a fixed number of *shards*, whose results are summed in order. So
@@ -94,7 +96,7 @@ def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
 
 _NEAR_CELLS = 3_000_000  # cells of the near opacity grid: 12 MB, which fit in a laptop's cache
 _FAR_CELLS = 1_000_000  # cells of the far opacity grid
-_INITIAL_OPTICAL_DEPTH = 1.5  # of the untrained field across the near box's longest half side
+_INITIAL_OPTICAL_DEPTH = 1.5  # optical depth of the untrained field along the near box's longest half side
 COARSEST_CELLS = 16
 """Cells of the coarsest hash level along the longest axis."""
 
@@ -119,7 +121,7 @@ class NearBox:
 
 
 def near_box_of_cameras(camera_to_world: NDArray[np.float64], near_half_extent: float = 0.0) -> NearBox:
-    """The near box of cameras (n, 4, 4), z up: contains them and, ahead of each, half their greatest extent.
+    """The near box of cameras (n, 4, 4), z up: contains the path and, ahead of each camera, half the path's extent.
 
     The box has a margin, which is smaller vertically, as most of what is filmed from a road lies beside the road. A
     nonzero `near_half_extent` [m] instead gives a cube with that half side around the cameras.

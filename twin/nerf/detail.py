@@ -38,7 +38,7 @@ _MIN_OPACITY = 0.98  # least opacity of a ray that shows a surface and nothing b
 _MIN_HITS = 24  # least number of training pixels in a stored tile
 _MAX_HITS = 8_000_000  # approximate greatest number of training pixels that are kept, 0.5 GB
 _SHARDS = 4
-_RAYS = 16384  # per step
+_RAYS = 16384  # rays per step
 _RATE, _FINAL_RATE = 0.04, 0.05  # initial learning rate, and the final one as a share of it
 _CLIPPED_SHARE = 2e-4  # share of values clipped by the range of a byte
 

@@ -99,7 +99,7 @@ def score_frame(
 def _small_scores(
     baked: BakedField, camera: Cameras, image: NDArray, mask: NDArray[np.bool_], fitted: list[NDArray[np.float32]]
 ) -> dict[str, float]:
-    """Small scores of a frame under the embeddings that were fitted on its left and its right half."""
+    """Small scores (see the module) of a frame, with the embeddings that were fitted on its left and its right half."""
     height, width = mask.shape
     size = min(_SMALL_WIDTH, width), max(1, round(height * min(_SMALL_WIDTH, width) / width))
     wanted, usable = resize(image, *size), resize(mask.astype(np.float32), *size) > 0.999
@@ -157,7 +157,7 @@ def evaluate(
 
 # ---- cross-lighting control
 
-_MAX_POSES = 60  # in all, evenly spaced over each lighting's frames
+_MAX_POSES = 60  # poses of all lightings together, evenly spaced over each lighting's frames
 _WIDTH = 96  # [px] longer side of the images
 
 

@@ -86,12 +86,12 @@ def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
 
 # ---- training
 
-_SHARDS = 4  # per batch
+_SHARDS = 4  # shards per batch
 _CELL_PIXELS = 2.0  # side of the finest cell at the distance of near surfaces [px of a training frame]
 _GROWTH_RANGE = (1.3, 2.2)  # limits of the growth of the cells per axis from one hash level to the next
 _HIDDEN = 64  # units per hidden layer
 _TRIPLE_SHARE = 0.3  # share of the rays that come in triples, for the plane loss
-_FREE_POINTS = 256  # per shard and step
+_FREE_POINTS = 256  # free points per shard and step
 _NETWORK_RATE = 1e-2  # initial learning rate of networks and embeddings
 _FINAL_RATE = 0.03  # final learning rates, as a share of the initial ones
 _RISE, _FALL = 0.3, 0.1  # rates at which opacity grid cells follow higher and lower samples
@@ -290,8 +290,10 @@ class Trainer:
         return self._trunk_backward(rows)
 
     def _update(self, task: int, rate: float) -> None:
-        """Scatters the gradient of hash level `task` and takes its Adam step. Each of the two tasks after the levels
-        updates half of the cells of the opacity grids."""
+        """Accumulates the gradient of hash level `task` and takes an Adam step on that level.
+
+        The two tasks after those of the levels update half of the cells of the opacity grids each.
+        """
         f, ws = self.field, self.ws
         levels = self.config.levels
         if task >= levels:

@@ -4,8 +4,8 @@
 center of the near box divided by its half side; the near box is [−1, 1]³. *Contracted position*: u inside the near box,
 (2 − 1/|u|)·u/|u| outside (Barron et al. 2022, eq. 10, but with the maximum norm), so all of space is in (−2, 2)³.
 *Grid position*: contracted position scaled to [0, 1]³. *Contracted meter*: a meter inside the near box; outside it, a
-length that is contracted to that of a meter inside, see `expansion`. Density is per contracted meter, so the far field
-starts no more opaque than the near field.
+length that is contracted to that of a meter inside, see `expansion`. Density is per contracted meter, so before
+training, the far field is no more opaque than the near field.
 """
 
 # Warp reads annotations as values.
