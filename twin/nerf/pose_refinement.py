@@ -21,7 +21,7 @@ from twin.types import Array
 from twin.warp_runtime import wp
 
 _STEP_PIXELS = 0.05  # [px of a training frame] initial image motion per step
-_NEIGHBORS = 2  # a held-out frame gets the mean correction of so many training frames
+_NEIGHBORS = 2  # number of training frames whose mean correction is applied to a held-out frame
 
 
 class PoseRefinement:

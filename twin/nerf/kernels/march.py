@@ -31,7 +31,7 @@ OPTIONS = {
     "fast_math": False,
     "cpu_compiler_flags": "-march=native -ffp-contract=fast -mllvm=-inline-threshold=9000",
 }
-"""Module options of kernels with such loops."""
+"""Module options of kernels with loops over lanes."""
 
 wp.set_module_options(OPTIONS)
 
@@ -483,7 +483,7 @@ def march_kernel(lanes: int) -> Any:
                     thick[j] = wp.where(occupied > 0, stride / (m * m), thick[j])
                     dense[j] = wp.where(occupied > 0, 1, dense[j])
                     sampling_count = sampling_count + occupied
-            if _WAIT_RATIO * sampling_count < alive_count:  # few lanes need a sample: they wait for others
+            if _WAIT_RATIO * sampling_count < alive_count:  # few lanes need a sample, so they wait until more do
                 for j in range(lanes):
                     ahead[j] = wp.where(dense[j] > 0, 0.0, ahead[j])
             else:

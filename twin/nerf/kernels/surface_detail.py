@@ -44,7 +44,7 @@ _MIN_GRADIENT = 1.0e-22  # rays with a smaller squared norm of the gradient are 
 
 @wp.struct
 class DetailGrid:
-    """Height map and tile index, which start at the same corner, and the hash grid."""
+    """Height map and tile index, which have the same lowest corner, and the hash grid."""
 
     origin: wp.vec2f
     """Lowest corner [m]."""
@@ -81,7 +81,7 @@ def height_of(array: wp.array(dtype=wp.float32), i: wp.int32) -> wp.float32: ...
 
 @wp.func
 def height_at(grid: DetailGrid, x: wp.float32, y: wp.float32) -> wp.float32:
-    """Height of the ground [m] at a distance (x, y) [m] from the grid's corner; at least `NO_GROUND` / 2 if unknown."""
+    """Height of the ground [m] at a distance (x, y) [m] from the grid's corner; `NO_GROUND` where it is unknown."""
     px = x * grid.per_height_cell
     py = y * grid.per_height_cell
     ix = int(px)
