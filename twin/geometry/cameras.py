@@ -1,8 +1,8 @@
 """Posed pinhole cameras, sparse points and projection.
 
 OpenCV axes: x right, y down, z forward. Pixel (0, 0) is the *corner* of the top-left pixel, whose center is (0.5, 0.5)
-as in COLMAP. *Depth* is the z coordinate in the camera frame, *distance* is measured along the ray. The world frame is
-metric with z up after stage `metric`; in `2_cameras` it is the frame of the reconstruction.
+as in COLMAP. *Depth* is the z coordinate in the camera frame, *distance* is measured along the ray. From stage `metric`
+on, the world frame is metric with z up; in the folder `2_cameras`, it is the frame of the reconstruction.
 """
 
 import os
@@ -133,7 +133,7 @@ class Viewpoints:
 
     camera_to_world: Array  # shape (n, 4, 4)
     intrinsics: Array  # fx, fy, cx, cy [px], shape (n, 4)
-    sizes: NDArray[np.int64]  # width, height [px] that the intrinsics are for, shape (n, 2)
+    sizes: NDArray[np.int64]  # width, height [px] of the images to which the intrinsics apply, shape (n, 2)
 
     @staticmethod
     def of(camera_to_world: Array, intrinsics: Array, size: tuple[int, int]) -> "Viewpoints":
@@ -198,7 +198,7 @@ class SparsePoints:
     rgb: NDArray[np.uint8]  # shape (m, 3)
     error: NDArray[np.float64]  # mean reprojection error [px], shape (m,)
     point: NDArray[np.int64]  # point index per observation, shape (k,)
-    frame: NDArray[np.int64]  # index into the `Cameras` stored beside them per observation, shape (k,)
+    frame: NDArray[np.int64]  # frame of each observation, as an index into the `Cameras` stored beside them, shape (k,)
 
     def __len__(self) -> int:
         return len(self.xyz)

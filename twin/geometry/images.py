@@ -18,19 +18,19 @@ from skimage.metrics import structural_similarity
 from twin.errors import InputError
 from twin.files import read_bytes, regular_file, write_bytes
 
-MAX_PIXELS = 2 * 89_478_485  # largest accepted image by its header; Pillow rejects larger ones as decompression bombs
+MAX_PIXELS = 2 * 89_478_485  # most pixels of an accepted image; Pillow rejects more as decompression bombs
 DECODE_ERRORS = (
     *(ArithmeticError, AttributeError, EOFError, LookupError, OSError, SyntaxError, TypeError, ValueError),
     *(AssertionError, MemoryError, NotImplementedError, RuntimeError, struct.error, zlib.error, cv2.error),
 )
 """Exceptions that Pillow and OpenCV raise for damaged files."""
-_MAX_BYTES = 2 << 30  # size of an image file
+_MAX_BYTES = 2 << 30  # greatest size of an image file [bytes]
 HEIF_SUFFIXES = (".heic", ".heif")
-"""Of the photos of phones; reading them needs the extra `heif`."""
+"""Suffixes of photos from phones; reading them needs the extra `heif`."""
 _HEIF = "HEIF"  # Pillow's name of the format
 _CURE = "replace or remove it"
-warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # issued at half of MAX_PIXELS
-warnings.filterwarnings("ignore", module="PIL")  # flawed headers; their values then count as unknown
+warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # from half of MAX_PIXELS on
+warnings.filterwarnings("ignore", module="PIL")  # warnings of flawed headers, whose values count as unknown
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -72,7 +72,7 @@ def _decode_heif(path: Path, image: PillowImage.Image, flags: int, cure: str) ->
 def open_header(path: Path, cure: str = _CURE) -> PillowImage.Image | None:
     """Opens an image file with Pillow, reading only the header; None for a format unknown to Pillow.
 
-    HEIF is upright as opened, whatever its EXIF orientation says.
+    A HEIF image is already upright when it is opened, whatever EXIF orientation its header gives.
 
     Raises InputError: no file, an empty one, more than `MAX_PIXELS`, or HEIF without pillow-heif.
     """

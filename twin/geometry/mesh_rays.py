@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from twin.types import Array
 from twin.warp_runtime import wp
 
-_FAR = 1.0e3  # [m]
+_FAR = 1.0e3  # [m] greatest distance of a query
 
 
 @wp.kernel
@@ -33,7 +33,7 @@ def _nearest(mesh: wp.uint64, points: wp.array[wp.vec3], out: wp.array[float]):
 @wp.kernel
 def _openness(mesh: wp.uint64, points: wp.array[wp.vec3], rays: wp.array[wp.vec3], reach: float, out: wp.array[float]):
     i = wp.tid()
-    free = wp.int32(0)  # a variable to Warp, where a bare literal would be a constant
+    free = wp.int32(0)  # declares a variable; Warp would treat a bare literal as a constant
     for k in range(rays.shape[0]):
         if not wp.mesh_query_ray_anyhit(mesh, points[i], rays[k], reach):
             free += 1

@@ -1,8 +1,8 @@
-"""Passes: the stretches of a filmed path that a robot can drive in one go.
+"""Passes: the segments of a filmed path that a robot can drive without interruption.
 
 A film may go down a road twice, come back in the other lane, drive laps, stop, back up, or be cut. Its path is divided
 at *jumps* (a cut, or frames that lie far apart), at *turns* (the camera comes back the way it came) and at *laps* (it
-goes the same way again). What remains between them is a *pass*, named `<source>:<number>`. `twin/geometry/route.py`
+goes the same way again). Each part between them is a *pass*, named `<source>:<number>`. `twin/geometry/route.py`
 chooses the route from the passes.
 """
 
@@ -21,22 +21,22 @@ from twin.geometry.poses import rotation_angle
 from twin.types import Array
 
 SPACING = 0.25  # [m] between the points of a path
-_SMOOTHING = 0.5  # [m] standard deviation; moves a 5 m turn by 0.5²/(2·5) = 2.5 cm
-_STATIONARY_RADIUS = 0.4  # [m] motion within this is standing or rocking
-_DEPARTURE_RADIUS = 1.6  # [m] beyond this the camera has left: a later return is another pass
-_JUMP_RATIO = 8.0  # times the typical step; uneven frame intervals and sudden starts stay below 4
-_MIN_JUMP = 5.0  # [m]
-_LONG_JUMP, _LONG_RATIO = 12.0, 3.0  # [m], times the typical step
+_SMOOTHING = 0.5  # [m] standard deviation of the smoothing; it moves a turn of 5 m radius by 0.5²/(2·5) = 2.5 cm
+_STATIONARY_RADIUS = 0.4  # [m] motion within this radius counts as standing or rocking
+_DEPARTURE_RADIUS = 1.6  # [m] beyond this radius the camera has left, and a later return is another pass
+_JUMP_RATIO = 8.0  # [typical steps] least length of a jump; uneven frame intervals and sudden starts stay below 4
+_MIN_JUMP = 5.0  # [m] least length of a jump
+_LONG_JUMP, _LONG_RATIO = 12.0, 3.0  # [m], [typical steps]; a step longer than both is a jump in any case
 _JUMP_WINDOW = 4  # steps before and after from which the typical step is computed
-_MAX_MISSING = 20.0  # frames in a row; longer gaps in time do not raise the allowed step further
-_BESIDE = 5.0  # [m] a path this close to an earlier part of itself retraces it; a 6 m bend is 12 m wide
-_ALONGSIDE = 0.5  # [m]
-_PARALLEL = np.cos(np.deg2rad(40.0))  # of the angle between a path and the part that it retraces
+_MAX_MISSING = 20.0  # [frame intervals] longer gaps in time do not raise the allowed step further
+_BESIDE = 5.0  # [m] a path this close to an earlier part of itself retraces it; a bend of 6 m radius is 12 m wide
+_ALONGSIDE = 0.5  # [m] greatest offset, along the path, of the point that it retraces
+_PARALLEL = np.cos(np.deg2rad(40.0))  # cosine of the greatest angle between a path and the part that it retraces
 _MIN_RETRACE = 1.5  # [m] shorter retraces are noise
 _MIN_LAP = 12.0  # [m] a path that goes the same way again has driven at least this far
-_MAX_U_TURN = 25.0  # [m] a longer way round is a loop at the end of the road and stays in the pass
-_MIN_PASS = 1.0  # [m]
-_CHORD = 1.0  # [m] over which headings are measured
+_MAX_U_TURN = 25.0  # [m] a longer turn is a loop at the end of the road and stays in the pass
+_MIN_PASS = 1.0  # [m] shorter passes are dropped
+_CHORD = 1.0  # [m] length over which headings are measured
 _MIN_PATH_FRAMES = 6
 _MAX_OUTLIER_FRACTION = 0.25  # if more frames of a source look wrong, its path is not smooth and no frame is removed
 _MAX_ROUGHNESS = 0.3  # a path with a larger median residual [median steps] is a set of unordered photos, not a film
@@ -57,7 +57,7 @@ class FilmedPass:
     path: Array
     """Points `SPACING` apart in the direction in which the camera looks, shape (m, 2) [m]."""
     ends_with: str
-    """`end` of the film, `jump`, `turn` or `lap`."""
+    """Reason why it ends: `end` (of the film), `jump`, `turn` or `lap`."""
 
     @property
     def length(self) -> float:
@@ -101,8 +101,8 @@ def path_jumps(positions: Array, times: Array, min_jump: float = _MIN_JUMP) -> N
     """Finds steps much longer than the typical step of a path, as between two passes filmed one after the other.
 
     A jump is longer than 5 m and than 8 typical steps of its neighborhood, allowing for missing frames; or longer than
-    12 m and 3 typical steps, whatever is missing. Takes camera centers (n, d) [m] in order of time, with times [s] or
-    indices (n,); returns the indices i of jumps from i to i + 1. `min_jump` replaces the 5 m.
+    12 m and 3 typical steps, however many frames are missing. Takes camera centers (n, d) [m] in order of time, with
+    times [s] or indices (n,); returns the indices i of jumps from i to i + 1. `min_jump` replaces the 5 m.
     """
     if len(positions) < 3:
         return np.zeros(0, np.int64)
@@ -151,7 +151,10 @@ def _between_retraces(
 
 
 def _retraces(path: Array) -> list[tuple[int, int, str]]:
-    """Where a path retraces itself: the last point before, the first point after, and `turn` or `lap`."""
+    """Cuts where a path begins to retrace itself.
+
+    Each is the last point of the pass before it, the first point of the pass after it, and `turn` or `lap`.
+    """
     if len(path) < 3:
         return []
     direction = path_directions(path)
@@ -201,7 +204,10 @@ def _looks_back(camera_to_world: Array, path: Array) -> bool:
 
 
 def smooth_path(positions: Array) -> Array:
-    """Path (m, 2) with points `SPACING` apart from camera centers in order of time (n, 3); (1, 2) if standing."""
+    """Path (m, 2) along camera centers (n, 3) in order of time, with points `SPACING` apart.
+
+    If the camera stands still, the path is one point, shape (1, 2).
+    """
     xy = remove_stationary(positions[path_inliers(positions)][:, :2])
     if len(xy) < 2:
         return xy[:1]
@@ -248,7 +254,7 @@ def path_length(path: Array) -> float:
 
 
 def path_directions(path: Array, chord: float = _CHORD) -> Array:
-    """Unit directions at the points of a path, of the chord around each, shape (m, 2)."""
+    """Unit direction of the chord around each point of a path, shape (m, 2)."""
     reach = max(round(chord / 2 / SPACING), 1)
     at = np.arange(len(path))
     along = path[np.minimum(at + reach, len(path) - 1)] - path[np.maximum(at - reach, 0)]
@@ -256,7 +262,7 @@ def path_directions(path: Array, chord: float = _CHORD) -> Array:
 
 
 def smooth_line(corners: Sequence[Array] | Array) -> Array:
-    """A path (m, 2) along a polyline (n ≥ 2, 2), its corners rounded as those of a filmed path."""
+    """A path (m, 2) along a polyline (n ≥ 2, 2), with corners rounded like those of a filmed path."""
     return resample(_smooth(resample(np.asarray(corners, float), curved=False), _SMOOTHING / SPACING), curved=False)
 
 
@@ -283,10 +289,10 @@ def _smooth(xy: Array, sigma: float) -> Array:
 
 
 def path_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
-    """Mask (n,) of the frames off the path of their neighbors, in any unit of length.
+    """Mask (n,) of the frames that lie off the path of their neighbors, for poses (n, 4, 4) in any unit of length.
 
     `limit` is the allowed position residual [median steps between frames]; more is allowed if the whole path is rough.
-    A path is divided where the film jumps, since the frames before a cut predict nothing behind it.
+    A path is divided where the film jumps, since the frames before a cut do not predict those after it.
     """
     n = len(camera_to_world)
     if n < _MIN_PATH_FRAMES:
@@ -301,7 +307,7 @@ def path_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
 def _piece_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
     """Outliers of a path without jumps, found one by one, the worst first.
 
-    None for fewer than 6 frames or a path that is not smooth.
+    Finds none in fewer than 6 frames or in a path that is not smooth.
     """
     n = len(camera_to_world)
     out = np.zeros(n, bool)
@@ -322,8 +328,8 @@ def _piece_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
         worst = int(np.argmax(score))
         if score[worst] <= 1.0:
             return out
-        # An outlier also spoils its neighbors' predictions. So of the worst frame and its neighbors, the frame
-        # without which the others agree best is removed.
+        # An outlier also spoils its neighbors' predictions. So the worst frame and its neighbors are candidates, and
+        # the candidate without which the other frames agree best is removed.
         candidates = [k for k in range(max(worst - 2, 0), min(worst + 3, len(kept))) if score[k] > 0.5]
         out[kept[min(candidates, key=lambda k: _score_without(camera_to_world[kept], k, max_offset, max_turn))]] = True
         if out.sum() > _MAX_OUTLIER_FRACTION * n:

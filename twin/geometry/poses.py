@@ -61,7 +61,7 @@ def inverse_pose(pose: Array) -> Array:
 
 def rotation_angle(rotation: Array) -> Array:
     """Angle of rotation matrices [rad], shape (..., 3, 3) → (...)."""
-    # Uses the skew part beside the trace: arccos of the trace alone loses half the digits near zero.
+    # The skew part is used with the trace, as the arccos of the trace alone loses half the digits near zero.
     skew = np.stack(
         [
             rotation[..., 2, 1] - rotation[..., 1, 2],

@@ -1,8 +1,8 @@
 """The route: the line that the robot drives, chosen from the filmed passes.
 
-By default it is the longest pass, continued by another pass of the same lighting that runs on from its end; `[route]`
-in scene.toml chooses passes, their direction, or way points. *Station* [m] is the arc length along it. The *corridor*
-is the area within a half width of the route; it is free, since the camera passed through it.
+By default it is the longest line made of a pass and of others of the same lighting that continue it; `[route]` in
+scene.toml chooses passes, their direction, or way points. *Station* [m] is the arc length along the route. The
+*corridor* is the area within a half width of the route; it is free, since the camera passed through it.
 """
 
 from dataclasses import dataclass
@@ -17,14 +17,14 @@ from twin.geometry.cameras import Cameras
 from twin.geometry.passes import SPACING, FilmedPass, find_passes, path_directions, path_length, resample, smooth_line
 from twin.types import Array
 
-_MIN_LENGTH = 2.0  # [m]
-_AS_LONG = 0.98  # the first line this close to the longest is chosen, so that noise does not decide
+_MIN_LENGTH = 2.0  # [m] least length of a route
+_AS_LONG = 0.98  # lines longer than this share of the longest count as equally long, so that noise does not decide
 _ASIDE = 0.6  # [m] largest lateral offset between a pass and its continuation; the joined line runs midway
 _BEYOND = 3.0  # [m] least length that a continuation adds
 _AGREE = np.cos(np.deg2rad(40.0))  # least cosine between the headings of joined passes
 _BLEND = 3.0  # [m] before and after a join over which the line goes from one pass to the other
-_MAX_FOLD = np.cos(np.deg2rad(120.0))  # of the change of heading over `_FOLD_CHORD`
-_FOLD_CHORD = 2.0  # [m]
+_MAX_FOLD = np.cos(np.deg2rad(120.0))  # cosine of the greatest change of heading over `_FOLD_CHORD`
+_FOLD_CHORD = 2.0  # [m] length along the line between the headings that are compared
 _OFF_FILM = 1.0  # [m] largest distance of a line through way points from the filmed paths
 
 
@@ -109,13 +109,13 @@ def _longest_line(passes: list[FilmedPass], max_gap: float) -> tuple[Array, tupl
     if not lines:
         return np.zeros((0, 2)), ()
     longest = max(path_length(line) for line, _ in lines)
-    # Among lines about as long as the longest, the one of fewest passes is chosen.
+    # Among lines about as long as the longest, the first with the fewest passes is chosen.
     fitting = [one for one in lines if path_length(one[0]) >= _AS_LONG * longest]
     return min(fitting, key=lambda one: len(one[1]))
 
 
 def _continued(line: Array, path: Array, max_gap: float) -> Array | None:
-    """A line extended by a path; None unless the path passes the line's end or starts ahead of it."""
+    """A line extended by a path; None unless the path passes close to its end or starts ahead of it."""
     if len(line) < 3 or len(path) < 3:
         return None
     end, ahead = line[-1], path_directions(line)[-1]

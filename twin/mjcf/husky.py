@@ -1,8 +1,8 @@
 """MuJoCo model of the Clearpath Husky A200, its visual geoms, and its quasi-static skid steering.
 
-Constants and frames: `twin.robot`. Names in the model: `add_husky`. `python -m twin.mjcf.husky` writes
-`twin/assets/husky/`: the robot alone in `husky.xml`, and on a plane in `scene.xml`. To attach it to another scene, and
-to find out which of that scene's options are wrong:
+`twin.robot` defines constants and frames; `add_husky` lists the names in the model. `python -m twin.mjcf.husky` writes
+`twin/assets/husky/`: the robot alone in `husky.xml`, and on a plane in `scene.xml`. To attach the robot to another
+scene, and to list the options of that scene that are wrong for it:
 
     husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tires need these
     robot = mujoco.MjSpec.from_file(str(husky.HUSKY_XML))
@@ -41,7 +41,7 @@ TIMESTEP = 0.002  # [s]
 HUSKY_XML = Path(__file__).parents[1] / "assets" / "husky" / "husky.xml"
 """The published robot alone, without a floor."""
 SCENE_XML = HUSKY_XML.with_name("scene.xml")
-"""The same on a plane, to be opened in a viewer."""
+"""The published robot on a plane, to be opened in a viewer."""
 
 _CHASSIS_INERTIA = (0.6022, 1.7386, 2.0296, -0.02364, -0.1197, -0.001544)  # ixx iyy izz ixy ixz iyz [kg m²]
 _WHEEL_INERTIA = (0.02467, 0.04411, 0.02467)  # [kg m²], the axle is y
@@ -49,12 +49,12 @@ _COLLISION_BOXES = (  # full size, center in the base [m]
     ((0.9874, 0.5709, 0.12375), (0.0, 0.0, 0.061875)),
     ((0.78992, 0.5709, 0.10375), (0.0, 0.0, 0.175625)),
 )
-# With MuJoCo's default solimp (d0 = 0.9) scrubbing wheels hop: 12 to 17 m/s² at the body in a point turn, and the
+# With MuJoCo's default solimp (d0 = 0.9), scrubbing wheels hop (12 to 17 m/s² at the body in a point turn), and the
 # effective track depends on friction. An impedance that starts from zero does not jump at touchdown. The width of
-# 2.5 mm is a compromise: with 3 mm a wheel sinks in by 1.6 mm and touches the facets of a height field ahead of it,
-# which shakes the camera by 0.9 m/s² instead of 0.5; with 1 mm a scrubbing wheel flutters at a friction of 1.0.
+# 2.5 mm is a compromise: with 3 mm, a wheel sinks in by 1.6 mm and touches the facets of a height field ahead of it,
+# which shakes the camera by 0.9 m/s² instead of 0.5 m/s²; with 1 mm, a scrubbing wheel flutters at a friction of 1.0.
 _WHEEL_SOLIMP = (0.0, 0.95, 0.0025, 0.5, 2.5)
-_WHEEL_SOLREF = (0.02, 2.0)  # twice critical damping: 1/8 less shaking on a height field
+_WHEEL_SOLREF = (0.02, 2.0)  # twice the critical damping, which reduces shaking on a height field by 1/8
 _IMU_POSITION = (0.19, 0.0, 0.149)  # in the base [m]
 
 ROBOT_VISUAL_GROUP, ROBOT_COLLISION_GROUP = 1, 4
@@ -65,9 +65,9 @@ def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
     """Sets the time step, the solver options that skid steering needs, and the softness of the ground."""
     params = params or HuskyParams()
     spec.option.timestep = TIMESTEP
-    # Euler and RK4 are unstable with a stiff speed servo; implicitfast adds its damping to the mass matrix.
+    # Euler and RK4 are unstable with a stiff speed servo; implicitfast adds the servo's damping to the mass matrix.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # The pyramidal cone gives the right chi, but a torque that is 21 % too low.
+    # The pyramidal cone gives the right track ratio, but a torque that is 21 % too low.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = params.slip_stiffness
     spec.option.viscosity = params.ground_viscosity
@@ -77,22 +77,23 @@ def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
 
 @dataclass(frozen=True)
 class WrongOption:
-    """An option with which the robot's tires do not skid as real ones."""
+    """An option of a model with which the robot's tires skid unrealistically."""
 
     option: str
     found: str
     expected: str
     cost: str
-    """Effect on a turn on the spot, as `benchmarks/husky_options.py` measures it; or what it does, if nothing turns."""
+    """Effect of the wrong option on the robot; the figures come from `benchmarks/husky_options.py`."""
 
     def __str__(self) -> str:
         return f"{self.option} is {self.found}; expected {self.expected}: {self.cost}"
 
 
 def check(model: mujoco.MjModel) -> list[WrongOption]:
-    """The options of a model with a Husky in it that are wrong for skidding; empty if all are right.
+    """Options of a model with a Husky that are wrong for skid steering; empty if all are right.
 
-    MuJoCo keeps the options of the scene that a robot is attached to, and lets its ground override the tires' contacts.
+    When a robot is attached to a scene, MuJoCo keeps the options of the scene, and the scene's ground can override the
+    contact parameters of the tires.
 
     Raises ValueError if the model has no Husky.
     """
@@ -164,8 +165,9 @@ def add_husky(
     Names: body and free joint `base_link`; bodies and joints `<front|rear>_<left|right>_wheel`; actuators `left` and
     `right`, commanded in wheel speed [rad/s]; cameras `front` (160 × 90) and `front_native` (native size); site `imu`;
     sensors `imu_gyro`, `imu_accelerometer`, `imu_orientation`, `<wheel>_wheel_position`, `<wheel>_wheel_velocity`,
-    `left_torque`, `right_torque`; collision geoms `chassis_0`, `chassis_1`, `<wheel>_tyre`; `chassis_dry`, without
-    contacts; `camera_*`, the camera's housing, which its own pictures leave out.
+    `left_torque`, `right_torque`; collision geoms `chassis_0`, `chassis_1`, `<wheel>_tyre`; `chassis_dry`, a geom
+    without contacts (see `disable_fluid_drag`); `camera_*`, the geoms of the camera's housing, which are left out of
+    the camera's own pictures.
 
     Args:
         spec: The model.
@@ -235,8 +237,8 @@ def _chassis_inertia(params: HuskyParams) -> tuple[float, Array, Array]:
 def disable_fluid_drag(body: mujoco.MjsBody, name: str) -> None:
     """Exempts a body from the drag of `ground_viscosity`.
 
-    MuJoCo's fluid acts on a whole body unless it has geoms with `fluid_ellipsoid`; then it acts on these alone. So a
-    tiny one is added.
+    MuJoCo's fluid acts on a whole body, unless some of its geoms have `fluid_ellipsoid`; then it acts on these alone.
+    So a tiny geom with `fluid_ellipsoid` is added.
     """
     body.add_geom(
         name=f"{name}_dry",
@@ -272,7 +274,7 @@ def _add_wheel(base: mujoco.MjsBody, name: str, index: int, params: HuskyParams)
         rgba=(0.2, 0.2, 0.8, 0.4),
         condim=6,
         priority=1,
-        # A rolling friction coefficient [m] over the radius is Crr.
+        # MuJoCo's rolling friction [m] is the rolling resistance coefficient times the radius.
         friction=(params.friction, params.spin_friction, max(params.rolling_resistance * radius, 1e-5)),
         solimp=_WHEEL_SOLIMP,
         solref=_WHEEL_SOLREF,
@@ -283,7 +285,7 @@ def _add_wheel(base: mujoco.MjsBody, name: str, index: int, params: HuskyParams)
 
 
 def _add_side_motor(spec: mujoco.MjSpec, side: str, params: HuskyParams) -> None:
-    """Adds the motor of a side: a servo on the mean speed of its two wheels, and the belt that keeps them equal."""
+    """Adds the motor of a side: a servo on the mean speed of its two wheels, and the belt that couples the wheels."""
     belt = spec.add_equality(
         name=f"{side}_belt",
         type=mujoco.mjtEq.mjEQ_JOINT,
@@ -352,7 +354,9 @@ def center_of_mass(params: HuskyParams) -> Array:
 
 
 def coulomb_track_ratio(center: Array, curvature_radius: float = 0.0) -> float:
-    """Track ratio chi of four point contacts under Coulomb friction at constant speed, for any coefficient.
+    """Track ratio chi (effective track over `TRACK`) of four point contacts under Coulomb friction at constant speed.
+
+    It does not depend on the friction coefficient μ.
 
     The friction force at a wheel with slip velocity s is −μN s/|s|; the forces and their moments about the center of
     mass sum to zero. A centered mass in a point turn gives exactly 1 + (wheelbase / track)².
@@ -386,7 +390,7 @@ def coulomb_track_ratio(center: Array, curvature_radius: float = 0.0) -> float:
 # ---- visual geoms
 
 
-_CAMERA_PREFIX = "camera_"  # of the names of the geoms of the camera's housing
+_CAMERA_PREFIX = "camera_"  # prefix of the names of the camera housing's geoms
 _YELLOW = (0.96, 0.74, 0.05, 1.0)
 _BLACK = (0.06, 0.06, 0.065, 1.0)
 _DARK = (0.13, 0.13, 0.14, 1.0)
@@ -515,7 +519,7 @@ def _hull() -> tuple[Array, NDArray[np.int64]]:
 def _tire(radius: float, width: float) -> tuple[Array, NDArray[np.int64]]:
     """Mesh of a tire with chevron lugs about the y axis."""
     steps = 4 * _LUGS
-    # Across the tire: position / half width, radius at a lug and in a groove / radius, lead of the chevron [lugs].
+    # Across the tire: position [half widths], radius at a lug and in a groove [tire radii], lead of the chevron [lugs].
     profile = (
         (-0.62, 0.50, 0.50, 0.0),
         (-0.98, 0.70, 0.70, 0.0),

@@ -40,10 +40,10 @@ from twin.robot import BASE_HEIGHT, HuskyParams, PixelCamera
 from twin.scene import SceneDir
 from twin.types import Array
 
-_HFIELD_BASE = 1.0  # [m] of solid below the lowest point, against tunneling
-_GROUND_OVERLAP = 0.15  # [m] above the height field, up to which its texture replaces the visual mesh
-_SETTLE_TIME = 2.0  # [s]
-_MIN_ROUTE = 2.0  # [m]
+_HFIELD_BASE = 1.0  # [m] thickness of solid ground below the lowest point, against tunneling
+_GROUND_OVERLAP = 0.15  # [m] up to this height above the height field, the visual mesh is left out
+_SETTLE_TIME = 2.0  # [s] simulated time in which the robot comes to rest before its state is stored
+_MIN_ROUTE = 2.0  # [m] least length of a route
 _SITE_SPACING = 1.0  # [m] between sites along the route
 
 
@@ -82,10 +82,10 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(out.resolve())
     husky.set_options(spec, config.robot)
-    # Saves computing the poses of thousands of static geoms; bodies with motors, as the robot, never sleep.
+    # Sleep saves computing the poses of thousands of static geoms; bodies with motors, such as the robot, never sleep.
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     _add_sky_and_lights(spec)
-    picture = mesh / "ground.png"  # written by the stage; `build_assets` alone makes none
+    picture = mesh / "ground.png"  # the stage `mesh` writes it; `build_assets` alone does not
     add_ground(spec, ground, assets, config.mjcf.hfield_cell, read_image(picture) if picture.exists() else None)
     faces = _add_visual(spec, ground, mesh / "visual.npz", assets)
     _add_parts(spec, parts, assets)
@@ -150,9 +150,9 @@ def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tup
 
 
 def covered_by_ground(vertices: NDArray, ground: Ground) -> NDArray[np.bool_]:
-    """Mask of the points (v, 3) within the height field's bounds and less than 0.15 m above it, or below.
+    """Mask of the points (v, 3) within the height field's horizontal bounds that are below it or up to 0.15 m above it.
 
-    Two surfaces within centimeters of each other would flicker, shade each other and hide the robot's wheels.
+    Two surfaces within centimeters of each other would flicker, cast shadows on each other and hide the robot's wheels.
     """
     rows, columns = ground.height.shape
     cell = (vertices[:, :2] - ground.origin) / ground.cell
@@ -199,14 +199,14 @@ def add_ground(
 ) -> None:
     """Adds the geom `ground`, a height field of `cell` [m]; writes its files to `assets`.
 
-    Its texture is the `picture` of `ground_picture`, or the ground's mean colors.
+    Its texture is `picture` (see `ground_picture`), or shows the mean color of each cell of the ground.
     """
     coarse = ground.coarsened(cell)
     # MuJoCo's binary height field: int32 rows, int32 columns, then float32 rows from the low-y edge.
     size = np.array(coarse.height.shape, np.int32)
     (assets / "ground.bin").write_bytes(size.tobytes() + coarse.height.astype(np.float32).tobytes())
-    # The texture spans the field edge to edge; without a picture a texel is a fine cell, the mean of its corners. The
-    # first row is at +y.
+    # The texture spans the field from edge to edge; its first row is at +y. Without a picture, each fine cell is a
+    # texel, with the mean color of the cell's corners.
     finer = round(coarse.cell / ground.cell)
     rows, columns = ((size - 1) * finer + 1 for size in coarse.height.shape)
     rgb = ground.rgb[:rows, :columns].astype(np.uint16)
@@ -283,8 +283,8 @@ def _add_robot(
     """Adds the Husky at the start of the route, lets it settle, and stores its state as the keyframe `spawn`.
 
     Returns:
-        x, y, z [m] and yaw [rad] at rest, and the names of the geoms, except the ground, that it touched at first and
-        that may have pushed it aside.
+        x, y, z [m] and yaw [rad] at rest, and the names of the geoms other than the ground that the robot touched
+        before it settled; these may have pushed it aside.
     """
     length = float(arc_lengths(route)[-1])
     if length < _MIN_ROUTE:
@@ -351,7 +351,7 @@ def write_obj(path: Path, vertices: NDArray, faces: NDArray, texcoords: NDArray 
     """Writes a Wavefront OBJ of vertices (v, 3) [m] and faces (f, 3), counter-clockwise seen from outside.
 
     `texcoords` are the texture coordinates of each face's corners, u from the left, v from the top, shape (f, 3, 2).
-    trimesh would need an own vertex for each of them, in a file almost twice as large.
+    trimesh would write a separate vertex for each of them, in a file almost twice as large.
     """
 
     def lines(line: str, rows: NDArray) -> str:
@@ -390,14 +390,15 @@ def face_texture(colors: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.float64
 
 _COMPARED_STEPS = 200
 _MAX_DEVIATION = 0.002  # [m] between the robot bases of the compiled model and of the copy
-_XML_PRECISION = 1e-5  # plus this fraction of the coordinates: the XML keeps six digits
+_XML_PRECISION = 1e-5  # further deviation as a fraction of the coordinates, as the XML keeps six digits
 _CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
 
 
 def check_portable(folder: Path, built: mujoco.MjModel) -> dict[str, Any]:
-    """Loads a moved copy of the scene in plain MuJoCo and compares its robot's motion with the compiled model `built`.
+    """Loads a moved copy of the scene in plain MuJoCo and compares its robot's motion with that in the model `built`.
 
-    Returns metrics for the report; `spawn_drift_m` is the creep of the parked robot in 0.4 s (soft tires on a slope).
+    Returns metrics for the report; `spawn_drift_m` is the creep of the parked robot in 0.4 s, due to soft tires on a
+    slope.
 
     Raises:
         RuntimeError: the copy is a different model or its robot moves differently, which is a bug.

@@ -122,7 +122,7 @@ def point_at(route: Array, s: Array | float) -> Array:
 
 
 def heading_at(route: Array, s: Array | float, window: float = 1.0) -> Array:
-    """Heading [rad] at arc lengths s, of the chord over `window` [m] around each; shape as s."""
+    """Heading [rad] at arc lengths s [m], shape as s: that of a chord over `window` [m] around s."""
     length = arc_lengths(route)[-1]
     window = min(window, length)
     middle = np.clip(s, window / 2, length - window / 2)
@@ -162,7 +162,7 @@ def nearest_on_route(
 
 
 def total_turn(route: Array) -> float:
-    """Total change of heading along the route [rad], left positive, full turns counted."""
+    """Total change of heading along the route [rad], positive to the left; full turns count."""
     s = np.append(np.arange(0.0, arc_lengths(route)[-1], 0.25), np.inf)
     heading = np.unwrap(heading_at(route, s))
     return float(heading[-1] - heading[0])

@@ -1,4 +1,4 @@
-"""Appearance embeddings in torch: those that training learns, and the fit of one to a photo.
+"""Appearance embeddings in torch: the embeddings that training learns, and the fit of an embedding to a photo.
 
 Training learns a vector per lighting plus a small residual per frame, which captures gradual changes within a film,
 such as exposure. `lightings.py` looks embeddings up by name.
@@ -71,12 +71,12 @@ def initial_appearance(
 # ---- fit to a photo
 
 _STEPS = 40
-_RATE = 0.05  # of the embedding
-_PRIOR = 1e-3  # weight of the distance from the initial embedding, as of residuals in training
+_RATE = 0.05  # learning rate of the embedding
+_PRIOR = 1e-3  # weight of the squared distance from the initial embedding; the same as that of residuals in training
 _INITIAL_EXTINCTION = 2.5e-3  # [1/m]
-_EXTINCTION_RATE, _AIRLIGHT_RATE = 0.3, 0.05  # the first of the logarithm of extinction
-_MAX_EXTINCTION = 0.1  # [1/m], a visibility of 30 m: a denser veil is probably on the lens
-_FARTHEST_SHARE = 0.25  # share of the rays, the farthest, whose mean color initializes the airlight
+_EXTINCTION_RATE, _AIRLIGHT_RATE = 0.3, 0.05  # learning rates of the logarithm of extinction and of the airlight
+_MAX_EXTINCTION = 0.1  # [1/m], a visibility of 30 m; a thicker veil in a photo probably lies on the lens
+_FARTHEST_SHARE = 0.25  # the mean color of this share of the rays, the farthest, initializes the airlight
 
 
 def fit_appearance(
@@ -90,9 +90,9 @@ def fit_appearance(
 ) -> tuple[Array32, Fog]:
     """Fits the embedding (dim,) and the fog under which traced rays have given colors (n, 3) in [0, 1].
 
-    `parameters` are those of the field's networks, which stay as they are. Features (n, CHANNELS − 1) and harmonics
+    `parameters` are the weights of the field's networks and stay fixed. Features (n, CHANNELS − 1) and harmonics
     (n, 16) come from `RadianceField.trace`. The embedding starts at `start`, the mean of its prior. Fog is fitted only
-    with distances along the rays [m], shape (n,).
+    if `distances` along the rays [m], shape (n,), are given.
     """
     origin = torch.as_tensor(start, device=features.device)
     embedding = origin.clone().requires_grad_(True)

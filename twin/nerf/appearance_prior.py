@@ -1,10 +1,10 @@
-"""Prior of plausible appearance embeddings: samples random ones and rejects those that could not have been filmed.
+"""Prior of plausible appearance embeddings: samples random embeddings and rejects implausible ones.
 
-DriveEnv-NeRF samples embeddings and a person picks those that look right. Here a rule of two parts decides, on the
-*picture* of an embedding: the colors of *probes*, rays through the training frames with known features. First, light
-adds: in linear light the picture must be nearly a non-negative sum of the filmed lightings' pictures. More sun, street
-lamps at noon and longer exposure are such sums; green walls are not. Second, statistics of brightness, contrast and
-color must lie in the slightly widened range of the filmed lightings and frames.
+In DriveEnv-NeRF, a person picks the sampled embeddings that look right. Here, a rule with two parts checks the
+*picture* of an embedding: the colors that it gives to *probes*, rays through the training frames with known features.
+First, light is additive: in linear light, the picture must be close to a sum of the filmed lightings' pictures with
+non-negative weights. More sun, street lamps at noon and longer exposure are such sums; green walls are not. Second,
+statistics of brightness, contrast and color must lie in the slightly widened range of the filmed lightings and frames.
 """
 
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ from twin.errors import InputError
 from twin.types import Array32
 
 _GAMMA = 2.2  # approximate tone curve of the films
-_MAX_MISFIT = 0.06  # rms color error of the nearest sum of lights [full scale = 1]
+_MAX_MISFIT = 0.06  # greatest rms color error of the nearest sum of lights [full scale = 1]
 _OUTLIER_ERROR = 0.2  # color error from which a probe is an outlier [full scale = 1]
-_MAX_OUTLIER_SHARE = 0.02  # of the probes
-_RANGE_MARGIN = (0.02, 0.1)  # filmed ranges grow by this much plus this share of their width, at both ends
-_CLIPPED = (0.02, 0.98)  # colors beyond are black or burnt out
-_CONCENTRATION = 0.7  # of the Dirichlet distribution: below 1 favors single lightings over even mixtures
+_MAX_OUTLIER_SHARE = 0.02  # greatest share of outliers among the probes
+_RANGE_MARGIN = (0.02, 0.1)  # at both ends, filmed ranges grow by the first value plus the second times their width
+_CLIPPED = (0.02, 0.98)  # a color with all channels below the first is black, above the second burnt out
+_CONCENTRATION = 0.7  # of the Dirichlet distribution; values below 1 favor single lightings over even mixtures
 _RESIDUAL_SCALE = 2.0  # scale of sampled frame residuals; the rule rejects implausible ones
 _MAX_TRIES = 200
 
@@ -34,7 +34,7 @@ class Probes:
     """Rays of training frames and the head that colors them, see `network.py`."""
 
     features: Array32
-    """Composited over the background, shape (k, CHANNELS − 1)."""
+    """Ray features composited over the background, shape (k, CHANNELS − 1)."""
     harmonics: Array32
     """Spherical harmonics of the ray directions, shape (k, 16)."""
     network: dict[str, Array32]
@@ -67,24 +67,27 @@ class AppearancePrior:
         low, high = filmed.min(0), filmed.max(0)
         margin = _RANGE_MARGIN[0] + _RANGE_MARGIN[1] * (high - low)
         self._low, self._high = low - margin, high + margin
-        # The nearest lighting is the frame's, as training keeps residuals small.
+        # A frame's lighting is the nearest one, as training keeps residuals small.
         nearest = np.linalg.norm(frame_vectors[:, None] - vectors, axis=-1).argmin(1)
         self._vectors, self._residuals = vectors, frame_vectors - vectors[nearest]
 
     def propose(self, rng: np.random.Generator) -> Array32:
-        """Samples an embedding (dim,) like the learned ones, not yet checked.
+        """Samples an unchecked embedding (dim,) that resembles the learned ones.
 
         It is a random mixture of the lightings plus a normal deviate with the covariance of the frame residuals.
         """
         embedding = rng.dirichlet(np.full(len(self._vectors), _CONCENTRATION)) @ self._vectors
         count = len(self._residuals)
         if count:
-            # Normal weights on the residuals give their covariance, however many dimensions they span.
+            # A sum of the residuals with normal weights has their covariance, even if they do not span all dimensions.
             embedding = embedding + _RESIDUAL_SCALE * rng.normal(size=count) @ self._residuals / np.sqrt(count)
         return embedding.astype(np.float32)
 
     def color_error(self, picture: NDArray) -> NDArray[np.float64]:
-        """Color errors of the nearest non-negative sum of the filmed lights, rms over channels, shape (k,)."""
+        """Color errors of the probes against the nearest non-negative sum of the filmed lights, shape (k,).
+
+        Each is the rms over the channels.
+        """
         from scipy.optimize import nnls
 
         weights, _ = nnls(self._lights, picture.ravel().astype(np.float64) ** _GAMMA)

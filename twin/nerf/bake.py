@@ -1,6 +1,7 @@
 """Bakes a radiance field: samples it into bricks around surfaces, fine-tunes and quantizes the samples.
 
-Terms as in `kernels/bricks.py`. Fine-tuning fits the samples to the training frames; networks and embeddings stay.
+`kernels/bricks.py` defines the terms. Fine-tuning fits the samples to the training frames; networks and embeddings stay
+fixed.
 """
 
 import time
@@ -23,14 +24,14 @@ from twin.runtime import bar
 from twin.warp_runtime import wp
 
 _SHARDS = 4
-_RAYS = 4096  # per step of fine-tuning
-_VIEWS = 64  # training views that find the surfaces, at most, evenly spaced
-_VIEW_WIDTH = 112  # [px] of these views
-_SAMPLES = 24  # per ray
-_MIN_WEIGHT = 0.004  # compositing weight from which a sample lies on a surface
+_RAYS = 4096  # rays per step of fine-tuning
+_VIEWS = 64  # greatest number of training views, evenly spaced, in which surfaces are searched
+_VIEW_WIDTH = 112  # [px] width of these views
+_SAMPLES = 24  # samples per ray
+_MIN_WEIGHT = 0.004  # a sample with a greater compositing weight lies on a surface
 _MIN_CELL = 0.03  # [m] least side of near cells
-_COARSENING = 1.15  # least growth of cells per attempt
-_LARGE_CELL = 0.15  # [m] near cells above this side allow _EXTRA_BRICKS times the bricks, for 7 % of the speed
+_COARSENING = 1.15  # least factor by which cells grow per attempt
+_LARGE_CELL = 0.15  # [m] above this near side, _EXTRA_BRICKS times the bricks are allowed, which costs 7 % of speed
 _EXTRA_BRICKS = 1.39
 _FAR_CELL_RATIO = 4.0  # side of far cells over that of near cells
 _EMPTY_RAW_DENSITY = -8.0  # raw density outside all bricks
@@ -47,7 +48,7 @@ def bake(
 
     Args:
         field: A trained field.
-        pixels: The frames it was trained on.
+        pixels: The frames that the field was trained on.
         seed: Seed of the fine-tuning batches.
         steps: Fine-tuning steps, at least 1.
         max_bricks: Cells grow until there are at most this many bricks (9,000 are 105 MB), or `_EXTRA_BRICKS` times as
@@ -122,7 +123,7 @@ def _layout(
         near_shape = np.maximum(np.ceil(2 * half / (cell * kernels.CELLS)), 1).astype(int)
         far_shape = np.maximum(np.ceil(4 * half / (cell * _FAR_CELL_RATIO * kernels.CELLS)), 4).astype(int)
         slots = _bricks_around(near * 2.0 - 0.5, near_shape), _bricks_around(far, far_shape)
-        # The near grid covers bricks that lie wholly inside the near box.
+        # Far bricks wholly inside the near box are dropped, as near bricks cover that space.
         low, high = slots[1] / far_shape, (slots[1] + 1) / far_shape
         slots = slots[0], slots[1][~((low >= 0.25) & (high <= 0.75)).all(1)]
         count = sum(map(len, slots))

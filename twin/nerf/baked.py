@@ -74,7 +74,7 @@ class BrickLayout:
 
 
 def brick_indices(layout: BrickLayout, near: NDArray, far: NDArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Near and far index (see `kernels/bricks.py`) of bricks (s, 3), whose slots count the near ones first."""
+    """Near and far index (see `kernels/bricks.py`) of near and far bricks, each (s, 3); near slots come first."""
     out = []
     for shape, slots, first in ((layout.near_shape, near, 0), (layout.far_shape, far, len(near))):
         index = np.full(shape, -1, np.int32)
@@ -84,15 +84,19 @@ def brick_indices(layout: BrickLayout, near: NDArray, far: NDArray) -> tuple[NDA
 
 
 def _density_codes(samples: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Reorders density bytes of bricks (s, 729) as `bricks.DENSITIES` says, shape (s · 810 + 8,)."""
+    """Density bytes of bricks (s, 729) in the order that is described at `bricks.DENSITIES`, shape (s · 810 + 8,)."""
     cube = samples.reshape(-1, *[CORNERS] * 3)
     halves = np.stack([cube[..., :HALF_CORNERS], cube[..., HALF_CORNERS - 1 :]], 2)
-    return np.concatenate([halves.ravel(), np.zeros(8, np.uint8)])  # padding, as eight bytes are read at a time
+    return np.concatenate([halves.ravel(), np.zeros(8, np.uint8)])  # padding, as the march reads eight bytes at a time
 
 
 def _stored_skips(index: NDArray[np.int32], distance: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
-    """Compresses a grid's skip distances per block, shape 4 · that of the brick index, to what the march reads: the
-    index with −d for bricks without a slot (d: least distance in it), and the stored bricks' distances (slots, 64)."""
+    """Compresses a grid's skip distances to the arrays that the march reads.
+
+    `distance` has one value per block; each of its axes is 4 times as long as that of the brick `index`. Returns the
+    index with −d for bricks without a slot (d: least distance in the brick), and the distances in the stored bricks,
+    shape (slots, 64).
+    """
     n0, n1, n2 = index.shape
     blocks = distance.reshape(n0, BLOCKS, n1, BLOCKS, n2, BLOCKS).transpose(0, 2, 4, 1, 3, 5).reshape(*index.shape, -1)
     stored = index >= 0
@@ -101,9 +105,9 @@ def _stored_skips(index: NDArray[np.int32], distance: NDArray[np.uint8]) -> tupl
 
 
 def skip_distances(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str, NDArray[np.uint8]]:
-    """Skip distances of all blocks of the near and the far grid, as arrays `near_leap` and `far_leap`.
+    """Skip distances (see `kernels/march.py`) of all blocks of both grids, as arrays `near_leap` and `far_leap`.
 
-    A block is occupied if a cell at one of its corners blocks more than `_MAX_EMPTY_OPACITY`.
+    A block is occupied if a cell with the density of one of the block's samples blocks more than `_MAX_EMPTY_OPACITY`.
     """
     from scipy.ndimage import distance_transform_cdt
 
@@ -129,7 +133,7 @@ def skip_distances(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str,
 
 
 def samples_read(layout: BrickLayout, arrays: dict[str, NDArray]) -> NDArray[np.bool_]:
-    """True for the samples (s, 729) of occupied blocks; the march reads no others, see `skip_distances`."""
+    """Mask of the samples (s, 729) of occupied blocks (see `skip_distances`); the march reads no other samples."""
     near, far = brick_indices(layout, arrays["near"], arrays["far"])
     skips = [_stored_skips(near, arrays["near_leap"])[1], _stored_skips(far, arrays["far_leap"])[1]]
     occupied = np.concatenate(skips).reshape(-1, *[BLOCKS] * 3) == 0
@@ -140,7 +144,7 @@ def samples_read(layout: BrickLayout, arrays: dict[str, NDArray]) -> NDArray[np.
 
 
 def _check_arrays(layout: BrickLayout, arrays: dict[str, NDArray], dim: int) -> None:
-    """Raises ValueError for arrays with which a kernel would read outside of them."""
+    """Raises ValueError if the arrays would make a kernel read outside of them."""
     near, far = arrays["near"], arrays["far"]
     slots, hidden = len(near) + len(far), arrays["network.head.1"].shape[0]
     background, inputs = arrays["network.backdrop.0"].shape[1], CHANNELS - 1 + HARMONICS + dim
@@ -176,7 +180,7 @@ def _check_arrays(layout: BrickLayout, arrays: dict[str, NDArray], dim: int) -> 
 
 @dataclass(frozen=True)
 class Detail:
-    """Features at surfaces, finer than bricks; terms as in `kernels/surface_detail.py`."""
+    """Features at surfaces, finer than those of bricks; `kernels/surface_detail.py` defines the terms."""
 
     heights: Array32
     """Height map [m], shape (along x, along y)."""
@@ -199,13 +203,13 @@ class Detail:
 
     @staticmethod
     def without_features(heights: Array32, origin: NDArray[np.float64], height_cell: float) -> "Detail":
-        """A height map alone."""
+        """Detail with a height map only."""
         none, step = np.zeros((0, CHANNELS), np.uint8), np.zeros(CHANNELS, np.float32)
         return Detail(heights, origin, height_cell, np.zeros((0, 2), np.int32), 1.0, none, step, 1.0, none, step)
 
     @property
     def tile_index(self) -> NDArray[np.int32]:
-        """Slots of the tiles of a grid that covers them, −1 where none is stored."""
+        """Slots of the tiles in the grid that covers them, −1 where no tile is stored."""
         index = np.full(self.tiles.max(0, initial=0) + 1, -1, np.int32)
         index[tuple(self.tiles.T)] = np.arange(len(self.tiles))
         return index
@@ -246,7 +250,7 @@ class Detail:
         return Detail(height_cell=height_cell, texel=texel, cell=cell, **named)
 
 
-_MAX_INDEX = 10_000  # tiles along an axis
+_MAX_INDEX = 10_000  # greatest number of tiles along an axis
 _DETAIL_ARRAYS = ("heights", "origin", "tiles", "texels", "texel_step", "vertices", "vertex_step")
 
 
@@ -268,7 +272,7 @@ def detail_grid(detail: Detail, device: str) -> Any:
 # ---- field
 
 _FORMAT = 2
-_MAX_TARGETS = 4  # image sizes kept: a vector env renders all its envs, and those that are being reset
+_MAX_TARGETS = 4  # kept render targets at most; a vector env uses one for all its envs and one for those in reset
 
 
 class BakedField:
@@ -334,7 +338,7 @@ class BakedField:
         w: Any = weights()
 
         def as_vec8(matrix: NDArray) -> Any:
-            """Groups of eight hidden units (first axis of the matrix), then the other axis."""
+            """Packs a matrix (units, m) as vectors of eight units: array (units / 8, m), flat."""
             return on_device(matrix.reshape(len(matrix) // 8, 8, -1).transpose(0, 2, 1).reshape(-1, 8), Vec8)
 
         w.head_0, w.head_1, w.head_2 = as_vec8(p["head.0"][:rows].T), as_vec8(p["head.1"].T), as_vec8(p["head.2"])
@@ -344,7 +348,7 @@ class BakedField:
         self._weights = w
         self._first_bias = p["head.0.bias"], p["head.0"][rows:]
         needed = kernels.cone_march, self._march, detail_kernels.add_detail, self._color_head
-        # Loaded here, so that no two threads do it at once.
+        # Loaded here, so that no two threads load them at once.
         with bar("compiling the renderer, once", len(needed), "part", after=1.0) as progress:
             for kernel in needed:
                 kernel.module.load(wp.get_device(device))
@@ -398,15 +402,15 @@ class BakedField:
         size: tuple[int, int] | None = None,
         stop: NDArray | None = None,
     ) -> Rendering:
-        """Renders n cameras, in air as clear as the film's.
+        """Renders n cameras, without the fog of added lightings.
 
         Args:
             cameras: `Cameras` of a scene, or `Viewpoints`.
-            lighting: A name, see `Lightings.embedding`, or an embedding (dim,); or one of either per camera.
+            lighting: A name (see `Lightings.embedding`) or an embedding (dim,); or a sequence of these, one per camera.
             size: Image width and height [px]; by default the size of the cameras.
-            stop: z-depth of other objects [m], shape (n, height, width), where the march ends. `opacity` is then the
-                fraction of the object's light that the field blocks, and `rgb` the color of the field up to the object
-                alone (not premultiplied).
+            stop: z-depth of other objects [m], shape (n, height, width), at which the march ends. `opacity` is then the
+                fraction of an object's light that the field in front of it blocks, and `rgb` the color of that part
+                of the field alone (not premultiplied).
 
         Raises:
             InputError: unknown lighting, or cameras of several sizes and no size given.
@@ -422,8 +426,8 @@ class BakedField:
     ) -> None:
         """Renders as `render` does and passes the result to `consume` without copying it to the host.
 
-        `consume` gets Warp arrays on the field's device, colors (n, height · width) of vec3 and opacities
-        (n, height · width), which are reused after it returns.
+        `consume` receives two Warp arrays on the field's device: colors (n, height · width) of vec3, and opacities
+        (n, height · width). Both are overwritten after it returns.
         """
         with self._lock:
             target = self._render(cameras, lighting)
@@ -499,7 +503,8 @@ class BakedField:
         if len(vectors) not in (1, n):
             raise InputError(f"{len(vectors)} lightings for {n} cameras; expected one, or one per camera")
         bias, matrix = self._first_bias
-        # One product per vector: for a matrix BLAS sums in another order, and an image must not depend on the others.
+        # One product per vector: BLAS may sum a matrix product in another order for another number of vectors, and an
+        # image must not depend on the other images.
         return np.broadcast_to(bias + np.stack([vector @ matrix for vector in vectors]), (n, len(bias)))
 
     # ---- files
@@ -545,7 +550,7 @@ class BakedField:
 
 
 class _RenderTarget:
-    """Buffers for images of one size, and recorded launches that render them in horizontal bands, for the cores."""
+    """Buffers for images of one size, and recorded launches that render them in horizontal bands, in parallel."""
 
     def __init__(self, field: BakedField, n: int, width: int, height: int, stopped: bool):
         self.shape, device = (n, height, width), field.device
@@ -563,7 +568,7 @@ class _RenderTarget:
         self.depth, self.opacity, self.rgb = new((n, pixels)), new((n, pixels)), new((n, pixels), wp.vec3f)
         self.features = new((n, CHANNELS, pixels))
         start = new((n, across * down))
-        # More bands than cores, as bands with sky in them finish sooner.
+        # More bands than cores keep all cores busy, as bands with sky finish sooner.
         bands = 3 * field._threads if field._pool else 1
         edges = np.unique(np.linspace(0, down, bands + 1).round().astype(int)).tolist()
         self.bands = range(len(edges) - 1)

@@ -1,8 +1,10 @@
-"""Devices, threads, layout and arrays of a radiance field; terms as in `kernels/space.py` and `kernels/sampler.py`.
+"""Devices, threads, layout and arrays of a radiance field.
 
-Warp runs a CPU launch on one thread but releases the interpreter lock meanwhile, as torch does in a matrix product: two
-Python threads keep two cores busy. A *shard* is a fixed part of a batch, whatever the number of cores. Shards are
-summed in order, so results do not depend on the number of cores either.
+The terms are defined in `kernels/space.py` and `kernels/sampler.py`.
+
+Warp runs a CPU launch on one thread. As Warp and torch release the interpreter lock while they compute, two Python
+threads keep two cores busy. A batch is divided into a fixed number of *shards*, whose results are summed in order. So
+results do not depend on the number of cores.
 """
 
 import threading
@@ -28,9 +30,9 @@ _lock = threading.Lock()
 
 
 def resolve_device(device: str | None) -> str:
-    """The device asked for, `cpu` or `cuda`; for None CUDA if both torch and Warp see it, else the CPU.
+    """The requested device, `cpu` or `cuda`; None means CUDA if both torch and Warp see it, else the CPU.
 
-    Raises InputError for another name, and for CUDA where there is none.
+    Raises InputError for another name, and for `cuda` if there is no CUDA device.
     """
     has_cuda = torch.cuda.is_available() and wp.is_cuda_available()
     if device not in (None, "cpu", "cuda"):
@@ -43,7 +45,7 @@ def resolve_device(device: str | None) -> str:
 def parallel(work: Callable[[int], T], items: Iterable[int], device: str) -> list[T]:
     """Maps `work` over items, in parallel on a CPU and serially on CUDA; results in order.
 
-    Each worker uses one torch thread: shards in parallel use the cores better than parallel operations.
+    Each worker uses one torch thread: parallel shards use the cores better than parallel operations within a shard.
     """
     global _pool
     items = list(items)
@@ -67,7 +69,7 @@ class single_threaded_torch:
 
 
 def in_batches(work: Callable[[slice], None], n: int, size: int, device: str) -> None:
-    """Calls `work` on batches of `size` of n rows, in parallel and without gradients."""
+    """Calls `work` on slices of n rows, at most `size` rows each, in parallel and without gradients."""
 
     @torch.no_grad()
     def one(start: int) -> None:
@@ -78,7 +80,7 @@ def in_batches(work: Callable[[slice], None], n: int, size: int, device: str) ->
 
 
 def load_training_kernels(device: str) -> None:
-    """Compiles or loads the training kernels before threads need them, each of which would compile its own."""
+    """Compiles or loads the training kernels once, before several threads would each compile their own copy."""
     for module in ("space", "sampler", "hashgrid", "composite"):
         wp.load_module(f"twin.nerf.kernels.{module}", device=device)
     if device == "cuda":  # torch and Warp exchange arrays without synchronizing, so they must share a stream
@@ -86,15 +88,15 @@ def load_training_kernels(device: str) -> None:
 
 
 def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
-    """A Warp array over a tensor's memory."""
+    """A Warp array that shares a tensor's memory."""
     return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
 
 
 # ---- layout
 
-_NEAR_CELLS = 3_000_000  # cells of the near opacity grid: 12 MB, as a laptop's cache holds
+_NEAR_CELLS = 3_000_000  # cells of the near opacity grid: 12 MB, which fit in a laptop's cache
 _FAR_CELLS = 1_000_000  # cells of the far opacity grid
-_INITIAL_OPTICAL_DEPTH = 1.5  # of the untrained field across the near box's longest half side
+_INITIAL_OPTICAL_DEPTH = 1.5  # optical depth of the untrained field along the near box's longest half side
 COARSEST_CELLS = 16
 """Cells of the coarsest hash level along the longest axis."""
 
@@ -119,10 +121,10 @@ class NearBox:
 
 
 def near_box_of_cameras(camera_to_world: NDArray[np.float64], near_half_extent: float = 0.0) -> NearBox:
-    """The near box of cameras (n, 4, 4), z up: their path and half the path's length ahead of each camera.
+    """The near box of cameras (n, 4, 4), z up: contains the path and, ahead of each camera, half the path's extent.
 
-    The vertical margin is smaller, as most of what is filmed from a road lies beside it. A nonzero `near_half_extent`
-    [m] instead gives a cube with that half side around the cameras.
+    The box has a margin, which is smaller vertically, as most of what is filmed from a road lies beside the road. A
+    nonzero `near_half_extent` [m] instead gives a cube with that half side around the cameras.
     """
     positions, ahead = camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
     low, high = positions.min(0), positions.max(0)
@@ -150,7 +152,10 @@ def opacity_grid_sizes(near_box: NearBox) -> list[tuple[tuple[int, ...], float]]
 
 
 def level_cells(near_box: NearBox, levels: int, growth: float) -> NDArray[np.float32]:
-    """Cells per axis of every hash level, shape (levels, 3); cubic in the near box, `growth` times more per level."""
+    """Cells per axis of every hash level, shape (levels, 3); each level has `growth` times more than the one before.
+
+    Cells are cubes inside the near box.
+    """
     sides = 4.0 * np.array(near_box.half)
     per_meter = COARSEST_CELLS * growth ** np.arange(levels) / sides.max()
     return np.maximum(per_meter[:, None] * sides, 1.0).astype(np.float32)
@@ -190,9 +195,9 @@ class Layout:
 
 
 class Workspace:
-    """Arrays of `rays` rays with `samples` samples each and of `extra` points after them, reused by all batches.
+    """Arrays for `rays` rays with `samples` samples each, followed by `extra` points; all batches reuse them.
 
-    Names with `w_` are Warp views of the torch tensors; those with `w_ray_` hold the samples on rays, a row per ray.
+    Names with `w_` are Warp views of the torch tensors; those with `w_ray_` have a row per ray and no extra points.
     """
 
     def __init__(self, layout: Layout, rays: int, samples: int, device: str, extra: int = 0, training: bool = False):

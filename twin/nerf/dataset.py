@@ -1,7 +1,8 @@
 """Training data of a field: pixels of the training frames, and depth supervision.
 
-Depth supervision is a pixel (not rounded) with a known distance along its ray. Its kinds are sparse points in the
-frames they were matched in, the ground under the camera path ahead (if the camera height is constant), and stereo.
+Depth supervision consists of pixels (not rounded) with a known distance along their rays. It has three kinds: sparse
+points in the frames in which they were matched, the ground under the camera path ahead (if the camera height is
+constant), and stereo.
 """
 
 from dataclasses import dataclass
@@ -14,8 +15,8 @@ from twin.geometry.cameras import Cameras, SparsePoints, project, scaled_intrins
 from twin.geometry.images import read_image, resize
 from twin.runtime import track
 
-_MAX_POINT_ERROR = 2.0  # [px] reprojection error of a used point
-_MIN_TRACK_LENGTH = 3  # frames of a used point
+_MAX_POINT_ERROR = 2.0  # [px] greatest reprojection error of a used point
+_MIN_TRACK_LENGTH = 3  # least number of frames in which a used point was matched
 _PATH_REACH = 12.0  # [camera heights] the path is used up to this distance ahead
 _PATH_OFFSETS = (-0.5, 0.0, 0.5)  # [camera heights] lateral offsets at which the ground is assumed level with the path
 _TRIPLE_SPACING = 0.02  # greatest spacing of a triple's pixels [share of the width]
@@ -91,7 +92,7 @@ class TrainingPixels:
         self.stereo = join_depths([])  # set from `stereo.stereo_depths`
 
     def _depths_in_frame(self, i: int, xyz: NDArray) -> DepthSupervision:
-        """Depth supervision from points (k, 3) [m] at unmasked pixels of training frame i."""
+        """Depth supervision of training frame i from those of the points (k, 3) [m] that lie on unmasked pixels."""
         pixel, depth = project(xyz, self.cameras.camera_to_world[i], self.intrinsics[i])
         inside = (depth > 0) & (pixel > 0.5).all(1) & (pixel < [self.width[i] - 0.5, self.height[i] - 0.5]).all(1)
         xyz, pixel = xyz[inside], pixel[inside]
@@ -109,7 +110,7 @@ class TrainingPixels:
         return join_depths(found)
 
     def _depths_of_path(self, camera_height: float) -> DepthSupervision:
-        """Depth supervision from the ground under the path ahead, where a nearly straight path makes it visible."""
+        """Depth supervision from the ground under the path ahead, as far as the path is nearly straight."""
         found = []
         for source in dict.fromkeys(self.cameras.sources):
             frames = np.flatnonzero([s == source for s in self.cameras.sources])
@@ -166,7 +167,10 @@ class TrainingPixels:
         return frame, pixel, self.colors[flat].astype(np.float32) / 255.0, np.zeros(len(flat), np.float32)
 
     def _triples(self, rng: np.random.Generator, n: int) -> tuple[NDArray, ...]:
-        """Three pixels in a line, the middle one second; all three are the middle one if one is outside or masked."""
+        """Triples of pixels in a line, the middle one second.
+
+        If a pixel of a triple is masked or outside the frame, all three are the middle one.
+        """
         middle = self._random(rng, n)
         frame, row, column = self._place(middle)
         reach = rng.uniform(1.0, np.maximum(2.0, _TRIPLE_SPACING * self.width[frame]))
@@ -210,7 +214,7 @@ def load_frame(
     path = cameras.mask_path(i)
     mask = np.ones((h, w), bool)
     if path is not None:
-        # A resized pixel is usable only if all pixels it averages are.
+        # A resized pixel is usable only if all pixels that it averages are usable.
         whole = read_image(path)[..., 0] > 0
         mask = resize(whole.astype(np.float32), w, h) > 0.999 if whole.shape != (h, w) else whole
     if (w, h) != (width, height):

@@ -1,8 +1,8 @@
-"""Detail of a baked field: fits it to the training frames; terms as in `kernels/surface_detail.py`.
+"""Fits the detail of a baked field to the training frames; `kernels/surface_detail.py` defines the terms.
 
-Bricks blur surfaces that are seen at grazing angles, the ground most of all: a ray runs through many of their cells
-before it is blocked. But where it is blocked is known better than that, and on the ground to a few centimeters, as its
-height is smooth. So features are looked up there that hold what those of the bricks lack.
+Bricks blur surfaces that are seen at grazing angles, most of all the ground: a ray passes through many cells before it
+is blocked. But the point where it meets the surface is known more precisely: on the ground to a few centimeters, as the
+height of the ground is smooth. So detail adds features at that point, which correct those of the bricks.
 """
 
 from dataclasses import dataclass, replace
@@ -28,18 +28,18 @@ from twin.warp_runtime import wp
 _TEXEL = 0.025  # [m] least side of the finest texels
 _MAX_TILES = 6000  # texels grow until there are at most this many tiles, 33 MB
 _CELL = 0.06  # [m] side of the hash grid's cells
-_LOG2_ROWS = 20  # of the hash grid's table, 16 MB
-_HEIGHT_CELL = 0.25  # [m]
-_HEIGHT_VIEW = 160  # [px] width of the views that find the ground
-_REACH = 12.0  # [m] greatest distance of a view from the ground it finds
-_MIN_UPRIGHT = 0.94  # z of the normal of ground (20° from level)
-_MIN_SEEN = 8  # pixels in a cell whose height is known
-_MIN_OPACITY = 0.98  # of a ray that shows a surface and nothing behind it
-_MIN_HITS = 24  # training pixels in a stored tile
-_MAX_HITS = 8_000_000  # training pixels that are kept, about: 0.5 GB
+_LOG2_ROWS = 20  # binary logarithm of the number of rows of the hash grid's table, 16 MB
+_HEIGHT_CELL = 0.25  # [m] spacing of the height map
+_HEIGHT_VIEW = 160  # [px] width of the rendered views in which the ground is searched
+_REACH = 12.0  # [m] greatest z-depth at which ground is searched in a view
+_MIN_UPRIGHT = 0.94  # least z of the ground's unit normal (20° from level)
+_MIN_SEEN = 8  # least number of pixels in a cell whose height is known
+_MIN_OPACITY = 0.98  # least opacity of a ray that shows a surface and nothing behind it
+_MIN_HITS = 24  # least number of training pixels in a stored tile
+_MAX_HITS = 8_000_000  # approximate greatest number of training pixels that are kept, 0.5 GB
 _SHARDS = 4
-_RAYS = 16384  # per step
-_RATE, _FINAL_RATE = 0.04, 0.05  # learning rate, and its final share
+_RAYS = 16384  # rays per step
+_RATE, _FINAL_RATE = 0.04, 0.05  # initial learning rate, and the final one as a share of it
 _CLIPPED_SHARE = 2e-4  # share of values clipped by the range of a byte
 
 
@@ -62,14 +62,14 @@ class SurfacePixels:
 def fit_detail(
     baked: BakedField, appearance: Appearance, pixels: TrainingPixels, seed: int, passes: float
 ) -> dict[str, Any]:
-    """Gives a baked field detail, fitted to the training frames; returns a summary.
+    """Fits detail to the training frames and adds it to a baked field; returns a summary.
 
     Args:
-        baked: Gets the detail.
+        baked: The field that the detail is added to.
         appearance: Embeddings of the training frames.
         pixels: Training frames of the field.
         seed: Seed of the order of pixels.
-        passes: How often every training pixel near enough is used.
+        passes: How often every usable training pixel is used.
     """
     ground = Detail.without_features(*_height_map(baked, pixels), _HEIGHT_CELL)
     seen = _surface_pixels(baked, pixels, ground, seed)
@@ -171,7 +171,7 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
             parts.append([hit[at], base, ray.astype(np.float16), pixels.colors[rows][at], frame])
             progress.update()
     order = rng.permutation(sum(len(part[0]) for part in parts))
-    # Column by column, as all of them twice would be the build's peak of memory.
+    # Columns are joined one by one, as a second copy of all of them would be the build's peak of memory.
     return SurfacePixels(*(np.concatenate([part.pop(0) for part in parts])[order] for _ in range(5)))
 
 
@@ -191,7 +191,7 @@ def _choose_tiles(hits: NDArray[np.float32], map_shape: tuple[int, ...]) -> tupl
 
 
 class _DetailFitter:
-    """Fits detail by gradient descent through the color head, which stays as it is."""
+    """Fits detail by gradient descent through the color head, which stays fixed."""
 
     def __init__(self, baked: BakedField, appearance: Appearance, detail: Detail, pixels: SurfacePixels):
         self.detail, self.pixels, self.device = detail, pixels, baked.device
@@ -274,7 +274,7 @@ class _DetailFitter:
         )
 
     def quantized(self) -> Detail:
-        """The detail as the renderer reads it: texels summed over the coarser levels, all as bytes."""
+        """The detail as the renderer reads it: bytes, with the coarser levels added to every texel."""
         total = wp.zeros(self.texels[0].shape, dtype=volume.Channels, device=self.device)
         wp.launch(
             kernels.sum_levels,
@@ -289,7 +289,7 @@ class _DetailFitter:
 
 
 def _as_bytes(values: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Values (rows, CHANNELS) as bytes around 128, and the value of a unit per channel."""
+    """Values (rows, CHANNELS) as bytes around 128, and the value of one byte step in each channel."""
     used = values[np.abs(values).sum(1) > 0.0]
     if not len(used):
         return np.full(values.shape, 128, np.uint8), np.zeros(values.shape[1], np.float32)

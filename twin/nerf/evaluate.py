@@ -1,9 +1,10 @@
-"""Evaluation of a field on held-out frames, and a control experiment: places rendered under other lightings.
+"""Evaluation of a field on held-out frames, and a control experiment: filmed poses rendered under other lightings.
 
-The embedding of a held-out frame is fitted on one half of the image, left or right, starting from its lighting's, and
-scored on the other half; the score is the mean of both ways. *Unfitted* scores use the lighting's embedding itself;
-*wrong* scores use those of the other lightings, unfitted. *Small* scores are those of images as policies see them, each
-half under the embedding that was fitted on the other. If there is a baked field, which is what users see, it is scored.
+The embedding of a held-out frame is fitted on the left or right half of the image, starting from the embedding of its
+lighting, and scored on the other half; the score is the mean over both halves. *Unfitted* scores use the embedding of
+the lighting itself; *wrong* scores use the embeddings of the other lightings, unfitted. *Small* scores use images of
+the size that policies see, each half rendered under the embedding that was fitted on the other half. If there is a
+baked field, it is scored instead of the trained one, since users see the baked one.
 """
 
 from functools import cache
@@ -25,19 +26,20 @@ from twin.nerf.rendering import RenderableField
 from twin.runtime import track
 from twin.types import Array
 
-_FIT_RAYS = 4000  # of half an image, evenly spaced
+_FIT_RAYS = 4000  # rays of half an image that a fit uses, evenly spaced
 _MAX_FRAMES = 6  # held-out frames scored per lighting, evenly spaced
 _SMALL_WIDTH = 160  # [px] of the images that policies see
 _SSIM_WINDOW = 11  # [px]
-_ROW_STEP = 8  # between the image rows on which a field is compared with its baked one
+_ROW_STEP = 8  # step between the image rows on which the trained and the baked field are compared
 
 
 def score_frame(
     field: RadianceField, cameras: Cameras, i: int, max_width: int, baked: BakedField | None = None
 ) -> dict[str, float]:
-    """Scores one held-out frame: `psnr`, `unfitted`, `wrong` (nan with one lighting) [dB] and `ssim`; with a baked
-    field also `baking_gain` (its unfitted PSNR less that of the field itself, on every eighth row), `psnr_small`,
-    `ssim_small`, and these of the lower half.
+    """Scores one held-out frame: `psnr`, `unfitted`, `wrong` (nan with one lighting) [dB] and `ssim`.
+
+    With a baked field also `baking_gain` (its unfitted PSNR minus that of the trained field, on every eighth row),
+    `psnr_small`, `ssim_small`, and for the lower half of the image `psnr_small_lower` and `ssim_small_lower`.
     """
     bytes_, mask, intrinsics = load_frame(cameras, i, max_width)
     image = bytes_.astype(np.float32) / 255.0
@@ -46,7 +48,7 @@ def score_frame(
     start = field.embedding(cameras.lightings[i])
     v, u = np.mgrid[:height, :width] + 0.5
     arrays = CameraArrays(camera.camera_to_world, intrinsics[None], field.device)
-    # The field itself is slow, so next to a baked one only some rows of it are rendered.
+    # The trained field is slow to render, so if a baked one is given, the trained one renders only some rows.
     rows = slice(None) if baked is None else slice(min(_ROW_STEP, height) // 2, None, _ROW_STEP)
     pixel = np.stack([u[rows].ravel(), v[rows].ravel()], -1)
     features, harmonics, _, _ = field.trace(arrays, np.zeros(len(pixel), int), pixel)
@@ -97,7 +99,7 @@ def score_frame(
 def _small_scores(
     baked: BakedField, camera: Cameras, image: NDArray, mask: NDArray[np.bool_], fitted: list[NDArray[np.float32]]
 ) -> dict[str, float]:
-    """Small scores of a frame under the embeddings that were fitted on its left and its right half."""
+    """Small scores (see the module) of a frame, with the embeddings that were fitted on its left and its right half."""
     height, width = mask.shape
     size = min(_SMALL_WIDTH, width), max(1, round(height * min(_SMALL_WIDTH, width) / width))
     wanted, usable = resize(image, *size), resize(mask.astype(np.float32), *size) > 0.999
@@ -119,10 +121,13 @@ def evaluate(
     max_frames: int = _MAX_FRAMES,
     baked: BakedField | None = None,
 ) -> dict[str, Any]:
-    """Mean held-out scores by lighting: `psnr` [dB], `ssim`, `n`, `psnr_unfitted` and `psnr_wrong_lighting` (None
-    without another lighting); with a baked field also `baking_gain` [dB] (see `score_frame`), and `psnr_small`,
-    `psnr_small_lower`, `ssim_small` and `ssim_small_lower` of images at most 160 px wide. Lightings without held-out
-    frames have n = 0 and no other entry."""
+    """Mean held-out scores by lighting, as a dictionary of dictionaries: score → lighting → mean.
+
+    The scores are `psnr` [dB], `ssim`, `psnr_unfitted` and `psnr_wrong_lighting` (None without another lighting); with
+    a baked field also `baking_gain` [dB] (see `score_frame`), and `psnr_small`, `psnr_small_lower`, `ssim_small` and
+    `ssim_small_lower` of images at most 160 px wide. `n` is the number of frames; lightings without held-out frames
+    have n = 0 and no other entry.
+    """
     columns = {"psnr": "psnr", "ssim": "ssim", "psnr_unfitted": "unfitted"}
     if baked is not None:
         small = ("psnr_small", "psnr_small_lower", "ssim_small", "ssim_small_lower")
@@ -152,7 +157,7 @@ def evaluate(
 
 # ---- cross-lighting control
 
-_MAX_POSES = 60  # in all, evenly spaced over each lighting's frames
+_MAX_POSES = 60  # poses of all lightings together, evenly spaced over each lighting's frames
 _WIDTH = 96  # [px] longer side of the images
 
 
@@ -161,7 +166,7 @@ def cross_lighting(
 ) -> dict[str, Any] | None:
     """Renders training poses under every lighting, not only their own; None with fewer than two lightings.
 
-    An image counts by its mean color alone (RGB in [0, 1], over unmasked pixels). No film shows a place under two
+    Only the mean color of an image is used (RGB in [0, 1], over unmasked pixels). No film shows a pose under two
     lightings, so the reference for lighting j is the nearest frame filmed under j.
 
     Keys, with Euclidean color distances in RGB:
@@ -214,7 +219,7 @@ def cross_lighting(
     for j, name in enumerate(lightings):
         rows = np.flatnonzero(light != j)
         nearest = [nearest_frame(trained, poses[row], name) for row in rows]
-        there = np.array([filmed(i) for i in nearest if i is not None])  # none is None: every lighting has a frame
+        there = np.array([filmed(i) for i in nearest if i is not None])  # never None: each lighting has a frame
         # Differences below a thousandth of a byte are rounding, and count as a tie.
         nearer = np.round(_distance(shown[rows, j], own[rows]) - _distance(shown[rows, j], there), 6)
         for key, reference in (("to_shown_rms", film[j]), ("to_filmed_rms", film[light[rows]])):

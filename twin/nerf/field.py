@@ -1,8 +1,8 @@
 """Radiance field: density and color of a place under every lighting it was filmed in.
 
-Hash grid and trunk give density and features per sample; the features are composited along the ray, and the head turns
-them into a color (`network.py`). Points and distances are in meters, in the world frame of the cameras;
-`kernels/space.py` defines the other terms.
+The hash grid and the trunk network give density and features per sample; the features are composited along the ray, and
+the head network maps them to a color (`network.py`). Points and distances are in meters, in the world frame of the
+cameras; `kernels/space.py` defines the other terms.
 """
 
 import math
@@ -44,15 +44,15 @@ from twin.warp_runtime import wp
 _FORMAT = 1
 QUERY_POINTS = 65536
 """Points per batch of `RadianceField.query`."""
-_RENDER_RAYS = 4096  # per batch
-_RENDER_SAMPLES = 24  # per ray
-_HEAD_RAYS = 8192  # per batch of the head
+_RENDER_RAYS = 4096  # rays per batch when rendering
+_RENDER_SAMPLES = 24  # samples per ray when rendering
+_HEAD_RAYS = 8192  # rays per batch of the head
 _RENDER_UNIFORM_WEIGHT = 0.02  # uniform share of the sampling distribution when rendering
 _MAX_SEED = 2**31 - 1  # kernels take 32-bit signed seeds
 
 
 class RadianceField:
-    """A trained (or training) field on one device."""
+    """A radiance field on one device, trained or in training."""
 
     def __init__(
         self,
@@ -101,7 +101,7 @@ class RadianceField:
         return self.layout.near_box.bounds
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
-        """See `Appearance.embedding`."""
+        """See `Lightings.embedding`."""
         return self.appearance.named().embedding(lighting)
 
     def add_lightings(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> None:
@@ -123,7 +123,7 @@ class RadianceField:
     def sample(
         self, ws: Workspace, start: int, count: int, floor: float, target_mass: float = 0.0, seed: int | None = None
     ) -> None:
-        """Rays → samples, see `sampler.sample_rays`. A seed jitters them; None takes the middles of the strata."""
+        """Rays → samples, see `sampler.sample_rays`: jittered, or at the middles of the strata if `seed` is None."""
         jitter = -1 if seed is None else seed & _MAX_SEED
         wp.launch(
             sampler.sample_rays,
@@ -170,7 +170,7 @@ class RadianceField:
     ) -> None:
         """Gradients of opacity, features and Σwᵢ/tᵢ per ray → gradients of the network outputs.
 
-        The numbers weight two regularizers, see `composite.composite_backward`.
+        The last four arguments are weights and scales of two regularizers, see `composite.composite_backward`.
         """
         wp.launch(
             volume.composite_backward,
@@ -214,7 +214,7 @@ class RadianceField:
     def trace(
         self, cameras: CameraArrays, camera: NDArray, pixel: NDArray, samples: int = _RENDER_SAMPLES
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Traces n rays, given by camera index (n,) and pixel (n, 2) [px], up to what does not depend on the lighting.
+        """Traces n rays, given by camera index (n,) and pixel (n, 2) [px]; the result does not depend on the lighting.
 
         Returns:
             Features (n, CHANNELS − 1), spherical harmonics of the directions (n, 16), z-depth [m] (n,), opacity (n,).
@@ -254,7 +254,7 @@ class RadianceField:
         return rgb.cpu().numpy()
 
     def render(self, cameras: PosedCameras, lighting: str | NDArray, size: tuple[int, int] | None = None) -> Rendering:
-        """Renders n cameras under one lighting, with arguments and errors of the much faster `BakedField.render`."""
+        """Renders n cameras under one lighting; arguments and errors as for the much faster `BakedField.render`."""
         vector = self.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
         intrinsics, (width, height) = intrinsics_for_size(cameras, size)
         n = len(intrinsics)
@@ -270,7 +270,7 @@ class RadianceField:
 
     @contextmanager
     def workspace(self, rays: int, samples: int, extra: int = 0) -> Iterator[Workspace]:
-        """Lends a spare workspace of this size, or a new one. Thread-safe, as each list operation is atomic."""
+        """Lends a spare or new workspace of this size. It is thread-safe, as each list operation is atomic."""
         spares = self._spare.setdefault((rays, samples, extra), [])
         try:
             ws = spares.pop()

@@ -1,7 +1,7 @@
 """Homogeneous fog, applied to an image by its depth (Koschmieder 1924).
 
-Light over a distance d keeps the share exp(−extinction · d) and gains the rest from the *airlight*, which the air
-scatters towards the camera. The meteorological visibility, where 5 % are kept, is 3 / extinction.
+Over a distance d, a share exp(−extinction · d) of a surface's light is kept; the rest of the color is the *airlight*,
+which the air scatters towards the camera. The meteorological visibility, at which 5 % are kept, is 3 / extinction.
 """
 
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ import numpy as np
 from twin.types import Array32
 
 REACH = 100.0
-"""Greatest distance [m] over which fog accumulates: it lies low, so the sky shines through."""
+"""Greatest distance [m] over which fog accumulates: as fog lies low, it does not hide the sky."""
 
 
 @dataclass(frozen=True)
 class Fog:
-    """Fog in addition to the film's; clear by default."""
+    """Fog in addition to any in the film; none by default."""
 
     extinction: float = 0.0
     """[1/m]"""
@@ -32,7 +32,10 @@ class Fog:
 
 
 def mixed(one: Fog | None, other: Fog | None, share: float) -> Fog | None:
-    """Fog `share` of the way from one to another, airlights weighted by extinction; None is the air of the film."""
+    """Interpolated fog, `share` of the way from `one` to `other`; None stands for the air of the film.
+
+    The airlights are weighted by the extinctions.
+    """
     if one is None and other is None:
         return None
     a, b = one or Fog(), other or Fog()

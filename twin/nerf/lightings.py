@@ -1,9 +1,10 @@
-"""Lightings by name, as NumPy arrays, for rendering without torch; and lightings added to a built scene.
+"""Lightings by name, as NumPy arrays for rendering without torch, and lightings added to a built scene.
 
 A lighting is requested by its name, by a frame (`day/000012`), or as a mixture `day:night:0.3`, 30 % of the way from
 day to night. Random lightings come from `appearance_prior.py`. `python -m twin.relight` fits a lighting to a photo and
-stores it in `<scene>/lightings/<name>.json`, outside `build/`, which may be deleted at any time. An embedding is valid
-for one field only, so each file stores the content digest of its field stage; with another build it is *stale*.
+stores it in `<scene>/lightings/<name>.json`, outside `build/`, since users may delete `build/` at any time. An
+embedding is valid for one field only, so each file stores the content digest of its field stage; with any other build
+of the field, the lighting is *stale*.
 """
 
 from collections.abc import Mapping
@@ -36,7 +37,7 @@ class Lightings:
     probes: appearance_prior.Probes | None = None
     """Rays on which random lightings are checked; a baked field has them."""
     stale: tuple[str, ...] = ()
-    """Added lightings that are refused: fitted to another build of the field or by an older twin."""
+    """Added lightings that are refused, since they were fitted to another build of the field or by an older twin."""
     count_added: int = 0
     """Number of added lightings, the last ones of `names`."""
     fogs: Mapping[str, Fog] = field(default_factory=dict)
@@ -63,14 +64,17 @@ class Lightings:
         raise InputError(f"lighting {lighting!r}: unknown; the field has {', '.join(self.names)}")
 
     def fog(self, lighting: str) -> Fog | None:
-        """Fog of an added lighting or of a mixture with one; None means the air of the film. Errors as `embedding`."""
+        """Fog of an added lighting or of a mixture with one; None means the air of the film.
+
+        Raises InputError for a mixture that is not `a:b:share` with a share from 0 to 1.
+        """
         if lighting in self.fogs:
             return self.fogs[lighting]
         mixture = None if lighting in self.names else _mixture(lighting)
         return mixed(self.fog(mixture[0]), self.fog(mixture[1]), mixture[2]) if mixture else None
 
     def sample(self, rng: np.random.Generator) -> Array32:
-        """Samples the embedding (dim,) of a plausible lighting; raises InputError without probes or success."""
+        """Samples the embedding (dim,) of a plausible lighting. Raises InputError without probes or success."""
         return self.prior.sample(rng)
 
     @cached_property
@@ -120,7 +124,7 @@ def _mixture(lighting: str) -> tuple[str, str, float] | None:
 
 # ---- lightings added to a scene
 
-_FORMAT = 2  # 1 has no fog
+_FORMAT = 2  # format 1 has no fog
 
 
 @dataclass(frozen=True)
@@ -133,7 +137,7 @@ class AddedLighting:
     air: Fog
     """Fog in the photo."""
     field: str
-    """Content digest of its field stage."""
+    """Content digest of the field stage that it was fitted to."""
     photo: str
     """Path of the photo, as given."""
     figures: dict[str, Any]
@@ -166,7 +170,7 @@ def added_lightings(scene: SceneDir, dim: int) -> tuple[dict[str, Array32], tupl
     for path in sorted(scene.lightings.glob("*.json")):
         with wrap_read_errors(path, "fit it again or delete it"):
             head = read_json(path)
-            if head["format"] == 1:  # without fog
+            if head["format"] == 1:  # has no fog
                 stale.append(path.stem)
                 continue
             if head["format"] != _FORMAT:

@@ -1,8 +1,8 @@
 """The field's networks: trunk per sample, head and background per ray.
 
 The *trunk* maps hash features of a sample to raw density and features. The *head* maps the features composited along a
-ray, the ray's direction and an appearance embedding to a color, so samples do not depend on the lighting. The
-*background* network (`backdrop.*`) maps the direction alone to the features of the sky, which needs no density.
+ray, the ray's direction and an appearance embedding to a color. So samples do not depend on the lighting. The
+*background* network (`backdrop.*`) maps the direction alone to the features of the sky, so the sky needs no density.
 """
 
 import torch
@@ -65,7 +65,7 @@ def trunk_backward(
 
 
 def ray_features(p: dict[str, torch.Tensor], composited: torch.Tensor, harmonics: torch.Tensor) -> torch.Tensor:
-    """Ray features over the background, shape (n, CHANNELS − 1). Slot 0 of `composited` is opacity."""
+    """Features of rays composited over the background, shape (n, CHANNELS − 1). Slot 0 of `composited` is opacity."""
     background = torch.relu(harmonics @ p["backdrop.0"] + p["backdrop.0.bias"]) @ p["backdrop.1"]
     return composited[:, 1:] + (1.0 - composited[:, :1]) * background
 
@@ -76,7 +76,7 @@ def head(
     """Colors in [0, 1], shape (n, 3), of rays under embeddings of shape (n, dim) or (dim,)."""
     f, s = features.shape[1], harmonics.shape[1]
     w = p["head.0"]
-    # A single embedding adds one bias to all rays.
+    # An embedding of shape (dim,) adds the same bias to all rays.
     x = features @ w[:f] + harmonics @ w[f : f + s] + (embedding @ w[f + s :] + p["head.0.bias"])
     x = torch.relu(torch.relu(x) @ p["head.1"] + p["head.1.bias"])
     return torch.sigmoid(x @ p["head.2"] + p["head.2.bias"])

@@ -1,9 +1,10 @@
 """Camera pose refinement during field training.
 
-A frame's *correction* is a translation [m] and a rotation vector about its center [rad], both in world axes. Samples of
-a ray keep their distances from the camera, so with the gradient gᵢ of the loss at sample i, at distance tᵢ along the
-unit direction d, the gradient of the translation is Σ gᵢ and that of the rotation d × Σ tᵢ·gᵢ. The dependence of color
-on the viewing direction is left out. Corrections are kept at zero mean, as a common motion would move the whole place.
+A frame's *correction* is a translation [m] and a rotation vector about the camera center [rad], both in world axes.
+The samples of a ray keep their distances from the camera. Let gᵢ be the gradient of the loss with respect to the
+position of sample i, and tᵢ its distance along the unit direction d. Then the gradient with respect to the translation
+is Σ gᵢ, and with respect to the rotation d × Σ tᵢ·gᵢ. The dependence of color on the viewing direction is ignored. The
+mean of the corrections is kept at zero, as a common motion of all cameras would move the whole place.
 """
 
 from dataclasses import replace
@@ -20,7 +21,7 @@ from twin.types import Array
 from twin.warp_runtime import wp
 
 _STEP_PIXELS = 0.05  # [px of a training frame] initial image motion per step
-_NEIGHBORS = 2  # training frames whose mean correction a held-out frame gets
+_NEIGHBORS = 2  # number of training frames whose mean correction is applied to a held-out frame
 
 
 class PoseRefinement:
@@ -52,7 +53,7 @@ class PoseRefinement:
         self._w_ray_grad: list[Any] = [warp_view(part, wp.vec3f) for part in self._ray_grad]
 
     def backward(self, field: RadianceField, start: int, count: int) -> None:
-        """Computes ray gradients of rays [start, start + count) from the gradients of their samples' features."""
+        """Computes gradients of the rays [start, start + count) from the gradients of their samples' features."""
         ws = self._ws
         wp.launch(
             hashgrid.encode_positions_backward,
@@ -92,9 +93,10 @@ class PoseRefinement:
         self.arrays.set_poses(pose)
 
     def refined_cameras(self, cameras: Cameras) -> tuple[Cameras, dict[str, float]]:
-        """Corrected poses of all frames, and a summary of how far the training frames moved [m], [°].
+        """Cameras with corrected poses of all frames, and a summary of the motions of the training frames [m], [°].
 
-        A held-out frame gets the mean correction of the `_NEIGHBORS` training frames of its source nearest in time.
+        A held-out frame gets the mean correction of the `_NEIGHBORS` training frames that are nearest in time in its
+        source.
         """
         rotation, translation = (part.detach().cpu().double().numpy() for part in (self.rotation, self.translation))
         every = np.zeros((len(cameras), 6))

@@ -16,7 +16,7 @@ class Rendering:
     rgb: NDArray[np.float32]
     """Color in [0, 1], shape (n, height, width, 3)."""
     depth: NDArray[np.float32]
-    """z-depth [m] at which half the light is blocked, `FAR` where less is; shape (n, height, width)."""
+    """z-depth [m] at which half the light is blocked, `FAR` where less is blocked; shape (n, height, width)."""
     opacity: NDArray[np.float32]
     """Share of the light that is blocked, in [0, 1], shape (n, height, width)."""
 

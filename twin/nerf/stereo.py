@@ -1,8 +1,9 @@
 """Multi-view stereo: depth supervision from frames of one film with known poses.
 
-A *source* of a frame is another frame of the same film with a similar view from a few degrees aside. PatchMatch stereo
-(Bleyer et al. 2011; for several views Galliani et al. 2015) fits a plane to every cell of a few pixels such that the
-sources look like the frame. A cell counts if enough sources find the same point. Surfaces without texture get no depth.
+A *source* of a frame is another frame of the same film that shows nearly the same view from a few degrees to the side.
+A frame is divided into *cells* of a few pixels. PatchMatch stereo (Bleyer et al. 2011; for several views Galliani et
+al. 2015) fits a plane to every cell, such that the sources, mapped by the plane, look like the frame. A cell is used if
+enough sources find the same point. Surfaces without texture get no depth.
 """
 
 from dataclasses import dataclass
@@ -21,15 +22,15 @@ from twin.types import Array
 from twin.warp_runtime import wp
 
 _GRID_CELLS = 160  # cells along a frame's longer side
-_MAX_SOURCES = 4  # per frame
+_MAX_SOURCES = 4  # sources per frame
 _ROUNDS = 4  # PatchMatch rounds after the first
-_BEST_ANGLE = 5.0  # [°] between two views of a point: less is imprecise, more changes the appearance too much
-_WINDOW_SPACING = 240  # longer side of a frame over the spacing of a window's pixels
-_MAX_COST = 0.5  # 1 − NCC
+_BEST_ANGLE = 5.0  # [°] between two views of a point: smaller angles are imprecise, larger ones change the appearance
+_WINDOW_SPACING = 240  # a frame's longer side is this many times the spacing of a window's pixels
+_MAX_COST = 0.5  # greatest 1 − NCC of a used cell
 _TOLERANCE = 0.04  # relative difference of inverse depth within which two frames agree
-_MIN_PARALLAX = 0.3  # [px] that a change by the tolerance must move a pixel in a source that votes
+_MIN_PARALLAX = 0.3  # [px] least motion of the pixel in a voting source when inverse depth changes by the tolerance
 _MIN_VOTES = 2  # sources that must agree
-_MIN_POINTS = 20  # sparse points from which a frame's depth range is estimated
+_MIN_POINTS = 20  # least number of sparse points from which a frame's depth range is estimated
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class StereoGeometry:
 def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[DepthSupervision, dict[str, Any]]:
     """Depth supervision for every frame that has sources, and a summary; the same seed gives the same depths.
 
-    The frames' sparse points give the depth range; without them nothing is found.
+    Sparse points give the range of depths to search; with fewer than 20, or fewer than 3 frames, nothing is found.
     """
     n = len(pixels.cameras)
     none = join_depths([])
@@ -142,9 +143,9 @@ def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[Depth
 
 
 def choose_sources(cameras: Cameras, intrinsics: Array, depth: Array) -> list[NDArray[np.int32]]:
-    """Up to four sources of every frame, best first, rated on points around its median depth [m], shape (n,).
+    """Up to four sources of every frame, best first, rated by their views of points around the frame's median depth.
 
-    `intrinsics` are fx, fy, cx, cy [px] of the scaled images, shape (n, 4).
+    `intrinsics` are fx, fy, cx, cy [px] of the scaled images, shape (n, 4); `depth` is the median depth [m], (n,).
     """
     n = len(cameras)
     positions, world_to_camera = cameras.positions, inverse_pose(cameras.camera_to_world)
@@ -163,7 +164,7 @@ def choose_sources(cameras: Cameras, intrinsics: Array, depth: Array) -> list[ND
         a, b = point - positions[i], point - positions[others, None]
         cosine = (a * b).sum(-1) / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1) + 1e-12)
         angle = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        # A window does not match at twice or half its scale.
+        # A window does not match its image at twice or half the scale.
         ratio = np.linalg.norm(b, axis=-1) / np.linalg.norm(a, axis=-1)
         spread = np.where(angle < _BEST_ANGLE, 2.0, 8.0)
         rating = (inside * np.exp(-(((angle - _BEST_ANGLE) / spread) ** 2) - (np.log(ratio) / 0.7) ** 2)).sum(-1)
@@ -173,7 +174,7 @@ def choose_sources(cameras: Cameras, intrinsics: Array, depth: Array) -> list[ND
 
 
 def _depth_quantiles(pixels: TrainingPixels, i: int) -> Array:
-    """Quantiles (1, 25, 50, 75, 99 %) of z-depth [m] of frame i's sparse points, or of all if it has few."""
+    """Quantiles (1, 25, 50, 75, 99 %) of z-depth [m] of frame i's sparse points, or of all frames' if it has few."""
     points = pixels.points
     own = points.frame == i
     if own.sum() < _MIN_POINTS:

@@ -1,4 +1,4 @@
-"""Stage `field`: trains a radiance field on metric cameras, bakes it for rendering with detail, and evaluates both.
+"""Stage `field`: trains a radiance field on metric cameras, bakes it, adds detail, and evaluates the result.
 
 The number of training steps is fixed (`nerf.steps`), and nothing depends on a clock, so on a CPU the same input gives
 the same field bit for bit. Every batch of rays comes with *free points*: random points around the camera path, where
@@ -50,11 +50,11 @@ from twin.warp_runtime import wp
 # ---- losses; distortion and depth are in `kernels/composite.py`
 
 _EDGE_SHARPNESS = 10.0  # a color contrast of 1/10 divides the plane loss by e
-_MAX_BEND = 0.5  # relative bending beyond this is a depth edge, whatever the colors are
+_MAX_BEND = 0.5  # greatest relative bend that counts: a larger one is a depth edge, whatever the colors are
 _HORIZON_SINE = 0.03  # rays this close to level are neither above nor below the horizon
 # Weights of the loss terms beside the color error.
 _DISTORTION = 0.005
-_DEPTH, _DEPTH_REACH = 0.25, 0.5  # at 1.0 the errors of stereo blur near surfaces by 0.6 dB
+_DEPTH, _DEPTH_REACH = 0.25, 0.5  # with a weight of 1.0, errors of stereo blur near surfaces, at a loss of 0.6 dB
 _PLANE = 0.01
 _FREE = 1e-3
 _SKY, _GROUND = 1e-2, 1e-2
@@ -75,9 +75,10 @@ def plane_loss(inverse_depth: torch.Tensor, color: torch.Tensor) -> torch.Tensor
 
 
 def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
-    """Mean cost of opaque rays above the horizon, as a plain sky fits at any distance, and of transparent ones below.
+    """Mean cost of opacity above the horizon and of transparency below it.
 
-    Takes the opacity of rays (n,) and the vertical component `up` (n,) of their directions.
+    The sky needs this cost, since a surface of a plain color would fit it at any distance. Takes the opacity of rays
+    (n,) and the vertical component `up` (n,) of their directions.
     """
     above, below = (up > _HORIZON_SINE).float(), (up < -_HORIZON_SINE).float()
     return (_SKY * above * opacity + _GROUND * below * (1.0 - opacity)).mean()
@@ -85,18 +86,18 @@ def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
 
 # ---- training
 
-_SHARDS = 4  # per batch
-_CELL_PIXELS = 2.0  # side of the finest cell [px of a training frame, at the near end of the visible range]
-_GROWTH_RANGE = (1.3, 2.2)  # of the cells from one hash level to the next
+_SHARDS = 4  # shards per batch
+_CELL_PIXELS = 2.0  # side of the finest cell at the distance of near surfaces [px of a training frame]
+_GROWTH_RANGE = (1.3, 2.2)  # limits of the growth of the cells per axis from one hash level to the next
 _HIDDEN = 64  # units per hidden layer
 _TRIPLE_SHARE = 0.3  # share of the rays that come in triples, for the plane loss
-_FREE_POINTS = 256  # per shard and step
+_FREE_POINTS = 256  # free points per shard and step
 _NETWORK_RATE = 1e-2  # initial learning rate of networks and embeddings
 _FINAL_RATE = 0.03  # final learning rates, as a share of the initial ones
 _RISE, _FALL = 0.3, 0.1  # rates at which opacity grid cells follow higher and lower samples
-_LOG_OFFSET = 0.05  # of the distortion's logarithmic distance [share of the near box's longest half side]
+_LOG_OFFSET = 0.05  # offset in the distortion's logarithmic distance [share of the near box's longest half side]
 _WARM_UP = 20  # steps of rising learning rate
-_EXPLORATION_SHARE = 0.15  # share of the steps over which sampling narrows down; cameras move only after it
+_EXPLORATION_SHARE = 0.15  # sampling narrows down over this share of the steps; cameras are refined only afterwards
 
 
 class Trainer:
@@ -261,7 +262,7 @@ class Trainer:
 
     @property
     def _refines(self) -> bool:
-        """True while cameras move: not at first, when the field is less accurate than they are."""
+        """True while cameras are refined; false at first, as long as the field is less accurate than the cameras."""
         return self.refinement is not None and self.steps_done >= _EXPLORATION_SHARE * self.config.steps
 
     def _trunk_backward(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
@@ -276,7 +277,10 @@ class Trainer:
         )
 
     def _free_backward(self, start: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Gradient of free · mean(log(1 + σ·scale)) over the free points; it saturates at high density."""
+        """Gradients of the loss `_FREE` · mean(log(1 + σ·scale)) over free points of density σ.
+
+        The gradient saturates at high density.
+        """
         f, ws = self.field, self.ws
         f.query(ws, start, _FREE_POINTS)
         rows = slice(start, start + _FREE_POINTS)
@@ -286,8 +290,10 @@ class Trainer:
         return self._trunk_backward(rows)
 
     def _update(self, task: int, rate: float) -> None:
-        """Scatters the gradient of hash level `task` and takes its Adam step. Each of the two tasks after the levels
-        updates half of the cells of the opacity grids."""
+        """Accumulates the gradient of hash level `task` and takes an Adam step on that level.
+
+        The two tasks after those of the levels update half of the cells of the opacity grids each.
+        """
         f, ws = self.field, self.ws
         levels = self.config.levels
         if task >= levels:
@@ -337,7 +343,7 @@ class Trainer:
 
 
 def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
-    """Straight segments of the camera path, shape (k, 2, 3) [m]; space within the near plane around them is empty.
+    """Straight segments of the camera path, shape (k, 2, 3) [m]; space closer to them than `near_plane` is empty.
 
     A segment much longer than the median of its source is a jump between photos, so only its ends count.
     """

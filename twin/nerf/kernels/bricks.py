@@ -1,9 +1,9 @@
 """Bricks: sparse storage of a baked field's samples, and the kernels that fine-tune them; `march.py` renders them.
 
-*Brick*: 8³ cells of a grid, stored as the 9³ samples on their corners, so that interpolation never leaves it. A sample
-is `CHANNELS` bytes: raw density and features (see `composite.py`), each in its channel's range. *Slot*: row of a stored
-brick; the *index* gives it per brick of a grid, −1 where none is stored. *Block*: 2³ cells. The *near* grid covers the
-near box, the *far* grid, of larger cells, the contracted cube.
+*Brick*: 8³ cells of a grid, stored as the 9³ samples on their corners, so that interpolation never leaves the brick. A
+sample is `CHANNELS` bytes: raw density and features (see `composite.py`), each scaled to the range of its channel.
+*Slot*: row of a stored brick; the *index* maps each brick of a grid to its slot, or to −1 if it is not stored. *Block*:
+2³ cells. The *near* grid covers the near box; the *far* grid, with larger cells, covers the contracted cube.
 """
 
 # Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
@@ -22,12 +22,13 @@ SAMPLES = CORNERS**3
 HALF_CORNERS = CORNERS // 2 + 1
 """Samples along z of half a brick."""
 DENSITIES = CORNERS * 2 * CORNERS * HALF_CORNERS
-"""Bytes of a brick's densities: along x, then by halves along z (the sample between them twice), then y, then z. So
-the four corners of a cell's face across x lie within eight bytes, and a cache line holds many cells."""
+"""Number of a brick's density bytes. Their axes, slowest first, are x, half along z (the two halves share the samples
+between them, which are stored twice), y, and z in the half. So the four corners of a cell's face normal to x lie within
+eight bytes, and a cache line holds many cells."""
 
 Bytes = wp.types.vector(length=CHANNELS, dtype=wp.uint8)
 
-_MIN_GRADIENT = 1.0e-22  # squared norm from which a sample takes part in a step
+_MIN_GRADIENT = 1.0e-22  # samples with a smaller squared norm of the gradient are skipped
 _SIDE = float(CELLS)
 
 
@@ -36,14 +37,14 @@ class Bricks:
     """A baked field in the layout of the march. Grids are flat, the last axis fastest."""
 
     near_index: wp.array(dtype=wp.int32)
-    """Slot of a brick, or −d where none is stored, d being the least skip distance of its blocks."""
+    """Slot of each brick, or −d if it is not stored, where d is the least skip distance of its blocks."""
     far_index: wp.array(dtype=wp.int32)
     skips: wp.array(dtype=wp.uint8)
     """Skip distances of the stored bricks' blocks, 64 per slot."""
     near_blocks: wp.vec3i
     far_blocks: wp.vec3i
     densities: wp.array(dtype=wp.uint8)
-    """See `brick_layout.density_codes`."""
+    """Densities of the stored bricks, in the order described at `DENSITIES`."""
     features: wp.array(dtype=Bytes)
     low: Channels
     step: Channels
@@ -170,11 +171,11 @@ def adam_step(
     gradient: wp.array2d(dtype=Channels),
     second: wp.array2d(dtype=wp.vec2f),
 ):
-    """Adam step (Kingma and Ba 2015) on samples with a gradient, which it clears; β = (0, 0.99).
+    """Takes an Adam step (Kingma and Ba 2015) on samples with a gradient and clears the gradient; β = (0, 0.99).
 
     To save memory there is no momentum, and a sample's features share one second moment. Visits the positions of
-    `interpolate_backward`, as most samples get no gradient. On CUDA two threads may reach a corner at once; both then
-    take the same step, or the later one none.
+    `interpolate_backward`, as most samples get no gradient. On CUDA, two threads may reach a sample at once: then both
+    take the same step, or the later one finds no gradient and takes none.
     """
     i = wp.tid()
     g = outputs_grad[i]

@@ -1,6 +1,7 @@
 """Color head on baked fields: composited features → colors, by the head and background networks of `network.py`.
 
-The first layer's *bias* includes the appearance, one per camera, so every camera of a launch can have its own lighting.
+The *bias* of the first layer includes the appearance. Every camera of a launch has its own bias, so it can have its own
+lighting.
 """
 
 # Warp reads annotations as values.
@@ -19,7 +20,7 @@ FEATURES = CHANNELS - 1
 LANES = {"cpu": 16, "cuda": 1}
 """Pixels per thread; see `march.py`."""
 
-_UNROLLING = OPTIONS | {"max_unroll": 8}  # unrolls loops over eight units, not those over lanes
+_UNROLLING = OPTIONS | {"max_unroll": 8}  # unrolls loops over eight units, not loops over lanes
 
 wp.set_module_options(OPTIONS)
 
@@ -32,7 +33,7 @@ _INPUTS = FEATURES + HARMONICS
 def harmonics_of(x: Any, y: Any, z: Any):
     """The 15 real spherical harmonics of degree 1 to 3 of unit vectors (x, y, z), up to constant factors.
 
-    Evaluates arrays of NumPy and torch, and is compiled by Warp. The harmonic of degree 0 is the constant 1.
+    The function accepts NumPy and torch arrays, and Warp compiles it. The harmonic of degree 0 is the constant 1.
     """
     xx = x * x
     yy = y * y
@@ -155,8 +156,9 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
                 for n in range(background_hidden):
                     a += g[n] * weights.backdrop_1[n * FEATURES + i]
                 x[i] = a
-        # Eight units at a time: each input is read once for all, and eight sums keep the processor's units busy. Both
-        # layers are written out, as one function for both, though equal to the bit, copies its inputs: 30 % slower.
+        # Eight hidden units at a time: each input is read once for all eight, and eight independent sums keep the
+        # processor busy. Both layers are written out: a function for both gives the same bits but is 30 % slower, as
+        # it copies its inputs.
         h = Hidden()
         for q in range(weights.head_1_bias.shape[0]):
             s = Eight()

@@ -1,8 +1,9 @@
 """Volume rendering of features along rays, with a hand-written backward pass and per-sample regularizers.
 
-A ray has K strata between K + 1 edges [m], of contracted lengths δ [contracted m]. A sample's network output holds raw
-density in slot 0 and features in the others. Weight wᵢ = Tᵢ·(1 − exp(−σᵢδᵢ)) (Max 1995). The composited output holds
-the *opacity* Σwᵢ in slot 0 and Σwᵢ·featureᵢ in the others.
+A ray has K strata, bounded by K + 1 edges [m]; their contracted lengths are δᵢ [contracted m]. The network output of a
+sample holds raw density in slot 0 and features in the other slots. The weight of sample i is wᵢ = Tᵢ·(1 − exp(−σᵢδᵢ)),
+where σᵢ is its density and Tᵢ the transmittance up to its stratum (Max 1995). The composited output holds the *opacity*
+Σwᵢ in slot 0 and Σwᵢ·featureᵢ in the other slots.
 """
 
 # Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
@@ -32,7 +33,7 @@ class Strata:
 
 @wp.func
 def density_of(raw: wp.float32, unit: wp.float32) -> wp.float32:
-    """Density [1/contracted m] of a raw output; `unit` is the density at 0."""
+    """Density [1/contracted m] of a raw output; `unit` is the density at raw output 0."""
     return unit * wp.exp(wp.min(raw, RAW_LIMIT))
 
 
@@ -56,7 +57,10 @@ def composite(
     inverse_distance: wp.array(dtype=wp.float32),
     median_distance: wp.array(dtype=wp.float32),
 ):
-    """Opacity and features per ray, Σwᵢ/tᵢ [1/m], and the distance [m] that blocks half the light (−1: none)."""
+    """Opacity and features per ray, Σwᵢ/tᵢ [1/m], and the distance [m] by which half the light is blocked.
+
+    The distance is −1 if less than half is blocked.
+    """
     i = start + wp.tid()
     transmittance = float(1.0)
     total = Channels()
@@ -138,7 +142,7 @@ def composite_backward(
             gw += depth * (wp.min(wp.abs(t / target - 1.0), depth_reach) - depth_reach)
         grad = gradient * w
         gw += wp.dot(gradient, out) - opacity_gradient * out[0]
-        # ∂wᵢ/∂σᵢ = δᵢ·T_{i+1}, ∂wⱼ/∂σᵢ = −δᵢ·wⱼ behind it.
+        # ∂wᵢ/∂σᵢ = δᵢ·T_{i+1}, and ∂wⱼ/∂σᵢ = −δᵢ·wⱼ for the samples j behind sample i.
         sigma = density_of(out[0], unit)
         left += w  # Tᵢ
         slope = gw * (left - w) - behind

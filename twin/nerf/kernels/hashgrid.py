@@ -1,8 +1,9 @@
 """Multi-resolution hash encoding (Müller et al. 2022, section 3): forward, hand-written backward, and optimizer.
 
-*Grid position*: see `kernels/space.py`. *Level*: one grid of vertices, from coarse to fine; levels that fit are stored
-densely, the others are hashed. *Table*: features of all levels, `FEATURES` floats per vertex. The backward pass is
-launched level by level: on a CPU one thread then sums each level in a fixed order, whatever the number of threads.
+*Grid position*: see `kernels/space.py`. *Level*: one of several grids of vertices, ordered from coarse to fine; levels
+that fit into their table are stored densely, the others are hashed. *Table*: features of all levels, `FEATURES` floats
+per vertex. The backward pass is launched level by level: on a CPU, one thread then sums a whole level in a fixed order,
+whatever the number of threads.
 """
 
 # Warp reads annotations as values.
@@ -29,7 +30,7 @@ class Levels:
     shapes: wp.array(dtype=wp.vec4i)
     """Vertices per axis, and 1 if the level is stored densely."""
     mask: wp.uint32
-    """Rows of a hashed level's table, a power of 2, minus 1."""
+    """Number of rows of a hashed level's table (a power of 2) minus 1."""
 
 
 @wp.struct
@@ -107,7 +108,7 @@ def encode_backward(
     k, i = wp.tid()
     level = first_level + k
     g = features_grad[i, level]
-    if wp.dot(g, g) == 0.0:  # behind an opaque sample; small gradients count, as Adam divides by their size
+    if wp.dot(g, g) == 0.0:  # zero behind an opaque sample; small gradients count, as Adam normalizes them
         return
     cell = cell_at(positions[i], levels.cells[level])
     for n in range(8):
@@ -151,10 +152,11 @@ def adam_step(
     first: wp.array2d(dtype=Feature),
     second: wp.array2d(dtype=Feature),
 ):
-    """Adam step (Kingma and Ba 2015) on the rows with a gradient, which it clears; launched over (levels, rows).
+    """Takes an Adam step (Kingma and Ba 2015) on the rows with a gradient and clears the gradient.
 
-    Rows without a gradient keep their values and moments, as a batch touches little of a table. `rate` is the learning
-    rate over 1 − β₁ᵗ and `second_correction` is 1 / (1 − β₂ᵗ); β = (0.9, 0.99).
+    Launched over (levels, rows). Rows without a gradient keep their values and moments, as a batch touches only a small
+    part of a table. `rate` is the learning rate divided by 1 − β₁ᵗ, and `second_correction` is 1 / (1 − β₂ᵗ);
+    β = (0.9, 0.99).
     """
     k, i = wp.tid()
     level = first_level + k

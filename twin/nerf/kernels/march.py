@@ -1,9 +1,10 @@
 """Ray marching through bricks of 8-bit samples, for one image or many, on CPU and CUDA.
 
 *Packet*: neighboring rays, eight to a row, that march together, one per *lane*. Loops over lanes have no branches, so
-the compiler vectorizes them; on CUDA, where the hardware does that, a packet has one lane. *Tile*: 8 × 8 pixels, whose
-rays are empty before the tile's *start*. Bricks, blocks and grids: `bricks.py`; skip distances: `lookup.py`; positions:
-`space.py`.
+the compiler vectorizes them; on CUDA, where the hardware runs threads in parallel, a packet has one lane. *Tile*: 8 × 8
+pixels; space is empty along its rays up to the tile's *start*. *Skip distance* of a block: its distance [blocks] in the
+maximum norm from the nearest occupied block, see `baked.skip_distances`. `bricks.py` defines bricks, blocks and grids;
+`space.py` defines positions.
 """
 
 # Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
@@ -30,7 +31,7 @@ OPTIONS = {
     "fast_math": False,
     "cpu_compiler_flags": "-march=native -ffp-contract=fast -mllvm=-inline-threshold=9000",
 }
-"""Module options of kernels with such loops."""
+"""Module options of kernels with loops over lanes."""
 
 wp.set_module_options(OPTIONS)
 
@@ -39,16 +40,16 @@ _INFINITE = 1.0e30
 _STEP_CELLS = 1.0  # step inside a brick [cells]
 _MIN_STEP_PIXELS = 1.0  # least step [pixel widths]
 _OPAQUE = 0.06  # transmittance that counts as zero; 0.03 takes 6 % longer for 0.01 dB
-_MIN_WEIGHT = 0.06  # weight from which features are looked up
+_MIN_WEIGHT = 0.06  # features are looked up when more weight than this has accumulated
 _WAIT_RATIO = 4  # sampling waits while fewer than 1/4 of the live lanes need it
 _MAX_STEPS = 1000
 _MAX_CONE_STEPS = 64
 _MIN_CONE_STEP = 0.5  # least step of the cone march [cells]
 
-_ACROSS = 2 * CORNERS * HALF_CORNERS  # from one face to the next
-_NEXT_Y = 8 * HALF_CORNERS  # bits
-_X = CORNERS * CORNERS  # from one sample to the next along each axis
-_Z = 1
+_ACROSS = 2 * CORNERS * HALF_CORNERS  # density bytes from one sample to the next along x
+_NEXT_Y = 8 * HALF_CORNERS  # density bits from one sample to the next along y
+_X = CORNERS * CORNERS  # rows of features from one sample to the next along x
+_Z = 1  # the same along z
 
 
 @wp.struct
@@ -63,7 +64,7 @@ class ImageBuffers:
     width: wp.int32
     height: wp.int32
     across: wp.int32
-    """Tiles in a row of tiles."""
+    """Number of tiles in a row."""
 
 
 # ---- arithmetic without calls and branches, so that the compiler vectorizes loops over lanes
@@ -100,7 +101,8 @@ def nonzero(x: wp.float32) -> wp.float32:
 # ---- lookups, compact because memory access limits the march
 
 
-# Warp arrays may be strided; these are contiguous, and the compiler does better when it knows.
+# Warp arrays may be strided. These are contiguous, and native access makes that known to the compiler, which then
+# generates faster code.
 @wp.func_native("return array.data[i];")
 def byte_of(array: wp.array(dtype=wp.uint8), i: wp.int32) -> wp.uint8: ...
 
@@ -125,7 +127,7 @@ def brick_at(index: wp.array(dtype=wp.int32), b1: wp.int32, b2: wp.int32, i0: wp
 
 @wp.func
 def skip_at(bricks: Bricks, brick: wp.int32, i0: wp.int32, i1: wp.int32, i2: wp.int32):
-    """Skip distance of a block, or of its brick if that is not stored."""
+    """Skip distance of a block, or of its whole brick if the brick is not stored."""
     at = wp.max(brick, 0) * 64 + ((i0 & 3) * 4 + (i1 & 3)) * 4 + (i2 & 3)
     stored = int(byte_of(bricks.skips, at))
     return wp.where(brick < 0, -brick, stored)
@@ -194,16 +196,17 @@ def features_at(bricks: Bricks, slot: wp.int32, p0: wp.float32, p1: wp.float32, 
 
 @wp.func
 def exit_distance(p: wp.float32, slowness: wp.float32, first: wp.int32, size: wp.int32, skip: wp.int32):
-    """Distance [m] at which a ray at p [blocks] leaves the blocks it may skip, at `slowness` [m/block].
+    """Distance [m] after which a ray leaves the blocks that it may skip, along one axis.
 
-    These are `size` blocks from `first` on and skip − 1 more on both sides.
+    The ray is at `p` [blocks] and needs `slowness` [m/block]. It may skip `size` blocks from `first` on, and skip − 1
+    more on both sides.
     """
     return (float(wp.where(slowness > 0.0, first + size + skip - 1, first + 1 - skip)) - p) * slowness
 
 
 @wp.func
 def contracted_velocity(u: wp.vec3f, v: wp.vec3f, m: wp.float32) -> wp.vec4f:
-    """Velocity of the contracted position [unit positions per meter], and of the maximum norm m; see `space.py`.
+    """Rates of change of the contracted position [1/m] and of the maximum norm m [1/m] along a ray; see `space.py`.
 
     c = u·f(m) with f = (2 − 1/m)/m, so dc/dt = v·f + u·f′·dm/dt.
     """
@@ -225,9 +228,10 @@ def unit_ray(k: wp.vec4f, u: wp.float32, v: wp.float32) -> wp.vec3f:
 
 @wp.kernel(enable_backward=False)
 def cone_march(bricks: Bricks, image: ImageBuffers, first: wp.int32, start: wp.array2d(dtype=wp.float32)):
-    """Cone march: distances [m] before which the tiles [first, first + dim) of every camera are empty.
+    """Cone march: finds distances [m] up to which space is empty in the tiles [first, first + dim) of every camera.
 
-    The rays of a tile lie within a chord α of its axis, so at distance t within a ball of radius α·t around the axis.
+    The unit directions of a tile's rays differ from that of its axis by at most a chord α. So at distance t, the rays
+    lie in a ball of radius α·t around a point of the axis.
     """
     camera, i = wp.tid()
     tile = first + i
@@ -272,7 +276,7 @@ def march_kernel(lanes: int) -> Any:
     """Builds the marching kernel for packets of `lanes` rays, 1, 8 or 16.
 
     It is launched over cameras and the packets of some tiles, `TILE`² / lanes each. It writes opacity and composited
-    features (cameras, CHANNELS, pixels), and the z-depth [m] at which half the light is blocked (−1: none).
+    features (cameras, CHANNELS, pixels), and the z-depth [m] at which half the light is blocked (−1 if less is).
     """
     Floats = wp.types.vector(length=lanes, dtype=wp.float32)
     Ints = wp.types.vector(length=lanes, dtype=wp.int32)
@@ -293,7 +297,7 @@ def march_kernel(lanes: int) -> Any:
     ):
         camera, packet = wp.tid()
         tile = first + packet // per_tile
-        corner = (packet % per_tile) * lanes  # of the packet in its tile
+        corner = (packet % per_tile) * lanes  # index, in the tile, of the packet's first pixel
         column = (tile % image.across) * TILE + corner % TILE
         row = (tile // image.across) * TILE + corner // TILE
         if row >= image.height:
@@ -313,13 +317,13 @@ def march_kernel(lanes: int) -> Any:
         begin = start[camera, tile]
 
         cosine = Floats()
-        r0 = Floats()  # along each axis of the near grid [blocks/m]
+        r0 = Floats()  # velocity along each axis of the near grid [blocks/m]
         r1 = Floats()
         r2 = Floats()
-        s0 = Floats()  # [m/block]
+        s0 = Floats()  # inverse of the velocity [m/block]
         s1 = Floats()
         s2 = Floats()
-        enter = Floats()  # of the near box [m]
+        enter = Floats()  # distances at which rays enter and leave the near box [m]
         leave = Floats()
         limit = Floats()
         t = Floats()
@@ -364,17 +368,17 @@ def march_kernel(lanes: int) -> Any:
 
         footprint = _MIN_STEP_PIXELS / k[0]  # width of a pixel per meter
         total = Totals()
-        dense = Ints()  # 1 if a lane samples, and then:
+        dense = Ints()  # 1 if a lane takes a sample; the next variables then describe its step
         slot = Ints()
         p0 = Floats()  # position [blocks of its grid]
         p1 = Floats()
         p2 = Floats()
-        length = Floats()  # of the step [m]
-        thick = Floats()  # of the step [contracted m]
+        length = Floats()  # length of the step [m]
+        thick = Floats()  # length of the step [contracted m]
         ahead = Floats()
         pending = Floats()  # weight of steps too faint for a feature lookup, passed on to the next step
         counted = Floats()
-        # Feature lookups are queued and done together, so that they wait for memory only.
+        # Feature lookups are queued and done together, so that only memory access limits their speed.
         queue_length = int(0)
         queued = QueueBits()
         queued_weight = QueueFloats()
@@ -453,7 +457,8 @@ def march_kernel(lanes: int) -> Any:
                     w1 = exit_distance(g[1], q1, i1 & -size, size, skip)
                     w2 = exit_distance(g[2], q2, i2 & -size, size, skip)
                     cell = 0.5 * wp.min(wp.min(wp.abs(q0), wp.abs(q1)), wp.abs(q2))  # length of a cell here [m]
-                    # On an outward ray the contracted position is about linear in 1/m. An inward ray goes half the way.
+                    # On an outward ray, the contracted position is about linear in 1/m. An inward ray advances by half
+                    # the distance at its current rate.
                     advance = wp.min(wp.min(w0, w1), w2)
                     slack = 1.0 - advance * c4[3] / m
                     advance = wp.where(
@@ -478,7 +483,7 @@ def march_kernel(lanes: int) -> Any:
                     thick[j] = wp.where(occupied > 0, stride / (m * m), thick[j])
                     dense[j] = wp.where(occupied > 0, 1, dense[j])
                     sampling_count = sampling_count + occupied
-            if _WAIT_RATIO * sampling_count < alive_count:  # the few sampling lanes wait for others
+            if _WAIT_RATIO * sampling_count < alive_count:  # few lanes need a sample, so they wait until more do
                 for j in range(lanes):
                     ahead[j] = wp.where(dense[j] > 0, 0.0, ahead[j])
             else:

@@ -1,9 +1,9 @@
 """PatchMatch stereo: fits planes that make source frames look like a reference frame.
 
-A *plane* at a pixel is (q, ∂q/∂u, ∂q/∂v): inverse z-depth q [1/m] and its slopes [1/(m px)], exact since the inverse
-depth of a plane is affine in the pixel. A *window* is 5 × 5 pixels `spacing` apart around the pixel; the plane maps it
-to a source frame. The cost is 1 − NCC, weighted towards window pixels similar to the middle one; the two best sources
-count, since a point may be hidden in the others (Gipuma, Galliani et al. 2015).
+A *plane* at a pixel is (q, ∂q/∂u, ∂q/∂v): inverse z-depth q [1/m] and its slopes [1/(m px)]. This is exact, since the
+inverse depth of a plane is affine in the pixel. A *window* is 5 × 5 pixels `spacing` apart around the pixel; the plane
+maps it to a source frame. The cost is 1 − NCC, with greater weights for window pixels that resemble the middle one.
+Only the two sources of lowest cost are used, since a point may be hidden in the others (Gipuma, Galliani et al. 2015).
 """
 
 # Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
@@ -17,8 +17,8 @@ Window = wp.types.vector(length=_PIXELS, dtype=wp.float32)
 
 _WORST_COST = 2.0  # cost in a source that does not contain the window
 _GRAY_SIGMA = 0.08  # gray difference at which a window pixel has weight 1/e
-_MAX_RETURN_ERROR = 2.0  # [px] of a point mapped to a source and back
-_MIN_VARIANCE = 1e-5  # of gray, below which a window has no texture to match
+_MAX_RETURN_ERROR = 2.0  # [px] greatest error of a point mapped to a source and back
+_MIN_VARIANCE = 1e-5  # a window with a smaller variance of gray has no texture to match
 
 
 @wp.struct
@@ -77,7 +77,7 @@ class ReferenceWindow:
 
 @wp.func
 def reference_window(frames: GrayImages, frame: int, center: wp.vec2, spacing: float) -> ReferenceWindow:
-    """The window around a pixel, the border repeated."""
+    """The window around a pixel; beyond the border of the frame, the border pixels are repeated."""
     window = ReferenceWindow()
     window.center = center
     window.spacing = spacing
@@ -117,7 +117,7 @@ def ncc_cost(frames: GrayImages, views: SourceViews, k: int, window: ReferenceWi
     source = views.source[k]
     homography = views.homography[k]
     epipole = views.epipole[k]
-    # The homography of the plane: affine in the window's offsets before the division.
+    # The plane's homography; its homogeneous coordinates, before the division, are affine in the window's offsets.
     middle = homography * wp.vec3(window.center[0], window.center[1], 1.0) + epipole * plane[0]
     along_u = (wp.vec3(homography[0, 0], homography[1, 0], homography[2, 0]) + epipole * plane[1]) * window.spacing
     along_v = (wp.vec3(homography[0, 1], homography[1, 1], homography[2, 1]) + epipole * plane[2]) * window.spacing
@@ -177,7 +177,7 @@ def sweep(
     planes: wp.array2d(dtype=wp.vec3),
     costs: wp.array2d(dtype=wp.float32),
 ):
-    """Sets every other cell to the best of its own plane, its neighbors' planes and some guesses.
+    """Sets every second cell, by `parity`, to the best of its own plane, its neighbors' planes and some guesses.
 
     Round 0 tries `first`, `second` (q = 0: none) and a random depth; later rounds try the planes of the four neighbors
     (which are of the other parity) and two perturbations that shrink from round to round.
@@ -255,7 +255,7 @@ def count_votes(
     parallax: float,
     votes: wp.array2d(dtype=wp.int32),
 ):
-    """Counts the sources that found the same point: their plane maps it back to its pixel at the same inverse depth.
+    """Counts the sources that found the same point: their planes have its inverse depth and map it back to its pixel.
 
     A source in which the pixel moves less than `parallax` [px] for a change of depth by `tolerance` does not vote, as
     it does not measure the depth.

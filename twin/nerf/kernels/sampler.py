@@ -1,9 +1,10 @@
 """Ray sampling: inverse-CDF sampling from opacity grids.
 
-*Opacity grid*: per cell the fraction of light that is blocked within it, averaged over the samples that fell into it.
-(Mean density would make a cell opaque that only a thin post passes through.) A fine grid covers the near box, a coarse
-one the contracted cube. *Bin*: one step of the march through the grids. *Stratum*: interval between two of K + 1 equal
-quantiles of the bins' weights; it is sampled once, and the sample stands for its whole length.
+*Opacity grid*: stores for each cell the fraction of light that the cell blocks, averaged over the samples in it. (With
+mean density instead, a cell that contains only a thin post would be opaque.) A fine grid covers the near box, and a
+coarse one covers the contracted cube. *Bin*: one step of the march through the grids. *Stratum*: one of the K intervals
+into which a ray is divided such that the bins' weights in each have the same sum; it is sampled once, and the sample
+represents the whole stratum.
 """
 
 # Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
@@ -15,12 +16,12 @@ from twin.warp_runtime import wp
 
 BINS = 256
 _FAR = 100.0  # unit positions beyond this count as the horizon
-_MAX_OPACITY = 0.99  # of a cell
+_MAX_OPACITY = 0.99  # greatest opacity of a cell
 _STEP = 0.75  # bin length [cells]
-_BINS_BEHIND = 2  # bins behind an opaque one
-_OPAQUE = 0.02  # transmittance from which a ray counts as blocked
-# A grazing ray runs for meters through cells that contain ground before it reaches the ground. So _DOUBT_SHARE of the
-# weight is distributed as if cells had only _DOUBT of their opacity.
+_BINS_BEHIND = 2  # number of bins behind an opaque one
+_OPAQUE = 0.02  # a ray with less transmittance counts as blocked
+# A grazing ray passes for meters through cells that contain ground before it reaches the ground. So _DOUBT_SHARE of the
+# weight is distributed as if the opacities of cells were multiplied by _DOUBT.
 _DOUBT_SHARE = 0.35
 _DOUBT = 0.25
 _WIDENING = 0.02  # least bin length as a share of the distance
@@ -45,7 +46,7 @@ def grid_cell(g: wp.vec3f, grid: wp.array3d(dtype=wp.float32)) -> wp.vec3i:
 
 @wp.func
 def near_box_position(g: wp.vec3f) -> wp.vec3f:
-    """Grid position → position in the near box scaled to [0, 1), outside that range outside the box."""
+    """Grid position → position relative to the near box, which spans [0, 1)³."""
     return 2.0 * g - wp.vec3f(0.5, 0.5, 0.5)
 
 
@@ -75,8 +76,8 @@ def sample_rays(
     Args:
         targets: Known distance of a surface [m], 0 = unknown; its bin gets `target_mass` of extra weight.
         near: Distance at which rays start [m].
-        floor: Weight spread evenly over all bins, beside at most 1 of the surfaces.
-        seed: Seed of the jitter within strata; negative takes their middles.
+        floor: Total weight spread evenly over all bins; the weights due to surfaces sum to at most 1.
+        seed: Seed of the jitter within strata; if it is negative, the middles of the strata are sampled.
     """
     i = start + wp.tid()
     o = rays.origins[i]
@@ -117,13 +118,13 @@ def sample_rays(
         t += step
         n += 1
         bounds[n] = t
-        # The surface may lie a cell behind the opaque one; a target further back must be reached, too.
+        # The surface may lie one cell behind the opaque one, and the march must also reach a target further back.
         if doubting < _OPAQUE and t > target:
             beyond += 1
             if beyond > _BINS_BEHIND:
                 break
 
-    # Neighboring bins share weight, as the surface may lie beside the bin of its cell.
+    # Each bin shares its weight with its neighbors, as the surface may lie in one of them.
     total = float(0.0)
     before = float(0.0)
     uniform = floor / wp.float32(n)
@@ -193,7 +194,7 @@ def update_grids(
     parts: wp.int32,
     grids: OpacityGrids,
 ):
-    """Moves sampled cells towards the opacity of their samples, at rate `rise` up and `fall` down.
+    """Moves sampled cells towards the opacity of their samples, at the rate `rise` upwards and `fall` downwards.
 
     Launched once per `part` of the cells, so that parts can run in parallel and each cell gets its samples in order.
     """

@@ -1,11 +1,11 @@
 """Contraction of unbounded space to a cube, and rays of pinhole cameras.
 
-*Near box*: axis-aligned box [m] that is mapped without distortion. *Unit position* u: offset from its center over its
-half side, per axis; the near box is [−1, 1]³. *Contracted position*: u inside the near box, (2 − 1/|u|)·u/|u| in the
-maximum norm outside (Barron et al. 2022, eq. 10, with the norm that keeps a box a box), so all of space is in (−2, 2)³.
+*Near box*: axis-aligned box [m] that is mapped without distortion. *Unit position* u: per axis, the offset from the
+center of the near box divided by its half side; the near box is [−1, 1]³. *Contracted position*: u inside the near box,
+(2 − 1/|u|)·u/|u| outside (Barron et al. 2022, eq. 10, but with the maximum norm), so all of space is in (−2, 2)³.
 *Grid position*: contracted position scaled to [0, 1]³. *Contracted meter*: a meter inside the near box; outside it, a
-length that is contracted to that of a meter inside, see `expansion`. Density is per contracted meter, so the far field
-starts no more opaque than the near field.
+length that is contracted to that of a meter inside, see `expansion`. Density is per contracted meter, so before
+training, the far field is no more opaque than the near field.
 """
 
 # Warp reads annotations as values.
@@ -17,7 +17,7 @@ _TOP = 1.0 - 1.0e-6  # greatest coordinate of a grid position
 
 @wp.struct
 class Contraction:
-    """The near box as the contraction needs it."""
+    """The near box, by the two values that the contraction uses."""
 
     center: wp.vec3f
     """[m]"""

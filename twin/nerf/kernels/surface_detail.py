@@ -1,11 +1,12 @@
-"""Detail: features finer than bricks, added to those of a ray at the point where it meets a surface.
+"""Detail: features finer than those of bricks, added to a ray's features at the point where it meets a surface.
 
-On the ground they are a texture, elsewhere a hash grid. A height map on a regular grid says where the ground is. A
-*texel* holds features at a node of a grid in (x, y); there are `LEVELS` such grids, each with texels twice as wide as
-the one before (a mipmap, Williams 1983). *Tile*: a square of `TILE`² texels of the finest level with the coarser texels
-on it; texels of all levels of a tile lie together, the finest first. *Slot*: row of a stored tile; the *index* gives it
-per tile, −1 where none is stored. The hash grid (Müller et al. 2022) has one level; its *vertices* share the rows of a
-table. *Footprint*: width of a pixel on the surface [m], by which a ray chooses its levels.
+On the ground, detail is stored as a texture, elsewhere as a hash grid. A height map on a regular grid gives the ground.
+A *texel* holds features at a node of a grid in (x, y); there are `LEVELS` such grids, each with texels twice as wide as
+the one before (a mipmap, Williams 1983). *Tile*: a square of `TILE`² texels of the finest level, and the coarser texels
+in that square; the texels of all levels of a tile are stored together, the finest first. *Slot*: row of a stored tile;
+the *index* maps each tile to its slot, or to −1 if it is not stored. The hash grid (Müller et al. 2022) has one level;
+its *vertices* share the rows of a table. *Footprint*: width of a pixel on the surface [m]; it determines the levels
+that a ray uses.
 """
 
 # Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
@@ -29,21 +30,21 @@ NO_GROUND = 1.0e6
 
 MAX_FOOTPRINT = 1.5
 """Greatest footprint of a pixel that a level serves [texels]."""
-_UNKNOWN = 1.0e3  # height above which an interpolated one contains a node without ground [m]
-_MIN_DESCENT = 0.01  # descent per meter along the ray of rays that can meet the ground
-_TOLERANCE, _TOLERANCE_PER_METER = 0.08, 0.01  # [m] between the ground and a surface that counts as ground
-_MAX_STRETCH = 4.0  # of a pixel on the ground, beyond which its length does not count
+_UNKNOWN = 1.0e3  # [m] a greater interpolated height comes from a node without ground
+_MIN_DESCENT = 0.01  # least descent per meter along a ray that can meet the ground
+_TOLERANCE, _TOLERANCE_PER_METER = 0.08, 0.01  # [m] greatest offset of a surface that counts as ground
+_MAX_STRETCH = 4.0  # if a pixel's image on the ground is longer than this times its width, the footprint grows
 _PRIME_Y = wp.uint32(2654435761)
 _PRIME_Z = wp.uint32(805459861)
 RUN = 16
 """Neighboring pixels per thread when rendering."""
 _ZERO = 128.0  # byte of the value 0
-_MIN_GRADIENT = 1.0e-22  # squared norm from which a ray takes part in a step
+_MIN_GRADIENT = 1.0e-22  # rays with a smaller squared norm of the gradient are skipped
 
 
 @wp.struct
 class DetailGrid:
-    """Height map and tile index, which start at the same corner, and the hash grid."""
+    """Height map and tile index, which have the same lowest corner, and the hash grid."""
 
     origin: wp.vec2f
     """Lowest corner [m]."""
@@ -63,24 +64,24 @@ class DetailGrid:
     cell: wp.float32
     """Side of the hash grid's cells [m]."""
     mask: wp.uint32
-    """Rows of the hash grid's table, a power of 2, minus 1."""
+    """Number of rows of the hash grid's table (a power of 2) minus 1."""
     coarsest: wp.float32
     """Side of the coarsest texels or cells [m]."""
 
 
-# A hit, where a ray meets a surface: x, y, z [m] from the corner of the height map, and the footprint [m], which is
-# negative if the surface is not the ground, and 0 if there is none.
+# A hit is a point where a ray meets a surface: x, y [m] from the corner of the height map, z [m], and the footprint
+# [m], which is negative if the surface is not the ground, and 0 if there is no surface.
 Hit = wp.vec4f
 
 
-# Warp arrays may be strided; these are contiguous, and the compiler does better when it knows.
+# Native access, as in `march.py`: makes known to the compiler that the array is contiguous.
 @wp.func_native("return array.data[i];")
 def height_of(array: wp.array(dtype=wp.float32), i: wp.int32) -> wp.float32: ...
 
 
 @wp.func
 def height_at(grid: DetailGrid, x: wp.float32, y: wp.float32) -> wp.float32:
-    """Height of the ground [m] at a distance (x, y) [m] from the grid's corner; at least `NO_GROUND` / 2 if unknown."""
+    """Height of the ground [m] at a distance (x, y) [m] from the grid's corner; `NO_GROUND` where it is unknown."""
     px = x * grid.per_height_cell
     py = y * grid.per_height_cell
     ix = int(px)
@@ -99,10 +100,10 @@ def height_at(grid: DetailGrid, x: wp.float32, y: wp.float32) -> wp.float32:
 
 @wp.func
 def surface_hit(grid: DetailGrid, o: wp.vec3f, ray: wp.vec3f, depth: wp.float32, per_pixel: wp.float32) -> Hit:
-    """Meets a surface with a ray on which it is at a z-depth [m].
+    """The hit of a ray from `o` that meets a surface at the z-depth `depth` [m].
 
     `ray` is the ray's direction with unit z-depth, and `per_pixel` the width of a pixel per meter of depth. The height
-    map is much flatter than the ray, so two steps of a fixed-point iteration find the ground.
+    map is much less steep than the ray, so two steps of a fixed-point iteration find the ground.
     """
     x0 = o[0] - grid.origin[0]
     y0 = o[1] - grid.origin[1]
@@ -124,7 +125,7 @@ def surface_hit(grid: DetailGrid, o: wp.vec3f, ray: wp.vec3f, depth: wp.float32,
 
 @wp.func
 def level_weight(footprint: wp.float32, texel: wp.float32) -> wp.float32:
-    """1 if a level of such texels is fine enough to show and coarse enough not to alias, else 0."""
+    """1 if texels of side `texel` [m] are coarse enough not to alias at a footprint [m], else 0."""
     return wp.where(footprint < MAX_FOOTPRINT * texel, 1.0, 0.0)
 
 
@@ -144,7 +145,7 @@ def texel_row(grid: DetailGrid, level: wp.int32, ix: wp.int32, iy: wp.int32) -> 
 
 @wp.func
 def vertex_row(grid: DetailGrid, x: wp.int32, y: wp.int32, z: wp.int32) -> wp.int32:
-    """Row of a vertex of the hash grid. Vertices of a block of 2³ lie together."""
+    """Row of a vertex of the hash grid; the vertices of a block of 2³ have consecutive rows."""
     block = wp.uint32(x >> 1) ^ (wp.uint32(y >> 1) * _PRIME_Y) ^ (wp.uint32(z >> 1) * _PRIME_Z)
     return wp.int32(((block << wp.uint32(3)) | wp.uint32((x & 1) * 4 + (y & 1) * 2 + (z & 1))) & grid.mask)
 
@@ -314,7 +315,7 @@ def adam_step_detail(
     vertices_grad: wp.array(dtype=Channels),
     vertices_second: wp.array(dtype=wp.float32),
 ):
-    """Adam step (Kingma and Ba 2015) on the rows with a gradient, which it clears; β = (0, 0.99).
+    """Takes an Adam step (Kingma and Ba 2015) on the rows with a gradient and clears the gradient; β = (0, 0.99).
 
     To save memory there is no momentum, and the features of a row share one second moment.
     """
@@ -345,7 +346,7 @@ def adam_step_detail(
 def sum_levels(
     tiles: wp.array(dtype=wp.vec2i), grid: DetailGrid, values: wp.array(dtype=Channels), total: wp.array(dtype=Channels)
 ):
-    """Every texel plus the coarser levels at its node; exact, as the nodes of a level are nodes of the finer ones."""
+    """Adds to every texel the coarser levels at its node; exact, as a level's nodes are nodes of all finer levels."""
     row = wp.tid()
     tile = tiles[row // TEXELS]
     rest = row % TEXELS
@@ -359,7 +360,7 @@ def sum_levels(
     y = float(tile[1] * side + rest % side) * texel
     out = values[row]
     for coarser in range(level + 1, LEVELS):
-        # A node of this level is a node of the coarser one or halfway between two, whatever the rounding.
+        # The small offset keeps rounding from moving a node into the neighboring cell of the coarser level.
         out += interpolated(grid, values, coarser, x + 1.0e-5 * texel, y + 1.0e-5 * texel)
     total[row] = out
 
@@ -369,7 +370,7 @@ def sum_levels(
 
 @wp.struct
 class DetailBytes:
-    """Features as bytes around 128, and the value of a unit per channel."""
+    """Features as bytes around 128, and the value of one byte step in each channel."""
 
     texels: wp.array(dtype=Bytes)
     """A texel is the sum of its level and the coarser ones at its node, so a ray reads one level."""
