@@ -3,9 +3,9 @@
 The model applies the limits of `twin.env.controller` to many windows at once, every 0.01 s instead of every 0.1 s, so
 that it is smooth in its parameters. (A real controller waits for its next period, and then changes speed for a whole
 period at once; on average these two effects cancel.) *Mean* and *half* speed are the mean of the two sides and half
-their difference [rad/s at the wheels]. Wheel commands may be in units of another robot (DRIVE's log assumes a
-Husky with wheels of 0.3 m), so they have a gain for the mean and one for the half speed. For commands v and ω, the gain
-of the mean speed is 1, and that of the half speed is the controller's separation multiplier.
+their difference [rad/s at the wheels]. Wheel commands may be in units of another robot (DRIVE's log assumes a Husky
+with wheels of 0.3 m), so they have a gain for the mean and one for the half speed. For commands v and ω, the gain of
+the mean speed is 1, and that of the half speed is the controller's separation multiplier.
 """
 
 from dataclasses import dataclass, replace
