@@ -45,10 +45,10 @@ from twin.types import Array
 # had a 1 % higher one (it was better straight on and worse in turns).
 #
 # In MuJoCo's elliptic cone (condim 6) sliding, spinning and rolling friction share one limit: a tire that rolls at v
-# and slides at u has the fraction u / √(u² + (v Crr / μ)²) of its grip sideways. So grip grows with the slip ratio
-# u / v, at first in proportion, as in a brush model of stiffness μ / Crr. On hard ground Crr is small and the tire obeys
-# Coulomb's law; on soft ground a rolling tire turns more easily than a standing one. The fitted Crr describes this
-# effect; the Crr that motor currents show (`benchmarks/motor_currents.py`) describes power, and may differ.
+# and slides at u has the fraction u / √(u² + (v Crr / μ)²) of its grip sideways. So grip grows with u / v, the slip
+# ratio, at first in proportion, as in a brush model of stiffness μ / Crr. On hard ground Crr is small and the tire
+# obeys Coulomb's law; on soft ground a rolling tire turns more easily than a standing one. The fitted Crr describes
+# this effect; the Crr that motor currents show (`benchmarks/motor_currents.py`) describes power, and may differ.
 
 _MANY = 100  # with fewer windows the delay of poses is not fitted, and the coarse search uses all windows
 _NEAR = 0.25  # `reach` of the search that starts near the solution

@@ -71,7 +71,7 @@ class CameraPath:
         knots = np.array([view.time for view in self.views]) - self.views[0].time
         poses = np.array([view.camera_to_world for view in self.views])
         t = np.clip(times, 0.0, knots[-1])
-        # The cubic spline would overshoot beside a standstill; there, and with two views, a monotone one is used.
+        # A cubic spline would overshoot at a standstill. With one, or with only two views, a monotone one is used.
         still = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).min() < 1e-6
         curve = PchipInterpolator if still or len(knots) == 2 else CubicSpline
         out = np.tile(np.eye(4), (len(t), 1, 1))
