@@ -686,7 +686,7 @@ def _camera_pose(client: viser.ClientHandle) -> Array:
 
 
 def slider_lighting(field: BakedField, value: float) -> EpisodeLighting:
-    """The lighting at a value of the slider: at an integer k the field's k-th one, between integers a mixture of two."""
+    """The lighting at a value of the slider: at an integer k the field's k-th, between integers a mixture of two."""
     names = field.lightings
     k = min(int(value), max(0, len(names) - 2))
     share = round(value - k, 4)

@@ -1,6 +1,6 @@
 """Sends pictures to the pages: coarse ones while something moves, a fine one at rest.
 
-One thread serves all pages in turn, so pictures never queue up: a change during a rendering appears in the next picture.
+One thread serves all pages in turn, so pictures never queue up: a change while one is rendered appears in the next.
 """
 
 import threading
@@ -124,7 +124,7 @@ class PictureLoop:
                 self._wake_within(pages, min(due))
 
     def _wake_within(self, pages: list[_Page], seconds: float) -> None:
-        """Sleeps until something changes, at most `seconds`, but not less than until the next coarse picture is due."""
+        """Sleeps until a change, or `seconds`; after a change, also until the next coarse picture is due."""
         if self._wake.wait(seconds):
             soonest = min((page.last + _MIN_PERIOD for page in pages), default=0.0)
             time.sleep(max(0.0, min(soonest - time.monotonic(), seconds)))

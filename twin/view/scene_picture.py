@@ -1,7 +1,7 @@
 """Pictures of a scene from a free camera: the field under a lighting, with the robot and obstacles in it.
 
-Without `add_objects`, only the field is rendered. After it, `twin.env.compositor` also draws robot and obstacles in each
-picture for which an `ObjectState` with their positions is given.
+Without `add_objects`, only the field is rendered. After it, `twin.env.compositor` also draws robot and obstacles in
+each picture for which an `ObjectState` with their positions is given.
 """
 
 import copy
