@@ -118,14 +118,14 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
 
 
 def _turned(corners: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Corners (f, 3, 3) of faces, rotated so that the first is opposite the longest edge, and their order (f, 3)."""
+    """Corners (f, 3, 3) of faces, the first one opposite the longest edge, and their cyclic order (f, 3)."""
     edges = np.linalg.norm(np.roll(corners, -1, 1) - np.roll(corners, 1, 1), axis=-1)
     order = (np.argmax(edges, 1)[:, None] + np.arange(3)) % 3
     return np.take_along_axis(corners, order[:, :, None], 1).astype(np.float64), order
 
 
 def _tile_sides(corner: Array, views: Views) -> NDArray[np.int64]:
-    """Sides of the faces' tiles [px] such that a texel is a pixel of the nearest view, shape (f,)."""
+    """Sides of the faces' tiles [px] such that a texel is as large as a pixel of the nearest view, shape (f,)."""
     legs = np.linalg.norm(corner[:, 1:] - corner[:, :1], axis=-1).max(1)
     nearest = cKDTree(views.camera_to_world[:, :3, 3]).query(corner.mean(1))[0]
     texel = np.maximum(nearest / views.intrinsics[:, 0].mean(), _MIN_TEXEL)
@@ -212,7 +212,7 @@ class _Baker:
         )
 
     def colors(self, points: Array, normals: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Colors (k, 3) in [0, 255] of points (k, 3) with unit normals, and weights (k,), 0 for points without a view."""
+        """Colors (k, 3) in [0, 255] of points (k, 3) with unit normals, and weights (k,), 0 for unseen points."""
         given: list[Any] = [wp.array(x.astype(np.float32), dtype=wp.vec3, device="cpu") for x in (points, normals)]
         out = wp.zeros(len(points), dtype=wp.vec3, device="cpu")
         total = wp.zeros(len(points), dtype=float, device="cpu")

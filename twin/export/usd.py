@@ -212,7 +212,7 @@ def _friction(stage: Any, path: str, value: float) -> Any:
 
 
 def _collide(prim: Any, material: Any, approximation: str | None = None) -> None:
-    """Makes a prim a collider; `approximation` is USD's collision approximation if it is a mesh."""
+    """Makes a prim a collider; `approximation` is USD's name of how a mesh is approximated."""
     from pxr import UsdPhysics, UsdShade
 
     UsdPhysics.CollisionAPI.Apply(prim)

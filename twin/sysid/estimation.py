@@ -88,7 +88,7 @@ def robust_loss(scaled: Array) -> Array:
 def robust_jacobian(scaled: Array, jacobian: Array) -> Array:
     """Approximate Jacobian of `robust_loss(scaled)` for least squares, from that of `scaled` (n, instants, c, p).
 
-    The gradient is exact. The part along the residuals is left out: Gauss-Newton does not need it.
+    The gradient of the loss that follows from it is exact; only the curvature is approximate.
     """
     norm = _squared_norm(scaled)
     return jacobian * _per_window(1 / (1 + norm) / _loss_factor(norm) / np.sqrt(scaled.shape[1]), jacobian)

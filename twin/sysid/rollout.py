@@ -216,7 +216,7 @@ def _initial_states(model: mujoco.MjModel, params: HuskyParams, start: Array) ->
     for i, sides in enumerate(start):
         rolling = sides * params.wheel_radius
         data.qvel[0] = rolling.mean()
-        data.qvel[5] = (rolling[1] - rolling[0]) / 2  # about half the yaw rate of a differential drive
+        data.qvel[5] = (rolling[1] - rolling[0]) / 2  # TRACK / 2 = 0.29 times the yaw rate of a differential drive
         data.qvel[joints] = np.tile(sides, 2)
         if model.na:
             data.act[:] = sides

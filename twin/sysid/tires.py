@@ -170,7 +170,7 @@ def fit_ground(
         height = defaults["center_of_mass_z"]
         refused["center_of_mass_z"] = f"center_of_mass_z = {height:.4g} m: on level ground, needs {_BRAKING}"
     fitting = np.flatnonzero(windows.fitting)
-    if len(fitting) < _MANY:  # a delay near zero would bias the others
+    if len(fitting) < _MANY:  # if the true delay is near zero, fitting it would bias the others
         refused["pose_late"] = f"pose_late = 0 s: from {len(fitting)} windows, needs {_MANY}"
     table = [
         Parameter(name, mean, std, low, high, defaults[name], unit, cure)
