@@ -35,13 +35,13 @@ _COARSER = 1.1  # factor by which texels grow until all tiles fit
 _DEPTH_TOLERANCE = 0.03  # relative difference of depth up to which a vertex is visible
 # The mesh is smoother than the field, so a texel may lie in front of or behind the surface that a view shows.
 _TEXEL_TOLERANCE = 0.08
-_SHARPNESS = 2.0  # exponent of a view's weight, cos(slant) / depth²
-_CHUNK = 2_000_000  # texels at once
+_SHARPNESS = 2.0  # a view's weight is this power of cos(slant) / depth²
+_CHUNK = 2_000_000  # texels computed at once
 _JPEG_QUALITY = 95
 
 
 def textured_glb(vertices: Array, faces: NDArray, views: Views) -> bytes:
-    """The file of a mesh with vertices (v, 3) [m] and faces (f, 3), its texture baked from views of one lighting.
+    """The `.glb` of a mesh with vertices (v, 3) [m] and faces (f, 3), its texture baked from views of one lighting.
 
     Raises:
         InputError: no view shows the mesh.

@@ -40,7 +40,7 @@ _CLIPPING = 0.01, 1000.0  # [m] nearest and farthest depth that cameras show
 _RING, _SHOULDER, _SHOULDER_OFFSET = 32, 16, 0.6  # vertices around a tire's middle and sides; offset / half width
 _CURVE_WIDTH, _GOAL_RADIUS = 0.05, 0.2  # [m]
 _SUN_INTENSITY, _SKY_INTENSITY = 1500.0, 600.0  # [nit]
-_SPLAT_EXTENT = 3.0  # standard deviations
+_SPLAT_EXTENT = 3.0  # standard deviations around a splat that count to its extent
 
 
 def require_usd() -> None:
@@ -334,7 +334,7 @@ def _add_geom(stage: Any, parent: str, model: mujoco.MjModel, index: int, materi
         v, nv = int(model.mesh_vertadr[number]), int(model.mesh_vertnum[number])
         f, nf = int(model.mesh_faceadr[number]), int(model.mesh_facenum[number])
         shape = _mesh(stage, path, model.mesh_vert[v : v + nv], model.mesh_face[f : f + nf])
-    if not (collides and kind != mujoco.mjtGeom.mjGEOM_BOX):  # a tire's hull is in its wheel's frame
+    if not (collides and kind != mujoco.mjtGeom.mjGEOM_BOX):  # a tire's hull is already in its wheel's frame
         _place(shape, geom.pos, geom.quat, scale)
     if collides:
         shape.CreatePurposeAttr(UsdGeom.Tokens.guide)

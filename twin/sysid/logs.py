@@ -47,10 +47,10 @@ _MAX_GAP = 0.5  # [s] between two rows of a table; windows with a longer one are
 _MIN_INTERVAL = 5e-4  # [s] median between rows; a shorter one means that time is not in seconds
 _FAST = 1.75  # samples; if a sensor's period is shorter, times of appearance are used, see `measurement_times`
 _JITTER = 4  # most samples between measurement and appearance of a pose, apart from the common delay
-_UNSTEADY = 0.1  # fraction of windows that contradict the period, above which the sensor counts as aperiodic
-_DROPOUT = 30  # samples without a fresh pose; windows with more are left out if the wheels turn
-_TURNING = 0.5  # [rad/s] mean of both sides' wheels
-_STANDING = 0.05  # [rad/s], [m/s]; windows in which neither wheels nor commands are ever faster are left out
+_UNSTEADY = 0.1  # if a larger fraction of windows contradicts the period, the sensor counts as aperiodic
+_DROPOUT = 30  # samples; windows without a fresh pose for longer are left out if the wheels turn
+_TURNING = 0.5  # [rad/s] mean of both sides' wheel speeds above which the wheels count as turning
+_STANDING = 0.05  # [rad/s], [m/s]; windows in which wheels and commands never reach it are left out
 _MAX_BYTES = 512 << 20  # largest log, unpacked
 _TICK = 1e-6  # [s] instants closer than this are the same
 _GROUP_WINDOWS = 3  # windows per group in a table without groups: six seconds
@@ -317,7 +317,7 @@ def _informative(windows: Windows, where: str) -> Windows:
 
 
 def _gapless(time: Array, where: str) -> NDArray[np.int64]:
-    """Numbers of the windows without a gap, shape (n,); window i begins i · `DURATION` [s] after the first row.
+    """Indices of the windows without a gap, shape (n,); window i begins i · `DURATION` [s] after the first row.
 
     Raises InputError: the median interval between rows is too long, or too short for times in seconds.
     """

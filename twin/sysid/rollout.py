@@ -45,7 +45,7 @@ class SlopeModel:
 
 
 _PRIOR, _PRIOR_STD = SlopeModel(0.25, 5.0, 0.25), 1.0  # median (a slope of 1.5°); std of the logarithms
-_RANGE = 1e-3, 1e3  # of each statistic; keeps the fit finite if the readings have no noise
+_RANGE = 1e-3, 1e3  # bounds of each statistic; they keep the fit finite if the readings have no noise
 
 
 def slope_gravity(windows: Windows, model: IcrModel) -> Array:
@@ -104,7 +104,7 @@ def smooth_slopes(
     """
     n, prior, noise = len(readings), model.steepness**2, model.noise**2
     keep = np.exp(-1 / model.windows)
-    predicted, predicted_var = np.zeros(n, complex), np.full(n, prior)  # predicted from previous windows
+    predicted, predicted_var = np.zeros(n, complex), np.full(n, prior)  # from the previous windows alone
     slope, var = np.zeros(n, complex), np.zeros(n)  # updated with the window's reading
     cost = 0.0
     for i in range(n):

@@ -38,7 +38,7 @@ _STEP = 0.3  # [m] before and after a fix, between which its heading is measured
 
 @dataclass(frozen=True)
 class TrialRecording:
-    """What a robot recorded of a drive."""
+    """A robot's recording of a drive."""
 
     path: Path
     topics: dict[str, str]
@@ -49,18 +49,18 @@ class TrialRecording:
     arrival: NDArray[np.int64]
     """Times at which the pictures were recorded [ns], shape (n,)."""
     pose_times: NDArray[np.int64]
-    """[ns], increasing, shape (p,)."""
+    """Stamps of the poses [ns], increasing, shape (p,)."""
     poses: Array
     """x, y [m] and yaw [rad], continuous, shape (p, 3)."""
     uprightness: Array
-    """Cosine of the robot's tilt, shape (p,); 1 for fixes."""
+    """Cosine of the robot's tilt, shape (p,); 1 if the poses come from fixes."""
     command_times: NDArray[np.int64]
-    """[ns], shape (c,)."""
+    """Stamps of the commands [ns], in order, shape (c,)."""
     commands: Array
     """v [m/s], ω [rad/s], shape (c, 2)."""
 
     def poses_at(self, times: NDArray[np.int64]) -> Array:
-        """Interpolated poses (k, 3) at times [ns]; before the first pose and after the last one, that pose."""
+        """Interpolated poses (k, 3) at times [ns], constant before the first and after the last recorded pose."""
         since = (times - self.pose_times[0]) * 1e-9
         knots = (self.pose_times - self.pose_times[0]) * 1e-9
         return np.stack([np.interp(since, knots, column) for column in self.poses.T], -1)
@@ -191,7 +191,7 @@ def _headings(xy: Array) -> Array:
 
 _MIN_LOCATED, _MIN_WAY = 5, 2.0  # least number of pictures; [m] least distance of the farthest pose from the first
 _MAX_RESIDUAL = 0.25  # [m] rms
-_OUTLIER = 3.0  # multiples of the median residual
+_OUTLIER = 3.0  # pictures whose residual is above this multiple of the median are left out
 _ROUNDS = 5
 
 

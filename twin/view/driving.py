@@ -100,7 +100,7 @@ class PlacedObstacles(EpisodeObstacles):
         return tuple(self.standing.values())
 
     def free(self, kind: str) -> str | None:
-        """Name of an obstacle of a kind that does not stand; None if all do."""
+        """Name of an obstacle of a kind that does not stand in the scene; None if all of them do."""
         return next((one.name for one in self._pool if one.kind == kind and one.name not in self.standing), None)
 
     def put(self, name: str, x: float, y: float, yaw: float) -> None:

@@ -21,10 +21,10 @@ COARSE_AREA, FINE_AREA = 320 * 180, 1280 * 720
 """Most pixels of a coarse and of a fine picture; a page with fewer pixels has pictures of its own size."""
 
 _REST = 0.12  # [s] without a change, after which the fine picture is rendered
-_MIN_PERIOD = 0.045  # [s] between two coarse pictures of a page; the browser needs the cores, too
+_MIN_PERIOD = 0.045  # [s] between two coarse pictures of a page; the browser needs CPU time, too
 _COARSE_QUALITY, _FINE_QUALITY = 80, 92
 _DEPTH_MARGIN, _DEPTH_SHARE = 0.06, 0.01  # [m], fraction of depth: layers at most this far behind the field are shown
-_MAX_DEPTH = 160.0  # [m] that viser can transmit; beyond, layers cover the picture
+_MAX_DEPTH = 160.0  # [m] that viser can transmit; beyond it, layers are drawn over the picture
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class FilmedFrame:
 
 @dataclass(frozen=True)
 class Shot:
-    """What a page shows."""
+    """The content of a page."""
 
     camera_to_world: Array
     fov: float
