@@ -5,8 +5,8 @@
     python -m twin.export scenes/demo --nerfstudio road_ns --colmap road_colmap
     python -m twin.export scenes/demo --task straight --task-file straight.json
 
-One module per format: `usd`, `gltf`, `nerfstudio`, `colmap`; splats are made in `twin.assets.gaussians`, task files in
-`twin.env.task_file`.
+One module per format: `usd`, `gltf`, `nerfstudio`, `colmap`; `twin.assets.gaussians` makes the splats, and
+`twin.env.task_file` the task files.
 """
 
 import argparse
@@ -107,7 +107,7 @@ def _field_files(
     """Writes the files whose colors are rendered from the field."""
     field, cameras = twin.field(), twin.cameras()
     lighting = lighting or field.lightings[0]
-    field.embedding(lighting)  # raises early for an unknown name
+    field.embedding(lighting)  # raises InputError early if the name is unknown
     lines = []
     mesh = load_arrays(require_stage(twin.scene, "mesh") / "visual.npz") if usd_file or glb else {}
     if usd_file or ply:
@@ -152,7 +152,7 @@ def _write_colmap(out: Path, cameras: Cameras, points: SparsePoints) -> None:
 
 
 def _copy_frames(cameras: Cameras, folder: Path, mask_name: Callable[[str], str], white: bool) -> None:
-    """Copies frames to `images/` and masks to `masks/`; `white` makes masks for frames without one."""
+    """Copies frames to `images/` and masks to `masks/`; if `white`, frames without a mask get a white one."""
     for i, name in enumerate(cameras.names):
         image = folder / "images" / f"{name}.png"
         image.parent.mkdir(parents=True, exist_ok=True)

@@ -1,10 +1,10 @@
-"""COLMAP workspace of a built place: frames, cameras and sparse points for others' trainers, in the scene's frame.
+"""COLMAP workspace of a built place: frames, cameras and sparse points for training programs, in the scene's frame.
 
     DIR/images/<source>/<number>.png     undistorted frames
-    DIR/masks/<source>/<number>.png.png  where there are masks; 0 = ignore
+    DIR/masks/<source>/<number>.png.png  for frames with a mask; 0 = ignore
     DIR/sparse/0/cameras.txt, images.txt, points3D.txt
 
-World: meters, z up. Points are observed where they project, not where a feature was detected: detections are not kept.
+World: meters, z up. Observations are the projections of the points, since detected features are not kept.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from twin.geometry.poses import inverse_pose
 
 
 def write_colmap(folder: Path, cameras: Cameras, points: SparsePoints) -> None:
-    """Writes the text model into `folder/sparse/0`; `points` are those stored beside the cameras."""
+    """Writes the text model into `folder/sparse/0`; `points` are those stored with the cameras."""
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
     keys = [(*size.tolist(), *k.tolist()) for size, k in zip(cameras.sizes, cameras.intrinsics, strict=True)]

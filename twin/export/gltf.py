@@ -1,8 +1,9 @@
 """glTF file (`.glb`) of the visual mesh with a texture baked from the radiance field under one lighting.
 
-Every face has a square of the texture of its own, its *tile*, as large as the nearest camera resolves it. A *texel* is
-a point of the face's plane; its color is a mean over rendered views in which it is visible, of which those that see it
-sharpest count most. The material is unlit (KHR_materials_unlit): filmed colors include the light. glTF is y up.
+Every face has its own square of the texture, its *tile*, with the resolution of the nearest camera. A *texel* is a
+point of the face's plane. Its color is a mean over the rendered views in which it is visible; the sharper a view shows
+it, the more the view counts. The material is unlit (KHR_materials_unlit): filmed colors include the light. glTF is y
+up.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -27,20 +28,20 @@ from twin.warp_runtime import wp
 VIEWS, WIDTH, FAR = 96, 640, 100.0
 """Number of views that the texture is baked from, their width [px], and the depth beyond which is background [m]."""
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-_SIDE = 4096  # [px] of the texture, which every viewer takes
+_SIDE = 4096  # [px] side of the texture; every viewer supports this size
 _MIN_TEXEL = 0.01  # [m]
 _MAX_TILE = 256  # [px]
 _COARSER = 1.1  # factor by which texels grow until all tiles fit
 _DEPTH_TOLERANCE = 0.03  # relative difference of depth up to which a vertex is visible
-# The mesh is smoother than the field, so that a texel may lie some way in front of or behind what a view shows there.
+# The mesh is smoother than the field, so a texel may lie in front of or behind the surface that a view shows.
 _TEXEL_TOLERANCE = 0.08
-_SHARPNESS = 2.0  # exponent of a view's weight, cos(slant) / depth²
-_CHUNK = 2_000_000  # texels at once
+_SHARPNESS = 2.0  # a view's weight is this power of cos(slant) / depth²
+_CHUNK = 2_000_000  # texels computed at once
 _JPEG_QUALITY = 95
 
 
 def textured_glb(vertices: Array, faces: NDArray, views: Views) -> bytes:
-    """The file of a mesh with vertices (v, 3) [m] and faces (f, 3), its texture baked from views of one lighting.
+    """The `.glb` of a mesh with vertices (v, 3) [m] and faces (f, 3), its texture baked from views of one lighting.
 
     Raises:
         InputError: no view shows the mesh.
@@ -98,7 +99,7 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
         total = np.stack([np.bincount(own[seen] - start, rgb[seen, c], stop - start) for c in range(3)], 1)
         with np.errstate(invalid="ignore"):
             means[start:stop] = total / n[:, None]
-        # What no view shows has the mean color of its face, or below of the nearest face with one.
+        # Texels that no view shows get the mean color of their face; faces that no view shows are filled below.
         rgb[~seen] = np.nan_to_num(means[own[~seen]], nan=-1.0)
         texture[y[own] + j, x[own] + i] = np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
         start = stop
@@ -117,14 +118,14 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
 
 
 def _turned(corners: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Corners (f, 3, 3) of faces, turned so that the first is opposite the longest edge, and their order (f, 3)."""
+    """Corners (f, 3, 3) of faces, the first one opposite the longest edge, and their cyclic order (f, 3)."""
     edges = np.linalg.norm(np.roll(corners, -1, 1) - np.roll(corners, 1, 1), axis=-1)
     order = (np.argmax(edges, 1)[:, None] + np.arange(3)) % 3
     return np.take_along_axis(corners, order[:, :, None], 1).astype(np.float64), order
 
 
 def _tile_sides(corner: Array, views: Views) -> NDArray[np.int64]:
-    """Sides of the faces' tiles [px] such that a texel is a pixel of the nearest view, shape (f,)."""
+    """Sides of the faces' tiles [px] such that a texel is as large as a pixel of the nearest view, shape (f,)."""
     legs = np.linalg.norm(corner[:, 1:] - corner[:, :1], axis=-1).max(1)
     nearest = cKDTree(views.camera_to_world[:, :3, 3]).query(corner.mean(1))[0]
     texel = np.maximum(nearest / views.intrinsics[:, 0].mean(), _MIN_TEXEL)
@@ -136,7 +137,7 @@ def _tile_sides(corner: Array, views: Views) -> NDArray[np.int64]:
 
 
 def pack_tiles(side: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray, int]:
-    """Places square tiles in rows, the largest first: sides, left and upper corners [px], and the texture's width."""
+    """Places square tiles in rows, the largest first; returns their sides, left and top edges, and the width [px]."""
     width = max(_SIDE if (side**2).sum() > _SIDE**2 / 4 else _SIDE // 2, int(side.max()))
     x, y = np.empty_like(side), np.empty_like(side)
     left = top = 0
@@ -196,7 +197,7 @@ def _gather(
 
 
 class _Baker:
-    """Colors of surface points from views, which it keeps as Warp arrays."""
+    """Computes colors of surface points from views, which are kept as Warp arrays."""
 
     def __init__(self, views: Views) -> None:
         def array(values: NDArray, kind: Any) -> Any:
@@ -211,7 +212,7 @@ class _Baker:
         )
 
     def colors(self, points: Array, normals: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Colors (k, 3) in [0, 255] of points (k, 3) with unit normals, and weights (k,), 0 where no view shows one."""
+        """Colors (k, 3) in [0, 255] of points (k, 3) with unit normals, and weights (k,), 0 for unseen points."""
         given: list[Any] = [wp.array(x.astype(np.float32), dtype=wp.vec3, device="cpu") for x in (points, normals)]
         out = wp.zeros(len(points), dtype=wp.vec3, device="cpu")
         total = wp.zeros(len(points), dtype=float, device="cpu")

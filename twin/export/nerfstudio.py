@@ -1,12 +1,12 @@
-"""nerfstudio data set of a built place: frames and cameras for others' trainers, in the scene's metric frame.
+"""nerfstudio data set of a built place: frames and cameras for other training programs, in the scene's metric frame.
 
     DIR/transforms.json                every frame
-    DIR/transforms_<lighting>.json     those under one lighting: ns-train ... nerfstudio-data --data that file
-    DIR/images/..., DIR/masks/...      undistorted frames; masks, where there are any: 0 = ignore
+    DIR/transforms_<lighting>.json     frames of one lighting: ns-train ... nerfstudio-data --data FILE
+    DIR/images/..., DIR/masks/...      undistorted frames; masks, if the place has any: 0 = ignore
     DIR/points.ply                     sparse points, from which splatfacto starts
 
 Cameras have OpenGL axes (x right, y up, looking along −z); the world is in meters, z up, and not transformed
-(`applied_transform` is the identity). nerfstudio itself turns, centers and scales the poses unless told otherwise.
+(`applied_transform` is the identity). By default, nerfstudio itself rotates, centers and scales the poses.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ POINTS = "points.ply"
 def write_nerfstudio(folder: Path, cameras: Cameras, points: SparsePoints, masked: bool) -> None:
     """Writes `transforms.json`, one more for each of several lightings, and the points.
 
-    `masked`: every frame has a mask, as nerfstudio demands all or none.
+    `masked`: every frame has a mask; nerfstudio requires masks for all frames or for none.
     """
     write_bytes(folder / POINTS, _points_ply(points))
     everything = range(len(cameras))
@@ -58,7 +58,7 @@ def transforms(cameras: Cameras, frames: Sequence[int], masked: bool) -> dict[st
         )
     held_out = [f"images/{cameras.names[i]}.png" for i in frames if cameras.held_out[i]]
     trained = [f"images/{cameras.names[i]}.png" for i in frames if not cameras.held_out[i]]
-    # nerfstudio wants all three lists or none.
+    # nerfstudio requires all three lists or none.
     split = {"train_filenames": trained, "val_filenames": held_out, "test_filenames": held_out} if held_out else {}
     return {
         "camera_model": "OPENCV",  # without distortion

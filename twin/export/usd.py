@@ -10,9 +10,9 @@
         Route/...               route, corridor, goal
         Sun, Sky, PhysicsScene
 
-Meters, kilograms, z up. Bodies, masses, joints, shapes and cameras are read from the compiled MuJoCo model: they are
-those that policies drove. USD's own physics has no belt between the wheels of a side: each wheel has a drive with
-half of the side's gain and torque. Splats shine by themselves; sun and sky light the robot and what is put beside it.
+Meters, kilograms, z up. Bodies, masses, joints, shapes and cameras are read from the compiled MuJoCo model, so they are
+those of the simulation. USD's own physics has no belt between the wheels of a side: each wheel has a drive with half of
+the side's gain and torque. Splats emit light; sun and sky light the robot and added objects.
 """
 
 import shutil
@@ -36,11 +36,11 @@ from twin.types import Array
 SUFFIXES = (".usdz", ".usd", ".usdc")
 _SH_CONSTANT = 0.28209479177387814  # spherical harmonic of degree 0, 1 / (2 √π)
 _APERTURE = 20.955  # [tenths of a meter] width of a camera's film; only its ratio to the focal length has an effect
-_CLIPPING = 0.01, 1000.0  # [m] nearest and farthest that cameras show
+_CLIPPING = 0.01, 1000.0  # [m] nearest and farthest depth that cameras show
 _RING, _SHOULDER, _SHOULDER_OFFSET = 32, 16, 0.6  # vertices around a tire's middle and sides; offset / half width
 _CURVE_WIDTH, _GOAL_RADIUS = 0.05, 0.2  # [m]
 _SUN_INTENSITY, _SKY_INTENSITY = 1500.0, 600.0  # [nit]
-_SPLAT_EXTENT = 3.0  # standard deviations
+_SPLAT_EXTENT = 3.0  # standard deviations around a splat that count to its extent
 
 
 def require_usd() -> None:
@@ -67,13 +67,13 @@ def write_usd(
 
     Args:
         path: The file.
-        splats: By lighting; they share all but `rgb`.
+        splats: Splats by lighting, which differ in `rgb` only.
         mesh: Vertices (v, 3) [m] and faces (f, 3) of the visual mesh.
-        colors: Of the mesh's vertices by lighting, shape (v, 3).
+        colors: Colors of the mesh's vertices by lighting, shape (v, 3).
         parts: Convex parts.
         model: The compiled scene.
         world: Route and robot; None for a scene without them.
-        selected: The lighting shown at first.
+        selected: The lighting that is selected in the file.
 
     Raises:
         InputError: another suffix, usd-core is missing, or two lightings would have one name.
@@ -100,8 +100,8 @@ def write_usd(
         robot = world.robot if world else HuskyParams()
         tires, bare = (
             _friction(stage, f"/World/Materials/{name}", value)
-            # The wheels' friction holds for a wheel on anything. Programs that average the friction of two surfaces, as
-            # PhysX does, get it too if the ground has the same.
+            # In MuJoCo the wheels' friction holds on every surface. Programs that average the friction of two surfaces,
+            # as PhysX does, get the same value if the ground has it, too.
             for name, value in (("TiresAndGround", robot.friction), ("Chassis", 1.0))
         )
         _add_collision(stage, model, parts, tires)
@@ -123,7 +123,7 @@ def write_usd(
 
 
 def variant_name(lighting: str) -> str:
-    """The name of a lighting's variant: that of the lighting, with _ for what USD does not allow there."""
+    """The name of a lighting's variant: the lighting's name, with _ for characters that USD does not allow."""
     return "".join(c if c.isalnum() or c in "_-|" else "_" for c in lighting)
 
 
@@ -212,7 +212,7 @@ def _friction(stage: Any, path: str, value: float) -> Any:
 
 
 def _collide(prim: Any, material: Any, approximation: str | None = None) -> None:
-    """Makes a prim a collider; `approximation` is that of meshes."""
+    """Makes a prim a collider; `approximation` is USD's name of how a mesh is approximated."""
     from pxr import UsdPhysics, UsdShade
 
     UsdPhysics.CollisionAPI.Apply(prim)
@@ -295,14 +295,14 @@ def _add_robot(stage: Any, model: mujoco.MjModel, tires: Any, bare: Any) -> None
         drive.CreateStiffnessAttr(0.0)
         drive.CreateDampingAttr(float(motor.gainprm[0]) / 2 * np.pi / 180)  # [N m s/°]
         drive.CreateMaxForceAttr(float(motor.forcerange[1]) / 2)  # [N m]
-        # PhysX's own: the inertia of motor and gear at the wheel.
+        # An attribute that only PhysX has: the inertia of motor and gear at the wheel.
         joint.GetPrim().AddAppliedSchema("PhysxJointAPI")
         armature = joint.GetPrim().CreateAttribute("physxJoint:armature", Sdf.ValueTypeNames.Float, custom=False)
         armature.Set(float(model.joint(name).armature[0]))
 
 
 def _add_geom(stage: Any, parent: str, model: mujoco.MjModel, index: int, material: Any) -> None:
-    """Adds a geom to its link: colliders as guides, others as they look. Geoms of neither kind are left out."""
+    """Adds a geom to its link: colliders as guides, visual geoms in their colors. Other geoms are left out."""
     from pxr import UsdGeom, Vt
 
     geom = model.geom(index)
@@ -334,7 +334,7 @@ def _add_geom(stage: Any, parent: str, model: mujoco.MjModel, index: int, materi
         v, nv = int(model.mesh_vertadr[number]), int(model.mesh_vertnum[number])
         f, nf = int(model.mesh_faceadr[number]), int(model.mesh_facenum[number])
         shape = _mesh(stage, path, model.mesh_vert[v : v + nv], model.mesh_face[f : f + nf])
-    if not (collides and kind != mujoco.mjtGeom.mjGEOM_BOX):  # a tire's hull is in its wheel's frame
+    if not (collides and kind != mujoco.mjtGeom.mjGEOM_BOX):  # a tire's hull is already in its wheel's frame
         _place(shape, geom.pos, geom.quat, scale)
     if collides:
         shape.CreatePurposeAttr(UsdGeom.Tokens.guide)
@@ -347,7 +347,7 @@ def _add_geom(stage: Any, parent: str, model: mujoco.MjModel, index: int, materi
 def tire_hull(model: mujoco.MjModel, geom: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """A tire (ellipsoid or cylinder about the wheel's y axis) as a convex hull: vertices (64, 3) [m], faces (f, 3).
 
-    64 vertices are what PhysX's hulls may have on a GPU.
+    PhysX allows at most 64 vertices per hull on a GPU.
     """
     from scipy.spatial import ConvexHull
 
@@ -378,7 +378,7 @@ def tire_hull(model: mujoco.MjModel, geom: int) -> tuple[NDArray[np.float32], ND
 
 
 def _add_camera(stage: Any, parent: str, model: mujoco.MjModel, index: int) -> None:
-    """Adds a camera at its seat; USD's cameras have MuJoCo's axes."""
+    """Adds a camera at its pose on the robot; cameras have the same axes in USD and MuJoCo."""
     from pxr import Gf, UsdGeom
 
     camera = model.camera(index)
@@ -390,10 +390,11 @@ def _add_camera(stage: Any, parent: str, model: mujoco.MjModel, index: int) -> N
     out.CreateProjectionAttr(UsdGeom.Tokens.perspective)
     out.CreateFocalLengthAttr(float(fx) * scale)
     out.CreateHorizontalApertureAttr(_APERTURE)
-    # USD has one focal length; pixels that are not square stretch the film instead.
+    # A USD camera has one focal length. If pixels are not square, the film's height is scaled instead.
     stretch = scale * float(fx / fy)
     out.CreateVerticalApertureAttr(float(sensor[1]) * stretch)
-    # MuJoCo's principal point is positive to the left and up of the middle; USD shifts the film against it.
+    # MuJoCo counts the principal point's offset from the center positive to the left and up; USD shifts the film in
+    # the opposite direction.
     out.CreateHorizontalApertureOffsetAttr(float(right) * scale)
     out.CreateVerticalApertureOffsetAttr(-float(up) * stretch)
     out.CreateClippingRangeAttr(Gf.Vec2f(*_CLIPPING))
@@ -466,6 +467,6 @@ def _vectors(array: NDArray | Array) -> Any:
 
 
 def _linear(srgb: NDArray) -> NDArray[np.float32]:
-    """Linear colors, as USD's display colors are, from sRGB in [0, 1]."""
+    """Linear colors from sRGB in [0, 1]; USD's display colors are linear."""
     srgb = np.asarray(srgb, np.float32)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -1,10 +1,11 @@
-"""Extrinsics and focal length of the robot's front camera, estimated from a film that it took in the built place.
+"""Extrinsics and focal length of the robot's front camera, estimated from its film of the built place.
 
 `capture/localize.py` localizes the film's frames. The extrinsics are the camera's height above flat ground and its
 rotation from straight ahead: yaw to the left, pitch down, roll to the right. Height, pitch and roll follow from the
-frames' poses relative to a base at rest on the ground below. Yaw follows from the direction of travel: a base that does
-not slide sideways moves along its heading, so its sideways steps must not add up. A camera ahead of the robot's turning
-point swings outwards in turns, so that point's forward offset from the base's origin is estimated together with yaw.
+frames' poses relative to a robot base at rest on the ground below. Yaw follows from the direction of travel: a base
+that does not slide sideways moves along its heading, so its sideways steps must not add up. A camera ahead of the point
+about which the robot turns swings outwards in turns. So the forward offset of this point from the base's origin is
+estimated together with yaw.
 """
 
 from collections.abc import Callable
@@ -38,19 +39,19 @@ from twin.types import Array, Image
 # ---- estimation from poses
 
 
-_MIN_FRAMES, _MIN_WAY = 16, 6.0  # frames, [m]
+_MIN_FRAMES, _MIN_WAY = 16, 6.0  # fewest frames; shortest path [m]
 _PARTS = 8  # consecutive parts of the film for the jackknife
 _NOISE, _OUTLYING = 0.01, 0.03  # [m] standard deviation of a sum of sideways steps; threshold of the robust loss
 _PIVOT = 0.1  # [m] prior standard deviation of the turning point's forward offset from the base's origin
-_ROUNDS = 3  # alternations of base poses and extrinsics
-_FAR_OFF, _JUMP = 8.0, 3.0  # outliers: multiples of the median deviation, and of the median step
+_ROUNDS = 3  # alternations between estimating base poses and extrinsics
+_FAR_OFF, _JUMP = 8.0, 3.0  # multiples of the median deviation (outliers) and of the median step (jumps)
 
 
 @dataclass(frozen=True)
 class CameraExtrinsics:
     """Values or standard errors of a camera's height [m] and angles [°].
 
-    Yaw and pitch absorb an error of the principal point, as intended: both shift the image alike.
+    Yaw and pitch absorb an error of the principal point, as intended: it shifts the image as they do.
     """
 
     height: float
@@ -101,16 +102,23 @@ def estimate_extrinsics(
 def camera_pose_on_ground(
     params: HuskyParams, position: Array, heading: float, ground_at: Callable[[Array], Array]
 ) -> Array:
-    """camera_to_world (4, 4), OpenCV axes, of a robot at rest with its camera at x, y (2,) [m] and a heading [rad]."""
+    """camera_to_world (4, 4), OpenCV axes, of the camera of a robot that is at rest on the ground.
+
+    Args:
+        params: The robot.
+        position: x, y of the camera (2,) [m].
+        heading: Heading of the base [rad].
+        ground_at: Returns the ground's height [m], shape (n,), at points (n, 2).
+    """
     base, rotation = _base_pose(position, heading, ground_at, np.array(params.camera_position))
     pose = np.eye(4)
     pose[:3, :3] = rotation @ params.camera_rotation
     pose[:3, 3] = base + rotation @ params.camera_position
-    return opencv_to_mujoco(pose)  # its own inverse
+    return opencv_to_mujoco(pose)  # this conversion is its own inverse
 
 
 def base_below_camera(params: HuskyParams, camera_to_world: Array, ground_at: Callable[[Array], Array]) -> Array:
-    """x, y [m], yaw [rad] (3,) of a robot at rest with its camera at a pose (4, 4), OpenCV axes."""
+    """x, y [m], yaw [rad] (3,) of the base of a robot at rest, from its camera's pose (4, 4), OpenCV axes."""
     heading = float(base_heading(camera_to_world, np.deg2rad(params.camera_yaw)))
     base, _ = _base_pose(camera_to_world[:2, 3], heading, ground_at, np.array(params.camera_position))
     return np.array([*base[:2], heading])
@@ -128,7 +136,7 @@ def _headings(poses: Array, pitch_roll: Array) -> Array:
 
 
 def _inliers(values: Array) -> NDArray[np.bool_]:
-    """Frames (n,) whose values (n, k) are within `_FAR_OFF` median deviations in every column."""
+    """Mask (n,) of frames whose values (n, k) are within `_FAR_OFF` median deviations of the median in every column."""
     off = np.abs(values - np.median(values, axis=0))
     return (off <= _FAR_OFF * np.maximum(np.median(off, axis=0), 1e-6)).all(1)
 
@@ -138,7 +146,7 @@ def _yaw(bases: Array, headings: Array, use: NDArray[np.bool_]) -> float:
 
     Args:
         bases: x, y of the base [m], shape (n, 2).
-        headings: Of the base for zero yaw [rad], shape (n,).
+        headings: Headings of the base if the camera's yaw is zero [rad], shape (n,).
         use: Frames to use, shape (n,). Gaps and jumps split the path into segments with separate sums of steps.
     """
     way = np.diff(bases, axis=0)
@@ -147,7 +155,7 @@ def _yaw(bases: Array, headings: Array, use: NDArray[np.bool_]) -> float:
     segments = [part for part in np.split(np.arange(len(bases)), np.flatnonzero(~connected) + 1) if len(part) > 2]
 
     def sideways(unknown: Array) -> Array:
-        """Sideways drift [m] of the point that the robot turns about, `pivot` [m] ahead of the base's origin.
+        """Sideways drift [m] of the point about which the robot turns, `pivot` [m] ahead of the base's origin.
 
         Per segment, the sum of sideways steps up to each frame, minus its mean over the segment; the last value is the
         residual of the prior of `pivot`.
@@ -169,7 +177,7 @@ def _relative_to_base(
     """Camera poses (n, 4, 4) relative to bases at rest on the ground below.
 
     Returns:
-        Yaw, pitch, roll [rad] (n, 3), heights above the bases' origins [m] (n,), and x, y of these [m] (n, 2).
+        Yaw, pitch, roll [rad] (n, 3), heights above the bases' origins [m] (n,), and x, y of the origins [m] (n, 2).
     """
     angles, heights, bases = np.zeros((len(poses), 3)), np.zeros(len(poses)), np.zeros((len(poses), 2))
     for i, (pose, heading) in enumerate(zip(poses, headings, strict=True)):
@@ -182,7 +190,7 @@ def _relative_to_base(
 def _base_pose(
     position: Array, heading: float, ground_at: Callable[[Array], Array], lens: Array
 ) -> tuple[Array, Array]:
-    """Origin [m] and axes (3, 3) of a base at rest whose lens, at `lens` (3,) [m] in the base, is above a position."""
+    """Origin [m] and axes (3, 3) of a base at rest whose lens, at `lens` (3,) [m] in the base, is above `position`."""
     rotation = Rotation.from_euler("Z", heading).as_matrix()
     arm = lens + np.array([0.0, 0.0, BASE_HEIGHT])  # from the ground
     for _ in range(2):  # a tilted base moves its lens sideways
@@ -209,7 +217,7 @@ class CameraCalibration:
     extrinsics: CameraExtrinsics
     standard_errors: CameraExtrinsics
     focal_given: bool
-    """False: the focal length is estimated, or a bag's."""
+    """False: the focal length is estimated, or comes from a bag's calibration."""
 
     @property
     def summary(self) -> str:
@@ -226,7 +234,7 @@ class CameraCalibration:
         }
         if not self.focal_given:
             lens, error = self.registration.lens, self.registration.focal_error
-            errors = (error, error, None, None) if error else None  # none of a bag's calibration
+            errors = (error, error, None, None) if error else None  # a bag's calibration has no errors
             out["camera_intrinsics"] = tuple(map(float, lens.intrinsics)), errors
             out["camera_size"] = (lens.width, lens.height), None
         return out
@@ -246,13 +254,13 @@ class CameraCalibration:
 def calibrate_camera(
     film: Path, scene: SceneDir, params: HuskyParams, topic: str = ""
 ) -> tuple[CameraCalibration, list[Image]]:
-    """Estimates the camera's extrinsics, and its focal length unless given; also returns the film's frames.
+    """Estimates the camera's extrinsics, and its focal length unless it is given; also returns the film's frames.
 
     Args:
         film: Undistorted film of the front camera, while the robot drives through the scene, mostly straight ahead; or
-            a bag with its pictures, from which its calibration takes the distortion.
+            a bag with the camera's pictures, which are undistorted by the bag's calibration.
         params: The robot, with given intrinsics or none.
-        topic: Of the bag's pictures; empty: the one with most of them.
+        topic: Topic of the bag's pictures; if empty, the topic with the most pictures.
 
     Raises:
         InputError: the scene is not built, or the film does not determine the extrinsics.
@@ -312,7 +320,7 @@ def write_camera_comparison(
 
 
 def _ground(scene: SceneDir) -> Ground:
-    """The ground of a scene. Raises InputError: not built up to the mesh."""
+    """The ground of a scene. Raises InputError: the scene is not built up to the mesh."""
     for stage in ("metric", "field", "mesh"):
         require_stage(scene, stage)
     return Ground.load(scene.stage("mesh"))

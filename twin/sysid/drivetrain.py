@@ -1,11 +1,11 @@
-"""Drivetrain model: wheel speeds that result from commands, by the robot's controller and servos, fitted to a log.
+"""Drivetrain model, fitted to a log: how the robot's controller and servos turn commands into wheel speeds.
 
 The model applies the limits of `twin.env.controller` to many windows at once, every 0.01 s instead of every 0.1 s, so
 that it is smooth in its parameters. (A real controller waits for its next period, and then changes speed for a whole
 period at once; on average these two effects cancel.) *Mean* and *half* speed are the mean of the two sides and half
-their difference [rad/s at the wheels]. Wheel commands may be in units of another robot (DRIVE's assume wheels of 0.3 m
-under a Husky), so they have a gain for the mean and one for the half speed. For commands v and ω the first is 1, the
-second the controller's separation multiplier.
+their difference [rad/s at the wheels]. Wheel commands may be in units of another robot (DRIVE's log assumes a Husky
+with wheels of 0.3 m), so they have a gain for the mean and one for the half speed. For commands v and ω, the gain of
+the mean speed is 1, and that of the half speed is the controller's separation multiplier.
 """
 
 from dataclasses import dataclass, replace
@@ -56,7 +56,7 @@ class Drivetrain:
         )
 
     def robot_fields(self, params: HuskyParams, twist: bool) -> dict[str, float]:
-        """Its fields of `HuskyParams`; for wheel commands the separation multiplier is that of `params`."""
+        """Its values of `HuskyParams` fields; for wheel commands the separation multiplier is that of `params`."""
         multiplier = self.half_gain if twist else params.separation_multiplier
         half = multiplier * TRACK / 2 / WHEEL_RADIUS
         return {
@@ -73,9 +73,9 @@ class Drivetrain:
 def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array, Array]:
     """Servo targets and the resulting wheel speeds, starting from each window's first wheel speeds.
 
-    A window that follows others starts with their delayed commands and with the state of their acceleration ramps,
-    which cannot be read from the wheels, as these lag behind. In other windows the wheels keep their speed until the
-    first command arrives.
+    A window that follows others starts with their delayed commands and with the state of their acceleration ramps;
+    it cannot be read from the wheel speeds, which lag behind the ramps. In other windows the wheels keep their speed
+    until the first command arrives.
 
     Returns:
         Targets and lagged wheel speeds, left and right [rad/s], each of shape (n, (k + EXTRA_SAMPLES) · 5, 2),
@@ -104,7 +104,7 @@ def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array
             begin[follows] = ended[follows - 1]
         return _wheel_speeds(drivetrain, _ramped(drivetrain, arrived, begin), speed)
 
-    # The results of two whole delays are interpolated, not the commands, as ramps are not linear in their input.
+    # Between two whole delays, the results are interpolated, not the commands: ramps are not linear in their input.
     one, other = delayed_by(whole), delayed_by(whole + 1)
     return (1 - share) * one[0] + share * other[0], (1 - share) * one[1] + share * other[1]
 
@@ -119,7 +119,7 @@ def _ramped(drivetrain: Drivetrain, commanded: Array, now: Array) -> Array:
 
 
 def _wheel_speeds(drivetrain: Drivetrain, ramped: Array, speed: Array) -> tuple[Array, Array]:
-    """Servo targets for mean and half speeds (n, steps, 2), and the wheel speeds that lag behind them from `speed` on.
+    """Servo targets for mean and half speeds (n, steps, 2), and the wheel speeds that lag behind them, from `speed`.
 
     Both are left and right [rad/s], shape (n, steps, 2).
     """
@@ -145,7 +145,7 @@ def fit_drivetrain(windows: Windows, params: HuskyParams) -> tuple[Drivetrain, F
     measured = windows.wheels[fitting]
     commanded = np.abs(windows.commanded_speeds[fitting, -1])
     half = np.abs(measured[..., 1] - measured[..., 0]) / 2
-    # Gains start from final wheel speeds, limits from the highest.
+    # Initial gains come from the windows' final wheel speeds, initial limits from the highest speeds.
     start = {
         "mean_gain": 1.0 if windows.twist else _gain(commanded[:, 0], np.abs(measured[:, -1].mean(1))),
         "half_gain": _gain(commanded[:, 1], half[:, -1]),
@@ -161,7 +161,8 @@ def fit_drivetrain(windows: Windows, params: HuskyParams) -> tuple[Drivetrain, F
         lagged = simulate_drivetrain(replace(default, **values), windows)[1]
         return (at_samples(lagged) - windows.wheels)[fitting]
 
-    # At a wrong latency accelerations hardly matter, so the search starts at the best of several pairs.
+    # At a wrong latency, accelerations hardly change the residuals. So the search starts at the best of several pairs
+    # of latency and acceleration.
     tries = [start | {"latency": t, "half_acceleration": a} for t in (0.05, 0.15, 0.25, 0.4) for a in (3.0, 8.0, 30.0)]
     start = min(tries, key=lambda values: negative_log_likelihood(residuals(values), _SIDES))
     table = [

@@ -2,7 +2,7 @@
 
 A *parameter* has a normal prior; the residuals of a window follow a multivariate Student's t distribution (below). A
 parameter is *identified* if, with all others free, its standard error is at most `_MAX_ERROR_SHARE` of its prior's
-standard deviation. While some are not, the least certain one is fixed at its default and the rest is fitted again.
+standard deviation. While some are not, the least certain one is fixed at its default and the others are fitted again.
 """
 
 from collections.abc import Callable
@@ -16,21 +16,22 @@ from twin.types import Array
 
 # ---- Student's t residuals
 #
-# A robot that is stuck for two seconds has residuals a hundred times as large as usual, which would decide a fit by
-# squares. So the residuals (predicted minus measured) of a window follow a heavy-tailed multivariate t distribution
-# (Lange, Little and Taylor 1989). For c components of scale σ its −2 log-likelihood is, up to a constant,
+# A robot that is stuck for two seconds has residuals a hundred times as large as usual, which would dominate a
+# least-squares fit. So the residuals (predicted minus measured) of a window follow a heavy-tailed multivariate t
+# distribution (Lange, Little and Taylor 1989). For c components with scales σ, −2 log-likelihood of a window is, up to
+# a constant,
 #
 #     2 Σ log σ + (ν + c) log(1 + s),    s = Σ (residual / σ)² / ν    (mean over the window's evaluated instants)
 #
-# with ν = `DEGREES_OF_FREEDOM`. Components of one *kind*, such as x and y, share their scale. Scales of maximum
-# likelihood are estimated in alternation with the model; both steps increase the likelihood. *Scaled* residuals are in
+# with ν = `DEGREES_OF_FREEDOM`. Components of one *kind*, such as x and y, share their scale. Maximum-likelihood
+# scales are estimated in alternation with the model; both steps increase the likelihood. *Scaled* residuals are in
 # units of σ √ν.
 
 
 Kinds = tuple[int, ...]
 """The kind of each residual component, numbered from 0."""
 
-DEGREES_OF_FREEDOM = 3.0  # fitted to a log (DRIVE's) it came to 2.6 to 3.2
+DEGREES_OF_FREEDOM = 3.0  # fits of ν to DRIVE's log gave 2.6 to 3.2
 
 _MIN_SCALE = 1e-3  # [m], [rad], [m/s], [rad/s]; logs are not more accurate
 _ROUNDS, _SETTLED = 10, 0.05  # most alternations of scales and model; relative change at which scales have converged
@@ -40,7 +41,7 @@ _ITERATIONS, _CLOSE = 500, 1e-4  # the same for expectation maximization
 def residual_scale(residuals: Array, kinds: Kinds) -> Array:
     """Maximum-likelihood scales σ √ν, shape (c,), of residuals (n, instants, c); σ is at least `_MIN_SCALE`.
 
-    If more than ν / (ν + c) of the windows have nearly no residuals, those alone determine the scale.
+    If more than ν / (ν + c) of the windows have residuals of nearly zero, these windows alone determine the scale.
     """
     kind = np.asarray(kinds)
     of_kind = [residuals[..., kind == k] for k in range(kind.max() + 1)]
@@ -49,7 +50,7 @@ def residual_scale(residuals: Array, kinds: Kinds) -> Array:
         weight = 1 / (1 + _squared_norm(residuals / (scale[kind] * np.sqrt(DEGREES_OF_FREEDOM))))
         square = [(weight * (r**2).mean((1, 2))).sum() / weight.sum() for r in of_kind]
         before, scale = scale, np.maximum(np.sqrt(square), _MIN_SCALE)
-        if not np.abs(scale / before - 1).max() >= _CLOSE:  # also true of NaN
+        if not np.abs(scale / before - 1).max() >= _CLOSE:  # written so that NaN ends the loop, too
             break
     return scale[kind] * np.sqrt(DEGREES_OF_FREEDOM)
 
@@ -68,7 +69,7 @@ def fit_with_scales(
 
     Args:
         residuals: Returns the residuals of a model, shape (n, instants, c).
-        solve: Returns the best model, from an initial one and the scales (c,).
+        solve: Returns the best model, from an initial model and the scales (c,).
     """
     scale = residual_scale(residuals(start), kinds)
     for _ in range(_ROUNDS):
@@ -87,7 +88,7 @@ def robust_loss(scaled: Array) -> Array:
 def robust_jacobian(scaled: Array, jacobian: Array) -> Array:
     """Approximate Jacobian of `robust_loss(scaled)` for least squares, from that of `scaled` (n, instants, c, p).
 
-    The gradient is exact. The part along the residuals is left out: Gauss-Newton does not need it.
+    The gradient of the loss that follows from it is exact; only the curvature is approximate.
     """
     norm = _squared_norm(scaled)
     return jacobian * _per_window(1 / (1 + norm) / _loss_factor(norm) / np.sqrt(scaled.shape[1]), jacobian)
@@ -115,10 +116,10 @@ def _per_window(factor: Array, like: Array) -> Array:
 # ---- maximum a posteriori estimation
 
 _MAX_ERROR_SHARE = 0.5  # largest standard error of an identified parameter, in prior standard deviations
-_MIN_CURVATURE = 0.1  # of the curvature of the squares, see `_inverse_curvature`
-_STEP = 0.05  # of finite differences, in prior standard deviations
-_NATS = 0.02  # a search ends when a step gains less log-likelihood, as 0.2 standard errors off the maximum do
-_EVALUATIONS = 50  # most evaluations per round of the search, without those of the Jacobians
+_MIN_CURVATURE = 0.1  # smallest curvature as a fraction of that of the squares, see `_inverse_curvature`
+_STEP = 0.05  # step of finite differences, in prior standard deviations
+_NATS = 0.02  # a search ends when a step gains less log-likelihood; 0.2 standard errors off the maximum cost as much
+_EVALUATIONS = 50  # most evaluations per round of the search, not counting those for Jacobians
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,7 @@ def maximize_posterior(
 
     Args:
         residuals: Returns the residuals of every window for values by name, shape (n, instants, c).
-        reach: Scale of the first step in prior standard deviations; smaller near the solution. A step is at most
+        reach: Scale of the first step in prior standard deviations; choose less near the solution. A step is at most
             √(reach · distance to the bound).
     """
     # In units of `reach` prior standard deviations from the start, SciPy's first step and tolerances have the same
@@ -191,7 +192,7 @@ def maximize_posterior(
             return np.concatenate([slopes, np.diag(prior_factor)]) * scales
 
         bounds = (low - origin) / scales - begin, (high - origin) / scales - begin
-        z = np.zeros(len(table))  # SciPy's first step is as long as its starting point is far from zero
+        z = np.zeros(len(table))  # SciPy's first step grows with the distance of its starting point from zero
         cost = float((losses(z) ** 2).sum()) / 2  # as SciPy defines it
         tolerance = min(1e-3, _NATS / ((DEGREES_OF_FREEDOM + len(kinds)) * max(cost, 1e-9)))
         return begin + least_squares(losses, z, jacobian, bounds, ftol=tolerance, xtol=1e-3, max_nfev=_EVALUATIONS).x
@@ -210,7 +211,7 @@ def fit_parameters(
 ) -> Fit:
     """Fits the parameters that the data identify; the others keep their defaults. Arguments as `maximize_posterior`.
 
-    `groups` (n,) are those of the windows; residuals within one may be correlated.
+    `groups` (n,) has the group of each window; residuals within a group may be correlated.
     """
     free = list(table)
     values = {p.name: start[p.name] for p in table}
@@ -255,7 +256,7 @@ def _prior_weights(table: list[Parameter], kinds: Kinds) -> Array:
 
 
 def _cached(residuals: Callable[[dict[str, float]], Array]) -> Callable[[dict[str, float]], Array]:
-    """The same function with a cache of the newest 4 (p + 1) results, as standard errors reuse the search's last."""
+    """The same function with a cache of the newest 4 (p + 1) results: standard errors reuse the search's last ones."""
     seen: dict[tuple[float, ...], Array] = {}
 
     def at(values: dict[str, float]) -> Array:
@@ -287,9 +288,9 @@ def _standard_errors(jacobian: Array, scaled: Array, groups: NDArray[np.int64], 
     groups, errors that treat windows as independent can be larger; the larger ones are returned.
 
     Args:
-        jacobian: Of the scaled residuals, shape (n, instants, c, p).
+        jacobian: Jacobian of the scaled residuals, shape (n, instants, c, p).
         scaled: Scaled residuals, shape (n, instants, c).
-        groups: Of the windows, shape (n,).
+        groups: Group of each window, shape (n,).
         stds: Standard deviations of the priors, shape (p,).
         weights: Weights of the priors, shape (p,).
     """
@@ -323,8 +324,9 @@ def _standard_errors(jacobian: Array, scaled: Array, groups: NDArray[np.int64], 
 def _inverse_curvature(information: Array, score: Array) -> Array:
     """Inverse of the curvature of the objective, shape (p, p).
 
-    log(1 + s) has less curvature than the squares that replace it in a step, by twice the squared score of a window.
-    Where noise would make the difference too small, `_MIN_CURVATURE` times the curvature of the squares is used.
+    The curvature of log(1 + s) is that of the squares that replace it in a step, minus twice the squared score of a
+    window. Where noise would make the difference too small, `_MIN_CURVATURE` times the curvature of the squares is
+    used.
     """
     root = np.linalg.inv(np.linalg.cholesky(information))
     less, axes = np.linalg.eigh(2 * root @ score.T @ score @ root.T)

@@ -39,7 +39,7 @@ _GROUND_FIELDS = {  # field of HuskyParams → parameters of `tires`
     "wheel_radius": ("radius_left", "radius_right"),
     "servo_gain": ("log10_servo_gain",),
 }
-_DIGITS = 6  # of numbers in robot.toml
+_DIGITS = 6  # digits of numbers in robot.toml
 _NO_TWIST = "the log's commands are wheel speeds, which bypass the controller's own multiplier; needs v and ω"
 
 
@@ -57,14 +57,14 @@ class Identification:
     baseline: Prediction
     fitted: Prediction
     level: Prediction
-    """As fitted, on level ground."""
+    """Prediction of the fitted model on level ground."""
 
     @property
     def identified(self) -> dict[str, tuple[float | tuple[float, ...], float | tuple[float | None, ...]]]:
         """Identified fields of HuskyParams: value and standard error, each a number or a tuple.
 
-        Errors of yaw rate and yaw acceleration hold at the fitted separation multiplier. The error of a component that
-        is not identified is None.
+        Errors of yaw rate and yaw acceleration are those at the fitted separation multiplier. The error of a component
+        that is not identified is None.
         """
         out: dict[str, tuple[Any, Any]] = {}
         twist = self.windows.twist
@@ -80,7 +80,7 @@ class Identification:
             value = getattr(self.robot, field)
             if names[0].startswith("log10_"):
                 errors = [errors[0] * np.log(10) * value]
-            elif field == "slip_stiffness":  # the inverse of what was fitted
+            elif field == "slip_stiffness":  # the fitted parameter is its inverse
                 errors = [errors[0] * value**2]
             out[field] = (value, tuple(errors)) if isinstance(value, tuple) else (value, errors[0])
         return out
@@ -187,7 +187,7 @@ def identify(
 
 
 def robot_toml(identification: Identification, previous: dict[str, Any], log: str) -> str:
-    """The text of a `robot.toml`: identified fields after those of the previous file that remain valid."""
+    """The text of a `robot.toml`: the previous fields that were not identified, then the identified ones."""
     scoring = int((~identification.windows.fitting).sum())
     score = identification.fitted.score(~identification.windows.fitting)
     comment = (

@@ -1,8 +1,8 @@
 """Kinematic models of skid steering, the baselines of the fitted model, and the scores of predictions.
 
 *Nominal*: a differential drive whose wheels roll without slip. *ICR model* (Mandow et al. 2007): each side's tread has
-an instantaneous center of rotation at its own lateral offset. It has five parameters, these offsets, a slip factor per
-side and a common forward offset, fitted with the robust loss of the MJCF's fit.
+an instantaneous center of rotation at its own lateral offset. Its five parameters are these offsets, a slip factor per
+side and a common forward offset; they are fitted with the same robust loss as the MJCF.
 """
 
 from dataclasses import asdict, dataclass
@@ -18,11 +18,11 @@ from twin.sysid.logs import MAX_POSE_AGE, PERIOD, SAMPLES, Windows, resample_pos
 from twin.types import Array
 
 POSE_KINDS: Kinds = (0, 0, 1)
-"""Residuals of x, y [m] and yaw [rad]."""
+"""Kinds of the residuals of x, y [m] and yaw [rad]."""
 EVALUATED_SAMPLES = (SAMPLES // 2, SAMPLES)
 """Samples of a window at which predicted and measured poses are compared."""
 
-_MIN_DIFFERENCE = 0.25  # [m/s] of the sides; below it the track ratio is noise
+_MIN_DIFFERENCE = 0.25  # [m/s] between the sides; with a smaller difference the track ratio is noise
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ NOMINAL = IcrModel()
 
 
 def integrate(motion: Array) -> Array:
-    """Poses x, y [m], yaw [rad] from zero, shape (n, k + 1, 3), for velocities (n, k, 3) held `PERIOD` [s] each."""
+    """Poses x, y [m], yaw [rad] from zero, shape (n, k + 1, 3), for velocities (n, k, 3) of `PERIOD` [s] each."""
     turned = motion[..., 2] * PERIOD
     yaw = np.concatenate([np.zeros((len(motion), 1)), np.cumsum(turned, 1)], 1)
     middle = yaw[:, :-1] + turned / 2
@@ -62,9 +62,9 @@ def integrate(motion: Array) -> Array:
 
 
 def predict(model: IcrModel, windows: Windows) -> Array:
-    """Poses since the measurement of each window's first one, shape (n, k + MAX_POSE_AGE + 1, 3).
+    """Predicted poses, from the time at which each window's first one was measured, (n, k + MAX_POSE_AGE + 1, 3).
 
-    They follow from the measured wheel speeds; beyond a window's end its last ones continue.
+    They follow from the measured wheel speeds; after a window's end, its last wheel speeds continue.
     """
     before = windows.preceding_wheels[:, -1 - MAX_POSE_AGE : -1]
     after = np.repeat(windows.wheels[:, -1:], MAX_POSE_AGE, 1)
@@ -110,14 +110,14 @@ def end_errors(predicted: Array, windows: Windows) -> tuple[Array, Array]:
 
 
 def track_ratios(windows: Windows, ends: Array) -> Array:
-    """Track ratio chi of each window, effective over geometric track, shape (n,), from poses at its end (n, 3)."""
+    """Track ratio chi (effective / geometric track) of each window, shape (n,), from the poses at its end (n, 3)."""
     difference = (windows.wheels[..., 1] - windows.wheels[..., 0]).mean(1) * WHEEL_RADIUS
     turned = np.where(np.abs(ends[:, 2]) < 1e-6, np.nan, ends[:, 2])
     return difference * windows.elapsed[:, -1] / (TRACK * turned)
 
 
 def steady_windows(windows: Windows) -> NDArray[np.bool_]:
-    """Windows whose sides turn at different constant speeds, for which chi is defined, shape (n,)."""
+    """Mask (n,) of windows in which the sides' wheels turn at constant, different speeds, as chi requires."""
     sides = windows.wheels * WHEEL_RADIUS
     thirds = np.stack([part.mean(1) for part in np.array_split(sides, 3, axis=1)])
     constant = np.ptp(thirds, axis=0).max(1) < 0.08
@@ -149,7 +149,8 @@ class Prediction:
     def __init__(self, name: str, windows: Windows, poses: Array, wheels: Array | None = None) -> None:
         """
         Args:
-            poses: `PERIOD` [s] apart since the measurement of each window's first, (n, k + MAX_POSE_AGE + 1, 3).
+            poses: `PERIOD` [s] apart, from the time at which each window's first one was measured,
+                shape (n, k + MAX_POSE_AGE + 1, 3).
             wheels: Shape (n, ≥ k, 2) [rad/s]; None: the model takes the measured ones.
         """
         self.name, self.windows, self.poses = name, windows, poses

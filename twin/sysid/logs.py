@@ -10,7 +10,7 @@ window *follows* the previous one if it begins when that one ends. A pose is *fr
   and `cmd_yaw_rate` [rad/s], or `cmd_left` and `cmd_right` [rad/s at the wheels]; `left_wheel_vel`, `right_wheel_vel`
   [rad/s]; `x`, `y` [m], `yaw` [rad] of the base in any fixed frame; optionally `acceleration_x`, `acceleration_y`
   [m/s²], proper acceleration in the base (x forward, y left; an IMU's raw reading), and `group`;
-- a robot's bag, as such a table (`twin.sysid.ros_bags`);
+- a robot's bag, converted to such a table (`twin.sysid.ros_bags`);
 - windows as published with DRIVE (Samson et al., BSD-3): an .npz of arrays (n, 40) at 20 Hz.
 """
 
@@ -35,7 +35,7 @@ from twin.types import Array
 PERIOD = 0.05  # [s] between two samples of a window
 DURATION = 2.0  # [s]
 SAMPLES = round(DURATION / PERIOD)
-MAX_POSE_AGE = 20  # samples between the measurement of a window's first pose and the window's start, at most
+MAX_POSE_AGE = 20  # most samples between the measurement of a window's first pose and the window's start
 
 TWIST = ("cmd_v", "cmd_yaw_rate")
 WHEEL_COMMANDS = ("cmd_left", "cmd_right")
@@ -46,33 +46,33 @@ ACCELERATION = ("acceleration_x", "acceleration_y")
 _MAX_GAP = 0.5  # [s] between two rows of a table; windows with a longer one are left out
 _MIN_INTERVAL = 5e-4  # [s] median between rows; a shorter one means that time is not in seconds
 _FAST = 1.75  # samples; if a sensor's period is shorter, times of appearance are used, see `measurement_times`
-_JITTER = 4  # samples between measurement and appearance of a pose, at most, apart from the common delay
-_UNSTEADY = 0.1  # fraction of windows that contradict the period, above which the sensor counts as aperiodic
-_DROPOUT = 30  # samples without a fresh pose; windows with more are left out if the wheels turn
-_TURNING = 0.5  # [rad/s] mean of both sides' wheels
-_STANDING = 0.05  # [rad/s], [m/s]; windows in which neither wheels nor commands are ever faster are left out
-_MAX_BYTES = 512 << 20  # of a log, unpacked
+_JITTER = 4  # most samples between measurement and appearance of a pose, apart from the common delay
+_UNSTEADY = 0.1  # if a larger fraction of windows contradicts the period, the sensor counts as aperiodic
+_DROPOUT = 30  # samples; windows without a fresh pose for longer are left out if the wheels turn
+_TURNING = 0.5  # [rad/s] mean of both sides' wheel speeds above which the wheels count as turning
+_STANDING = 0.05  # [rad/s], [m/s]; windows in which wheels and commands never reach it are left out
+_MAX_BYTES = 512 << 20  # largest log, unpacked
 _TICK = 1e-6  # [s] instants closer than this are the same
-_GROUP_WINDOWS = 3  # in a table without groups: six seconds
-_CONTINUES = 1.0  # [rad/s] change of wheel speeds between consecutive windows, summed over both sides, at most
+_GROUP_WINDOWS = 3  # windows per group in a table without groups: six seconds
+_CONTINUES = 1.0  # [rad/s] largest change of wheel speeds between consecutive windows, summed over both sides
 
 # ---- measurement times of poses
 
 
 def measurement_times(fresh: NDArray[np.bool_]) -> Array:
-    """Estimates when every pose of a log's windows was measured, from when poses changed.
+    """Estimates the time at which each pose of a log's windows was measured, from the samples at which poses changed.
 
     A pose sensor measures at a steady rate, but its poses reach the log with varying delay: a robot moves as far
     between fresh poses that appear 0.05 s apart as between those that appear 0.15 s apart. (In turning windows of
     DRIVE's log, yaw as a function of the number of the fresh pose is smooth to 0.3°, as a function of its time of
-    appearance to 0.7°.) So the n-th fresh pose counts as measured n periods after the first; if all later ones are late
-    by more than half a period, poses were lost.
+    appearance to 0.7°.) So the n-th fresh pose counts as measured n periods after the first; if a pose and all later
+    ones are late by more than half a period, poses before it were lost and are counted, too.
 
     Times of appearance are used instead for windows that contradict the period by more than `_JITTER`, and for the
-    whole log if many do or the sensor is fast.
+    whole log if many windows do so or if the sensor is fast.
 
     Args:
-        fresh: Which poses, without the first, differ from the one before, shape (n, k).
+        fresh: Mask of the poses, without the first, that differ from the one before, shape (n, k).
 
     Returns:
         Times [samples], shape (n, k + 1); a window starts at 0.
@@ -135,9 +135,9 @@ class Windows:
     poses: Array
     """x, y [m], yaw [rad] relative to the first, shape (n, k + 1, 3)."""
     groups: NDArray[np.int64]
-    """Shape (n,)."""
+    """Group of each window, shape (n,)."""
     follows: NDArray[np.bool_]
-    """Shape (n,)."""
+    """True for windows that follow the previous one, shape (n,)."""
     acceleration: Array | None = None
     """Proper acceleration forward and to the left [m/s²], shape (n, k, 2)."""
 
@@ -153,7 +153,7 @@ class Windows:
     def preceding_wheels(self) -> Array:
         """Wheel speeds in the `DURATION` before each window and at its start [rad/s], shape (n, k + 1, 2).
 
-        Those of the previous window if this one follows it, else the speed at the start.
+        If a window follows the previous one, these are the previous one's; else the speed at the start is repeated.
         """
         out = np.repeat(self.wheels[:, :1], self.wheels.shape[1] + 1, 1)
         follows = np.flatnonzero(self.follows)
@@ -183,7 +183,7 @@ class Windows:
 
     @property
     def fresh(self) -> NDArray[np.bool_]:
-        """Which poses, without the first, are fresh, shape (n, k)."""
+        """Mask of the fresh poses, without the first pose, shape (n, k)."""
         return np.abs(np.diff(self.poses, axis=1)).max(2) > 1e-6
 
     @property
@@ -193,7 +193,7 @@ class Windows:
 
     @cached_property
     def measurement_times(self) -> Array:
-        """Measurement time of each pose, up to a common delay [s since the first sample], shape (n, k + 1)."""
+        """Measurement time of each pose [s since the first sample], except for a common delay, shape (n, k + 1)."""
         return measurement_times(self.fresh) * PERIOD
 
     @property
@@ -243,7 +243,7 @@ def cut_windows(columns: dict[str, Array], where: str) -> Windows:
     """Cuts a table into windows; a sample takes the newest row at its instant.
 
     Args:
-        columns: By name, shape (rows,) each; see the module's head.
+        columns: Columns by name, shape (rows,) each; see the module's head.
         where: The log's name in errors.
 
     Raises:
@@ -292,7 +292,7 @@ def cut_windows(columns: dict[str, Array], where: str) -> Windows:
 
 
 def _informative(windows: Windows, where: str) -> Windows:
-    """Leaves out windows that lose poses while the wheels turn, and those in which the robot stands as commanded.
+    """Leaves out windows that lose poses while the wheels turn, and those in which the robot stands still as commanded.
 
     Raises InputError: poses are lost in more than half of the windows in which the wheels turn.
     """
@@ -317,7 +317,7 @@ def _informative(windows: Windows, where: str) -> Windows:
 
 
 def _gapless(time: Array, where: str) -> NDArray[np.int64]:
-    """Numbers of the windows without a gap, shape (n,); window i begins i · `DURATION` [s] after the first row.
+    """Indices of the windows without a gap, shape (n,); window i begins i · `DURATION` [s] after the first row.
 
     Raises InputError: the median interval between rows is too long, or too short for times in seconds.
     """
@@ -344,8 +344,9 @@ def _gapless(time: Array, where: str) -> NDArray[np.int64]:
 def _published_windows(columns: dict[str, Array], where: str) -> Windows:
     """Windows of DRIVE: the pose at 2 s, `gt_icp_*`, is the 41st sample; x and y of the robot's IMU are negated.
 
-    The data show their wrong sign: `imu_acceleration_x` falls when the wheels speed up, and `imu_acceleration_y` points
-    out of the turn (correlations −0.16 and −0.11 over 16,000 samples). The yaw rate has the right sign.
+    The data show that their sign is wrong: `imu_acceleration_x` falls when the wheels speed up, and
+    `imu_acceleration_y` points out of the turn (correlations −0.16 and −0.11 over 16,000 samples). The yaw rate has the
+    right sign.
     """
     poses = [f"{{}}icp_{name}" for name in POSE]
     imu = ("imu_acceleration_x", "imu_acceleration_y")
@@ -422,8 +423,8 @@ def _finite(columns: dict[str, Array], where: str) -> None:
 
 # ---- plausibility
 
-_MIN_WINDOWS = 20  # to fit to; half as many to score on
-_MIN_TURNS = 10  # windows that turn by more than _TURN, at least a quarter of them to either side
+_MIN_WINDOWS = 20  # least number to fit to; half as many to score on
+_MIN_TURNS = 10  # least number of windows that turn by more than `_TURN`; a quarter as many to each side
 _TURN = 0.25  # [rad]
 
 _MOVING = 0.15  # [m/s] of wheels or robot: slower windows are not used to check units
@@ -490,7 +491,7 @@ def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, 
 def _check_ratio(
     ratio: float | None, expected: tuple[float, float], where: str, message: str, cures: dict[float, str]
 ) -> None:
-    """Raises InputError if a ratio is out of range, with the cure of the nearest factor."""
+    """Raises InputError if a ratio is out of range; the message has the cure of the nearest factor."""
     low, high = expected
     if ratio is None or low <= ratio <= high:
         return

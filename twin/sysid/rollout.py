@@ -26,10 +26,10 @@ from twin.types import Array
 
 
 Complex = NDArray[np.complex128]
-"""Gravity along x, with that along y as the imaginary part [m/s²]."""
+"""Gravity along x (real part) and along y (imaginary part) [m/s²]."""
 
 GRAVITY = 9.81  # [m/s²]
-MAX_SLOPE = 0.2  # of gravity; readings above 11° are bumps or glitches
+MAX_SLOPE = 0.2  # fraction of gravity; readings above 11° are bumps or glitches
 
 
 @dataclass(frozen=True)
@@ -39,27 +39,27 @@ class SlopeModel:
     steepness: float
     """Standard deviation of the slope [m/s²]."""
     windows: float
-    """Windows after which the autocorrelation is 1 / e."""
+    """Number of windows after which the autocorrelation is 1 / e."""
     noise: float
     """Standard deviation of a window's reading [m/s²]."""
 
 
-_PRIOR, _PRIOR_STD = SlopeModel(0.25, 5.0, 0.25), 1.0  # median (gentle: 1.5°), standard deviation of the logarithms
-_RANGE = 1e-3, 1e3  # of each statistic; keeps the fit finite if the readings have no noise
+_PRIOR, _PRIOR_STD = SlopeModel(0.25, 5.0, 0.25), 1.0  # median (a slope of 1.5°); std of the logarithms
+_RANGE = 1e-3, 1e3  # bounds of each statistic; they keep the fit finite if the readings have no noise
 
 
 def slope_gravity(windows: Windows, model: IcrModel) -> Array:
-    """Gravity along x and y [m/s²] in the robot's frame where each window's `preceding_wheels` begin, shape (n, 2).
+    """Gravity along x and y [m/s²] in the robot's frame at the start of each window's `preceding_wheels`, shape (n, 2).
 
     Tires that scrub sideways over soft ground slide downhill by more than a good model's error, so a log on real ground
     is fitted with its slope. At rest an accelerometer reads minus gravity. A rattling robot's mean over a window is
     noisy, but consecutive windows have similar slopes, so the readings are smoothed (`smooth_slopes`) with their most
-    probable statistics (`fit_slope_model`), which shrink a rough IMU's slopes towards level ground. Subtracting the
-    log's median removes what is constant in the robot's frame (mounting of the IMU, a pitched chassis). Headings and
-    the motion's own acceleration come from wheel speeds alone, since poses are to be predicted.
+    probable statistics (`fit_slope_model`), which shrink a noisy IMU's slopes towards level ground. Subtracting the
+    log's median removes errors that are constant in the robot's frame (mounting of the IMU, a pitched chassis).
+    Headings and the motion's own acceleration come from wheel speeds alone, since poses are to be predicted.
 
     Args:
-        windows: All of a log; without accelerations the result is zero.
+        windows: All windows of a log; without accelerations the result is zero.
         model: Kinematics for headings and velocities.
     """
     if windows.acceleration is None:
@@ -104,7 +104,7 @@ def smooth_slopes(
     """
     n, prior, noise = len(readings), model.steepness**2, model.noise**2
     keep = np.exp(-1 / model.windows)
-    predicted, predicted_var = np.zeros(n, complex), np.full(n, prior)  # from previous windows
+    predicted, predicted_var = np.zeros(n, complex), np.full(n, prior)  # from the previous windows alone
     slope, var = np.zeros(n, complex), np.zeros(n)  # updated with the window's reading
     cost = 0.0
     for i in range(n):
@@ -144,7 +144,7 @@ class Rollouts:
 
 
 def plane_model(params: HuskyParams, timestep: float | None = None) -> mujoco.MjModel:
-    """The Husky on a plane, without the visual geometry, which takes a third of the time and most of the memory."""
+    """The Husky on a plane, without the visual geometry, which costs a third of the time and most of the memory."""
     spec = mujoco.MjSpec()
     set_options(spec, params)
     if timestep:
@@ -165,9 +165,9 @@ def simulate_windows(
 
     Args:
         params: The robot and its ground; its `servo_lag` acts on `targets`, but not on `before`.
-        targets: Of the servos, left and right [rad/s], `CONTROL_STEP` [s] apart, shape (n, steps, 2).
+        targets: Servo targets, left and right [rad/s], `CONTROL_STEP` [s] apart, shape (n, steps, 2).
         before: Wheel speeds up to time zero, left and right [rad/s], `PERIOD` [s] apart, (n, ≥ LEAD_SAMPLES + 2, 2).
-        slope: Gravity along x and y in the robot's frame where `before` begins [m/s²], shape (n, 2).
+        slope: Gravity along x and y in the robot's frame at the start of `before` [m/s²], shape (n, 2).
         timestep: [s], a whole fraction of `PERIOD`; None: the scene's.
     """
     model = plane_model(params, timestep)
@@ -184,7 +184,7 @@ def simulate_windows(
     states, sensors = rollout.rollout(models, [mujoco.MjData(model) for _ in range(threads)], states, control)
     torque = [model.sensor(f"{side}_torque").adr[0] for side in ("left", "right")]
     torques = sensors[:, lead:, torque]
-    # A rollout's first state is the one after a step, so time zero is the last step of the lead.
+    # A rollout's first state is that after the first step, so time zero is the last step of the lead.
     seen = states[:, lead - 1 - LEAD_SAMPLES * per_sample :: per_sample]
     position, velocity = seen[..., 1 : 1 + model.nq], seen[..., 1 + model.nq : 1 + model.nq + model.nv]
     n, k = targets.shape[0], SAMPLES + EXTRA_SAMPLES
@@ -196,9 +196,9 @@ def simulate_windows(
 
 
 def _lag_compensated(wheels: Array, count: int, lag: float) -> Array:
-    """Targets with which servos of a first-order lag [s] interpolate wheel speeds (n, k, 2), `PERIOD` [s] apart.
+    """Targets with which servos follow wheel speeds (n, k, 2), `PERIOD` [s] apart, despite a first-order lag [s].
 
-    Shape (n, (k − 1) · count, 2).
+    Between samples the wheel speeds are interpolated linearly. Shape (n, (k − 1) · count, 2).
     """
     share = (np.arange(count) + 0.5)[:, None] / count
     change = np.diff(wheels, axis=1)[:, :, None]
@@ -216,7 +216,7 @@ def _initial_states(model: mujoco.MjModel, params: HuskyParams, start: Array) ->
     for i, sides in enumerate(start):
         rolling = sides * params.wheel_radius
         data.qvel[0] = rolling.mean()
-        data.qvel[5] = (rolling[1] - rolling[0]) / 2  # about half the yaw rate of a differential drive
+        data.qvel[5] = (rolling[1] - rolling[0]) / 2  # TRACK / 2 = 0.29 times the yaw rate of a differential drive
         data.qvel[joints] = np.tile(sides, 2)
         if model.na:
             data.act[:] = sides

@@ -1,8 +1,8 @@
-"""Drive logs from bags, as tables: a row per joint state, with the newest values of the other topics.
+"""Drive logs from bags, as tables that have a row per joint state and the newest values of the other topics.
 
-Where a bag has no joint states, the wheel speeds are those of the wheels' odometry, by the inverse of Clearpath's
-kinematics. Poses that come from the wheels would hide their slip; in their place are taken those of the bag's own
-pictures, if a scene was built from it: of the robot at rest below the reconstructed cameras.
+If a bag has no joint states, the wheel speeds are computed from the wheels' odometry by the inverse of Clearpath's
+kinematics. Poses that come from the wheels are not used, since they hide the wheels' slip. If a bag has no others but a
+scene was built from its pictures, the poses are those of a robot at rest below the reconstructed cameras.
 """
 
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ from twin.types import Array
 
 @dataclass(frozen=True)
 class FilmedPoses:
-    """Poses of a robot by the pictures that it took."""
+    """Poses of a robot, reconstructed from the pictures that it took."""
 
     times: NDArray[np.int64]
     """Stamps of the pictures [ns], increasing, shape (n,)."""
@@ -50,7 +50,7 @@ class FilmedPoses:
 
 
 def filmed_poses(scene: SceneDir, config: SceneConfig, bag: Path) -> FilmedPoses | None:
-    """The robot's poses by the reconstruction of a bag's pictures; None unless the scene was built from that bag.
+    """The robot's poses, reconstructed from a bag's pictures; None unless the scene was built from that bag.
 
     Raises InputError: the bag is unreadable.
     """
@@ -79,15 +79,15 @@ def _are_same(one: Path, other: Path) -> bool:
 
 
 def read_bag(path: Path, filmed: FilmedPoses | None = None) -> dict[str, Array]:
-    """The columns that `twin.sysid.logs` describes.
+    """Reads a bag into the columns that `twin.sysid.logs` describes.
 
     Args:
         path: See `twin.capture.bag`.
-        filmed: Poses in place of those that come from the wheels.
+        filmed: Poses to use if the bag has only poses that come from the wheels.
 
     Raises:
         InputError: rosbags is not installed, the bag is unreadable, a kind of message is missing, or the poses come
-            from the wheels.
+            from the wheels and `filmed` is None.
     """
     with open_bag(path, "record it anew or give a .csv") as bag:
         kinds, values = _kinds(bag.connections, path, filmed)
@@ -113,7 +113,7 @@ def read_bag(path: Path, filmed: FilmedPoses | None = None) -> dict[str, Array]:
 
 
 def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tuple[list[str], dict[str, Any]]:
-    """The kinds of topics to read, and the connection of the wheels' odometry if it stands in for joint states."""
+    """The kinds of topics to read, and the connection of the wheels' odometry if it replaces missing joint states."""
     kinds, values = list(TYPES), {}
     counts = messages_by_topic(connections, TYPES["poses"])
     if not any(count >= MIN_POSES and not is_from_wheels(name) for name, count in counts.items()):
@@ -139,7 +139,7 @@ def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tu
 
 
 def _wheels_of_odometry(message: Any) -> tuple[float, float]:
-    """Wheel speeds left and right [rad/s] of the wheels' odometry."""
+    """Wheel speeds left and right [rad/s] from a message of the wheels' odometry."""
     v, yaw_rate = message.twist.twist.linear.x, message.twist.twist.angular.z
     half = yaw_rate * TRACK * HuskyParams.separation_multiplier / 2.0
     return (v - half) / WHEEL_RADIUS, (v + half) / WHEEL_RADIUS
@@ -154,7 +154,7 @@ _NAMES = {
 
 
 def _columns(tables: dict[str, Array]) -> dict[str, Array]:
-    """A row per joint state, once every topic has had a message."""
+    """Columns with a row per joint state, from the time at which every topic has had a message."""
     begin = max(table[0, 0] for table in tables.values())
     time = np.unique(tables["wheels"][:, 0])
     time = time[time >= begin]

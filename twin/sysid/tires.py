@@ -1,9 +1,9 @@
 """Tires and ground, fitted to the poses of a log.
 
 All terms are parameters of the MJCF: contact coefficients, `impratio`, and the viscosity of a medium around the tires
-alone. All but the rolling resistance of hard ground are off by default. Two more parameters belong to the log: the
-offset of the pose sensor from the base's origin, and the delay of poses against wheel speeds. The height of the mass is
-fitted only on slopes, as poses on level ground do not depend on it.
+alone. By default all are off, except the rolling resistance of hard ground. Two more parameters belong to the log: the
+offset of the pose sensor from the base's origin, and the delay of poses against wheel speeds. The height of the center
+of mass is fitted only on slopes, as poses on level ground do not depend on it.
 """
 
 from collections.abc import Callable
@@ -24,8 +24,9 @@ from twin.types import Array
 #
 # Four point contacts under Coulomb friction turn with the same track ratio chi at every speed and friction, and move
 # the body at the mean speed of the wheels. A Husky on grass (DRIVE's log) turns with chi 2.0 in gentle bends and 2.3 in
-# hard ones; in hard turns it moves at 0.4 to 0.7 of the wheels' mean speed, though it slips 2.5 % going straight. Each
-# model below was fitted to the even groups of that log and scored on its odd ones (median pose error after 2 s):
+# hard ones; in hard turns it moves at 0.4 to 0.7 of the wheels' mean speed, though it slips only 2.5 % when it goes
+# straight. Each model below was fitted to the even groups of that log and scored on its odd ones (median pose error
+# after 2 s):
 #
 #     Coulomb, friction and center of mass fitted       0.23 m, 13 to 26°
 #     + spin friction of the contact patch              0.21 m, 6°: turns correctly, but moves as fast as its wheels
@@ -36,26 +37,26 @@ from twin.types import Array
 #     + wheels and slope before each window             0.12 m, 4.7°: a body keeps its motion for half a second
 #     + measurement times of poses (`logs`)             0.12 m, 4.8°
 #     + rolling resistance                              0.12 m, 4.8°: grip grows with slip; drag is not needed
-#     + ramps continued between windows (`drivetrain`)  0.12 m, 4.5°: lagging wheels do not show them
-#     + residual scales from the log (`estimation`)     0.11 m, 4.6°: fixed ones weighted yaw too much
+#     + ramps continued between windows (`drivetrain`)  0.12 m, 4.5°: wheel speeds lag and do not show them
+#     + residual scales from the log (`estimation`)     0.11 m, 4.6°: fixed scales weighted yaw too much
 #
 # The last row is the shipped model (`docs/benchmarks.md`). Alternatives to drag, tried before rolling resistance:
 # drag on all bodies, or on the chassis alone, had a 5 % higher loss; a sliding support that carries part of the weight
-# had 1 % (better straight on, worse in turns).
+# had a 1 % higher one (it was better straight on and worse in turns).
 #
 # In MuJoCo's elliptic cone (condim 6) sliding, spinning and rolling friction share one limit: a tire that rolls at v
-# and slides at u has the fraction u / √(u² + (v Crr / μ)²) of its grip across. So grip grows with the slip ratio u / v,
-# at first in proportion, as in a brush model of stiffness μ / Crr. On hard ground Crr is small and the tire is
-# Coulomb's; on soft ground a rolling tire turns more easily than a standing one. The fitted Crr describes this; the Crr
-# that motor currents show (`benchmarks/motor_currents.py`) describes power, and may differ.
+# and slides at u has the fraction u / √(u² + (v Crr / μ)²) of its grip sideways. So grip grows with u / v, the slip
+# ratio, at first in proportion, as in a brush model of stiffness μ / Crr. On hard ground Crr is small and the tire
+# obeys Coulomb's law; on soft ground a rolling tire turns more easily than a standing one. The fitted Crr describes
+# this effect; the Crr that motor currents show (`benchmarks/motor_currents.py`) describes power, and may differ.
 
-_MANY = 100  # windows; with fewer the delay of poses is not fitted and the search uses all
+_MANY = 100  # with fewer windows the delay of poses is not fitted, and the coarse search uses all windows
 _NEAR = 0.25  # `reach` of the search that starts near the solution
 _TURNS, _BENDS = "hard turns at several speeds", "gentle bends as well as hard turns"
 _BRAKING = "hard braking, or slopes"
 # Prior mean and standard deviation, lowest and highest value, unit, cure. Prior means are those of soft ground and of
-# the published robot without load; its publications give centers of mass that differ by one standard deviation of the
-# prior of x. Creep is the inverse of slip stiffness, as slip is proportional to it.
+# the published robot without load; publications differ about its center of mass by one standard deviation of the prior
+# of x. Creep, the inverse of slip stiffness, is fitted because slip is proportional to it.
 _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "friction": (0.3, 0.2, 0.05, 1.5, "", _TURNS),
     "spin_friction": (0.03, 0.03, 0.0, 0.3, "m", _TURNS),
@@ -125,7 +126,7 @@ def simulate_log(
     slope: Array,
     timestep: float | None = None,
 ) -> Rollouts:
-    """Simulates the log's commands with these values; poses are those of `_measured_poses`."""
+    """Simulates the log's commands with these values; the poses are as its sensor measures them (`_measured_poses`)."""
     targets, _ = simulate_drivetrain(drivetrain, windows)
     fitted = robot_with_values(_with_drivetrain(params, drivetrain), values)
     out = simulate_windows(fitted, targets, windows.preceding_wheels, slope, timestep)
@@ -133,14 +134,14 @@ def simulate_log(
 
 
 def _with_drivetrain(params: HuskyParams, drivetrain: Drivetrain) -> HuskyParams:
-    """A robot with the drivetrain's lag, and without a limit of wheel speeds, which is in the servo targets."""
+    """A robot with the drivetrain's lag and unlimited wheel speeds: the servo targets are limited already."""
     return replace(params, servo_lag=drivetrain.lag, max_wheel_speed=5.0)
 
 
 def _measured_poses(rollouts: Rollouts, values: dict[str, float], windows: Windows) -> Array:
-    """Poses as the log's sensor measures them, at its own place and time, shape (n, k + MAX_POSE_AGE + 1, 3).
+    """Poses as the log's sensor measures them, at the sensor's position and time, shape (n, k + MAX_POSE_AGE + 1, 3).
 
-    Position is relative to the sensor's, yaw to the robot's, at the first measurement.
+    At the first measurement the sensor's position and the robot's yaw are zero.
     """
     poses = resample_poses(rollouts.poses, values["pose_late"] - windows.measurement_times[:, 0], LEAD_SAMPLES)
     x, y = values["pose_x"], values["pose_y"]
@@ -155,12 +156,12 @@ def fit_ground(
     slope: Array,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Fit:
-    """Fits tires, ground and masses to the poses of a log's windows for fitting.
+    """Fits the parameters of `_TABLE` to the poses of a log's windows for fitting.
 
     Args:
         params: The robot that gives the defaults.
         drivetrain: See `drivetrain.fit_drivetrain`.
-        windows: All of a log.
+        windows: All windows of a log.
         slope: See `rollout.slope_gravity`, shape (n, 2).
     """
     defaults = values_of_robot(params)
@@ -169,7 +170,7 @@ def fit_ground(
         height = defaults["center_of_mass_z"]
         refused["center_of_mass_z"] = f"center_of_mass_z = {height:.4g} m: on level ground, needs {_BRAKING}"
     fitting = np.flatnonzero(windows.fitting)
-    if len(fitting) < _MANY:  # a delay near zero would bias the others
+    if len(fitting) < _MANY:  # if the true delay is near zero, fitting it would bias the others
         refused["pose_late"] = f"pose_late = 0 s: from {len(fitting)} windows, needs {_MANY}"
     table = [
         Parameter(name, mean, std, low, high, defaults[name], unit, cure)
@@ -191,8 +192,9 @@ def fit_ground(
 
         return pose_residuals
 
-    # A coarse time step and a third of many windows find the neighborhood in a tenth of the time. The final fit uses
-    # the shipped time step, since values fitted at a coarse one compensate for it.
+    # The coarse search uses a long time step and, if there are many windows, a third of them. It gets near the solution
+    # in a tenth of the time. The final fit uses the shipped time step, since values that are fitted at a longer one
+    # compensate for its errors.
     some = fitting
     if len(fitting) >= _MANY:
         some = np.sort(np.random.default_rng(0).choice(fitting, len(fitting) // 3, replace=False))

@@ -1,8 +1,8 @@
 """A trial on the road, read from the robot's bag: pictures, calibration, poses and commands.
 
 Times are nanoseconds (`twin.capture.bag.message_times`). Poses are planar, in the frame of their topic (odometry, RTK);
-`fit_frame` finds that frame in the scene from pictures that were located there. Pictures stay in the bag until they are
-wanted.
+`fit_frame` finds that frame in the scene from pictures that were located there. Pictures are read from the bag only
+when they are needed.
 """
 
 from collections.abc import Iterator
@@ -33,34 +33,34 @@ from twin.errors import InputError
 from twin.types import Array
 from twin_policy import Camera, PictureError
 
-_STEP = 0.3  # [m] of motion from which a fix's heading is taken
+_STEP = 0.3  # [m] before and after a fix, between which its heading is measured
 
 
 @dataclass(frozen=True)
 class TrialRecording:
-    """What a robot recorded of a drive."""
+    """A robot's recording of a drive."""
 
     path: Path
     topics: dict[str, str]
-    """Topics by what they hold: pictures, camera, poses, commands."""
+    """Topics by kind: pictures, camera, poses, commands."""
     camera: Camera
     shutter: NDArray[np.int64]
     """Stamps of the pictures [ns], increasing, shape (n,)."""
     arrival: NDArray[np.int64]
-    """When each was recorded [ns], shape (n,)."""
+    """Times at which the pictures were recorded [ns], shape (n,)."""
     pose_times: NDArray[np.int64]
-    """[ns], increasing, shape (p,)."""
+    """Stamps of the poses [ns], increasing, shape (p,)."""
     poses: Array
     """x, y [m] and yaw [rad], continuous, shape (p, 3)."""
     uprightness: Array
-    """Cosine of the robot's tilt, shape (p,); 1 for fixes."""
+    """Cosine of the robot's tilt, shape (p,); 1 if the poses come from fixes."""
     command_times: NDArray[np.int64]
-    """[ns], shape (c,)."""
+    """Stamps of the commands [ns], in order, shape (c,)."""
     commands: Array
     """v [m/s], ω [rad/s], shape (c, 2)."""
 
     def poses_at(self, times: NDArray[np.int64]) -> Array:
-        """Interpolated poses (k, 3) at times [ns]; the first and last beyond the ends."""
+        """Interpolated poses (k, 3) at times [ns], constant before the first and after the last recorded pose."""
         since = (times - self.pose_times[0]) * 1e-9
         knots = (self.pose_times - self.pose_times[0]) * 1e-9
         return np.stack([np.interp(since, knots, column) for column in self.poses.T], -1)
@@ -82,7 +82,7 @@ def read_trial(path: Path, given: dict[str, str] | None = None) -> TrialRecordin
 
     Args:
         path: The bag's folder, or its .mcap or .db3 file.
-        given: Topics of `pictures`, `camera`, `poses` and `commands` that the user names.
+        given: Topics that the user gives, by kind: `pictures`, `camera`, `poses`, `commands`.
 
     Raises:
         InputError: an unreadable bag, or topics that are missing, empty or contradictory.
@@ -189,9 +189,9 @@ def _headings(xy: Array) -> Array:
 
 # ---- the frame of the poses
 
-_MIN_LOCATED, _MIN_WAY = 5, 2.0  # pictures, [m] between the farthest two
+_MIN_LOCATED, _MIN_WAY = 5, 2.0  # least number of pictures; [m] least distance of the farthest pose from the first
 _MAX_RESIDUAL = 0.25  # [m] rms
-_OUTLIER = 3.0  # multiples of the median residual
+_OUTLIER = 3.0  # pictures whose residual is above this multiple of the median are left out
 _ROUNDS = 5
 
 
@@ -206,7 +206,7 @@ class FrameFit:
     residual: float = 0.0
     """Root mean square distance between the poses and the located pictures [m]."""
     scale: float = 1.0
-    """Metres of the scene per metre of the poses, by the same pictures; reported only, not applied to poses."""
+    """Metres of the scene per metre of the poses, from the same pictures; reported only, not applied to poses."""
     located: int = 0
     """Pictures used."""
 
@@ -218,11 +218,11 @@ class FrameFit:
 
 
 def fit_frame(poses: Array, located: Array, where: str) -> FrameFit:
-    """Fits the frame by positions, without scale; pictures that were located wrongly are left out.
+    """Fits the frame to positions, without a scale; wrongly located pictures are left out.
 
     Args:
         poses: Recorded poses at the pictures' stamps, shape (n, 3).
-        located: Poses of the base in the scene by the same pictures, shape (n, 3).
+        located: Poses of the base in the scene, located from the same pictures, shape (n, 3).
         where: The recording's name in errors.
 
     Raises:

@@ -90,7 +90,7 @@ def serve(twin: Twin, given: argparse.Namespace) -> None:
 
     page = open_page(twin, given.host, given.port, given.lighting, announce)
     try:
-        page.loop.has_shown.wait(_HEAD_START)  # the first picture needs both cores
+        page.loop.has_shown.wait(_HEAD_START)  # rendering the first picture needs all cores
         load_driving(page, given.task, policy, given.seed)
         threading.Event().wait()
     finally:
@@ -106,7 +106,7 @@ def open_page(
 ) -> "Page":
     """Opens the page of a built scene, without the robot.
 
-    `announce` is called with its address as soon as it can be opened, before the field is loaded.
+    `announce` is called with its address as soon as the page can be opened, before the field is loaded.
 
     Raises:
         InputError: viser is missing, the scene has no field, or an unknown lighting or unusable address.
@@ -115,7 +115,7 @@ def open_page(
         import viser  # noqa: F401
     except ModuleNotFoundError as error:
         raise InputError(f"{error}: the page needs viser; pip install 'twin[view]'") from None
-    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a page that was just closed
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # for a page that was just closed
     from twin.view.guarded_server import open_server
 
     for stage in ("metric", "field"):
@@ -152,7 +152,7 @@ def _check_driver(twin: Twin, given: argparse.Namespace) -> "Policy | None":
 
 
 def load_driving(page: "Page", task: str | None = None, policy: "Policy | None" = None, seed: int = 0) -> None:
-    """Adds the robot to an open page; a scene that cannot be driven says so there.
+    """Adds the robot to an open page; if the scene cannot be driven, the page shows why.
 
     Raises:
         InputError: a policy or task was asked for and cannot be driven.

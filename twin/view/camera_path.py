@@ -3,9 +3,9 @@
     {"format": 1, "views": [{"time": 0.0, "camera_to_world": [[...], ...], "fov": 60.0, "lighting": "sun"}, ...]}
 
 `time` [s] increases, `camera_to_world` is 4×4 with OpenCV axes in the scene's frame, `fov` [°] is the vertical angle of
-view, and `lighting` is a name or mixture as for `twin film`, or an embedding as a list of numbers, by default the first
-filmed one. Positions follow a cubic spline, rotations a spline of their own; angle of view, lighting and fog are
-interpolated linearly.
+view, and `lighting` is a name or mixture as for `twin film`, or an embedding as a list of numbers; by default it is the
+first filmed lighting. Positions follow a cubic spline, rotations a spline of their own; angle of view, lighting and fog
+are interpolated linearly.
 """
 
 from collections.abc import Callable, Sequence
@@ -71,7 +71,7 @@ class CameraPath:
         knots = np.array([view.time for view in self.views]) - self.views[0].time
         poses = np.array([view.camera_to_world for view in self.views])
         t = np.clip(times, 0.0, knots[-1])
-        # The cubic spline is smooth; two views, or a standstill, must not swing out.
+        # A cubic spline would overshoot at a standstill. With one, or with only two views, a monotone one is used.
         still = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).min() < 1e-6
         curve = PchipInterpolator if still or len(knots) == 2 else CubicSpline
         out = np.tile(np.eye(4), (len(t), 1, 1))
@@ -121,7 +121,7 @@ def named_lighting(field: BakedField, name: str) -> EpisodeLighting:
 
 
 def _view_row(view: KeyView) -> dict[str, Any]:
-    # Names have no blanks; that of a sampled lighting has.
+    # The name of a sampled lighting has a blank; names and mixtures of the field's lightings have none.
     named = None if " " in view.lighting.name else view.lighting.name
     return {
         "time": view.time,
@@ -174,7 +174,7 @@ def write_path_film(
         picture: Renders the scene; robot and obstacles are left out.
         size: Width, height [px]; even.
         fps: Frames per second.
-        on_frame: Called with the numbers of written and of all frames; may raise to stop, and no file is left.
+        on_frame: Called with the numbers of written and of all frames; if it raises, no file is left.
     """
     views = path.at(path_frames(path, fps))
     with VideoWriter(out, size, fps, _CRF) as writer:

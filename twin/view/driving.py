@@ -1,8 +1,8 @@
 """Driving in the page: the Husky in the scene's own environment, stepped in real time by keys, a policy or a script.
 
-Two environments share one set of obstacles, which may be added, moved and removed at any time. By keys the robot may
-reverse and go anywhere, and contacts are only told; a policy or the scripted driver drives a *task* of the scene, which
-ends as it does in `twin validate`.
+Two environments share one set of obstacles, which may be added, moved and removed at any time. Driven by keys, the
+robot may reverse and go anywhere, and contacts are only reported. A policy or the scripted driver drives a *task* of
+the scene, which ends as it does in `twin validate`.
 """
 
 import copy
@@ -33,11 +33,11 @@ from twin.view.scene_picture import ObjectState
 
 KEYS_DRIVER, SCRIPTED_DRIVER = "keys W A S D", "scripted driver"
 
-_PER_KIND = 4  # obstacles of each kind that may stand at once
-_REACH = 25.0  # [m] beside the route, within which solid parts stop the robot when driven by keys
+_PER_KIND = 4  # obstacles of each kind that may be added to those of scene.toml
+_REACH = 25.0  # [m] beside the route; within it, solid parts stop a robot that is driven by keys
 _LONG = 1e6  # [s] time limit of a drive by keys
-_MAX_LAG = 0.5  # [s] behind real time that is caught up; more is dropped
-_POSE_STEPS = 12  # of the search for station and lateral of a point
+_MAX_LAG = 0.5  # [s] largest lag behind real time that is caught up; the rest is dropped
+_POSE_STEPS = 12  # iterations of `station_and_lateral`
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class DriveFacts:
     """[s]"""
     base_to_world: Array
     camera_to_world: Array
-    """Of the robot's camera, OpenCV axes."""
+    """Pose of the robot's camera, OpenCV axes."""
     image: Image
     """The robot's picture, shape (h, w, 3)."""
     command: Array
@@ -76,11 +76,11 @@ class DriveFacts:
     cause: str
     """Cause of the episode's end; empty while it goes on."""
     rate: float
-    """Simulated over real time since the last steps; 1 is real time."""
+    """Simulated time over real time, averaged over the last steps."""
 
 
 class PlacedObstacles(EpisodeObstacles):
-    """The obstacles that now stand in the scene, out of a pool of each kind."""
+    """The obstacles that now stand in the scene, taken from a pool with several of each kind."""
 
     def __init__(self, world: World, segment: RouteSegment, given: tuple[ObstacleConfig, ...]) -> None:
         """`given` are those of scene.toml, which stand from the beginning."""
@@ -90,7 +90,7 @@ class PlacedObstacles(EpisodeObstacles):
         spare = [ObstacleConfig(f"added_{kind}_{k}", kind) for kind in OBSTACLE_KINDS for k in range(_PER_KIND)]
         self._pool = (*named, *spare)
         self.standing: dict[str, ObstacleConfig] = {one.name: one for one in named}
-        """By name."""
+        """The standing obstacles by name."""
 
     @property
     def pool(self) -> tuple[ObstacleConfig, ...]:
@@ -100,11 +100,11 @@ class PlacedObstacles(EpisodeObstacles):
         return tuple(self.standing.values())
 
     def free(self, kind: str) -> str | None:
-        """Name of an obstacle of a kind that does not stand; None if all do."""
+        """Name of an obstacle of a kind that does not stand in the scene; None if all of them do."""
         return next((one.name for one in self._pool if one.kind == kind and one.name not in self.standing), None)
 
     def put(self, name: str, x: float, y: float, yaw: float) -> None:
-        """Puts the obstacle of a name to x, y [m] and yaw [rad] in the world; it stands still from then on."""
+        """Puts the named obstacle at x, y [m] and yaw [rad] in the world, where it stands still."""
         mine = next(one for one in self._pool if one.name == name)
         station, lateral = station_and_lateral(self._world.route, np.array([x, y]))
         turn = np.rad2deg(yaw - float(heading_at(self._world.route, station)))
@@ -184,12 +184,12 @@ class Driving:
         Args:
             twin: A built scene with a route.
             field: Its field.
-            task: That a policy or the scripted driver drives.
+            task: The task that a policy or the scripted driver drives.
             policy: A `twin.learn.policy.Policy`, or None.
-            lighting: Of the robot's pictures.
+            lighting: Lighting of the robot's pictures.
             held: Returns the held keys.
             on_step: Called after every control step and reset, from the stepping thread.
-            seed: Of the task's episodes.
+            seed: Seed of the task's episodes.
 
         Raises:
             InputError: the scene cannot be driven, or has no such task.
@@ -249,14 +249,14 @@ class Driving:
 
     @property
     def environment(self) -> DriveEnvironment:
-        """The environment of the present driver; made when first driven."""
+        """The environment of the present driver, created when it is first needed."""
         name, factory, kind = self._drivers[self._name][1]
         if name not in self._environments:
             self._environments[name] = self._environment(factory, kind)
         return self._environments[name]
 
     def choose(self, driver: str) -> None:
-        """Another driver takes over, from the start of its task."""
+        """Switches to a driver, which begins at the start of its task."""
         with self._lock:
             self.pause()
             if driver != self._name:
@@ -273,7 +273,7 @@ class Driving:
         self._running.clear()
 
     def reset(self) -> None:
-        """Back to the start of a new episode."""
+        """Starts a new episode."""
         with self._lock:
             environment = self.environment
             self._step = environment.relight(environment.reset(), self._lighting)
@@ -286,7 +286,7 @@ class Driving:
             self.environment.pixels.set_lighting(0, lighting, fill=False)
 
     def objects(self) -> ObjectState:
-        """Where robot and obstacles are now."""
+        """The present positions of robot and obstacles."""
         with self._lock:
             return ObjectState.of(self.environment.physics.data.ptr)
 

@@ -1,12 +1,12 @@
-"""A viser server that only answers whom it should, and that hears the page's keys.
+"""A viser server that answers only authorized requests, and receives the keys that are held on its pages.
 
-viser has no access control and no key events. All its traffic, plain requests and handshakes alike, passes one hook of
-the `websockets` library, which `open_server` wraps while viser opens its port:
+viser has no access control and no key events. All its traffic, both plain requests and WebSocket handshakes, passes one
+hook of the `websockets` library. `open_server` wraps this hook while viser opens its port:
 
-*Host and origin.* Bound to this machine alone, the server answers requests for a loopback name only, so that no other
-site can point its name here (DNS rebinding); a handshake must come from a page of its own.
-*Token.* Bound to anything else, each request needs the token: once in the address, then as a cookie. Without TLS both
-can be read on the network.
+*Host and origin.* If the server is bound to this machine alone, it answers requests for a loopback name only, so that
+no other site can point its name here (DNS rebinding). A handshake must come from the server's own page.
+*Token.* If the server is bound to any other address, each request needs the token: the first one in its address, later
+ones as a cookie. Without TLS both can be read on the network.
 *Script.* The page gets `page.js`, which reports held keys to the socket `/keys` and hands dropped photos to the page.
 """
 
@@ -44,7 +44,7 @@ _KEYS_PATH = "/keys"
 _HELD_TIME = 0.35  # [s] for which a report of held keys is valid; the page repeats it every 0.1 s
 _MAX_REPORT = 200  # characters
 _STOP_TIME = 3.0  # [s]
-_PORTS = 50  # that are tried from the given one on
+_PORTS = 50  # number of ports to try, from the given one on
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 
 Check = Callable[[ServerConnection, Request], Response | None]
@@ -58,7 +58,7 @@ class HeldKeys:
         self._lock = threading.Lock()
 
     def report(self, page: int, keys: str) -> None:
-        """A page reports its held keys; none removes the page."""
+        """Stores the held keys that a page reports; without any, the page is removed."""
         with self._lock:
             self._reports.pop(page, None)
             if held := frozenset(keys) & frozenset(KEYS):
@@ -79,7 +79,7 @@ class Gate:
         self._token, self._cookie = token, f"twin_{port}"
 
     def refusal(self, request: Request) -> Response | None:
-        """The answer to a request that is not let through; None lets it through."""
+        """The answer to a request that is refused; None if the request is allowed."""
         host, origin = _header(request, "Host"), _header(request, "Origin")
         if self._token is None and (host is None or _hostname(host) not in _LOOPBACK_NAMES):
             return _plain(http.HTTPStatus.FORBIDDEN, "this page is for this machine only; see twin view --host\n")
@@ -120,7 +120,7 @@ class GuardedServer:
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def set_driving(self, driving: bool) -> None:
-        """Tells the pages whether their keys W A S D drive the robot; else they move the camera."""
+        """Tells the pages whether the keys W A S D drive the robot (True) or move the camera (False)."""
         self._driving = driving
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the server has stopped
@@ -129,7 +129,7 @@ class GuardedServer:
     def stop(self) -> None:
         with _silent():
             self.viser.stop()
-            for thread in self._threads:  # one prints when it ends
+            for thread in self._threads:  # one of them prints when it ends
                 thread.join(_STOP_TIME)
 
     async def _tell_pages(self) -> None:
@@ -153,7 +153,7 @@ class GuardedServer:
 
 
 def open_server(host: str, port: int, label: str) -> GuardedServer:
-    """Opens viser's server on a port from `port` on.
+    """Opens viser's server on the first free port from `port` on.
 
     Raises:
         InputError: an address that is not this machine's, or no free port.
@@ -191,7 +191,7 @@ def open_server(host: str, port: int, label: str) -> GuardedServer:
         with _silent():
             server.stop()
         raise RuntimeError(f"viser {viser.__version__} opens its port in another way: the page would be unguarded")
-    # Pages may ask for a public tunnel to here; nobody gets one.
+    # viser lets a page request a public tunnel to this server; such requests do nothing here.
     server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
     name = f"[{host}]" if ":" in host else host
     shown = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, name)
@@ -203,7 +203,7 @@ def open_server(host: str, port: int, label: str) -> GuardedServer:
 
 @contextlib.contextmanager
 def _wrapped_serve(wrap: Callable[[Callable[..., Any], Check], tuple[Callable[..., Any], Check]]) -> Iterator[None]:
-    """`websockets.asyncio.server.serve` wraps its handler and request check within the block."""
+    """Within the block, `websockets.asyncio.server.serve` wraps its handler and request check."""
     original: Any = websockets.asyncio.server.serve
 
     def serve(handler: Any, host: Any, port: Any, *, process_request: Check, **more: Any) -> Any:
@@ -218,7 +218,7 @@ def _wrapped_serve(wrap: Callable[[Callable[..., Any], Check], tuple[Callable[..
 
 
 def _silent() -> contextlib.redirect_stdout[io.StringIO]:
-    """viser prints a banner of its own, without the token."""
+    """Suppresses viser's own banner, whose address lacks the token."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
@@ -275,7 +275,7 @@ def _header(request: Request, name: str) -> str | None:
 
 
 def _is_handshake(request: Request) -> bool:
-    """True unless the request is a plain one; viser takes the same header for the sign of a handshake."""
+    """True for a WebSocket handshake, which viser, too, recognizes by this header."""
     return bool(request.headers.get_all("Upgrade"))
 
 

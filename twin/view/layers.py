@@ -28,10 +28,10 @@ FILMED_CAMERAS = "filmed cameras"
 PALETTE = ((255, 183, 77), (100, 181, 246), (186, 104, 200), (129, 199, 132), (229, 115, 115), (77, 208, 225))
 """Colors of the filmed lightings, in their order."""
 
-_UP = np.array([0.0, 0.0, 0.04])  # [m] lift of lines and areas above the ground, so that it does not hide them
+_UP = np.array([0.0, 0.0, 0.04])  # [m] lift of lines and areas, so that the ground does not hide them
 _GROUND_CELL, _GROUND_FACES = 0.25, 40_000
 _FRUSTUM_DEPTH = 0.2  # [m]
-_CLICK_ANGLE = 0.5  # [°] beside a frustum that still hits it
+_CLICK_ANGLE = 0.5  # [°] largest angle between a click and the frustum that it hits
 _GAMMA = 2.2
 _TRUST_STEP = 0.4  # [m] between points of the trust map
 _NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
@@ -97,7 +97,7 @@ def _has(twin: Twin, stage: str) -> bool:
 
 
 def _frustums(scene: viser.SceneApi, path: str, cameras: Cameras) -> list[viser.SceneNodeHandle]:
-    """The filmed cameras as lines, in a color per lighting: one node for all of a lighting, as hundreds are slow."""
+    """The filmed cameras as lines, in a color per lighting: one node per lighting, as hundreds of nodes are slow."""
     out: list[viser.SceneNodeHandle] = []
     for number, lighting in enumerate(dict.fromkeys(cameras.lightings)):
         segments = []
@@ -116,12 +116,12 @@ def _frustums(scene: viser.SceneApi, path: str, cameras: Cameras) -> list[viser.
 
 
 def clicked_frame(cameras: Cameras, origin: Array, direction: Array) -> int | None:
-    """Index of the frame whose camera a ray passes nearest to, in angle; None if it passes none."""
+    """Index of the frame whose camera is nearest to a ray, in angle; None if the ray passes near none."""
     ahead = cameras.positions - origin
     distance = np.linalg.norm(ahead, axis=1)
     along = ahead @ (direction / np.linalg.norm(direction))
     angle = np.arccos(np.clip(along / np.maximum(distance, 1e-9), -1.0, 1.0))
-    # The frustum, not only its tip, may be clicked.
+    # Clicks on the whole frustum count, not only those on its tip.
     angle = np.where(distance > _FRUSTUM_DEPTH, angle - np.arctan(0.5 * _FRUSTUM_DEPTH / distance), np.inf)
     best = int(np.argmin(angle))
     return best if angle[best] < np.deg2rad(_CLICK_ANGLE) else None
@@ -177,7 +177,7 @@ def _trust_map(
     heading = heading_at(world.route, along)
     left = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], -1)
     points = point_at(world.route, along) + aside[..., None] * left
-    # The route's own height is wrong beside a slope.
+    # Beside the route the ground may be higher or lower than the route.
     points[..., 2] = Ground.load(twin.scene.stage("mesh")).at(points[..., :2])
     colors = (255.0 * colormaps["viridis"](trust.ravel())[:, :3]).astype(np.uint8)
     lifted = points.reshape(-1, 3) + _UP
@@ -188,6 +188,6 @@ def _colored_mesh(
     scene: viser.SceneApi, path: str, vertices: NDArray, faces: NDArray, colors: NDArray
 ) -> viser.SceneNodeHandle:
     """A mesh with a color per vertex, uint8 (v, 3)."""
-    linear = (255.0 * (colors / 255.0) ** _GAMMA + 0.5).astype(np.uint8)  # as glTF has them
+    linear = (255.0 * (colors / 255.0) ** _GAMMA + 0.5).astype(np.uint8)  # glTF stores linear colors
     mesh = trimesh.Trimesh(vertices, faces, vertex_colors=linear, process=False)
     return scene.add_mesh_trimesh(path, mesh, **_NO_SHADOWS)

@@ -52,16 +52,16 @@ from twin.view.scene_picture import ScenePicture
 FILM_SIZE, FILM_FPS = (1280, 720), 30
 """Width, height [px] and frames per second of a path's film."""
 
-_FOV = np.deg2rad(60.0)  # vertical, of a new page's camera
+_FOV = np.deg2rad(60.0)  # [rad] vertical angle of view of a new page's camera
 _PATH_SPEED, _MIN_STEP = 1.5, 1.0  # [m/s] along a path, [s] between two key views
-_MOVED, _TURNED = 0.03, 0.02  # [m], of the look direction: more leaves the comparison with the film
-_ECHO_TIME = 1.0  # [s] in which the page answers with the camera that it was given
+_MOVED, _TURNED = 0.03, 0.02  # [m], change of the view direction; a larger movement ends the comparison with the film
+_ECHO_TIME = 1.0  # [s] within which a page reports a camera pose that the server has set
 _HISTORY = 100  # control steps in the plot of torques
 _PLOT_SIZE = 320, 150  # [px]
 _FACTS_PERIOD = 0.24  # [s] between two updates of the panel's facts
 _MAX_PHOTO = 60 << 20  # [bytes]
 _PATH_COLOR = (255, 64, 129)
-_OBSTACLE_AHEAD = 4.0  # [m] of the camera, where a new obstacle is put
+_OBSTACLE_AHEAD = 4.0  # [m] in front of the camera, where a new obstacle is put
 _FRAME_CACHE = 4
 
 
@@ -99,7 +99,7 @@ class Page:
     # ---- cameras of the pages
 
     def _set_initial_camera(self) -> None:
-        """A new page looks along the film."""
+        """A new page starts at the camera of the first filmed frame."""
         first = self.cameras.camera_to_world[0]
         camera = self.server.initial_camera
         camera.position = first[:3, 3]
@@ -128,7 +128,7 @@ class Page:
         self.loop.touch(client)
 
     def _place(self, client: viser.ClientHandle, pose: Array, fov: float, level: bool = True) -> None:
-        """Moves a page's camera; a level one keeps z up, so that its controls turn about it."""
+        """Moves a page's camera; if `level`, the page's controls turn it about the world's z axis."""
         with client.atomic():
             client.camera.up_direction = np.array([0.0, 0.0, 1.0]) if level else -pose[:3, 1]
             client.camera.position = pose[:3, 3]
@@ -140,7 +140,7 @@ class Page:
         return list(self.server.get_clients().values())
 
     def _shot(self, client: viser.ClientHandle) -> Shot:
-        """What a page shows now."""
+        """The present content of a page."""
         index, driving = self._film_index, self.driving
         film = None
         if index is not None:
@@ -188,7 +188,7 @@ class Page:
                 self.notify("That did not work", str(error), "red")
 
     def _submit(self, job: Callable[..., None], *given: Any) -> None:
-        """Runs a job after those before it; a bug's traceback is printed."""
+        """Runs a job after all earlier ones; the traceback of an unexpected error is printed."""
         self._jobs.submit(job, *given).add_done_callback(lambda future: future.cancelled() or future.result())
 
     def notify(self, title: str, body: str, color: Any = None, seconds: float | None = 12.0) -> None:
@@ -216,7 +216,7 @@ class Page:
         gui = self.server.gui
         self._light_folder = gui.add_folder("Lighting")
         with self._light_folder:
-            # The type of a handle's value lacks its setter.
+            # viser's type of a handle declares no setter of `value`.
             self._slider: Any = self._add_slider(0.0)
             button = gui.add_button("Sample a lighting", hint="one that nobody filmed but could have", order=10.0)
             self._on_click(button, lambda event: self._sample())
@@ -247,7 +247,7 @@ class Page:
                 self._on_update(box, changed)
 
     def _add_slider(self, value: float) -> viser.GuiInputHandle[float]:
-        """A slider from each lighting of the field to the next."""
+        """A slider through the field's lightings; between two of them it mixes them."""
         names = self.field.lightings
         slider = self.server.gui.add_slider(
             "lighting",
@@ -365,7 +365,7 @@ class Page:
         if self._film_index is None or self.cameras.lightings[self._film_index] != lighting:
             self._slider.value = float(self.field.lightings.index(lighting))
             self._slid()
-        self._read_frame(index)  # raises here if it cannot
+        self._read_frame(index)  # raises here if the frame cannot be read
         self._film_index, self._film_placed = index, time.monotonic()
         self._follow = None
         used = "held out: the field never saw it" if self.cameras.held_out[index] else "one that the field learned from"
@@ -376,7 +376,7 @@ class Page:
             self._place(client, pose, fov, level=False)
 
     def _listen_to_clicks(self, listen: bool) -> None:
-        """Clicks on filmed cameras are heard while they are shown."""
+        """Handles clicks on filmed cameras if `listen`, else ignores them."""
         self.server.scene.remove_click_callback()
         if listen:
             self.server.scene.on_click()(self._clicked)
@@ -476,7 +476,7 @@ class Page:
         self._show_path()
 
     def _fly(self, event: viser.GuiEvent) -> None:
-        """Moves the page's camera along the path, as time passes."""
+        """Moves the page's camera along the path in real time."""
         client, path = event.client, self.path()
         if client is not None:
             threading.Thread(target=self._fly_along, args=(client, path), daemon=True).start()
@@ -542,7 +542,7 @@ class Page:
         self.loop.touch()
 
     def no_driving(self, why: str) -> None:
-        """Says why nothing can be driven."""
+        """Shows why the scene cannot be driven."""
         self._drive_note.content = why
 
     def _choose_driver(self, driving: Driving) -> None:
@@ -686,7 +686,7 @@ def _camera_pose(client: viser.ClientHandle) -> Array:
 
 
 def slider_lighting(field: BakedField, value: float) -> EpisodeLighting:
-    """The lighting at a place of the slider: k is the k-th lighting of the field, between two it is their mixture."""
+    """The lighting at a value of the slider: at an integer k the field's k-th, between integers a mixture of two."""
     names = field.lightings
     k = min(int(value), max(0, len(names) - 2))
     share = round(value - k, 4)

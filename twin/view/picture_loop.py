@@ -1,6 +1,6 @@
 """Sends pictures to the pages: coarse ones while something moves, a fine one at rest.
 
-One thread serves all pages in turn, so pictures never queue up: what changed while one was rendered is in the next.
+One thread serves all pages in turn, so pictures never queue up: a change while one is rendered appears in the next.
 """
 
 import threading
@@ -18,13 +18,13 @@ from twin.types import Array, Image
 from twin.view.scene_picture import FreeCamera, ObjectState, ScenePicture
 
 COARSE_AREA, FINE_AREA = 320 * 180, 1280 * 720
-"""Pixels of a coarse picture, and the most of a fine one, which else has the page's size."""
+"""Most pixels of a coarse and of a fine picture; a page with fewer pixels has pictures of its own size."""
 
-_REST = 0.12  # [s] without a change, then the fine picture is rendered
-_MIN_PERIOD = 0.045  # [s] between two coarse pictures of a page; the browser needs the cores, too
+_REST = 0.12  # [s] without a change, after which the fine picture is rendered
+_MIN_PERIOD = 0.045  # [s] between two coarse pictures of a page; the browser needs CPU time, too
 _COARSE_QUALITY, _FINE_QUALITY = 80, 92
-_DEPTH_MARGIN, _DEPTH_SHARE = 0.06, 0.01  # [m], of depth: layers up to this far behind the field's surface are shown
-_MAX_DEPTH = 160.0  # [m] that viser can transmit; beyond, layers cover the picture
+_DEPTH_MARGIN, _DEPTH_SHARE = 0.06, 0.01  # [m], fraction of depth: layers at most this far behind the field are shown
+_MAX_DEPTH = 160.0  # [m] that viser can transmit; beyond it, layers are drawn over the picture
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class FilmedFrame:
 
 @dataclass(frozen=True)
 class Shot:
-    """What a page shows."""
+    """The content of a page."""
 
     camera_to_world: Array
     fov: float
@@ -50,7 +50,7 @@ class Shot:
     lighting: EpisodeLighting
     objects: ObjectState | None
     has_layers: bool
-    """Layers are shown: the picture needs its depth."""
+    """True if layers are shown, which need the picture's depth."""
     film: FilmedFrame | None = None
 
 
@@ -67,7 +67,7 @@ class PictureLoop:
     """The thread that renders and sends pictures."""
 
     def __init__(self, picture: ScenePicture, shot: Callable[[viser.ClientHandle], Shot]) -> None:
-        """`shot` says what a page shows now."""
+        """`shot` returns the present content of a page."""
         self._picture, self._shot = picture, shot
         self._pages: dict[int, _Page] = {}
         self._wake, self._lock = threading.Event(), threading.Lock()
@@ -89,7 +89,7 @@ class PictureLoop:
             self._pages.pop(client.client_id, None)
 
     def touch(self, client: viser.ClientHandle | None = None) -> None:
-        """What a page shows has changed; None: what all pages show."""
+        """Requests a new picture for a page whose content has changed; None: for all pages."""
         with self._lock:
             for page in self._pages.values():
                 if client is None or page.client is client:
@@ -124,7 +124,7 @@ class PictureLoop:
                 self._wake_within(pages, min(due))
 
     def _wake_within(self, pages: list[_Page], seconds: float) -> None:
-        """Sleeps until something changes, at most so long; a page's next coarse picture is not due earlier."""
+        """Sleeps until a change, or `seconds`; after a change, also until the next coarse picture is due."""
         if self._wake.wait(seconds):
             soonest = min((page.last + _MIN_PERIOD for page in pages), default=0.0)
             time.sleep(max(0.0, min(soonest - time.monotonic(), seconds)))
@@ -162,7 +162,7 @@ class PictureLoop:
 
 
 def picture_size(page: tuple[int, int], area: int) -> tuple[int, int] | None:
-    """Width, height [px] of a picture of a page's shape, of at most `area` pixels, even; None for a page without any.
+    """Even width and height [px] of a picture with a page's shape and at most `area` pixels; None for a tiny page.
 
     A small page has pictures of its own size.
     """

@@ -1,7 +1,7 @@
 """Pictures of a scene from a free camera: the field under a lighting, with the robot and obstacles in it.
 
-The field alone needs nothing but itself. Robot and obstacles are composited by `twin.env.compositor` once `add_objects`
-was called; they are drawn where a state of their model is given.
+Without `add_objects`, only the field is rendered. After it, `twin.env.compositor` also draws robot and obstacles in
+each picture for which an `ObjectState` with their positions is given.
 """
 
 import copy
@@ -24,8 +24,8 @@ from twin.nerf.rendering import Rendering
 from twin.types import Array, Array32
 
 _CAMERA = "view"  # name of the free camera in the model
-_MAX_COMPOSITORS = 3  # coarse, fine, and those of a page that is being resized
-_MAX_RAYS = 4  # sizes whose rays are kept
+_MAX_COMPOSITORS = 3  # for coarse and fine pictures, and for a page that is being resized
+_MAX_RAYS = 4  # cameras (size and intrinsics) whose ray lengths are kept
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class ObjectState:
 
 
 class ScenePicture:
-    """Renders a scene from free cameras, from several threads."""
+    """Renders a scene from free cameras; several threads may call it."""
 
     def __init__(self, field: BakedField) -> None:
         self.field = field
@@ -76,7 +76,7 @@ class ScenePicture:
         self._lock = threading.Lock()
 
     def add_objects(self, world: World, obstacles: tuple[ObstacleConfig, ...]) -> None:
-        """Adds the robot of a world, and obstacles, to the pictures; a state has their positions in this order."""
+        """Adds the robot of a world, and obstacles, to the pictures; an `ObjectState` lists obstacles in this order."""
         spec = episode_spec(world, 0.0, 0.0, 0.0)  # solid parts are not drawn
         add_obstacles(spec, obstacles, world)
         spec.worldbody.add_camera(name=_CAMERA)
@@ -88,7 +88,7 @@ class ScenePicture:
             self._compositors.clear()
 
     def render(self, camera: FreeCamera, lighting: EpisodeLighting, objects: ObjectState | None = None) -> Rendering:
-        """Renders one picture, with the lighting's fog; `objects` are drawn if the camera's center is its middle."""
+        """Renders one picture, with the lighting's fog; for `objects`, the principal point must be the center."""
         with self._lock:
             if objects is None or self._model is None:
                 view = Viewpoints.of(camera.camera_to_world, camera.intrinsics, camera.size)
@@ -121,7 +121,7 @@ class ScenePicture:
         return self._compositors[key]
 
     def _ray_lengths(self, camera: FreeCamera) -> Array32:
-        """Length of the rays of unit z-depth, shape (height, width)."""
+        """Length of each pixel's ray up to z-depth 1, shape (height, width)."""
         key = (*camera.size, camera.intrinsics.tobytes())
         if key not in self._rays:
             rays = unproject(pixel_grid(*camera.size), camera.intrinsics)
