@@ -219,7 +219,7 @@ def failure_summary(failures: Sequence[Failure]) -> str:
 
 
 def _main_light(lighting: str) -> str:
-    """The first filmed lighting named in a sampled one, such as sun in `training: sun 0.62, night 0.38`."""
+    """The filmed lighting with the largest weight in a sampled one: sun in `training: sun 0.62, night 0.38`."""
     _, _, mixture = lighting.partition(": ")
     return mixture.split(" ")[0] if mixture else lighting
 
