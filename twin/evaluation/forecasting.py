@@ -98,8 +98,8 @@ class TrialAllocation:
     task: str
     policies: int
     basis: str
-    """`road`: the trials are added to the real ones. `twin`: real trials of two policies are missing, so the twin's
-    rates are assumed."""
+    """`road`: the trials are added to the real ones. `twin`: fewer than two policies have real trials, so the
+    twin's rates are assumed."""
     winner_now: float | None = None
     """See `RankingConfidence.winner`."""
     order_now: float | None = None

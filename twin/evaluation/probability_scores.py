@@ -28,7 +28,7 @@ SCORE_DIFFERENCE = Statistic(
 )
 """Mean over policies of the difference of two scores, as a `Statistic` for `jackknife_interval` on a `score_pair`."""
 
-_LEAST = 0.005  # smallest probability of an outcome; predictions closer to 0 or 1 are clipped
+_LEAST = 0.005  # in log scores and recalibration, probabilities closer to 0 or 1 than this are clipped
 _RIDGE = 0.1  # weight of a recalibration's prior, which favors unchanged probabilities
 _NEWTON_STEPS = 30
 
