@@ -58,7 +58,7 @@ def align_to_log(
         target: Folder of a scene, a `robot.toml`, or `PUBLISHED_ROBOT`.
         log: See `twin.sysid.logs`.
         out: Folder for the results; by default the scene's.
-        use_slope: Use the log's accelerometer data, if there are any.
+        use_slope: Account for the ground's slope, estimated from the log's accelerations, if it has any.
 
     Raises:
         InputError: the robot is unknown, the folder is not writable, or the log is unusable.
