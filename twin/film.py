@@ -61,8 +61,7 @@ def film(
 
     Raises:
         InputError: the scene, task, policy or an option is unknown, the seed is negative, or rerun-sdk is needed but
-        not
-            installed.
+            not installed.
     """
     from twin.env.episode import record_episode
     from twin.report.episode_video import write_episode_video

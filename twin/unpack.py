@@ -140,8 +140,7 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
 
     Raises:
         InputError: an error of `read_manifest`; a file differs from its declaration; the folder exists and is not
-        empty;
-            or the pack has a policy that may run code and is not trusted.
+            empty; or the pack has a policy that may run code and is not trusted.
     """
     manifest = read_manifest(path)
     zips = [name for name in manifest["files"] if name.endswith(".zip")]
