@@ -45,7 +45,7 @@ DEFAULT_LIGHTINGS = (HELD_OUT, str(Condition(HELD_OUT, True)))
 
 _FIRST_SEED, _PER_LIGHTING, _BLOCKS = 1_000_000_000, 1_000, 900_000  # see `lighting_seeds`
 _SEARCH_SEED, _FINAL_SEED = 2_000_000, 3_000_000  # first seeds of the search for the worst lighting, and of its test
-_SEARCH_LIGHTINGS, _SEARCH_EPISODES, _SEARCH_KEPT = 16, 4, 4  # lightings, episodes in each, lightings kept: round 1
+_SEARCH_LIGHTINGS, _SEARCH_EPISODES, _SEARCH_KEPT = 16, 4, 4  # in the first round: lightings, episodes each, kept
 _MAX_PROCESSES = 1024
 
 Key = tuple[str, str, str, int]

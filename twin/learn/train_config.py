@@ -111,7 +111,8 @@ class TrainConfig:
     learning_rate: float = 5e-4
     """Largest learning rate; see `training.cycle_rate`."""
     cycle: int = 12_000
-    """Number of steps in which the learning rate falls to its lowest value; then, it starts again at the largest."""
+    """Length of a cycle of the learning rate [steps]. At its end the rate is lowest; the next cycle starts at the
+    largest rate."""
     tau: float = 0.01
     """Averaging rate of the target critics, per update."""
     shift: int = 2
