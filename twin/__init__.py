@@ -1,6 +1,6 @@
 """twin: a filmed place as a MuJoCo digital twin, in which driving policies are trained and evaluated."""
 
-# zlib before anything that may load pycolmap: the other order corrupts PNG and zlib for the whole process.
+# zlib must be imported before pycolmap; the other order corrupts zlib, and so PNG files, in the whole process.
 import zlib  # noqa: F401
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Imports public names at their first use, so that `twin --help` imports nothing heavy."""
+    """Imports a public name at its first use, so that `twin --help` imports nothing heavy."""
     if name == "__version__":
         from importlib import metadata
 
@@ -39,7 +39,7 @@ def __getattr__(name: str) -> Any:
     return value
 
 
-# For gymnasium.make("twin/Drive-v0"); imports nothing of the environment.
+# For gymnasium.make("twin/Drive-v0"); registering does not import the environment.
 gymnasium.register(
     "twin/Drive-v0", entry_point="twin.env.gym_env:DriveEnv", vector_entry_point="twin.env.gym_env:DriveVectorEnv"
 )

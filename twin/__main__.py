@@ -1,4 +1,4 @@
-"""The command `twin`, also `python -m twin`: lists the verbs, and runs one."""
+"""The command `twin`, also `python -m twin`: lists the verbs, or runs one of them."""
 
 import sys
 

@@ -6,17 +6,17 @@
     python -m twin.align husky drive.npz --out aligned
 
 From a log, system identification fits the controller's limits and latency, the servo's lag, tires, ground, center of
-mass and effective wheel radii to half of the log. The other half scores them, against a kinematic model fitted to the
-first half, too. Each value has a standard error; parameters that the log does not determine keep their values and are
-listed. Results are `robot.toml`, which the scene's next build uses, and `alignment/` with `align.json` and four
-figures.
+mass and effective wheel radii to half of the log. On the other half, the fit is scored and compared with a kinematic
+model that was also fitted to the first half. Each value has a standard error; parameters that the log does not
+determine keep their values and are listed. Results are `robot.toml`, which the scene's next build uses, and
+`alignment/` with `align.json` and four figures.
 
-A robot's bag is a log; with --camera, its pictures are a film. If the scene was built from that bag, and its only poses
-are the wheels', the poses of the pictures are used.
+A robot's bag is used as a log, or with --camera, its pictures as a film. If the scene was built from the bag, and the
+bag's only poses are wheel odometry, the camera poses of its pictures are used instead.
 
 From a film that the robot's front camera records in the built place, the camera's extrinsics (height, yaw, pitch, roll)
-are fitted, and its focal length unless `[robot] camera_intrinsics` is given. They go to the same `robot.toml`;
-`alignment/camera.png` shows the film beside the twin's images.
+are fitted, and also its focal length unless `[robot] camera_intrinsics` is given. The values are written to the same
+`robot.toml`; `alignment/camera.png` shows the film beside the twin's images.
 """
 
 import argparse
@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from twin.sysid.camera_extrinsics import CameraCalibration
 
 RESULT_FOLDER = "alignment"
-"""Folder of figures beside `robot.toml`."""
+"""Folder beside `robot.toml` for figures."""
 PUBLISHED_ROBOT = "husky"
-"""Given instead of a scene for the published robot."""
+"""Name that is given instead of a scene for the published robot."""
 _FILM_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
 _INTRINSICS_FIELDS = ("camera_intrinsics", "camera_size")
 
@@ -58,10 +58,10 @@ def align_to_log(
         target: Folder of a scene, a `robot.toml`, or `PUBLISHED_ROBOT`.
         log: See `twin.sysid.logs`.
         out: Folder for the results; by default the scene's.
-        use_slope: Use the log's accelerations, if it has any.
+        use_slope: Account for the ground's slope, estimated from the log's accelerations, if it has any.
 
     Raises:
-        InputError: unknown robot, no writable folder, or an unusable log.
+        InputError: the robot is unknown, the folder is not writable, or the log is unusable.
     """
     params, kept, folder = _robot(target)
     folder = out or folder
@@ -85,7 +85,7 @@ def align_to_log(
 
 
 def _windows(target: str, log: Path) -> Windows:
-    """The windows of a log; those of a bag that the scene was built from may use the poses of its pictures."""
+    """The windows of a log. For a bag from which the scene was built, they may use the camera poses of its pictures."""
     root = Path(target).parent if Path(target).name == "scene.toml" else Path(target)
     if not (is_bag(log) and exists(log) and SceneDir(root).config_file.exists()):
         return read_log(log)
@@ -99,7 +99,7 @@ def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalib
     """Fits the camera of a built scene's robot to a film or a bag; writes the results and returns their folder.
 
     Raises:
-        InputError: unknown scene or film, no writable folder, or an unusable film.
+        InputError: the scene or film is unknown, the folder is not writable, or the film is unusable.
     """
     from twin.sysid.camera_extrinsics import calibrate_camera, write_camera_comparison
 
@@ -129,7 +129,7 @@ def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalib
 
 
 def _robot(target: str) -> tuple[HuskyParams, dict[str, Any], Path | None]:
-    """The initial robot, the table of its robot.toml, and the folder of that file."""
+    """The initial robot parameters, the table of its robot.toml, and the folder of that file."""
     if target == PUBLISHED_ROBOT:
         return HuskyParams(), {}, None
     path = Path(target)
@@ -177,7 +177,7 @@ def summary(result: Identification) -> str:
 
 
 def _fitted(identified: dict[str, tuple[Any, Any]]) -> list[str]:
-    """Lines of the fields with value and standard error."""
+    """One line per fitted field, with its value and standard error."""
     rows = []
     for name, (value, error) in identified.items():
         text = ", ".join(f"{v:.4g}" for v in value) if isinstance(value, tuple) else f"{value:.4g}"

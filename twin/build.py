@@ -1,4 +1,4 @@
-"""Verb: turns a filmed place into a drivable twin, stage by stage, and skips stages that are up to date.
+"""Verb: builds a drivable twin of a filmed place, stage by stage; stages that are up to date are skipped.
 
     python -m twin.build SCENE [--until STAGE] [--force STAGE] [--set nerf.steps=4000] [--device cpu|cuda] [--quiet]
 
@@ -27,7 +27,7 @@ from twin.scene import SceneDir, Stamp, commit_stage, package_versions, recover_
 
 @dataclass(frozen=True)
 class Stage:
-    """A build stage and the dependencies of its result."""
+    """A build stage, and what its result depends on."""
 
     name: str
     module: str
@@ -35,7 +35,7 @@ class Stage:
     version: int
     """Incremented when a change of the code alters the result."""
     config: tuple[str, ...]
-    """Sections, or `section.key`, of `scene.toml` that the stage reads."""
+    """Sections of `scene.toml`, or single settings `section.key`, that the stage reads."""
     upstream: tuple[str, ...]
     """Stages whose results this stage reads."""
 
@@ -59,8 +59,9 @@ PIPELINE = (
 
 _ON_DEVICE = ("field", "mesh")  # stages that take a device
 _WRITTEN = ("build", "runs", "validation", "forecast", "lightings")  # folders of a scene that are never inputs
-# Durations [s] on the demo with 2 cores; only their ratios matter, since the pace of a build is measured. The remaining
-# time is shown once stages worth 30 s have run; the first stage alone is too short to estimate the pace.
+# Durations [s] for the demo with 2 cores. Only their ratios matter, since the speed of a build is measured. The
+# remaining time is shown once stages with a typical duration of 30 s have run; the first stage is too short to estimate
+# the speed.
 _TYPICAL = {"capture": 5.0, "cameras": 90.0, "metric": 1.0, "field": 280.0, "mesh": 70.0, "mjcf": 3.0, "review": 45.0}
 _LEAST_TIMED = 30.0
 
@@ -79,7 +80,7 @@ def build(
         until: Last stage to run; None = all.
         force: Stages to run again although they are up to date.
         overrides: `section.key=value` settings that take precedence over `scene.toml`.
-        device: cpu or cuda, for field and mesh; None: cuda where it is usable.
+        device: cpu or cuda, for the stages field and mesh; None: cuda if it is usable.
 
     Raises:
         InputError: bad input; earlier results stay as they are.
@@ -115,9 +116,9 @@ def build(
 
 
 def _announce(stage: Stage, done: dict[str, float], until: str | None) -> None:
-    """Logs which stage begins and, once the pace is known, how long the rest of the build takes.
+    """Logs that a stage begins and, once the speed of the build is known, the remaining time of the build.
 
-    `done` has the durations [s] of the stages that this build ran before it.
+    `done` has the durations [s] of the earlier stages that this build has run.
     """
     names = [one.name for one in PIPELINE]
     names = names[: names.index(until) + 1] if until else names
@@ -133,8 +134,8 @@ def _announce(stage: Stage, done: dict[str, float], until: str | None) -> None:
 def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
     """SHA-256 of every file of the sources, by path relative to the scene.
 
-    All files of a folder are hashed, without twin's own output. If the folder contains the scene itself, or is a posed
-    image set outside it, only the files that the build reads are hashed.
+    All files of a source folder are hashed, except twin's own output. If the folder contains the scene itself, or is a
+    posed image set outside the scene, only the files that the build reads are hashed.
 
     Raises:
         InputError: a source is missing, or neither a file nor a folder.
@@ -166,7 +167,7 @@ def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
 
 
 def _files_below(folder: Path, scene: SceneDir) -> list[Path]:
-    """The regular files below a folder, without twin's output; none if the folder contains the scene itself."""
+    """The regular files below a folder, except twin's output; none if the folder contains the scene itself."""
     root, top = scene.root.resolve(), folder.resolve()
     written = {(root / name) for name in _WRITTEN}
     if not folder.is_dir() or root.is_relative_to(top) or top in written:
@@ -185,7 +186,8 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
     for name in stage.config:
         section, _, key = name.partition(".")
         settings[name] = table[section][key] if key else table[section]
-    # Settings that were added later and have no effect are left out, so that older results stay valid.
+    # Settings that older versions did not have are left out where they have no effect, so that older results stay
+    # valid.
     for one in (settings.get("capture", {}), *settings.get("source", ())):
         for key in ("keep", "topic"):
             if key in one and not one[key]:
@@ -254,7 +256,7 @@ def _report(scene: SceneDir, config: SceneConfig, stamps: dict[str, Stamp], skip
 
 
 def publish(scene: SceneDir, report: dict[str, Any]) -> None:
-    """Writes `report.json` and, if the build is complete, `report.html` with its film beside it.
+    """Writes `report.json` and, if the build is complete, `report.html` and the review film.
 
     Adds `truth` (the comparison with the ground truth, if there is one) and `cautions` to the report.
     """

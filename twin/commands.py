@@ -1,13 +1,13 @@
 """The command line of every verb: `twin VERB`, also `python -m twin.VERB`.
 
-Only options are defined here, so that help appears at once; a verb's module is imported when its work begins.
+Only options are defined here, so that `--help` is fast; a verb's module is imported when the verb runs.
 
 | exit status | meaning |
 |---|---|
 | 0 | done |
 | 1 | a bug: a traceback |
-| 2 | bad input, or the machine refuses (disk full, no permission): one line with the cause and the cure |
-| 128 + n | stopped by signal n (SIGINT, SIGTERM, SIGHUP): one line; running the same command again continues |
+| 2 | bad input, or an error of the operating system (disk full, no permission): one line with cause and cure |
+| 128 + n | stopped by signal n (SIGINT, SIGTERM, SIGHUP): one line; the same command, run again, continues |
 """
 
 import argparse
@@ -32,7 +32,7 @@ from twin.scene import STAGES
 _FULL = "free some space and run it again"
 _DENIED = "make it readable and writable, or choose another place"
 _CURES = {
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _FULL),  # EFBIG: a limit on the size of files
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _FULL),  # EFBIG: a file exceeds the size limit
     **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), _DENIED),
     **dict.fromkeys((errno.EEXIST, errno.ENOTEMPTY), "move it away"),
     errno.ENOENT: "put it there, or correct the path",
@@ -53,15 +53,15 @@ class Verb:
     define: Callable[[argparse.ArgumentParser], None]
     """Adds the verb's description and options to a parser."""
     module: str
-    """Module whose function `command` does the work, given the parsed options."""
+    """Module whose function `command` runs the verb with the parsed options."""
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line."""
+    """An argument parser that prints errors as one line."""
 
     def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
         if action.option_strings and action.nargs is None and arg_strings == ["--"]:
-            # argparse would take the value of --option=-- for the end of the options, and return an empty list.
+            # For --option=--, argparse would treat the value as the end of the options and return an empty list.
             raise argparse.ArgumentError(action, "expected one argument")
         return super()._get_values(action, arg_strings)
 
@@ -70,7 +70,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class _Help(argparse.HelpFormatter):
-    """Shows the default of every option that has one, and keeps the line breaks of an epilog."""
+    """Adds an option's default to its help, and keeps the line breaks of an epilog."""
 
     def _get_help_string(self, action: argparse.Action) -> str:
         text, value = action.help or "", action.default
@@ -86,7 +86,10 @@ class _Help(argparse.HelpFormatter):
 
 
 def main(verb: str, arguments: list[str] | None = None) -> int:
-    """Runs a verb (a key of `VERBS`) with the given arguments, or those of the process; returns the exit status."""
+    """Runs a verb (a key of `VERBS`) with the given arguments; returns the exit status.
+
+    By default, the arguments are those of the process.
+    """
 
     def work(options: argparse.Namespace) -> None:
         importlib.import_module(VERBS[verb].module).command(options)
@@ -115,9 +118,9 @@ def run(
             sys.stdout.flush()
     except InputError as error:
         return print_error(error)
-    except BrokenPipeError:  # the reader of our output has gone
+    except BrokenPipeError:  # the program that read the output has ended
         with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the exit would report an error
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that exiting raises no second error
         return 128 + int(signal.SIGPIPE)
     except MemoryError as error:
         return print_error(f"out of memory ({error}); close other programs, or ask for less at once")
@@ -131,9 +134,9 @@ def run(
 
 
 def _describe(error: OSError) -> str:
-    """The operation that the machine refused, and the cure if one is known."""
+    """The message for an error of the operating system: file, error, and the cure if one is known."""
     number = error.errno
-    if number is None and "requested and" in str(error):  # NumPy's error for a write that was cut short
+    if number is None and "requested and" in str(error):  # NumPy's error if a file could not be written completely
         number = errno.ENOSPC
     what = os.strerror(number) if number else str(error)
     where = f"{error.filename2 or error.filename}: " if error.filename else ""
@@ -599,4 +602,4 @@ VERBS = {
     "forecast": Verb("predict success on the real road from success in the twin", _forecast, "twin.forecast"),
     "reality": Verb("a generated place whose truth is known: film it, drive in it", _reality, "twin.reality.__main__"),
 }
-"""In the order in which a user meets them."""
+"""The verbs, in the order in which a user needs them."""

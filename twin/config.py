@@ -1,8 +1,8 @@
 """Settings of `scene.toml`: one frozen dataclass per stage, with units, ranges and defaults; read by `config_file.py`.
 
-A *source* is one film (or photo folder, or posed image set) under one *lighting*. Several sources may share a lighting.
-With values outside their ranges a stage, often minutes into a build, runs out of memory, fails in its arithmetic or
-never ends.
+A *source* is one film (or bag, photo folder, or posed image set) under one *lighting*. Several sources may share a
+lighting. Ranges are checked before a build, since with values outside them a stage may run out of memory, fail in its
+arithmetic or never end.
 """
 
 from dataclasses import dataclass, field
@@ -12,16 +12,17 @@ from twin.robot import HuskyParams
 from twin.types import Range
 
 TRAINING, HELD_OUT, ANY = "training", "held-out", "any"
-"""Given in place of a lighting's name to sample one per episode; see `twin/env/episode_lighting.py`."""
+"""Names that stand for a lighting sampled for each episode; see `twin/env/episode_lighting.py`."""
 RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
 """Not allowed as names of lightings."""
 RANDOMIZED = "+randomised"
-"""Suffix of randomized conditions in tables, see `Condition`; not allowed at the end of a lighting's name."""
+"""Suffix of randomized conditions in tables, see `Condition`; the name of a lighting must not end with it."""
 
 CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
-"""Causes of an episode's or trial's end, in the order of tables; judges decide which one takes precedence."""
+"""Causes for which an episode or trial ends, in the order of tables. If several apply, the code that judges the episode
+decides which one counts."""
 TWIST, STEERING = "twist", "steering"
-"""Kinds of a policy's actions: speed and yaw rate, or the yaw rate at a fixed speed."""
+"""Kinds of actions of a policy: `twist` is speed and yaw rate, `steering` is the yaw rate at a fixed speed."""
 
 KINDS = ("auto", "video", "bag", "images", "colmap", "transforms")
 MAPPERS = ("auto", "global", "incremental")
@@ -60,12 +61,13 @@ MARKER_FAMILIES = {
 
 @dataclass(frozen=True)
 class Condition:
-    """Condition of an episode. Tables write it as `night` or `night+randomised`; only this class converts that text."""
+    """Condition of an episode. In tables it is a text such as `night` or `night+randomised`; only this class parses and
+    writes that text."""
 
     lighting: str
     """A name, a mixture, or one of `RESERVED_LIGHTINGS`; see `twin/env/episode_lighting.py`."""
     randomised: bool = False
-    """Robot, weather and distractor objects are randomized; see `twin/env/domain_randomization.py`."""
+    """True if robot, weather and distractor objects are randomized; see `twin/env/domain_randomization.py`."""
 
     @staticmethod
     def parse(text: str) -> "Condition":
@@ -78,7 +80,7 @@ class Condition:
 
 @dataclass(frozen=True)
 class CalibrationConfig:
-    """A calibrated camera, held fixed in structure from motion. Lengths [px] at `width` × `height`."""
+    """A calibrated camera, held fixed in structure from motion. Lengths are in pixels of `width` × `height` images."""
 
     model: str = "PINHOLE"
     """A COLMAP camera model: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE, ..."""
@@ -93,24 +95,24 @@ class SourceConfig:
     """One film, bag, photo folder or posed image set under one lighting."""
 
     path: str = ""
-    """Video file, robot's bag, image folder, COLMAP model folder or transforms.json, relative to the scene folder."""
+    """Path of a video, robot's bag, image folder, COLMAP model or transforms.json, relative to the scene folder."""
     lighting: str = ""
     """Name of the lighting, not one of `RESERVED_LIGHTINGS`; by default the file's stem."""
     kind: str = "auto"
     """auto, video, bag, images, colmap or transforms."""
     topic: str = ""
-    """The pictures' topic in a bag; by default the one with most pictures."""
+    """Topic of the pictures in a bag; by default the one with most pictures."""
     images: str = ""
-    """Image folder of a COLMAP model or transforms.json, if not beside it."""
+    """Image folder of a COLMAP model or transforms.json, if it is not beside that."""
     mask: str = ""
     """One static mask image, or a folder of masks named like the frames; 0 = ignore."""
     camera: CalibrationConfig | None = None
-    """Known intrinsics, held fixed; by default those of a bag's camera_info. Calibrate if possible: forward motion
-    biases self-calibration."""
+    """Known intrinsics, held fixed; for a bag, by default those of its camera_info. Calibrate the camera if possible,
+    since forward motion biases self-calibration."""
     camera_height: Annotated[float, Range(0)] = 0.0
     """Height of this source's lens above the ground [m], if sources differ; 0 = `metric.camera_height`."""
     keep: tuple[tuple[float, ...], ...] = ()
-    """Segments of this film that are used; replaces `capture.keep`."""
+    """Segments of this film that are used, instead of those in `capture.keep`."""
 
 
 @dataclass(frozen=True)
@@ -118,11 +120,12 @@ class CaptureConfig:
     """Selection of frames."""
 
     frames: Annotated[int, Range(0)] = 0
-    """Number of frames to keep per source: the sharpest of each of that many equal time slots; 0: use `fps`."""
+    """Number of frames to keep per source: the film is divided into as many equal time slots, and the sharpest frame of
+    each is kept. 0: use `fps`."""
     fps: Annotated[float, Range(0.001, 1000)] = 2.0
-    """Frames to keep per second of video, if `frames` is 0."""
+    """Number of frames to keep per second of video, if `frames` is 0."""
     max_frames: Annotated[int, Range(2)] = 300
-    """Upper bound per source."""
+    """Largest number of frames per source."""
     max_size: Annotated[int, Range(64)] = 1280
     """Longer side of a kept frame [px], at least 64 for enough features; larger images are scaled down."""
     held_out_every: Annotated[int, Range(2)] = 8
@@ -131,7 +134,8 @@ class CaptureConfig:
     """Segments of every film that are used, [[from, to], ...] in seconds from its first frame, ends included, ordered
     and disjoint; empty = all. Photos need timestamps."""
     min_motion: Annotated[float, Range(0)] = 1.0
-    """Frames with less motion since the last kept one [px, median optical flow at 320 px width] are dropped."""
+    """Frames that moved less than this since the last kept frame are dropped [px of median optical flow, at a width of
+    320 px]."""
 
 
 @dataclass(frozen=True)
@@ -139,17 +143,17 @@ class CamerasConfig:
     """Structure from motion."""
 
     features: Annotated[int, Range(1, 1_000_000)] = 3000
-    """Upper bound of SIFT features per frame."""
+    """Largest number of SIFT features per frame."""
     max_feature_size: Annotated[int, Range(64, 100_000)] = 1280
     """Longer side of the image for feature detection [px]."""
     mapper: str = "auto"
     """auto (global, then incremental), global or incremental."""
     min_registered: Annotated[float, Range(0, 1)] = 0.6
-    """Fraction of frames that must register, or the stage fails."""
+    """Fraction of frames that must be registered; otherwise the stage fails."""
     max_outlier: Annotated[float, Range(0.001)] = 0.3
     """Distance from the path through its neighbors beyond which a frame is an outlier [median steps of the film]."""
     free_focal: bool = False
-    """Ignore given calibrations and self-calibrate (for comparison; a calibrated camera is better)."""
+    """Ignore given calibrations, and self-calibrate. This is for comparisons; a calibrated camera is better."""
 
 
 @dataclass(frozen=True)
@@ -207,8 +211,8 @@ class NerfConfig:
     """The radiance field and its training; the defaults are those of quality "standard"."""
 
     quality: str = "standard"
-    """"draft", "standard" or "high": sets those of `steps`, `bake_steps`, `detail_passes` and `max_width` that are not
-    given, see `QUALITIES`."""
+    """"draft", "standard" or "high": sets `steps`, `bake_steps`, `detail_passes` and `max_width` unless they are given,
+    see `QUALITIES`."""
     steps: Annotated[int, Range(1)] = 2000
     rays: Annotated[int, Range(1, 2**20)] = 4096
     """Rays per step."""
@@ -220,19 +224,20 @@ class NerfConfig:
     stereo: bool = True
     """Supervise depth from stereo between frames in addition to the sparse points."""
     bake_steps: Annotated[int, Range(1)] = 600
-    """Fine-tuning steps of the baked field, which renders images."""
+    """Number of fine-tuning steps of the baked field, which renders the images."""
     detail_passes: Annotated[float, Range(0, 100)] = 2.0
-    """How often each training pixel on a near surface is used to fit the detail that bricks lack; 0 = no detail."""
+    """How often each training pixel on a near surface is used to fit details that are too fine for bricks; 0 = no
+    detail."""
     max_bricks: Annotated[int, Range(100)] = 9000
-    """Largest number of bricks (blocks of 8 × 8 × 8 cells with 8-bit samples) of the baked field, which determines the
-    cell size; 9,000 take about 105 MB. It is raised by a factor of 1.39 (146 MB) if cells would exceed 15 cm. Fewer
-    than 100 do not cover even the coarsest far grid."""
+    """Largest number of bricks (blocks of 8 × 8 × 8 cells with 8-bit samples) of the baked field. It determines the
+    cell size; 9,000 bricks take about 105 MB. It is raised by a factor of 1.39 (146 MB) if cells would exceed 15 cm.
+    Fewer than 100 bricks do not cover even the coarsest far grid."""
     max_width: Annotated[int, Range(32)] = 480
     """Longer side of training images [px]."""
     refine_cameras: bool = False
-    """Refine camera poses while training, if they are less accurate than the images. The field and its scores use the
-    refined poses; report images and `twin.relight` use the original ones, which differ from them by the report's
-    `field.cameras_moved`."""
+    """Refine camera poses while training; useful if the poses are less accurate than the images. The field and its
+    scores use the refined poses; report images and `twin.relight` use the original ones. `field.cameras_moved` in the
+    report is the difference."""
     learning_rate: Annotated[float, Range(1e-6, 1)] = 3e-2
     appearance_dim: Annotated[int, Range(1, 1024)] = 32
     levels: Annotated[int, Range(1, 32)] = 8
@@ -248,7 +253,7 @@ QUALITIES: dict[str, dict[str, int | float]] = {
     "standard": {},
     "high": {"steps": 8000, "bake_steps": 3000, "detail_passes": 4.0, "max_width": 640},
 }
-"""Settings of `NerfConfig` by quality, where they differ from the defaults."""
+"""For each quality, the settings of `NerfConfig` that differ from the defaults."""
 
 
 @dataclass(frozen=True)
@@ -264,15 +269,15 @@ class MeshConfig:
     obstacle_height: Annotated[float, Range(0)] = 0.2
     """Height above the ground from which geometry is an obstacle [m]."""
     max_height: Annotated[float, Range(0.1, 100)] = 2.5
-    """Height at which obstacles are cut off, above the robot's reach [m]."""
+    """Height above the ground at which obstacles are cut off; choose it above the robot's reach [m]."""
     max_parts: Annotated[int, Range(0)] = 2000
-    """Upper bound of convex parts."""
+    """Largest number of convex parts."""
     max_protrusion: Annotated[float, Range(0.01)] = 0.2
-    """Upper bound of a convex part's protrusion from its mesh [m]."""
+    """Protrusion of a convex part from its mesh, above which the part is split [m]."""
     margin: Annotated[float, Range(1, 1000)] = 12.0
     """Distance from the route within which the place is meshed [m]."""
     views: Annotated[int, Range(1)] = 100
-    """Upper bound of filmed poses from which depth is rendered for surface and ground."""
+    """Largest number of filmed poses at which depth is rendered for surface and ground."""
     view_width: Annotated[int, Range(8, 4096)] = 200
     """Width of these renderings [px]."""
 
@@ -284,11 +289,11 @@ class RouteConfig:
     passes: tuple[str, ...] = ()
     """Passes in driving order, such as "noon:2", or "noon" for the longest one of that source; see the report."""
     points: tuple[tuple[float, ...], ...] = ()
-    """Way points [x, y] [m] instead of passes, in the frame of the report's map, at most 1 m off what was filmed."""
+    """Way points [x, y] [m] instead of passes, in the frame of the report's map, at most 1 m from the filmed paths."""
     reverse: bool = False
-    """Drive against the filmed direction. The camera then looks where nobody filmed."""
+    """Drive against the filmed direction. The robot's camera then shows views that were not filmed."""
     max_gap: Annotated[float, Range(0, 50)] = 5.0
-    """Longest unfilmed way between two passes that are joined [m]."""
+    """Longest distance that was not filmed between two passes that are joined [m]."""
 
 
 @dataclass(frozen=True)
@@ -300,9 +305,9 @@ class MjcfConfig:
     half_width: Annotated[float, Range(0.1, 100)] = 1.0
     """Half width of the drivable corridor around the route [m]."""
     hfield_cell: Annotated[float, Range(0.01, 10)] = 0.3
-    """Cell of the collision height field [m], a multiple of `mesh.ground_cell`. A wheel on an edge between cells
-    touches several facets, so smaller cells cause more vibration and cost more; the ground is smoothed to this scale
-    (`mesh.ground_smoothing`)."""
+    """Cell size of the collision height field [m], a multiple of `mesh.ground_cell`. A wheel on an edge between cells
+    touches several facets, so smaller cells cause more vibration, and they take more time. They would not show more
+    detail, since the ground is smoothed to about this scale (`mesh.ground_smoothing`)."""
     corridor_margin: Annotated[float, Range(0, 100)] = 0.0
     """Extra clearance between the corridor and convex parts [m]."""
 
@@ -319,7 +324,8 @@ class ReviewConfig:
     render_width: Annotated[int, Range(1, 4096)] = 224
     """Longer side of renderings of the radiance field [px]; they are scaled up to the panel."""
     renders: Annotated[int, Range(0)] = 120
-    """Number of renderings of the radiance field in the film; more give a smoother film and a longer build."""
+    """Number of renderings of the radiance field in the film; more renderings make the film smoother and the build
+    longer."""
 
 
 OBSTACLE_KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")
@@ -344,9 +350,9 @@ class ObstacleConfig:
     speed: float = 1.2
     """Speed if it moves [m/s]."""
     delay: float = 0.0
-    """Time for which it has been moving when the episode begins [s]."""
+    """Time for which it has already been moving when the episode begins [s]."""
     color: tuple[float, ...] = ()
-    """Main color as red, green, blue, 0 to 1; by default that of its kind."""
+    """Main color as red, green, blue, each from 0 to 1; by default the color of its kind."""
     size: tuple[float, ...] = ()
     """Length, width, height of a box [m]."""
 
@@ -359,7 +365,7 @@ class TaskConfig:
     start: float = 0.0
     """Arc length on the route where it starts [m]."""
     length: float = 0.0
-    """[m]"""
+    """Length of the segment [m]."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Reads and checks `scene.toml` and `robot.toml` into the dataclasses of `config.py`.
 
-An *override* is a command-line setting `section.key=value`, which replaces that of the file. An unknown key is an error
-that suggests the nearest valid name; otherwise a typo would silently become a default.
+An *override* is a setting `section.key=value` of the command line, which replaces that of the file. An unknown key is
+an error that suggests the nearest valid name; if unknown keys were ignored, a misspelled setting would silently have
+its default.
 """
 
 import dataclasses
@@ -39,7 +40,7 @@ from twin.types import Range, setting_ranges
 ROBOT_TOML = "robot.toml"
 
 MAX_NAME = 80
-"""Upper bound of characters of a name that becomes part of a file name."""
+"""Largest number of characters in a name that becomes part of a file name."""
 _SECTIONS = ("capture", "cameras", "metric", "nerf", "mesh", "route", "mjcf", "review")
 
 
@@ -47,7 +48,7 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
     """Reads `scene.toml` and, for `[robot]`, the `robot.toml` beside it; applies `section.key=value` overrides.
 
     Raises:
-        InputError: no such file, wrong TOML, unknown key, wrong type, or a value out of range.
+        InputError: no such file, invalid TOML, unknown key, wrong type, or a value out of range.
     """
     table = _read_table(path)
     if table is None:
@@ -70,7 +71,7 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
 
 
 def read_robot(path: Path) -> dict[str, Any]:
-    """The checked table of a `robot.toml`; empty if there is no such file. Raises InputError."""
+    """The table of a `robot.toml`; empty if there is no such file. Raises InputError for an invalid table."""
     table = _read_table(path) or {}
     parse_table(HuskyParams, table, str(path))
     return table
@@ -82,7 +83,7 @@ def merge_robot(robot: dict[str, Any], by_hand: dict[str, Any], where: str) -> d
     `camera_intrinsics` and `camera_size` belong together: both come from the table that has the intrinsics.
 
     Raises:
-        InputError: `by_hand` has the size and `robot` the intrinsics; `where` opens the message.
+        InputError: `by_hand` has the size, but only `robot` has the intrinsics. The message begins with `where`.
     """
     if "camera_intrinsics" in by_hand:
         robot = {name: value for name, value in robot.items() if name != "camera_size"}
@@ -112,7 +113,7 @@ def _apply_override(table: dict[str, Any], override: str) -> None:
         raise InputError(f"--set {override!r}: expected section.key=value, such as nerf.steps=4000")
     try:
         value = parse_toml(f"value = {text}", "--set")["value"]
-    except (InputError, KeyError):  # a bare word, checked as a string
+    except (InputError, KeyError):  # a word without quotes, which is taken as a string
         value = text
     for name in names[:-1]:
         table = table.setdefault(name, {})
@@ -122,7 +123,7 @@ def _apply_override(table: dict[str, Any], override: str) -> None:
 
 
 def parse_table(kind: type, table: Any, where: str) -> Any:
-    """Converts a TOML table to the frozen dataclass `kind`, checked key by key. Raises InputError."""
+    """Converts a TOML table to the frozen dataclass `kind`. Raises InputError for an unknown key or a wrong type."""
     if not isinstance(table, dict):
         raise InputError(f"{where}: expected a table, got {short_repr(table)}")
     hints = typing.get_type_hints(kind)
@@ -162,7 +163,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
 
 
 def _check(config: SceneConfig, folder: str) -> None:
-    """Raises InputError for settings that a stage could not work with, before the build begins."""
+    """Raises InputError for invalid settings, so that no stage fails on them during the build."""
     _require(config.source, "no [[source]] given; add one per film, with path = and lighting =")
     for source in config.source:
         _check_source(source)
@@ -236,7 +237,7 @@ def _check_source(source: SourceConfig) -> None:
 
 
 def check_lighting(name: str, what: str) -> None:
-    """Raises InputError for a name that a lighting cannot have; `what` opens the message."""
+    """Raises InputError for a name that is not allowed for a lighting; the message begins with `what`."""
     _require(
         not set(name) & set(":/") and not name.endswith(RANDOMIZED),
         f"{what} = {name!r}: ':', '/' and '{RANDOMIZED}' are reserved; choose a plain name",

@@ -3,8 +3,8 @@
     python -m twin.drive demo
     python -m twin.drive scenes/demo --policy first --lighting night --view
 
-The policy that came with a pack drives, or the only run of a scene, on the task of its training; without one, the
-scripted driver. `twin.film` has more options.
+By default, the driver is the first policy in a pack, or the policy of a scene's only run, on the task of its training;
+if there is no such policy, it is the scripted driver. `twin.film` has more options.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from twin.unpack import SUFFIX, packed_policies
 
 
 def chosen_policy(twin: Twin, name: str | None) -> str | None:
-    """The policy that drives: the one named, else the first of the pack, else the only run; None: scripted."""
+    """The policy that drives: the one named, else the first in the pack, else the only run; None: scripted driver."""
     root = twin.scene.root
     if name is None:
         runs = sorted(path.parent.name for path in root.glob(f"runs/*/{JSON}"))
@@ -31,7 +31,7 @@ def chosen_policy(twin: Twin, name: str | None) -> str | None:
 
 
 def chosen_task(twin: Twin, name: str | None, policy: str | None, trust: bool) -> str:
-    """The task: the one named, else that of the policy's training if the scene has it, else the scene's first."""
+    """The task: the one named, else that of the policy's training if the scene has it, else the scene's first task."""
     tasks = scene_tasks(twin.world(), load_config(twin.scene.config_file).task)
     if name is None and policy is not None:
         name = load_policy(find_policy(twin.scene.root, policy), trust).trained.get("task")

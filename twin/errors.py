@@ -1,4 +1,4 @@
-"""`InputError`, raised for wrong input as opposed to bugs, and helpers for short error messages."""
+"""`InputError`, which is raised for wrong input (not for bugs), and helpers for short error messages."""
 
 import contextlib
 import re
@@ -6,11 +6,11 @@ import sys
 from collections.abc import Iterable
 from typing import Any
 
-_MAX_VALUE = 80  # characters of a value in a message
-_MAX_WORD = 300  # characters of a word, such as a path
-_MAX_MESSAGE = 1500  # characters of a message
+_MAX_VALUE = 80  # largest number of characters of a value in a message
+_MAX_WORD = 300  # largest number of characters of a word, such as a path
+_MAX_MESSAGE = 1500  # largest number of characters of a message
 _LONG_VALUES = (
-    # In quotes; an apostrophe within a word is no quote.
+    # Values in quotes; an apostrophe within a word does not count as a quote.
     re.compile(rf"(?<!\w)'([^']{{{_MAX_VALUE - 3}}})[^']{{4,}}'(?!\w)"),
     re.compile(rf'(?<!\w)"([^"]{{{_MAX_VALUE - 3}}})[^"]{{4,}}"(?!\w)'),
 )
@@ -19,15 +19,16 @@ _LONG_WORD = re.compile(rf"(\S{{{_MAX_WORD - 63}}})\S{{4,}}(\S{{60}})")
 
 
 class InputError(ValueError):
-    """Wrong input: one line with the value, the expectation and the cure. Verbs print it and exit with status 2."""
+    """Wrong input. The message is one line with the value, what was expected, and the cure. Verbs print it and exit
+    with status 2."""
 
     def __init__(self, message: object = "") -> None:
         super().__init__(shortened(str(message)))
 
 
 def shortened(message: str) -> str:
-    """A message as one line of printable characters, with long quoted values, numbers and words cut."""
-    if len(message) > 2 * _MAX_MESSAGE:  # before the patterns: a value may have megabytes
+    """A message as one line of printable characters, in which long quoted values, numbers and words are cut."""
+    if len(message) > 2 * _MAX_MESSAGE:  # first, since the patterns would be slow on values of megabytes
         message = f"{message[:_MAX_MESSAGE]}...{message[-_MAX_MESSAGE:]}"
     message = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
     for pattern in _LONG_VALUES:
@@ -39,7 +40,7 @@ def shortened(message: str) -> str:
 
 
 def short_repr(value: Any) -> str:
-    """`repr` of a value from a file, cut at 80 characters; never raises."""
+    """`repr` of a value from a file, cut to 80 characters; a value that Python cannot print is described instead."""
     try:
         text = repr(value)
     except RecursionError:

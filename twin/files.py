@@ -1,7 +1,8 @@
 """Checked reading and atomic writing of files.
 
-Readers accept regular files only, so that none blocks on a pipe, and raise `InputError` with the file's name for any
-defect. Writers write a `.partial` file and rename it: a full disk or a kill leaves the former file unchanged.
+Readers accept regular files only, so that they never block on a pipe, and raise `InputError` with the file's name for
+any defect. Writers write a `.partial` file and rename it, so if the disk is full or the process is killed, the old file
+remains unchanged.
 """
 
 import contextlib
@@ -30,10 +31,10 @@ from safetensors.numpy import load_file
 
 from twin.errors import InputError
 
-_MAX_TEXT = 64 << 20  # [bytes] of a JSON or CSV file
-_MAX_DIGITS = 40  # of an integer in JSON; a random generator's state has 39
-_MAX_ARRAYS = 2 << 30  # [bytes] of all arrays of a file, uncompressed
-_MAX_TOML = 4 << 20  # [bytes]
+_MAX_TEXT = 64 << 20  # [bytes] largest JSON or CSV file
+_MAX_DIGITS = 40  # largest number of digits of an integer in JSON; the state of a random generator has 39
+_MAX_ARRAYS = 2 << 30  # [bytes] largest total size of the arrays in a file, uncompressed
+_MAX_TOML = 4 << 20  # [bytes] largest TOML file
 _DEEP_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){64}""")  # 64 or more dotted parts
 _INT64_LIMIT = 2**63  # bound of TOML integers
 _FILE_KINDS = {
@@ -61,7 +62,7 @@ def regular_file(path: Path) -> Path:
 
 
 def exists(path: Path) -> bool:
-    """True if the path exists; False for an invalid file name, for which Path.exists raises."""
+    """True if the path exists; False for an invalid file name, for which Path.exists raises an error."""
     try:
         return path.exists()
     except OSError:
@@ -69,7 +70,7 @@ def exists(path: Path) -> bool:
 
 
 def is_link(path: Path) -> bool:
-    """True for a link, dangling or not; False for an invalid file name."""
+    """True for a link, even if its target is missing; False for an invalid file name."""
     try:
         return path.is_symlink()
     except (OSError, ValueError):
@@ -77,7 +78,7 @@ def is_link(path: Path) -> bool:
 
 
 def read_bytes(path: Path, most: int | None = None) -> bytes:
-    """The contents of a file. Raises InputError as `regular_file` does, or for more than `most` bytes."""
+    """The contents of a file. Raises InputError as `regular_file` does, or if there are more than `most` bytes."""
     size = regular_file(path).stat().st_size
     if most is not None and size > most:
         raise InputError(f"{path} has {size:,} bytes; expected at most {most:,}")
@@ -96,12 +97,13 @@ def read_text(path: Path, most: int = _MAX_TEXT) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file with finite numbers and integers of at most 40 digits. Raises InputError for others."""
+    """The value in a JSON file. Raises InputError for other files, for numbers that are not finite, and for integers
+    of more than 40 digits."""
     return parse_json(read_text(path), path)
 
 
 def parse_json(text: str, where: object) -> Any:
-    """The value of a JSON text, checked as by `read_json`; `where` opens the error message."""
+    """The value of a JSON text, checked as in `read_json`; error messages begin with `where`."""
     try:
         return json.loads(text, parse_int=_json_integer, parse_float=_json_float, parse_constant=_json_float)
     except RecursionError:
@@ -124,14 +126,14 @@ def _json_float(text: str) -> float:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The table in a TOML file with 64-bit integers. Raises InputError for other files."""
+    """The table in a TOML file. Raises InputError for other files, or integers that do not fit 64 bits."""
     return parse_toml(read_text(path, _MAX_TOML), path)
 
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:
-    """The table of a TOML text, checked as by `read_toml`; `where` opens the error message."""
+    """The table of a TOML text, checked as in `read_toml`; error messages begin with `where`."""
     try:
-        if _DEEP_KEY.search(text):  # tomllib's time for one is quadratic in its parts
+        if _DEEP_KEY.search(text):  # tomllib's time for such a key is quadratic in the number of its parts
             raise RecursionError
         table = tomllib.loads(text)
         _check_numbers(table)
@@ -151,9 +153,10 @@ def _check_numbers(value: Any) -> None:
 
 
 def load_arrays(path: Path, most: int = _MAX_ARRAYS) -> dict[str, NDArray]:
-    """The arrays of an npz file; nothing in it can run code.
+    """The arrays of an npz file; loading it runs no code.
 
-    Raises InputError as `regular_file` does, or for a damaged file, pickled objects, or more than `most` bytes in all.
+    Raises InputError as `regular_file` does, or for a damaged file, pickled objects, or more than `most` bytes in
+    total.
     """
     with wrap_read_errors(regular_file(path), "expected arrays as numpy.savez writes them, without pickled objects"):
         with zipfile.ZipFile(path) as archive:
@@ -167,7 +170,7 @@ def load_arrays(path: Path, most: int = _MAX_ARRAYS) -> dict[str, NDArray]:
 
 
 def _check_header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
-    """Raises ValueError if an array's header declares more data than the file has, so that it is not allocated."""
+    """Raises ValueError if an array's header declares more data than the file has, before memory is allocated."""
     if not entry.filename.endswith(".npy"):
         return
     with archive.open(entry) as file:
@@ -200,13 +203,16 @@ def load_tensors(path: Path) -> dict[str, NDArray]:
 
 
 def toml_string(text: str) -> str:
-    """A text as a basic string of TOML, with escaped special characters; lone surrogates are replaced."""
+    """Converts a text to a TOML string, with special characters escaped; lone surrogates are replaced."""
     text = text.encode("utf-8", "replace").decode("utf-8")
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def toml_value(value: Any, digits: int | None = None) -> str:
-    """A value of TOML, tables inline, lists and tuples as arrays; floats are exact, or have `digits` digits."""
+    """Converts a value to TOML: dicts to inline tables, lists and tuples to arrays.
+
+    Floats are written exactly, or with `digits` significant digits.
+    """
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple | list):
@@ -222,7 +228,10 @@ def toml_value(value: Any, digits: int | None = None) -> str:
 
 
 def check_shapes(arrays: Mapping[str, tuple[NDArray, tuple[int, ...], str]]) -> None:
-    """Raises ValueError if an array, given by name as (array, shape, dtype.kind), has another shape or kind."""
+    """Raises ValueError if an array has another shape or kind than given.
+
+    `arrays` maps each name to the array, the expected shape and the expected dtype.kind.
+    """
     for name, (array, shape, kind) in arrays.items():
         if array.shape != shape or array.dtype.kind != kind:
             raise ValueError(f"{name} is {array.dtype} {array.shape}; expected {shape} of kind {kind!r}")
@@ -254,9 +263,9 @@ def digest_json(value: Any) -> str:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path that replaces `path` when the block ends, or is removed if the block fails.
+    """Yields a temporary path that replaces `path` when the block ends, or is removed if the block fails.
 
-    It has the suffix of `path`, by which writers of films and arrays choose the format.
+    The temporary path has the suffix of `path`, by which writers of films and arrays choose the format.
     """
     partial = path.with_name(f".{path.stem[:200]}.partial{path.suffix}")
     try:
@@ -285,7 +294,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def json_bytes(value: Any) -> bytes:
-    """The file contents that `write_json` writes."""
+    """The bytes that `write_json` writes."""
     return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode("utf-8")
 
 
@@ -328,7 +337,7 @@ def remove(path: Path) -> None:
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Yields a temporary folder that becomes `path` when the block ends, or is removed if it fails."""
+    """Yields a temporary folder that becomes `path` when the block ends, or is removed if the block fails."""
     partial = path.with_name(f".{path.name[:200]}.partial")
     remove(partial)
     partial.mkdir()
@@ -339,17 +348,17 @@ def new_folder(path: Path) -> Iterator[Path]:
         remove(partial)
 
 
-# ---- paths given by users, which may be invalid
+# ---- paths that users give, which may be invalid
 
 
 def require_parent(path: Path) -> None:
-    """Raises InputError if the folder in which a path is to be written is missing."""
+    """Raises InputError if the parent folder of a path to be written is missing."""
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}; create it, or give another path")
 
 
 def require_absent(path: Path) -> None:
-    """Raises InputError if a folder to be written is there already, or its parent is not."""
+    """Raises InputError if a folder to be written exists already, or its parent folder is missing."""
     require_parent(path)
     if path.exists() or path.is_symlink():
         raise InputError(f"{path} is there already; remove it, or give another folder")
@@ -364,7 +373,7 @@ def is_file(path: Path) -> bool:
 
 
 def is_folder(path: Path, cure: str) -> bool:
-    """True for a folder, False for a regular file. Raises InputError for anything else; `cure` ends the message."""
+    """True for a folder, False for a regular file. Raises InputError for anything else, with `cure` in the message."""
     with contextlib.suppress(OSError, ValueError):  # `regular_file` raises
         if stat.S_ISDIR(path.stat().st_mode):
             return True

@@ -5,10 +5,10 @@
     python -m twin.film scenes/demo --policy first --task straight --rerun drive.rrd
     python -m twin.film scenes/demo --lerobot drives --episodes 20
 
-The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is
-scripted, or a policy that `twin.validate` accepts, in an environment with the policy's options. Task, lighting and seed
-determine the episode: those of a row of `validation/episodes.csv` reproduce it. `--rerun` also writes the drive as a
-recording of Rerun. `--lerobot` records drives as a dataset to learn from instead.
+The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is scripted,
+or a policy that `twin.validate` accepts, in an environment with the policy's options. Task, lighting and seed determine
+the episode, so those of a row of `validation/episodes.csv` reproduce its episode. `--rerun` also writes the drive as a
+recording for Rerun. With `--lerobot`, drives are recorded as a dataset for learning instead of a film.
 """
 
 import argparse
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from twin.env.drivers import Driver
     from twin.env.episode import Episode
 
-_MAX_DIGITS = 6  # of the number of obstacles
+_MAX_DIGITS = 6  # largest number of digits in --obstacles
 
 
 def film(
@@ -56,11 +56,12 @@ def film(
         out: The mp4 file; by default `films/<task>_<lighting>_<seed>.mp4` in the scene's folder, or for a pack
             `<pack>_<task>_<lighting>_<seed>.mp4` in the working folder.
         trust: Allows a policy file to run code.
-        rerun: A file for a recording of Rerun, see `twin.report.rerun_recording`; None: none.
+        rerun: A file for a Rerun recording, see `twin.report.rerun_recording`; None: no recording.
         options: See `twin.env.options.Options`; by default those of the policy.
 
     Raises:
-        InputError: an unknown scene, task, policy or option, a negative seed, or rerun-sdk is not installed.
+        InputError: the scene, task, policy or an option is unknown, the seed is negative, or rerun-sdk is needed but
+            not installed.
     """
     from twin.env.episode import record_episode
     from twin.report.episode_video import write_episode_video
@@ -76,12 +77,12 @@ def film(
     environment = load(scene, task, seed, **options)
     images: list[np.ndarray] = []
     motion: list[tuple[float, float]] = []
-    cameras: list[np.ndarray] = []  # on the robot
+    cameras: list[np.ndarray] = []  # the camera's pose on the robot
 
     def watch(step: dm_env.TimeStep) -> None:
         images.append(step.observation["pixels"][-1].copy())
         motion.append((environment.physics.speed, environment.physics.yaw_rate))
-        if not cameras:  # before the robot moves, so that the camera's latency does not matter
+        if not cameras:  # measured before the robot moves, so that the camera's latency does not matter
             cameras.append(inverse_pose(environment.physics.base_to_world) @ environment.physics.camera_to_world)
         progress.update()
 
@@ -120,10 +121,11 @@ def record_dataset(
         root, task, policy, trust, options: See `film`.
         out: The dataset's folder; must not exist.
         episodes: Number of drives, at least 1.
-        seed: Seed of the first drive; the others have the following ones, each the episode that `film` drives.
+        seed: Seed of the first drive; the other drives have the following seeds. Each is the episode that `film` drives
+            with that seed.
 
     Raises:
-        InputError: as `film`, or `out` exists, or pyarrow is not installed.
+        InputError: an error of `film`; `out` exists, or pyarrow is not installed.
     """
     from twin.env.episode import record_episode
     from twin.report.drive_dataset import DriveDataset, drive_instruction, require_pyarrow
@@ -165,7 +167,7 @@ def record_dataset(
 def _driver(
     scene: Twin, policy: str | None, seed: int, trust: bool, options: dict[str, Any]
 ) -> tuple["Driver", str, dict[str, Any]]:
-    """Driver, its name, and the environment's options: the given ones, else those of the policy."""
+    """The driver, its name, and the environment's options; given options take precedence over those of the policy."""
     from twin.env.drivers import PolicyDriver, RouteDriver
 
     if seed < 0:
@@ -214,7 +216,7 @@ def command(given: argparse.Namespace) -> None:
 
 
 def film_options(lighting: str | None) -> dict[str, Any]:
-    """Options of the environment for `--lighting`."""
+    """Options of the environment that `--lighting` determines."""
     if not lighting:
         return {}
     from twin.config import Condition
@@ -224,7 +226,7 @@ def film_options(lighting: str | None) -> dict[str, Any]:
 
 
 def summary(path: Path, episode: "Episode") -> str:
-    """One line: how the drive ended, and where its film is."""
+    """One line with the end of the drive and the path of its film."""
     return f"{episode.cause or 'cut off'} after {episode.progress[-1]:.1f} m and {episode.times[-1]:.1f} s: {path}"
 
 

@@ -2,8 +2,9 @@
 
     python -m twin.forecast SCENE [--real results.csv]
 
-reads `validation/episodes.csv` of `twin.validate` and the user's real trials, and writes `forecast.json`,
-`forecast.csv` and `forecast.html` to `<SCENE>/forecast`. Without real trials it only ranks the policies in the twin.
+This reads `validation/episodes.csv`, which `twin.validate` writes, and the user's table of real trials. It writes
+`forecast.json`, `forecast.csv` and `forecast.html` to `<SCENE>/forecast`. Without real trials, it only ranks the
+policies in the twin.
 """
 
 import argparse
@@ -26,10 +27,10 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
     Args:
         root: The scene folder.
         real: `results.csv` of real trials, if any.
-        seed: Seed of the resampling.
+        seed: Seed of the sampling from posteriors.
 
     Raises:
-        InputError: nothing has been validated, or a table is wrong; nothing is written.
+        InputError: nothing has been validated, or a table is invalid; then nothing is written.
     """
     from twin.evaluation.forecasting import make_forecast
     from twin.evaluation.training_curves import training_summaries

@@ -1,4 +1,4 @@
-"""A built scene for Python code: `twin.load_scene("scenes/demo")`."""
+"""Access to a built scene from Python: `twin.load_scene("scenes/demo")`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Twin:
-    """A built scene. Each method reads its part from disk, and raises InputError if its stage has not been built."""
+    """A built scene. Each method reads a part of it from disk, and raises InputError if that part was not built."""
 
     scene: SceneDir
 
@@ -43,9 +43,10 @@ class Twin:
         return field
 
     def radiance_field(self, device: str | None = None) -> RadianceField:
-        """The radiance field as trained, in torch: slower and slightly finer than `field`, with the same lightings.
+        """The radiance field as trained, in torch: slower and slightly more detailed than `field`, with the same
+        lightings.
 
-        `device` is cpu or cuda; None: cuda where it is usable.
+        `device` is cpu or cuda; None: cuda if it is usable.
         """
         from twin.nerf.field import RadianceField
         from twin.nerf.lightings import added_lightings
@@ -69,9 +70,9 @@ class Twin:
 
 
 def load_scene(path: str | Path) -> Twin:
-    """Opens a scene folder built by `twin.build`, or a pack of one (see `twin.unpack.open_scene`).
+    """Opens a scene folder built by `twin.build`, or a pack of a scene (see `twin.unpack.open_scene`).
 
-    Raises InputError if there is none.
+    Raises InputError if there is no scene at the path.
     """
     scene = SceneDir(open_scene(Path(path)))
     if not scene.config_file.exists():
@@ -80,7 +81,7 @@ def load_scene(path: str | Path) -> Twin:
 
 
 def load_writable(path: Path) -> Twin:
-    """Opens a scene folder to which results are added. Raises InputError as `load_scene` does, and for a pack."""
+    """Opens a scene folder to which results will be added. Raises InputError as `load_scene` does, or for a pack."""
     twin = load_scene(path)
     if twin.scene.root != path:
         raise InputError(f"{path} is a pack; unpack it where results may go: twin unpack {path} FOLDER")

@@ -2,10 +2,10 @@
 
     python -m twin.new scenes/my_road day.mp4 dusk.mp4 --camera-height 1.2
 
-writes `scenes/my_road/scene.toml` with the common settings and copies the films into `input/`;
-`python -m twin.build scenes/my_road` builds it. Of a bag (`twin.capture.bag_film`) the pictures and their calibration
-are used; its GPS and odometry become sources of scale, and its `/tf_static` gives the camera's height and, in
-`robot.toml`, its seat on the robot.
+This writes `scenes/my_road/scene.toml` with the common settings and copies the films into `input/`;
+`python -m twin.build scenes/my_road` then builds the scene. A bag (`twin.capture.bag_film`) provides pictures and their
+calibration. Its GPS and odometry become sources of scale. Its `/tf_static` gives the camera's height, and the camera's
+position and angles on the robot (its *seat*), which are written to `robot.toml`.
 
 A *posed image set* is a `transforms.json` or a COLMAP model, which refers to image files. Its *root* is the deepest
 folder that contains all of its files; they are copied with their paths relative to the root.
@@ -36,9 +36,9 @@ from twin.scene import SceneDir
 from twin.sysid.identification import toml_text
 
 _POSED = ("colmap", "transforms")
-_MIN_FIX_WAY = 20.0  # [m] between the farthest fixes: below it they tell no scale
-_MIN_ODOMETRY_WAY = 15.0  # [m]
-_SEAT_TOLERANCE = 0.02  # [m] of a camera's height by /tf_static
+_MIN_FIX_WAY = 20.0  # [m] from the first GPS fix to the farthest one; with less, GPS does not determine the scale
+_MIN_ODOMETRY_WAY = 15.0  # [m] length of the path; with less, odometry does not determine the scale
+_SEAT_TOLERANCE = 0.02  # [m] standard deviation of a camera's height that comes from /tf_static
 _SEAT_FIELDS = ("height", "offset", "yaw", "pitch", "roll")
 
 _HEAD = """\
@@ -77,17 +77,18 @@ half_width = 1.0               # half the width of the drivable corridor around 
 
 
 def new_scene(root: Path, films: list[Path], camera_height: float | None = None, topic: str = "") -> Path:
-    """Writes a scene folder: copies of the films under `input/`, `robot.toml` if a bag has the camera's seat, then
-    `scene.toml`, whose path is returned. Logs what was taken from bags, and what is wrong with films.
+    """Writes a scene folder: copies of the films in `input/`, `robot.toml` if a bag has the camera's seat, and
+    `scene.toml`. Returns the path of `scene.toml`. Logs the data found in bags, and problems with films.
 
     Args:
         root: The scene folder; created if it does not exist.
-        films: Films, bags, image folders or posed image sets; one source and one lighting each.
-        camera_height: Lens above the ground [m]; None: by a bag, or left for the user to fill in.
-        topic: Of the bags' pictures; empty: the one with most of them.
+        films: Films, bags, image folders or posed image sets. Each becomes a source with its own lighting.
+        camera_height: Height of the lens above the ground [m]; None: taken from a bag, or left to the user.
+        topic: Topic of the pictures in bags; empty: the topic with most pictures.
 
     Raises:
-        InputError: an existing scene, an unreadable film, missing images of a posed image set, or an invalid height.
+        InputError: a scene exists already, a film is unreadable, images of a posed image set are missing, or the height
+            is invalid.
     """
     scene = SceneDir(root)
     if scene.config_file.exists():
@@ -130,7 +131,7 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
 
 
 def _scale_lines(bags: list[BagContents], camera_height: float | None, seat: CameraSeat | None) -> dict[str, str]:
-    """Lines of [metric], active where the value is known."""
+    """Lines for [metric]; a line is commented out if its value is not known."""
     if camera_height is not None:
         height = f"camera_height = {camera_height:<14g} # lens above the ground [m], carried at a constant height"
     elif seat is not None:
@@ -151,7 +152,7 @@ def _scale_lines(bags: list[BagContents], camera_height: float | None, seat: Cam
 
 
 def _fix_way(bag: BagContents) -> float:
-    """Greatest distance of a bag's fixes from the first one while it films [m]."""
+    """Largest distance between the first and any other GPS fix during a bag's film [m]."""
     during = (bag.fix_times >= bag.stamps[0]) & (bag.fix_times <= bag.stamps[-1])
     fixes = np.nan_to_num(bag.fixes[during & np.isfinite(bag.fixes[:, :2]).all(1)])
     if len(fixes) < 3:
@@ -160,14 +161,15 @@ def _fix_way(bag: BagContents) -> float:
 
 
 def _odometry_way(bag: BagContents) -> float:
-    """Length of a bag's path by odometry while it films [m]."""
+    """Length of the path during a bag's film, by odometry [m]."""
     during = (bag.odometry_times >= bag.stamps[0]) & (bag.odometry_times <= bag.stamps[-1])
     some = bag.odometry[during & np.isfinite(bag.odometry).all(1)]
     return float(np.linalg.norm(np.diff(some[:: max(1, len(some) // 1000)], axis=0), axis=1).sum())
 
 
 def _write_seat(path: Path, seat: CameraSeat, bag: BagContents) -> bool:
-    """Writes `robot.toml` with the camera's seat; False if it is none of a Husky's camera. Keeps an existing file."""
+    """Writes `robot.toml` with the camera's seat, unless the file exists. Returns False if the seat is out of the
+    ranges for a Husky."""
     fields = {f"camera_{name}": getattr(seat, name) for name in _SEAT_FIELDS}
     try:
         parse_table(HuskyParams, {k: list(v) if isinstance(v, tuple) else v for k, v in fields.items()}, str(path))
@@ -180,7 +182,7 @@ def _write_seat(path: Path, seat: CameraSeat, bag: BagContents) -> bool:
 
 
 def _taken(bag: BagContents) -> str:
-    """Lines on what a bag gave."""
+    """Text that lists the data found in a bag."""
     rate = (len(bag.stamps) - 1) / max(bag.duration, 1e-9)
     lines = [
         f"{bag.path.name}: {len(bag.stamps)} pictures of {bag.topics['pictures']}, {bag.size[0]}x{bag.size[1]} "
@@ -208,7 +210,8 @@ def _taken(bag: BagContents) -> str:
 
 
 def _import_film(film: Path, inputs: Path) -> Path:
-    """Copies a film, folder or posed image set to `input/`, unless it is there already; returns its relative path."""
+    """Copies a film, folder or posed image set to `input/`, unless it is there already; returns its path relative to
+    `input/`."""
     film, inputs = (Path(os.path.normpath(path.absolute())) for path in (film, inputs))
     if film.is_relative_to(inputs):
         return film.relative_to(inputs)
@@ -221,7 +224,7 @@ def _copy_film(film: Path, inputs: Path) -> Path:
     while copy.exists() and not _is_same(film, copy):
         copy, number = inputs / f"{film.stem}_{number}{film.suffix}", number + 1
     if not copy.exists():
-        aside = copy.with_name(copy.name + ".partial")  # so that an interrupted copy is not taken for a film
+        aside = copy.with_name(copy.name + ".partial")  # so that an interrupted copy does not count as a film
         if film.is_dir():
             shutil.rmtree(aside, ignore_errors=True)
             shutil.copytree(film, aside, ignore=_not_copied)
@@ -232,7 +235,7 @@ def _copy_film(film: Path, inputs: Path) -> Path:
 
 
 def _not_copied(folder: str, names: list[str]) -> list[str]:
-    """Entries of a folder that are not copied: pipes, devices, dangling links, links to folders (may be cyclic)."""
+    """Entries of a folder that are not copied: pipes, devices, dangling links, and links to folders."""
     paths = [Path(folder) / name for name in names]
     return [path.name for path in paths if not is_file(path) and (path.is_symlink() or not path.is_dir())]
 

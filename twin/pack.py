@@ -1,15 +1,16 @@
-"""Verb: packs a built scene into one file, with what driving needs and chosen policies, for another machine.
+"""Verb: packs a built scene, with chosen policies, into one file for another machine.
 
     python -m twin.pack scenes/demo --policy first -o demo.twin
     python -m twin.pack scenes/demo --policy first --levels 8 -o scenes/demo.twin
 
-Packed are the baked field, the MJCF scene with its assets, ground, parts and cameras, tasks, robot, and lightings of
-photos. Films, frames, the field as trained and reports stay behind, and so does what is private and not needed:
-comments and paths of `scene.toml`, photos, dependencies in stamps, GPS positions. `twin.unpack` has the format.
+A pack contains what driving needs: the baked field, the MJCF scene with its assets, ground, parts and cameras, tasks,
+robot, and lightings of photos. It does not contain films, frames, the field as trained and reports, nor private data
+that driving does not need: comments and paths of `scene.toml`, photos, dependencies in stamps, GPS positions. The
+format is described in `twin.unpack`.
 
-A pack drives as the scene does, bit for bit: of the field only those samples are replaced that no ray reads
-(`samples_read`). With `--levels` below 256 the features are rounded to so many values, which shrinks the pack and makes
-it another field.
+Driving in a pack gives the same results as in the scene, bit for bit: in the field, only samples that no ray reads are
+replaced (`samples_read`). With `--levels` below 256, the features are rounded to that number of values. The pack is
+then smaller, but contains a different field.
 """
 
 import argparse
@@ -38,10 +39,10 @@ from twin.nerf.baked import BrickLayout, samples_read
 from twin.scene import STAGES, SceneDir, Stamp, package_versions, require_stage, stage_result
 
 LEVELS = 256
-"""Values of a byte: as built."""
-_ZERO = 128  # byte about which features are rounded; it is the value 0 of detail
-_FINER = 4  # levels of the density per level of a feature: it decides where surfaces are
-_VERTEX_STEP = 2  # steps of the hash grid's vertices, whose range is half as wide, per step of a feature
+"""Number of values of a byte; with so many levels, the field is not rounded."""
+_ZERO = 128  # features are rounded to multiples of the step from this byte, which stands for 0 in the detail
+_FINER = 4  # step of features / step of the density, which is rounded less because it determines surfaces
+_VERTEX_STEP = 2  # step of the hash grid's vertices / step of features
 _PACKED = {"metric": ("cameras.json", "cameras.npz"), "field": ("baked.json", "baked.safetensors")}
 _MESH = ("ground.npz", "parts.npz", "visual.npz")
 _TEXT = """\
@@ -78,13 +79,14 @@ def pack(
         root: The scene.
         out: The file; by default `<name of the folder>.twin` in the working folder.
         policies: Runs, checkpoints, policy folders or ONNX files; with `trust` also zips of stable-baselines3.
-        levels: Values to which the field's features are rounded, 2 to 256.
-        licence: Terms for whoever receives it.
+        levels: Number of values to which the field's features are rounded, 2 to 256.
+        licence: Terms for those who receive the pack.
         positions: Adds the films' GPS positions.
-        trust: Packs policies that may run code; whoever unpacks the file must trust them, too.
+        trust: Also packs policies that may run code; those who unpack the file must trust them, too.
 
     Raises:
-        InputError: the scene is not built, a policy cannot be packed, no GPS positions, or a setting out of range.
+        InputError: the scene is not built, a policy cannot be packed, `positions` are wanted but there are none, or a
+            setting is out of range.
     """
     if not 2 <= levels <= LEVELS:
         raise InputError(f"--levels {levels}: expected 2 to {LEVELS}")
@@ -167,9 +169,10 @@ def _positions(twin: Twin) -> bytes:
 
 
 def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
-    """Adds what driving needs of each stage, with stamps of that alone; returns the field's result.
+    """Adds the files of each stage that driving needs, with a stamp for these files; returns the field's result.
 
-    Results are those of the build, so that lightings and tables remain valid, unless the field is rounded.
+    The results in the stamps are those of the build, so that lightings and tables remain valid; only a rounded field
+    gets another result.
     """
     results = {}
     for stage in unpack.STAGES_PACKED:
@@ -202,8 +205,8 @@ def _tuples(table: dict[str, Any]) -> dict[str, Any]:
 def packed_field(layout: BrickLayout, arrays: dict[str, NDArray], levels: int = LEVELS) -> dict[str, NDArray]:
     """The arrays of a baked field (see `BakedField`) for a pack.
 
-    Samples that no ray reads repeat the one before, which takes no space. Below 256 `levels`, densities and features
-    are rounded.
+    Samples that no ray reads become copies of the sample before, which compress to almost nothing. With `levels` below
+    256, densities and features are rounded.
     """
     step = LEVELS / levels
     features = arrays["features"]
@@ -221,7 +224,7 @@ def packed_field(layout: BrickLayout, arrays: dict[str, NDArray], levels: int = 
 
 
 def rounded(values: NDArray[np.uint8], step: float) -> NDArray[np.uint8]:
-    """Bytes rounded to multiples of a step from `_ZERO`."""
+    """Rounds bytes to multiples of a step, counted from `_ZERO`."""
     table = np.round((np.arange(LEVELS) - _ZERO) / step) * step + _ZERO
     return np.clip(np.round(table), 0, LEVELS - 1).astype(np.uint8)[values]
 
@@ -261,7 +264,7 @@ def _write(out: Path, files: dict[str, bytes], head: dict[str, Any], trust: bool
 
 
 def _entry(name: str) -> zipfile.ZipInfo:
-    """An entry without a time, so that the same scene gives the same pack."""
+    """A zip entry without a time, so that the same scene always gives the same pack."""
     entry = zipfile.ZipInfo(name)
     entry.compress_type = zipfile.ZIP_DEFLATED
     entry.external_attr = 0o100644 << 16

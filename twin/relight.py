@@ -2,10 +2,11 @@
 
     python -m twin.relight scenes/demo photo.jpg --name afternoon
 
-localizes the photo, then fits an appearance embedding and fog so that renderings of the frozen field match it. The
-lighting is saved as `<scene>/lightings/afternoon.json`, with a labelled image beside it: the photo, the field under the
-fitted lighting, and under the most similar filmed one. Afterwards `twin.load_scene(scene).field()` has it as
-`lighting="afternoon"` or `"sun:afternoon:0.5"`; environments apply its fog to their images.
+This localizes the photo, then fits an appearance embedding and fog so that renderings of the frozen field match the
+photo. The lighting is saved as `<scene>/lightings/afternoon.json`, with an image beside it that shows the photo, the
+field under the fitted lighting, and the field under the most similar filmed lighting. Afterwards,
+`twin.load_scene(scene).field()` has the lighting as `lighting="afternoon"` or in mixtures such as
+`"sun:afternoon:0.5"`; environments apply its fog to their images.
 """
 
 import argparse
@@ -28,11 +29,11 @@ from twin.scene import SceneDir, require_stage, stage_result
 _CLEAR = Fog()
 _MAX_WIDTH = 480  # [px] longer side of the fitted image, as for training frames
 _STEPS = 300
-_RAYS = 10_000  # upper bound of fitted rays, spread evenly
-_START_RAYS = 1000  # for choosing the most similar filmed frame
-_FOG_GAIN = 0.2  # [dB] by which fog must improve the other half of the image
+_RAYS = 10_000  # the fit uses about this many rays, evenly spaced over the image
+_START_RAYS = 1000  # number of rays by which the most similar filmed frame is chosen
+_FOG_GAIN = 0.2  # [dB] by which fog must improve the half of the image that is not fitted
 _GAP = 4  # [px] between the images
-_LABEL_SIZE = 13  # [px] of text in the images; usual labels fit into an upright photo of 270 px
+_LABEL_SIZE = 13  # [px] text size in the images; usual labels fit into an upright photo 270 px wide
 
 
 @dataclass(frozen=True)
@@ -44,17 +45,17 @@ class PhotoFit:
     embedding: NDArray[np.float32]
     """Appearance embedding, shape (dim,)."""
     fog: Fog
-    """No fog if it does not improve the fit."""
+    """The fitted fog, or none if fog does not improve the fit."""
     images: tuple[NDArray, NDArray, NDArray]
-    """Photo, field under the fitted lighting and fog, field under the nearest; RGB in [0, 1], shapes (h, w, 3)."""
+    """Photo, field under the fitted lighting and fog, field under `nearest`; RGB in [0, 1], shapes (h, w, 3)."""
     psnr_nearest: float
-    """[dB]"""
+    """PSNR of the field under `nearest` [dB]."""
     psnr_fitted: float
-    """[dB]"""
+    """PSNR of the field under the fitted lighting and fog [dB]."""
     psnr_other_half: float
     """Mean PSNR of the left and right half of the image, each under the lighting fitted to the other half [dB]."""
     psnr_clear_other_half: float
-    """The same without fog [dB]."""
+    """The same mean for fits without fog [dB]."""
 
 
 def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArray) -> PhotoFit:
@@ -93,8 +94,8 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
 
     filmed = {name: render(field.embedding(name)) for name in field.lightings}
     nearest = max(filmed, key=lambda name: psnr(filmed[name], photo))
-    # The fit starts from the most similar frame's embedding. Compared with a start from a lighting's, other views of
-    # the place gain up to 1.7 dB on the demo, and lose at most 0.2 dB.
+    # The fit starts from the most similar embedding of a frame or a lighting. On the demo, compared with a start from
+    # embeddings of lightings alone, other views of the place gain up to 1.7 dB and lose at most 0.2 dB.
     some = slice(None, None, max(1, height * width // _START_RAYS))
     starts = [*field.appearance.named().vectors, *field.appearance.named().frame_vectors]
     renders = [field.color(features[some], harmonics[some], one) for one in starts]
@@ -137,7 +138,7 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
     """Adds the lighting of a photo to a scene under a name, and returns it.
 
     Raises:
-        InputError: no built scene, an unusable photo, a photo that cannot be localized, or an invalid name.
+        InputError: the scene is not built, the photo is unusable or cannot be localized, or the name is invalid.
     """
     scene = SceneDir(root)
     if not scene.config_file.exists():

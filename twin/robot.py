@@ -2,10 +2,10 @@
 
 *Base* is Clearpath's `base_link`: x forward, y left, z up; its origin lies between the wheels, 0.132 m above flat
 ground. A *side* is the front and rear wheel on the left or right, driven by one motor through gear and belt. The *track
-ratio* chi = (v_right − v_left) / (yaw rate · track) is 1 for a differential
-drive with freely rolling wheels and larger for a skid-steered robot, whose tires scrub sideways.
+ratio* chi = (v_right − v_left) / (yaw rate · track) is 1 for a differential drive with freely rolling wheels, and
+larger for a skid-steered robot, whose tires scrub sideways.
 
-Source of the constants: Clearpath's published description (husky.urdf.xacro, wheel.urdf.xacro, control.yaml).
+The constants are from Clearpath's published description (husky.urdf.xacro, wheel.urdf.xacro, control.yaml).
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ WHEEL_RADIUS = 0.1651  # [m] nominal, used by the robot's controller
 WHEEL_WIDTH = 0.1143  # [m]
 WHEELBASE = 0.512  # [m]
 TRACK = 0.5708  # [m]
-HUB_HEIGHT = 0.03282  # [m] above the base origin
-BASE_HEIGHT = WHEEL_RADIUS - HUB_HEIGHT  # [m] of the base origin above flat ground
+HUB_HEIGHT = 0.03282  # [m] height of the wheel hubs above the base origin
+BASE_HEIGHT = WHEEL_RADIUS - HUB_HEIGHT  # [m] height of the base origin above flat ground
 GEAR_RATIO = 79.0  # motor turns per wheel turn
 
 CAMERA_SIZE = (160, 90)
@@ -51,7 +51,8 @@ class PixelCamera:
     def resized(self, size: tuple[int, int]) -> "PixelCamera":
         """The same camera at another image size (width, height) [px].
 
-        fx and fy scale with the width; another aspect ratio crops or extends the height about its middle.
+        fx and fy scale with the width. If the aspect ratio changes, the picture is cropped or extended equally at the
+        top and bottom.
         """
         scale = size[0] / self.size[0]
         fx, fy, cx, cy = (float(x) * scale for x in self.intrinsics)
@@ -78,24 +79,26 @@ CONTROLLERS = {
     "ros2": ControllerTiming(0.05, 0.5),
     "ros2_50hz": ControllerTiming(0.02, 0.5),
 }
-"""Clearpath's configurations by name: ROS 1's for the Husky; ROS 2's for the A200 (20 Hz), and for robots at 50 Hz."""
+"""Clearpath's configurations by name: `ros1` for the Husky on ROS 1, `ros2` for the A200 on ROS 2 (20 Hz), `ros2_50hz`
+for robots on ROS 2 with 50 Hz."""
 
 
 @dataclass(frozen=True)
 class HuskyParams:
     """Parameters that differ between robots or are fitted to logs: `[robot]` in `scene.toml`, and `robot.toml`.
 
-    Ranges are wide enough for any Husky, and narrow enough to catch millimetres, radians and percent.
+    Ranges are wide enough for any Husky, and narrow enough to reveal values in wrong units such as millimeters.
 
     Raises:
-        InputError: a value out of range.
+        InputError: a value is out of range.
     """
 
     # Body.
     center_of_mass: Annotated[tuple[float, float, float], Range(-0.5, 0.5)] = (0.0, 0.0, 0.062)
-    """Center of mass of the chassis in the base [m]. The published (−.00065, −.085, .062) is 8.5 cm to the right in a
-    symmetric robot. With x and y exchanged (`REAR_HEAVY`) the robot turns with chi = 1.43; centered, with 1.805, nearer
-    to Clearpath's controller (1.82 to 1.875) and to logs of a real robot (2.15 and more)."""
+    """Center of mass of the chassis in the base [m]. The published one, (−.00065, −.085, .062), lies 8.5 cm to the
+    right, although the robot is symmetric. With x and y exchanged (`REAR_HEAVY`), the robot turns with chi = 1.43. With
+    this centered one, chi is 1.805, nearer to Clearpath's controller (1.82 to 1.875) and to logs of a real robot (2.15
+    and more)."""
     payload_mass: Annotated[float, Range(0, 100)] = 0.0
     """Mass on the top plate [kg]."""
     payload_position: Annotated[tuple[float, float, float], Range(-2, 2)] = (0.0, 0.0, 0.35)
@@ -110,46 +113,48 @@ class HuskyParams:
     wheel_radius: Annotated[tuple[float, float], Range(0.1, 0.25)] = (WHEEL_RADIUS, WHEEL_RADIUS)
     """Effective radius of the left and right tires [m]. The robot's controller uses the nominal radius."""
     spin_friction: Annotated[float, Range(0, 1)] = 1e-4
-    """Torsional friction of a tire's contact patch: moment / load [m]. On hard ground the scrubbing of four wheels
-    dominates; tires that sink in have a long patch."""
+    """Torsional friction of a tire's contact patch: moment / load [m]. On hard ground it is negligible against the
+    scrubbing of four wheels; tires that sink in have a long contact patch."""
     slip_stiffness: Annotated[float, Range(0.001, 1_000)] = 10.0
     """Stiffness of tire friction relative to normal contact (MuJoCo's `impratio`). Below 1, tires creep as on soft
-    ground: force grows with slip speed before they slide."""
+    ground: before they slide, the friction force grows with the slip speed."""
     ground_viscosity: Annotated[float, Range(0, 1_000)] = 0.0
     """Viscosity of the medium around the wheels, such as long grass, mud or snow [Pa s]. The drag of a tire is about
     2.4 m × viscosity × speed."""
     wheel_shape: str = "ellipsoid"
-    """ellipsoid (one contact per wheel on a plane) or cylinder (two edges)."""
+    """`ellipsoid` (one contact per wheel on a plane) or `cylinder` (contacts at two edges)."""
 
     # Drivetrain.
     servo_gain: Annotated[float, Range(1, 100_000)] = 1600.0
-    """Torque of a side per wheel speed error [N m s/rad]; stiff, as in the motor controllers' encoder loop."""
+    """Torque of a side per wheel speed error [N m s/rad]; high, since the motor controllers' encoder loop is stiff."""
     servo_lag: Annotated[float, Range(0, 2)] = 0.0
     """Time constant of the first-order lag of a side's wheel speed command [s]."""
     motor_inertia: Annotated[float, Range(0, 5)] = 0.15
-    """Inertia of rotor and gears at one wheel [kg m²]: about 5e-5 kg m² per motor (estimated), times the squared gear
-    ratio of 79, shared by two wheels. It also prevents stick-slip flutter of stiffly driven wheels: without it the
-    robot hops in a point turn at 1.8 rad/s on a friction of 1.0 (9 m/s² rms at the camera); 0.1 suffices."""
+    """Inertia of rotor and gears at one wheel [kg m²]: about 5e-5 kg m² per motor (estimated), times the square of the
+    gear ratio 79, shared by two wheels. It also prevents stick-slip flutter of stiffly driven wheels: without it, the
+    robot hops in a point turn at 1.8 rad/s with a friction of 1.0 (9 m/s² rms at the camera). A value of 0.1 suffices
+    for that."""
     motor_torque: Annotated[float, Range(1, 500)] = 70.0
     """Torque limit of a side at its wheels [N m]; not published."""
     motor_constant: Annotated[float, Range(0.0001, 10)] = 0.035
-    """Torque per current at the motor's shaft, net of losses of gear and belt [N m/A]; not published. By default the
-    motor's continuous 8 A give 22 N m at the wheels of a side."""
+    """Torque per current at the motor's shaft, after subtracting losses of gear and belt [N m/A]; not published. With
+    the default, the motor's continuous current of 8 A gives 22 N m at the wheels of a side."""
 
     # Controller.
     controller: str = "ros1"
     """Timing of the wheel controller, a key of `CONTROLLERS`: ros1, ros2 or ros2_50hz. Limits are separate: Clearpath's
     A200 on ROS 2 has 1 m/s², 1 rad/s and 1 rad/s²."""
     max_speed: Annotated[float, Range(0.01, 5)] = 1.0
-    """[m/s]"""
+    """Limit of the speed [m/s]."""
     max_acceleration: Annotated[float, Range(0.01, 100)] = 3.0
-    """[m/s²]"""
+    """Limit of the acceleration [m/s²]."""
     max_yaw_rate: Annotated[float, Range(0.01, 10)] = 2.0
-    """[rad/s]"""
+    """Limit of the yaw rate [rad/s]."""
     max_yaw_acceleration: Annotated[float, Range(0.01, 100)] = 6.0
-    """[rad/s²]"""
+    """Limit of the yaw acceleration [rad/s²]."""
     max_wheel_speed: Annotated[float, Range(0.01, 5)] = 1.0
-    """Limit of a tire's circumferential speed [m/s], to which both sides are scaled down together."""
+    """Limit of a tire's circumferential speed [m/s]. If one side would exceed it, both are scaled down by the same
+    factor."""
     separation_multiplier: Annotated[float, Range(0.5, 5)] = 1.875
     """Clearpath's `wheel_separation_multiplier`: the controller's estimate of chi."""
     command_latency: Annotated[float, Range(0, 2)] = 0.0
@@ -161,15 +166,16 @@ class HuskyParams:
     camera_offset: Annotated[tuple[float, float], Range(-2, 2)] = (0.36, 0.0)
     """Position of the lens forward and left of the base origin [m]."""
     camera_pitch: Annotated[float, Range(-90, 90)] = 5.0
-    """Downward angle [°]."""
+    """Angle by which the camera looks down [°]."""
     camera_yaw: Annotated[float, Range(-180, 180)] = 0.0
-    """Angle to the left [°]."""
+    """Angle by which the camera looks to the left [°]."""
     camera_roll: Annotated[float, Range(-180, 180)] = 0.0
-    """Angle of leaning to the right [°]."""
+    """Angle by which the camera leans to the right [°]."""
     camera_intrinsics: Annotated[tuple[float, ...], Range(-100_000, 100_000)] = ()
-    """fx, fy, cx, cy at `camera_size` [px]; if empty, those of the scene's film, or of a ZED 2 without a scene."""
+    """fx, fy, cx, cy at `camera_size` [px]. If empty, they are those of the scene's film or, without a scene, those of
+    a ZED 2."""
     camera_size: Annotated[tuple[int, int], Range(1, 20_000)] = ZED2.size
-    """Width, height of native images [px]."""
+    """Width, height of the camera's native images [px]."""
     camera_latency: Annotated[float, Range(0, 2)] = 0.0
     """Delay from exposure to the policy's receipt of the image [s]."""
 

@@ -28,7 +28,7 @@ _quiet = False
 
 
 def set_quiet(quiet: bool) -> None:
-    """Turns all progress output of this process off (True) or on."""
+    """Turns all progress output of this process off (True) or on (False)."""
     global _quiet
     _quiet = quiet
 
@@ -54,7 +54,7 @@ _stage: BuildStage | None = None
 
 
 def set_stage(stage: BuildStage | None) -> None:
-    """Sets the build stage that progress bars show with the time left of the build; None outside a build."""
+    """Sets the build stage, which progress bars show with the remaining time of the build; None outside a build."""
     global _stage
     _stage = stage
 
@@ -64,7 +64,7 @@ tqdm.set_lock(threading.RLock())
 
 
 class _Bar(tqdm):
-    """A progress bar that also shows the time left of the whole build."""
+    """A progress bar that also shows the remaining time of the build, if one is running."""
 
     @property
     def format_dict(self) -> dict[str, Any]:
@@ -79,8 +79,9 @@ class _Bar(tqdm):
 
 
 def bar(what: str, total: int, unit: str = "it", after: float = 0.0) -> tqdm:
-    """A progress bar, also a context manager: drawn in a terminal, a line every 10 s in a log file, none if quiet.
+    """A progress bar, which is also a context manager.
 
+    In a terminal it is redrawn in place; in a log file it writes a line every 10 s; with `set_quiet`, nothing is shown.
     It appears after a delay `after` [s], for work that is slow only the first time.
     """
     every = 0.1 if sys.stderr.isatty() else 10.0
@@ -120,10 +121,10 @@ class Stopped(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def stoppable() -> Iterator[None]:
-    """SIGINT, SIGTERM and SIGHUP raise `Stopped` within the block, the first time only, so that cleanup can finish.
+    """Within the block, the first SIGINT, SIGTERM or SIGHUP raises `Stopped`.
 
-    A signal that the process was started to ignore, as by nohup, stays ignored. A second SIGINT ends the process at
-    once.
+    Later ones have no effect, so that cleanup can finish, but a later SIGINT ends the process at once. Signals that
+    were ignored when the process started, for example because of nohup, stay ignored.
     """
     stopping = False
 
@@ -140,14 +141,15 @@ def stoppable() -> Iterator[None]:
 
 
 class StopNotice:
-    """Number of the first signal that asked to stop; 0: none."""
+    """`number` is that of the first signal that asked the process to stop, or 0."""
 
     number = 0
 
 
 @contextlib.contextmanager
 def stop_noted() -> Iterator[StopNotice]:
-    """Only notes SIGINT, SIGTERM and SIGHUP within the block, which saves its work and then raises `Stopped`."""
+    """Within the block, SIGINT, SIGTERM and SIGHUP are only noted. The block should then save its work and raise
+    `Stopped`."""
     stop = StopNotice()
 
     def note(number: int, _: Any) -> None:
@@ -179,13 +181,16 @@ def signals_kept() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            if handler is not None:  # not from Python
+            if handler is not None:  # None: the handler was not set by Python
                 signal.signal(number, handler)
 
 
 @contextlib.contextmanager
 def signals_held() -> Iterator[None]:
-    """Delays SIGINT, SIGTERM and SIGHUP to the end of the block; in processes started in it, until they unblock."""
+    """Delays SIGINT, SIGTERM and SIGHUP to the end of the block.
+
+    Processes that are started in the block have these signals blocked until they unblock them.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPING)
     try:
         yield
@@ -197,7 +202,7 @@ def signals_held() -> Iterator[None]:
 
 _PARENT = "TWIN_PARENT"  # environment variable with the process number of the parent
 _PR_SET_PDEATHSIG = 1
-_PARENT_POLL = 0.5  # [s] between checks for the parent
+_PARENT_POLL = 0.5  # [s] between checks whether the parent is alive
 
 
 def child_environment(**more: str) -> dict[str, str]:
@@ -206,9 +211,10 @@ def child_environment(**more: str) -> dict[str, str]:
 
 
 def die_with_parent(parent: int | None = None) -> None:
-    """Makes this process die when its parent dies, so that no second writer survives; call first in a child.
+    """Makes this process end when its parent ends, so that it does not go on writing files; to be called first in a
+    child.
 
-    `parent` is a process number; by default that of `child_environment`, or the present parent.
+    `parent` is a process number, by default that from `child_environment`, or else that of the present parent.
     """
     parent = parent or int(os.environ.get(_PARENT, os.getppid()))
     if sys.platform == "linux":
@@ -219,7 +225,7 @@ def die_with_parent(parent: int | None = None) -> None:
             time.sleep(_PARENT_POLL)
         os._exit(1)
 
-    if os.getppid() != parent:  # it died before the call
+    if os.getppid() != parent:  # the parent ended before the call
         os._exit(1)
     # For systems without prctl.
     threading.Thread(target=exit_when_orphaned, daemon=True).start()
@@ -247,7 +253,7 @@ def limit_cores(limit: int) -> None:
 
 
 def available_cores() -> int:
-    """Number of CPU cores this process may use: its affinity, the container's quota, and `limit_cores`."""
+    """Number of CPU cores that this process may use, by its affinity, the container's quota and `limit_cores`."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(count, _core_limit or count, _quota() or count)
 
@@ -279,7 +285,7 @@ def resident_memory() -> int:
 
 
 class PeakMemory:
-    """Context manager that samples `resident_memory`; `bytes` is the maximum."""
+    """Context manager that samples `resident_memory`; `bytes` is the largest sample."""
 
     def __init__(self) -> None:
         self.bytes = 0
@@ -306,11 +312,12 @@ class PeakMemory:
 
 @contextlib.contextmanager
 def exclusive_lock(path: Path, what: str) -> Iterator[None]:
-    """Holds a lock on a file, released when the process ends, even if killed.
+    """Holds a lock on a file during the block. The lock is also released when the process ends, even if it is killed.
 
     Args:
-        path: Lock file with the holder's process number, removed at the end; one left by a killed process is reused.
-        what: Describes the locked work in the error message.
+        path: Lock file, which contains the holder's process number. It is removed at the end; a file that a killed
+            process left is reused.
+        what: Description of the locked work for the error message.
 
     Raises:
         InputError: another process holds the lock, or `path` is not a regular file.

@@ -1,7 +1,7 @@
 """Paths of a scene folder, and the stamps of build stages.
 
 scenes/<name>/
-  scene.toml            the only hand-written file
+  scene.toml            settings; the only file that is written by hand
   robot.toml            optional: robot parameters, as in `[robot]` of scene.toml
   input/                films or photos; only `twin.new` writes here
   build/
@@ -11,9 +11,9 @@ scenes/<name>/
   validation/           episodes.csv, cells.csv, validation.html, films/: policies evaluated in the twin
   forecast/             forecast.json .csv .html: forecast of success on the real road
 
-A stage's *key* is the hash of all that its result depends on: its config sections, the digests of its input files, the
-*results* (content digests) of its upstream stages, its version and the seed. A stage folder is up to date if its stamp
-has the present key and its files match the stamp. Package versions are recorded, but are not part of the key.
+A stage's *key* is the hash of everything on which its result depends: its config sections, the digests of its input
+files, the *results* (content digests) of its upstream stages, its version and the seed. A stage folder is up to date if
+its stamp has the present key and its files match the stamp. Package versions are recorded, but are not part of the key.
 """
 
 import os
@@ -50,7 +50,7 @@ STAGES: dict[str, str] = {
 """Stage name → folder under `build/`, in running order."""
 
 PACK_JSON = "pack.json"
-"""Marks a scene folder that was unpacked from a pack (`twin.unpack`), and has what driving needs alone."""
+"""File that marks a scene folder as unpacked from a pack (`twin.unpack`); such a folder has only what driving needs."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class SceneDir:
         return self.build / STAGES[name]
 
     def partial(self, name: str) -> Path:
-        """The folder of a stage while it is written."""
+        """The folder to which a running stage writes."""
         return self.build / f"{STAGES[name]}.partial"
 
     @property
@@ -103,12 +103,12 @@ class SceneDir:
 
     @property
     def episodes_csv(self) -> Path:
-        """One row per trial in the twin; for columns see `twin.evaluation.trials`."""
+        """Table with one row per trial in the twin; for its columns see `twin.evaluation.trials`."""
         return self.validation / "episodes.csv"
 
     @property
     def cells_csv(self) -> Path:
-        """Trials aggregated by policy, task and lighting."""
+        """Table of trials aggregated by policy, task and lighting."""
         return self.validation / "cells.csv"
 
     @property
@@ -126,13 +126,14 @@ class SceneDir:
 
 
 _NAME = re.compile(r"\w[\w.-]*")
-_MAX_NAME = 80  # characters; a file system takes 255 bytes, including what twin appends
+_MAX_NAME = 80  # characters; file names may have 255 bytes, including the suffixes that twin appends
 
 
 def check_name(name: str, what: str) -> str:
-    """Returns a name of letters, digits and `_ . -`, for a file or folder.
+    """Returns `name` if it is a valid name for a file or folder: letters, digits and `_ . -`.
 
-    Raises InputError for any other, such as a path; `what`, the origin of the name such as `--run`, opens the message.
+    Raises InputError for any other name, such as a path. The message begins with `what`, the option that gives the
+    name, such as `--run`.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"{what} {name!r}: expected a name of letters, digits and _ . - only, no path")
@@ -149,7 +150,7 @@ def run_folder(scene: SceneDir, name: str) -> Path:
 # ---- stamps
 
 _CURE = "build the scene again"
-_MAX_HASHED = 256 << 20  # [bytes] of a file that is hashed when a scene is opened
+_MAX_HASHED = 256 << 20  # [bytes] largest file that is hashed when a scene is opened
 _PACKAGES = ("twin", "numpy", "torch", "warp-lang", "mujoco", "mujoco-warp", "pycolmap", "coacd", "av", "scipy")
 
 
@@ -173,9 +174,9 @@ class Stamp:
     device: str
     packages: dict[str, str]
     sha256: dict[str, str] = field(default_factory=dict)
-    """Digest of every file. Older stamps have none; their folders are compared with `result` instead."""
+    """Digest of every file. Older stamps have no such digests; their folders are compared with `result` instead."""
     itself: str = ""
-    """Digest of all fields above; empty in older stamps."""
+    """Digest of all other fields; empty in older stamps."""
 
     def save(self, folder: Path) -> None:
         write_bytes(folder / "stamp.json", self.content())
@@ -230,9 +231,9 @@ def digest_folder(folder: Path) -> tuple[str, dict[str, int], dict[str, str]]:
 
 
 def write_stamp(folder: Path, stage: str, depends: dict[str, Any] | None = None, **more: Any) -> Stamp:
-    """Writes the stamp of a stage folder for its present files.
+    """Writes the stamp of a stage folder for the files that are in it now.
 
-    `more` are fields of `Stamp`: metrics, seconds, peak_memory_bytes, device.
+    `more` has further fields of `Stamp`: metrics, seconds, peak_memory_bytes, device.
     """
     depends = depends or {}
     result, files, sha256 = digest_folder(folder)
@@ -263,9 +264,10 @@ def _verified_stamp(scene: SceneDir, stage: str) -> Stamp:
 
 
 def require_stage(scene: SceneDir, stage: str) -> Path:
-    """The folder of a built stage, after its files were compared with its stamp, which a process does once.
+    """Returns the folder of a built stage, after comparing its files with its stamp (once per process).
 
-    Files above 256 MiB are compared by size only; the next build, which reads everything, finds other changes.
+    Files larger than 256 MiB are compared by size only. A build reads all files completely, and so also finds other
+    changes in these.
 
     Raises:
         InputError: the stage has not been built, or one of its files is damaged.
@@ -285,7 +287,7 @@ def package_versions() -> dict[str, str]:
 
 
 def commit_stage(scene: SceneDir, stage: str) -> None:
-    """Replaces the folder of a stage by its stamped partial folder; `recover_stages` repairs an interrupted call."""
+    """Replaces a stage's folder by its complete partial folder; `recover_stages` repairs an interrupted call."""
     partial, final = scene.partial(stage), scene.stage(stage)
     old = final.with_name(final.name + ".old")
     remove(old)
@@ -309,7 +311,7 @@ def recover_stages(scene: SceneDir) -> None:
 
 
 def replace_file(source: Path, target: Path) -> None:
-    """Replaces `target` by a copy of `source` atomically (a hard link if the file system supports it)."""
+    """Replaces `target` atomically by a hard link to `source`, or by a copy if the file system has no hard links."""
     with atomic_path(target) as partial:
         partial.unlink(missing_ok=True)
         try:

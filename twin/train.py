@@ -4,8 +4,9 @@
     python -m twin.train scenes/demo --task straight --run plain --observe simulator
     python -m twin.train scenes/demo --task straight --run day --lighting sun
 
-A training ends when tests without exploration arrive often enough (`--success`), when they get no better, or at
-`--steps`. The same command continues a stopped or killed run. The policy is in `runs/<name>` of the scene's folder.
+A training ends when the success rate in tests without exploration reaches `--success`, when tests no longer improve, or
+at `--steps`. If a run was stopped or killed, the same command continues it. The policy is saved in `runs/<name>` of the
+scene's folder.
 """
 
 import argparse
@@ -42,7 +43,7 @@ def command(given: argparse.Namespace) -> None:
     config = TrainConfig(**{**PRESETS[given.preset], **settings})
     twin = load_writable(given.scene)
     folder = run_folder(twin.scene, given.run)
-    require_stage(twin.scene, "mjcf")  # before the run's folder is created
+    require_stage(twin.scene, "mjcf")  # checked before the run's folder is created
     with exclusive_lock(folder.with_name(f".{folder.name}.lock"), f"{folder} is being trained"):
         choice = _train(twin, folder, config, given.processes, given.wandb)
     picture = write_success_curve(folder)
@@ -74,7 +75,7 @@ def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
 def _train(
     twin: Twin, folder: Path, config: "TrainConfig", processes: int | None, project: str | None
 ) -> dict[str, Any]:
-    """Trains with progress bars; returns the contents of `choice.json`. `project` is one of Weights & Biases."""
+    """Trains with progress bars; returns the contents of `choice.json`. `project`: in Weights & Biases; None: none."""
     try:
         from twin.learn.selection import earlier_choice, train_until_learnt
         from twin.learn.training import prepare_folder
@@ -91,7 +92,7 @@ def _train(
     with logging as log, runtime.bar("train, at most", config.steps, "step") as bar:
 
         def watch(steps: int, recent: Sequence[bool]) -> None:
-            if not bar.n:  # steps of earlier calls do not count in the rate
+            if not bar.n:  # the bar's speed must not include the steps of earlier calls
                 bar.initial = bar.n = bar.last_print_n = steps
             bar.update(steps - bar.n)
             if recent:

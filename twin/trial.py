@@ -1,19 +1,20 @@
-"""Verb: turns a robot's recording of a trial on the road into a row of `real.csv`, a film and a comparison.
+"""Verb: evaluates a robot's recording of a trial on the road: counts it in `real.csv`, and compares it with the twin.
 
     python -m twin.trial scenes/my_road monday_1.mcap --policy first --task straight --lighting monday
 
 The bag has the front camera's pictures and camera_info, commands, and poses (RTK, LiDAR or filtered odometry). Pictures
-are located in the scene, which places the poses there; then the twin's own rules of success and failure apply. Poses do
-not show a collision; `--cause collision` states that the recording ends with one.
+are localized in the scene, and the poses are fitted to their positions. Then the trial is judged by the twin's rules of
+success and failure. Poses do not show collisions; `--cause collision` states that the recording ends with one.
 
-`<scene>/trials/<bag>/` gets `trial.mp4`, the robot's pictures beside the twin's, and `trial.json`: the outcome, how far
-the twin's robot ends from the real one under the same commands, how similar the pictures are, and whether the policy
-gives the recorded commands for the recorded pictures. The trial is counted in `real.csv`, and listed with its cause in
-`real_trials.csv` beside it.
+Two files are written to `<scene>/trials/<bag>/`: `trial.mp4` shows the robot's pictures beside the twin's. `trial.json`
+has the outcome, the distance between the final positions of the twin's robot and the real one under the same commands,
+the similarity of the pictures, and the fraction of the recorded commands that the policy gives again for the recorded
+pictures. The trial is counted in `real.csv`, and listed with its cause in `real_trials.csv` beside it.
 
     python -m twin.trial scenes/my_road monday_1.mcap monday_2.mcap --task straight --lerobot drives
 
-`--lerobot` writes recordings, also of drives by hand, as a dataset to learn from instead; see `record_dataset`.
+With `--lerobot`, recordings are instead written as a dataset for learning; they may also be of drives by hand. See
+`record_dataset`.
 """
 
 import argparse
@@ -49,13 +50,15 @@ from twin.types import Array, Image
 from twin_policy import Camera, Limits, PictureError, Pilot, Rectifier
 
 SCENE_FRAME, FIT = "scene", "pictures"
-_LOCATED = 24  # pictures that are located in the scene
-_MOVING = 0.02  # [m/s], [rad/s]: the first faster command starts the trial
+_LOCATED = 24  # number of pictures that are localized in the scene
+_MOVING = 0.02  # [m/s], [rad/s]; the trial starts with the first command that exceeds this
 _ANSWER = 300_000_000  # [ns] longest time from a picture to the command that follows from it
-_SAME = 1e-3  # [m/s], [rad/s] below which two commands are the same
-_SPEED_SPAN = 0.2  # [s] over which a speed is taken from poses, before the instant, so that it shows no later command
-_MAX_GAP = 0.5  # [s] that a dataset may be without a picture, and that a command is in force (Clearpath's, on ROS 2)
-_START_OFFSET, _START_HEADING = 0.3, 10.0  # [m], [°] within which trials in the twin start
+_SAME = 1e-3  # [m/s], [rad/s]; commands that differ by less count as equal
+_SPEED_SPAN = (
+    0.2  # [s] before an instant over which speed is measured from poses; later poses would show later commands
+)
+_MAX_GAP = 0.5  # [s] longest time without a picture in a dataset, and time for which a command is in force (ROS 2)
+_START_OFFSET, _START_HEADING = 0.3, 10.0  # [m], [°] largest deviations from the route at a trial's start in the twin
 
 
 def record_trial(
@@ -70,22 +73,23 @@ def record_trial(
     frame: str = FIT,
     topics: dict[str, str] | None = None,
 ) -> tuple[Trial, dict[str, Any], Path]:
-    """Judges a trial, writes its results, and returns its row, its figures and its folder.
+    """Judges a trial, and writes its results. Returns its table row, its figures and its folder.
 
     Args:
         root: A built scene.
         bag: See `twin.sysid.trial_recording`.
-        policy_name: A run's name, or see `twin.learn.policy.load_policy`: the policy that drove.
+        policy_name: The policy that drove: a run's name, or a source of `twin.learn.policy.load_policy`.
         task: See `twin.load`.
         lighting: Name of the day or light in `real.csv`.
         out: `real.csv`; by default the scene's.
-        twin_lighting: The twin's lighting to compare with; by default the one of the same name.
-        cause: The operator's verdict on the recording's end.
-        frame: `SCENE_FRAME` if the poses are in the scene's frame; `FIT`: located by pictures.
-        topics: Of the bag; see `read_trial`.
+        twin_lighting: The twin's lighting to compare with; by default the one named `lighting`.
+        cause: The cause of the recording's end, as stated by the operator.
+        frame: `SCENE_FRAME` if the poses are in the scene's frame; `FIT` if their frame is to be fitted to localized
+            pictures.
+        topics: Topics of the bag; see `read_trial`.
 
     Raises:
-        InputError: an unusable scene, policy, bag or table, or a trial without an outcome.
+        InputError: scene, policy, bag or table is unusable, or the trial has no outcome.
     """
     scene = load_scene(root)
     policy = load_policy(find_policy(root, policy_name))
@@ -155,19 +159,20 @@ def record_dataset(
 ) -> list[Episode]:
     """Writes drives on the road as a LeRobot dataset, see `twin.report.drive_dataset`; returns them as episodes.
 
-    A frame has the newest picture, as a policy would see it; speed and yaw rate by the poses before it; and the mean of
-    the commands until the next frame. Poses and the twin's rules give the rest.
+    A frame has the newest picture, as a policy would see it; speed and yaw rate from the poses before it; and the mean
+    of the commands until the next frame. The other data come from the poses and the twin's rules.
 
     Args:
         root, task, frame, topics: See `record_trial`.
         bags: One drive each, by a policy or by hand.
         out: The dataset's folder; must not exist.
-        policy_name: The policy whose camera and period the frames have; None: those of the scene's environments.
+        policy_name: The policy that determines the frames' camera and period; None: those of the scene's environments.
         lighting: Name of the day or light in the dataset's table of drives.
-        cause: The operator's verdict on the end of the recording, if there is one bag.
+        cause: The cause of the recording's end, as stated by the operator; only allowed with a single bag.
 
     Raises:
-        InputError: as `record_trial`, but a drive needs no outcome; `out` exists, or pyarrow is not installed.
+        InputError: an error of `record_trial`, except that a drive needs no outcome; `out` exists, or pyarrow is not
+            installed.
     """
     from twin.report.drive_dataset import DriveDataset, drive_instruction, require_pyarrow
 
@@ -207,7 +212,7 @@ def record_dataset(
                 Episode(
                     times=trial.times,
                     base_to_world=base_to_world,
-                    qpos=np.zeros((len(stamps), 0)),  # the simulator's, which a robot does not have
+                    qpos=np.zeros((len(stamps), 0)),  # the simulator's state, which a recording does not have
                     actions=_actions(recording, stamps, options.control_timestep),
                     rewards=rewards,
                     speed=motion[:, 0],
@@ -229,7 +234,7 @@ def record_dataset(
 
 
 def _begin(recording: TrialRecording) -> int:
-    """Time of the first command that moves the robot [ns], which starts the trial."""
+    """Start of the trial [ns]: the time of the first command that moves the robot."""
     moving = np.flatnonzero(np.abs(recording.commands).max(1, initial=0.0) > _MOVING)
     if not len(moving):
         topic = recording.topics["commands"]
@@ -245,9 +250,10 @@ def _motion(recording: TrialRecording, stamps: NDArray[np.int64]) -> Array:
 
 
 def _actions(recording: TrialRecording, stamps: NDArray[np.int64], period: float) -> Array:
-    """The commands in force in the step after each instant, v [m/s] and ω [rad/s], shape (k, 2); the last is zero.
+    """Action in the step after each instant, v [m/s] and ω [rad/s], shape (k, 2); the last one is zero.
 
-    It is their mean; if there is none, the one before, unless the robot has stopped for want of commands.
+    It is the mean of the commands in the step. If there are none, it is the last command before, or zero if that is too
+    old, since the robot has then stopped.
     """
     actions = np.zeros((len(stamps), 2))
     ends = np.searchsorted(recording.command_times, stamps + round(period * 1e9))
@@ -261,7 +267,7 @@ def _actions(recording: TrialRecording, stamps: NDArray[np.int64], period: float
 
 
 def _pictures_at(recording: TrialRecording, rectify: Rectifier, stamps: NDArray[np.int64]) -> list[Image]:
-    """The newest picture (h, w, 3) at each instant. Raises InputError: there is none that is recent."""
+    """The newest picture (h, w, 3) at each instant. Raises InputError: at an instant there is no recent picture."""
     newest = np.maximum(0, np.searchsorted(recording.shutter, stamps, side="right") - 1)
     ages = np.abs(stamps - recording.shutter[newest]) * 1e-9
     if ages.max() > _MAX_GAP:
@@ -286,7 +292,7 @@ def _key(trial: Trial) -> tuple[str, str, str, int]:
 
 
 def _known_trials(table: Path, out: Path) -> list[Trial]:
-    """The trials recorded so far. Raises InputError: `out` has other trials, which would be lost."""
+    """The trials recorded so far. Raises InputError: `out` has further trials, which would be lost."""
     known = read_trials(table) if table.exists() else []
     explained = {cell.key: cell for cell in tally(known)}
     for key, (trials, _) in (read_counts(out) if out.exists() else {}).items():
@@ -300,7 +306,7 @@ def _known_trials(table: Path, out: Path) -> list[Trial]:
 
 
 def _rectifier(recording: TrialRecording, policy: Policy | None, factory: EnvFactory) -> Rectifier:
-    """From the robot's camera to the policy's, else to that of the scene's environments."""
+    """Rectifier from the robot's camera to the policy's camera, or else to that of the scene's environments."""
     size = factory.options.size
     own = (policy and policy.trained.get("camera")) or factory.world.camera.resized(size).intrinsics
     try:
@@ -311,7 +317,7 @@ def _rectifier(recording: TrialRecording, policy: Policy | None, factory: EnvFac
 
 
 def _frame(recording: TrialRecording, scene: Twin, factory: EnvFactory, begin: int) -> FrameFit:
-    """Locates pictures, evenly spaced along the way, in the scene, and fits the frame of the poses to them."""
+    """Localizes pictures, evenly spaced along the drive, in the scene, and fits the frame of the poses to them."""
     ground = Ground.load(require_stage(scene.scene, "mesh"))
     stamps = recording.shutter[recording.shutter >= begin]
     xy = recording.poses_at(stamps)[:, :2]
@@ -352,7 +358,7 @@ def _judge(recording: TrialRecording, factory: EnvFactory, fit: FrameFit, begin:
 
 
 def _with_cause(trial: JudgedTrial, cause: str | None, bag: Path) -> JudgedTrial:
-    """The trial with the operator's verdict."""
+    """The trial with the cause stated by the operator, if one is given."""
     if cause == "goal" and trial.cause != "goal":
         raise InputError(
             f"{bag}: the recording ends {trial.progress[-1]:.1f} m along the task ({trial.cause or 'no outcome'}); "
@@ -382,11 +388,12 @@ class _PolicyOfPictures:
 def _pictures(
     recording: TrialRecording, rectify: Rectifier, policy: Policy, begin: int, end: int
 ) -> tuple[NDArray[np.int64], list[Image], Array]:
-    """Plays the pictures from the start to the end through the pilot.
+    """Feeds the pictures between start and end to the pilot that runs policies on the robot.
 
     Returns:
-        Stamps [ns] (n,) and pictures (h, w, 3) that the policy used; and its commands minus the recorded ones that
-        follow each picture, v [m/s] and ω [rad/s], shape (m, 2), m ≤ n.
+        Stamps [ns] (n,) of the pictures that the policy used; these pictures (h, w, 3); and for each that is soon
+        followed by a recorded command, the policy's command minus the recorded one, v [m/s] and ω [rad/s], shape
+        (m, 2), m ≤ n.
     """
     first = max(0, int(np.searchsorted(recording.shutter, begin, side="right")) - 1)
     which = slice(first, int(np.searchsorted(recording.shutter, end, side="right")))
@@ -396,7 +403,7 @@ def _pictures(
     def clock() -> int:
         return now
 
-    # On the robot, faults in time stop it; here every picture is evaluated, so the limits are wide.
+    # On the robot, the pilot stops if pictures are late. Here every picture is evaluated, so the limits are wide.
     loose = Limits(timeout=10.0, inference=10.0, ahead=10.0, clock_jump=10.0, rest=0.0)
     pilot = Pilot(_PolicyOfPictures(policy), loose, rectify.pinhole, clock, clock)  # type: ignore[arg-type]
     pilot.set_camera(recording.camera)

@@ -1,4 +1,4 @@
-"""Array types shared by all packages, whose shapes and units their users state, and ranges of settings."""
+"""Array types for all packages, and ranges of settings. Shapes and units are stated where the types are used."""
 
 import math
 import typing
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-"""Double precision: geometry, physics and statistics."""
+"""Double precision, for geometry, physics and statistics."""
 Array32 = NDArray[np.float32]
-"""Single precision: the radiance field and its renderers."""
+"""Single precision, for the radiance field and its renderers."""
 Image = NDArray[np.uint8]
 """RGB, shape (height, width, 3), or (n, height, width, 3)."""
 Indices = NDArray[np.int64]
@@ -19,7 +19,7 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Range:
-    """Bounds of a setting, both included: `Annotated[float, Range(0, 1)]`."""
+    """Bounds of a setting, both included, as in `Annotated[float, Range(0, 1)]`."""
 
     low: float
     high: float = math.inf

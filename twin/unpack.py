@@ -1,14 +1,14 @@
-"""Verb: unpacks a *pack*, one file with all that driving in a built scene needs; `twin.pack` writes them.
+"""Verb: unpacks a *pack*, a file with everything that driving in a built scene needs. `twin.pack` writes packs.
 
     python -m twin.unpack demo.twin scenes/demo_copy
 
 A pack is a zip: `README.txt` for people, `manifest.json`, then the files of a scene folder. The manifest has the size
-and SHA-256 of each file as unpacked, and its *coding*: `plain`, or `differences` for the field
+and SHA-256 of each file as unpacked, and the file's *coding*: `plain`, or `differences` for the field
 (see `encode_differences`).
 
-A pack may come from anyone. Nothing in it runs. A name outside the places in `_PLACES`, such as a path that leads
-elsewhere, a link, a doubled name, a size above the bounds or other than declared, or a wrong digest is refused, and
-then nothing stays on the disk.
+A pack may come from anyone, so unpacking runs nothing in it. A pack is refused if it has a name that does not match
+`_PLACES` (such as a path that leads elsewhere), a link, the same name twice, a size above the bounds or different from
+the declared one, or a wrong digest. Then nothing remains on the disk.
 """
 
 import argparse
@@ -43,14 +43,14 @@ FORMAT, VERSION = "twin pack", 1
 MANIFEST, README = "manifest.json", "README.txt"
 PLAIN, DIFFERENCES = "plain", "differences"
 STAGES_PACKED = ("metric", "field", "mesh", "mjcf")
-"""Stages of a build that are packed, in part."""
+"""Stages of a build of which a part is packed."""
 
 _MAX_FILES = 20_000
-_MAX_FILE, _MAX_TOTAL = 2 << 30, 4 << 30  # [bytes] of a file and of all, unpacked
-_MAX_RATIO, _FREE = 30, 16 << 20  # total size over the pack's, from a total of `_FREE` bytes on
+_MAX_FILE, _MAX_TOTAL = 2 << 30, 4 << 30  # [bytes] largest file, and largest total size, unpacked
+_MAX_RATIO, _FREE = 30, 16 << 20  # largest total size / the pack's size; [bytes] totals up to this are always allowed
 _MAX_MANIFEST = 16 << 20  # [bytes]
 _CHUNK = 4 << 20  # [bytes]
-_N = r"\w[\w.+-]{0,99}"  # a name in a path; a leading dot, and so "..", has no place
+_N = r"\w[\w.+-]{0,99}"  # a name in a path; it cannot begin with a dot, so ".." is excluded
 _PLACES = re.compile(
     rf"scene\.toml|robot\.toml|positions\.csv|lightings/{_N}\.json"
     rf"|build/{STAGES['metric']}/(cameras\.(json|npz)|stamp\.json)"
@@ -62,8 +62,8 @@ _PLACES = re.compile(
 _CURE = "fetch it again, or ask its sender for another"
 _NOT_A_PACK = "expected a pack, as twin pack writes it"
 _XML_PATHS = ("file", "meshdir", "texturedir", "assetdir", "fileright", "fileleft", "fileup", "filedown", "filefront")
-_XML_REFUSED = ("include", "plugin", "extension", "model", "attach")  # of other files, or of code
-_HEADER = 8  # [bytes] before the header of a safetensors file: its length
+_XML_REFUSED = ("include", "plugin", "extension", "model", "attach")  # elements that load other files or code
+_HEADER = 8  # [bytes] of a safetensors file before its header; they contain the header's length
 
 
 def digest(content: bytes) -> str:
@@ -75,10 +75,10 @@ def digest(content: bytes) -> str:
 
 
 def encode_differences(content: bytes) -> bytes:
-    """A safetensors file whose byte arrays of two axes and more are stored so that they compress well; of equal length.
+    """Recodes the byte arrays with two or more axes in a safetensors file, so that the file compresses better.
 
-    Each channel (the last axis) lies together, as differences modulo 256 from one value to the next, because neighbors
-    are alike. `decode_differences` is its exact inverse.
+    The values of each channel (the last axis) are stored together, as differences modulo 256 from one value to the
+    next, because neighbors are alike. The length does not change. `decode_differences` is the exact inverse.
     """
     return _recode(content, lambda a: np.diff(np.ascontiguousarray(np.moveaxis(a, -1, 0)).ravel(), prepend=np.uint8(0)))
 
@@ -117,9 +117,10 @@ def _recode(content: bytes, change: Any) -> bytes:
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """The checked manifest of a pack.
+    """Reads and checks the manifest of a pack.
 
-    Raises InputError: no pack, another version, or names, links, or declared sizes that are refused.
+    Raises InputError: the file is not a pack, it has another version, or it has names, links or declared sizes that are
+    refused.
     """
     if not is_file(path):
         raise InputError(f"{path} is no file; {_NOT_A_PACK}")
@@ -130,7 +131,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
 def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
     """Unpacks a pack into a new folder; returns its manifest.
 
-    The folder appears when all is written and checked, or not at all.
+    The folder is created only after everything was written and checked.
 
     Args:
         path: The pack.
@@ -138,7 +139,8 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
         trust: Also takes policies that may run code when they are loaded.
 
     Raises:
-        InputError: see `read_manifest`; a file that is not as declared; the folder exists; an untrusted policy.
+        InputError: an error of `read_manifest`; a file differs from its declaration; the folder exists and is not
+            empty; or the pack has a policy that may run code and is not trusted.
     """
     manifest = read_manifest(path)
     zips = [name for name in manifest["files"] if name.endswith(".zip")]
@@ -229,7 +231,7 @@ def _extract(archive: zipfile.ZipFile, name: str, facts: dict[str, Any], target:
 
 
 def _check_contents(root: Path, path: Path) -> None:
-    """Raises InputError for files that name others outside the scene."""
+    """Raises InputError if a file of the scene refers to a file outside it."""
     scene = SceneDir(root)
     try:
         load_config(scene.config_file)
@@ -249,13 +251,14 @@ def _check_contents(root: Path, path: Path) -> None:
         raise InputError(f"{path}: {short_repr(bad)} names a file outside the scene; {_CURE}")
 
 
-# ---- packs in the place of scene folders
+# ---- packs used instead of scene folders
 
 
 def open_scene(path: Path) -> Path:
-    """The folder of a scene: `path`, or if that is a pack, or the name of one, its contents in a cache.
+    """The folder of a scene: `path` itself, or for a pack or the name of a pack, the folder of its contents in a cache.
 
-    A pack is unpacked once into `$XDG_CACHE_HOME/twin/packs`, by its digest; several processes may do so at once.
+    A pack is unpacked once, into a folder in `$XDG_CACHE_HOME/twin/packs` that is named after its digest. Several
+    processes may do so at once.
 
     Raises InputError: see `unpack`.
     """
@@ -273,9 +276,9 @@ def open_scene(path: Path) -> Path:
 
 
 def find_pack(path: Path) -> Path | None:
-    """The pack at a path, or by a name alone, such as `demo`, here, in `scenes/`, or in that of a checkout of twin.
+    """The pack at a path, or with a name such as `demo`; None if there is none.
 
-    None if there is none.
+    Names are searched in the working folder, in its `scenes/`, and in `scenes/` of twin's repository.
     """
     if is_file(path):
         return path if path.suffix == SUFFIX or zipfile.is_zipfile(path) else None
@@ -286,7 +289,7 @@ def find_pack(path: Path) -> Path | None:
 
 
 def is_cached(root: Path) -> bool:
-    """True for a scene folder in the cache of packs, which is no place for results."""
+    """True for a scene folder in the cache of packs, to which no results may be written."""
     return root.parent == _cache()
 
 

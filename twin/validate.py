@@ -3,9 +3,9 @@
     python -m twin.validate scenes/demo --task straight --policy scenes/demo/runs/first --episodes 100
     python -m twin.validate scenes/demo --policy first plain my_module:act --lightings held-out night --worst --films
 
-A policy is a run (name or folder), a checkpoint of one, an ONNX file or `module:function`. All policies drive the same
-episodes. Those in `validation/episodes.csv` are not driven again, so a stopped validation continues.
-`validation/validation.html` shows the results.
+A policy is a run (name or folder), a checkpoint of a run, an ONNX file or `module:function`. All policies drive the
+same episodes. Episodes that are in `validation/episodes.csv` are not driven again, so the same command continues a
+stopped validation. `validation/validation.html` shows the results.
 """
 
 import argparse
@@ -41,11 +41,11 @@ from twin.runtime import exclusive_lock
 from twin.scene import SceneDir
 
 DEFAULT_LIGHTINGS = (HELD_OUT, str(Condition(HELD_OUT, True)))
-"""Unseen light alone, and with domain randomization, which is closer to a real road."""
+"""Held-out lightings, first without and then with domain randomization, which is closer to a real road."""
 
 _FIRST_SEED, _PER_LIGHTING, _BLOCKS = 1_000_000_000, 1_000, 900_000  # see `lighting_seeds`
-_SEARCH_SEED, _FINAL_SEED = 2_000_000, 3_000_000  # of the search for the worst lighting, and of its final evaluation
-_SEARCH_LIGHTINGS, _SEARCH_EPISODES, _SEARCH_KEPT = 16, 4, 4  # sampled, episodes in each, kept after the first round
+_SEARCH_SEED, _FINAL_SEED = 2_000_000, 3_000_000  # first seeds of the search for the worst lighting, and of its test
+_SEARCH_LIGHTINGS, _SEARCH_EPISODES, _SEARCH_KEPT = 16, 4, 4  # in the first round: lightings, episodes each, kept
 _MAX_PROCESSES = 1024
 
 Key = tuple[str, str, str, int]
@@ -72,14 +72,14 @@ class Campaign:
             sources: Sources of the policies by name.
             trust: Allows policy files to run code.
             processes: Number of local worker processes.
-            ray: Address of a Ray cluster to use instead of them.
+            ray: Address of a Ray cluster to use instead of worker processes; None: none.
         """
         self._scene, self.task, self.path = str(twin.scene.root.resolve()), task, path
         self._sources, self._trust, self._processes, self._ray = sources, trust, processes, ray
         self._done = {_key(t): t for t in _read_table(path)}
 
     def drive(self, wanted: Sequence[tuple[str, str, Iterable[int]]], what: str) -> list[Trial]:
-        """Trials of (policy, lighting, seeds), in that order; drives missing ones and adds them to the table."""
+        """Returns the trials of each (policy, lighting, seeds) in order; first drives those missing in the table."""
         keys = [(name, self.task, lighting, seed) for name, lighting, seeds in wanted for seed in seeds]
         chunks: list[tuple[str, EpisodeChunk]] = []
         for name, lighting, seeds in wanted:
@@ -131,8 +131,9 @@ def validate(
     """Drives missing episodes and writes `validation/`; returns the contents of its `summary.json`.
 
     Raises:
-        InputError: unknown policy, scene, task or lighting; tables of another build, or of other policies with the same
-            names; an episode that ends differently when it is filmed; another process that writes the same tables.
+        InputError: the policy, scene, task or lighting is unknown; the tables are of another build, or of other
+            policies with the same names; an episode ends differently when it is filmed; or another process is writing
+            the same tables.
     """
     twin = load_writable(root)
     folder = twin.scene.validation
@@ -159,7 +160,7 @@ def validate(
 
 
 def _write_results(twin: Twin) -> dict:
-    """Writes `cells.csv`, `summary.json`, maps and the page from the tables; returns the summary."""
+    """Writes `cells.csv`, `summary.json`, maps, the page and policy cards from the tables; returns the summary."""
     folder, trials = twin.scene.validation, read_trials(twin.scene.episodes_csv)
     write_text(twin.scene.cells_csv, cells_csv(tally(trials)))
     results = summarize(trials)
@@ -177,7 +178,7 @@ def _write_results(twin: Twin) -> dict:
 
 
 def _worst_lightings(path: Path) -> list[dict]:
-    """The final evaluation in the worst lighting, a cell for every policy and task with a search."""
+    """Results of the final evaluations in the worst lighting, one cell per policy and task with a search."""
     trials = _read_table(path)
     cells = summarize([t for t in trials if t.seed >= _FINAL_SEED])["cells"]
     return [
@@ -220,7 +221,7 @@ def _write_films(root: Path, folder: Path, source: str, trust: bool, trials: Seq
 
 
 def _read_films(folder: Path) -> list[dict]:
-    """The entries of `films.json`; none without the file. Raises InputError if `_write_films` did not write it."""
+    """The entries of `films.json`; empty if there is no such file. Raises InputError for an invalid file."""
     path = folder / "films" / "films.json"
     if not path.exists():
         return []
@@ -235,15 +236,18 @@ def _read_films(folder: Path) -> list[dict]:
 def lighting_seeds(lighting: str, episodes: int) -> range:
     """Seeds of a lighting's episodes, the same for every policy and different for every lighting.
 
-    A seed also determines start, robot, weather and distractors: episodes of ten lightings with the same seed would be
-    correlated, and a confidence interval for ten too narrow.
+    A seed also determines start, robot, weather and distractor objects. So episodes of several lightings with the same
+    seed would be correlated, and a confidence interval over these lightings would be too narrow.
     """
     first = _FIRST_SEED + _PER_LIGHTING * (crc32(lighting.encode()) % _BLOCKS)
     return range(first, first + episodes)
 
 
 def _search_worst_lighting(search: Campaign, policy: str, episodes: int) -> None:
-    """Finds a policy's worst of sampled lightings by successive halving, and evaluates it in new episodes."""
+    """Searches sampled lightings for a policy's worst one, and evaluates the policy there in new episodes.
+
+    After each round, the lightings with the worst scores are kept and driven in twice as many further episodes.
+    """
     seeds = range(_SEARCH_SEED, _SEARCH_SEED + _SEARCH_EPISODES)
     candidates = [f"drawn_{k}" for k in range(_SEARCH_LIGHTINGS)]
     trials_by_lighting: dict[str, list[Trial]] = {name: [] for name in candidates}
@@ -255,7 +259,7 @@ def _search_worst_lighting(search: Campaign, policy: str, episodes: int) -> None
         kept = _SEARCH_KEPT if len(candidates) > _SEARCH_KEPT else 1
         candidates = sorted(candidates, key=lambda name: _score(trials_by_lighting[name]))[:kept]
         seeds = range(seeds.stop, seeds.stop + 2 * len(seeds))
-    # The minimum over many noisy scores is biased, hence an independent evaluation.
+    # The minimum of many noisy scores is biased, so the lighting found is evaluated in independent episodes.
     final = range(_FINAL_SEED, _FINAL_SEED + episodes)
     search.drive([(policy, candidates[0], final)], f"{candidates[0]} again")
 
@@ -265,7 +269,7 @@ def _score(trials: Sequence[Trial]) -> tuple[float, float]:
 
 
 def _named(root: Path, sources: Sequence[str], trust: bool) -> dict[str, str]:
-    """Sources of policies by their name in tables; loads each policy once to report errors early."""
+    """Maps the policies' names in tables to their sources; loads each policy once, to report errors early."""
     out: dict[str, str] = {}
     for source in sources:
         where = find_policy(root, source)
@@ -276,7 +280,10 @@ def _named(root: Path, sources: Sequence[str], trust: bool) -> dict[str, str]:
 
 
 def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], policies: dict[str, str]) -> None:
-    """Records digests of policies and of roads (task and lighting). Raises InputError if one in the tables changed."""
+    """Records digests of policies and of roads (a task under a lighting).
+
+    Raises InputError if a policy or road that is in the tables has changed.
+    """
     path = folder / "validated.json"
     recorded: dict[str, Any] = {"roads": {}, "policies": {}}
     if path.exists():
@@ -306,12 +313,12 @@ def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], p
 
 
 def _road(task: str, lighting: str) -> str:
-    """Key of a task under a lighting; sampled lightings share one, as they come from one field."""
+    """Key of a task under a lighting; all sampled lightings have the same key, since they come from the same field."""
     return f"{task}, {'drawn' if lighting.startswith('drawn_') else lighting}"
 
 
 def _digest(path: Path, source: str) -> str:
-    """Digest of a policy's files, or of the name of a function, whose code is unknown."""
+    """Digest of a policy's files. For a function, whose code is unknown, the digest of its name."""
     if path.is_dir():
         return digest_file(path / JSON)  # it contains the digest of the weights
     return digest_file(path) if path.is_file() else digest_json(source)
@@ -333,7 +340,7 @@ def _key(trial: Trial) -> Key:
 
 
 def _drop_partial_row(path: Path) -> None:
-    """Removes an incomplete last line left by a killed process."""
+    """Removes an incomplete last line, which a killed process may leave."""
     if path.exists():
         blob = path.read_bytes()
         if not blob.endswith(b"\n"):
@@ -342,7 +349,7 @@ def _drop_partial_row(path: Path) -> None:
 
 
 def _read_table(path: Path) -> list[Trial]:
-    """The trials in a table; none if it is missing or has no rows."""
+    """The trials in a table; empty if the table is missing or has no rows."""
     return read_trials(path) if path.exists() and path.read_bytes().count(b"\n") > 1 else []
 
 

@@ -1,4 +1,4 @@
-"""Warp without its warning about a missing CUDA driver, which no setting silences; `wp` is imported from here."""
+"""Imports Warp as `wp` without its warning about a missing CUDA driver, which no setting of Warp silences."""
 
 import contextlib
 import os
@@ -15,7 +15,7 @@ _EXPECTED = b"Could not find or load the NVIDIA CUDA driver"
 
 @contextlib.contextmanager
 def _without_the_warning() -> Iterator[None]:
-    """Captures what the block prints on standard error, and passes on all but the expected line."""
+    """Captures the output of the block on standard error, and writes all of it except the expected line."""
     try:
         sys.stderr.flush()
         real = os.dup(2)
@@ -35,6 +35,6 @@ def _without_the_warning() -> Iterator[None]:
                     os.write(2, line)
 
 
-wp.config.log_level = wp.LOG_ERROR  # the progress bars of twin report compilation
+wp.config.log_level = wp.LOG_ERROR  # twin's own progress bars report compilation
 with _without_the_warning():
     wp.init()

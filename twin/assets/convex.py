@@ -1,11 +1,12 @@
 """Convex decomposition of closed meshes by CoACD (Wei et al. 2022), with checked results.
 
-*Piece*: a closed mesh to decompose. *Part*: a closed convex hull. *Protrusion*: largest distance of a part's surface
-outside its piece [m]. *Uncovered*: fraction of a piece's surface further than the protrusion bound from every part.
+*Piece*: a closed mesh to decompose. *Part*: a closed convex hull. *Protrusion*: largest distance by which a part's
+surface lies outside its piece [m]. *Uncovered*: fraction of a piece's surface that is further than the protrusion bound
+from every part.
 
-CoACD has crashed, grown shapes, closed doorways and returned different results for one seed. So it runs in child
-processes with one thread and a time limit, its results are cached by a hash of the input, and parts that protrude too
-far are split.
+CoACD has crashed, enlarged shapes, closed doorways and returned different results for the same seed. So it runs in
+child processes with one thread and a time limit, its results are cached by a hash of the input, and parts that protrude
+too far are split.
 """
 
 import hashlib
@@ -29,10 +30,10 @@ from twin.files import digest_json, load_arrays, save_arrays
 from twin.runtime import child_environment, die_with_parent
 from twin.types import Array
 
-_MAX_COACD_FACES = 400  # meshes for CoACD are decimated to this, since its time grows fast; checks use all faces
+_MAX_COACD_FACES = 400  # CoACD gets meshes decimated to this, since its time grows fast; checks use all faces
 # Results are checked, so a coarser search than CoACD's defaults suffices.
 _SEARCH = {"resolution": 100, "mcts_nodes": 5, "mcts_iterations": 10, "mcts_max_depth": 2}
-_TIME_LIMIT = 120.0  # [s] per piece, far more than any needs: a busy machine shall not change the result
+_TIME_LIMIT = 120.0  # [s] per piece, far more than any piece needs, so that a busy machine does not change the result
 _PROCESSES = 2
 _MAX_HULL_VERTICES = 32
 _SAMPLE_SPACING = 0.06  # [m] between test points on surfaces
@@ -84,7 +85,7 @@ class SolidPiece:
     def from_mesh(
         vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]] | None = None
     ) -> "SolidPiece":
-        """Samples a mesh. `inside` is a faster test than the default, which computes winding numbers."""
+        """Samples a mesh. `inside` may be a faster test than the default, which computes winding numbers."""
         vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
         samples = surface_samples(vertices, faces, _SAMPLE_SPACING)
 
@@ -119,10 +120,11 @@ class Decomposition:
 
 
 def decompose(pieces: list[SolidPiece], bound: float, cache: Path, seed: int) -> Decomposition:
-    """Decomposes closed meshes into convex parts that protrude by at most `bound`.
+    """Decomposes closed meshes into convex parts, which are split until they protrude by at most `bound` [m].
 
-    A piece whose hull is within the bound [m] becomes that hull. If CoACD fails on a piece, its hull is split instead.
-    `cache` is the folder of earlier CoACD results, created if missing.
+    A part that was split `_MAX_SPLITS` times may protrude further. A piece whose hull is within the bound becomes that
+    hull. If CoACD fails on a piece, the piece's hull is split instead. `cache` is the folder of earlier CoACD results,
+    created if missing.
     """
     parts_of: list[list[tuple[ConvexPart, float]]] = []
     for piece in pieces:
@@ -153,9 +155,11 @@ def decompose(pieces: list[SolidPiece], bound: float, cache: Path, seed: int) ->
 def split_to_bound(
     part: ConvexPart, piece: SolidPiece, bound: float, max_splits: int = _MAX_SPLITS
 ) -> list[tuple[ConvexPart, float]]:
-    """Splits a part until none protrudes by more than `bound` [m]; returns the parts with their protrusions [m].
+    """Splits a part until no part protrudes by more than `bound` [m], or `max_splits` times; returns the parts with
+    their protrusions [m].
 
-    A split halves the piece's surface inside the part along its longest axis and takes the hull of each half.
+    A split divides the piece's surface inside the part at the middle of its longest axis, and takes the hull of each
+    half.
     """
     protrusion = piece.protrusion(part)
     if max_splits == 0 or protrusion <= bound:
@@ -193,7 +197,7 @@ def half_spaces(part: ConvexPart) -> tuple[Array, Array]:
 
 
 def uncovered_fraction(piece: SolidPiece, parts: list[ConvexPart], bound: float) -> float:
-    """Fraction of the piece's surface further than about `bound` [m] from every part."""
+    """Fraction of the piece's surface that is further than about `bound` [m] from every part."""
     uncovered = np.ones(len(piece.samples), bool)
     for part in parts:
         uncovered[uncovered] = ~inside_hull(part, piece.samples[uncovered], bound)
@@ -261,7 +265,7 @@ def _run_coacd(
 
 
 def _run_children(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: threading.Event) -> None:
-    """Runs child processes one after another until every job has a result or failed, or until `stopped` is set."""
+    """Runs child processes one after another until every job has succeeded or failed, or until `stopped` is set."""
     pending = list(jobs)
     while pending:
         command = [sys.executable, "-m", "twin.assets.convex", *(str(path) for job in pending for path in job)]
@@ -286,7 +290,7 @@ def _run_children(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: thr
             return
         finished = sum(target.exists() for _, target in pending)
         bar.update(finished - done)
-        # Jobs run in order, so the first without a result crashed or timed out.
+        # Jobs run in order, so the first job without a result has crashed or timed out.
         pending = [job for job in pending if not job[1].exists()][1:]
 
 
@@ -298,7 +302,7 @@ def _read_parts(path: Path) -> list[ConvexPart] | None:
 
 
 def _decompose_files(paths: list[Path]) -> None:
-    """Runs CoACD on files, each followed by the path of its result (in the child process)."""
+    """Runs CoACD on files, in the child process. `paths` has each file followed by the path of its result."""
     import coacd
 
     coacd.set_log_level("off")

@@ -1,8 +1,8 @@
 """Gaussian splats (Kerbl et al. 2023, "3D Gaussian Splatting") of a radiance field, and their `.ply` files.
 
-These Gaussians are not fitted to photos. Each is a pixel of a view rendered from a filmed pose: a disk as large as the
-pixel's footprint on the surface; where views overlap, the smallest is kept. Their color does not depend on the viewing
-direction. Gaussians of one set of views have the same geometry under every lighting and differ in color alone.
+These Gaussians are not fitted to photos. Each one corresponds to a pixel of a view rendered at a filmed pose: a disk as
+large as the pixel's footprint on the surface. Where views overlap, the smallest disks are kept. Colors do not depend on
+the viewing direction. Under different lightings, the Gaussians of one set of views differ in color alone.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,13 +22,13 @@ from twin.types import Array
 
 VIEWS, WIDTH = 60, 320
 """Number of rendered views, and their width [px]."""
-FAR = 100.0  # [m] beyond which geometry becomes background
+FAR = 100.0  # [m] depth beyond which geometry becomes background
 _BACKGROUND = 150.0  # [m] distance of the background's splats
-_MIN_SKY, _MAX_SKY = 500, 50_000  # pixels that the sky's color is fitted to
-_SKY_TOLERANCE = 30.0  # rms difference over lightings and channels, of 255, up to which a color is the sky's
-_BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3  # the same, and within how many pixels [px], beside the former
-_MIN_CELL = 0.01  # [m] side of the smallest thinning cell, which keeps one Gaussian
-_DISK, _THICKNESS = 0.8, 0.2  # standard deviations along the surface and across it [pixel widths]
+_MIN_SKY, _MAX_SKY = 500, 50_000  # least and largest number of pixels to which the sky's color is fitted
+_SKY_TOLERANCE = 30.0  # rms difference from the sky's color over lightings and channels (0 to 255) of a sky pixel
+_BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3  # the same for pixels that blend sky and leaves; [px] from a sky pixel
+_MIN_CELL = 0.01  # [m] side of the smallest cells in which one Gaussian is kept
+_DISK, _THICKNESS = 0.8, 0.2  # standard deviations along the surface and perpendicular to it [pixel widths]
 _MAX_ELONGATION = 4.0  # length / width of a disk seen at a grazing angle
 _OPACITY = 0.97
 _SH_CONSTANT = 0.28209479177387814  # spherical harmonic of degree 0, 1 / (2 √π)
@@ -50,7 +50,7 @@ class Gaussians:
     """In (0, 1), shape (k,)."""
 
     def render_settings(self) -> dict[str, NDArray[np.float32]]:
-        """Arguments of `mujoco_warp.create_render_context` that make it draw these splats."""
+        """Arguments for `mujoco_warp.create_render_context`, which then draws these splats."""
         return {
             "splat_position": np.ascontiguousarray(self.positions),
             "splat_rotation": np.ascontiguousarray(self.rotations),
@@ -59,7 +59,7 @@ class Gaussians:
         }
 
     def to_ply(self) -> bytes:
-        """Binary `.ply` for 3DGS viewers: colors as spherical harmonics, opacities as logits, scales as logarithms."""
+        """Binary `.ply` for 3DGS viewers. Colors are spherical harmonics, opacities logits, scales logarithms."""
         columns = {
             **dict(zip("xyz", self.positions.T, strict=True)),
             **{f"n{axis}": np.zeros(len(self.rgb)) for axis in "xyz"},
@@ -84,12 +84,13 @@ _MAX_COORDINATE = 1e6  # [m]
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Reads a binary `.ply` of 3DGS trainers and viewers, in the frame that the file has.
+    """Reads a binary `.ply` as written by 3DGS trainers, in the file's coordinate frame.
 
-    Only the constant color is kept, no higher spherical harmonics. Gaussians that are not finite are left out.
+    Of the color, only the constant term is read, not the higher spherical harmonics. Gaussians with numbers that are
+    not finite are left out.
 
     Raises:
-        InputError: no such file, another format, or one cut off.
+        InputError: there is no such file, it has another format, or it is cut off.
     """
     content = read_bytes(path, _MAX_PLY)
     cure = "expected a 3D Gaussian splat .ply (binary, little endian), as 3DGS trainers write"
@@ -140,7 +141,7 @@ _COLUMNS = {"f_dc": 3, "scale": 3, "rot": 4}
 
 
 def views_by_lighting(field: ColorField, cameras: Cameras, lightings: Sequence[str]) -> dict[str, Views]:
-    """The views that Gaussians are made of, in air without fog, under each of the lightings; all have the same depth.
+    """Views without fog under each of the lightings, from which Gaussians are made; all have the same depth.
 
     Raises:
         InputError: unknown lighting.
@@ -154,17 +155,18 @@ def views_by_lighting(field: ColorField, cameras: Cameras, lightings: Sequence[s
 
 
 def gaussians_by_lighting(views: Mapping[str, Views]) -> dict[str, Gaussians]:
-    """Gaussians under each lighting of `views_by_lighting`: the same ones in other colors."""
+    """Gaussians for each lighting of `views_by_lighting`; they differ in color alone."""
     splats, pixel = gaussians_of_views(next(iter(views.values())), _BACKGROUND)
     return {name: replace(splats, rgb=_colors(one, pixel)) for name, one in views.items()}
 
 
 def sky_on_surfaces(views: Sequence[Views]) -> NDArray[np.bool_]:
-    """Mask of pixels (n, h, w) that show the sky's color on something nearer, such as a gap in a crown.
+    """Mask of pixels (n, h, w) that have the sky's color but a nearer depth, such as gaps in the crown of a tree.
 
-    Seen from elsewhere they would be blue clumps; they belong to the background. The sky's color is fitted to the
-    pixels of the background as a quadratic function of the direction; a pixel above the horizon has that color if it
-    does under every lighting. Pixels beside such ones may differ more from it, as they blend it with leaves.
+    As Gaussians they would look like blue clumps from other directions, so they belong to the background. The sky's
+    color is fitted to the background's pixels as a quadratic function of the direction. A pixel above the horizon is
+    selected if its rms difference from that color, over all lightings, is small. Pixels next to selected ones may
+    differ more, since they blend sky and leaves.
 
     Args:
         views: The same views under each filmed lighting.
@@ -191,7 +193,7 @@ def sky_on_surfaces(views: Sequence[Views]) -> NDArray[np.bool_]:
 
 
 def gaussians_of_views(views: Views, background: float) -> tuple[Gaussians, NDArray[np.int64]]:
-    """One Gaussian per pixel, thinned to one per cell of about its own size.
+    """One Gaussian per pixel, thinned to one per cell; the cells are about as large as the Gaussians.
 
     Pixels of depth 0 are skipped; depths are limited to `background` [m].
 
@@ -217,7 +219,7 @@ def gaussians_of_views(views: Views, background: float) -> tuple[Gaussians, NDAr
     joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
     keep = select_sharpest(joined[0], joined[3])
     position, rays, normal, width, length, pixel = (column[keep] for column in joined)
-    along = rays - (rays * normal).sum(1, keepdims=True) * normal  # the ray projected onto the surface: the long axis
+    along = rays - (rays * normal).sum(1, keepdims=True) * normal  # long axis: the ray projected onto the surface
     along += 1e-6 * np.cross(normal, [0.3, 0.5, 0.8])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     frame = np.stack([along, np.cross(normal, along), normal], -1)
@@ -252,9 +254,10 @@ def _surface_normals(points: Array) -> Array:
 
 
 def select_sharpest(points: Array, width: Array) -> NDArray[np.int64]:
-    """Indices of the points (k, 3) to keep: in each cell without a finer point, that of the smallest width (k,) [m].
+    """Indices of the points (k, 3) to keep, by their widths (k,) [m].
 
-    A point's cell size is its width, rounded up to `_MIN_CELL` times a power of two.
+    A point's cell has the point's width as its size, rounded up to `_MIN_CELL` times a power of two. In each cell, the
+    point with the smallest width is kept, unless the cell contains a kept point with smaller cells.
     """
     level = np.maximum(np.ceil(np.log2(width / _MIN_CELL)), 0).astype(int)
     kept: list[NDArray[np.int64]] = []

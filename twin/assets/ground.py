@@ -1,7 +1,7 @@
 """Ground height field, fitted to rendered depth, sparse points and the camera path.
 
-A height datum is a height z ± σ measured at (x, y), of one of three kinds: `field` (rendered pixels on near-level
-surfaces), `points` (structure from motion) and `path` (camera centers minus the camera height).
+A height datum is a height z ± σ measured at (x, y). There are three kinds of data: `field` (rendered pixels on
+near-level surfaces), `points` (structure from motion) and `path` (camera centers minus the camera height).
 """
 
 from dataclasses import dataclass, replace
@@ -36,7 +36,7 @@ class Ground:
     measured: NDArray[np.bool_]
     """False where the height is extrapolated, shape as `height`."""
     rgb: NDArray[np.uint8]
-    """Mean color, shape (rows, columns, 3)."""
+    """Mean color of the ground around each node, shape (rows, columns, 3)."""
 
     def at(self, xy: NDArray) -> NDArray[np.float64]:
         """Bilinear height [m] at points (..., 2), clamped to the edge."""
@@ -50,7 +50,10 @@ class Ground:
         return Ground(self.height[nodes], self.origin, self.cell * n, self.measured[nodes], self.rgb[nodes])
 
     def triangles(self, cell: float, max_faces: int) -> tuple[Array, NDArray[np.int64]]:
-        """Vertices (v, 3) [m] and upward faces (f, 3) on every n-th node, at least `cell` [m] wide, ≤ `max_faces`."""
+        """Vertices (v, 3) [m], and faces (f, 3) that face upwards, on every n-th node.
+
+        Triangles are about `cell` [m] wide, or wider if there would be more than about `max_faces`.
+        """
         rows, columns = self.height.shape
         step = max(1, round(cell / self.cell), int(np.ceil(np.sqrt(2 * rows * columns / max_faces))))
         row, column = (np.unique(np.append(np.arange(0, n, step), n - 1)) for n in (rows, columns))
@@ -97,15 +100,15 @@ def _interpolate(height: Array, origin: Array, cell: float, xy: Array, order: in
 # ---- height data
 
 DATA_KINDS = ("field", "points", "path")
-_MIN_UPRIGHT = 0.94  # z of a normal (20° from vertical); steeper surfaces are no ground
-_GATE, _GATE_PER_METER = 0.25, 0.05  # [m] largest height difference to the path, plus so much per meter of distance
-_SIGMA_FIELD = 0.03  # [m] σ of a cell's median rendered height near the lens
-_SIGMA_POINTS = 0.04  # [m] σ of a cell's median sparse point
+_MIN_UPRIGHT = 0.94  # z of a normal (20° from vertical); steeper surfaces are not ground
+_GATE, _GATE_PER_METER = 0.25, 0.05  # [m] largest height difference to the path: at the path, and added per meter away
+_SIGMA_FIELD = 0.03  # [m] σ of the median rendered height in a cell, near the lens
+_SIGMA_POINTS = 0.04  # [m] σ of the median height of the sparse points in a cell
 _SIGMA_PATH = 0.012  # [m] σ of the path of a rigidly mounted camera
-_LATERAL_OFFSETS = (-0.6, -0.3, 0.0, 0.3, 0.6)  # [m] beside the path, where the wheels drove
-_CROSS_SLOPE = 0.02  # possible cross slope of a road, which the path does not measure
-_DATA_CELL = 0.25  # [m] side of the squares with one datum each
-_MAX_DEPTH = 18.0  # [m] ground beyond this depth fills only a few pixel rows
+_LATERAL_OFFSETS = (-0.6, -0.3, 0.0, 0.3, 0.6)  # [m] offsets of path data to the left, as wide as the wheels' track
+_CROSS_SLOPE = 0.02  # σ of the cross slope of a road, which the path does not measure
+_DATA_CELL = 0.25  # [m] side of the square cells with one datum each
+_MAX_DEPTH = 18.0  # [m] farther ground is not used, since it fills only a few pixel rows
 
 
 @dataclass(frozen=True)
@@ -150,7 +153,8 @@ def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData
 
 
 def _field_data(views: Views) -> tuple[HeightData, Array, NDArray[np.uint8]]:
-    """Data from near-level rendered pixels, one per cell, and points (k, 3) and colors (k, 3) of these pixels."""
+    """Data from rendered pixels on near-level surfaces, one datum per cell; also the points (k, 3) and colors (k, 3) of
+    these pixels."""
     points, sigmas, colors = [], [], []
     for i in range(len(views)):
         depth = views.depth[i]
@@ -166,12 +170,17 @@ def _field_data(views: Views) -> tuple[HeightData, Array, NDArray[np.uint8]]:
 def _path_data(
     cameras: Cameras, ground_height: Array | None, camera_height: float
 ) -> tuple[HeightData, dict[str, dict]]:
-    """Data from the camera path minus the camera height, with σ from how steadily each source was carried.
+    """Data from the camera path minus the camera height; σ depends on how steadily each source's camera was carried.
 
     Args:
         cameras: n metric cameras.
-        ground_height: Ground height below each camera by the other kinds of data [m], shape (n,); None = unknown.
-        camera_height: The height that set the scale [m]; 0 = the median of each source above `ground_height`.
+        ground_height: Ground height below each camera according to the other kinds of data [m], shape (n,); None =
+            unknown.
+        camera_height: The camera height that set the scale [m]; 0 = use each source's median height above
+            `ground_height`.
+
+    Returns:
+        The data, and for each source its height and variations [m], for the report.
     """
     parts, metrics = [], {}
     for index in source_frames(cameras):
@@ -186,7 +195,7 @@ def _path_data(
         if ground_height is not None and len(z) > 4:
             drift = gaussian_filter1d(above, 4.0, mode="nearest")
             slow = 1.4826 * float(np.median(np.abs(drift - np.median(drift))))
-        # The other kinds of data vary by about 3 cm themselves; the rest is the motion of the camera.
+        # The other kinds of data vary by about 3 cm; any further slow variation is attributed to the camera.
         sigma = float(np.sqrt(_SIGMA_PATH**2 + rapid**2 + max(0.0, slow**2 - 0.03**2)))
         metrics[cameras.sources[index[0]]] = {
             "camera_height_m": height,
@@ -218,7 +227,7 @@ def _path_strip(xyz: Array, sigma: float) -> HeightData:
 
 
 def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> float:
-    """Median height of data above the path data within `reach` [m]; 0 with fewer than ten pairs."""
+    """Median height of data above the nearest path data, over pairs within `reach` [m]; 0 with fewer than ten pairs."""
     if len(path.xyz) == 0 or len(data.xyz) == 0:
         return 0.0
     away, nearest = cKDTree(path.xyz[:, :2]).query(data.xyz[:, :2], distance_upper_bound=reach)
@@ -228,14 +237,14 @@ def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> floa
 
 # ---- fit
 
-_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m], and upper bounds
+_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m], and largest numbers of nodes
 _MAX_CELLS = 1_500_000
-_SMOOTHING_LENGTH = 0.5  # [m] shorter structure is smoothed as noise
-_EXTRAPOLATION_LENGTH = 8.0  # [m] over which slopes continue without data
+_SMOOTHING_LENGTH = 0.5  # [m] shorter structure is smoothed, as noise
+_EXTRAPOLATION_LENGTH = 8.0  # [m] distance over which slopes continue where there are no data
 _REWEIGHTINGS = 6
-_COLOR_WIDTHS = (0.1, 0.4, 1.6, 6.4)  # [m] σ of means of colors
-_COLOR_WEIGHT = 0.1  # least share of cells with a color for a mean to count in full
-_MIN_DATA = 50  # with fewer data the ground is flat
+_COLOR_WIDTHS = (0.1, 0.4, 1.6, 6.4)  # [m] σ of the Gaussian windows for mean colors
+_COLOR_WEIGHT = 0.1  # fraction of a window's cells with a color, from which its mean has full weight
+_MIN_DATA = 50  # with fewer data, the ground is flat
 
 
 @dataclass(frozen=True)
@@ -249,7 +258,7 @@ class HeightGrid:
 
     @staticmethod
     def covering(low: Array, high: Array, cell: float, max_nodes: int) -> "HeightGrid":
-        """A grid over the box from `low` to `high` (x, y); the cell grows where it would exceed `max_nodes`."""
+        """A grid over the box from `low` to `high` (x, y); the cell grows if there would be more than `max_nodes`."""
         cell = max(cell, float(np.sqrt(np.prod(high - low) / max_nodes)))
         columns, rows = (int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
         return HeightGrid(np.asarray(low, float), cell, rows, columns)
@@ -266,7 +275,10 @@ class HeightGrid:
         return self.origin + self.cell * np.stack([x, y], -1)
 
     def sample(self, height: Array, xy: Array, order: int = 1) -> Array:
-        """Heights [m] at points (..., 2), from nodes (rows, columns) by splines of `order`, clamped to the edge."""
+        """Heights [m] at points (..., 2), interpolated between nodes `height` (rows, columns) by splines of `order`.
+
+        Points outside the grid get the height at its edge.
+        """
         return _interpolate(height, self.origin, self.cell, xy, order)
 
 
@@ -278,10 +290,11 @@ def fit_height(
         Σ ρ((h(xᵢ, yᵢ) − zᵢ) / σᵢ) + λ Σ |second differences of h|² + μ Σ |first differences of h|²
 
     with the Geman-McClure loss ρ, by iteratively reweighted least squares with sparse factorization. The second term
-    smooths bumps but not slopes; the last one limits how far a slope continues without data.
+    smooths bumps but not slopes; the last term limits how far a slope continues without data.
 
-    At least one datum must be inside the grid. The first weights come from the heights `initial` (rows, columns) [m],
-    or are equal. Returns heights (rows, columns) [m], and the final weight of each datum in [0, 1], shape (k,).
+    At least one datum must be inside the grid. If heights `initial` (rows, columns) [m] are given, the first robust
+    weights are computed from them; otherwise the first robust weights are all 1. Returns heights (rows, columns) [m],
+    and the final robust weight of each datum in [0, 1], shape (k,).
     """
     node, inside = grid.index(data.xyz[:, :2])
     node, z, sigma = node[inside], data.xyz[inside, 2], data.sigma[inside]
@@ -291,7 +304,7 @@ def fit_height(
     robust = np.ones(len(z))
     for iteration in range(iterations):
         if height is not None:
-            # The width of the loss shrinks from 3 σ to 2 σ: a poor first solution shall not reject good data.
+            # The width of the loss shrinks from 2.5 σ to 2 σ, so that a poor first solution does not reject good data.
             width = (max(3.0 - iteration / 2, 2.0) if initial is None else 2.0) * sigma
             robust = (1.0 + ((height[node] - z) / width) ** 2) ** -2
         weight = robust / sigma**2
@@ -350,8 +363,8 @@ def build_ground(
 ) -> tuple[Ground, dict[str, Any]]:
     """Fits the ground over a box, given by its low and high corners (x, y) [m]; also returns metrics for the report.
 
-    `height` is the camera height that set the scale [m]; 0 = estimate it per source; None = do not use the path (an
-    object was filmed from around it).
+    `height` is the camera height that set the scale [m]; 0 = estimate it per source; None = do not use the path,
+    because the camera moved around an object.
     """
     low, high = box
     coarse = HeightGrid.covering(low, high, _COARSE_CELL, _COARSE_NODES)
@@ -364,7 +377,7 @@ def build_ground(
     visible = []
     for data in (field, sparse_points):
         away = tree.query(data.xyz[:, :2])[0] if tree is not None else np.zeros(len(data.xyz))
-        # Many points are on obstacles, far from the level of the path.
+        # Rejects the many points on obstacles, whose heights differ from the level of the path.
         gap = np.abs(data.xyz[:, 2] - coarse.sample(level, data.xyz[:, :2]))
         keep = gap < _GATE + _GATE_PER_METER * away
         visible.append(HeightData(data.xyz[keep], data.sigma[keep], data.kind[keep]))
@@ -372,7 +385,8 @@ def build_ground(
     if height is not None and sum(len(data.xyz) for data in visible) >= _MIN_DATA:
         below = coarse.sample(fit_height(HeightData.join(visible), coarse)[0], cameras.positions[:, :2])
         path, path_metrics = _path_data(cameras, below, height)
-        # Each kind has an offset in height (blurred depth, tilted scale), which would leave a step beside the path.
+        # Data of each kind have a height offset (blurred depth, tilted scale), which would cause a step beside the
+        # path.
         bias = [bias_to_path(data, path) for data in visible]
         visible = [replace(d, xyz=d.xyz - [0.0, 0.0, b]) for d, b in zip(visible, bias, strict=True)]
     data = HeightData.join([*visible, path])
@@ -401,8 +415,7 @@ def build_ground(
 
 
 def _mean_colors(grid: HeightGrid, points: Array, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Mean color per cell; a cell without pixels has a mean of cells around it, over a wider circle the farther they
-    are."""
+    """Mean color of each cell, shape (rows, columns, 3) uint8, over windows that widen where there are few pixels."""
     node, inside = grid.index(points[:, :2])
     count = np.bincount(node[inside], minlength=grid.rows * grid.columns)
     if not count.any():

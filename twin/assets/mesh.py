@@ -31,14 +31,14 @@ from twin.scene import SceneDir
 from twin.types import Array
 
 _VISUAL_FACES = 150_000
-_MARGIN_ABOVE = 2.0  # [m] of the visual mesh above the highest obstacle
-_MARGIN_BELOW = 1.0  # [m] of the visual mesh below the lowest ground
+_MARGIN_ABOVE = 2.0  # [m] the visual mesh extends this far above the highest possible obstacle
+_MARGIN_BELOW = 1.0  # [m] the visual mesh extends this far below the lowest ground
 _VISUAL_GROUND_CELL = 0.4  # [m] smallest width of the ground triangles
 _SPECK_AREA = 0.25  # [m²] smaller components are floaters
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = None) -> dict[str, Any]:
-    """Runs the stage, see `twin.build`. Raises InputError: a route is wanted but the camera hardly moved."""
+    """Runs the stage; see `twin.build`. Raises InputError: the scene needs a route, but the camera hardly moved."""
     from twin.nerf.field import RadianceField
 
     field = RadianceField.load(scene.stage("field"), device)
@@ -53,7 +53,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
 def build_assets(
     field: ColorField, cameras: Cameras, points: SparsePoints, config: SceneConfig, out: Path, cache: Path
 ) -> dict[str, Any]:
-    """Writes all files of the stage from any field; returns the metrics."""
+    """Writes the files of the stage, except `ground.png`, from any field; returns the metrics."""
     clock = [("start", time.perf_counter())]
     settings = config.mesh
     filmed = filmed_route(cameras, config.route) if config.mjcf.route else None
@@ -61,7 +61,7 @@ def build_assets(
     path = route if route is not None else cameras.positions[:, :2]
     low, high = path.min(0) - settings.margin, path.max(0) + settings.margin
     if route is None:
-        # Around an object, the field beyond its near box is background.
+        # In a capture around an object, everything outside the field's near box is background.
         low, high = np.maximum(low, field.bounds[0, :2]), np.minimum(high, field.bounds[1, :2])
     far = settings.margin + 2.0
     views = render_views(field, cameras, settings.views, settings.view_width, FREE_SPACE_REACH * far)
@@ -106,7 +106,7 @@ def build_assets(
 
 
 def _camera_height(config: SceneConfig) -> float:
-    """The given height of the camera [m]; 0 if there is none or sources differ, so that it is estimated per source."""
+    """The given height of the camera [m]; 0 if none is given or sources differ, so that it is estimated per source."""
     heights = {source.camera_height or config.metric.camera_height for source in config.source}
     return heights.pop() if len(heights) == 1 else 0.0
 
@@ -122,12 +122,12 @@ def _surface_points(views: Views, ground: Ground, box: Array, far: float) -> Arr
 
 
 def _visual_mesh(volume: tsdf.Volume, views: Views, ground: Ground) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Colored triangles of the seen surfaces above the ground and of the ground itself, and metrics."""
+    """Colored triangles of the surfaces that views see above the ground, and of the ground itself; also metrics."""
     vertices, faces = tsdf.zero_level(volume.distance, volume.origin, volume.voxel)
     above = vertices[:, 2] - ground.at(vertices[:, :2]) > 0.05
     vertices, faces = tsdf.compact(vertices, faces[above[faces].any(1)])
     colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, volume.band)
-    # The far side of the band of distances is no surface; no view sees it.
+    # Removes the rear boundary of the band of valid distances, which is not a surface and which no view sees.
     vertices, faces = tsdf.compact(vertices, faces[seen[faces].all(1)])
     vertices, faces, floaters = tsdf.remove_specks(vertices, faces, _SPECK_AREA)
     vertices, faces = tsdf.decimate(vertices, faces, _VISUAL_FACES * 2 // 3)
@@ -196,7 +196,8 @@ def _save_parts(
 
 
 def _roughness(ground: Ground, route: Array | None) -> dict[str, float | None]:
-    """RMS slope of the measured ground; along the route RMS slope and curvature, and coverage within 1.5 m."""
+    """RMS slope of the measured ground; with a route, also RMS slope and curvature along it, and the measured fraction
+    of the ground within 1.5 m of it."""
     dy, dx = np.gradient(ground.height, ground.cell)
     slope = np.hypot(dx, dy)[ground.measured]
     metrics: dict[str, float | None] = {"slope_rms": float(np.sqrt(np.mean(slope**2))) if len(slope) else None}

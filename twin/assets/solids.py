@@ -1,8 +1,9 @@
 """Closed meshes of the obstacles for the convex decomposition, and the corridor that is kept free of them.
 
-The solid is the negative part of the distance field and the hidden space up to `_HIDDEN_DEPTH` behind it: a film from a
-road shows fronts only, and a wall needs thickness to collide with. The corridor is the area within a half width of the
-filmed route, up to `HEADROOM` above the ground; it is free, since the camera passed through it.
+The solid is the space where the distance field is negative, and the hidden space up to `_HIDDEN_DEPTH` behind it: a
+film from a road shows only the fronts of obstacles, but a wall needs thickness for collisions. The corridor is the
+space within a half width of the filmed route, up to `HEADROOM` above the ground; it is free, since the camera passed
+through it.
 """
 
 from dataclasses import dataclass
@@ -22,13 +23,13 @@ from twin.geometry.route import distance_to_route
 from twin.types import Array
 
 HEADROOM = 1.5  # [m] height of the corridor above the ground
-_GROUND_CLEARANCE = 0.1  # [m] above the height field, below which everything is ground
-_MAX_GROUND_GAP = 0.6  # [m] smaller gaps to the ground are closed, so that nothing hovers
-_EMBEDDING = 0.15  # [m] depth of parts below the ground
+_GROUND_CLEARANCE = 0.1  # [m] above the height field; everything lower is ground
+_MAX_GROUND_GAP = 0.6  # [m] smaller gaps between obstacles and the ground are closed, so that nothing hovers
+_EMBEDDING = 0.15  # [m] depth to which parts extend below the ground
 _TILE_SIZE = 3.0  # [m] side of the square columns that large obstacles are divided into
-_MIN_VOXELS = 8  # smaller components are noise
-_MIN_HOVERING_VOXELS = 64  # smaller components are noise if they hover
-_HIDDEN_DEPTH = 0.3  # [m] behind a surface where hidden space is solid
+_MIN_VOXELS = 8  # components with fewer voxels are noise
+_MIN_HOVERING_VOXELS = 64  # components that hover above the ground are noise if they have fewer voxels
+_HIDDEN_DEPTH = 0.3  # [m] hidden space up to this far behind a surface is solid
 _MAX_GAP = 0.45  # [m] narrower gaps in the solid are closed
 _SMOOTHING = 0.7  # voxels
 _EROSION = 0.06  # [m] inward offset of surfaces: blur moves edges outwards, and convex hulls add volume
@@ -43,17 +44,17 @@ class Corridor:
     route: Array
     """Shape (m, 2) [m]."""
     reach: float
-    """Half width plus margin [m]."""
+    """Half width of the corridor plus its margin [m]."""
 
 
 def solid_pieces(
     volume: Volume, ground: Ground, corridor: Corridor | None, cameras: Cameras, config: MeshConfig
 ) -> tuple[list[SolidPiece], dict[str, int]]:
-    """Closed meshes, at most a tile wide, of all components that reach `obstacle_height` above the ground.
+    """Closed meshes, at most one tile wide, of all components that reach `obstacle_height` above the ground.
 
     Returns:
-        Pieces, nearest to the path first, and the numbers of components that are `standing`, and of the `specks` and
-        `low` ones left out.
+        Pieces, nearest to the path first; and the number of components used (`standing`), and of those left out because
+        they are small (`specks`) or low (`low`).
     """
     voxel = volume.voxel
     columns = volume.distance.shape[:2]
@@ -109,7 +110,7 @@ def solid_pieces(
 
 
 def _solid_distance(volume: Volume) -> NDArray[np.float32]:
-    """Distance field [m] of the solid: the fused field near seen surfaces, clipped to a voxel and eroded by `_EROSION`.
+    """Distance field [m] of the solid, clipped to one voxel, smoothed, and eroded by `_EROSION`.
 
     Gaps narrower than `_MAX_GAP`, as in foliage and noise, are closed: the robot cannot pass them, and each one would
     lengthen the decomposition.
@@ -125,12 +126,12 @@ def _solid_distance(volume: Volume) -> NDArray[np.float32]:
     field = np.where(np.isfinite(volume.distance), np.clip(volume.distance, -voxel, voxel), smooth)
     field = np.where(closed & ~seen, np.minimum(field, smooth), field)
     field = gaussian_filter(field, _SMOOTHING) + _EROSION
-    # Keeps obstacles that are as thin as a lamp post.
+    # Erosion must not remove obstacles as thin as a lamp post.
     return np.where(volume.distance < -_CERTAIN_DEPTH, np.minimum(field, -0.1 * voxel), field).astype(np.float32)
 
 
 def _close_downwards(field: NDArray, above: NDArray, voxel: float) -> None:
-    """Fills each column from its lowest solid voxel to the ground if the gap is small, in place."""
+    """Fills each column of `field`, in place, from its lowest solid voxel to the ground if the gap is small."""
     matter = field < 0
     lowest = np.where(matter, above, np.inf).min(-1)
     fill = (lowest < _MAX_GROUND_GAP)[..., None] & (above < lowest[..., None]) & (above > -_EMBEDDING - voxel)
@@ -138,7 +139,10 @@ def _close_downwards(field: NDArray, above: NDArray, voxel: float) -> None:
 
 
 def _block_piece(values: NDArray, volume: Volume, start: NDArray) -> SolidPiece | None:
-    """The closed surface of the block of the field that starts at voxel `start`; None if it is empty."""
+    """The closed surface of a block of the field, with the values `values` and its first voxel at `start`.
+
+    None if the block is empty.
+    """
     voxel = volume.voxel
     padded = np.pad(values, 1, constant_values=0.5 * voxel)
     origin = volume.origin + voxel * (start - 1)
@@ -155,7 +159,7 @@ def _block_piece(values: NDArray, volume: Volume, start: NDArray) -> SolidPiece 
 def clear_corridor(
     parts: list[ConvexPart], corridor: Corridor, ground: Ground
 ) -> tuple[list[tuple[int, ConvexPart]], int]:
-    """Cuts convex parts below the headroom along tangents of the corridor until they are clear of it.
+    """Cuts convex parts that are below the headroom along tangents of the corridor, until they are outside it.
 
     Returns:
         The remaining parts, each with the index of its original, and the number of parts that were cut or dropped.
@@ -200,12 +204,13 @@ def clip_part(part: ConvexPart, normal: Array, offset: float) -> ConvexPart | No
 
 
 def _sagitta(reach: float) -> float:
-    """Largest error [m] of measuring distances from the route's points, `SPACING` apart, instead of from its line."""
+    """Largest error [m] if a distance is measured to the route's points, `SPACING` apart, instead of to its line."""
     return SPACING**2 / (8 * reach)
 
 
 def _intrusion(part: ConvexPart, route: Array, reach: float, ground: Ground) -> tuple[float, Array, Array]:
-    """Depth [m] of a part inside the corridor (≤ 0 = clear), the route point there, and the unit vector to the part."""
+    """Depth [m] to which a part reaches into the corridor (≤ 0: it is outside), the route point where it is deepest,
+    and the unit vector from that point to the part."""
     clear = (-1.0, np.zeros(2), np.zeros(2))
     low, high = part.vertices[:, :2].min(0) - reach, part.vertices[:, :2].max(0) + reach
     near = route[((route >= low) & (route <= high)).all(1)]
@@ -232,7 +237,7 @@ def _intrusion(part: ConvexPart, route: Array, reach: float, ground: Ground) -> 
 
 
 def _distance_to_outline(points: Array, outline: Array) -> tuple[Array, Array]:
-    """Distance (k,) of points (k, 2) to a convex polygon, 0 inside, and the nearest points (k, 2) of its edges."""
+    """Distance (k,) of points (k, 2) to a convex polygon, 0 inside, and the nearest points (k, 2) on its edges."""
     along = np.roll(outline, -1, axis=0) - outline
     toward = points[:, None] - outline
     fraction = np.einsum("kij,ij->ki", toward, along) / np.maximum((along**2).sum(1), 1e-18)

@@ -1,10 +1,10 @@
 """Fusion of depth maps into a truncated signed distance field (TSDF), and triangle meshes from it.
 
-*Signed distance* [m]: positive in free space, negative behind a surface, valid within ± `band` of it. At each voxel a
-view votes `near` if its surface passes within the band, `free` if it sees further (Curless & Levoy 1996, eqs. 3 and 4,
-with votes for free space), so the views through a floater outvote the few that show it. At a depth edge the radiance
-field has a false, slanted surface from the near to the far side. The view sees it edge-on, so its votes have little
-weight, and views from elsewhere outvote it.
+*Signed distance* [m]: positive in free space, negative behind a surface, valid within ± `band` of the surface. At each
+voxel, a view votes `near` if its surface is within the band, and `free` if its surface is further away (Curless & Levoy
+1996, eqs. 3 and 4, with votes for free space). So the few views that show a floater are outvoted by those that see
+through it. At a depth edge, the radiance field has a false, slanted surface between the near and the far side. The view
+sees this surface edge-on, so its votes have little weight, and views from elsewhere outvote it.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -25,9 +25,9 @@ from twin.geometry.poses import inverse_pose
 from twin.types import Array
 from twin.warp_runtime import wp
 
-FREE_SPACE_REACH = 2.5  # free votes reach this many times as far as surface votes
+FREE_SPACE_REACH = 2.5  # largest depth of free votes / largest depth of surface votes
 _HALF_WEIGHT_DEPTH = 5.0  # [m] depth at which a vote has half weight, since pixels and errors grow with depth
-_CLEARANCE = 0.1  # of the depth: beyond `far`, a voxel is free only if the surface is this much further
+_CLEARANCE = 0.1  # beyond `far`, a voxel is free only if the surface is further by this fraction of the voxel's depth
 _SAME_SURFACE_RATIO = 1.1  # largest depth ratio of neighboring pixels on one surface
 
 
@@ -82,7 +82,7 @@ def _fuse_kernel(
                 high = wp.max(wp.max(a, b), wp.max(c, d))
                 surface = depth[view, nearest_row, nearest_column]
                 if low > 0.0 and high < one_surface * low:
-                    # One surface: inverse depth is bilinear on it.
+                    # The four pixels are on one surface, so inverse depth is bilinear.
                     s = u - float(column)
                     t = v - float(row)
                     surface = 1.0 / ((1.0 - t) * ((1.0 - s) / a + s / b) + t * ((1.0 - s) / c + s / d))
@@ -144,7 +144,7 @@ def _color_kernel(
 
 
 def fuse(points: Array, views: Views, band: float, far: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Fuses all views at points (k, 3): signed distance [m] (NaN without near votes), near and free votes, each (k,).
+    """Fuses all views at points (k, 3): signed distance [m] (NaN without near votes), near and free votes, shapes (k,).
 
     Views vote for surfaces up to the depth `far` [m], and for free space up to `FREE_SPACE_REACH` times as far.
     """
@@ -161,9 +161,10 @@ def fuse(points: Array, views: Views, band: float, far: float) -> tuple[NDArray,
 def color_points(
     points: Array, normals: Array, views: Views, tolerance: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Colors (k, 3) of surface points (k, 3) with normals (k, 3) from the nearest views, and a mask (k,) of those seen.
+    """Colors (k, 3) of surface points (k, 3) with normals (k, 3), and a mask (k,) of the points that a view sees.
 
-    A view sees a point that faces it if its depth there agrees within `tolerance` [m] plus 5 %.
+    Colors are weighted means in which the nearest views dominate. A view sees a point if the surface faces the view,
+    and the view's depth at its pixel agrees with the point's depth within `tolerance` [m] plus 5 %.
     """
     with wp.ScopedDevice("cpu"):
         colors = wp.zeros(len(points), dtype=wp.vec3)
@@ -190,9 +191,9 @@ def _camera_arrays(points: Array, views: Views) -> list[wp.array]:
 
 _BLOCK = 4  # voxels
 _MAX_VOXELS = 60_000_000
-_BAND_VOXELS = 2.0  # voxels on each side of a surface
+_BAND_VOXELS = 2.0  # half width of the band around a surface [voxels]
 _VOXELS_PER_LAUNCH = 400_000
-_FREE_MAJORITY = 0.75  # fraction of free votes that removes a surface
+_FREE_MAJORITY = 0.75  # a surface is removed where more than this fraction of the votes is free
 
 
 @dataclass(frozen=True)
@@ -200,11 +201,13 @@ class Volume:
     """Grid of signed distances; voxel (i, j, k) is at origin + voxel · (i, j, k) [m]."""
 
     distance: NDArray[np.float32]
-    """[m], shape (x, y, z); NaN where no surface is near, or unseen."""
+    """[m], shape (x, y, z); NaN where no surface is near, or where no view has a vote."""
     hidden: NDArray[np.bool_]
-    """Voxels near a surface but without votes, which may be solid."""
+    """Mask of voxels near a surface but without votes, which may be solid; shape (x, y, z)."""
     origin: Array
+    """Position of voxel (0, 0, 0) [m], shape (3,)."""
     voxel: float
+    """Grid spacing [m]."""
     outvoted: int
     """Number of voxels at which free votes removed a surface."""
 
@@ -214,9 +217,10 @@ class Volume:
 
 
 def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float) -> Volume:
-    """Fuses views over a box (low and high corner, shape (2, 3)), in blocks of 4³ voxels near surface points (k, 3).
+    """Fuses views over a box, in those blocks of 4³ voxels that are near the surface points `hits` (k, 3).
 
-    The spacing `voxel` [m] grows if the box would have more than 60 million voxels. `far`: see `fuse`.
+    `box` has the low and the high corner, shape (2, 3) [m]. The spacing `voxel` [m] grows if the box would have more
+    than 60 million voxels. For `far` see `fuse`.
     """
     voxel = max(voxel, float((np.prod(box[1] - box[0]) / _MAX_VOXELS) ** (1 / 3)))
     blocks = np.ceil((box[1] - box[0]) / (voxel * _BLOCK)).astype(int) + 1
@@ -247,11 +251,11 @@ def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float)
 
 
 def zero_level(distance: NDArray, origin: Array, voxel: float) -> tuple[Array, NDArray[np.int64]]:
-    """Marching cubes of a distance field (NaN = unseen): vertices (v, 3) [m], and faces (f, 3) that face free space."""
+    """Marching cubes of a distance field (NaN = unknown): vertices (v, 3) [m], and faces (f, 3) towards free space."""
     if not ((distance < 0).any() and (distance > 0).any()):
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent", allow_degenerate=False)
-    # A crossing on an edge with an unseen end is NaN; its triangles are dropped.
+    # On a grid edge with an unknown end the vertex is NaN; its triangles are dropped.
     faces = faces[np.isfinite(vertices).all(1)[faces].all(1)]
     return compact(origin + voxel * vertices.astype(np.float64), faces.astype(np.int64))
 

@@ -1,7 +1,7 @@
 """Color and depth rendered from the radiance field at training poses: the input of ground, mesh and splats.
 
-A view is one rendered pose. Its slant is |n · r| for the surface normal n and the ray r of unit z-depth: a point 1 m of
-z-depth behind a surface is `slant` meters away from it.
+A *view* is the rendering at one pose. The *slant* of a pixel is |n · r|, with the surface normal n and the ray r of
+unit z-depth: a point 1 m of z-depth behind the surface is `slant` meters away from the surface.
 """
 
 from dataclasses import dataclass
@@ -17,14 +17,14 @@ from twin.types import Array
 
 _BATCH = 8
 _METERS_PER_RADIAN = 3.0  # [m per rad] weight of direction in the distance between views
-_FLYING_PIXEL_STEP = 0.06  # relative step of inverse depth to both neighbors, above which a pixel is on no surface
+_FLYING_PIXEL_STEP = 0.06  # relative step of inverse depth; with larger ones to both neighbors, a pixel is suspect
 _MIN_OPACITY = 0.5
 _MIN_SLANT = 0.12  # below this, normals from depth are unreliable
 _MIN_DEPTH = 0.3  # [m] from the lens; nearer depth is discarded
 
 
 class ColorField(RenderableField, Protocol):
-    """A renderable field with a near box; `RadianceField` is one."""
+    """A renderable field with a near box, such as `RadianceField`."""
 
     @property
     def bounds(self) -> Array:
@@ -43,9 +43,9 @@ class Views:
     rgb: NDArray[np.uint8]
     """Shape (n, h, w, 3)."""
     depth: NDArray[np.float32]
-    """z-depth [m], shape (n, h, w); 0 where unreliable, and larger than any surface's for the background."""
+    """z-depth [m], shape (n, h, w); 0 where unreliable; larger than the depth of any surface for the background."""
     slant: NDArray[np.float32]
-    """Shape (n, h, w), in [0.12, √(1 + r²)]."""
+    """Slant of each pixel, shape (n, h, w), at least `_MIN_SLANT`."""
     upward: NDArray[np.float32]
     """z of the unit surface normal that faces the lens, shape (n, h, w)."""
 
@@ -63,9 +63,10 @@ class Views:
 def render_views(
     field: RenderableField, cameras: Cameras, count: int, width: int, far: float, lighting: str | None = None
 ) -> Views:
-    """Renders the field from up to `count` well-distributed training frames, by default under its first lighting.
+    """Renders the field at up to `count` well-distributed training poses, by default under its first lighting.
 
-    Views are `width` [px] wide and have the aspect ratio of the first camera. Depth beyond `far` [m] is background.
+    Views are `width` [px] wide and have the aspect ratio of the first camera. Pixels with depth beyond `far` [m] are
+    background.
     """
     chosen = cameras.select(select_spread_frames(cameras, count))
     size = (width, max(2, round(width * float(cameras.sizes[0, 1] / cameras.sizes[0, 0]))))
@@ -98,8 +99,9 @@ def select_spread_frames(cameras: Cameras, count: int) -> NDArray[np.int64]:
 def reliable_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.float32]:
     """Sets depth (n, h, w) to 0 where a pixel is too near, half transparent or between two surfaces.
 
-    Depth beyond `far` [m] and that of nearly transparent pixels becomes background at 10 · far. The inverse depth of a
-    plane is linear in the image; second differences distinguish a pixel between two surfaces from a slope.
+    Pixels with depth beyond `far` [m] and nearly transparent pixels become background, with the depth 10 · far. The
+    inverse depth of a plane is linear in the image, so second differences distinguish a pixel between two surfaces from
+    a pixel on a slope.
     """
     out = np.where((depth > far) | (opacity < 0.1) | ~np.isfinite(depth), 10.0 * far, depth).astype(np.float32)
     bad = (out < _MIN_DEPTH) | ((opacity < _MIN_OPACITY) & (out < far))
@@ -108,7 +110,7 @@ def reliable_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.f
         across = np.moveaxis(inverse, axis, -1)
         step = np.diff(across)
         first, second = step[..., :-1], step[..., 1:]
-        # Pixels whose inverse depth is between their neighbors', far from both, and off the line between them.
+        # Selects pixels with an inverse depth between those of their neighbors, far from both, and off their line.
         steep = np.minimum(np.abs(first), np.abs(second)) > _FLYING_PIXEL_STEP * across[..., 1:-1]
         bent = np.abs(first - second) > 0.3 * np.abs(first + second)
         np.moveaxis(bad, axis, -1)[..., 1:-1] |= steep & bent & (first * second > 0)
@@ -117,7 +119,7 @@ def reliable_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.f
 
 
 def surface_slant(depth: NDArray, intrinsics: Array, camera_to_world: Array) -> tuple[NDArray, NDArray]:
-    """Slant and upward component of the normal, each (n, h, w), from central differences of inverse depth.
+    """Slant, and upward component of the normal, shapes (n, h, w), from central differences of inverse depth.
 
     A plane n · x = c seen along r = (x, y, 1) has inverse depth q = (n · r) / c, hence n ∝ (∂ₓ, ∂ᵧ, q − x ∂ₓ − y ∂ᵧ).
     """

@@ -2,9 +2,9 @@
 
 A *group* is the policies of one task, or of all tasks, that were driven on the road. A *day* is a lighting of the real
 trials; a *training* is a run, with all its checkpoints. Every number is an `Estimate`: a value with its count, or the
-reason why there is no value; and a 90 % interval where one is known to have that coverage, or the reason why there is
-none. Intervals are about the population of trainings and days of which these are a sample (modules `jackknife` and
-`rate_model`, with their coverage in `benchmarks/intervals.py`), not about these cells.
+reason why there is no value. It has a 90 % interval if the method is known to have that coverage, or else the reason
+why there is none. Intervals are about the population from which the trainings and days are a sample, not about the
+measured cells (see `jackknife` and `rate_model`; their coverage is measured in `benchmarks/intervals.py`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -72,11 +72,11 @@ class Estimate:
     low: float | None = None
     high: float | None = None
     n: int = 0
-    """Number of trials for a rate, of policies or cells for a statistic."""
+    """For a rate, the number of trials; for a statistic, the number of policies or cells."""
     missing: str = ""
-    """The reason; empty if there is a value."""
+    """The reason why there is no value; empty if there is one."""
     no_interval: str = ""
-    """The reason why the value has no interval, and what is missing for one; else empty."""
+    """The reason why the value has no interval, and the data that an interval needs; empty if there is an interval."""
 
 
 @dataclass(frozen=True)
@@ -103,18 +103,18 @@ class PredictorScore:
     brier: Estimate
     log: Estimate
     gain: Estimate
-    """Log score of this predictor minus that of the twin: above 0 the twin is better. Missing for the twin itself."""
+    """Log score of this predictor minus that of the twin; above 0, the twin is better. Missing for the twin itself."""
 
 
 @dataclass(frozen=True)
 class OrderedPairs:
-    """Pairs of policies of one task with different real rates, by the difference of their twin scores."""
+    """Pairs of policies of one task with different real rates, whose twin scores differ by `low` to `high`."""
 
     low: float
     high: float
     pairs: int
     right: float
-    """Number of pairs in the road's order; a pair tied in the twin counts one half."""
+    """Number of pairs that the twin orders as the road does; a pair tied in the twin counts one half."""
 
 
 @dataclass(frozen=True)
@@ -138,19 +138,19 @@ class Agreement:
     corrected_coverage: Estimate
     """Fraction of candidates whose real rate lies in the interval predicted without them."""
     mean_real: Estimate
-    """Prediction-powered mean real rate of policies such as these, driven or not."""
+    """Prediction-powered estimate of the mean real rate of policies like these, driven on the road or not."""
     trainings: int = 0
     days: int = 0
     twin_error: Estimate = Estimate(missing="not measured")
     """Mean over policies of the absolute difference of real rate and twin score."""
     scores: tuple[PredictorScore, ...] = ()
-    """The twin first, then its recalibration and the baselines."""
+    """First the twin, then its recalibration and the baselines."""
     calibration: tuple[CalibrationBin, ...] = ()
     errors: tuple[DayErrors, ...] = ()
     ordered: tuple[OrderedPairs, ...] = ()
 
 
-# ---- parts that the forecast uses, too
+# ---- parts that `forecasting` also uses
 
 
 def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
@@ -175,7 +175,7 @@ def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
 
 
 def unit_counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, Indices]:
-    """Successes and trials of each policy's units: a unit is a cell if `by_day`, else a single episode."""
+    """Successes and trials of each policy's units, shapes (n, k): a unit is a cell if `by_day`, else an episode."""
     if by_day:
         return padded_counts([[(c.successes, c.trials) for c in row] for row in rows])
     won = [sum(c.successes for c in row) for row in rows]
@@ -184,7 +184,7 @@ def unit_counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, 
 
 
 def compare_cells(cell: Cell, mate: Cell) -> CellPair:
-    """A real cell and the twin's cell `mate`, with the interval of their difference."""
+    """Compares a real cell with the twin's cell `mate`, by the interval of the difference of their rates."""
     value, low, high = rate_difference(
         twin_successes=mate.successes,
         twin_trials=mate.trials,
@@ -207,7 +207,7 @@ def share_estimate(count: int, total: int, no_interval: str) -> Estimate:
 
 
 def measure_agreement(task: str, real: Sequence[Cell], twin: Cells, further: Sequence[float]) -> Agreement:
-    """Agreement of a group's real cells with the twin's cells that they are compared with.
+    """Agreement of a group's real cells with the corresponding cells of the twin.
 
     Args:
         task: Name of the task, or of all tasks together.
@@ -304,7 +304,7 @@ TWIN, RECALIBRATED, OTHERS, SHUFFLED = (
 
 
 def _probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> dict[str, Any]:
-    """Scores of the twin and of baselines, its calibration, and its errors by day."""
+    """Scores of the twin and of the baselines; the twin's calibration, and its errors by day."""
     probability, several = _twin_probabilities(data, real, twin)
     logs = {TWIN: log_score(probability, data.real)}
     briers = {TWIN: brier(probability, data.real)}
@@ -362,7 +362,7 @@ def _trials_and_days(real: Sequence[Cell]) -> tuple[Indices, NDArray[np.object_]
 
 
 def _twin_probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> tuple[Array, bool]:
-    """The twin's probability of success in each cell, and whether any policy has several."""
+    """The twin's probability of success in each real cell; True if a policy is compared with several twin cells."""
     rows = _real_rows(real)
     mine = [list(dict.fromkeys(cell.twin_key for cell in row)) for row in rows]
     several = max(map(len, mine)) > 1

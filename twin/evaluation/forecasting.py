@@ -1,9 +1,9 @@
-"""Forecast of real success rates from rates in the twin: the numbers, of which `report/` makes pages and tables.
+"""Forecast of real success rates from rates in the twin. `report/` makes pages and tables from these numbers.
 
 A *candidate* is a policy on a task. Its twin score is the mean of its rates under the *compared lightings*: the twin's
-lightings that real cells of the task are compared with, or all of them without real trials. It is *driven* if it has
-real trials. A *day* is a lighting of the real trials; a *training* is a run, with all its checkpoints. `agreement`
-compares the driven candidates of one task, or of all tasks, with the twin.
+lightings with which real cells of the task are compared, or all lightings if there are no real trials. A candidate is
+*driven* if it has real trials. A *day* is a lighting of the real trials; a *training* is a run, with all its
+checkpoints. `agreement` compares the driven candidates of one task, or of all tasks, with the twin.
 """
 
 from collections.abc import Mapping, Sequence
@@ -54,22 +54,22 @@ class Candidate:
     policy: str
     task: str
     lightings: tuple[str, ...]
-    """The twin's lightings of its score."""
+    """The twin's lightings over which its score is averaged."""
     twin: Estimate
-    """Twin score. Its interval is over days if days are compared with several of its lightings; otherwise over the
-    episodes under its lightings."""
+    """Twin score. Its interval is over days if real days are compared with several of the twin's lightings, otherwise
+    over episodes under its lightings."""
     twin_rank: Estimate
     """Expected rank among the task's candidates (1 is best), and its interval."""
     twin_ranks: tuple[float, ...]
     """Probability of each rank in the twin."""
     real: Estimate
-    """Mean over its real cells; its interval is over days."""
+    """Mean rate over its real cells; the interval is over days."""
     real_ranks: tuple[float, ...]
     """Probability of each rank on the road among the driven candidates; empty unless it and another one are driven."""
     corrected: Estimate
-    """Real rate predicted from its twin score and the driven candidates of other trainings."""
+    """Real rate, predicted from its twin score and the rates of the driven candidates of other trainings."""
     trained: Estimate = _NOT_KNOWN
-    """Success rate in training before it was saved."""
+    """Success rate in training before the policy was saved."""
 
     @property
     def driven(self) -> bool:
@@ -78,7 +78,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class LeftOutLighting:
-    """Prediction of one real lighting from the task's others."""
+    """Prediction of the real rates under one lighting from those under the task's other lightings."""
 
     task: str
     lighting: str
@@ -86,9 +86,9 @@ class LeftOutLighting:
     twin_error: Estimate
     """Mean absolute difference of twin and real rates."""
     corrected_error: Estimate
-    """The same after a correction fitted under the other lightings."""
+    """Mean absolute difference of predicted and real rates, with a correction fitted under the other lightings."""
     coverage: Estimate
-    """Fraction of cells within the predicted interval."""
+    """Fraction of cells whose real rate lies in the predicted interval."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,8 @@ class TrialAllocation:
     task: str
     policies: int
     basis: str
-    """`road`: trials are added to the real ones; `twin`: there are none, and the twin's rates are assumed."""
+    """`road`: the trials are added to the real ones. `twin`: fewer than two policies have real trials, so the
+    twin's rates are assumed."""
     winner_now: float | None = None
     """See `RankingConfidence.winner`."""
     order_now: float | None = None
@@ -150,7 +151,7 @@ class Forecast:
 
 
 def _without_nulls(value: Any) -> Any:
-    """A JSON value without entries that are null, so that the records' fields take their defaults."""
+    """Removes entries that are null from a JSON value, so that the dataclasses' fields get their defaults."""
     if isinstance(value, dict):
         return {key: _without_nulls(item) for key, item in value.items() if item is not None}
     return [_without_nulls(item) for item in value] if isinstance(value, list) else value
@@ -172,7 +173,7 @@ def make_forecast(
         scene: Name of the scene.
         twin: Cells of the twin.
         real: Real cells, each with a twin cell to compare with; may be empty.
-        seed: Of the resampling.
+        seed: Seed of the sampling from posteriors.
         trained: Success rates in training by (policy, task), where known.
     """
     tasks = tuple(dict.fromkeys(cell.task for cell in twin))
@@ -286,8 +287,10 @@ def _scores(real: Sequence[Cell], twin: Cells) -> tuple[float, float]:
 
 
 def _sampled_rates(rows: Sequence[Sequence[Cell]], by_day: bool, rng: np.random.Generator) -> Array:
-    """Samples of the policies' true rates, shape (samples, n). Effects of a day that all policies share are not
-    modeled, since they hardly change ranks."""
+    """Samples of the policies' true rates, shape (samples, n).
+
+    Day effects that are common to all policies are not modeled, since they hardly change ranks.
+    """
     return RateModel.fit(*unit_counts(rows, by_day), shared_days=False).sample(rng, ranking.SAMPLES)
 
 
@@ -308,12 +311,12 @@ def _rates_over_days(rows: Sequence[Sequence[Cell]], road: bool = True) -> list[
 
 
 def _mean_rate(cells: Sequence[Cell]) -> Estimate:
-    """Mean rate, with an interval over episodes under these lightings."""
+    """Mean of the cells' rates, with an interval over episodes under these lightings."""
     return Estimate(*mean_rate([c.successes for c in cells], [c.trials for c in cells]), sum(c.trials for c in cells))
 
 
 def _left_out(task: str, real: Sequence[Cell], twin: Cells) -> list[LeftOutLighting]:
-    """Each real lighting of a task predicted from the others."""
+    """Predicts the real rates under each lighting of a task from those under its other lightings."""
     lightings = [cell.lighting for cell in real]
     names = list(dict.fromkeys(lightings))
     twin_rate, real_rate = np.array([_scores([cell], twin) for cell in real]).T

@@ -1,14 +1,14 @@
-"""Jackknife intervals of statistics over policies: places, or trainings and days, are the units left out.
+"""Jackknife intervals of statistics over policies. The units left out are places, or trainings and days.
 
-The *estimand* of an interval is the mean of the statistic over repetitions of the experiment with as many new
-trainings, new days and new trials, at the same place; with several places, over repetitions with new places, too. For a
-mean rate or a bias this is the rate of the population; for a correlation, MMRV or regret it is what such an experiment
-gives on average, the noise of its few days and trials included. It is no statement about these policies on these days.
+The *estimand* of an interval is the mean of the statistic over repetitions of the experiment with the same numbers of
+new trainings, new days and new trials, at the same place; if there are several places, with new places as well. For a
+mean rate or a bias, this is the value in the population. For a correlation, MMRV or regret, it is the average result of
+such an experiment, including the noise of its few days and trials. It says nothing about these policies on these days.
 
-Units are what varies independently: a *training* (checkpoints of a run are one unit), a *day* (a lighting of the real
-trials, left out of the twin and the road together), a *place* (with all its policies and days). With one place the
-design is crossed, so the variance is that of two-way clustering (Cameron, Gelbach and Miller, J. Bus. Econ. Stat. 29,
-2011; each part by leaving one unit out, Efron and Stein 1981):
+Units vary independently of each other: a *training* (checkpoints of a run are one unit), a *day* (a lighting of the
+real trials, left out of the twin and the road together), a *place* (with all its policies and days). With one place,
+trainings and days are crossed, so the variance is that of two-way clustering (Cameron, Gelbach and Miller, J. Bus.
+Econ. Stat. 29, 2011); each part is computed by leaving one unit out (Efron and Stein 1981):
 
     V = V_training + V_day − V_both / 2
 
@@ -20,8 +20,8 @@ freedom, at least half of those of the trainings (few days made intervals too wi
 units than its coverage was tested with, nor if leaving units out changes nothing, since the variance cannot be
 estimated then.
 
-A bootstrap was worse (coverage 0.5 to 0.8): it samples some policies twice, which raises correlations, and twin and
-real rates that are sampled again agree less than the observed ones.
+A bootstrap was worse (coverage 0.5 to 0.8): it samples some policies twice, which raises correlations, and resampled
+trials give twin and real rates that agree less than the observed ones.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -43,24 +43,24 @@ from twin.types import Array, Indices
 MIN_TRAININGS, MIN_DAYS, MIN_PLACES = 8, 4, 5
 """Number of units below which a correlation or MMRV has no interval."""
 MIN_PEARSON_TRAININGS = 12
-"""The same for Pearson's correlation, which can depend on a single policy."""
+"""Number of trainings below which Pearson's correlation, which can depend on a single policy, has no interval."""
 MIN_BIAS_TRAININGS, MIN_BIAS_DAYS = 5, 3
-"""The same for a mean difference."""
+"""Number of units below which a mean difference has no interval."""
 
-_SHARE_OF_BOTH = 0.5  # of V_both that is subtracted; see the module
-_LARGEST = 0.999  # correlation on Fisher's scale
+_SHARE_OF_BOTH = 0.5  # fraction of V_both that is subtracted; see the module
+_LARGEST = 0.999  # correlations are clipped to ± this on Fisher's scale
 
 
 @dataclass(frozen=True)
 class PairedCells:
-    """Up to k real cells of n policies, and the twin's cells they are compared with.
+    """Up to k real cells of each of n policies, and the twin's cells with which they are compared.
 
-    A policy driven on two tasks counts as two. Shorter rows are padded with cells of weight 0. Rates may have leading
-    axes: separate experiments of the same design.
+    A policy driven on two tasks counts as two policies. Rows with fewer cells are padded with cells of weight 0. Rates
+    may have leading axes, for separate experiments of the same design.
     """
 
     twin: Array
-    """Rate of the twin's cell that each real cell is compared with, shape (..., n, k)."""
+    """For each real cell, the rate of the twin's cell with which it is compared, shape (..., n, k)."""
     real: Array
     """Rate of each real cell, shape (..., n, k)."""
     weight: Array
@@ -89,9 +89,9 @@ class PairedCells:
         return len(np.unique(self.day[self.weight > 0]))
 
     def rates(self, kept: Array | None = None) -> dict[str, Array]:
-        """Mean twin and real rates of the policies, shapes (..., n), from the cells `kept` (n, k), by default all.
+        """Mean twin and real rates of the policies, shapes (..., n), over the cells in the mask `kept` (n, k).
 
-        Policies without such a cell are left out.
+        By default, all cells are kept. Policies without a kept cell are left out.
         """
         weight = self.weight if kept is None else self.weight * kept
         total = weight.sum(-1)
@@ -129,7 +129,7 @@ def pair_cells(real: Sequence[Cell], twin: Mapping[tuple[str, str, str], Cell]) 
 
 @dataclass(frozen=True)
 class Statistic:
-    """A statistic of policies' rates, with the scale on which its interval is symmetric."""
+    """A statistic of policies' rates, and the scale on which its interval is symmetric."""
 
     of: Callable[..., Array]
     """Function of `twin` and `real`, shapes (..., n) → (...)."""
@@ -139,7 +139,7 @@ class Statistic:
     high: float
     """Limits of the interval."""
     linear: bool = False
-    """True: a mean of differences, for which V_both is subtracted entirely."""
+    """True for a mean of differences, for which V_both is subtracted entirely."""
     trainings: int = MIN_TRAININGS
     days: int = MIN_DAYS
     """Numbers of units below which there is no interval."""
@@ -172,11 +172,12 @@ STATISTICS = {
     "mmrv": Statistic(mmrv_batched, _identity, _identity, 0.0, 1.0),
     "bias": Statistic(mean_bias, _identity, _identity, -1.0, 1.0, True, MIN_BIAS_TRAININGS, MIN_BIAS_DAYS),
 }
-"""Statistics that have intervals. Regret and agreement of the winner have none from one place: they are maxima."""
+"""Statistics that have intervals. Regret and agreement of the winner at one place have none, since they depend on a
+maximum."""
 
 
 def mean_over_tasks(statistic: Callable[..., tuple[Array, Array]], data: PairedCells) -> tuple[Array, Array]:
-    """Mean over tasks of a pair of statistics that are defined only within a task."""
+    """Means over tasks of two statistics that are defined only within a task."""
     rates = data.rates()
     each = [statistic(twin=rates["twin"][..., of], real=rates["real"][..., of]) for of in data.strata if len(of) > 1]
     return np.mean([one[0] for one in each], 0), np.mean([one[1] for one in each], 0)
@@ -188,8 +189,9 @@ def mean_over_tasks(statistic: Callable[..., tuple[Array, Array]], data: PairedC
 def jackknife_interval(statistic: Statistic, data: PairedCells, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
     """Ends of the interval of a statistic at one place, shapes (...).
 
-    Experiments along leading axes whose units do not determine a variance get nan. Raises UndefinedStatistic: too few
-    units, with the number that is missing; or, for a single experiment, no variance.
+    The ends are nan for experiments along leading axes whose units do not determine a variance. Raises
+    UndefinedStatistic: there are too few units (the message has the number needed); or, for a single experiment, the
+    variance is not determined.
     """
     trainings, days = data.trainings, data.days
     lacking = [
@@ -216,8 +218,8 @@ def place_interval(
 ) -> tuple[Array, Array, Array]:
     """A statistic over several places, and the ends of its interval with the place as the unit, shapes (...).
 
-    The value is the mean of the places' own statistics; if `pooled`, it is the statistic of all their policies
-    together. Raises UndefinedStatistic as `jackknife_interval` does.
+    The value is the mean of the statistics of the single places; if `pooled`, it is the statistic of the policies of
+    all places together. Raises UndefinedStatistic as `jackknife_interval` does.
     """
     if len(places) < MIN_PLACES:
         raise UndefinedStatistic(f"too few for an interval: {len(places)} places, {MIN_PLACES} are needed")
@@ -237,11 +239,15 @@ def place_interval(
 def mean_difference_interval(
     differences: Array, confidence: float = CONFIDENCE, limits: tuple[float, float] = (-1.0, 1.0)
 ) -> tuple[float, float, float]:
-    """Mean of the differences of two setups, a value per pair of trainings or per place, (n,), and its interval (t).
+    """Mean of the differences of two setups, and the ends of its interval by Student's t.
 
-    The interval is kept within `limits`, those of a difference of rates by default.
+    Args:
+        differences: One value per pair of trainings or per place, shape (n,).
+        confidence: Confidence level of the interval.
+        limits: The interval is clipped to these; by default, those of a difference of rates.
 
-    Raises UndefinedStatistic: fewer than `MIN_PLACES`, or all equal.
+    Raises:
+        UndefinedStatistic: there are fewer than `MIN_PLACES` differences, or all are equal.
     """
     n = len(differences)
     if n < MIN_PLACES:
@@ -258,7 +264,7 @@ def _variance(statistic: Statistic, replicates: Sequence[dict[str, Array]]) -> A
 
 
 def _spread(left_out: Array) -> Array:
-    """Jackknife variance from values without each of m units, shape (m, ...)."""
+    """Jackknife variance, from the m values that leave out one unit each, shape (m, ...)."""
     m = len(left_out)
     return np.asarray((m - 1) / m * ((left_out - left_out.mean(0)) ** 2).sum(0))
 

@@ -5,10 +5,10 @@ A predictor gives a probability p of success for each cell (policy, day) of the 
     Brier score: mean over trials of (p − outcome)²
     log score: mean over trials of −log of the probability that was given to the outcome
 
-Both are 0 at best and *proper*: no other p than one's true belief has a better expectation (Gneiting and Raftery, J.
-Am. Stat. Assoc. 102, 2007). The scores of the twin mean little alone; they are compared with baselines that do not look
-at the twin, or not at the day. Baselines that are fitted to real trials, and the twin's recalibration, use only trials
-of other trainings than the one that they predict.
+Both scores are 0 at best and *proper*: the expected score is best if p is the true probability (Gneiting and Raftery,
+J. Am. Stat. Assoc. 102, 2007). To be interpreted, the twin's scores are compared with those of baselines that do not
+use the twin, or do not use its differences between days. Baselines that are fitted to real trials, and the twin's
+recalibration, predict each training from trials of other trainings only.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,8 +28,8 @@ SCORE_DIFFERENCE = Statistic(
 )
 """Mean over policies of the difference of two scores, as a `Statistic` for `jackknife_interval` on a `score_pair`."""
 
-_LEAST = 0.005  # probability that any predictor leaves to either outcome
-_RIDGE = 0.1  # weight of a recalibration's prior, which prefers to leave probabilities unchanged
+_LEAST = 0.005  # in log scores and recalibration, probabilities closer to 0 or 1 than this are clipped
+_RIDGE = 0.1  # weight of a recalibration's prior, which favors unchanged probabilities
 _NEWTON_STEPS = 30
 
 
@@ -56,7 +56,7 @@ class DayErrors:
     misses: int
     """Missed failures: the twin predicts success (p ≥ ½), and fewer than half of the trials succeed."""
     false_alarms: int
-    """The twin predicts failure, and half of the trials or more succeed."""
+    """The twin predicts failure (p < ½), and at least half of the trials succeed."""
 
 
 def brier(probability: Array, rate: Array) -> Array:
@@ -71,7 +71,7 @@ def log_score(probability: Array, rate: Array) -> Array:
 
 
 def score_pair(data: PairedCells, score: Array, baseline: Array) -> PairedCells:
-    """The cells with scores (n, k) instead of rates, so that their `mean_bias` is baseline minus score."""
+    """`data` with scores (n, k) instead of rates, so that its `mean_bias` is the mean of baseline minus score."""
     return PairedCells(score, baseline, data.weight, data.training, data.day, data.strata)
 
 
@@ -81,15 +81,18 @@ def mean_score(data: PairedCells, score: Array) -> float:
 
 
 def twin_probabilities(successes: Array | Indices, trials: Array | Indices) -> Array:
-    """The twin's probability for each of its cells, shrunk towards the policy's rate in the twin, shapes (n, k)."""
+    """The twin's probability of success in each of its cells, shrunk towards the policy's rate in the twin.
+
+    Arguments and result have shape (n, k).
+    """
     return RateModel.fit(successes, trials, shared_days=False, road=False).cell_means()
 
 
 def shuffled_days(probability: Array, weight: Array, rate: Array, score: Callable[[Array, Array], Array]) -> Array:
-    """Expected score of each cell if the policy's days were permuted at random in the twin, shape (n, k).
+    """Expected score of each cell if the twin's days of each policy were permuted at random, shape (n, k).
 
     Args:
-        probability: Of each cell, shape (n, k).
+        probability: Predicted probability of success in each cell, shape (n, k).
         weight: 1 for a cell, 0 for padding.
         rate: Success rates on the road, shape (n, k).
         score: `brier` or `log_score`.
@@ -101,10 +104,10 @@ def shuffled_days(probability: Array, weight: Array, rate: Array, score: Callabl
 
 
 def other_trainings(data: PairedCells, groups: Indices) -> Array:
-    """Baseline: success rate on the road of the same group in other trainings, for each policy, shape (n,).
+    """Baseline: for each policy, the mean real rate of policies of the same group in other trainings, shape (n,).
 
-    The rate of all other trainings is a prior with the weight of one trial. `groups` names the group of each policy,
-    such as its setup; all equal gives the mean of the other policies.
+    The mean rate of all policies of other trainings is a prior with the weight of one policy. `groups` names the group
+    of each policy, such as its setup. If all are equal, the baseline is the mean over the policies of other trainings.
     """
     real = data.rates()["real"]
     out = np.full(data.policies, 0.5)
@@ -117,7 +120,7 @@ def other_trainings(data: PairedCells, groups: Indices) -> Array:
 
 
 def recalibrated(probability: Array, data: PairedCells) -> Array:
-    """Probabilities (n, k) on a logistic line fitted to the real trials of other trainings (Platt 1999)."""
+    """Recalibrates probabilities (n, k) by a logistic regression on the real trials of other trainings (Platt 1999)."""
     x = np.log(np.clip(probability, _LEAST, 1 - _LEAST)) - np.log1p(-np.clip(probability, _LEAST, 1 - _LEAST))
     out = np.empty_like(probability)
     for training in np.unique(data.training):
@@ -132,7 +135,7 @@ def recalibrated(probability: Array, data: PairedCells) -> Array:
 
 
 def _logistic_line(x: Array, rate: Array) -> tuple[float, float]:
-    """Intercept and slope by Newton's method, with a weak prior at 0 and 1."""
+    """Intercept and slope of a logistic regression by Newton's method, with a weak prior centered at 0 and 1."""
     design = np.stack([np.ones_like(x), x], -1)
     start = np.array([0.0, 1.0])
     line = start.copy()
@@ -162,7 +165,7 @@ def calibration(probability: Array, rate: Array, trials: Indices) -> tuple[Calib
 
 
 def errors_by_day(probability: Array, rate: Array, days: Sequence[str]) -> tuple[DayErrors, ...]:
-    """Misses and false alarms of cells, shapes (c,), by day in order of first occurrence."""
+    """Counts misses and false alarms of cells, shapes (c,), for each day in order of first occurrence."""
     out = []
     for day in dict.fromkeys(days):
         of = np.array([other == day for other in days])

@@ -1,9 +1,10 @@
 """Bayesian ranking of policies: probabilities of ranks, and how many further trials would settle the ranking.
 
 Samples of the policies' true rates come from the posterior of `twin.evaluation.rate_model`, which shrinks a rate
-towards the other policies and treats trials of one day as correlated. A rank's probability is the fraction of samples
-in which a policy has it. All this holds for the world in which the trials were driven: a ranking in the twin is no
-evidence of one on the road.
+towards the other policies and treats trials of one day as correlated. The probability of a policy's rank is the
+fraction of samples in which the policy has that rank. Results hold for the world, twin or road, in which the trials
+were driven: a ranking in the twin is no
+evidence of a ranking on the road.
 """
 
 from dataclasses import dataclass
@@ -13,9 +14,9 @@ import numpy as np
 from twin.evaluation.statistics import CONFIDENCE
 from twin.types import Array
 
-SETTLED_PROBABILITY = 0.95  # least confidence of a settled ranking
-MARGIN = 0.05  # policies whose true scores differ by less count as equally good
-MAX_TRIALS = 1000  # most further trials per policy that are considered
+SETTLED_PROBABILITY = 0.95  # least expected confidence in a ranking that counts as settled
+MARGIN = 0.05  # policies whose true rates differ by less count as equally good
+MAX_TRIALS = 1000  # largest number of further trials per policy that is considered
 
 SAMPLES = 4000  # of the posterior
 _STEP = 5  # trials
@@ -44,22 +45,22 @@ class RankingConfidence:
     """Expected confidence in a ranking after further trials, averaged over the posterior of the rates."""
 
     winner: float
-    """Probability that the leading policy is within `MARGIN` of the truly best."""
+    """Probability that the leading policy's true rate is within `MARGIN` of the best true rate."""
     order: float
-    """Expected fraction of pairs in the right order, among those with true scores more than `MARGIN` apart."""
+    """Expected fraction of pairs in the right order, among pairs whose true rates differ by more than `MARGIN`."""
 
 
 def expected_confidence(rates: Array, more: int, seed: int, so_far: bool = True) -> RankingConfidence:
     """Expected confidence in the ranking after `more` trials per policy, each on a day of its own.
 
-    Policies are ranked by the posterior mean after trials at the sampled rates; the posterior so far is taken for a
-    Beta distribution of the samples' mean and variance.
+    The further trials are simulated at the sampled rates, and policies are ranked by their posterior means after these.
+    Each policy's present posterior is approximated by a Beta distribution with the samples' mean and variance.
 
     Args:
         rates: Samples of the true rates, shape (samples, n).
         more: Further trials per policy.
-        seed: With the same seed, different `more` are compared on the same samples.
-        so_far: False: the trials so far determine the true rates, but do not count for the ranking.
+        seed: Seed of the simulated trials.
+        so_far: If False, the ranking uses the further trials alone; `rates` come from the trials so far in any case.
     """
     won = np.random.default_rng(seed).binomial(more, rates)
     if so_far:

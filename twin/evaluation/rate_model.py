@@ -1,30 +1,31 @@
 """Success rates of policies and of their population, by a hierarchical beta-binomial model.
 
-Of a policy's trials on one day most end alike, so the trials are not independent; the day is. With m trials on day j,
-policy i succeeds yᵢⱼ times:
+Most trials of a policy on one day have the same outcome, so the independent units are days, not trials. With m trials
+on day j, policy i succeeds yᵢⱼ times:
 
     rᵢⱼ | pᵢ ~ Beta with mean pᵢ and intra-class correlation ρ        the rate on day j
     yᵢⱼ | rᵢⱼ ~ Binomial(m, rᵢⱼ)
     pᵢ ~ Beta with mean μᵢ and intra-class correlation τ              the policy's rate over days
     logit μᵢ = logit μ + β xᵢ                                        xᵢ: a covariate such as the twin's rate, or none
 
-A Beta distribution of mean p and intra-class correlation ρ is Beta(p/ρ − p, (1 − p)/ρ − (1 − p)); ρ = 1 makes all
-trials of a day agree, ρ = 0 makes them independent. τ has a uniform prior and μ Jeffreys'. For the road ρ has
-Beta(5, 1), since on most days all trials of a policy end alike (706 of 720 cells in docs/benchmarks.md), and few days
-do not suffice to estimate ρ: with a uniform prior, intervals from four such days held 0.79 of the time. For the twin's
-rates (`road=False`) ρ has a uniform prior. All are integrated over a grid, so that intervals need no sampling and no
-seed. A policy's rate is thus shrunk towards the other policies, as far as these are alike, and not towards one half;
-policies share ρ, so that even two days suffice to estimate it if eight policies drove on them. The beta-binomial
-distribution is Skellam's (J. R. Stat. Soc. B 10, 1948); for hierarchical models see Gelman et al., Bayesian Data
-Analysis, section 5.3.
+A Beta distribution with mean p and intra-class correlation ρ is Beta(p/ρ − p, (1 − p)/ρ − (1 − p)). With ρ = 1, all
+trials of a day have the same outcome; with ρ = 0, they are independent. τ has a uniform prior, and μ has Jeffreys'. For
+the road, the prior of ρ is Beta(5, 1), since on most days all trials of a policy have the same outcome (706 of 720
+cells in docs/benchmarks.md), and few days do not suffice to estimate ρ: with a uniform prior, intervals from four such
+days had a coverage of 0.79. For the twin's rates (`road=False`), ρ has a uniform prior. All parameters are integrated
+over a grid, so intervals need neither sampling nor a seed. A policy's rate is thus shrunk towards those of the other
+policies, and more strongly the more alike these are, but not towards one half. Policies share ρ, so even two days
+suffice to estimate it if eight policies drove on them. The beta-binomial distribution is Skellam's (J. R. Stat. Soc. B
+10, 1948); for hierarchical models see Gelman et al., Bayesian Data Analysis, section 5.3.
 
-Policies of one experiment drive on the same days, and a bad day is bad for all of them, so their cells are not
-independent: the product of their likelihoods is a *composite* likelihood. It is raised to the power (2k − 1) / (2k + 1)
-for k days (Ribatet, Cooley and Davison, Statistica Sinica 22, 2012, on scaling such likelihoods); without this power,
-intervals from two days held 0.72 to 0.92 of the time.
+Policies of one experiment drive on the same days, and a bad day is bad for all of them. So their cells are not
+independent, and the product of their likelihoods is a *composite* likelihood. It is raised to the power
+(2k − 1) / (2k + 1) for k days (for such scaling see Ribatet, Cooley and Davison, Statistica Sinica 22, 2012). Without
+this power, intervals from two days had coverages of 0.72 to 0.92.
 
-The estimand is the rate over the *population* of days of the kind that were driven (`interval`), or of policies and
-days (`mean_interval`), not over these days; `cell_means` is about these. Coverage: `benchmarks/intervals.py`.
+The estimand of `interval` is the rate over the *population* of days like those driven, and that of `mean_interval` is
+the rate over the population of policies and days. `cell_means` estimates rates on the days that were driven. For the
+coverage of the intervals see `benchmarks/intervals.py`.
 """
 
 from dataclasses import dataclass
@@ -44,10 +45,10 @@ MIN_SETUP_TRAININGS = 4
 _EDGES = np.concatenate([[0.0], expit(np.linspace(-7.5, 7.5, 47)), [1.0]])
 """Edges of the grid of rates."""
 _RATES = np.concatenate([[_EDGES[1] / 3], expit((logit(_EDGES[1:-2]) + logit(_EDGES[2:-1])) / 2), [1 - _EDGES[1] / 3]])
-_CORRELATIONS = (np.arange(10) + 0.5) / 10  # of ρ and τ, the latter equally likely
-_ROAD_PRIOR = 4.0  # exponent of the prior of ρ, Beta(5, 1)
-_MEANS = np.sin(np.pi / 2 * (np.arange(15) + 0.5) / 15) ** 2  # of μ: quantiles of Jeffreys' Beta(½, ½)
-_SLOPES = (0.0, 0.5, 1.0)  # of β, equally likely
+_CORRELATIONS = (np.arange(10) + 0.5) / 10  # grid of ρ and τ; values of τ are equally likely
+_ROAD_PRIOR = 4.0  # exponent of the density of Beta(5, 1), the prior of ρ
+_MEANS = np.sin(np.pi / 2 * (np.arange(15) + 0.5) / 15) ** 2  # grid of μ: quantiles of Jeffreys' prior Beta(½, ½)
+_SLOPES = (0.0, 0.5, 1.0)  # grid of β, equally likely
 
 
 @dataclass(frozen=True)
@@ -55,17 +56,18 @@ class RateModel:
     """Posterior of the rates of n policies; see the module."""
 
     successes: Array
-    """Per cell, shape (n, k)."""
+    """Successes in each cell, shape (n, k)."""
     trials: Array
-    """Shape (n, k); 0 in padding."""
+    """Trials in each cell, shape (n, k); 0 in padding."""
     likelihood: Array
-    """Of each policy's cells given rate (g) and ρ (r), up to a factor per policy, shape (n, g, r)."""
+    """Likelihood of each policy's cells given its rate (axis g) and ρ (axis r), up to a factor per policy, shape
+    (n, g, r)."""
     prior: Array
-    """Mass of the grid's rates under each pair of μ, τ (and β), shape (n or 1, h, g)."""
+    """Prior mass of the grid's rates for each combination h of μ, τ and β, shape (n or 1, h, g)."""
     evidence: Array
-    """Likelihood of each policy's cells under each pair of hyperparameters, shape (n, h, r)."""
+    """Likelihood of each policy's cells for each h and ρ, shape (n, h, r)."""
     weight: Array
-    """Posterior of the hyperparameters, shape (h, r)."""
+    """Posterior mass of each h and ρ, shape (h, r)."""
     means: Array
     """μ of each h, shape (h,)."""
 
@@ -82,9 +84,9 @@ class RateModel:
         Args:
             successes: Successes of each cell.
             trials: Trials of each cell.
-            covariate: xᵢ [logit], shape (n,), centered here; None: no covariate.
-            shared_days: True: policies drove on the same few days; see the module.
-            road: True: the prior of ρ is the road's; False: it is uniform.
+            covariate: xᵢ [logit], shape (n,), from which the mean is subtracted here; None: no covariate.
+            shared_days: True if the policies drove on the same few days; see the module.
+            road: If True, the prior of ρ is that for the road, otherwise it is uniform.
 
         Raises:
             ValueError: more successes than trials, negative counts, or shapes that differ.
@@ -144,7 +146,7 @@ class RateModel:
         return out
 
     def cell_means(self) -> Array:
-        """Posterior mean of the rate of each cell, shape (n, k): its own trials, shrunk towards the policy's rate."""
+        """Posterior mean of the rate of each cell, shape (n, k): the cell's rate, shrunk towards the policy's rate."""
         joint = self._joint()
         size = 1.0 / _CORRELATIONS - 1.0
         won, driven = self.successes[:, :, None, None], self.trials[:, :, None, None]
@@ -159,7 +161,7 @@ def _beta(mean: Array, correlation: Array) -> tuple[Array, Array]:
 
 
 def _masses(mean: Array, correlation: Array) -> Array:
-    """Mass of Beta distributions (..., h) on the grid, shape (..., h, g)."""
+    """Mass of Beta distributions on the grid of rates, from means and correlations (..., h); shape (..., h, g)."""
     a, b = _beta(mean, correlation)
     return np.diff(betainc(a[..., None], b[..., None], _EDGES), axis=-1)
 
@@ -177,7 +179,7 @@ def _likelihood(won: Array, driven: Array) -> Array:
 
 
 def _shortest(mass: Array, edges: Array, confidence: float) -> tuple[float, float]:
-    """Shortest interval of a distribution given by the mass between edges, uniform within."""
+    """Shortest interval with mass `confidence`, for a distribution with the given masses, uniform between the edges."""
     below = np.concatenate([[0.0], np.cumsum(mass)])
     below /= below[-1]
     start = np.linspace(0.0, 1.0 - confidence, 201)
@@ -187,7 +189,7 @@ def _shortest(mass: Array, edges: Array, confidence: float) -> tuple[float, floa
 
 
 def padded_counts(rows: list[list[tuple[int, int]]]) -> tuple[Indices, Indices]:
-    """Successes and trials, shapes (n, k), from (successes, trials) of each policy's cells; 0 in padding."""
+    """Arrays of successes and trials (n, k), padded with 0, from (successes, trials) of each cell of each policy."""
     shape = len(rows), max(map(len, rows))
     won, driven = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
     for i, row in enumerate(rows):

@@ -1,12 +1,12 @@
 """Statistics of success rates in closed form: intervals, agreement of twin and road, prediction of real rates.
 
-A *rate* is successes over trials; its interval contains the true rate with probability `CONFIDENCE`. *Twin scores* and
-*real scores* are rates of the same policies in the twin and on the road, in the same order, along the last axis;
-leading axes are separate experiments. Twin and real are keyword-only, as they are not interchangeable (regret and rank
-violations are differences of real rates).
+A *rate* is successes divided by trials; its interval contains the true rate with probability `CONFIDENCE`. *Twin
+scores* and *real scores* are rates of the same policies in the twin and on the road, in the same order, along the last
+axis; leading axes are separate experiments. The arguments `twin` and `real` are keyword-only, since they are not
+interchangeable (regret and rank violations are differences of real rates).
 
-Functions raise `UndefinedStatistic` if the data do not determine a statistic. Those ending in `_batched` work over
-leading axes, for resampling, and return nan instead.
+Functions raise `UndefinedStatistic` if the data do not determine a statistic. Functions with a name that ends in
+`_batched` work over leading axes, for resampling, and return nan instead of raising it.
 """
 
 from collections.abc import Sequence
@@ -29,9 +29,9 @@ MIN_PREDICTORS = 7
 MIN_TRIALS = 5
 """Number of trials per cell below which no correlation is given."""
 
-_MIN_POINTS = 3  # of a correlation
-_DECIMALS = 12  # scores equal to this many decimals are tied, since the order of a sum changes its last bits
-_MIN_VARIANCE = 1e-12  # scores of less variance count as equal
+_MIN_POINTS = 3  # smallest number of policies for a correlation
+_DECIMALS = 12  # scores equal to this many decimals are tied, since the order of summation changes the last bits
+_MIN_VARIANCE = 1e-12  # scores with a smaller variance count as equal
 
 
 class UndefinedStatistic(ValueError):
@@ -43,7 +43,8 @@ class UndefinedStatistic(ValueError):
 
 def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
     """Lower and upper end of a rate's score interval (Wilson 1927); eq. 4 of Brown, Cai and DasGupta, Statistical
-    Science 16 (2001). Unlike SciPy's, it takes arrays, and successes that are not whole numbers (see `mean_rate`).
+    Science 16 (2001). Unlike SciPy's function, this one accepts arrays, and numbers of successes that are not whole
+    (see `mean_rate`).
     """
     n = np.asarray(trials, float)
     p = np.asarray(successes, float) / n
@@ -56,8 +57,9 @@ def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDEN
 def mean_rate(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
     """Unweighted mean of the rates of k cells, shape (k,), and the ends of its interval.
 
-    The interval is Wilson's for k² / Σ 1/nᵢ trials, for which a binomial rate has the mean's variance if all rates are
-    equal. Unequal rates have less variance, so the interval errs to the wide side.
+    The interval is Wilson's for k² / Σ 1/nᵢ trials: with so many trials, a binomial rate has the same variance as the
+    mean if all cells have the same true rate. Cells with unequal rates have less variance, so the interval is then too
+    wide rather than too narrow.
     """
     n = np.asarray(trials, float)
     mean = float(np.mean(np.asarray(successes, float) / n))
@@ -77,11 +79,12 @@ def rate_summary(won: int, trials: int) -> dict[str, Any]:
 def rate_over_days(rates: ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
     """Unweighted mean of the rates of k days, shape (k,), and the ends of its interval with the day as the unit.
 
-    Trials of one day share its lighting and weather. The interval assumes that their outcomes agree entirely: with an
-    intra-class correlation ρ of 1 the design effect 1 + (m − 1) ρ equals the m trials of a day (Kish, Survey Sampling,
-    1965, section 5.4), so k days count as k trials of Wilson's interval. Rates between 0 and 1 have less variance than
-    successes and failures of the same mean, so it errs to the wide side. It holds for further days of the same
-    policies, not for further policies. Raises ValueError: no rate, or one outside [0, 1].
+    Trials of one day share its lighting and weather. The interval assumes that all trials of a day have the same
+    outcome: with an intra-class correlation ρ of 1, the design effect 1 + (m − 1) ρ equals the number m of trials of a
+    day (Kish, Survey Sampling, 1965, section 5.4), so k days count as k trials in Wilson's interval. Rates between 0
+    and 1 have less variance than successes and failures with the same mean, so the interval is then too wide rather
+    than too narrow. It holds for further days of the same policies, not for further policies. Raises ValueError: no
+    rate, or one outside [0, 1].
     """
     days = np.asarray(rates, float)
     if days.ndim != 1 or not len(days) or not ((days >= 0.0) & (days <= 1.0)).all():
@@ -122,7 +125,7 @@ def pearson(*, twin: ArrayLike, real: ArrayLike) -> float:
 
 
 def spearman(*, twin: ArrayLike, real: ArrayLike) -> float:
-    """Pearson's correlation of ranks; tied scores share their mean rank. Raises UndefinedStatistic as `pearson`."""
+    """Pearson's correlation of ranks; tied scores share their mean rank. Raises UndefinedStatistic like `pearson`."""
     twin, real = _validated(twin, real)
     return float(spearman_batched(twin=twin, real=real))
 
@@ -130,21 +133,21 @@ def spearman(*, twin: ArrayLike, real: ArrayLike) -> float:
 def mmrv(*, twin: ArrayLike, real: ArrayLike) -> float:
     """Mean maximum rank violation in [0, 1], 0 is best: SIMPLER (Li et al., arXiv 2405.05941), section on metrics.
 
-    The violation of a pair of policies that twin and road order differently is the difference of their real scores:
-    |Rᵢ − Rⱼ| · 1[(Sᵢ < Sⱼ) ≠ (Rᵢ < Rⱼ)]; MMRV is the mean over i of the largest over j. It is not symmetric in its
-    arguments, and published code names them in both orders. If two policies are tied in the twin, but not on the road,
-    the violation counts for the worse of the two; in the paper's published code, which compares by >, for the better.
-    Raises UndefinedStatistic: fewer than two policies.
+    If twin and road order a pair of policies differently, the violation is the difference of their real scores:
+    |Rᵢ − Rⱼ| · 1[(Sᵢ < Sⱼ) ≠ (Rᵢ < Rⱼ)]. MMRV is the mean over i of the largest violation over j. It is not symmetric
+    in twin and real, and published code has both orders of the arguments. If two policies are tied in the twin but not
+    on the road, the violation counts for the policy with the lower real score; in the paper's published code, which
+    compares by >, it counts for the one with the higher real score. Raises UndefinedStatistic: fewer than two policies.
     """
     twin, real = _validated(twin, real, needed=2, varied=False)
     return float(mmrv_batched(twin=twin, real=real))
 
 
 def winner(*, twin: ArrayLike, real: ArrayLike) -> tuple[float, float]:
-    """Agreement and regret of the twin's best policy, means over policies tied as best in the twin.
+    """Agreement and regret of the twin's best policy; if several are tied as best in the twin, the means over them.
 
-    Agreement is 1 if it is the road's best, too, else 0; regret is the real rate of the road's best policy minus its
-    own. Raises UndefinedStatistic: fewer than two policies.
+    Agreement is 1 if the policy is also the best on the road, else 0. Regret is the real rate of the road's best policy
+    minus the real rate of this policy. Raises UndefinedStatistic: fewer than two policies.
     """
     twin, real = _validated(twin, real, needed=2, varied=False)
     agreement, regret = winner_batched(twin=twin, real=real)
@@ -208,8 +211,8 @@ def _validated(twin: ArrayLike, real: ArrayLike, needed: int = _MIN_POINTS, vari
 #
 #     θ = λ · mean(f̃) + mean(Y − λ f)            eq. 4 of PPI++ (Angelopoulos, Duchi and Zrnic, arXiv 2311.01453)
 #
-# which is unbiased however inaccurate the twin is. Its variance is least at the *power* λ = Cov(Y, f) / ((1 + n/N)
-# Var f) (its example 6.1). A single further policy of twin score f̃ is predicted with the λ for N → ∞,
+# which is unbiased however inaccurate the twin is. Its variance is least for the *power* λ = Cov(Y, f) / ((1 + n/N)
+# Var f) (example 6.1 of PPI++). A single further policy with twin score f̃ is predicted with the λ for N → ∞,
 #
 #     Ŷ = λ f̃ + mean(Y − λ f),  λ = Cov(Y, f) / Var f,
 #
@@ -218,13 +221,13 @@ def _validated(twin: ArrayLike, real: ArrayLike, needed: int = _MIN_POINTS, vari
 
 @dataclass(frozen=True)
 class PredictionPoweredMean:
-    """Estimate of the mean real score of policies like those driven."""
+    """Estimate of the mean real score of policies like those driven, and the ends of its interval."""
 
     value: float
     low: float
     high: float
     power: float
-    """λ: weight of the twin scores; 0: not used, 1: taken as they are."""
+    """λ, the weight of the twin scores: at 0 they are not used, at 1 they have full weight."""
 
 
 def prediction_powered_mean(
@@ -235,19 +238,19 @@ def prediction_powered_mean(
     power: float | None = None,
     confidence: float = CONFIDENCE,
 ) -> PredictionPoweredMean:
-    """PPI++ for a mean.
+    """Estimates the mean real score by PPI++.
 
-    λ is tuned without the policy it is applied to (leave one out), which keeps the estimate exactly unbiased; tuned on
-    the same few policies it would be biased (Mani et al., arXiv 2505.20178). The interval uses Student's t with n − 1
-    degrees of freedom and is not clipped to [0, 1]. In simulation it covers 0.91 to 0.93 for policies of varied
-    quality, but 0.8 for six policies most of which fail.
+    For each policy, λ is tuned on the other policies (leave one out), so the estimate is exactly unbiased. With a λ
+    tuned on all of the few policies it would be biased (Mani et al., arXiv 2505.20178). The interval uses Student's t
+    with n − 1 degrees of freedom and is not clipped to [0, 1]. In simulation its coverage is 0.91 to 0.93 for policies
+    of varied quality, but 0.8 for six policies most of which fail.
 
     Args:
         twin: fᵢ, shape (n,).
         real: Yᵢ, shape (n,).
         twin_only: f̃ⱼ, shape (N,).
-        power: λ; None: tuned.
-        confidence: Of the interval.
+        power: λ; None: λ is tuned.
+        confidence: Confidence level of the interval.
 
     Raises:
         UndefinedStatistic: n < 5, or N < 2.
@@ -302,11 +305,11 @@ class LinearCorrection:
         return LinearCorrection(slope, float(f.mean()), float(y.mean()), residual_std, squares, len(y))
 
     def predict(self, twin: ArrayLike, confidence: float = CONFIDENCE) -> tuple[Array, Array, Array]:
-        """Real scores, in as many trials as the fitted policies had, predicted from twin scores.
+        """Predicts real scores, in as many trials as the fitted policies had, from twin scores.
 
-        Returns values and ends of their intervals, clipped to [0, 1], each of the shape of `twin`. The interval is that
-        of simple regression for a new observation (Draper and Smith, Applied Regression Analysis, section 3.1). It is
-        centered on the clipped value, so that it keeps its width where the line leaves the range of rates.
+        Returns values and ends of their intervals, clipped to [0, 1], each of the shape of `twin`. The interval is the
+        prediction interval of simple regression (Draper and Smith, Applied Regression Analysis, section 3.1). It is
+        centered on the clipped value, so that it does not vanish where the line leaves [0, 1].
         """
         f = np.asarray(twin, float)
         middle = np.clip(self.real_mean + self.slope * (f - self.twin_mean), 0, 1)
@@ -319,10 +322,10 @@ class LinearCorrection:
 def leave_one_group_out(
     *, twin: ArrayLike, real: ArrayLike, groups: Sequence[object], confidence: float = CONFIDENCE
 ) -> tuple[Array, Array, Array]:
-    """Each real score predicted by the line through all other groups: values and ends of intervals, shapes (n,).
+    """Predicts each real score by the line fitted to all other groups: values and ends of intervals, shapes (n,).
 
-    `groups` names the group of each score, such as its policy or lighting. Raises UndefinedStatistic: fewer than 5
-    scores remain without a group.
+    `groups` names the group of each score, such as its policy or lighting. Raises UndefinedStatistic: without one of
+    the groups, fewer than 5 scores remain.
     """
     f, y = np.asarray(twin, float), np.asarray(real, float)
     out = np.empty((3, len(y)))

@@ -1,4 +1,4 @@
-"""Success during training, from a run's `episodes.csv`: curves, and the rate before each saved policy."""
+"""Success during training, from a run's `episodes.csv`: curves, and the rate before a policy was saved."""
 
 import csv
 import io
@@ -21,21 +21,21 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 CHOICE_FILE = "choice.json"
-"""File of a run with the selection of its policy; see `learn/training.py`."""
+"""File of a run with the selection of its policy; see `learn/selection.py`."""
 _MAX_BINS = 25  # points of a curve
 _MIN_EPISODES = 5  # per point
 
 
 def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Summaries of the trainings of policies in `runs/` that are unchanged since their validation.
+    """Summarizes the trainings of policies in `runs/`, for those policies that are unchanged since their validation.
 
     Args:
         root: The scene folder.
         policies: Names as in tables, `run` or `run/checkpoint`.
 
     Returns:
-        By policy, JSON-able: run, step at which it was saved, task, observe and lighting of the training, and the
-        `rate_summary` of the `RECENT_EPISODES` before that step.
+        By policy, JSON-able: its run; the step at which it was saved; task, observe and lighting of the training; and
+        the `rate_summary` of the last `RECENT_EPISODES` episodes up to that step.
     """
     digests = validated_digests(root)
     out = {}
@@ -58,7 +58,7 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
 
 
 def validated_digests(root: Path) -> dict[str, Any]:
-    """Digests of the validated policies of a scene by name; empty before any validation."""
+    """Digests of a scene's validated policies by name; empty if nothing was validated yet."""
     record = SceneDir(root).validation / "validated.json"
     if not record.exists():
         return {}
@@ -67,7 +67,7 @@ def validated_digests(root: Path) -> dict[str, Any]:
 
 
 def _is_there(path: Path) -> bool:
-    """True if the file exists; False also for impossible names, as a table may contain any."""
+    """True for an existing regular file; False also for an invalid file name, which a table may contain."""
     try:
         return bool(regular_file(path))
     except InputError:
@@ -77,13 +77,13 @@ def _is_there(path: Path) -> bool:
 def read_episodes(folder: Path) -> tuple[Indices, Indices]:
     """Reads a run's episodes: steps at which they ended, ascending, and success, 0 or 1; shapes (n,).
 
-    Episodes that started along the route are left out, as they are easier. Raises InputError: no such file, or one that
-    no training wrote.
+    Episodes that started further along the route are left out, since they are easier. Raises InputError: there is no
+    such file, or its contents are not those that a training writes.
     """
     path = folder / "episodes.csv"
     text = read_text(path)
     with wrap_read_errors(path, "cut its last lines off, or train anew under another name"):
-        # Older runs have no start_m: all their episodes were whole.
+        # Tables of older runs have no column start_m; all their episodes started at the beginning.
         whole = [row for row in csv.DictReader(io.StringIO(text)) if float(row.get("start_m") or 0.0) == 0.0]
         rows = [(int(row["step"]), int(row["success"])) for row in whole]
         steps, success = np.array(rows, np.int64).reshape(-1, 2).T
@@ -93,9 +93,10 @@ def read_episodes(folder: Path) -> tuple[Indices, Indices]:
 
 
 def binned_rates(steps: Indices, success: Indices, bins: int = _MAX_BINS) -> list[tuple[float, int, int, float, float]]:
-    """Bins of about equally many episodes: mean step, successes, episodes, and the ends of the rate's interval.
+    """Divides the episodes of `read_episodes` into up to `bins` bins with about equal numbers of episodes.
 
-    At most `bins` bins of the episodes of `read_episodes`, each of at least 5 if possible.
+    Returns for each bin: mean step, successes, episodes, and the ends of the rate's interval. A bin has at least
+    `_MIN_EPISODES` episodes; if there are fewer in all, there is one bin.
     """
     out = []
     parts = max(1, min(bins, len(steps) // _MIN_EPISODES))
@@ -106,7 +107,7 @@ def binned_rates(steps: Indices, success: Indices, bins: int = _MAX_BINS) -> lis
 
 
 def plot_success_curve(axes: Axes, steps: Indices, success: Indices, color: str) -> None:
-    """Plots the success rate over steps, with its interval, from one episode or more; see `binned_rates`."""
+    """Plots the success rate over steps, with its interval; see `binned_rates`. Needs at least one episode."""
     step, won, count, low, high = np.array(binned_rates(steps, success), float).T
     axes.fill_between(step, low, high, color=color, alpha=0.2, linewidth=0, label="90 % interval")
     axes.plot(step, won / count, ".-", color=color, label=f"{len(steps)} episodes, {int(count[0])} a point")
@@ -121,12 +122,12 @@ def _plot_choice(axes: Axes, choice: dict[str, Any]) -> None:
     rate = chosen["successes"] / chosen["trials"]
     low, high = wilson(chosen["successes"], chosen["trials"])
     label = f"the chosen policy in {chosen['trials']} new episodes"
-    bars = [[max(0.0, rate - low)], [max(0.0, high - rate)]]  # rounding may put an end on the wrong side
+    bars = [[max(0.0, rate - low)], [max(0.0, high - rate)]]  # rounding could make a length negative
     axes.errorbar(chosen["step"], rate, bars, fmt="o", color="#d95f02", capsize=3, label=label)
 
 
 def write_success_curve(folder: Path) -> Path:
-    """Writes `success.png` of a run: success over steps with 90 % intervals, and the selection of its policy."""
+    """Writes `success.png` to a run's folder: success over steps with 90 % intervals, and the selected policy."""
     steps, success = read_episodes(folder)
     path = folder / "success.png"
     figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")

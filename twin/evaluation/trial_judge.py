@@ -1,8 +1,8 @@
-"""Judges a trial on the road by the twin's own rules, and measures how far the twin is from it.
+"""Judges a trial on the road by the twin's rules of success and failure, and compares the trial with the twin.
 
-The recorded poses, sampled once per control step, go through the environment's `RewardAndTermination`. *Replay*: the
+The recorded poses, sampled once per control step, are judged by the environment's `RewardAndTermination`. *Replay*: the
 recorded commands drive the twin's robot from the same start. *Views*: the field rendered from the poses at which the
-robot's pictures were taken. The operator states what poses cannot show, such as a collision.
+robot's pictures were taken. Outcomes that poses cannot show, such as a collision, are stated by the operator.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from twin.nerf.rendering import Rendering
 from twin.robot import PixelCamera
 from twin.types import Array, Image
 
-_PROBES = 8  # pictures by which a lighting is chosen
+_PROBES = 8  # number of pictures by which a lighting is chosen
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class JudgedTrial:
     cause: str
     """One of `twin.config.CAUSES`; empty if the recording ends before an outcome."""
     start_heading: float
-    """Yaw against the route at the start [rad]."""
+    """Yaw relative to the route at the start [rad]."""
     rewards: Array
-    """Reward of the step that ended at each instant, by the environment's terms without steering; the first is zero.
-    Shape (k,)."""
+    """Reward of the step that ended at each instant, by the environment's reward terms except that for steering; the
+    first is zero. Shape (k,)."""
 
 
 def judge(factory: EnvFactory, times: Array, poses: Array, uprightness: Array) -> JudgedTrial:
@@ -47,7 +47,7 @@ def judge(factory: EnvFactory, times: Array, poses: Array, uprightness: Array) -
 
     Args:
         factory: Scene, task and options.
-        times: [s] since the start, one control step apart, the first 0; shape (n,).
+        times: [s] since the start, one control step apart, starting at 0; shape (n,).
         poses: x, y [m], yaw [rad] of the base in the scene, shape (n, 3).
         uprightness: Cosine of the tilt, shape (n,).
     """
@@ -70,13 +70,13 @@ def judge(factory: EnvFactory, times: Array, poses: Array, uprightness: Array) -
 
 
 def replay(factory: EnvFactory, start: Array, times: Array, command_times: Array, commands: Array) -> Array:
-    """Drives the twin's robot by recorded commands; returns its poses (k, 3) at `times` (k,) [s], the first 0.
+    """Drives the twin's robot by recorded commands; returns its poses (k, 3) at `times`: x, y [m], yaw [rad].
 
     Args:
         factory: Scene and robot.
         start: x, y [m], yaw [rad] at rest, shape (3,).
-        times: Increasing.
-        command_times: When each command was given [s], increasing, shape (c,).
+        times: [s], increasing, starting at 0, shape (k,).
+        command_times: Times at which the commands were given [s], increasing, shape (c,).
         commands: v [m/s], ω [rad/s], shape (c, 2).
     """
     robot = factory.make_env(0)[0].robot
@@ -104,7 +104,8 @@ class TrialViews:
     psnr: Array
     """[dB], shape (n,)."""
     matched_psnr: Array
-    """PSNR after matching each color's mean and deviation, so that only shapes and shadows differ [dB], shape (n,)."""
+    """PSNR after each color's mean and standard deviation were matched, so that shapes and shadows determine it [dB],
+    shape (n,)."""
     trust: Array
     """See `twin.env.trust`, shape (n,)."""
 
@@ -118,8 +119,8 @@ def view(
         factory: Scene, with its field.
         poses: x, y [m], yaw [rad] of the base, shape (n, 3).
         pictures: RGB uint8 (h, w, 3) of `camera`.
-        camera: A pinhole camera at the pictures' size.
-        lighting: By name; None: the filmed or added one with the best median PSNR.
+        camera: A pinhole camera with the pictures' size.
+        lighting: Name of a lighting; None: the filmed or added lighting with the best median PSNR.
     """
     field, trust = factory.field, factory.trust
     assert field is not None and trust is not None  # the options have pixels
@@ -150,6 +151,6 @@ def view(
 
 
 def _matched(picture: Array, reference: Array) -> Array:
-    """A picture with the mean and standard deviation of each of the reference's colors."""
+    """The picture with each color scaled to the mean and standard deviation of that color in the reference."""
     mean, std = picture.mean((0, 1)), picture.std((0, 1))
     return np.clip((picture - mean) / np.maximum(std, 1e-3) * reference.std((0, 1)) + reference.mean((0, 1)), 0.0, 1.0)

@@ -6,8 +6,9 @@ in `results.csv`:
 
     policy,lighting,trials,successes            optional columns: task, twin_lighting
 
-`task` is required only for a policy validated on several. `twin_lighting` is required if the twin has no lighting of
-that name: it names the one to compare with, such as `held-out+randomised` for `dusk_on_monday`.
+`task` is required only for a policy that was validated on several tasks. `twin_lighting` is required if the twin has no
+lighting named `lighting`: it names the twin's lighting to compare with, such as `held-out+randomised` for
+`dusk_on_monday`.
 """
 
 import csv
@@ -30,15 +31,15 @@ CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "lo
 RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
 """Columns of `results.csv`."""
 SETUP_COLUMNS = ("place", "day", "robot", "camera", "outside_training")
-"""Numbers of place, day, robot and camera, and what of the latter lies outside training's ranges; `twin.reality` writes
-them."""
+"""Columns that `twin.reality` writes: numbers of place, day, robot and camera, and the parameters of robot and camera
+that lie outside the ranges of the training."""
 OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting", *SETUP_COLUMNS)
 """Further columns that `results.csv` may have."""
 RECENT_EPISODES = 20
-"""Number of newest episodes, started at the segment's beginning, that a training's success rate is counted over; a
-training on a CPU has about 40."""
+"""Number of episodes over which a training's success rate is measured: the newest ones that started at the beginning of
+the task's route segment."""
 
-_MAX_COUNT, _MAX_SEED = 10**6, 2**63 - 1  # trials or steps in a cell; a seed
+_MAX_COUNT, _MAX_SEED = 10**6, 2**63 - 1  # largest count in a table, and largest seed
 _VALIDATE_COMMAND = "python -m twin.validate"
 
 
@@ -130,9 +131,10 @@ def write_real_trials(
     twin_lighting: str,
     setup: Callable[[str], tuple[str, ...]] | None = None,
 ) -> None:
-    """Writes real trials, a row each, to `table`, and their counts to `out`, as `read_results` reads them.
+    """Writes real trials, one row each, to `table`, and their counts to `out`, in the format of `read_results`.
 
-    Cells that `out` already has keep their `twin_lighting` and `SETUP_COLUMNS`; `setup` gives those of a new lighting.
+    Cells that are already in `out` keep their `twin_lighting` and `SETUP_COLUMNS`. For other cells, `setup` gives the
+    values of `SETUP_COLUMNS` by the lighting's name.
     """
     known: dict[tuple[str, str, str], dict[str, str]] = {}
     if out.exists():
@@ -156,9 +158,9 @@ def write_real_trials(
 
 
 def read_trials(path: Path) -> list[Trial]:
-    """Reads `validation/episodes.csv`, or a compressed one (`.csv.gz`).
+    """Reads a table such as `validation/episodes.csv`, which may be compressed (`.csv.gz`).
 
-    Raises InputError: no such file, or an invalid row, with its line.
+    Raises InputError: no such file, or an invalid row (the message has its line).
     """
     if not path.exists():
         raise InputError(
@@ -183,9 +185,9 @@ def read_trials(path: Path) -> list[Trial]:
 
 
 def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
-    """Reads `results.csv` and checks that each real cell has one of the twin's cells to compare with.
+    """Reads `results.csv` and checks that for each real cell there is a cell of the twin to compare with.
 
-    Raises InputError: no such file, or a wrong header, unknown name, impossible count or duplicate, with its line.
+    Raises InputError: no such file, a wrong header, or a line with an unknown name, an impossible count or a duplicate.
     """
     if not path.exists():
         raise InputError(f"{path} does not exist; write one, with the columns {','.join(RESULT_COLUMNS)}")
@@ -260,7 +262,7 @@ def _name_hint(name: str, valid: Sequence[str]) -> str:
 
 
 def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterable[tuple[str, dict[str, str]]]:
-    """Yields the location of each row, and its fields by column name."""
+    """Yields for each row its location (file and line), and its fields by column name."""
     reader = csv.reader(io.StringIO(_table_text(path)))
     wanted = ",".join(needed) + "".join(f"[,{name}]" for name in optional)
     try:
@@ -297,7 +299,7 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
 
 
 def _table_text(path: Path) -> str:
-    """Text of a table, which may be compressed. Raises InputError: damaged."""
+    """Text of a table, which may be compressed. Raises InputError: the file is damaged."""
     if path.suffix != ".gz":
         return read_text(path)
     with wrap_read_errors(path, "restore it"):

@@ -5,8 +5,8 @@
     v, yaw_rate = policy.command(action)    # m/s, rad/s
 
 A *policy folder* contains `policy.json` (control, sizes of the network, its training), `policy.safetensors` (weights)
-and `policy.onnx` (both in one file, for a robot that has ONNX Runtime but not this package). Loading runs no code
-unless the user trusts a file; `load_policy` lists the other formats.
+and `policy.onnx` (both in one file, for a robot that has ONNX Runtime but not this package). Loading a file runs no
+code from it unless the user trusts it; `load_policy` lists the other formats.
 """
 
 import contextlib
@@ -36,8 +36,8 @@ JSON, WEIGHTS, ONNX = "policy.json", "policy.safetensors", "policy.onnx"
 FORMAT, VERSION = "twin policy", 2
 
 _MAX_SIDE, _MAX_STACK = 4096, 64  # side of a picture [px], pictures in a stack
-_MAX_BYTES = 256 << 20  # of a file
-_METADATA_KEY = "twin"  # in an ONNX file
+_MAX_BYTES = 256 << 20  # largest file
+_METADATA_KEY = "twin"  # key of twin's entry in an ONNX file's metadata
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,11 @@ class Control:
     """Meaning and timing of a policy's actions. The defaults apply to policies of unknown origin."""
 
     action: str = STEERING
-    """steering: one number, the yaw rate; twist: two, speed and yaw rate."""
+    """With `steering`, an action is one number, the yaw rate; with `twist`, two numbers, speed and yaw rate."""
     speed: float = 1.0
-    """[m/s]; steering: the constant speed; twist: the speed at action 1, with standstill at -1."""
+    """[m/s]. With `steering`, the constant speed; with `twist`, the speed at action 1 (action -1 is standstill)."""
     yaw_rate: float = 1.0
-    """Yaw rate at action 1, to the left [rad/s]."""
+    """Yaw rate at action 1, positive to the left [rad/s]."""
     control_timestep: float = 0.1
     """Time between two actions, and between two pictures of a stack [s]."""
 
@@ -64,7 +64,7 @@ class Control:
 
     @property
     def actions(self) -> int:
-        """Numbers in an action."""
+        """Number of components of an action."""
         return 1 if self.action == STEERING else 2
 
 
@@ -74,7 +74,7 @@ class Policy:
 
     name: str
     act: ActFunction
-    """The network; its output is not checked, unlike that of `actions`."""
+    """The network. Its output is not checked; the method `actions` checks it."""
     control: Control
     size: tuple[int, int] = (160, 90)
     """Width, height of the pictures [px]."""
@@ -85,7 +85,7 @@ class Policy:
     def actions(self, stacks: Image) -> Array32:
         """Stacks uint8 (n, 3 · stack, height, width) → actions (n, actions), each number in [-1, 1].
 
-        Raises InputError: stacks of another shape, or an output that is not an action.
+        Raises InputError: stacks of another shape or type, or an output of another shape or that is not finite.
         """
         width, height = self.size
         expected = (3 * self.stack, height, width)
@@ -124,7 +124,7 @@ def save_policy(
 
     Args:
         weights: See `Architecture.shapes`.
-        trained: Description of the training, JSON-able.
+        trained: Description of the training, JSON-able; see `Policy.trained`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     weights = {name: np.ascontiguousarray(weights[name], np.float32) for name in architecture.shapes()}
@@ -137,23 +137,24 @@ def save_policy(
 
 
 def copy_policy(source: Path, folder: Path) -> None:
-    """Replaces the files of a policy folder by another's."""
+    """Replaces the files of the policy folder `folder` by those of `source`."""
     _replace_policy(folder, {name: read_bytes(source / name) for name in (WEIGHTS, ONNX, JSON)})
 
 
 def _replace_policy(folder: Path, files: dict[str, bytes]) -> None:
-    """Replaces files, policy.json last; on a full disk the old policy remains complete."""
-    with contextlib.ExitStack() as stack:  # its exit renames the temporary files, the last entered first
+    """Replaces files, policy.json last; if the disk is full, the old policy remains complete."""
+    with contextlib.ExitStack() as stack:  # on exit, the temporary files are renamed in reverse order of entry
         temporary = {name: stack.enter_context(atomic_path(folder / name)) for name in reversed(files)}
         for name, content in files.items():
             temporary[name].write_bytes(content)
-        (folder / JSON).unlink(missing_ok=True)  # it must not describe other weights, even for a moment
+        (folder / JSON).unlink(missing_ok=True)  # the old one must not describe the new weights, even for a moment
 
 
 def find_policy(root: Path, source: str) -> str:
-    """The `source` for `load_policy`, with names as in tables (`run`, `run/checkpoint`) resolved to folders in `runs/`.
+    """Converts a policy's name or path to a `source` for `load_policy`.
 
-    Existing paths become absolute, since nodes of a cluster have other working folders; the rest is unchanged.
+    Names as in tables (`run`, `run/checkpoint`) become folders in `runs/`. Paths that exist become absolute, since
+    nodes of a cluster have other working folders; other sources are unchanged.
     """
     run, _, checkpoint = source.partition("/")
     folder = root / "runs" / run
@@ -165,13 +166,13 @@ def find_policy(root: Path, source: str) -> str:
 def load_policy(source: str | Path, trust: bool = False) -> Policy:
     """Loads a policy from
 
-    - a policy folder, such as a run or a checkpoint of one (or its policy.json);
+    - a policy folder, such as a run or a checkpoint of a run (or the folder's policy.json);
     - an ONNX file with one input, uint8 or float32 (n, 3 · stack, height, width) of values 0 to 255, and one output
       (n, 1 or 2) in [-1, 1];
     - `module:function`, the user's own function of one stack uint8 (3 · stack, height, width);
-    - a zip of stable-baselines3, only with `trust`, since loading it runs its code.
+    - a zip file of a SAC of stable-baselines3, only with `trust`, since loading it can run code from the file.
 
-    Raises InputError: no such policy, or one that is damaged or of another format.
+    Raises InputError: there is no such policy, or it is damaged or has another format.
     """
     path = Path(source)
     if path.name == JSON:
@@ -220,13 +221,13 @@ def _from_onnx(path: Path) -> Policy:
 
     try:
         model = onnx.load_model_from_string(_read(path))
-        # Refused before the checker, which would open the files.
+        # Must come before the check of the model, which would open these files.
         if any(one.data_location == onnx.TensorProto.EXTERNAL for one in _tensors(model)):
             raise InputError(f"{path}: its weights are in other files; save it with its weights inside")
         onnx.checker.check_model(model)
     except InputError:
         raise
-    except Exception as error:  # of protobuf, of the checker, or Python's for deep nesting
+    except Exception as error:  # from protobuf, the checker, or Python's recursion limit
         raise InputError(f"{path}: not an ONNX file: {type(error).__name__}: {error}") from None
     names = {one.name for one in model.graph.initializer}
     inputs = [one for one in model.graph.input if one.name not in names]
@@ -257,7 +258,7 @@ def _from_onnx(path: Path) -> Policy:
 
 
 def _tensors(model: Any) -> Iterator[Any]:
-    """Every tensor of an ONNX model, wherever it is nested."""
+    """Yields every tensor of an ONNX model, at any depth of nesting."""
     waiting = [model]
     while waiting:
         message = waiting.pop()
@@ -269,7 +270,7 @@ def _tensors(model: Any) -> Iterator[Any]:
 
 
 def _from_callable(name: str) -> Policy:
-    # Only here: files of policies load without the environments.
+    # Imported here, so that policy files load without the environments.
     from twin.env.drivers import find_callable
 
     function = find_callable(name)
@@ -320,7 +321,7 @@ def _session(model: bytes, path: Path) -> ActFunction:
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
-    # One thread: environments run in parallel, and the order of sums is fixed.
+    # One thread, since environments run in parallel, and so that the order of sums is fixed.
     settings.intra_op_num_threads = settings.inter_op_num_threads = 1
     settings.log_severity_level = 4
     try:

@@ -1,7 +1,8 @@
 """Evaluation of policies on numbered episodes of a task, on this machine or a Ray cluster.
 
-Seed and lighting determine an *episode*: start, robot and light depend neither on the policy nor on the machine or
-other episodes. So all policies drive the same episodes, and *chunks* of a campaign can run in any order.
+Seed and lighting determine an *episode*: its start, robot and light depend neither on the policy nor on the machine or
+other episodes. So all policies drive the same episodes. A *campaign* is a sequence of *chunks* of episodes, which can
+run in any order.
 """
 
 import dataclasses
@@ -52,7 +53,10 @@ class EpisodeChunk:
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """An episode's result: progress [m], mean trust over its pictures, sum of its rewards, lighting as sampled."""
+    """An episode's result: cause of its end, progress [m], mean trust over its pictures, sum of its rewards.
+
+    `lighting` is the lighting as sampled; see `LocalVectorEnv.info`.
+    """
 
     seed: int
     cause: str
@@ -64,7 +68,10 @@ class EpisodeResult:
 
 
 def run_chunk(chunk: EpisodeChunk) -> list[EpisodeResult]:
-    """Results of a chunk, in the order of its seeds. Raises InputError: unknown policy, scene, task or lighting."""
+    """Results of a chunk, in the order of its seeds.
+
+    Raises InputError: the policy, scene, task or lighting is unknown.
+    """
     envs = _vector_env(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.condition)
     return run_episodes(_policy(chunk.source, chunk.trust), envs, chunk.seeds)
 
@@ -75,9 +82,9 @@ def run_episodes(
     seeds: Sequence[int],
     watch: Callable[[], object] = lambda: None,
 ) -> list[EpisodeResult]:
-    """Results of an episode per seed, in that order, driven in all environments at once.
+    """Drives one episode per seed, in parallel in all environments; returns the results in the order of the seeds.
 
-    `envs` need pictures, and their current episodes are abandoned. `watch` is called after every episode.
+    `envs` must have pictures; their current episodes are abandoned. `watch` is called after every episode.
     """
     assert envs.pixels is not None
     waiting = list(range(len(seeds)))
@@ -108,9 +115,10 @@ def run_episodes(
 
 
 def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[list[EpisodeResult]]:
-    """Drives chunks in worker processes on this machine, which end with this one; yields their results in order.
+    """Drives chunks in worker processes on this machine; yields their results in order.
 
-    Raises InputError: an error of `run_chunk`, or a process ended, most likely because memory ran out.
+    The workers end with the calling process. Raises InputError: an error of `run_chunk`, or a worker ended, most
+    likely because memory ran out.
     """
     if processes == 1:
         yield from map(run_chunk, chunks)
@@ -133,7 +141,7 @@ def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[lis
 
 
 def with_sampled_lighting(factory: EnvFactory, number: int) -> EnvFactory:
-    """Adds a lighting `drawn_<number>` to the factory's field, sampled from the filmed ones with that seed."""
+    """Adds a lighting `drawn_<number>` to the factory's field, sampled from the filmed ones with the seed `number`."""
     assert factory.field is not None
     name = f"drawn_{number}"
     if name not in factory.field.lightings:
@@ -171,15 +179,15 @@ def _vector_env(scene: str, task: str, source: str, trust: bool, condition: Cond
 
 # ---- campaigns on a Ray cluster
 
-_CORES = 2  # that a chunk uses
+_CORES = 2  # cores reserved per chunk
 _CONNECT_TIMEOUT = 5.0  # [s]
 
 
 def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[list[EpisodeResult]]:
-    """`campaign` on a Ray cluster (address `auto`: the one on this machine).
+    """`campaign` on a Ray cluster (address `auto`: the cluster on this machine).
 
-    Its nodes need `twin`, and scene and policies under the same paths. Raises InputError: Ray is not installed, there
-    is no such cluster, or an error of `run_chunk`.
+    Every node must have `twin` installed, and the scene and the policies under the same paths. Raises InputError: Ray
+    is not installed, there is no such cluster, or an error of `run_chunk`.
     """
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # silences a warning of Ray on GPUs
     try:
@@ -187,7 +195,7 @@ def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[li
     except ImportError:
         raise InputError("--ray needs more: pip install .[ray]") from None
     try:
-        if address != "auto":  # Ray itself retries for minutes
+        if address != "auto":  # checked here, since Ray retries for minutes
             host, _, port = address.rpartition(":")
             socket.create_connection((host, int(port)), _CONNECT_TIMEOUT).close()
         with signals_kept():  # Ray replaces the handler of SIGTERM
@@ -196,7 +204,7 @@ def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[li
         first = str(error).splitlines()[0]
         raise InputError(f"--ray {address}: no cluster there ({first}); start one with `ray start --head`") from None
     try:
-        # No more cores than the largest node has, or the tasks would wait for ever.
+        # A task that asks for more cores than the largest node has would wait for ever.
         cores = max((node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0)
         if cores < 1:
             raise InputError(f"--ray {address}: no node of the cluster has a core to give; start one with `ray start`")

@@ -2,9 +2,10 @@
 
 A *stack* is uint8 (3 · stack, height, width), the newest picture last. Preprocessing averages blocks of `pool` × `pool`
 pixels and normalizes each color of each picture to a fixed mean and standard deviation in the lower half, where the
-ground is; this removes exposure, white balance and most of the lighting. Both steps return bytes, so that training and
-driving use the same values. Convolutions with ReLU follow, a linear layer with layer normalization and tanh (the
-encoder of DrQ, Kostrikov et al. 2020, at another size), hidden layers with ReLU, and a tanh for actions in [-1, 1].
+ground is; this removes exposure, white balance and most of the lighting. Both steps return uint8, so that training and
+driving use the same values. Then come convolutions with ReLU, a linear layer with layer normalization and tanh (the
+encoder of DrQ, Kostrikov et al. 2020, with other sizes), hidden layers with ReLU, and an output layer with tanh, for
+actions in [-1, 1].
 """
 
 from dataclasses import dataclass
@@ -19,8 +20,8 @@ NORM_EPSILON = 1e-5
 GROUND_MEAN, GROUND_STD = 128.0, 48.0
 """Mean and standard deviation of a normalized color in the lower half of a picture."""
 NOISE_STD = 4.0
-"""Added to the standard deviation of a color, so that normalization does not amplify noise in plain pictures."""
-_OPSET, _IR = 17, 8  # old enough for the ONNX Runtime on a robot
+"""Added to the standard deviation of a color, so that normalization does not amplify noise in uniform pictures."""
+_OPSET, _IR = 17, 8  # old versions of the format, which old versions of ONNX Runtime on a robot can read
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,9 @@ class Architecture:
     """Width, height of the pictures [px]."""
     stack: int = 4
     pool: int = 2
-    """Side of the averaged blocks [px]: 1, 2 or 4, which are exact in floating point."""
+    """Side of the averaged blocks [px]: 1, 2 or 4, for which the average is exact in floating point."""
     convolutions: tuple[tuple[int, int, int], ...] = ((32, 4, 4), (64, 3, 2))
-    """Channels, kernel, stride of each."""
+    """Channels, kernel and stride of each convolution."""
     features: int = 64
     """Size of the encoder's output."""
     hidden: tuple[int, ...] = (256, 256)
@@ -41,7 +42,7 @@ class Architecture:
     actions: int = 1
 
     def __post_init__(self) -> None:
-        """Raises ValueError: sizes that do not fit together, or too large for a robot's computer."""
+        """Raises ValueError: sizes that do not fit together, or are too large for a robot's computer."""
         if len(self.size) != 2:
             raise ValueError(f"size = {self.size}: expected (width, height)")
         numbers = [*self.size, self.stack, self.features, self.actions, *self.hidden, *sum(self.convolutions, ())]
@@ -101,7 +102,7 @@ def average_pool(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
 
 
 def normalize_colors(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Channels (..., height, width) scaled to mean `GROUND_MEAN` and std of about `GROUND_STD` in the lower half."""
+    """Scales channels (..., height, width) to mean `GROUND_MEAN` and std of about `GROUND_STD` in the lower half."""
     ground = pictures[..., pictures.shape[-2] // 2 :, :].astype(np.float32)
     mean, std = ground.mean((-2, -1), keepdims=True), ground.std((-2, -1), keepdims=True)
     scaled = (pictures.astype(np.float32) - mean) * (np.float32(GROUND_STD) / (std + np.float32(NOISE_STD)))
@@ -114,9 +115,12 @@ def preprocess(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
 
 
 def onnx_bytes(architecture: Architecture, weights: dict[str, Array32], notes: dict[str, str]) -> bytes:
-    """Network and preprocessing as an ONNX file: `pixels` uint8 (n, 3 · stack, height, width) → `action` (n, actions).
+    """Network and preprocessing as an ONNX file, from `pixels` to `action`.
+
+    The input `pixels` is uint8 (n, 3 · stack, height, width), the output `action` (n, actions).
 
     Args:
+        architecture: Sizes of the network.
         weights: See `Architecture.shapes`.
         notes: The file's metadata.
     """

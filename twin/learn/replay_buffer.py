@@ -1,10 +1,11 @@
 """A replay buffer of single pictures instead of stacks, and color augmentation of its samples.
 
-Each environment's pictures are written once, in order, to a ring in a file. A *transition* refers to its newest picture
-and stores its *age*, the steps since its episode began. The stack before the transition consists of that picture and
-those before it, with the episode's first repeated if there are too few; the stack after it ends with the next picture
-of the ring. An episode's last picture is followed by the next episode's first. A buffer that stores both stacks, of
-four pictures each, would take eight times the memory.
+Each environment's pictures are written once, in order, to a ring buffer in a file. A *transition* stores the number of
+the newest picture before it, and its *age*: the steps since its episode began. The stack before the transition consists
+of that picture and its predecessors; if the episode has too few, its first picture is repeated. The stack after the
+transition ends with the next picture of the ring. After an episode's last picture, the ring continues with the next
+episode's first. A buffer that stored both stacks of every transition, of four pictures each, would need eight times the
+memory.
 """
 
 from pathlib import Path
@@ -24,24 +25,24 @@ from twin.files import allocate
 # ---- color augmentation
 
 _GAMMA, _CONTRAST, _TINT = 0.25, 0.25, 0.08  # standard deviations of logarithms
-_KNOTS, _SHADING = (3, 5), 0.4  # of the brightness pattern: knots down and across, standard deviation of the logarithm
-_MAX_COVERS, _COVER_SIDES = 4, (0.1, 0.5)  # number of rectangles, exclusive; their sides as fractions of the picture's
+_KNOTS, _SHADING = (3, 5), 0.4  # brightness pattern: knots down and across, standard deviation of the logarithm
+_MAX_COVERS, _COVER_SIDES = 4, (0.1, 0.5)  # fewer rectangles than this; range of side / the picture's side
 _LEVELS = np.arange(256) / 255.0
 
 
 def augment_colors(stacks: NDArray[np.uint8], strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Randomizes the colors of stacks, for skies and shadows that no lighting of the field shows.
+    """Randomizes the colors of stacks, to simulate skies and shadows that no lighting of the field shows.
 
-    The policy's normalization removes brightness, contrast and tint of the whole ground; this randomizes the rest.
-    Every stack is changed differently, but all its pictures alike, which preserves motion:
+    The policy's normalization removes brightness, contrast and tint of the whole ground; this function randomizes what
+    remains. Every stack is changed differently. All pictures of a stack are changed alike, which preserves motion:
 
-        tone     v → v^gamma, and contrast about the middle
+        tone     v → v^gamma, then a change of contrast about mid-gray
         tint     a gain per color
         shading  a smooth pattern of brightness
         covers   rectangles of one color, so that steering does not rely on a single object in the background
 
     Args:
-        stacks: Shape (k, 3 · stack, height, width), the colors of one picture next to each other.
+        stacks: Shape (k, 3 · stack, height, width); the three channels of a picture are adjacent.
         strength: Factor of the standard deviations; 0 changes nothing.
     """
     count, channels, height, width = stacks.shape
@@ -62,7 +63,7 @@ def augment_colors(stacks: NDArray[np.uint8], strength: float, rng: np.random.Ge
 
 
 def _curves(count: int, strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A tone curve per sample and color, shape (count, 3, 256)."""
+    """A tone curve per stack and color, shape (count, 3, 256)."""
 
     def factors(deviation: float, colors: int) -> NDArray[np.float64]:
         return np.exp(strength * deviation * rng.normal(size=(count, colors, 1)))
@@ -73,12 +74,12 @@ def _curves(count: int, strength: float, rng: np.random.Generator) -> NDArray[np
 
 # ---- the buffer
 
-_SHORT = 8  # steps; the ring has room for all transitions if episodes are at least this long on average, else for fewer
+_SHORT = 8  # steps; if episodes are shorter than this on average, the ring has no room for all transitions
 _ROWS = ("actions", "rewards", "ends", "newest", "age", "states", "states_after")
 
 
 class ReplaySamples(NamedTuple):
-    """The samples of stable-baselines3 with privileged states."""
+    """Samples as in stable-baselines3, and the privileged states before and after each transition."""
 
     observations: torch.Tensor
     actions: torch.Tensor
@@ -92,8 +93,8 @@ class ReplaySamples(NamedTuple):
 class FrameReplayBuffer(ReplayBuffer):
     """Transitions of n environments whose observations are stacks (3 · stack, height, width), the newest picture last.
 
-    The ring has `slack` more pictures than the transitions need, so that pictures written after a save do not overwrite
-    those of the saved transitions: a killed training resumes with all of them.
+    The ring has room for more pictures than the transitions need, see `slack`. So pictures written after a save do not
+    overwrite those of the saved transitions, and a killed training resumes with all saved transitions.
     """
 
     def __init__(
@@ -115,14 +116,15 @@ class FrameReplayBuffer(ReplayBuffer):
         Args:
             buffer_size: Transitions of all environments together.
             observation_space: uint8 (3 · stack, height, width).
-            file: For the pictures; None: in memory. An existing file is kept, see `set_state`.
+            file: File for the pictures; None: they stay in memory. An existing file is kept, see `set_state`.
             slack: Largest number of transitions, of all environments together, added between two saves.
-            shift: Largest random shift of samples each way [px], edges repeated (DrQ, Kostrikov et al. 2020).
-            color_strength: Strength of `augment_colors`, for half of the stacks before transitions.
-            state_size: Size of the `state` in an `info`.
+            shift: Largest random shift of a sampled stack in each direction [px]; edge pixels are repeated (DrQ,
+                Kostrikov et al. 2020).
+            color_strength: Strength of `augment_colors`, which is applied to half of the stacks before transitions.
+            state_size: Size of the privileged `state` in an `info`.
 
         Raises:
-            InputError: a file of another size.
+            InputError: the file has another size.
             OSError: the disk has no room for the whole file.
         """
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
@@ -136,13 +138,13 @@ class FrameReplayBuffer(ReplayBuffer):
         self.rewards, self.ends = np.zeros(size, np.float32), np.zeros(size, np.float32)
         self.newest, self.age = np.zeros(size, np.int64), np.zeros(size, np.int64)
         self.states = np.zeros((*size, state_size), np.float32)
-        """The robot's state before each transition; NaN in the first one after `break_off`."""
+        """The robot's state before each transition; NaN for an environment's first transition after `break_off`."""
         self.states_after = np.zeros((*size, state_size), np.float32)
         self._state = np.full((n_envs, state_size), np.nan, np.float32)
         slack = -(-2 * slack // n_envs)
         self._reach = self.buffer_size + self.buffer_size // _SHORT + self.stack + 2
         self.length = self._reach + slack
-        """Pictures in a ring."""
+        """Number of pictures that a ring holds."""
         shape = (n_envs, self.length, 3, height, width)
         if file is None:
             self.frames = np.zeros(shape, np.uint8)
@@ -150,11 +152,11 @@ class FrameReplayBuffer(ReplayBuffer):
             bytes_needed = int(np.prod(shape))
             if file.exists() and file.stat().st_size != bytes_needed:
                 raise InputError(f"{file} has {file.stat().st_size} bytes; expected {bytes_needed}: damaged")
-            allocate(file, bytes_needed)  # on a full disk an error now, not a SIGBUS hours later
+            allocate(file, bytes_needed)  # raises an error if the disk is full; otherwise SIGBUS would follow later
             self.frames = np.memmap(file, np.uint8, "r+", shape=shape)
         self.written = np.zeros(n_envs, np.int64)
-        """Pictures ever written to each ring."""
-        self._ages = np.full(n_envs, -1)  # steps of each environment's episode; -1: none
+        """Number of pictures written to each ring so far, overwritten ones included."""
+        self._ages = np.full(n_envs, -1)  # steps since each environment's episode began; -1: no episode yet
 
     def add(
         self,
@@ -165,7 +167,10 @@ class FrameReplayBuffer(ReplayBuffer):
         done: NDArray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """Adds a transition of every environment; its observations must be consecutive until `done` or `break_off`."""
+        """Adds a transition of every environment.
+
+        Until `done` or `break_off`, an environment's observations must be consecutive.
+        """
         for i in range(self.n_envs):
             if self._ages[i] < 0:
                 self._write(i, obs[i, -3:])
@@ -186,7 +191,7 @@ class FrameReplayBuffer(ReplayBuffer):
             self.full, self.pos = True, 0
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplaySamples:  # type: ignore[override]
-        """Samples complete transitions uniformly; stacks are uint8."""
+        """Samples transitions uniformly among those for which `is_complete`; stacks are uint8."""
         filled = self.buffer_size if self.full else self.pos
         row, env_index = np.empty(0, int), np.empty(0, int)
         while len(row) < batch_size:
@@ -198,7 +203,7 @@ class FrameReplayBuffer(ReplayBuffer):
         if self.shift:
             before, after = self._shifted(before), self._shifted(after)
         if self.color_strength:
-            # Half of the stacks, but not those that targets are computed from (SVEA, Hansen et al. 2021).
+            # Stacks after transitions, from which the targets are computed, stay unchanged (SVEA, Hansen et al. 2021).
             half = batch_size // 2
             before[:half] = augment_colors(before[:half], self.color_strength, self.rng)
         rest = self.actions[row, env_index], after, self.ends[row, env_index, None], self.rewards[row, env_index, None]
@@ -222,14 +227,14 @@ class FrameReplayBuffer(ReplayBuffer):
         return out[0], out[1]
 
     def state(self) -> tuple[dict[str, NDArray], dict[str, Any]]:
-        """The state without the pictures, as arrays and JSON-able values; flushes the pictures to their file."""
+        """The buffer's state without pictures, as arrays and JSON-able values; flushes the pictures to their file."""
         if isinstance(self.frames, np.memmap):
             self.frames.flush()
         arrays = {name: getattr(self, name) for name in _ROWS} | {"written": self.written}
         return arrays, {"pos": self.pos, "full": self.full, "rng": self.rng.bit_generator.state}
 
     def set_state(self, arrays: dict[str, NDArray], rest: dict[str, Any]) -> None:
-        """Restores a state. Pictures are those in the file; all environments begin new episodes."""
+        """Restores what `state` returned. The pictures must be in the file; all environments begin new episodes."""
         for name in (*_ROWS, "written"):
             getattr(self, name)[:] = arrays[name]
         self.pos, self.full = rest["pos"], rest["full"]
@@ -237,7 +242,7 @@ class FrameReplayBuffer(ReplayBuffer):
         self.break_off()
 
     def break_off(self) -> None:
-        """States that all environments begin new episodes with the next transition."""
+        """Marks that all environments begin new episodes with the next transition."""
         self._ages[:], self._state[:] = -1, np.nan
 
     def _write(self, env_index: int, picture: NDArray) -> None:

@@ -1,8 +1,9 @@
 """SAC from pixels (Haarnoja et al. 2018) on stable-baselines3, and the saved states of a training.
 
-Actor and critics share one encoder, from stacks to features. Only the critics' loss trains it (Yarats et al. 2019;
-Kostrikov et al. 2020), and it has no target network (Yarats et al. 2021, DrQ-v2). An update runs it forward twice and
-backward once; with the separate encoders of stable-baselines3 it would be five and three times.
+Actor and critics share one encoder, which maps stacks to features. Only the critics' loss and that of the state head
+train it (Yarats et al. 2019; Kostrikov et al. 2020), and it has no target network (Yarats et al. 2021, DrQ-v2). An
+update runs the encoder forward twice and backward once. The separate encoders of stable-baselines3 would run forward
+five times and backward three times.
 
 The critics also receive the robot's privileged *state* (Pinto et al. 2018, asymmetric actor-critic); the actor never
 does. A linear *state head* predicts the state from the features, as an auxiliary loss for the encoder.
@@ -41,12 +42,12 @@ from twin.types import Array32
 
 _LOGGED = ("critic_loss", "actor_loss", "state_loss", "ent_coef", "value")
 _MAX_STATE = 3.0  # states are clamped at this multiple of their scale
-_AVERAGING_RATE = 1e-3  # of the averaged actor, per update
+_AVERAGING_RATE = 1e-3  # weight of the newest actor in the averaged actor, per update
 _STATE, _TENSORS, _REPLAY = "state.json", "tensors.safetensors", "replay.npz"
 
 
 class Encoder(BaseFeaturesExtractor):
-    """Layers of `Architecture` from preprocessed stacks, values 0 to 255, to features."""
+    """The layers of `Architecture` that map preprocessed stacks, values 0 to 255, to features."""
 
     def __init__(self, observation_space: spaces.Box, architecture: Architecture) -> None:
         super().__init__(observation_space, architecture.features)
@@ -62,7 +63,7 @@ class Encoder(BaseFeaturesExtractor):
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
         """Shapes (n, 3 · stack, h, w) → (n, features)."""
-        # Scaling the first convolution's weights instead of the pictures saves a third of an update.
+        # Scaling the first convolution's weights, instead of the pictures, saves a third of an update's time.
         weight = self.first.weight
         bias = self.first.bias - 0.5 * weight.sum((1, 2, 3))  # type: ignore[operator]
         out = nn.functional.conv2d(pictures.float(), weight / 255.0, bias, self.first.stride)
@@ -70,14 +71,14 @@ class Encoder(BaseFeaturesExtractor):
 
 
 class DrivePolicy(SACPolicy):
-    """Actor and critics with one encoder, which the critics' optimizer trains."""
+    """Actor and critics that share an encoder; the critics' optimizer trains it."""
 
     def __init__(self, *arguments: Any, state_size: int = 0, **rest: Any) -> None:
         self._state_size = state_size
         super().__init__(*arguments, **rest)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        """Critics of features and states."""
+        """Returns critics whose inputs are features, states and actions."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         kwargs["features_dim"] += self._state_size
         return ContinuousCritic(**kwargs).to(self.device)
@@ -95,11 +96,12 @@ class PixelSAC(SAC):
     """SAC with a shared encoder and privileged states."""
 
     averaged_actor: Actor
-    """Running mean of the actor and its encoder, which becomes the policy. The actor itself fluctuates between updates;
-    saved at a bad moment, it leaves the road."""
+    """Running mean of the actor and its encoder; this is the policy that is saved. The actor itself fluctuates between
+    updates, and a single state of it may leave the road."""
 
     def __init__(self, *arguments: Any, state_scales: tuple[float, ...] = (), **rest: Any) -> None:
-        """`state_scales`: typical magnitudes of the privileged state's numbers; empty: none. The rest is `SAC`'s."""
+        """`state_scales`: typical magnitudes of the privileged state's numbers; empty: no privileged state. The other
+        arguments are those of `SAC`."""
         self._scales = state_scales
         super().__init__(*arguments, **rest)
 
@@ -166,7 +168,7 @@ class PixelSAC(SAC):
             self.logger.record(f"train/{name}", value)
 
     def break_off_episodes(self) -> None:
-        """Lets all environments begin new episodes with the next step, whatever they were used for meanwhile."""
+        """Begins new episodes in all environments with the next step, so that they can be used for something else."""
         assert isinstance(self.replay_buffer, FrameReplayBuffer)
         self.replay_buffer.break_off()
         self._last_obs = None
@@ -190,7 +192,7 @@ class PixelSAC(SAC):
 
 
 def actor_weights(model: PixelSAC, architecture: Architecture) -> dict[str, Array32]:
-    """Weights of the averaged, deterministic actor, by the names of `Architecture.shapes`."""
+    """Weights of the deterministic averaged actor, by the names in `Architecture.shapes`."""
     actor = model.averaged_actor
     encoder = actor.features_extractor
     assert isinstance(encoder, Encoder)
@@ -209,12 +211,12 @@ def actor_weights(model: PixelSAC, architecture: Architecture) -> dict[str, Arra
 # ---- saved states
 #
 # A state contains the whole training, in files that run no code when they are loaded: tensors as safetensors, the
-# replay buffer without its pictures as npz, the rest as JSON. `state.json`, written last, names the complete folder
-# `state_<steps>`, so that a killed training leaves one complete state.
+# replay buffer without its pictures as npz, the rest as JSON. `state.json` is written last and names the folder
+# `state_<steps>` that is complete, so a killed training always leaves one complete state.
 
 
 def save_state(folder: Path, model: PixelSAC, more: dict[str, Any]) -> None:
-    """Writes a state with JSON-able values `more`, then removes the previous state.
+    """Writes a state, together with the JSON-able values `more`, then removes the previous state.
 
     Raises OSError: the disk is full; the previous state is intact.
     """
@@ -226,7 +228,7 @@ def save_state(folder: Path, model: PixelSAC, more: dict[str, Any]) -> None:
         write_bytes(folder / name / _TENSORS, tensor_bytes(_tensors(model)))
         arrays, replay = model.replay_buffer.state()
         save_arrays(folder / name / _REPLAY, arrays)
-    except OSError:  # make room on the disk for the error's log
+    except OSError:  # frees space on the disk, so that the error can be logged
         remove(folder / name)
         raise
     counts = {"steps": model.num_timesteps, "updates": model._n_updates, "episodes": model._episode_num}
@@ -249,9 +251,9 @@ def saved_steps(folder: Path) -> int:
 
 
 def load_state(folder: Path, model: PixelSAC) -> dict[str, Any]:
-    """Restores the saved state in a new model and returns its `more`.
+    """Restores the saved state in a new model and returns the `more` given to `save_state`.
 
-    Raises InputError: files are missing, damaged, or of another network.
+    Raises InputError: files are missing or damaged, or belong to another network.
     """
     assert isinstance(model.replay_buffer, FrameReplayBuffer)
     with wrap_read_errors(folder, "train anew under another name"):

@@ -1,19 +1,19 @@
-"""When a training ends and which of its policies is kept: tests between segments of the training, and a last word.
+"""Decides when a training ends and which of its policies is kept, by tests between segments of the training.
 
 A *test* drives the newest policy, without exploration, in whole episodes like those of the training. All tests of a run
-have the same episodes, which the training never has. A test is broken off once more episodes failed than the asked
-success rate allows. The training ends
+use the same episodes, and the training never uses these. A test is broken off once more episodes have failed than the
+required success rate `config.success` allows. The training ends
 
-- when a test *reaches* the asked rate;
-- when `PATIENCE` tests in a row were not better than those before, neither in their success nor in the distance along
-  the route;
+- when a test *reaches* the required rate;
+- when `PATIENCE` tests in a row have improved neither the success rate nor the mean distance along the route;
 - at the largest number of steps.
 
-In the first two cases the training goes on for `config.settle` steps with a falling learning rate (`training.py`) and a
-last test. Of the policies that drove a whole test the one with most successes is kept, among equals the one with the
-highest mean reward; if none reached the asked rate, the best `_FINALISTS` drive whole tests first. The best of several
-is partly lucky, so the *last word* is its success in fresh episodes, which decided nothing. Where the lighting varies
-these are under held-out lightings with everything randomised, as `twin validate` drives them by default.
+In the first two cases the training first continues for `config.settle` steps with a falling learning rate
+(`training.py`), followed by one more test. The policy that is kept is the one with most successes among those that
+drove a whole test; ties are broken by the mean reward. If no policy reached the required rate, the best `_FINALISTS`
+drive whole tests before the choice. The best of several results is biased upwards by luck. So the kept policy drives
+fresh episodes, which no decision used, in a *final test*. If the lighting varies, these episodes have held-out
+lightings and everything randomized, as in `twin validate` by default.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,22 +41,22 @@ from twin.loading import Twin
 
 TESTS_FILE = "tests.json"
 FRESH_EPISODES = 40
-"""Number of episodes of the last word."""
+"""Number of episodes of the final test."""
 PATIENCE = 4
 REACHED, NO_BETTER, ALL_STEPS = ENDS = ("reached", "no better", "steps")
 """Reasons to end a training."""
 
-_BATCHES = (8, 12, 20)  # episodes of a test, between which it may be broken off
+_BATCHES = (8, 12, 20)  # numbers of episodes; a test may be broken off after each batch
 _TEST_EPISODES = sum(_BATCHES)
-_BETTER = 0.02  # of success, or of the mean distance along the route: what counts as better
+_BETTER = 0.02  # least improvement: of the success rate, absolute; of the mean distance along the route, relative
 _FINALISTS = 3
 _STREAM = 7  # see `training._TRAINING_STREAM`
-_PLACE = 5.0  # [m] of the route that failures are counted over
+_PLACE = 5.0  # [m] length of the route sections in which failures are counted
 
 
 @dataclass(frozen=True)
 class Failure:
-    """An episode of a test that did not arrive."""
+    """An episode of a test in which the robot did not reach the goal."""
 
     cause: str
     progress: float
@@ -67,7 +67,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class PolicyTest:
-    """A test of the policy of a step, in the first `trials` of the test episodes."""
+    """A test of the policy saved at a step, in the first `trials` test episodes."""
 
     step: int
     trials: int
@@ -75,7 +75,7 @@ class PolicyTest:
     progress: float
     """Mean distance along the route [m]."""
     reward: float
-    """Mean sum of rewards."""
+    """Mean over episodes of the sum of rewards."""
     failures: tuple[Failure, ...] = ()
 
     @property
@@ -117,7 +117,7 @@ def next_segment(config: TrainConfig, tests: Sequence[PolicyTest]) -> Segment:
 
 
 def earlier_choice(twin: Twin, folder: Path, config: TrainConfig) -> dict[str, Any] | None:
-    """The choice of an ended training, as `train_until_learnt` returns it; None: it is to be trained (on).
+    """The choice of a training that has ended, as `train_until_learnt` returns it; None: more training is needed.
 
     Raises InputError: an existing run has another configuration or is damaged.
     """
@@ -136,14 +136,16 @@ def train_until_learnt(
     processes: int | None = None,
     writers: Sequence[KVWriter] = (),
 ) -> dict[str, Any]:
-    """Trains and tests until the training ends (see the module), and keeps the best policy as the run's.
+    """Trains and tests until the training ends (see the module), and saves the kept policy as that of the run.
 
-    An earlier choice is returned as it is unless `config` asks for more steps or more success. A killed call goes on.
-    Arguments and errors are those of `train`; `writers` also receive the tests' scores, as `tests/...`.
+    An earlier choice is returned unchanged unless `config` asks for more steps or a higher success rate. If a call was
+    killed, the next one resumes its training. Arguments and errors are those of `train`; `writers` also receive the
+    tests' scores, as `tests/...`.
 
     Returns:
-        The contents of `choice.json`: steps; the asked success and whether it is reached; why the training ended; the
-        tests; `chosen`, the last word, with its condition; and a sentence on where and why episodes failed.
+        The contents of `choice.json`: the number of steps; the required success rate and whether it is reached; the
+        reason why the training ended; the tests; `chosen`, the final test, with its condition; and a sentence on where
+        and why episodes failed.
     """
     if before := earlier_choice(twin, folder, config):
         return before
@@ -205,7 +207,7 @@ def _choose(
 
 
 def failure_summary(failures: Sequence[Failure]) -> str:
-    """Where, why and in which light most of the failures happened; empty without failures."""
+    """A sentence on where, why and in which light most of the failures happened; empty without failures."""
     if not failures:
         return ""
     bins = [int(one.progress // _PLACE) for one in failures]
@@ -217,19 +219,19 @@ def failure_summary(failures: Sequence[Failure]) -> str:
 
 
 def _main_light(lighting: str) -> str:
-    """The filmed lighting with the largest share in a sampled one, such as sun in `training: sun 0.62, night 0.38`."""
+    """The filmed lighting with the largest weight in a sampled one: sun in `training: sun 0.62, night 0.38`."""
     _, _, mixture = lighting.partition(": ")
     return mixture.split(" ")[0] if mixture else lighting
 
 
 def _most(values: list[Any]) -> tuple[Any, int]:
-    """The most frequent value, the first among equals, and its count."""
+    """The most frequent value (the first one if several are tied), and its count."""
     best = max(values, key=values.count)
     return best, values.count(best)
 
 
 def _test(config: TrainConfig, step: int, drive: Callable[[Sequence[int]], list[EpisodeResult]]) -> PolicyTest:
-    """Tests a policy in batches of episodes, until more failed than the asked success rate allows."""
+    """Tests a policy in batches of episodes; stops once more have failed than the required success rate allows."""
     allowed = int(_TEST_EPISODES * (1.0 - config.success) + 1e-9)
     seeds, driven = _seeds(config), list[EpisodeResult]()
     for start, end in pairwise(np.cumsum([0, *_BATCHES]).tolist()):
@@ -250,7 +252,7 @@ def _checkpoint(folder: Path, step: int) -> Path:
 
 
 def read_choice(folder: Path) -> dict[str, Any] | None:
-    """The earlier choice of the training as it is saved; None if there is none."""
+    """The choice saved for the training's present state; None if there is none."""
     path = folder / CHOICE_FILE
     if not path.exists() or not has_state(folder / "state"):
         return None
@@ -268,7 +270,7 @@ def read_choice(folder: Path) -> dict[str, Any] | None:
 
 
 def read_tests(folder: Path) -> list[PolicyTest]:
-    """Tests of the training so far, of saved policies."""
+    """Tests made so far, up to the step of the training's saved state."""
     path = folder / TESTS_FILE
     if not path.exists() or not has_state(folder / "state"):
         return []

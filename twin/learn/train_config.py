@@ -74,56 +74,58 @@ class TrainConfig:
     success: float = 0.95
     """Success rate at which the training ends (`selection.py`)."""
     steps: int = 24_000
-    """Largest number."""
+    """Largest number of steps."""
     worlds: int = 8
     action: str = STEERING
-    """This and the next two: see `Control`."""
+    """This field and the next two are those of `Control`."""
     speed: float = 1.0
     yaw_rate: float = 1.0
     centring: float = 1.0
-    """Fraction of the step reward lost at the corridor's edge; none on the route."""
+    """Fraction of the step reward that is lost at the corridor's edge; on the route, nothing is lost."""
     steering: float = 0.5
-    """Fraction of the step reward lost at full steering."""
+    """Fraction of the step reward that is lost at full steering."""
     entropy: float = -0.5
-    """Target entropy per number of an action [nat]; -0.5 corresponds to a standard deviation of 0.15, -1 to 0.09, for
-    numbers in [-1, 1]."""
+    """Target entropy per component of an action [nat]. For components in [-1, 1], -0.5 corresponds to a standard
+    deviation of 0.15, and -1 to 0.09."""
     start_along: float = 0.9
-    """Every second episode starts within this fraction of the segment, beside the route and at an angle, so that a
-    policy practices returning to the middle."""
+    """Every second episode starts within this first fraction of the segment, beside the route and at an angle to it, so
+    that a policy practices returning to the middle."""
     randomise: bool = True
     """Randomizes the robot in every episode and, where the lighting varies, weather and distractor objects."""
     privileged: bool = True
     """The critics, but not the policy, receive the robot's state, which the encoder learns to predict (`sac.py`)."""
     pool: int = 2
     convolutions: tuple[tuple[int, int, int], ...] = ((16, 5, 3), (32, 3, 2), (32, 3, 1))
-    """Channels, kernel, stride."""
+    """Channels, kernel and stride of each convolution."""
     features: int = 64
     hidden: tuple[int, ...] = (256, 256)
     batch: int = 128
     buffer: int = 50_000
-    """Transitions."""
+    """Number of transitions in the replay buffer."""
     starts: int = 1_000
-    """Steps of random actions before learning begins."""
+    """Number of steps with random actions before learning begins."""
     updates: float = 0.5
     """Updates per step."""
     gamma: float = 0.97
-    """Discount per step; a reward 33 steps (3 s) away counts a third."""
+    """Discount per step; a reward 33 steps (3 s) ahead counts about a third."""
     learning_rate: float = 5e-4
-    """Largest; see `training.cycle_rate`."""
+    """Largest learning rate; see `training.cycle_rate`."""
     cycle: int = 12_000
-    """Steps after which the learning rate has fallen, and begins anew if the training goes on."""
+    """Length of a cycle of the learning rate [steps]. At its end the rate is lowest; the next cycle starts at the
+    largest rate."""
     tau: float = 0.01
     """Averaging rate of the target critics, per update."""
     shift: int = 2
-    """Random shift of preprocessed pictures in updates [px]."""
+    """Largest random shift of preprocessed pictures in updates [px]."""
     colours: float = 1.0
     """Strength of color augmentation in updates (`replay_buffer.py`); applied only if the lighting varies."""
     checkpoints: int = 20
-    """Policies saved during the training."""
+    """Number of policies that are saved during the training, at equal intervals."""
     test_every: int = 3_000
     """Steps between two tests of the policy (`selection.py`)."""
     settle: int = 2_000
-    """Steps for which a training goes on, with a falling learning rate, after a test has reached `success`."""
+    """Number of steps, with a falling learning rate, after a test that reached `success` or the last of several tests
+    without improvement (`selection.py`)."""
     save_every: int = 4_000
     """Steps between two saved states."""
     device: str = "cpu"
@@ -166,8 +168,9 @@ class TrainConfig:
 
     def options(self) -> dict[str, Any]:
         """Options of the environment."""
-        # The goal is worth as much as surviving for ever: a policy that earned less would linger before it. The reward
-        # lost off the route keeps policies away from the kerb, where a single disturbance ends an episode.
+        # The goal is worth as much as the step rewards of an endless episode; otherwise it would pay to wait before the
+        # goal. The reward lost beside the route keeps policies away from the kerb, where a single disturbance can end
+        # an episode.
         goal = Rewards.step * self.gamma / (1.0 - self.gamma)
         rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
         ranges = Ranges() if self.lighting_varies else _ROBOT_ONLY
@@ -184,7 +187,7 @@ class TrainConfig:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "cpu": {},
-    # The paper's input at full resolution. Not measured on a GPU yet.
+    # The input has the paper's full resolution. This preset has not been measured on a GPU.
     "gpu": {
         "pool": 1,
         "convolutions": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),

@@ -1,11 +1,13 @@
-"""A training run: SAC in many environments; `selection.py` decides when it ends and which policy is kept.
+"""A training run: SAC in many environments. `selection.py` decides when it ends and which policy is kept.
 
 runs/<name>/
   config.json                             the configuration
-  policy.json .safetensors .onnx          the newest policy (`policy.py`); after the training the selected one
+  policy.json .safetensors .onnx          the newest policy (`policy.py`); after the training, the selected one
   tests.json, choice.json                 tests of policies, and the selection (`selection.py`)
   checkpoints/<steps>/                    policies saved during the training
-  episodes.csv, log.csv, tensorboard/     episodes driven in training; speed, memory and losses at every save
+  episodes.csv                            episodes driven in training
+  log.csv                                 speed, memory, entropy coefficient and value at every save
+  tensorboard/                            losses and other values logged by stable-baselines3
   state/                                  the saved state (`sac.py`) and the replay buffer's pictures
 """
 
@@ -61,10 +63,11 @@ TRAINING_EPISODE_COLUMNS = (
 )
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
 Watch = Callable[[int, Sequence[bool]], None]
-"""Receives the steps done, and the success of the last `RECENT_EPISODES` that started at the segment's beginning."""
+"""Receives the steps done, and the success of the last `RECENT_EPISODES` episodes that started at the beginning of the
+task's route segment."""
 
 Drive = Callable[[Path, Sequence[int], Callable[[], object]], list[EpisodeResult]]
-"""Drives a policy folder in whole episodes of the training's kind, one per seed; see `run_episodes`."""
+"""Drives the policy of a folder in whole episodes like those of the training, one per seed; see `run_episodes`."""
 
 
 @dataclass(frozen=True)
@@ -74,30 +77,31 @@ class Segment:
     until: int
     """Steps at its end, where a checkpoint is saved."""
     settle_from: int | None
-    """Step from which the learning rate falls to its lowest value at the end; None: it follows its cycle."""
+    """Step from which the learning rate falls, to its lowest value at the segment's end; None: it follows its cycle."""
     why: str = ""
-    """Reason to end the training after this segment; empty: it goes on."""
+    """Reason to end the training after this segment; empty: the training continues."""
 
 
 Referee = Callable[[int, Drive], Segment | None]
-"""Returns the segment that follows when so many steps are done, or None to end the training; may drive policies."""
+"""Receives the number of steps done and a function that drives policies. Returns the next segment, or None to end the
+training."""
 
-_NO_CURVES = ("step", "seed", "lighting", "cause")  # columns
-_FINAL_RATE = 0.1  # of the learning rate, at the end
-# A seed derives from the run's seed, this number (`selection.py` has another) and the number of resumptions, so that no
-# random stream is used twice.
+_NO_CURVES = ("step", "seed", "lighting", "cause")  # columns that are not sent to the writers as curves
+_FINAL_RATE = 0.1  # lowest learning rate / `config.learning_rate`
+# Seeds derive from the run's seed, the number of resumptions and this number, which differs from `selection._STREAM`.
+# So no random stream is used twice.
 _TRAINING_STREAM = 6
 
 
 class PreprocessedVecEnv(VecEnvWrapper):
-    """Environments with the policy's preprocessing, in which networks can learn while the environments step."""
+    """Environments with the policy's preprocessing; a function such as the networks' updates can run during a step."""
 
     def __init__(self, envs: DriveVecEnv, pool: int) -> None:
         channels, height, width = envs.observation_space.shape  # type: ignore[misc]
         super().__init__(envs, spaces.Box(0, 255, (channels, height // pool, width // pool), np.uint8))
         self._pool, self._thread = pool, ThreadPoolExecutor(1)
         self.meanwhile: Callable[[], None] = lambda: None
-        """Called while the environments step, which must not depend on it: the updates of the networks."""
+        """Called while the environments step, for the updates of the networks; the step must not depend on it."""
 
     def reset(self) -> NDArray:
         return preprocess(np.asarray(self.venv.reset()), self._pool)
@@ -126,16 +130,16 @@ def train(
 ) -> None:
     """Trains a policy, or resumes a training that was stopped or killed.
 
-    SIGINT, SIGTERM and SIGHUP save the state and raise `Stopped`, a KeyboardInterrupt.
+    On SIGINT, SIGTERM and SIGHUP, it saves the state and raises `Stopped`, a KeyboardInterrupt.
 
     Args:
         config: Must equal that of an existing run, except for `steps` and `success`.
         processes: See `make_vector_env`; the number does not change the result.
-        referee: Plans the training; by default it is one segment of `config.steps`.
-        writers: Receive what goes to `tensorboard/`, `episodes.csv` and `log.csv`, too.
+        referee: Plans the training; by default, the training is one segment of `config.steps`.
+        writers: Also receive the numbers that are written to `tensorboard/`, `episodes.csv` and `log.csv`.
 
     Raises:
-        InputError: an existing run has another configuration or is damaged, the folder is not empty and not a run, or
+        InputError: an existing run has another configuration or is damaged, the folder is neither empty nor a run, or
             an error of `twin.load`.
         OSError: the disk is full; the last saved state is intact.
     """
@@ -231,7 +235,7 @@ def _model(envs: PreprocessedVecEnv, config: TrainConfig, pictures: Path) -> Pix
             "features_extractor_kwargs": {"architecture": config.architecture},
             "net_arch": list(config.hidden),
             "share_features_extractor": True,
-            "normalize_images": False,  # the encoder scales them
+            "normalize_images": False,  # the encoder scales the pixel values
             "state_size": len(config.state_scales),
         },
         seed=config.seed,
@@ -242,7 +246,7 @@ def _model(envs: PreprocessedVecEnv, config: TrainConfig, pictures: Path) -> Pix
 
 
 def _learning_rate(config: TrainConfig, model: PixelSAC, segment: Segment, _: float) -> float:
-    """Learning rate of the next update; a settling segment takes it to its lowest value by its end."""
+    """Learning rate of the next update; in a settling segment, it falls linearly to its lowest value at the end."""
     step, lowest = model.num_timesteps, _FINAL_RATE * config.learning_rate
     if segment.settle_from is None or step <= segment.settle_from:
         return cycle_rate(config, step)
@@ -251,10 +255,11 @@ def _learning_rate(config: TrainConfig, model: PixelSAC, segment: Segment, _: fl
 
 
 def cycle_rate(config: TrainConfig, step: int) -> float:
-    """Learning rate at a step without settling: constant in the first half of each cycle, then falling linearly.
+    """Learning rate at a step, without settling: constant in the first half of each cycle, then falling linearly.
 
-    Cycles have about `config.cycle` steps and divide `config.steps` evenly. At 12,000 steps in one place, 40 and 37 of
-    40 test episodes arrived with the fall (two trainings), 35 without it (one); see docs/findings.md.
+    Cycles have about `config.cycle` steps and divide `config.steps` evenly. After 12,000 steps in one place, 40 and 37
+    of 40 test episodes succeeded in two trainings with the falling rate, and 35 in one with a constant rate; see
+    docs/findings.md.
     """
     length = config.steps / max(1, round(config.steps / config.cycle))
     left = 1.0 - (step % length) / length if step < config.steps else 0.0
@@ -262,9 +267,9 @@ def cycle_rate(config: TrainConfig, step: int) -> float:
 
 
 def prepare_folder(folder: Path) -> None:
-    """Creates a run's folder, with `state` in it, by which runs are recognized.
+    """Creates a run's folder and in it the folder `state`, by which runs are recognized.
 
-    Raises InputError if there is a folder that is neither empty nor a run, as a training deletes and replaces files.
+    Raises InputError if the folder exists and is neither empty nor a run, since a training deletes and replaces files.
     """
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise InputError(f"{folder} is not a folder; move it away, or give another --run")
@@ -276,7 +281,10 @@ def prepare_folder(folder: Path) -> None:
 
 
 def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
-    """Settings that all calls of a run share, as read from its file: the configuration and the state of the road."""
+    """Settings that must be equal in all calls of a run: the configuration and the fingerprint of the road.
+
+    The values are JSON types, as read from `config.json`.
+    """
     road = fingerprint(twin, config.task, Condition(config.lighting, config.randomise))
     return dict(json.loads(json.dumps({**dataclasses.asdict(config), "road": road})))
 
@@ -330,7 +338,7 @@ class _RunRecorder(BaseCallback):
         return self._wall + time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
-        # Written only now, because a configuration with which no environment starts is not valid.
+        # Written only now: if no environment starts with a configuration, it is invalid and must not be saved.
         write_json(self._folder / "config.json", self._settings)
         self._saved = self._first = self.model.num_timesteps
         self._first_updates = self.model._n_updates
@@ -339,7 +347,7 @@ class _RunRecorder(BaseCallback):
         _keep_rows(self._folder / "log.csv", LOG_COLUMNS, self._saved)
 
     def _on_rollout_start(self) -> None:
-        # Unlike in _on_step, the buffer contains all collected transitions.
+        # Here the buffer contains all collected transitions; in _on_step the newest are missing.
         if self._stop.number or self.model.num_timesteps - self._saved >= self._config.save_every:
             self.save()
         if self._stop.number:
@@ -384,7 +392,7 @@ class _RunRecorder(BaseCallback):
         self._saved = model.num_timesteps
 
     def _append(self, table: str, columns: tuple[str, ...], rows: list[tuple]) -> None:
-        """Adds rows to a table of the run, and their numbers to the writers, as `<table>/<column>`."""
+        """Appends rows to a table of the run, and sends their numbers to the writers, as `<table>/<column>`."""
         if not rows:
             return
         with (self._folder / f"{table}.csv").open("a", newline="", encoding="utf-8") as file:
