@@ -1,4 +1,4 @@
-"""Tables of trials in the twin, which `twin.validate` writes, and on the road, which the user writes.
+"""Tables of trials in the twin, which `twin.validate` writes, and on the road (`real.csv`).
 
 A *trial* is one drive of a policy, on a task, under a lighting; it succeeds or fails. A *cell* is all trials of one
 policy, task and lighting. In the twin every trial is a row of `validation/episodes.csv`; real trials are given as cells

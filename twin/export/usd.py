@@ -1,4 +1,4 @@
-"""USD file of a built place, for Isaac Sim and other programs that read UsdPhysics.
+"""USD file of a built place (splats, collision, robot), for Isaac Sim and other programs that read UsdPhysics.
 
     /World                      variant sets `lighting` (colors) and `appearance` (splats, or the mesh)
         Place/Splats            ParticleField3DGaussianSplat

@@ -189,7 +189,7 @@ def _choose(
     best = max(finalists, key=lambda one: (one.successes, one.reward))
     condition = Condition(HELD_OUT, True) if config.lighting_varies else Condition(config.lighting, config.randomise)
     options = condition_options(condition) if config.lighting_varies else {}
-    fresh = PolicyTest.of(best.step, drive(best.step, seeds[_TEST_EPISODES:], "last word", options))
+    fresh = PolicyTest.of(best.step, drive(best.step, seeds[_TEST_EPISODES:], "final test", options))
     copy_policy(_checkpoint(folder, best.step), folder)
     by_step = {one.step: one for one in [*tests, *finalists]}
     out = {
