@@ -83,7 +83,7 @@ class Shape:
 class Kind:
     """Distribution of policies, days and the twin's errors; effects in logit divided by the sharpness.
 
-    Effects without a comment are standard deviations.
+    `training`, `place`, `day` and `cell` are standard deviations.
     """
 
     setups: tuple[float, float, float]

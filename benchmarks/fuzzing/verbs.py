@@ -1,4 +1,4 @@
-"""Fuzz target of verbs: command lines that a verb must refuse, or finish at once."""
+"""Fuzz target of verbs: command lines that a verb must refuse or finish quickly."""
 
 import os
 import shutil
@@ -66,7 +66,7 @@ def verb(case: Case) -> bool:
 
 
 def command_of(case: Case) -> list[str]:
-    """Arguments of `twin`: a verb and its own."""
+    """Arguments of `twin`: a verb and the verb's arguments."""
     rng = case.rng
     name = rng.choice(VERBS)
     if name == "reality":
