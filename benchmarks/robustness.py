@@ -104,7 +104,7 @@ def kills(times: int, folder: Path, only: str | None = None, seed: int = 0) -> d
     Args:
         times: Number of kills of each.
         folder: Folder for the scenes.
-        only: "build", "train" or "validate", to kill only these.
+        only: "build", "train" or "validate" kills only this verb; None kills all three.
         seed: Seed of the kill times.
     """
     each = {"build": _killed_builds, "train": _killed_trainings, "validate": _killed_validations}

@@ -198,7 +198,7 @@ def _filmed(
 
 
 def measure(filming: Filming) -> dict[str, float]:
-    """Distance from the filmed line [m], largest step [m], sharpest turn over 2 m [°], relative length."""
+    """Distance from the filmed line [m], largest step [m], sharpest turn over 2 m [°], length / `longest`."""
     route = filmed_route(filming.cameras)
     line, film = route.line, np.concatenate(filming.lines)
     off = np.array([np.linalg.norm(film - point, axis=1).min() for point in line])

@@ -10,7 +10,7 @@ from twin.config import MeshConfig
 from twin.types import Array
 
 _SPACING = 0.25  # [m] between data, as in `twin.assets.ground`
-_FIELD_NOISE, _PATH_NOISE = 0.03, 0.012  # [m] σ of heights from rendering and from the camera path
+_FIELD_NOISE, _PATH_NOISE = 0.03, 0.012  # [m] σ of rendered and of camera path heights, as in `twin.assets.ground`
 _LATERAL_OFFSETS = np.array([-0.6, -0.3, 0.0, 0.3, 0.6])  # [m] from the path
 
 

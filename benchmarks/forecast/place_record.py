@@ -1,9 +1,10 @@
 """Record of a place, in files under version control: every episode and trial, and the digests of the policies.
 
     results/version_N/place_P/
-      place.json            figures of build and trainings; robot and camera, and which of their values are outside the
-      ranges of training policies.json         digest of every policy, written before the first trial episodes.csv.gz
-      a row per episode in the twin trials.csv.gz         a row per trial in the reality
+      place.json            figures of build and trainings; robot and camera, and their values outside training's ranges
+      policies.json         digest of every policy, written before the first trial
+      episodes.csv.gz       a row per episode in the twin
+      trials.csv.gz         a row per trial in the reality
 
 The same tables give the same bytes. No row of a record is ever lost or changed.
 """

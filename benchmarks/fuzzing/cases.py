@@ -94,7 +94,7 @@ def run_case(target: Target, seed: int, k: int, work: Path, samples: Any, second
             accepted = target.run(case) is not False
     except InputError as error:
         failure = _message_fault(str(error))
-    except OSError as error:  # only a name that is too long may raise it
+    except OSError as error:  # passes only if a name is too long
         failure = "" if error.errno == errno.ENAMETOOLONG else _text(error)
         line = _source_line(error)
     except _TimeLimitExceeded as error:
