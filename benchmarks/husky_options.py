@@ -29,7 +29,7 @@ Edit = Callable[[mujoco.MjSpec], None]
 
 
 def option(**values: object) -> Edit:
-    """Sets options of the scene."""
+    """An edit that sets options of the scene."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         for name, value in values.items():
@@ -39,7 +39,7 @@ def option(**values: object) -> Edit:
 
 
 def ground(**values: object) -> Edit:
-    """Sets attributes of the ground."""
+    """An edit that sets attributes of the ground."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         for name, value in values.items():

@@ -75,7 +75,7 @@ class Shape:
     """Policies per training."""
     days: int
     twin_trials: int
-    """Per policy and day."""
+    """Trials in the twin per policy and day."""
     trials: int = 5
 
 

@@ -175,7 +175,7 @@ def points_on(origins: Tensor, directions: Tensor, edges: Tensor) -> Tensor:
 
 
 def unit_cube(points: Tensor) -> Tensor:
-    """Space contracted to a cube, scaled to [0, 1): Barron et al. 2022, eq. 10, in the maximum norm. (..., 3)."""
+    """Points (..., 3) contracted to a cube and scaled to [0, 1): Barron et al. 2022, eq. 10, in the maximum norm."""
     norm = points.abs().amax(-1, keepdim=True).clamp(min=1.0)
     return ((2.0 - 1.0 / norm) * points / norm + 2.0) / 4.0
 
@@ -188,7 +188,7 @@ def weights_of(density: Tensor, edges: Tensor) -> Tensor:
 
 
 def resampled(spacing: Tensor, weights: Tensor, count: int) -> Tensor:
-    """Edges (r, count + 1) at equal quantiles of the weights (r, s) between edges (r, s + 1), all in spacing.
+    """New edges (r, count + 1) at equal quantiles of the weights (r, s) between the edges `spacing` (r, s + 1).
 
     Barron et al. 2022, section 3, with nerfstudio's padding of the weights.
     """

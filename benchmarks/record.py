@@ -64,7 +64,7 @@ def _lost_member(old: dict[str, Any], new: dict[str, Any], key: str, where: str)
 
 
 def _labelled(items: list[Any]) -> dict[str, Any]:
-    """The objects of a list by label, numbered where labels repeat; other items are left out."""
+    """The objects of a list by label, numbered if labels repeat; other items are left out."""
     out, count = {}, Counter[str]()
     for item in items:
         if isinstance(item, dict):
@@ -118,7 +118,7 @@ def _reason_to_keep(path: Path, record: dict[str, Any]) -> str:
 
 
 def save(path: Path | None, record: dict[str, Any], replace: bool | None = False) -> int:
-    """`write_record` for the end of a script; writes nothing if `path` is None.
+    """Calls `write_record` at the end of a script; writes nothing if `path` is None.
 
     Returns:
         The exit status: 0, or 2 with one line on standard error.

@@ -19,7 +19,7 @@ from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parents[1]
 _START = {"bash": ("--norc", "--noprofile"), "zsh": ("-f",)}
-_INHERITED = ("PYTHONPATH", "VIRTUAL_ENV")  # would point the copy at another checkout
+_INHERITED = ("PYTHONPATH", "VIRTUAL_ENV")  # would make the copy use another checkout
 
 
 def commands(text: str, index: bool) -> list[str]:

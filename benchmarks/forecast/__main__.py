@@ -58,7 +58,7 @@ class Commands:
         self._running: set[subprocess.Popen] = set()
 
     def stop(self, *_: object) -> None:
-        """Moves the deadline to now; a signal handler."""
+        """Signal handler: moves the deadline to now, and ends running commands."""
         self._end = 0.0
         for process in tuple(self._running):
             process.send_signal(signal.SIGTERM)

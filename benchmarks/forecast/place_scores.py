@@ -108,7 +108,7 @@ def _elsewhere(places: list[PlaceRecord], one: PlaceRecord, by_setup: bool) -> A
 
 
 def _predicted(places: list[PlaceRecord], one: PlaceRecord, name: str) -> Array:
-    """A predictor's probability of every cell."""
+    """A predictor's probability of success in every cell, shape (n, k)."""
     flat = {
         HELD_OUT: lambda: twin_probabilities(one.held_out[:, None, 0], one.held_out[:, None, 1])[:, 0],
         SETUP: lambda: _elsewhere(places, one, True),

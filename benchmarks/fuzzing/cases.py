@@ -39,7 +39,7 @@ class Case:
 
     rng: Random
     folder: Path
-    """Empty; the only folder that the case may write to."""
+    """An empty folder, the only one that the case may write to."""
     samples: Any
     """`samples.Samples` of this process; None on the command line."""
 

@@ -23,7 +23,7 @@ SETUPS: dict[str, tuple[str, ...]] = {
 }
 """Name → options of `twin.train`."""
 STEPS = {"straight": 12_000, "right": 16_000}
-"""Largest number of steps. The published runs used all; now a training ends once it has learnt, see `twin.learn`."""
+"""Largest number of steps. Published runs used all; a training now ends once it has learnt (`twin.learn.selection`)."""
 SHARES = (0.25, 0.5)
 """Fractions of a run's steps at which checkpoints are taken for the forecast."""
 EPISODES = 50

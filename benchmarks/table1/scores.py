@@ -65,7 +65,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 RULE_TRIALS = 5
 """Episodes per day assumed for the rule, as many as in the twin."""
-_HALF = max(SHARES) - 0.05  # fraction of a training; checkpoints are saved within 100 steps of the fraction
+_HALF = max(SHARES) - 0.05  # of a training, with a tolerance: checkpoints are saved within 100 steps of it
 
 Counts = dict[str, tuple[int, int]]
 """Successes and trials by weather."""
@@ -154,7 +154,7 @@ class Scores:
     cells: float | None
     """Fraction of the cells whose predicted and real counts are compatible; None if the predictor has no counts."""
     corrected: tuple[int, int]
-    """Number of policies whose rate is within the interval predicted from other trainings, and number of intervals."""
+    """Number of policies in their interval predicted from the task's other trainings, and number of intervals."""
 
 
 def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> Scores | None:
