@@ -1,4 +1,4 @@
-"""Agreement of the aligned Husky model with logs of real ones.
+"""Benchmark of the aligned Husky model against logs of real Huskies.
 
 Prints the figures of `python -m twin.align`, and measured motor currents on asphalt beside simulated torques.
 
@@ -28,11 +28,14 @@ _LOG = Path("husky_drive") / "husky_drive_dev.npz"
 _ASPHALT = "borealtc_asphalt"
 
 TARGETS = {"position_m": 0.12, "yaw_deg": 4.7, "wheels_rad_s": 0.3}
-"""Upper limits of medians over held-out windows."""
+"""Upper limits of the median errors over held-out windows."""
 
 
 def turning_efforts(data: Path) -> dict[str, dict[str, float]]:
-    """Current or torque of a side in a steady turn, relative to driving straight: outer, inner, mean of both sides."""
+    """Motor current or torque in a steady turn, relative to driving straight: outer side, inner side, mean of both.
+
+    The keys are "measured" and the names of the simulated robots.
+    """
     steady = motor_currents.read_currents(sorted((data / _ASPHALT).glob("ASPHALT_pro_*.npz")))
     published = HuskyParams()
     rolling = motor_currents.rolling_resistance_of(steady, published)
@@ -69,7 +72,7 @@ def against_kinematics(figures: dict[str, Any]) -> list[str]:
 
 
 def verdicts(figures: dict[str, Any]) -> list[tuple[str, float, float, bool]]:
-    """Name, value, target and True if the target is met, per target."""
+    """One row per target: name, value, target, and True if the target is met."""
     held_out = figures["scores"]["fitted"]["held_out"]
     rows = [(name, held_out[name], most, held_out[name] <= most) for name, most in TARGETS.items()]
     return [*rows, *((f"better than ICR, {k}", v, 1 / 3, v >= 1 / 3) for k, v in figures["better_than_icr"].items())]

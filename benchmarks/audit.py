@@ -1,13 +1,14 @@
 """Audit of a scene for flaws of physics or task rules that a learning policy could exploit.
 
-Two *explorers* drive: the *random* one follows a random walk; the *greedy* one takes short cuts to the goal in episodes
-and rams convex parts at full speed while roaming. *Episodes* end by the task's rules; *roaming* has no task, so the
-robot can push, slide along and climb walls for long.
+Two *explorers* drive the robot. The *random* one follows a random walk. The *greedy* one takes short cuts to the goal
+in episodes, and rams convex parts of the collision geometry at full speed while roaming. *Episodes* end by the task's
+rules; *roaming* has no task, so the robot can push against walls, slide along them and climb them for long.
 
 *Tunnelling*: the robot penetrates a part deeper than `_TUNNEL_DEPTH`. *Climbing*: the base is more than
 `_CLIMB_HEIGHT` above its standing height. *Wall sliding*: the robot touches a part and moves faster than
 `_SLIDE_SPEED`, which is legitimate while roaming and a flaw of the rules in an episode. *Gap*: the visual mesh is
-inside the robot's body without a contact. A *false success* is an episode that reached its goal after any of these.
+inside the robot's body without a contact. A *false success* is an episode that reached its goal after any of these
+events.
 """
 
 import time
@@ -34,8 +35,8 @@ EVENTS = ("tunnelling", "climbing", "wall_sliding", "gap")
 _TUNNEL_DEPTH = 0.05  # [m]
 _CLIMB_HEIGHT = 0.08  # [m]
 _SLIDE_SPEED = 0.2  # [m/s]
-_BODY = ((-0.40, 0.40), (-0.22, 0.22), (0.02, 0.20))  # [m] x, y, z ranges in the base, well inside its collision boxes
-_ROAM_WIDTH = 6.0  # [m] from the route
+_BODY = ((-0.40, 0.40), (-0.22, 0.22), (0.02, 0.20))  # [m] x, y, z ranges in the base frame, inside its hulls
+_ROAM_WIDTH = 6.0  # [m] the robot roams at most this far from the route
 _ROAM_TIME = 20.0  # [s] between relocations of the robot
 _CONTROL_PERIOD = 0.1  # [s]
 _PUSH_STEPS, _BACK_STEPS = 60, 15  # control steps towards a part, and away from it
@@ -52,7 +53,7 @@ class Findings:
     touching: int = 0
     """Control steps with a contact."""
     events: Counter = field(default_factory=Counter)
-    """Control steps with an event, by its name; in an episode with the prefix `episode_`."""
+    """Control steps with an event, by the name of the event; those of episodes have the prefix `episode_`."""
     places: dict[str, list[list[float]]] = field(default_factory=dict)
     """x, y [m] of the first 20 occurrences of each event."""
     false_successes: int = 0
@@ -229,7 +230,7 @@ class _Wanderer:
 
 
 class _ShortCut:
-    """Drives straight at a point of the route 1 to 12 m ahead."""
+    """Drives straight towards a point on the route 1 to 12 m ahead."""
 
     def __init__(self, world: World, segment: RouteSegment, rng: np.random.Generator) -> None:
         self._route, self._s = world.route[:, :2], segment.start

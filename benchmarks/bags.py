@@ -1,13 +1,13 @@
-"""Benchmark of bags as films: a scene is built from its films, and from bags made of them, and both are compared.
+"""Benchmark of ROS 2 bags as input: builds a scene from films and from bags made of these films, and compares both.
 
     python benchmarks/bags.py SCENE --work FOLDER [--films sun] [--quick] [--again] [--until metric] [--json FILE]
 
 SCENE is a generated place (`twin reality film`). For each film, FOLDER/bags gets a ROS 2 bag with the film's pictures
-(raw, so that both builds read the same pixels), their camera_info, and, from the true poses, what a robot records
-beside them: odometry that is 2 % too long and drifts by a degree per metre, fixes that wander by a metre, and
-/tf_static. Both scenes are built with the camera's height as scale; then the bags' scene is scaled by odometry and by
-GPS. Prints the figures of both builds, and each scale's error. With --again the films are built twice, which shows how
-far a build differs from itself.
+(raw, so that both builds read the same pixels) and their camera_info. The bag also contains other data that a robot
+records, made from the true poses: odometry that is 2 % too long and drifts by a degree per metre, GPS fixes with an
+error that wanders by a metre, and /tf_static. Both scenes get their scale from the camera's height; then the bags'
+scene gets it from odometry, and from GPS. Prints the figures of both builds, and the error of each scale.
+With --again, the scene is built from the films twice, which shows how much two builds from the same input differ.
 """
 
 import argparse
@@ -39,8 +39,8 @@ from twin.scene import SceneDir
 _START = 1_700_000_000 * 10**9  # [ns]
 _RATE = 20.0  # [Hz] of odometry
 _FIX_RATE = 5.0  # [Hz]
-_LONG, _TURN = 1.02, np.radians(1.0)  # odometry: factor of lengths, drift [rad/m]
-_WANDER = 1.0  # [m] of the fixes
+_LONG, _TURN = 1.02, np.radians(1.0)  # odometry: factor of lengths, drift of the heading [rad/m]
+_WANDER = 1.0  # [m] standard deviation of the fixes' error
 _AHEAD, _BASE = 0.36, 0.13  # [m] lens ahead of the base, base above the ground
 _EARTH = 6_378_137.0  # [m]
 _QUICK = ("nerf.steps=400", "nerf.rays=2048", "nerf.max_width=240", "nerf.bake_steps=60", "nerf.max_bricks=2500")
@@ -62,7 +62,7 @@ FIGURES = (
 
 
 def write_bag(path: Path, film: Path, truth: Truth, name: str, seed: int) -> None:
-    """Writes the bag of one film; its pictures are as the film's decoder gives them."""
+    """Writes the bag of one film; its pictures are the film's decoded frames, turned upright."""
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     messages, rng = BagMessages(), np.random.default_rng(seed)
@@ -127,7 +127,7 @@ def write_bag(path: Path, film: Path, truth: Truth, name: str, seed: int) -> Non
 
 
 def _drifted(base: np.ndarray) -> np.ndarray:
-    """Odometry of a base's poses (n, 4, 4), in the frame of the first."""
+    """Odometry with the errors `_LONG` and `_TURN`, in the frame of the first of the true poses `base` (n, 4, 4)."""
     local = inverse_pose(base[0]) @ base
     steps = np.diff(local[:, :3, 3], axis=0)
     way = np.append(0.0, np.cumsum(np.linalg.norm(steps, axis=1)))
@@ -154,7 +154,7 @@ def _transform(types: Any, header: Any, child: str, pose: np.ndarray) -> Any:
 
 
 def figures(root: Path, report: dict[str, Any]) -> dict[str, Any]:
-    """The compared figures of a build."""
+    """Figures of a build that are compared, by name."""
     scene = SceneDir(root)
     cameras = Cameras.load(scene.stage("metric"))
     errors: dict[str, Any] = camera_errors(cameras.camera_to_world, matched_poses(Truth.load(scene.truth), cameras))
@@ -222,7 +222,7 @@ def main() -> int:
         given = (f"metric.{name}=true", "metric.camera_height=0.0")
         try:
             metric = build(scenes["bags"], until="metric", overrides=(*overrides, *given))["metric"]
-        except InputError as problem:  # GPS on a short road
+        except InputError as problem:  # for example, GPS on a short road
             print(f"scale by {name}: {problem}")
             continue
         cameras = Cameras.load(SceneDir(scenes["bags"]).stage("metric"))
@@ -237,7 +237,7 @@ def main() -> int:
 
 
 def _same_pictures(scenes: dict[str, Path]) -> float:
-    """Fraction of the kept frames of the films' scene that the bags' scene has, too, bit for bit."""
+    """Fraction of the frames kept in the films' scene that are also in the bags' scene, bit for bit."""
     images = {kind: SceneDir(root).stage("capture") / "images" for kind, root in scenes.items()}
     kept = sorted(path.relative_to(images["films"]) for path in images["films"].rglob("*.png"))
     equal = [

@@ -1,6 +1,6 @@
-"""Drives a headless Chromium over the DevTools protocol: what the tests and the benchmark of `twin view` look through.
+"""Drives a headless Chromium over the DevTools protocol, for the tests and the benchmark of `twin view`.
 
-Pages are drawn without a GPU (SwiftShader). A page's errors, in its console or thrown, are collected in `errors`.
+Pages are drawn without a GPU (SwiftShader). `errors` collects a page's errors: uncaught exceptions and console errors.
 """
 
 import atexit
@@ -137,7 +137,7 @@ class Chromium:
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
-        """A mouse event: `mousePressed`, `mouseMoved`, `mouseReleased` or `mouseWheel`, at a place [px]."""
+        """A mouse event: `mousePressed`, `mouseMoved`, `mouseReleased` or `mouseWheel`, at a position [px]."""
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
 
     def click(self, x: float, y: float) -> None:
@@ -145,7 +145,10 @@ class Chromium:
             self.mouse(kind, x, y, button="left", buttons=1, clickCount=1)
 
     def click_on(self, kind: str, text: str) -> None:
-        """Clicks the visible element of a CSS selector that has a text, or whose row in viser's panel has it."""
+        """Clicks the first visible element that matches a CSS selector `kind` and has a text.
+
+        The text of an empty element is that of its row in viser's panel.
+        """
         found = self.wait(
             f"""(() => {{
               for (const e of document.querySelectorAll({json.dumps(kind)})) {{
@@ -162,7 +165,7 @@ class Chromium:
         self.click(*found)
 
     def slide(self, label: str, share: float) -> None:
-        """Clicks a slider of viser's panel, found by the beginning of its row's text, at a share of its length."""
+        """Clicks a slider of viser's panel at a fraction of its length; the text of its row starts with `label`."""
         left, width, y = self.wait(
             f"""(() => {{
               for (const e of document.querySelectorAll("[role=slider]")) {{

@@ -1,12 +1,12 @@
-"""Appearance gap to another day that remains after a photo of it, and how weather randomisation covers the gap.
+"""Appearance gap between the twin and another day, given a photo of the day, compared with weather randomisation.
 
     python benchmarks/day.py SCENE [--days NAME ...] [--policies RUN ...] [--json FILE] [--pictures FOLDER]
 
 The scene was built from the film of the known-truth world and has a lighting from one photo of each day
 (`benchmarks/table1`, step `photos`). Images of every day from eight other stations of the road are compared with
 renderings from the same poses under the photo's appearance and fog, in PSNR and in the change of the policies'
-steering. That change is compared with the one that randomised sun and shadows cause. *Lasting*: mean over stations of
-a day's change, rms over days. *Local*: the rest.
+steering. The change of steering is compared with the change that randomised sun and shadows cause. *Lasting* change:
+rms over days of the mean over stations. *Local* change: rms of the deviations from this mean.
 """
 
 import argparse
@@ -58,7 +58,7 @@ def true_images(days: list[str]) -> tuple[Pictures, NDArray[np.float64]]:
 
 
 def lasting_and_local(change: NDArray) -> NDArray:
-    """Rms over days of the mean over stations, and rms of the rest, of changes (days, stations)."""
+    """Lasting and local change: rms of the days' means of changes (days, stations), and of the deviations from them."""
     mean = change.mean(1, keepdims=True)
     return np.sqrt([(mean**2).mean(), ((change - mean) ** 2).mean()])
 
@@ -70,7 +70,7 @@ def steering(policy: Callable, pictures: Pictures) -> NDArray:
 
 
 def ratios(gaps: list[NDArray], randomised: list[NDArray], rng: np.random.Generator | None = None) -> NDArray:
-    """Ratios of lasting and local changes to those of randomised weather, geometric means over policies.
+    """Ratios of lasting and local changes to those under randomised weather, geometric means over policies.
 
     Args:
         gaps: Steering changes between twin and truth, (days, stations) per policy.
@@ -147,7 +147,7 @@ def main() -> int:
     responses: dict[float, list[NDArray]] = {scale: [] for scale in SCALES}
     for source in track(given.policies, "policies", unit="policy"):
         policy = load_policy(str(find_policy(given.scene, source)), False)
-        places = slice(1, STRAIGHT if Path(source).name.startswith("straight") else None)  # not where photos were taken
+        places = slice(1, STRAIGHT if Path(source).name.startswith("straight") else None)  # photos show station 0
         before = steering(policy, fogged[:, places])
         gaps.append(steering(policy, truth[:, places]) - before)
         for scale, many in pictures.items():

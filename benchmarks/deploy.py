@@ -1,9 +1,9 @@
-"""Benchmark of the robot's pilot: pictures per second on one core, and the latency it adds.
+"""Benchmark of the robot's pilot: pictures per second on one core, and the latency that the pilot adds.
 
     python benchmarks/deploy.py [--policy RUN] [--json FILE]
 
 Pictures of 1280×720 px arrive as JPEG or BGRA from a camera with distortion; each is decoded, rectified, scaled,
-stacked and shown to the policy. Latency is the time from a picture's arrival to its command, on one core that no other
+stacked and given to the policy. Latency is the time from a picture's arrival to its command, on one core that no other
 program should use meanwhile. Without --policy, measures policies that have the sizes of `twin train`'s presets and
 random weights.
 """
@@ -33,7 +33,7 @@ _STEP = 100_000_000  # [ns]
 
 
 def picture() -> np.ndarray:
-    """A street-like BGR picture: smooth, with edges and noise, so that its JPEG has a usual size (some 200 kB)."""
+    """A street-like BGR picture: smooth, with edges and noise, so that its JPEG has a usual size (about 200 kB)."""
     rng = np.random.default_rng(0)
     out = cv2.resize(rng.integers(0, 256, (24, 40, 3), np.uint8), (1280, 720), interpolation=cv2.INTER_CUBIC)
     for _ in range(60):
@@ -43,8 +43,8 @@ def picture() -> np.ndarray:
 
 
 def measure(policy: OnnxPolicy, kind: str, count: int) -> dict[str, Any]:
-    """Shows `count` pictures of a kind, one after the other."""
-    now = 0  # of both clocks; what is measured is the real time
+    """Speed and latency of the pilot over `count` pictures of a kind; the first tenth of them does not count."""
+    now = 0  # [ns] time on the pilot's two clocks; the latency is measured in real time
 
     def clock() -> int:
         return now

@@ -4,7 +4,7 @@
 
 Prints a table; `env_sections.py` defines each figure. The robot drives the tasks `straight` and `right_turn`, or the
 whole route in a scene that has neither. Speeds are for 160×90 images, 10 Hz control and 2 ms physics; each is the best
-of several short runs in a process of its own, bound to the stated number of cores.
+of several short runs in a separate process that is bound to the stated number of cores.
 """
 
 import argparse
@@ -32,7 +32,7 @@ TARGETS: dict[str, tuple[str, float]] = {
     "overlay.mask_iou": ("≥", 0.9),
     "gpu.steps_per_s": ("≥", 10_000.0),
 }
-"""Figure → sense and target."""
+"""Figure → comparison and target."""
 
 
 def verdict(name: str, value: Any) -> tuple[str, str]:

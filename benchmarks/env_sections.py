@@ -1,4 +1,4 @@
-"""Sections of `env.py`. Each takes a built scene and `quick`, which makes it tiny, and returns figures by name."""
+"""Sections of `env.py`. Each takes a built scene and `quick`, which shortens it, and returns figures by name."""
 
 import json
 import os
@@ -15,7 +15,7 @@ _HERE = Path(__file__).parent
 
 
 def worker(*arguments: str | Path | int, cores: int = 1) -> dict[str, Any]:
-    """Figures of a function of `env_workers.py`, run in a process of its own that is bound to this many cores.
+    """Figures of a function of `env_workers.py`, run in a separate process that is bound to `cores` cores.
 
     Raises:
         RuntimeError: the process failed.
@@ -42,9 +42,9 @@ def speed(scene: Path, quick: bool) -> dict[str, Any]:
 
     `ratio_to_software_gl`: speed of one environment over that of the same environment with `mujoco.Renderer` images of
     the extracted mesh in software OpenGL (Mesa through EGL); both alternate in one process. `ratio_to_one_process`:
-    speed of a vector env in two processes over one in a single process with two threads, alternating.
-    `cpu_ms_per_step`: processor time, which other load on the machine affects less. `load_s`: `twin.load` and the first
-    reset with cached kernels.
+    speed of a vector env in two processes over that of one in a single process with two threads; their runs alternate.
+    `cpu_ms_per_step`: processor time, which depends less than wall time on other load of the machine.
+    `load_s`: `twin.load` and the first reset with cached kernels.
     """
     runs = 1 if quick else 4
     out = worker("single", scene, runs)
@@ -56,7 +56,7 @@ def speed(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def memory(scene: Path, quick: bool) -> dict[str, Any]:
-    """Peak memory of all processes of a vector env of 64, after steps with pixels."""
+    """Peak memory of all processes of a vector env of 64 environments, after steps with pixels."""
     return worker("memory", scene, 4 if quick else 64, cores=2)
 
 
@@ -114,14 +114,14 @@ def trust(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def overlay(scene: Path, quick: bool) -> dict[str, Any]:
-    """Obstacles composited into the twin against the same ones in the true world (`overlay.py`); needs the truth."""
+    """Compares obstacles in the twin's images with those in the true world (`overlay.py`); needs the truth."""
     from overlay import KINDS, round_trip
 
     return round_trip(scene, None, KINDS[:1] if quick else KINDS)
 
 
 def visual_vs_collision(scene: Path, quick: bool) -> dict[str, Any]:
-    """Visual against collision geometry (`twin.report.visual_vs_collision`), from the report of the last build."""
+    """Compares visual with collision geometry (`twin.report.visual_vs_collision`), from the last build's report."""
     from twin.loading import load_scene
 
     found = load_scene(scene).report().get("seen_touched")

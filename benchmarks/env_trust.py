@@ -21,7 +21,7 @@ TURNS = (0.0, 20.0, -45.0, 90.0, 180.0)  # [°] from the route's heading
 _EYE = 0.6  # [m] camera height
 _STEP = 6.0  # [m] along the route between positions
 _FAR = 20.0  # [m] errors are evaluated up to this true depth
-_BINS = ((0.9, 1.01), (0.5, 0.9), (0.0, 0.5))
+_BINS = ((0.9, 1.01), (0.5, 0.9), (0.0, 0.5))  # ranges of the trust score
 
 
 def trust_against_truth(path: Path) -> dict[str, Any]:

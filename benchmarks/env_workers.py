@@ -1,4 +1,4 @@
-"""Measurements that `env_sections.py` runs in processes of their own; each prints one line of JSON.
+"""Measurements that `env_sections.py` runs in separate processes; each prints one line of JSON.
 
 python benchmarks/env_workers.py FUNCTION SCENE [NUMBERS ...]
 """
@@ -26,14 +26,14 @@ def standard_tasks(scene: Path) -> list[str]:
 
 
 def one_obstacle(scene: Path) -> dict[str, Any]:
-    """Options with a cone that stays in view for the first twenty metres."""
+    """Options of an environment with a cone that stays in view for the first twenty metres."""
     from twin.config import ObstacleConfig
 
     return {"obstacles": (ObstacleConfig("it", "cone", 24.0, 0.9),), "start_offset": 0.0, "start_heading": 0.0}
 
 
 def single(scene: Path, runs: int) -> dict[str, Any]:
-    """One environment on one core, alternating with MuJoCo's own renderer if software OpenGL is available."""
+    """Speed of one environment on one core, alternating with MuJoCo's renderer if software OpenGL is available."""
     import twin
     from twin.env.drivers import RouteDriver
 
@@ -105,7 +105,7 @@ def software_gl(scene: Path) -> tuple[Any, str]:
 
 
 def batch(scene: Path, count: int, runs: int) -> dict[str, Any]:
-    """A vector env on two cores, alternating between two processes and one; counts the steps of all environments."""
+    """Speed of a vector env on two cores, alternately in two processes and in one, in steps of all environments."""
     spread, alone = _vector_env(scene, count), _vector_env(scene, count, 1)
     both = [(_vector_env_pace(spread), _vector_env_pace(alone)) for _ in range(runs)]
     rates, costs = zip(*(pair[0] for pair in both), strict=True)
@@ -140,7 +140,7 @@ def _cpu_time() -> float:
 
 
 def physics(scene: Path, runs: int) -> dict[str, Any]:
-    """One environment without images on one core."""
+    """Speed of one environment without images on one core."""
     import twin
     from twin.env.drivers import RouteDriver
 
@@ -158,7 +158,7 @@ def memory(scene: Path, count: int) -> dict[str, Any]:
     envs.begin([0])
     envs.close()
     peaks = [resource.getrusage(who).ru_maxrss * 1024 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    # The children are alike; ru_maxrss is that of the largest.
+    # ru_maxrss of the children is that of the largest one; the others have about the same.
     return {f"worlds{count}.bytes": peaks[0] + peaks[1] * getattr(envs, "processes", 0)}
 
 
@@ -198,7 +198,7 @@ def soak(scene: Path, steps: int) -> dict[str, Any]:
 
 
 def gpu(scene: Path, count: int) -> dict[str, Any]:
-    """As `batch` on a GPU, without obstacles."""
+    """Speed of a vector env on a GPU, without obstacles."""
     import warp
 
     envs = _vector_env(scene, count, device="cuda", obstacles=())
@@ -217,8 +217,8 @@ def gpu(scene: Path, count: int) -> dict[str, Any]:
 def host(scene: Path, count: int) -> dict[str, Any]:
     """Host time of a GPU vector env per step; physics and rendering are replaced by stubs.
 
-    The host holds the GIL throughout, so `host.steps_per_s` is an upper limit of `GpuVectorEnv.step` on any GPU.
-    `host.info_us` is the time for `info` and `state` of an environment, which stable-baselines3 requests.
+    The host holds the GIL throughout, so `host.steps_per_s` is an upper limit on the speed of `GpuVectorEnv` with any
+    GPU. `host.info_us` is the time for `info` and `state` of an environment, which stable-baselines3 requests.
     """
     import dataclasses
 
@@ -237,7 +237,7 @@ def host(scene: Path, count: int) -> dict[str, Any]:
 
     GpuSimulation._advance, BakedField.render_on_device = lambda self: None, show  # type: ignore[method-assign]
     factory = EnvFactory.open(scene, standard_tasks(scene)[-1], {"obstacles": (), "size": (8, 8)})
-    # Images stay on the device; the field itself is on the CPU.
+    # With "cuda" the images stay on the device, as on a GPU; the field itself is on the CPU.
     options = dataclasses.replace(factory.options, device="cuda")
     envs = GpuVectorEnv(dataclasses.replace(factory, options=options), list(range(count)), "cpu")
     begin = time.perf_counter()

@@ -1,10 +1,10 @@
-"""How near exported files are to the film: PSNR at held-out frames of what they hold, by ray casting.
+"""Benchmark of exported files against the film: PSNR of their ray-cast images at held-out frames.
 
     python benchmarks/exports.py --scene scenes/demo --only mesh      # the .glb, against colors per vertex
     python benchmarks/exports.py --scene scenes/demo --only splats    # the .ply in MuJoCo Warp's splat renderer
 
-`mesh` scores the pixels that show the mesh; both meshes have the same geometry, so the same pixels. The texture is read
-back from the file that was written.
+`mesh` scores only pixels that show the mesh. Both meshes have the same geometry and thus cover the same pixels. The
+texture is read back from the exported file.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -81,7 +81,7 @@ class MeshDrawing:
 
 
 def held_out_frames(twin: Twin, lighting: str, size: tuple[int, int]):
-    """Pose, rays in the world (h · w, 3) and photo of every held-out frame under a lighting."""
+    """Index, pose, rays in the camera frame (h, w, 3) and photo of every held-out frame under a lighting."""
     cameras = twin.cameras()
     for i in np.flatnonzero(cameras.held_out):
         if cameras.lightings[i] == lighting:
@@ -92,7 +92,7 @@ def held_out_frames(twin: Twin, lighting: str, size: tuple[int, int]):
 
 
 def score_mesh(twin: Twin, lighting: str, size: tuple[int, int]) -> None:
-    """Prints the PSNR of both colorings of the mesh."""
+    """Prints the PSNR of the mesh with colors per vertex, of the textured mesh, and of the field."""
     field, cameras = twin.field(), twin.cameras()
     stored = load_arrays(require_stage(twin.scene, "mesh") / "visual.npz")
     vertices, faces = stored["vertices"].astype(np.float64), stored["faces"]
@@ -117,7 +117,7 @@ def score_mesh(twin: Twin, lighting: str, size: tuple[int, int]) -> None:
         pictures["field"] = (
             field.render(cameras.select(np.array([i])), lighting, size).rgb[0].astype(np.float64) * 255.0
         )
-        for k in (1, 4):  # in full, and averaged over squares, as policies see it
+        for k in (1, 4):  # at full size, and averaged over 4 × 4 pixels, as policies see it
             for name, rgb in pictures.items():
                 value = psnr(_averaged(rgb, k) / 255.0, _averaged(photo, k) / 255.0, _averaged(hit, k) == 1.0)
                 scores.setdefault((name, k), []).append(value)
@@ -140,7 +140,7 @@ def score_splats(twin: Twin, lighting: str, size: tuple[int, int], frames: int) 
     spec = mujoco.MjSpec()
     spec.worldbody.add_camera(name="eye")
     spec.worldbody.add_geom(size=[0.01] * 3, pos=[0, 0, -1000])
-    spec.stat.extent = 20.0  # draws as far as the scene does: 1 km
+    spec.stat.extent = 20.0  # draws up to 1 km, as far as the scene does
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -1,10 +1,10 @@
-"""Benchmark of the radiance field and its renderer: training within budgets, baking, speed, depth, memory, GPU.
+"""Benchmark of the radiance field and its renderer: training within time budgets, baking, speed, depth, memory, GPU.
 
     python benchmarks/field.py --scene BUILT_SCENE [--only fox bake render depth train gpu] [--json FILE] [--quick]
 
-Prints a table; `field_sections.py` defines each figure. `fox` reads the real captures in ../shared/data beside the
-project (or `--data`) and trains for 60, 300 and 1200 s. All sections except `fox` and `gpu` need a complete build and
-write nothing into the scene. A full run takes about 35 minutes on an otherwise idle machine.
+Prints a table; `field_sections.py` defines each figure. `fox` reads the real capture `fox` in `--data`
+(default: ../shared/data beside the project) and trains for 60, 300 and 1200 s. All sections except `fox` and `gpu` need
+a complete build and write nothing into the scene. A full run takes about 35 minutes on an otherwise idle machine.
 """
 
 import argparse
@@ -41,7 +41,10 @@ TARGETS: dict[str, tuple[str, float]] = {
 
 
 def verdict(name: str, figures: dict[str, Any]) -> tuple[str, str]:
-    """A figure's target and "yes" or "no" with a reason; empty strings for a figure without a target."""
+    """A figure's target and "yes" or "no"; empty strings for a figure without a target.
+
+    If training exceeded the budget of a PSNR, the second text is "no" with the time it took, even without a target.
+    """
     sense, wanted = TARGETS.get(name, (None, 0.0))
     overtime = ""
     section, _, rest = name.rpartition(".")

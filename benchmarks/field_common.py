@@ -1,4 +1,4 @@
-"""Settings of a run of `field.py`, and the calls that load fields, render and start workers."""
+"""Settings of a run of `field.py`, and functions that load fields, render and start workers."""
 
 import json
 import os
@@ -55,7 +55,7 @@ def load_baked(path: Path, device: str = "cpu") -> Any:
 
 
 def render(field: Any, poses: NDArray, intrinsics: NDArray, size: tuple[int, int], lighting: str) -> Any:
-    """Renders n views of either field under one lighting; poses (n, 4, 4), intrinsics (4,) [px] at `size`."""
+    """Renders n views of a trained or baked field under a lighting; poses (n, 4, 4), intrinsics (4,) [px] at `size`."""
     from twin.geometry.cameras import Viewpoints
 
     return field.render(Viewpoints.of(poses, intrinsics, size), lighting, size)
@@ -79,7 +79,7 @@ def worker(*arguments: str | Path | int, environment: dict[str, str] | None = No
 def route_views(bench: Bench) -> Path:
     """A file with views of the robot's front camera along the route: poses (k, 4, 4), intrinsics (4,) [px].
 
-    The scripted follower drives the route, so the camera has the height and the pitching of the robot's.
+    The scripted driver drives the route in simulation, so the views have the height and pitch of the robot's camera.
     """
     file = bench.work / "views.npz"
     if not file.exists():

@@ -1,7 +1,7 @@
 """Sections of `field.py`. Each returns figures by name.
 
 *Unfitted* and *fitted* scores are defined in `twin/nerf/evaluate.py`. A *budget* is the wall time [s] from the start of
-training to the finished field, including reading the frames and stereo; kernels are compiled before.
+training to the finished field, including stereo and the reading of frames; kernels are compiled before it starts.
 """
 
 import time
@@ -50,7 +50,10 @@ def timed_fit(
 
 
 def fox(bench: Bench) -> Figures:
-    """Training within budgets on the fox capture: given poses, every 8th image held out, 270×480 px, defaults."""
+    """Training within budgets on the fox capture.
+
+    The poses are the given ones, every 8th image of 270×480 px is held out, and settings are the defaults.
+    """
     cameras, points = _fox_scene(bench)
     config = replace(NerfConfig(), max_width=bench.pick(NerfConfig().max_width, 96))
     budgets = bench.pick(bench.budgets, (10,))
@@ -107,7 +110,7 @@ def _within_budgets(
 
 
 def bake(bench: Bench) -> Figures:
-    """PSNR loss of baking over all held-out frames, its size and its time."""
+    """Baking: PSNR loss over all held-out frames, size of the baked field, and time."""
     from twin.nerf.evaluate import evaluate
 
     scene = SceneDir(bench.scene)
@@ -132,7 +135,7 @@ def bake(bench: Bench) -> Figures:
 
 
 def _bake(bench: Bench, field: Any) -> tuple[Any, Figures, float]:
-    """Bakes the scene's field into the work folder: the baked field, the report of `bake`, and its wall time [s]."""
+    """Bakes the scene's field into the work folder; returns the baked field, the report of `bake`, wall time [s]."""
     import warp as wp
 
     from twin.nerf.bake import bake as run
@@ -163,7 +166,7 @@ def baked_path(bench: Bench) -> Path:
 
 
 def speed(bench: Bench) -> Figures:
-    """Speed of 160×90 images with depth along the route, in processes of their own."""
+    """Rendering speed of 160×90 images with depth along the route, in separate processes."""
     place, views = baked_path(bench), route_views(bench)
     count, repeats = bench.pick((60, 5), (4, 1))
     found: Figures = {}
@@ -211,7 +214,7 @@ def depth(bench: Bench) -> Figures:
 
 
 def train(bench: Bench) -> Figures:
-    """Peak memory of training on 200 frames of the scene at the trained size, in a process of its own."""
+    """Peak memory of training on 200 frames of the scene, in their size in training, in a separate process."""
     row = worker("memory", bench.scene, bench.pick(200, 12), bench.pick(60, 3))
     size = "{:.0f}x{:.0f}".format(*row["size"])
     return {"train.peak_bytes": row["peak_bytes"], "train.frames": row["frames"], "train.frame_size": size}

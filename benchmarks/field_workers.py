@@ -1,4 +1,4 @@
-"""Measurements that `field.py` runs in processes of their own; each prints one line of JSON.
+"""Measurements that `field.py` runs in separate processes; each prints one line of JSON.
 
     python field_workers.py frames PLACE VIEWS CORES FRAMES REPEATS
     python field_workers.py ratio  PLACE VIEWS WIDTH REPEATS
@@ -6,7 +6,7 @@
     python field_workers.py memory SCENE FRAMES STEPS
 
 PLACE is a scene with a baked field, or a folder that contains one; VIEWS is a file of `field_common.route_views`.
-Imports within functions are late because the core count must be set, or the clock started, before them.
+Functions import late, because the core count must be set, or the clock started, before the imports.
 """
 
 import itertools
@@ -22,7 +22,7 @@ from typing import Any
 def use_cores(count: int) -> None:
     """Binds this process to this many cores. Call it before importing numpy and torch, which count cores at import.
 
-    The number of threads stays the package's own choice, as on a machine with this many cores.
+    The package itself chooses the number of threads, as on a machine with this many cores.
 
     Raises:
         OSError: the system cannot bind processes to cores.
@@ -68,7 +68,7 @@ def frames(place: str, views: str, cores: str, count: str, repeats: str) -> dict
 
 
 def ratio(place: str, views: str, width: str, repeats: str) -> dict[str, Any]:
-    """Frame times on one core, alternating: one frame of Nerfacto, plain and tuned, and eight of the baked field."""
+    """Frame times on one core, in turns: a frame of plain Nerfacto, one of tuned Nerfacto, eight of the baked field."""
     use_cores(1)
     import nerfacto_reference
     import nerfacto_tuned
@@ -154,7 +154,7 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
     cameras = Cameras.load(paths.stage("metric"))
     points = SparsePoints.load(paths.stage("metric"))
     cameras = replace(cameras, held_out=np.zeros(len(cameras), bool))
-    chosen = np.resize(np.arange(len(cameras)), int(count))  # unsorted, as the points refer to frames by index
+    chosen = np.resize(np.arange(len(cameras)), int(count))  # keeps the frames' indices, to which the points refer
     height = constant_height(read_json(paths.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
     trained, _, _ = train_field(
         cameras.select(chosen), points, replace(config.nerf, steps=int(steps)), config.seed, height, "cpu"
@@ -178,7 +178,7 @@ def peak_bytes() -> int:
 
 
 def _views(file: str, count: int, lightings: tuple[str, ...]) -> tuple[Any, Any, list[str]]:
-    """Poses spread along the route, intrinsics, and a lighting for each: named ones and mixtures in turn."""
+    """Poses spread along the route, intrinsics, and a lighting per pose: the field's lightings and mixtures in turn."""
     import numpy as np
 
     with np.load(file) as data:

@@ -1,10 +1,10 @@
-"""Fuzzer: hostile input to every reader and every verb, which must be accepted or refused in one line.
+"""Fuzzer: every reader and every verb must accept hostile input, or refuse it with a message of one line.
 
     python benchmarks/fuzz.py --cases 50000 --seed 1 [--only TARGET] [--case K] [--command-line 60]
 
 A case depends on (seed, target, number) alone, so `--only TARGET --case K` repeats it. `fuzzing/cases.py` defines when
-a case passes; `fuzzing/targets.py` lists the targets. Cases run in one child process at a time; a process that dies is
-a failure, and a new one runs the rest.
+a case passes; `fuzzing/targets.py` lists the targets. Cases run in one child process at a time. If the process
+dies, the case counts as a failure, and a new process runs the remaining cases.
 
 Prints a table, then every failure; the exit status is 1 if there are any.
 """
@@ -45,8 +45,8 @@ from fuzzing.cases import (
 
 _HERE = Path(__file__).resolve().parent
 _ROOT = _HERE.parent
-_MAX_DATA = 8 << 30  # [bytes] data segment of the child, so that no case exhausts the machine
-_START_SECONDS = 600.0  # for the child to make its samples
+_MAX_DATA = 8 << 30  # [bytes] limit of the child's data segment, so that no case uses up the memory
+_START_SECONDS = 600.0  # time limit for the child to make its samples
 _WARM_UP_SECONDS = 10.0
 
 
@@ -107,7 +107,7 @@ def run_cases(
 
 
 def _outcomes_of_child(cases: list[tuple[str, int]], seed: int, folder: Path, seconds: float) -> Iterator[Outcome]:
-    """Outcomes of cases until the child ends; if it dies or hangs, the last outcome says so."""
+    """Outcomes of cases until the child ends; if it dies or hangs, the last outcome is that failure."""
     work = folder / "work"
     remove(work)
     work.mkdir()
@@ -151,7 +151,7 @@ def _outcomes_of_child(cases: list[tuple[str, int]], seed: int, folder: Path, se
 
 
 def _enqueue_lines(file: Any, lines: "queue.Queue[bytes]") -> None:
-    """Puts every line of a file as it arrives, then an empty one."""
+    """Puts every line of a file into a queue as it arrives, and an empty line at the end."""
     for line in file:
         lines.put(line)
     lines.put(b"")
@@ -161,10 +161,10 @@ def _run_child(work: Path, seed: int, seconds: float) -> None:
     """Runs the cases given on standard input; writes one outcome per line."""
     cases = json.loads(sys.stdin.read())
     out = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # prints of readers do not mix with the outcomes
+    os.dup2(2, 1)  # text that readers print must not mix with the outcomes
     resource.setrlimit(resource.RLIMIT_DATA, (_MAX_DATA, _MAX_DATA))
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # dies with its parent
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # the child dies with its parent
     import faulthandler
 
     faulthandler.enable()
@@ -177,7 +177,7 @@ def _run_child(work: Path, seed: int, seconds: float) -> None:
 
     samples = Samples(work)
     targets = {one.name: one for one in TARGETS}
-    for name in dict.fromkeys(name for name, _ in cases):  # so that no case pays for imports and caches
+    for name in dict.fromkeys(name for name, _ in cases):  # imports and caches do not count in a case's time
         with contextlib.suppress(BaseException), time_limit(_WARM_UP_SECONDS):
             targets[name].run(new_case(work, f"warm/{name}", samples))
     print("ready", file=sys.stderr, flush=True)
@@ -189,7 +189,7 @@ def _run_child(work: Path, seed: int, seconds: float) -> None:
 
 
 def run_command_lines(cases: int, seed: int, seconds: float = MAX_SECONDS) -> Row:
-    """Runs cases of verbs as `python -m twin.VERB`, two at a time."""
+    """Runs cases of verbs as `python -m twin VERB`, two at a time."""
     from concurrent.futures import ThreadPoolExecutor
 
     row = Row()

@@ -2,8 +2,8 @@
 
     python benchmarks/husky.py [--scene BUILT_SCENE] [--only A1 B6 ...] [--json FILE]
 
-With `--scene` also chi of the scene's robot on the scene's ground, and the simulation speed there. A run takes 40 s on
-the machine in `docs/benchmarks.md`. The exit status is 1 if a row fails or a control passes.
+With `--scene`, also measures chi of the scene's robot on the scene's ground, and the simulation speed there. A run
+takes 40 s on the machine in `docs/benchmarks.md`. The exit status is 1 if a row fails or a negative control passes.
 """
 
 import argparse
@@ -35,8 +35,8 @@ _SPEED = (4.0, 4.5)  # [rad/s] of the left and right wheels: a gentle bend at 0.
 def steps_per_second(model: mujoco.MjModel) -> float:
     """Calls of `mj_step` per second on one core, over one drive of 10 s.
 
-    The drive is timed in pieces of 0.2 s, one call each; the fastest repeat of a piece counts, which excludes other
-    load on the machine.
+    The drive is timed in pieces of 0.2 s, one call each. For each piece the fastest repeat counts, which reduces the
+    effect of other load on the machine.
     """
     seconds = np.full(_PIECES, np.inf)
     for _ in range(_REPEATS):
@@ -65,7 +65,7 @@ def speeds(scene: Path | None) -> list[Row]:
 
 
 def scene_rows(path: Path) -> list[Row]:
-    """E3 on a built scene."""
+    """Rows of test E3 (chi) on the ground of a built scene."""
     scene = load_scene(path)
     world = scene.world()
     x, y, _, yaw = world.spawn

@@ -1,10 +1,11 @@
-"""Cost of the options that a scene can override against the Husky's tires, see `twin.mjcf.husky.check`.
+"""Effects of scene options that do not suit the Husky's tires, see `twin.mjcf.husky.check`.
 
     python benchmarks/husky_options.py [--json FILE]
 
-Turns on the spot at a commanded 1 rad/s on a plane and on a flat road as the mesh stage reconstructs it: yaw rate and
-motor torque over those with the right options on the plane, power of the motors over the contacts' dissipation (1 if
-energy is conserved), and the vertical acceleration at the camera (jolt). Parked on a slope: creep. Takes a minute.
+The robot turns on the spot at a commanded 1 rad/s, on a plane and on a flat road as the mesh stage reconstructs it.
+Prints yaw rate and motor torque, divided by those with the right options on the plane; motor power divided by the power
+that the contacts dissipate (1 if energy is conserved); vertical acceleration at the camera (jolt); and the speed of the
+robot when parked on a slope (creep). Takes a minute.
 """
 
 import argparse
@@ -28,7 +29,7 @@ Edit = Callable[[mujoco.MjSpec], None]
 
 
 def option(**values: object) -> Edit:
-    """Sets options of the scene."""
+    """An edit that sets options of the scene."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         for name, value in values.items():
@@ -38,7 +39,7 @@ def option(**values: object) -> Edit:
 
 
 def ground(**values: object) -> Edit:
-    """Sets attributes of the ground."""
+    """An edit that sets attributes of the ground."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         for name, value in values.items():
@@ -48,7 +49,7 @@ def ground(**values: object) -> Edit:
 
 
 def pairs(spec: mujoco.MjSpec) -> None:
-    """Gives every tire's contact with the ground explicitly."""
+    """Defines every tire's contact with the ground as an explicit pair."""
     for name in WHEELS:
         spec.add_pair(geomname1=f"{name}_tyre", geomname2="ground")
 
@@ -86,27 +87,27 @@ CASES: dict[str, Edit | None] = {
 
 @dataclass(frozen=True)
 class Cost:
-    """What a model does that `check` judges."""
+    """Behaviour of a model, and the number of faults that `check` finds in it."""
 
     yaw_rate: float
-    """Turning on the spot on a plane [rad/s]."""
+    """Yaw rate of a turn on the spot on a plane [rad/s]."""
     torque: float
-    """Of a motor, per wheel [N m]."""
+    """Mean motor torque per wheel in that turn [N m]."""
     balance: float
-    """Power of the motors over the contacts' dissipation."""
+    """Power of the motors divided by the power that the contacts dissipate."""
     jolt: float
     """Vertical acceleration at the camera [m/s²]."""
     ground_yaw_rate: float
-    """The turn on a reconstructed flat road [rad/s]."""
+    """Yaw rate of the same turn on a reconstructed flat road [rad/s]."""
     ground_jolt: float
-    """And its jolt [m/s²]."""
+    """Vertical acceleration at the camera on that road [m/s²]."""
     creep: float
-    """Speed of the parked robot on a slope 2° below that on which it slides, after 2 s [mm/s]."""
+    """Speed after 2 s of the robot parked on a slope that is 2° less steep than the one on which it slides [mm/s]."""
     faults: int
-    """Number of options that `check` calls wrong."""
+    """Number of options that `check` reports as wrong."""
 
     def differs(self, right: "Cost") -> bool:
-        """True if it does not do what the right options do: 2 % of yaw rate, 5 % of torque, a jolt, a creep."""
+        """True if yaw rate differs by 2 % or torque by 5 % from the right options, or if jolt or creep is large."""
         turns = abs(self.yaw_rate / right.yaw_rate - 1) < 0.02 and abs(self.ground_yaw_rate / right.yaw_rate - 1) < 0.02
         quiet = self.jolt < 0.2 and self.ground_jolt < 1.0
         return not (turns and quiet and abs(self.torque / right.torque - 1) < 0.05 and self.creep < 5.0)

@@ -1,4 +1,4 @@
-"""Draws the Husky's picture for its folder, `twin/assets/husky/husky.png`, by the ray caster that draws environments.
+"""Draws the picture of the Husky, `twin/assets/husky/husky.png`, with the ray caster of the environments.
 
 python benchmarks/husky_picture.py
 """

@@ -8,25 +8,25 @@ p succeeds on day d at the rate
     road: logit = s (q_p + day_d + cell_pd)            twin: the same with a sharpness, bias and noise of its own
 
 where q_p is a setup's mean plus the effects of place, training and checkpoint. Day and cell effects are correlated
-between twin and road: a low sun troubles both. With a large sharpness s a policy succeeds in all trials of a day or in
-none, as in 706 of the 720 cells of Table 1, to which the kind `recorded` is fitted.
+between twin and road: a low sun, for example, makes both harder. With a large sharpness s a policy succeeds in all
+trials of a day or in none, as in 706 of the 720 cells of Table 1, to which the kind `recorded` is fitted.
 
-*Estimands*, which an interval must contain 9 times in 10:
+An interval must contain its *estimand* in 90 % of the worlds. The estimands are:
 
-- Pearson, Spearman, MMRV, bias, regret: the mean of the statistic over further worlds of the same shape: other
-  trainings, days and trials, at the same place or, where the shape has several, at other places.
-- policy: its rate on the road over all days of this kind, averaged over the policies; *policy, middling* those between
-  0.1 and 0.9.
-- setup: the rate on the road over all trainings and days of the kind, of finished policies; with several places, which
-  are the units then, over places, too.
+- Pearson, Spearman, MMRV, bias, regret: the mean of the statistic over further worlds of the same shape, with
+  other trainings, days and trials, at the same place or, if the shape has several places, at other places.
+- policy: a policy's rate on the road over all days of this kind; coverage is averaged over the policies. *policy,
+  middling*: the same, only for policies whose rate is between 0.1 and 0.9.
+- setup: the rate on the road of a setup's finished policies, over all trainings and days of the kind. With several
+  places also over all places; the interval's units then are the places.
 - setup, these trainings: the rate over all days of the finished policies that drove (`rate_over_days`), at one place.
-- setups' difference: the difference of two such rates, by pairs of trainings at one place.
+- setups' difference: the difference of two setups' rates, from pairs of trainings at one place, or from several places.
 - twin: a policy's rate in the twin over all days of this kind.
-- predicted: the observed real rate of a policy, predicted from the twin's rates and the other trainings.
+- predicted: the observed real rate of a policy, predicted from its rate in the twin and from the other trainings.
 
-Prints coverage, or – where no interval is printed in that shape. Worlds whose units do not determine an interval are
-not counted, as none is printed there, either; *refused* is their largest share. Rates are estimated in a quarter of the
-worlds where these have more than ten policies. The seed is fixed. Takes ten minutes of one core.
+Prints coverage, or – if a forecast of that shape has no such interval. Worlds whose units do not determine an interval
+are not counted, because a forecast prints none for them, either; *refused* is their largest fraction. In shapes of more
+than ten policies, rates are estimated in a quarter of the worlds. The seed is fixed. Takes ten minutes on one core.
 """
 
 import argparse
@@ -57,7 +57,7 @@ from record import add_record_options, save
 WORLDS = 1000
 _MEAN_OVER = 6000  # worlds that estimate the mean of a statistic
 _BATCH = 250
-_RATE_WORLDS = 250  # of which rates are estimated, in shapes of more policies than a user has
+_RATE_WORLDS = 250  # of `WORLDS`, those whose rates are estimated if there are more policies than `_USERS_POLICIES`
 _USERS_POLICIES = 10
 _QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)
 
@@ -75,19 +75,23 @@ class Shape:
     """Policies per training."""
     days: int
     twin_trials: int
-    """Per policy and day."""
+    """Trials in the twin per policy and day."""
     trials: int = 5
 
 
 @dataclass(frozen=True)
 class Kind:
-    """How policies, days and the twin vary [logit divided by the sharpness]."""
+    """Distribution of policies, days and the twin's errors; effects in logit divided by the sharpness.
+
+    `training`, `place`, `day` and `cell` are standard deviations.
+    """
 
     setups: tuple[float, float, float]
+    """Means of three setups."""
     training: float
     place: float
     checkpoint: float
-    """How much worse the first checkpoint is; its noise is a third of it."""
+    """By how much the first checkpoint is worse than the last one; the standard deviation is a third of it."""
     day: float
     cell: float
     shared: float
@@ -128,7 +132,7 @@ class Worlds:
     quality: np.ndarray
     """q_p, shape (worlds, places, policies)."""
     twin_quality: np.ndarray
-    """The same with the twin's error."""
+    """q_p plus the bias and the noise of the twin, shape (worlds, places, policies)."""
     setup: np.ndarray
     """Index of each policy's setup in `Kind.setups`, shape (worlds, places, policies)."""
 
@@ -158,12 +162,12 @@ class Worlds:
         return _rate(self.kind.sharpness, self.quality, np.hypot(self.kind.day, self.kind.cell))
 
     def twin_rates(self) -> np.ndarray:
-        """The same in the twin."""
+        """True rates in the twin over all days, shape (worlds, places, policies)."""
         return _rate(self.kind.twin_sharpness, self.twin_quality, np.hypot(self.kind.day, self.kind.cell))
 
 
 def simulate(rng: np.random.Generator, kind: Kind, shape: Shape, worlds: int) -> Worlds:
-    """Simulates worlds. With one place its effect is part of the kind, and the same in all of them."""
+    """Simulates worlds. The effect of a single place is the same in all worlds and part of `Kind.setups`."""
     per_place = (worlds, shape.places, shape.trainings)
     if shape.setups:
         setup = np.broadcast_to(np.arange(shape.trainings) * shape.setups // shape.trainings % 3, per_place)
@@ -192,7 +196,7 @@ def simulate(rng: np.random.Generator, kind: Kind, shape: Shape, worlds: int) ->
 
 
 def _rate(sharpness: float, quality: np.ndarray, std: float) -> np.ndarray:
-    """Mean rate where the quality has a normal deviation."""
+    """Mean rate over a normally distributed quality with mean `quality` and standard deviation `std`."""
     out = np.zeros_like(quality)
     for z in _QUANTILES:
         out += expit(sharpness * (quality + std * z))
@@ -208,11 +212,14 @@ def setup_rate(kind: Kind, shape: Shape, setup: int) -> float:
 # ---- coverage
 
 Hits = dict[str, np.ndarray]
-"""Interval → 1 where it holds its estimand, 0 where not, nan where it is refused."""
+"""Name of an interval → 1 in worlds where it contains its estimand, 0 where not, nan where there is no interval.
+
+Where a world has several such intervals, the value is their mean.
+"""
 
 
 def coverage(kind: Kind, shape: Shape, worlds: int, seed: int = 0) -> dict[str, float]:
-    """Coverage of each interval; nan where it is never printed. *refused*: the largest share of worlds without one."""
+    """Coverage of each interval; nan if no world has it. *refused*: the largest fraction of worlds without one."""
     rng = np.random.default_rng(seed)
     truth = expected(kind, shape, rng)
     parts = [
@@ -280,7 +287,7 @@ def _places_of(statistic: Statistic, worlds: Worlds, pooled: bool) -> Callable[[
 
 
 def _rates(worlds: Worlds) -> Hits:
-    """Rates of single policies, at the first place."""
+    """Hits of the intervals for rates of single policies, at the first place."""
     shape, true = worlds.shape, worlds.policy_rates()[:, 0]
     policy, twin = np.full((2, *true.shape), np.nan)
     if shape.days >= MIN_RATE_DAYS:
@@ -306,7 +313,7 @@ def _mean_or_nan(values: np.ndarray) -> np.ndarray:
 
 
 def _setups(worlds: Worlds) -> Hits:
-    """Rates of setups, and differences of two setups."""
+    """Hits of the intervals for rates of setups, and for differences of two setups."""
     shape, done = worlds.shape, worlds.finished
     setups = worlds.setup[0, 0, done]
     aims = [setup_rate(worlds.kind, shape, setup) for setup in range(3)]

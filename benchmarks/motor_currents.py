@@ -1,9 +1,9 @@
 """Motor effort of turning relative to driving straight: measured currents against simulated torques.
 
-*Steady*: both sides drive forward at constant speed for 1 s. *Straight* and *turning* differ by the speed difference of
-the sides. In a turn the *outer* side drives and the *inner* side is dragged. Currents in the logs are unsigned and zero
-while a motor brakes, so negative simulated torques count as zero. Torque per ampere is not published but cancels in the
-ratios. The logs have no poses, so nothing else can be compared.
+*Steady*: both sides drive forward at constant speed for 1 s. *Straight* and *turning* samples have a small and a
+large speed difference of the sides. In a turn the *outer* side drives and the *inner* side is dragged. Currents in the
+logs are unsigned and zero while a motor brakes, so negative simulated torques count as zero. Torque per ampere is not
+published but cancels in the ratios. The logs have no poses, so nothing else can be compared.
 """
 
 from dataclasses import dataclass, replace
@@ -115,7 +115,7 @@ def rolling_resistance_of(steady: SteadySamples, params: HuskyParams) -> float:
     """Rolling resistance, including gear and belt losses, at which the simulated effort equals the measured one.
 
     Raises:
-        InputError: no value between 0.002 and 0.4 does.
+        InputError: there is no such value between 0.002 and 0.4.
     """
     target = measured_effort(steady).total
 

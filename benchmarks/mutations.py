@@ -1,9 +1,9 @@
-"""Breaks the package in one place at a time and runs the tests that should see it; takes three minutes.
+"""Breaks the package in one place at a time and runs the tests that should fail; takes three minutes.
 
     python benchmarks/mutations.py [--only WORDS]
 
-Each mutation is a change of one line of a copy of the checkout. It is *red* if a test fails. The exit status is 1 if
-one is not, or if its line is no longer found exactly once, which means that this list is to be brought up to date.
+A mutation changes one line in a copy of the last commit. It is *red* if a test fails. The exit status is 1 if a
+mutation is not red, or if its line does not occur exactly once in the file; the list of mutations must then be updated.
 """
 
 import argparse
@@ -20,7 +20,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Mutation:
-    """A line of a file, and what replaces it."""
+    """A line of a file, and its replacement."""
 
     name: str
     path: str
@@ -120,7 +120,7 @@ MUTATIONS = (
 
 
 def is_red(mutation: Mutation, root: Path) -> bool:
-    """Whether a test fails in the mutated copy, which is mended again."""
+    """True if a test fails in the mutated copy; restores the copy afterwards."""
     path = root / mutation.path
     text = path.read_text(encoding="utf-8")
     if text.count(mutation.line) != 1:

@@ -1,13 +1,13 @@
 """Nerfacto in plain torch, the baseline for the renderer's speed.
 
-Nerfacto is Tancik et al. 2023, "Nerfstudio" (arXiv 2302.04264); its hash grid is Müller et al. 2022, "Instant NGP", its
-proposal networks and its contraction of space are Barron et al. 2022, "Mip-NeRF 360". The sizes are the published ones;
-the weights are random, as only time is measured. The code follows the papers without optimisation: every sample passes
-through every network on concatenated inputs, as in nerfstudio's torch implementation. `nerfacto_tuned.py` renders the
-same image with optimised torch code.
+Nerfacto is described in Tancik et al. 2023, "Nerfstudio" (arXiv 2302.04264), its hash grid in Müller et al. 2022,
+"Instant NGP", its proposal networks and contraction of space in Barron et al. 2022, "Mip-NeRF 360". The sizes are the
+published ones; the weights are random, as only time is measured. The code follows the papers without optimisation:
+every sample passes through every network on concatenated inputs, as in nerfstudio's torch implementation.
+`nerfacto_tuned.py` renders the same image with optimised torch code.
 
-Shapes: r rays, s samples on each, s + 1 *edges* that bound them. *Spacing* is the coordinate in [0, 1] along a ray:
-uniform in distance up to one unit, in inverse distance beyond.
+Shapes: r rays, s samples on each, s + 1 *edges* that bound them. *Spacing* is the coordinate in [0, 1] along a ray;
+it is uniform in distance up to one unit, and in inverse distance beyond.
 """
 
 import itertools
@@ -57,19 +57,19 @@ class HashGrid:
 
 
 class Proposal:
-    """A proposal network: density alone."""
+    """A proposal network, which returns density only."""
 
     def __init__(self, finest: int):
         self.grid = HashGrid(_PROPOSAL_LEVELS, _PROPOSAL_LOG2, finest)
         self.mlp = mlp(FEATURES * _PROPOSAL_LEVELS, _PROPOSAL_HIDDEN, 1)
 
     def __call__(self, points: Tensor) -> Tensor:
-        """Shape (r, s, 3) → (r, s)."""
+        """Density (r, s) at points (r, s, 3)."""
         return self.mlp(self.grid(unit_cube(points)))[..., 0].exp()
 
 
 class Field:
-    """The main field: density, and color by direction and appearance."""
+    """The main field: density, and color that depends on direction and appearance."""
 
     def __init__(self) -> None:
         self.grid = HashGrid(_LEVELS, _LOG2, _FINEST)
@@ -91,9 +91,9 @@ class Nerfacto:
     """The renderer: proposal sampling and compositing; distances in half sides of the near box."""
 
     proposals: tuple[Callable[[Tensor], Tensor], ...]
-    """Called as `Proposal`."""
+    """Same arguments and result as `Proposal`."""
     field: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-    """Called as `Field`."""
+    """Same arguments and result as `Field`."""
 
     @torch.no_grad()
     def rays(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -157,7 +157,7 @@ def spatial_hash(vertices: Tensor, size: int) -> Tensor:
 
 
 def spacing_of(distance: Tensor) -> Tensor:
-    """Spacing of distances, up to scale: [0, 0.5] for the first unit, [0.5, 1] beyond."""
+    """Unscaled spacing of distances: in [0, 0.5] up to one unit, in [0.5, 1] beyond."""
     return torch.where(distance < 1.0, distance / 2, 1.0 - 0.5 / distance)
 
 
@@ -175,7 +175,7 @@ def points_on(origins: Tensor, directions: Tensor, edges: Tensor) -> Tensor:
 
 
 def unit_cube(points: Tensor) -> Tensor:
-    """Space contracted to a cube, scaled to [0, 1): Barron et al. 2022, eq. 10, in the maximum norm. (..., 3)."""
+    """Points (..., 3) contracted to a cube and scaled to [0, 1): Barron et al. 2022, eq. 10, in the maximum norm."""
     norm = points.abs().amax(-1, keepdim=True).clamp(min=1.0)
     return ((2.0 - 1.0 / norm) * points / norm + 2.0) / 4.0
 
@@ -188,7 +188,7 @@ def weights_of(density: Tensor, edges: Tensor) -> Tensor:
 
 
 def resampled(spacing: Tensor, weights: Tensor, count: int) -> Tensor:
-    """Edges (r, count + 1) at equal quantiles of the weights (r, s) between edges (r, s + 1), all in spacing.
+    """New edges (r, count + 1) at equal quantiles of the weights (r, s) between the edges `spacing` (r, s + 1).
 
     Barron et al. 2022, section 3, with nerfstudio's padding of the weights.
     """

@@ -26,7 +26,7 @@ class TunedGrid:
     """Optimised `HashGrid`."""
 
     def __init__(self, grid: HashGrid):
-        self.levels = []  # (resolution, whether dense, both features of each entry as one number)
+        self.levels = []  # (resolution, True if dense, both features of each entry as one number)
         for table, resolution in zip(grid.table, grid.resolutions, strict=True):
             dense = (resolution + 1) ** 3 <= len(table)
             if dense:
@@ -69,7 +69,7 @@ class TunedProposal:
         self.first, self.second = plain.mlp[0], plain.mlp[2]
 
     def __call__(self, points: Tensor) -> Tensor:
-        """Shape (r, s, 3) → (r, s)."""
+        """Density (r, s) at points (r, s, 3)."""
         hidden = columns(self.first, self.grid(cube_columns(points))).relu_()
         return columns(self.second, hidden).exp_().view(points.shape[:-1])
 

@@ -5,8 +5,8 @@
 The scene was filmed without obstacles. At several places along the route, each obstacle is composited into the twin and
 rendered in the known-truth world, in the same colors. Both are rendered from the same pose of the robot's front camera
 at 160×90, with the film's camera response and without noise. *Obstacle pixels* are those that show the obstacle in the
-truth. *Unshaded* is the composite with plain colors. A drive along the route also compares the visual with the
-collision geometry, see `twin/report/visual_vs_collision.py`.
+truth. *Unshaded* is the composite with plain colors, without shading. A drive along the route also
+compares the visual with the collision geometry, see `twin/report/visual_vs_collision.py`.
 """
 
 import argparse
@@ -76,7 +76,7 @@ class TrueWorld:
         with wp.ScopedDevice("cpu"):
             self.device_model = mujoco_warp.put_model(self.model)
             self.device = mujoco_warp.put_data(self.model, self.data)
-            # As `twin.reality.filming.Renderer`; the second one samples pixel centers, for the mask.
+            # The first is as in `twin.reality.filming.Renderer`; the second one samples pixel centers, for the depth.
             self.contexts = [
                 mujoco_warp.create_render_context(
                     self.model,
@@ -136,9 +136,9 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
         Figures by name: `overlay.obstacle_psnr.<lighting>`, `overlay.unshaded_psnr.<lighting>` [dB],
         `overlay.gain_over_unshaded.<lighting>` [dB], `overlay.psnr_of.<kind>` [dB], `overlay.mask_iou` and
         `overlay.mask_iou.<lighting>`; `overlay.shadow_rms.<lighting>`, rms error of the shadow factor over pixels
-        beside the obstacle that the obstacle dims by 5 % in the twin or in the truth;
-        `overlay.no_shadow_rms.<lighting>`, the same error if the twin had no shadows; `overlay.places.<lighting>`,
-        number of placements.
+        beside the obstacle that its shadow dims by more than 5 % in the twin or in the truth;
+        `overlay.no_shadow_rms.<lighting>`, the error that a twin without shadows would have;
+        `overlay.places.<lighting>`, number of placements.
     """
     scene = load_scene(scene_path)
     world, field = scene.world(), scene.field()
@@ -232,7 +232,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
 
 
 def visual_vs_collision(scene_path: Path) -> dict[str, Any]:
-    """`seen_touched.*` of `twin.report.visual_vs_collision`, along a drive of the scripted follower."""
+    """Figures `seen_touched.*` of `twin.report.visual_vs_collision`, for a scripted drive along the route."""
     from twin.assets.ground import Ground
     from twin.env.drivers import follow_route
     from twin.env.physics import HuskyPhysics

@@ -2,7 +2,7 @@
 
     python benchmarks/quality.py SCENE [--qualities draft standard high] [--json FILE] [--picture docs/quality.png]
 
-The scene must be built up to stage `metric`; the fields are trained from these cameras in a temporary folder. Times are
+The scene must be built up to stage `metric`; the fields are trained from its cameras in a temporary folder. Times are
 those of stage `field` alone, on an otherwise idle machine.
 """
 

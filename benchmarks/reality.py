@@ -1,11 +1,12 @@
-"""Figures of the real test: how fast its rasteriser is, how near to the film, and where its tasks lie.
+"""Benchmark of the real test: speed of its rasteriser, difference from the film's renderer, and places of its tasks.
 
     python benchmarks/reality.py [--scene BUILT_SCENE_WITH_TRUTH] [--json FILE] [--pictures FOLDER]
     python benchmarks/reality.py --sheet docs/places.jpg
 
-Pictures of 160×90 are compared, before the sensor, with frames of the film's renderer in the film's size that are
-shrunk to it, from a robot's height along the film's path; *small* is the film's renderer at 160×90 itself. With a
-scene, its route is laid on the true one. `--sheet` instead writes one picture with a frame of each of the places 1 to
+Rasterised pictures of 160×90, without the sensor model, are compared with frames that the film's renderer draws in the
+film's size and that are then reduced to 160×90. The poses lie on the film's path, at the height of a robot's camera.
+*small*: the same comparison for frames that the film's renderer draws at 160×90. With a scene, its route is compared
+with the true one. `--sheet` instead writes one picture with a frame of each of the places 1 to
 30.
 """
 
@@ -37,12 +38,12 @@ from twin.reality.truth import Truth
 from twin.runtime import track
 
 _LIGHTINGS = ("sun", "overcast", "night")
-_EVERY = 12  # frames of the film
-_LOWER = 0.6  # [m] that the robot's camera is below the film's
+_EVERY = 12  # one in this many frames of the film is compared
+_LOWER = 0.6  # [m] height of the film's camera above the robot's
 
 
 def pictures(folder: Path | None) -> Iterator[tuple[str, float]]:
-    """Names and values, lighting by lighting."""
+    """Names and values of the figures of each lighting."""
     place, large = places.build(), filming.FilmingPlan()
     small = replace(large, width=160, height=90)
     for lighting in _LIGHTINGS:
@@ -69,7 +70,7 @@ def pictures(folder: Path | None) -> Iterator[tuple[str, float]]:
 
 
 def places_of_tasks(scene: Path) -> Iterator[tuple[str, float]]:
-    """Distances of a built scene's tasks from those of the real test: name and value."""
+    """Names and values: distances of a built scene's route from the true route, and the station where it begins."""
     twin = load_scene(scene)
     truth = Truth.load(twin.scene.truth)
     cameras = Cameras.load(twin.scene.stage("metric"))
@@ -81,7 +82,7 @@ def places_of_tasks(scene: Path) -> Iterator[tuple[str, float]]:
 
 
 def contact_sheet(path: Path) -> None:
-    """Writes a frame of each of the places 1 to 30, 6 to a row; the lightings take turns."""
+    """Writes a frame of each of the places 1 to 30, 6 to a row; the lighting changes from place to place."""
     width, height = 240, 135
     frames = []
     for number in track(list(range(1, 31)), "contact sheet", unit="place"):

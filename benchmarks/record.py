@@ -1,7 +1,7 @@
 """Records of benchmark figures: JSON files that are not overwritten by a record with fewer entries.
 
-Entries of a record are the members of its nested objects, the items of lists of objects (runs, policies, rows), and the
-number of `trials` behind a rate; plain values may change. JSON has no NaN and no infinity: these become null.
+Entries of a record are the members of its nested objects, and the items of lists of objects (runs, policies, rows). A
+number of `trials` must not decrease; other plain values may change. JSON has no NaN and no infinity: these become null.
 """
 
 import argparse
@@ -38,7 +38,7 @@ def lost(old: Any, new: Any, where: str = "") -> list[str]:
     Args:
         old: The recorded value.
         new: Its replacement.
-        where: Name of both.
+        where: Path of both within their record, for error messages.
     """
     if isinstance(old, dict):
         if not isinstance(new, dict):
@@ -64,7 +64,7 @@ def _lost_member(old: dict[str, Any], new: dict[str, Any], key: str, where: str)
 
 
 def _labelled(items: list[Any]) -> dict[str, Any]:
-    """The objects of a list by label, numbered where labels repeat; other items are left out."""
+    """The objects of a list by label, numbered if labels repeat; other items are left out."""
     out, count = {}, Counter[str]()
     for item in items:
         if isinstance(item, dict):
@@ -85,11 +85,12 @@ def write_record(path: Path, record: dict[str, Any], replace: bool | None = Fals
     Args:
         path: The file.
         record: A JSON object; may contain NaN and infinity.
-        replace: True overwrites a record even if the new one lacks entries; None: the script has no such option.
+        replace: True overwrites a record even if the new one lacks entries; None is False for a script without
+            `--replace-record`.
 
     Raises:
-        InputError: the file has entries that the new record lacks, or is no record. It is kept, and the new record is
-            in `<path>.partial`.
+        InputError: the file has entries that the new record lacks, or is no record. The file is kept, and the new
+            record is in `<path>.partial`.
     """
     if not replace and path.exists():
         wrong = _reason_to_keep(path, record)
@@ -117,7 +118,7 @@ def _reason_to_keep(path: Path, record: dict[str, Any]) -> str:
 
 
 def save(path: Path | None, record: dict[str, Any], replace: bool | None = False) -> int:
-    """`write_record` for the end of a script; writes nothing if `path` is None.
+    """Calls `write_record` at the end of a script; writes nothing if `path` is None.
 
     Returns:
         The exit status: 0, or 2 with one line on standard error.

@@ -4,7 +4,7 @@
     python benchmarks/robustness.py kills [--times 50] [--only build|train|validate]
     python benchmarks/robustness.py disk                              # needs permission to mount a tmpfs
 
-Each prints a table and, with --json FILE, writes it; the exit status is 1 on any loss. All work is done on tiny
+Each test prints a table and, with --json FILE, writes it. The exit status is 1 if the test fails. All tests use tiny
 generated scenes in a temporary folder.
 """
 
@@ -52,7 +52,7 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
 
     Args:
         steps: Control steps of all environments together.
-        folder: For the scene.
+        folder: Folder for the scene.
     """
     import psutil
     import tqdm
@@ -99,13 +99,13 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
 
 
 def kills(times: int, folder: Path, only: str | None = None, seed: int = 0) -> dict[str, Any]:
-    """Kills a build, a training and a validation at random times, resumes them, and compares with undisturbed ones.
+    """Kills builds, trainings and validations at random times, resumes them, and compares them with undisturbed ones.
 
     Args:
-        times: Kills of each.
-        folder: For the scenes.
-        only: Name of a single one.
-        seed: Of the kill times.
+        times: Number of kills of each.
+        folder: Folder for the scenes.
+        only: "build", "train" or "validate" kills only this verb; None kills all three.
+        seed: Seed of the kill times.
     """
     each = {"build": _killed_builds, "train": _killed_trainings, "validate": _killed_validations}
     rng = np.random.default_rng(seed)
@@ -133,7 +133,7 @@ def _killed_after(command: list[str], seconds: float) -> bool:
             children |= {one.pid: one for one in psutil.Process(process.pid).children(recursive=True)}
         process.send_signal(signal.SIGKILL)
         process.wait()
-    # A worker that has just started notices only after its imports, which take seconds.
+    # A worker that has just started notices its parent's death only after its imports, which take seconds.
     left = psutil.wait_procs(list(children.values()), timeout=30.0)[1]
     assert not left, f"alive after kill -9: {left}"
     return True
@@ -172,7 +172,7 @@ def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[s
 
     root = _filmed(folder)
     scene = SceneDir(root)
-    stages = ("capture", "cameras", "metric", "field", "mesh", "mjcf")  # the review contains its own timings
+    stages = ("capture", "cameras", "metric", "field", "mesh", "mjcf")  # not the review, whose results contain timings
     subprocess.run(_build_command(root), cwd=_ROOT, check=True)
     wanted, longest = _results(root, stages), max(_seconds(root).values())
     killed = finished = different = 0
@@ -265,7 +265,7 @@ def _rows(run: Path) -> list[dict[str, Any]]:
 
 
 def _is_complete(run: Path, steps: int) -> bool:
-    """Checks a finished training: all steps, tables without gaps or repetitions, a complete replay buffer."""
+    """True if a finished training is complete: all steps, tables without gaps or repetitions, a whole replay buffer."""
     head = json.loads((run / "state" / "state.json").read_text())
     rows = _rows(run)
     at = [int(row["step"]) for row in rows]
@@ -321,7 +321,7 @@ def _digest(path: Path) -> str:
 
 @contextlib.contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[Path]:
-    """Mounts a tmpfs of a size [bytes]. Raises OSError: mounting is not permitted."""
+    """Mounts a tmpfs of `size` bytes. Raises OSError: mounting is not permitted."""
     folder.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)], capture_output=True)
     if done.returncode:
@@ -342,7 +342,7 @@ def fill(disk: Path, leave: int) -> Path:
 
 
 def full_disk_fault(command: list[str], root: Path) -> str:
-    """Runs a command that must fail with one line and exit status 2, keeping all files; returns what differs, or ""."""
+    """Runs a command that must fail with one line and exit status 2, keeping all files; returns a fault, or ""."""
     before = _contents(root)
     done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True)
     lines = [line for line in done.stderr.splitlines() if not line.startswith("Warp CUDA warning")]
@@ -355,7 +355,7 @@ def full_disk_fault(command: list[str], root: Path) -> str:
 
 
 def _contents(root: Path) -> dict[str, str]:
-    skipped = ("/runs/", "/validation/", "/tensorboard/")  # tables there grow, and a row may be cut
+    skipped = ("/runs/", "/validation/", "/tensorboard/")  # tables there grow, and their last row may be cut
     files = [path for path in root.rglob("*") if path.is_file() and not any(s in f"/{path}" for s in skipped)]
     return {str(path.relative_to(root)): _digest(path) for path in files}
 
@@ -367,7 +367,10 @@ def disk(folder: Path) -> dict[str, Any]:
 
 
 def full_build(folder: Path) -> dict[str, str]:
-    """Every stage of a build, without space and with 64 KiB; then an export of the build."""
+    """Runs every stage of a build with no free space and with 64 KiB, then an export of the build.
+
+    Returns "ok" or the fault of each run, by name.
+    """
     from twin.scene import STAGES, SceneDir
 
     out: dict[str, str] = {}
@@ -390,7 +393,10 @@ def full_build(folder: Path) -> dict[str, str]:
 
 
 def full_verbs(folder: Path) -> dict[str, str]:
-    """A training, a validation and a film, without space and with little; then again with enough."""
+    """Runs a training, a validation and a film with no free space, with little, and with enough.
+
+    Returns "ok" or the fault of each run, by name.
+    """
     from tiny_runs import tiny_runs
     from tiny_twin import tiny_twin
 

@@ -1,11 +1,12 @@
-"""Routes from filmings drawn by number: passes, laps, there and back, stops, reversals, cuts.
+"""Benchmark of routes from random simulated filmings: passes, laps, there and back, stops, reversals, cuts.
 
     python benchmarks/routes.py [--first 1] [--count 40]
 
-Numbers 1 to 999 are for development, 1,000 upwards for reports, each once. A filming is a set of camera poses along a
-drawn line with errors of structure from motion, so no pictures are needed. Prints a row per filming: the kind, the
-route's largest distance from the filmed line, its largest step, its sharpest turn over 2 m, and its length over that of
-the longest way that was filmed in one go. The exit status is 1 if a route is more than 0.3 m off, jumps, or folds.
+The number of a filming seeds it. Numbers 1 to 999 are for development; those from 1,000 on are for reports, each used
+once. A filming is a set of camera poses along a random line, with errors like those of structure from motion, so no
+pictures are needed. Prints a row per filming: the kind, the route's largest distance from the filmed line, its largest
+step, its sharpest turn over 2 m, and its length divided by that of the longest way filmed without interruption. The
+exit status is 1 if a route is more than 0.3 m off the filmed line, has a step above 0.3 m, or turns by more than 120°.
 """
 
 import argparse
@@ -43,14 +44,14 @@ _MAX_OFF, _MAX_STEP, _MAX_TURN = 0.3, 0.3, 120.0  # [m], [m], [°]
 
 @dataclass(frozen=True)
 class Filming:
-    """Cameras of a drawn filming and the true lines that the camera moved along."""
+    """Cameras of a random filming and the true lines that the camera moved along."""
 
     kind: str
     cameras: Cameras
     lines: tuple[Array, ...]
     """True lines (m, 2) [m]; those across a permitted gap are included."""
     longest: float
-    """Longest way filmed in one go [m], turns excluded."""
+    """Longest way filmed without interruption [m], without turning manoeuvres."""
 
 
 def drawn_line(rng: np.random.Generator, length: float) -> Array:
@@ -81,12 +82,12 @@ def arc(start: Array, end: Array) -> Array:
 
 
 def draw_filming(number: int) -> Filming:
-    """The filming with this number; kinds follow each other."""
+    """The filming with this number; the kinds repeat in the order of `KINDS`."""
     rng = np.random.default_rng([2026, number])
     kind = KINDS[number % len(KINDS)]
     line = drawn_line(rng, rng.uniform(25.0, 90.0))
     total, spacing = path_length(line), rng.uniform(0.3, 1.8)
-    films: list[tuple[str, str, list[Array]]] = []  # source, lighting, pieces of way
+    films: list[tuple[str, str, list[Array]]] = []  # source, lighting, pieces of the way
     bridges: list[Array] = []
     longest = total
     if kind == "backs_up":
@@ -150,7 +151,7 @@ def draw_filming(number: int) -> Filming:
 def _filmed(
     rng: np.random.Generator, kind: str, source: str, lighting: str, pieces: list[Array], spacing: float
 ) -> Cameras:
-    """Frames about `spacing` apart along pieces of way, with noise, wander and heading of a handheld camera."""
+    """Frames about `spacing` [m] apart along pieces of the way, with noise of position and heading."""
     xy, heading, times, now = list[Array](), list[float](), list[float](), 0.0
     frame_time = 0.5
     for piece in pieces:
@@ -181,7 +182,7 @@ def _filmed(
     pose[:, :3, 1] = [0.0, 0.0, -1.0]  # down
     pose[:, 0, 2], pose[:, 1, 2], pose[:, 2, 2] = np.cos(yaw), np.sin(yaw), 0.0  # forward
     pose[:, :2, 3], pose[:, 2, 3] = np.array(xy) + 0.02 * rng.standard_normal((n, 2)), 1.2
-    if n > 20 and rng.random() < 0.3:  # a frame that is registered wrongly
+    if n > 20 and rng.random() < 0.3:  # one frame is registered wrongly
         pose[int(rng.integers(5, n - 5)), :3, 3] += [1.5 + 4.0 * spacing, -2.0 - 4.0 * spacing, 0.5]
     return Cameras(
         tuple(f"{source}/{i:06d}" for i in range(n)),
@@ -197,7 +198,7 @@ def _filmed(
 
 
 def measure(filming: Filming) -> dict[str, float]:
-    """Distance from the filmed line [m], largest step [m], sharpest turn over 2 m [°], length over the longest way."""
+    """Distance from the filmed line [m], largest step [m], sharpest turn over 2 m [°], length / `longest`."""
     route = filmed_route(filming.cameras)
     line, film = route.line, np.concatenate(filming.lines)
     off = np.array([np.linalg.norm(film - point, axis=1).min() for point in line])

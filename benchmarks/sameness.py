@@ -2,10 +2,10 @@
 
     python benchmarks/sameness.py COMMIT [--work DIR]
 
-COMMIT films and builds a tiny scene. Both trees then open that build, drive the same episodes, train the same few
-steps, validate the trained policy, and rebuild field, mesh and scene from the same cameras. The digests of the results
-are compared; the exit status is 1 if any differs. The scripts use public names only, so they run before and after
-renames. Structure from motion is not compared, as it is not repeatable.
+The tree of COMMIT films and builds a tiny scene. Both trees then open that build, drive the same episodes, train the
+same few steps, validate the trained policy, and rebuild field, mesh and scene from the same cameras. The digests of the
+results are compared; the exit status is 1 if any differs. The scripts use public names only, so they run before and
+after renames. Structure from motion is not compared, as it is not repeatable.
 """
 
 import argparse

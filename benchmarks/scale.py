@@ -1,11 +1,12 @@
-"""Coverage of the scale's uncertainty over simulated captures.
+"""Coverage of the scale's stated uncertainty over simulated captures.
 
     python benchmarks/scale.py [--first 1] [--count 200]
 
-A capture is a drive with known truth: its height is measured with an error, the road has slope, crossfall, a crown and
-a kerb, structure from motion bends the path and scatters points. Numbers 1 to 999 are for development, 1,000 upwards
-for reports, each once. Prints how often the truth lies within one and two standard deviations, and the median error.
-The errors of structure from motion are simulated, so this does not replace captures that are really reconstructed.
+A capture is a simulated drive with known truth: the camera's height is measured with an error; the road has slope,
+crossfall, a crown and a kerb; structure from motion bends the path and scatters points. The number of a capture seeds
+it: 1 to 999 are for development; those from 1,000 on are for reports, each used once. Prints how often the truth lies
+within one and two standard deviations, and the median error. The errors of structure from motion are simulated, so this
+does not replace tests with reconstructed captures.
 """
 
 import argparse
@@ -21,11 +22,11 @@ from twin.geometry.cameras import Cameras
 from twin.geometry.poses import look_at
 from twin.types import Array
 
-_TOLERANCE = 0.01  # [m] standard deviation of the height as measured
+_TOLERANCE = 0.01  # [m] standard deviation of the error of the measured height
 
 
 def draw_capture(number: int) -> tuple[Cameras, Array, float]:
-    """Cameras and sparse points (m, 3) whose true scale is 1, and the height that its user measured [m]."""
+    """Cameras and sparse points (m, 3) whose true scale is 1, and the measured height of the camera [m]."""
     rng = np.random.default_rng([2027, number])
     length, spacing, height = rng.uniform(20.0, 80.0), rng.uniform(0.4, 1.5), rng.uniform(0.4, 1.7)
     s = np.arange(0.0, length, spacing)
@@ -56,7 +57,7 @@ def draw_capture(number: int) -> tuple[Cameras, Array, float]:
     other = eyes[rng.integers(0, len(s), 1200)] + rng.uniform(-15, 15, (1200, 3))
     other[:, 2] = np.maximum(other[:, 2], ground(0.0, 0.0) + slope * other[:, 0]) + 0.4
     points = np.concatenate([road, other])
-    # Structure from motion bends a drive: height and yaw grow by the square of the way.
+    # Structure from motion bends a drive: errors of position grow with the squared distance from the start.
     bend = rng.normal(0.0, 0.1 / 40.0**2, 3) * [1.0, 1.0, 0.5]
     for one in (points, poses[:, :3, 3]):
         one += bend * ((one[:, :2] - xy[0]) ** 2).sum(1)[:, None]
@@ -76,7 +77,7 @@ def draw_capture(number: int) -> tuple[Cameras, Array, float]:
 
 
 def estimate(number: int) -> Scale:
-    """The scale of a drawn capture; its truth is 1."""
+    """The estimated scale of a simulated capture; the true scale is 1."""
     cameras, points, measured = draw_capture(number)
     up, road = up_from_ground(cameras.camera_to_world, points)
     return scale_from_height(cameras, up, points, road, MetricConfig(measured, _TOLERANCE), {})

@@ -1,20 +1,21 @@
-"""How many real trials the twin saves: n real trials alone against n with the twin, on the record of Table 1.
+"""Benchmark of the real trials that the twin saves: n real trials with and without the twin, on Table 1's record.
 
     python benchmarks/trials_saved.py [--results benchmarks/table1/results.json] [--json FILE] [--picture FILE]
 
 The recorded days are the population, and a policy's rate over all of them is the truth. An *experiment* draws days from
-it with replacement: on some the policies drive on the road, five trials each; of twenty further ones there is a photo
-alone, so that only the twin drives there. A policy's rate is then estimated in four ways:
+it with replacement. On some of these days the policies drive on the road, five trials each. For twenty further days
+there is only a photo, so that the policies drive only in the twin. A policy's rate is then estimated in four ways:
 
 - alone: from the real trials, by the model of `twin.evaluation.rate_model`.
-- twin: the same with the policy's rate in the twin as covariate, so that it is drawn towards what the twin says.
-- mean: the mean over the driven days, Student's t over days.
-- powered: prediction-powered inference (PPI++, `prediction_powered_mean`): the same mean plus λ times what the twin
-  says of the further days minus of the driven ones. Unbiased however wrong the twin is. λ comes from other trainings.
+- twin: the same with the policy's rate in the twin as covariate, so that the estimate is shrunk towards the twin's.
+- mean: the mean real rate over the driven days; its interval is Student's t over days.
+- powered: prediction-powered inference (PPI++, `prediction_powered_mean`): the same mean plus λ times the
+  difference between the twin's rates on the further days and on the driven days. It is unbiased even if the twin is
+  wrong. λ is tuned on other trainings.
 
 Prints, by number of real trials per policy: width and coverage of the 90 % intervals, root mean square error, and how
-often the policy with the highest estimate is within 5 points of the best of its task. *Middling* policies succeed in 2
-to 98 % of the days; for the others a few trials suffice with or without the twin. The seed is fixed; takes two minutes.
+often the policy with the highest estimate is within 5 points of the best of its task. *Middling* policies have a
+rate of 2 to 98 %; for the others a few trials suffice with or without the twin. The seed is fixed; takes two minutes.
 """
 
 import argparse
@@ -36,13 +37,13 @@ sys.path.append(str(Path(__file__).parent))
 from record import add_record_options, save
 
 DAYS = (2, 3, 4, 6, 8, 12, 16)
-"""Driven days."""
+"""Numbers of driven days."""
 TRIALS = 5  # per policy and day
 PHOTOS = 20
 """Days with a photo and no trials."""
 MARGIN = 0.05
 WAYS = ("alone", "twin", "mean", "powered")
-_LEAST_DAYS = 5  # of the intervals over days alone
+_LEAST_DAYS = 5  # fewest driven days for an interval of `mean` or `powered`
 _EXPERIMENTS = 60
 
 
@@ -53,7 +54,7 @@ class Record:
     real: np.ndarray
     """Rate on the road."""
     twin: np.ndarray
-    """Successes in the twin, of `episodes`."""
+    """Successes in the twin, out of `episodes`."""
     episodes: int
     training: np.ndarray
     task: np.ndarray
@@ -83,11 +84,11 @@ def read_record(path: Path) -> Record:
 
 
 Estimates = dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""Way → estimates of the policies and ends of their intervals, shapes (n,); nan where there is none."""
+"""Way of estimation → estimates of the policies, lower and upper ends of their intervals or nan; shapes (n,)."""
 
 
 def estimates(record: Record, driven: np.ndarray, photos: np.ndarray, rng: np.random.Generator) -> Estimates:
-    """One experiment on some of the recorded days."""
+    """Estimates of one experiment; `driven` and `photos` are indices of recorded days."""
     won = rng.binomial(TRIALS, record.real[:, driven])
     counts = won, np.full(won.shape, TRIALS)
     twin = record.twin[:, np.concatenate([driven, photos])]
@@ -122,7 +123,7 @@ def powers(training: np.ndarray, f: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def best_chosen(record: Record, estimate: np.ndarray, among: np.ndarray, rng: np.random.Generator) -> float:
-    """Fraction of the tasks in which the chosen policy is within `MARGIN` of the best; ties are broken at random."""
+    """Fraction of tasks whose policy with the highest estimate is within `MARGIN` of the best; ties break at random."""
     hits = []
     for task in np.unique(record.task):
         mine = np.flatnonzero(among & (record.task == task))
@@ -156,7 +157,7 @@ def row(record: Record, days: int, experiments: int, seed: int = 0) -> dict[str,
 
 
 def picture(rows: dict[int, Any]) -> Figure:
-    """Error and choice of the best of the middling policies over the number of real trials."""
+    """Plots of error and of correct choices against the number of real trials, for the middling policies."""
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     labels = {

@@ -2,10 +2,11 @@
 
     python benchmarks/view.py --scene BUILT_SCENE [--minutes 5] [--json FILE]
 
-`twin view` runs as a process of its own; the browser draws without a GPU. A picture counts when the browser has decoded
-it. "Moving" is a drag of the mouse at 25 events a second; "at rest" begins with its release. The random part clicks,
-drags, presses keys and slides wherever the page has something, and compares memory after its first fifth with the end.
-The share of the cores that other programs had is measured, too: speeds mean something only where it is small.
+`twin view` runs in a separate process; the browser draws without a GPU. A picture counts when the browser has decoded
+it. "Moving" is a drag of the mouse at 25 events a second; "at rest" begins when the mouse button is released. The
+random part clicks, drags, presses keys and moves sliders at random, and compares memory at its end with memory after
+its first fifth. The number of cores that other programs use is measured, too: speeds are meaningful only if it is
+small.
 """
 
 import argparse
@@ -33,10 +34,10 @@ TARGETS = {
     "random.errors": ("≤", 0.0),
     "random.growth_bytes": ("≤", 32 * 2**20),
 }
-"""Figure → sense and target."""
+"""Figure → comparison and target."""
 
 _SIZE = (960, 540)  # of the page [px]; the panel leaves 640×540 of it to the picture
-# The picture's images alone are loaded by a script that sets the property `src`; the panel's have it as attribute.
+# Counts the picture's images only: a script sets their property `src`. The panel's images have it as an attribute.
 _COUNT = """
 window.pictures = 0;
 const source = Object.getOwnPropertyDescriptor(HTMLImageElement.prototype, "src");
@@ -69,13 +70,13 @@ class Served:
         return psutil.Process(self.process.pid).memory_info().rss
 
     def stop(self) -> str:
-        """Ends it and returns what it said on standard error."""
+        """Ends the process and returns its standard error."""
         self.process.terminate()
         return self.process.communicate(timeout=30.0)[1]
 
 
 class OtherWork:
-    """Measures the cores that other processes than these used, in cores, within a block."""
+    """Context manager; `cores` is the mean number of cores used by processes other than `mine` and their children."""
 
     def __init__(self, mine: list[int]) -> None:
         self._mine = mine
@@ -136,7 +137,7 @@ def rest(browser: Chromium, seconds: float = 6.0) -> float:
 
 
 def random_clicks(browser: Chromium, served: Served, seconds: float, seed: int = 0) -> dict[str, Any]:
-    """Clicks, drags, keys and slides at random; returns actions, errors and growth of memory."""
+    """Clicks, drags, presses keys and moves sliders at random; returns actions, errors and growth of memory."""
     rng, began, actions, early = np.random.default_rng(seed), time.monotonic(), 0, 0
     while (now := time.monotonic() - began) < seconds:
         kind = rng.integers(5)
@@ -154,7 +155,7 @@ def random_clicks(browser: Chromium, served: Served, seconds: float, seed: int =
             browser.key(letter, True)
             time.sleep(float(rng.uniform(0.0, 0.6)))
             browser.key(letter, False)
-        else:  # something of the panel: a tab, button, box or slider
+        else:  # an element of the panel: a tab, button, box or slider
             found = browser.evaluate(
                 """(() => [...document.querySelectorAll('[role=tab], button, input, [role=slider], [role=option]')]
                   .filter((e) => e.offsetParent !== null && !/photo|Render|Save|Load/.test(e.textContent)
@@ -184,7 +185,7 @@ def random_clicks(browser: Chromium, served: Served, seconds: float, seed: int =
 
 
 def measure(scene: Path, minutes: float) -> dict[str, Any]:
-    """All figures."""
+    """Measures all figures."""
     served = Served(scene)
     try:
         with Chromium(_SIZE) as browser:

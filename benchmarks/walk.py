@@ -3,8 +3,8 @@
     python benchmarks/walk.py [--shell bash|zsh] [--index] [--until WORDS]
 
 Skipped: commands on `scenes/my_road`, which needs films; the test suite, which CI runs; and without `--index` the
-command that fetches PyTorch from its own index. The shell is an interactive one without start-up files, as for pasted
-text. Prints each command with its time; the exit status is that of the first command that fails.
+command that fetches PyTorch from its own index. The shell is interactive, as for pasted text, and reads no start-up
+files. Prints each command with its time; the exit status is that of the first command that fails.
 """
 
 import argparse
@@ -19,11 +19,11 @@ from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parents[1]
 _START = {"bash": ("--norc", "--noprofile"), "zsh": ("-f",)}
-_INHERITED = ("PYTHONPATH", "VIRTUAL_ENV")  # would point the copy at another checkout
+_INHERITED = ("PYTHONPATH", "VIRTUAL_ENV")  # would make the copy use another checkout
 
 
 def commands(text: str, index: bool) -> list[str]:
-    """Commands in the shell blocks of a page, without the skipped ones; one joined by `&&` counts as several."""
+    """Commands in the shell blocks of a page, without the skipped ones; a line joined by `&&` gives several."""
     blocks = re.findall(r"^```sh\n(.*?)^```$", text, re.S | re.M)
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines() if line.strip()]
     lines = [line for line in lines if "my_road" not in line and "pytest" not in line]

@@ -57,7 +57,7 @@ class Recording:
     """Series over n physics steps. Wheels are ordered as `twin.robot.WHEELS`, sides as `SIDES`."""
 
     timestep: float
-    """[s]"""
+    """Physics time step [s]."""
     wheel: Array
     """Wheel speeds [rad/s], shape (n, 4)."""
     torque: Array
@@ -65,7 +65,7 @@ class Recording:
     pose: Array
     """x, y, z [m], yaw and pitch [rad] of the base, yaw without jumps, shape (n, 5)."""
     velocity: Array
-    """x, y in the world [m/s] and yaw rate [rad/s], shape (n, 3)."""
+    """Velocity along x and y of the world [m/s], and yaw rate [rad/s], shape (n, 3)."""
     camera_z: Array
     """Height of the front camera [m], shape (n,)."""
     loaded: NDArray[np.int64]
@@ -85,7 +85,7 @@ class Recording:
 
     @property
     def chi(self) -> float:
-        """Track ratio: wheel speed difference over yaw rate times track."""
+        """Track ratio: wheel speed difference divided by the product of yaw rate and track."""
         return self.wheel_difference / (self.yaw_rate * TRACK)
 
     @property
@@ -123,8 +123,8 @@ def record(
     """Drives the robot through its controller for `seconds`, and records each physics step after the first `skip` [s].
 
     Args:
-        commands: Maps the time [s] to v [m/s] and ω [rad/s], every 0.1 s; None is no command.
-        params: Of the controller.
+        commands: Maps the time [s], every 0.1 s, to v [m/s] and ω [rad/s]; None means no command.
+        params: Parameters of the controller.
         data: Initial state, changed in place; the robot at rest by default.
     """
     data = state_at_rest(model) if data is None else data

@@ -10,7 +10,7 @@ from twin.config import MeshConfig
 from twin.types import Array
 
 _SPACING = 0.25  # [m] between data, as in `twin.assets.ground`
-_FIELD_NOISE, _PATH_NOISE = 0.03, 0.012  # [m] σ of rendered heights and of a steady camera, as in `twin.assets.ground`
+_FIELD_NOISE, _PATH_NOISE = 0.03, 0.012  # [m] σ of rendered and of camera path heights, as in `twin.assets.ground`
 _LATERAL_OFFSETS = np.array([-0.6, -0.3, 0.0, 0.3, 0.6])  # [m] from the path
 
 
@@ -56,8 +56,8 @@ def reconstructed(
 def roughness(ground: Ground, line: Array) -> tuple[float, float]:
     """Rms [m] and correlation length [m] of the heights along a polyline (m, ≥2).
 
-    A straight line is subtracted per 8 m, which is much longer than the robot. The correlation length is the lag at
-    which the autocorrelation falls to 1/e.
+    A straight line is fitted to every 8 m, much more than the robot's length, and subtracted. The correlation length is
+    the lag at which the autocorrelation falls to 1/e.
     """
     step = ground.cell / 2
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1))])

@@ -101,7 +101,7 @@ def scrubbing(subject: Subject) -> list[Row]:
 
 
 def quiet(subject: Subject) -> list[Row]:
-    """B6 and B7: jolt of the camera, and share of steps with four wheels loaded, in point turns."""
+    """B6 and B7: jolt of the camera, and fraction of steps with four wheels loaded, in point turns."""
     rows, loaded = [], []
     for rate, friction in (*((rate, subject.params.friction) for rate in _TURNS), (1.8, 1.0)):
         # Flutter takes seconds to build up and first occurs in the fastest turn at the highest friction.

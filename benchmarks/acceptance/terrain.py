@@ -1,4 +1,4 @@
-"""Rows E, ground as a build reconstructs it, and P, convex parts."""
+"""Rows E (ground as a build reconstructs it) and P (convex parts)."""
 
 import math
 from dataclasses import replace
@@ -45,7 +45,7 @@ def flat_ground(subject: Subject) -> list[Row]:
 
 
 def reconstructed_ground(subject: Subject) -> list[Row]:
-    """E3: chi on the roughest road that the pipeline produces: bumps of 3 cm rms and 0.5 m, low-passed."""
+    """E3: chi on the roughest road that the pipeline produces, fitted to bumps of 3 cm rms and 0.5 m kernel width."""
     rng = np.random.default_rng(1)
     ground = reconstructed(rng, random_relief(0.03, 0.5, rng))
     return chi_on(subject, ground, (-4.0, 0.0, 0.1), np.array([[-7.0, 0.0], [7.0, 0.0]]), "reconstructed bumps")
@@ -61,7 +61,7 @@ def chi_on(subject: Subject, ground: Ground, start: tuple[float, float, float], 
 
 
 def halved_step(subject: Subject) -> list[Row]:
-    """E4: change of chi and power with half the time step, on a plane and, over a whole turn, on a height field."""
+    """E4: change of chi and power with half the time step, on a plane, and on a height field over a whole turn."""
 
     def halve(spec: mujoco.MjSpec) -> None:
         if subject.edit is not None:
@@ -105,7 +105,7 @@ def plates(subject: Subject) -> list[Row]:
 
 
 def ramp(subject: Subject) -> list[Row]:
-    """P2: climbing a wedge of 10° to a platform of 0.35 m; both are convex meshes, as curbs and ramps of a build."""
+    """P2: climbing a wedge of 10° to a platform of 0.35 m; both are convex meshes, like curbs and ramps of a build."""
     height, run_up = 0.35, 0.35 / math.tan(math.radians(10.0))
 
     def put(spec: mujoco.MjSpec) -> None:

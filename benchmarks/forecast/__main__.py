@@ -1,21 +1,21 @@
-"""The forecast experiment: how well the twin forecasts success on the road, at places that nobody chose or looked at.
+"""The forecast experiment: how well the twin forecasts success on the road, at random places not examined before.
 
     python benchmarks/forecast WORK [--minutes 150] [--jobs 2] [--places 100 101] [--ray ADDRESS]
-    python benchmarks/forecast --tables                     scores of the kept results alone, in seconds
+    python benchmarks/forecast --tables                     only the scores of the kept results, in seconds
 
 `protocol.toml` fixes every number in advance; `place_record.py` keeps every episode and trial in `results/`; the scores
 are defined in `place_scores.py`. Steps at a place, each a command of `twin` that resumes where it was interrupted:
 
-- film: films the place under its lightings, as its number draws it.
-- build: builds the twin; aligns the robot to a drive log and a film by its own camera; builds again with it.
-- photos: one photo of each day by the robot's camera gives the twin that day's lighting. A photo that cannot be placed
-  leaves the day to the held-out lightings.
-- train: one training per setup. Their digests are kept before anything drives.
+- film: generates the place from its number, and films it under its lightings.
+- build: builds the twin; aligns the robot to a drive log and a film of its own camera; builds again with this robot.
+- photos: adds each day's lighting to the twin, from one photo by the robot's camera. If a photo cannot be placed,
+  held-out lightings stand for its day.
+- train: trains one policy per setup, and records the policies' digests before any of them drives.
 - validate: drives every policy in the twin, under the lighting of each day and under held-out lightings.
-- drive: drives every policy in the reality, on each day, on the task that the twin wrote.
+- drive: drives every policy in the reality, on each day, on the task that the twin exported.
 
-WORK holds the scenes (1 GB a place). The same command goes on after a kill, or when `--minutes` are over. A place of
-60 m takes about two hours of two cores. Results never lose a row. What fails stops its place with the command's error.
+WORK holds the scenes (1 GB a place). After a kill, or when `--minutes` are over, the same command continues. A place of
+60 m takes about two hours of two cores. Results never lose a row. A command that fails stops its place, with its error.
 """
 
 import argparse
@@ -43,7 +43,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 from record import save
 
 RESULTS = Path(__file__).with_name("results")
-_GRACE = 60.0  # [s] that a command has to save its state
+_GRACE = 60.0  # [s] given to a command to save its state
 
 
 class TimeIsUp(Exception):
@@ -58,7 +58,7 @@ class Commands:
         self._running: set[subprocess.Popen] = set()
 
     def stop(self, *_: object) -> None:
-        """Moves the deadline to now; a signal handler."""
+        """Signal handler: moves the deadline to now, and ends running commands."""
         self._end = 0.0
         for process in tuple(self._running):
             process.send_signal(signal.SIGTERM)
@@ -82,7 +82,7 @@ class Commands:
         return status
 
     def _end_of(self, process: subprocess.Popen) -> None:
-        """Lets a command that still runs save its state."""
+        """Ends a command that still runs, and lets it save its state."""
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)
             try:
@@ -93,7 +93,7 @@ class Commands:
         self._running.discard(process)
 
     def must(self, *arguments: str | Path, cores: int = 1) -> None:
-        """Raises InputError: the command failed."""
+        """Runs a command. Raises InputError: the command failed."""
         status = self(*arguments, cores=cores)
         if status:
             raise InputError(f"{' '.join(map(str, arguments))}: exit status {status}; its own message is above")
@@ -126,7 +126,7 @@ class PlaceRun:
         self.run.must("twin.reality", "compare", self.scene, cores=self.jobs)
 
     def photos(self) -> None:
-        """Adds the days' lightings; `photos.json` in the scene names the days whose photo could not be placed."""
+        """Adds the days' lightings; `photos.json` in the scene records for each day if its photo could be placed."""
         done = dict(read_json(self._photos)) if self._photos.exists() else {}
         for day in (day for day in self.days if day not in done):
             photo = self.scene / "photos" / f"{day}.png"
@@ -180,7 +180,7 @@ class PlaceRun:
             list(pool.map(one, self.protocol.setups))
 
     def write_record(self) -> None:
-        """Keeps what has been driven so far."""
+        """Writes all episodes and trials so far to the record."""
         episodes = self.scene / "validation" / "episodes.csv"
         wanted = {HELD_OUT_CONDITION, *map(by_photo, self.days)}
         if episodes.exists():
@@ -214,7 +214,7 @@ class PlaceRun:
 
 
 def run_place(one: PlaceRun, ray: str | None) -> None:
-    """All steps of a place. What was driven is kept even if a step fails or the time is up."""
+    """Runs all steps of a place. Writes the record even if a step fails or the time is up."""
     steps: Sequence[Callable[[], None]] = (one.film, one.build, one.photos, one.train)
     try:
         for step in steps:

@@ -1,12 +1,12 @@
 """Record of a place, in files under version control: every episode and trial, and the digests of the policies.
 
     results/version_N/place_P/
-      place.json            figures of build and trainings; robot and camera, and what of these training never sampled
+      place.json            figures of build and trainings; robot and camera, and their values outside training's ranges
       policies.json         digest of every policy, written before the first trial
       episodes.csv.gz       a row per episode in the twin
       trials.csv.gz         a row per trial in the reality
 
-The same tables give the same bytes. A record never loses a row, and no row of it changes.
+The same tables give the same bytes. No row of a record is ever lost or changed.
 """
 
 import gzip
@@ -40,8 +40,8 @@ class PlaceRecord:
     """Names of the setups, in the protocol's order."""
     days: tuple[str, ...]
     twin: Array
-    """Successes and episodes in the twin under the photo of each day, or if that could not be placed under held-out
-    lightings, shape (n, k, 2)."""
+    """Successes and episodes in the twin under the lighting of each day's photo, or under held-out lightings if the
+    photo could not be placed; shape (n, k, 2)."""
     held_out: Array
     """Successes and episodes under held-out lightings, shape (n, 2)."""
     real: Array
@@ -51,7 +51,7 @@ class PlaceRecord:
 def freeze(folder: Path, runs: dict[str, Path]) -> None:
     """Records the digests of trained policies; `runs` names their folders.
 
-    Raises InputError: the record has other policies, so that trials would be driven by what was not frozen.
+    Raises InputError: the record has other digests; trials would then be driven by policies it does not contain.
     """
     digests = {name: digest_file(path / "policy.json") for name, path in runs.items()}
     record = folder / POLICIES
@@ -64,7 +64,7 @@ def freeze(folder: Path, runs: dict[str, Path]) -> None:
 def keep(path: Path, trials: list[Trial]) -> None:
     """Writes a table of trials, sorted.
 
-    Raises InputError: the table has rows that are not among them; it is kept.
+    Raises InputError: the existing table has rows that are not among `trials`; it is kept.
     """
     new = sorted(trials, key=lambda one: (one.policy, one.task, one.lighting, one.seed))
     gone = set(read_trials(path)) - set(new) if path.exists() else set()
@@ -83,7 +83,7 @@ def keep(path: Path, trials: list[Trial]) -> None:
 
 
 def read_place(folder: Path, place: int, policies: tuple[str, ...], days: list[str]) -> PlaceRecord | None:
-    """The record of a place; None unless all of it was driven."""
+    """The record of a place; None if trials or episodes are missing."""
     if not (folder / TRIALS).exists() or not (folder / EPISODES).exists():
         return None
     twin, real = _counts(read_trials(folder / EPISODES)), _counts(read_trials(folder / TRIALS))

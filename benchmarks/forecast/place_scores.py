@@ -1,15 +1,16 @@
 """Scores of a forecast experiment over places, from the kept tables alone.
 
-The forecast of a policy on a day is its success rate in the twin under the lighting of that day's photo (of a day whose
-photo could not be placed: under held-out lightings). Baselines do not look at the twin: the success of other policies
-on the road, at *other places* only, and the twin's own rates with the days shuffled.
+The forecast of a policy on a day is its success rate in the twin under the lighting of that day's photo, or
+under held-out lightings if the photo could not be placed. The baselines are success on the road at *other places* only,
+which does not use the twin, and the twin's own rates with the days shuffled.
 
-- within: mean over places of Spearman, MMRV and regret of the place's policies; over all: of all policies together.
+- within: mean over places of Spearman, MMRV and regret of the place's policies; over all: the statistic of
+  the policies of all places together.
 - single days: mean over places of the log and Brier scores of all cells; *gain* is a baseline's log score minus the
-  twin's, above 0 where the twin is better.
+  twin's, above 0 if the twin is better.
 
-Intervals (90 %) have the place as their unit (`twin.evaluation.jackknife`): they are about experiments at other places.
-There are none for fewer than five places.
+Intervals (90 %) have the place as their unit (`twin.evaluation.jackknife`), so they hold for experiments at other
+places. There are none for fewer than five places.
 """
 
 from collections.abc import Callable
@@ -93,7 +94,10 @@ def _held_out(one: PlaceRecord) -> Array:
 
 
 def _elsewhere(places: list[PlaceRecord], one: PlaceRecord, by_setup: bool) -> Array:
-    """Success on the road at other places, shape (n,): of all setups, or of the same, shrunk as by a place more."""
+    """Success on the road at other places, shape (n,).
+
+    The mean of all setups, or if `by_setup`, the mean of each setup, shrunk by one more place with the mean of all.
+    """
     others = [_real(other).mean(1) for other in places if other is not one]
     if not others:
         return np.full(len(one.policies), np.nan)
@@ -104,7 +108,7 @@ def _elsewhere(places: list[PlaceRecord], one: PlaceRecord, by_setup: bool) -> A
 
 
 def _predicted(places: list[PlaceRecord], one: PlaceRecord, name: str) -> Array:
-    """A predictor's probability of every cell."""
+    """A predictor's probability of success in every cell, shape (n, k)."""
     flat = {
         HELD_OUT: lambda: twin_probabilities(one.held_out[:, None, 0], one.held_out[:, None, 1])[:, 0],
         SETUP: lambda: _elsewhere(places, one, True),
@@ -116,7 +120,7 @@ def _predicted(places: list[PlaceRecord], one: PlaceRecord, name: str) -> Array:
 
 
 def _cells(places: list[PlaceRecord], one: PlaceRecord, name: str) -> PairedCells:
-    """Rates of policies as the rankings use them: the twin's are counts, not shrunk."""
+    """Predicted and real rates for the rankings; the twin's are ratios of counts, without shrinkage."""
     predicted = one.twin[..., 0] / one.twin[..., 1] if name == TWIN else _predicted(places, one, name)
     n, k = predicted.shape
     day = np.broadcast_to(np.arange(k), (n, k))
@@ -156,7 +160,7 @@ def _alone(data: PairedCells) -> dict[str, float | None]:
 
 
 def _over_places(statistic: Statistic, places: list[PairedCells], pooled: bool) -> dict[str, float | None]:
-    """A statistic over places with its interval; nulls where it has none."""
+    """A statistic over places with its interval; None for values that are undefined."""
     if not places:
         return {"value": None, "low": None, "high": None}
     try:
@@ -213,7 +217,7 @@ def _gain(log: list[float], twin: list[float]) -> dict[str, float | None]:
 
 
 def _met(protocol: Protocol, out: dict[str, Any]) -> dict[str, bool | None]:
-    """Whether each wanted figure is reached; null while it is undefined."""
+    """Wanted figure → True if it is reached; None if it is undefined."""
     ranking = out["ranking"][TWIN]
     varied = [row["real"] for row in out["road"] if row["setup"] == next(iter(protocol.setups))]
     figures = {

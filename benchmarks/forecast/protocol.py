@@ -1,4 +1,4 @@
-"""Protocol of the forecast experiment: places, days, trials and setups, and what must hold (`protocol.toml`)."""
+"""Protocol of the forecast experiment: places, days, trials, setups, and the wanted scores (`protocol.toml`)."""
 
 import tomllib
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 
 PROTOCOL = Path(__file__).with_name("protocol.toml")
 FIRST_TEST_PLACE = 100
-"""Places below this number were looked at in development."""
+"""Places below this number were examined during development."""
 _FIRST_LIGHTING = "{first}"
 
 
@@ -27,7 +27,7 @@ class Protocol:
     held_out_episodes: int
     trials: int
     setups: dict[str, tuple[str, ...]]
-    """Name → options of `twin.train`; a place has one training of each, with the setup's name."""
+    """Name → options of `twin.train`; a place has one training per setup, under the setup's name."""
     wanted: dict[str, float]
 
     @property

@@ -1,7 +1,7 @@
 """Targets of the fuzzer `benchmarks/fuzz.py`.
 
 `cases` runs one case and applies the oracle; `values` mutates texts, trees and bytes; `samples` holds the valid files
-that cases start from; the other modules hold the targets by the kind of input, listed in `targets`. Every draw comes
-from the case's `random.Random`, which is seeded by (seed, target name, case number): renaming a target or reordering
-its draws changes its cases.
+that cases start from; the other modules hold the targets by the kind of input, listed in `targets`. Every random choice
+comes from the case's `random.Random`, which is seeded by (seed, target name, case number): renaming a target or
+reordering its draws changes its cases.
 """

@@ -18,7 +18,7 @@ STAGES = {"2_metric": "metric", "3_field": "field", "4_mesh": "mesh", "5_mjcf": 
 
 
 def lighting(case: Case) -> None:
-    """A lighting added from a photo."""
+    """A mutated file of a lighting that was added from a photo."""
     import twin
     from twin.scene import stage_result
 
@@ -111,7 +111,7 @@ def _mutate_npz(rng: Random, path: Path) -> None:
 
 
 def stage_parts(case: Case) -> None:
-    """Files of stages without their stamps: sparse points, captures, cameras."""
+    """A corrupted file of sparse points, a capture or cameras, without a stamp."""
     from twin.capture.capture_data import Capture, SourceInfo
     from twin.geometry.cameras import Cameras, SparsePoints
 
@@ -149,7 +149,7 @@ def forecast(case: Case) -> None:
 
 
 def run_metadata(case: Case) -> None:
-    """JSON beside runs and validations: what was trained and validated, configs, checkpoints, choices."""
+    """JSON files of runs and validations: summaries of trainings, configs, checkpoints, choices."""
     from twin.evaluation.training_curves import CHOICE_FILE, write_success_curve
     from twin.learn import sac, selection, training
 

@@ -88,7 +88,7 @@ def image(case: Case) -> None:
 
 
 def _with_forged_size(rng: Random, suffix: str, data: bytes) -> bytes:
-    """An image whose header states another size, with a valid checksum; corrupted where the format is not handled."""
+    """An image whose header states another size, with a valid checksum; for other formats, corrupted bytes."""
     out = bytearray(data)
     sizes = [rng.choice((0, 1, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 30_000)) for _ in range(2)]
     if suffix == ".png":

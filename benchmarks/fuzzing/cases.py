@@ -1,11 +1,11 @@
 """One fuzz case and its oracle.
 
-A target passes where it returns, or raises `InputError` with one line of fewer than `MAX_MESSAGE` characters. A verb
-passes where it exits with 0, or with 2 and one such line on standard error. Every other outcome is a failure: another
+A target passes if it returns, or raises `InputError` with one line of fewer than `MAX_MESSAGE` characters. A verb
+passes if it exits with 0, or with 2 and one such line on standard error. Every other outcome is a failure: another
 exception, too much time or memory, a file changed outside the case's folder, a planted payload that ran.
 
-A working folder holds `case` (the case's own, writable), `cwd` and `kept` (must not change) and the `marker` that a
-payload writes.
+A working folder contains the folders `case` (only there may the case write), `cwd` and `kept` (both must not change),
+and the file `marker` if a payload has run.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ class Case:
 
     rng: Random
     folder: Path
-    """Empty; the only folder that the case may write to."""
+    """An empty folder, the only one that the case may write to."""
     samples: Any
     """`samples.Samples` of this process; None on the command line."""
 
@@ -53,7 +53,7 @@ class Target:
     weight: float
     """Relative number of its cases."""
     run: Callable[[Case], bool | None]
-    """Runs a case; returns False where a verb refused."""
+    """Runs a case; returns False if a verb refused its input."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Outcome:
     failure: str = ""
     """Reason of the failure; empty if the case passed."""
     line: str = ""
-    """Source line that raised."""
+    """Source line that raised the error."""
     seconds: float = 0.0
     memory: int = 0
     """Peak resident memory [bytes]."""
@@ -94,7 +94,7 @@ def run_case(target: Target, seed: int, k: int, work: Path, samples: Any, second
             accepted = target.run(case) is not False
     except InputError as error:
         failure = _message_fault(str(error))
-    except OSError as error:  # verbs print it as one line
+    except OSError as error:  # passes only if a name is too long
         failure = "" if error.errno == errno.ENAMETOOLONG else _text(error)
         line = _source_line(error)
     except _TimeLimitExceeded as error:
@@ -166,7 +166,7 @@ def time_limit(seconds: float) -> Iterator[None]:
         raise _TimeLimitExceeded
 
     former = signal.signal(signal.SIGALRM, expire)
-    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # repeats in case the target swallows the first
+    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # repeats in case the target catches the first exception
     try:
         yield
     finally:
@@ -182,7 +182,7 @@ def _text(error: BaseException) -> str:
 
 
 def _source_line(error: BaseException) -> str:
-    """Innermost line of twin that raised; of a library if none is in twin."""
+    """Innermost source line of twin in the traceback, or of a library if there is none of twin."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = [frame for frame in frames if "/twin/" in frame.filename]
     frame = (ours or frames)[-1]
@@ -227,7 +227,7 @@ def _reset_peak_memory() -> None:
 
 
 def _peak_memory() -> int:
-    """[bytes] resident since the last reset; since the start of the process where the system has no reset."""
+    """Peak resident memory [bytes] since the last reset, or since the start of the process without such a reset."""
     try:
         status = Path("/proc/self/status").read_text()
         return int(status.split("VmHWM:")[1].split()[0]) << 10

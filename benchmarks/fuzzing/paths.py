@@ -1,4 +1,4 @@
-"""Fuzz target of paths that are no regular, readable file: pipes, devices, loops, sockets, odd names."""
+"""Fuzz target of paths that are not regular, readable files: pipes, devices, loops, sockets, odd names."""
 
 import contextlib
 import os

@@ -35,7 +35,7 @@ def policy_folder(case: Case) -> None:
 
 
 def _mutated_safetensors(rng: Random, data: bytes) -> bytes:
-    """A safetensors file with a mutated header, or corrupted."""
+    """A safetensors file with a mutated header or corrupted bytes."""
     if rng.random() >= 0.5:
         return corrupted(rng, data)
     size = struct.unpack("<Q", data[:8])[0]

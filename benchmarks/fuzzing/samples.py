@@ -59,7 +59,7 @@ class Samples:
     def __init__(self, work: Path) -> None:
         self.folder = work / "stuff"
         self.folder.mkdir()
-        _ = self.twin, self.film, self.bags  # made here, as the snapshots of cases must not see them appear
+        _ = self.twin, self.film, self.bags  # made now, so that they do not appear as changes by a case
 
     @cached_property
     def twin(self) -> Path:
@@ -150,7 +150,7 @@ class Samples:
 
     @cached_property
     def environment(self) -> Any:
-        """An environment without pixels, reset."""
+        """An environment without pixels, after a reset."""
         import twin
 
         environment = twin.load(self.twin, "ahead", 0, pixels=False)

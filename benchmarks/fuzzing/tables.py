@@ -13,7 +13,7 @@ from fuzzing.values import corrupted, hostile_literal, hostile_text, mutated_tex
 
 
 def mutated_csv(rng: Random, text: str) -> bytes:
-    """A CSV with one or two changes to its cells or rows, then as `mutated_text`."""
+    """Bytes of a CSV with one or two changed cells or rows, further mutated by `mutated_text`."""
     rows = [line.split(",") for line in text.splitlines()]
     for _ in range(rng.choice((1, 1, 2))):
         row = rng.choice(rows[1:] if rng.random() < 0.8 else rows)
@@ -65,7 +65,7 @@ def log_csv(case: Case) -> None:
 
 
 def log_npz(case: Case) -> None:
-    """A log with up to two hostile columns; then, in some cases, forged or corrupted as a file."""
+    """A log with up to two hostile columns; in some cases, its file is then forged or corrupted."""
     from twin.sysid.logs import read_log
 
     rng, columns = case.rng, dict(case.samples.log)

@@ -1,6 +1,6 @@
 """Hostile values and mutations of valid ones: Python objects, JSON and TOML trees, texts, bytes.
 
-Every draw comes from the `random.Random` that is passed in.
+Every random choice comes from the `random.Random` that is passed in.
 """
 
 import copy
@@ -57,7 +57,7 @@ _OBJECTS: tuple[Any, ...] = (
 
 
 def hostile_text(rng: Random) -> str:
-    """A hostile text; 1 % of them have a megabyte."""
+    """A hostile text; in 1 % of calls it has a megabyte."""
     return "x" * 1_000_000 if rng.random() < 0.01 else rng.choice(_WORDS)
 
 
@@ -169,7 +169,7 @@ def _toml(value: Any) -> str:
 
 
 def mutated_json(rng: Random, tree: Any) -> bytes:
-    """JSON of a mutated copy of a tree, as `mutated_text` of it."""
+    """JSON of a mutated copy of a tree, further mutated by `mutated_text`."""
     return mutated_text(rng, json_text(mutated(rng, tree)))
 
 

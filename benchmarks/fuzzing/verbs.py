@@ -1,4 +1,4 @@
-"""Fuzz target of verbs: command lines that a verb must refuse, or finish at once."""
+"""Fuzz target of verbs: command lines that a verb must refuse or finish quickly."""
 
 import os
 import shutil
@@ -66,7 +66,7 @@ def verb(case: Case) -> bool:
 
 
 def command_of(case: Case) -> list[str]:
-    """Arguments of `twin`: a verb and its own."""
+    """Arguments of `twin`: a verb and the verb's arguments."""
     rng = case.rng
     name = rng.choice(VERBS)
     if name == "reality":
@@ -110,7 +110,7 @@ def _value(case: Case, option: str, valid: Sequence[str]) -> str:
         value = override(rng)[:100_000].replace("\x00", "")
         errors = "surrogateescape" if "\ud800" not in value else "replace"
         value = value.encode("utf-8", errors).decode("utf-8", "replace")
-    if option in _OUTPUTS:  # a verb writes where the user asks, so outputs stay in the case's folder
+    if option in _OUTPUTS:  # a verb writes where the user asks; this keeps outputs in the case's folder
         value = str(case.folder / value[:250].strip("/").replace("..", "")) if value else ""
     return value
 

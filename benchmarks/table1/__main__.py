@@ -11,10 +11,10 @@ Steps, each a command of `twin` that resumes where it was interrupted:
 - real: drives every policy in the known-truth world under weather that was not filmed.
 - forecast: forecasts real success, once from held-out lightings, once from the photos.
 
-The published plan is the default; the same call with more seeds adds runs. `results.json` beside this file records
+The defaults are the published plan; the same call with more seeds adds runs. `results.json` beside this file records
 every run. It is never overwritten by a record with fewer runs, policies, days or trials: the command then ends with
 status 2, the new record is in `results.json.partial`, and `--results` names another file for it. `plan.py` defines
-setups, sizes and checkpoints. The first tables printed are those of `scores.py`, which needs `results.json` alone.
+setups, sizes and checkpoints. The first tables printed are those of `scores.py`, which needs only `results.json`.
 """
 
 import argparse
@@ -94,7 +94,10 @@ def real(scene: Path, run: Run) -> None:
 
 
 def forecast(scene: Path) -> None:
-    """Forecasts from held-out lightings, kept in `HELD_OUT_FORECAST`, then from photos, if validated under them."""
+    """Forecasts from held-out lightings, then from photos for the policies that were validated under these.
+
+    The first forecast is then kept in `HELD_OUT_FORECAST`.
+    """
     tables = sorted(path for path in (scene / "real").glob("*_*.csv") if path.stem.split("_")[0] in TASKS)
     rows = [row for path in tables if not path.stem.endswith("_trials") for row in _rows(path)]
     _forecast(scene, "results.csv", rows)

@@ -31,7 +31,7 @@ from twin.types import Image
 
 _WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] total width, gap between images, height of a caption
 _PER_ROW = 5  # images
-_SEEDS = range(1, 1 + _PER_ROW)  # of the twin's images
+_SEEDS = range(1, 1 + _PER_ROW)  # of the episodes that the twin's images show
 _SHOWN = list(WEATHER)[: 2 * _PER_ROW]
 _PAPER = {
     INK: "#16202a",

@@ -23,13 +23,16 @@ SETUPS: dict[str, tuple[str, ...]] = {
 }
 """Name → options of `twin.train`."""
 STEPS = {"straight": 12_000, "right": 16_000}
-"""Most steps. The published runs took them all; by now a training ends when it has learnt (`twin.learn.selection`)."""
+"""Largest number of steps. Published runs used all; a training now ends once it has learnt (`twin.learn.selection`)."""
 SHARES = (0.25, 0.5)
 """Fractions of a run's steps at which checkpoints are taken for the forecast."""
 EPISODES = 50
 """Episodes in the twin per policy and held-out lighting."""
 LIGHTINGS = {"final": (HELD_OUT, str(Condition(HELD_OUT, True))), "checkpoint": (str(Condition(HELD_OUT, True)),)}
-"""Lightings of the twin. Forecasts use the randomised one; the paper's table, of finished policies, the other."""
+"""Lightings in the twin for finished policies and for checkpoints.
+
+Forecasts use the randomised condition. The paper's table, which has only finished policies, uses the other one.
+"""
 PHOTOS = tuple(str(Condition(name, True)) for name in WEATHER)
 """Lightings of the twin from a photo of each test day, for forecasts per weather."""
 PHOTO_EPISODES = 5
@@ -44,7 +47,7 @@ PAPER: dict[tuple[str, str], tuple[float, float, float]] = {
     ("one_light", "right"): (1.00, 0.95, 0.67),
     ("varied", "right"): (1.00, 1.00, 0.83),
 }
-"""Training, validation and real success, arXiv 2403.15791, table 1."""
+"""Success in training, in validation and on the road, arXiv 2403.15791, table 1."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class Run:
         return scene / "runs" / self.name
 
     def checkpoints(self, scene: Path) -> list[Path]:
-        """Checkpoints for the forecast: the last one of each of `SHARES`, up to 100 steps late."""
+        """Checkpoints for the forecast: for each of `SHARES`, the last one saved up to 100 steps after it."""
         saved = sorted((self.folder(scene) / "checkpoints").glob("*"), key=lambda path: int(path.name))
         before = [[path for path in saved if int(path.name) <= share * STEPS[self.task] + 100] for share in SHARES]
         return [some[-1] for some in before if some]
@@ -77,5 +80,5 @@ class Run:
 
 
 def runs(seeds: list[int], tasks: list[str], setups: list[str]) -> list[Run]:
-    """Runs of all cells, seed by seed."""
+    """Runs of all combinations, seed by seed."""
     return [Run(task, setup, seed) for seed in seeds for setup in setups for task in tasks]

@@ -16,7 +16,7 @@ from twin.files import read_json
 _EVALUATIONS = ("validate", "validate_randomised", "validate_by_photo", "real")
 _BY_DAY = ("validate_by_photo", "real")
 HELD_OUT_FORECAST = "forecast_held_out"
-"""Folder of the held-out forecast; `forecast` then holds the one from photos."""
+"""Folder of the forecast from held-out lightings, if `forecast` contains the one from photos."""
 FORECAST = (
     "pearson",
     "spearman",
@@ -101,7 +101,7 @@ def _training(folder: Path) -> dict[str, Any]:
 
 
 def _own_kind(choice: dict[str, Any]) -> dict[str, Any]:
-    """Episodes of the chosen policy in the training's own lighting; its last word is under held-out lightings."""
+    """Test of the chosen policy in the training's own lighting; `choice["chosen"]` is its test under held-out ones."""
     return next(one for one in choice["candidates"] if one["step"] == choice["chosen"]["step"])
 
 

@@ -1,16 +1,16 @@
-"""Scores of the experiment, computed from `results.json`; days that no choice had seen come first.
+"""Scores of the experiment, computed from `results.json`, first for the days that influenced no choice.
 
     python benchmarks/table1/scores.py [--results FILE]
 
-Prints success on the road by groups of days; how well the twin's rates rank the policies there; how well it predicts
-single days, by proper scores against baselines that do not look at the twin; and its false alarms and missed failures.
-Rates on the road have intervals over days. Ranking and scores have the forecast's intervals, about further trainings
-and days on this street (`twin/evaluation/jackknife.py`; coverage in this shape: `benchmarks/intervals.py`). A *rule*
-that does not use the twin is a baseline of the ranking; see `rule`.
+Prints success on the road by groups of days; how well the twin's rates rank the policies there; how well the twin
+predicts single days, in proper scores, compared with baselines that do not use the twin; and its false alarms and
+missed failures. Rates on the road have intervals over days. Ranking and scores have a forecast's intervals, which hold
+for further trainings and days on this street (`twin/evaluation/jackknife.py`; coverage in this shape:
+`benchmarks/intervals.py`). A *rule* that does not use the twin is a baseline of the ranking; see `rule`.
 
 A *choice* is a decision made while trials or images of a day were known: the training methods, developed in the five
-stated weathers, and the fraction of the weather randomisation kept beside a photo, measured on images of these and of
-days 1 to 5. Days 6 to 15 were driven after everything was fixed.
+stated weathers, and the fraction of the weather randomisation that is kept if there is a photo, measured on images of
+these weathers and of days 1 to 5. Days 6 to 15 were driven after everything was fixed.
 """
 
 import argparse
@@ -65,7 +65,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 RULE_TRIALS = 5
 """Episodes per day assumed for the rule, as many as in the twin."""
-_HALF = max(SHARES) - 0.05  # fraction of a training; checkpoints are saved within 100 steps of the fraction
+_HALF = max(SHARES) - 0.05  # of a training, with a tolerance: checkpoints are saved within 100 steps of it
 
 Counts = dict[str, tuple[int, int]]
 """Successes and trials by weather."""
@@ -81,7 +81,7 @@ class PolicyRecord:
     trained: float
     """Fraction of its training that is done, 1 for a finished policy."""
     twin: Counts
-    """In the twin under a lighting from a photo of each day."""
+    """Counts in the twin under a lighting from a photo of each day."""
     held_out: float
     """Success rate in the twin under held-out lightings with everything else randomised."""
     real: Counts
@@ -114,9 +114,9 @@ def counts(part: dict[str, Any]) -> Counts:
 
 
 def rule(policy: PolicyRecord) -> float:
-    """A baseline without the twin: 1 if lightings varied in training and at least half of it is done, else 0.
+    """A baseline without the twin: 1 if lightings varied in training and at least half the training is done, else 0.
 
-    It was formulated when all trials were known.
+    The rule was formulated after all trials were known.
     """
     return float(policy.setup == "varied" and policy.trained >= _HALF)
 
@@ -148,13 +148,13 @@ class Scores:
     intervals: dict[str, tuple[float, float] | None]
     """Statistic → its 90 % interval; None where there is none."""
     regret: float | None
-    """Mean over tasks."""
+    """Mean regret over tasks."""
     bias: float
     """Mean over policies of real minus predicted rate."""
     cells: float | None
     """Fraction of the cells whose predicted and real counts are compatible; None if the predictor has no counts."""
     corrected: tuple[int, int]
-    """Number of policies within the interval predicted from the task's other trainings, and number of intervals."""
+    """Number of policies in their interval predicted from the task's other trainings, and number of intervals."""
 
 
 def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> Scores | None:
@@ -182,7 +182,7 @@ def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]
 
 
 def paired_cells(policies: Sequence[PolicyRecord], days: Sequence[str], twin: np.ndarray) -> PairedCells:
-    """Real rates of policies on days with predictions (n, k), as units of the jackknife."""
+    """Real rates of policies on days, and predictions `twin` (n, k) of them, as units of the jackknife."""
     tasks, runs = [policy.task for policy in policies], [training_of(policy.name) for policy in policies]
     return PairedCells(
         twin=twin,
@@ -225,7 +225,7 @@ class DayScores:
 
 
 def probabilities(policies: Sequence[PolicyRecord], days: Sequence[str]) -> tuple[PairedCells, dict[str, np.ndarray]]:
-    """The cells, and the probability of success by predictor, shapes (n, k); baselines use other trainings alone."""
+    """The cells, and the probability of success by predictor, shapes (n, k); baselines use only other trainings."""
     counts_ = np.array([[policy.twin[day] for day in days] for policy in policies])
     twin = twin_probabilities(counts_[..., 0], counts_[..., 1])
     data = paired_cells(policies, days, twin)
@@ -314,7 +314,7 @@ def _defined(statistic: Callable[..., float], twin: np.ndarray, real: np.ndarray
 
 
 def _cells_held(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> float | None:
-    """Fraction of cells compatible as in the forecast: the interval of the difference of rates contains 0."""
+    """Fraction of cells that agree as in a forecast: the interval of the difference of their rates contains 0."""
     if predictor not in ("twin, by a photo of each day", "rule without the twin"):
         return None
     predicted = [
@@ -340,7 +340,7 @@ def over_days(parts: Sequence[Counts]) -> str:
     """Mean over days of the rates of several policies, its interval over days, and the counts.
 
     Args:
-        parts: Counts by policy, all of the same days.
+        parts: Counts of each policy, all on the same days.
 
     Returns:
         "0.05 [0.01, 0.20], 15/250"; "–" without trials.
