@@ -1,8 +1,9 @@
 """Gaussian splats (Kerbl et al. 2023, "3D Gaussian Splatting") of a radiance field, and their `.ply` files.
 
-These Gaussians are not fitted to photos. Each is a pixel of a view rendered from a filmed pose: a disk as large as the
-pixel's footprint on the surface; where views overlap, the smallest is kept. Their color does not depend on the viewing
-direction. Gaussians of one set of views have the same geometry under every lighting and differ in color alone.
+These Gaussians are not fitted to photos. Each is made from one pixel of a view rendered from a filmed pose: it is a
+disk as large as the pixel's footprint on the surface. Where views overlap, the smallest disk is kept. The colors do not
+depend on the viewing direction. Gaussians of one set of views have the same geometry under every lighting; only their
+colors differ.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,12 +23,12 @@ from twin.types import Array
 
 VIEWS, WIDTH = 60, 320
 """Number of rendered views, and their width [px]."""
-FAR = 100.0  # [m] beyond which geometry becomes background
+FAR = 100.0  # [m] geometry at a larger depth becomes background
 _BACKGROUND = 150.0  # [m] distance of the background's splats
-_MIN_SKY, _MAX_SKY = 500, 50_000  # pixels that the sky's color is fitted to
-_SKY_TOLERANCE = 30.0  # rms difference over lightings and channels, of 255, up to which a color is the sky's
-_BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3  # the same, and within how many pixels [px], beside the former
-_MIN_CELL = 0.01  # [m] side of the smallest thinning cell, which keeps one Gaussian
+_MIN_SKY, _MAX_SKY = 500, 50_000  # number of pixels that the sky's color is fitted to
+_SKY_TOLERANCE = 30.0  # of 255; a color is the sky's if their rms difference (lightings, channels) is smaller
+_BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3  # larger tolerance, which holds up to so many pixels beside the sky's [px]
+_MIN_CELL = 0.01  # [m] side of the smallest thinning cell; each cell keeps one Gaussian
 _DISK, _THICKNESS = 0.8, 0.2  # standard deviations along the surface and across it [pixel widths]
 _MAX_ELONGATION = 4.0  # length / width of a disk seen at a grazing angle
 _OPACITY = 0.97
@@ -39,7 +40,7 @@ class Gaussians:
     """k disks, each with a normal along its z axis."""
 
     positions: NDArray[np.float32]
-    """[m], shape (k, 3)."""
+    """Centers [m], shape (k, 3)."""
     rotations: NDArray[np.float32]
     """Quaternions w, x, y, z, shape (k, 4)."""
     scales: NDArray[np.float32]
@@ -50,7 +51,7 @@ class Gaussians:
     """In (0, 1), shape (k,)."""
 
     def render_settings(self) -> dict[str, NDArray[np.float32]]:
-        """Arguments of `mujoco_warp.create_render_context` that make it draw these splats."""
+        """Arguments for `mujoco_warp.create_render_context`, which then draws these splats."""
         return {
             "splat_position": np.ascontiguousarray(self.positions),
             "splat_rotation": np.ascontiguousarray(self.rotations),
@@ -84,12 +85,12 @@ _MAX_COORDINATE = 1e6  # [m]
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Reads a binary `.ply` of 3DGS trainers and viewers, in the frame that the file has.
+    """Reads a binary `.ply` as 3DGS trainers and viewers write it; the coordinate frame is that of the file.
 
-    Only the constant color is kept, no higher spherical harmonics. Gaussians that are not finite are left out.
+    Only the constant color is kept; higher spherical harmonics are ignored. Gaussians that are not finite are left out.
 
     Raises:
-        InputError: no such file, another format, or one cut off.
+        InputError: The file does not exist, has another format, or is cut off.
     """
     content = read_bytes(path, _MAX_PLY)
     cure = "expected a 3D Gaussian splat .ply (binary, little endian), as 3DGS trainers write"
@@ -140,7 +141,7 @@ _COLUMNS = {"f_dc": 3, "scale": 3, "rot": 4}
 
 
 def views_by_lighting(field: ColorField, cameras: Cameras, lightings: Sequence[str]) -> dict[str, Views]:
-    """The views that Gaussians are made of, in air without fog, under each of the lightings; all have the same depth.
+    """Views under each lighting, in air without fog, from which Gaussians are made; all have the same depth.
 
     Raises:
         InputError: unknown lighting.
@@ -154,7 +155,7 @@ def views_by_lighting(field: ColorField, cameras: Cameras, lightings: Sequence[s
 
 
 def gaussians_by_lighting(views: Mapping[str, Views]) -> dict[str, Gaussians]:
-    """Gaussians under each lighting of `views_by_lighting`: the same ones in other colors."""
+    """Gaussians under each lighting of `views_by_lighting`; they differ in color only."""
     splats, pixel = gaussians_of_views(next(iter(views.values())), _BACKGROUND)
     return {name: replace(splats, rgb=_colors(one, pixel)) for name, one in views.items()}
 
@@ -162,9 +163,10 @@ def gaussians_by_lighting(views: Mapping[str, Views]) -> dict[str, Gaussians]:
 def sky_on_surfaces(views: Sequence[Views]) -> NDArray[np.bool_]:
     """Mask of pixels (n, h, w) that show the sky's color on something nearer, such as a gap in a crown.
 
-    Seen from elsewhere they would be blue clumps; they belong to the background. The sky's color is fitted to the
-    pixels of the background as a quadratic function of the direction; a pixel above the horizon has that color if it
-    does under every lighting. Pixels beside such ones may differ more from it, as they blend it with leaves.
+    Seen from elsewhere, Gaussians of such pixels would look like blue clumps; they belong to the background. The sky's
+    color under each lighting is a quadratic function of the direction, fitted to the pixels of the background. A pixel
+    above the horizon is in the mask if its mean square difference from that color, over all lightings, is small. For
+    pixels beside it the limit is larger, since they blend the sky's color with that of leaves.
 
     Args:
         views: The same views under each filmed lighting.
@@ -196,7 +198,7 @@ def gaussians_of_views(views: Views, background: float) -> tuple[Gaussians, NDAr
     Pixels of depth 0 are skipped; depths are limited to `background` [m].
 
     Returns:
-        k Gaussians, and the pixel of each as an index into the views' (n · h · w) pixels, shape (k,).
+        k Gaussians, and for each the index (k,) of its pixel among the n · h · w pixels of the views.
     """
     columns: list[list[NDArray]] = []
     for i in range(len(views)):
@@ -238,7 +240,7 @@ def _colors(views: Views, pixel: NDArray[np.int64]) -> NDArray[np.float32]:
 
 
 def _surface_normals(points: Array) -> Array:
-    """Unit normals (h, w, 3) of a grid of points, from differences to the nearer neighbor along each axis."""
+    """Unit normals (h, w, 3) of a grid of points, from the differences to the nearer neighbor along each grid axis."""
 
     def difference(axis: int) -> Array:
         step = np.diff(points, axis=axis)
@@ -252,9 +254,9 @@ def _surface_normals(points: Array) -> Array:
 
 
 def select_sharpest(points: Array, width: Array) -> NDArray[np.int64]:
-    """Indices of the points (k, 3) to keep: in each cell without a finer point, that of the smallest width (k,) [m].
+    """Indices of the points (k, 3) to keep: the point of smallest width (k,) [m] in each cell that has no finer point.
 
-    A point's cell size is its width, rounded up to `_MIN_CELL` times a power of two.
+    The side of a point's cell is its width, rounded up to `_MIN_CELL` times a power of two.
     """
     level = np.maximum(np.ceil(np.log2(width / _MIN_CELL)), 0).astype(int)
     kept: list[NDArray[np.int64]] = []
