@@ -50,7 +50,7 @@ class Ground:
         return Ground(self.height[nodes], self.origin, self.cell * n, self.measured[nodes], self.rgb[nodes])
 
     def triangles(self, cell: float, max_faces: int) -> tuple[Array, NDArray[np.int64]]:
-        """Vertices (v, 3) [m] and upward faces (f, 3) on every n-th node. Nodes are ≥ `cell` [m] apart; f ≤ `max_faces`."""
+        """Vertices (v, 3) [m] and upward faces (f, 3) about `cell` [m] wide, or wider to limit them to `max_faces`."""
         rows, columns = self.height.shape
         step = max(1, round(cell / self.cell), int(np.ceil(np.sqrt(2 * rows * columns / max_faces))))
         row, column = (np.unique(np.append(np.arange(0, n, step), n - 1)) for n in (rows, columns))
@@ -266,7 +266,7 @@ class HeightGrid:
         return self.origin + self.cell * np.stack([x, y], -1)
 
     def sample(self, height: Array, xy: Array, order: int = 1) -> Array:
-        """Heights [m] at points (..., 2), from splines through the nodes' `height` (rows, columns); clamped to the edge."""
+        """Heights [m] at points (..., 2), by splines through the nodes' (rows, columns); clamped to the edge."""
         return _interpolate(height, self.origin, self.cell, xy, order)
 
 
