@@ -1,12 +1,12 @@
 """Convex decomposition of closed meshes by CoACD (Wei et al. 2022), with checked results.
 
-*Piece*: a closed mesh to decompose. *Part*: a closed convex hull. *Protrusion*: largest distance by which a part's
-surface lies outside its piece [m]. *Uncovered*: fraction of a piece's surface that is further than the protrusion bound
-from every part.
+*Piece*: a closed mesh to decompose. *Part*: a closed convex hull. *Protrusion* [m]: the largest
+distance by which a part's surface lies outside its piece. *Uncovered*: the fraction of a piece's surface whose
+distance to every part exceeds the protrusion bound.
 
-CoACD has crashed, enlarged shapes, closed doorways and returned different results for the same seed. So it runs in
-child processes with one thread and a time limit, its results are cached by a hash of the input, and parts that protrude
-too far are split.
+CoACD has crashed, enlarged shapes, closed doorways, and returned different results for one seed. So it runs in child
+processes with one thread and a time limit. Its results are cached by a hash of the input. Parts that protrude too far
+are split.
 """
 
 import hashlib
@@ -30,10 +30,10 @@ from twin.files import digest_json, load_arrays, save_arrays
 from twin.runtime import child_environment, die_with_parent
 from twin.types import Array
 
-_MAX_COACD_FACES = 400  # CoACD gets meshes decimated to this, since its time grows fast; checks use all faces
+_MAX_COACD_FACES = 400  # larger meshes are decimated for CoACD, since its time grows fast; checks use all faces
 # Results are checked, so a coarser search than CoACD's defaults suffices.
 _SEARCH = {"resolution": 100, "mcts_nodes": 5, "mcts_iterations": 10, "mcts_max_depth": 2}
-_TIME_LIMIT = 120.0  # [s] per piece, far more than any piece needs, so that a busy machine does not change the result
+_TIME_LIMIT = 120.0  # [s] per piece; far more than any piece needs, so that a busy machine does not change the result
 _PROCESSES = 2
 _MAX_HULL_VERTICES = 32
 _SAMPLE_SPACING = 0.06  # [m] between test points on surfaces
@@ -85,7 +85,7 @@ class SolidPiece:
     def from_mesh(
         vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]] | None = None
     ) -> "SolidPiece":
-        """Samples a mesh. `inside` may be a faster test than the default, which computes winding numbers."""
+        """Samples a mesh. `inside` may be given as a faster test than the default, which computes winding numbers."""
         vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
         samples = surface_samples(vertices, faces, _SAMPLE_SPACING)
 
@@ -95,7 +95,7 @@ class SolidPiece:
         return SolidPiece(vertices, faces, samples, cKDTree(samples), inside or by_winding)
 
     def protrusion(self, part: ConvexPart) -> float:
-        """Protrusion of a part [m], overestimated by up to half the sample spacing."""
+        """Protrusion of a part [m]. It may be overestimated by up to half the sample spacing."""
         points = surface_samples(part.vertices, part.faces, 2 * _SAMPLE_SPACING)
         away = self.tree.query(points)[0]
         far = away > _SAMPLE_SPACING
@@ -158,8 +158,8 @@ def split_to_bound(
     """Splits a part until no part protrudes by more than `bound` [m], or `max_splits` times; returns the parts with
     their protrusions [m].
 
-    A split divides the piece's surface inside the part at the middle of its longest axis, and takes the hull of each
-    half.
+    A split takes the samples of the piece's surface inside the part, divides them in the middle of their longest
+    axis, and takes the hull of each half.
     """
     protrusion = piece.protrusion(part)
     if max_splits == 0 or protrusion <= bound:
@@ -187,7 +187,7 @@ def inside_hull(part: ConvexPart, points: Array, slack: float = 0.0) -> NDArray[
 
 
 def half_spaces(part: ConvexPart) -> tuple[Array, Array]:
-    """Outward normals (f, 3) and offsets (f,) of the faces; inside, normal · x ≤ offset."""
+    """Outward normals (f, 3) and offsets (f,) of the faces; points x inside have normal · x ≤ offset."""
     a, b, c = (part.vertices[part.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
@@ -197,7 +197,7 @@ def half_spaces(part: ConvexPart) -> tuple[Array, Array]:
 
 
 def uncovered_fraction(piece: SolidPiece, parts: list[ConvexPart], bound: float) -> float:
-    """Fraction of the piece's surface that is further than about `bound` [m] from every part."""
+    """Fraction of the piece's surface whose distance to every part exceeds about `bound` [m]."""
     uncovered = np.ones(len(piece.samples), bool)
     for part in parts:
         uncovered[uncovered] = ~inside_hull(part, piece.samples[uncovered], bound)
@@ -205,7 +205,7 @@ def uncovered_fraction(piece: SolidPiece, parts: list[ConvexPart], bound: float)
 
 
 def surface_samples(vertices: Array, faces: NDArray, spacing: float) -> Array:
-    """Points on a regular grid in every triangle, about `spacing` [m] apart, including the vertices; shape (k, 3)."""
+    """Points (k, 3) about `spacing` [m] apart: the vertices, and a regular grid in every triangle."""
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
     level = np.clip(np.ceil(longest / spacing).astype(int), 1, 64)
@@ -219,9 +219,9 @@ def surface_samples(vertices: Array, faces: NDArray, spacing: float) -> Array:
 
 
 def winding_number(points: Array, vertices: Array, faces: NDArray) -> Array:
-    """Winding number of a closed mesh around points (k, 3): 1 inside, 0 outside; shape (k,).
+    """Winding numbers (k,) of a closed mesh around points (k, 3): 1 inside, 0 outside.
 
-    It is the sum of signed solid angles over 4π (van Oosterom & Strackee 1983, eq. 8).
+    Each is the sum of the faces' signed solid angles, divided by 4π (van Oosterom & Strackee 1983, eq. 8).
     """
     out = np.zeros(len(points))
     corners = vertices[faces]
@@ -238,7 +238,7 @@ def winding_number(points: Array, vertices: Array, faces: NDArray) -> Array:
 def _run_coacd(
     pieces: list[SolidPiece], bound: float, cache: Path, seed: int
 ) -> tuple[list[list[ConvexPart] | None], int]:
-    """CoACD's parts of each piece (None if it failed), and the number of cached results."""
+    """Returns CoACD's parts of each piece (None if it failed), and the number of results found in the cache."""
     cache.mkdir(parents=True, exist_ok=True)
     setting = {**_SEARCH, "bound": bound, "seed": seed, "faces": _MAX_COACD_FACES, "coacd": metadata.version("coacd")}
     jobs = []
@@ -265,7 +265,7 @@ def _run_coacd(
 
 
 def _run_children(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: threading.Event) -> None:
-    """Runs child processes one after another until every job has succeeded or failed, or until `stopped` is set."""
+    """Runs child processes one after another, until every job has a result or has failed, or `stopped` is set."""
     pending = list(jobs)
     while pending:
         command = [sys.executable, "-m", "twin.assets.convex", *(str(path) for job in pending for path in job)]
@@ -302,7 +302,7 @@ def _read_parts(path: Path) -> list[ConvexPart] | None:
 
 
 def _decompose_files(paths: list[Path]) -> None:
-    """Runs CoACD on files, in the child process. `paths` has each file followed by the path of its result."""
+    """Runs CoACD in the child process. Each input path in `paths` is followed by the path of its result."""
     import coacd
 
     coacd.set_log_level("off")

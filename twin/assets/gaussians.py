@@ -1,8 +1,9 @@
 """Gaussian splats (Kerbl et al. 2023, "3D Gaussian Splatting") of a radiance field, and their `.ply` files.
 
-These Gaussians are not fitted to photos. Each one corresponds to a pixel of a view rendered at a filmed pose: a disk as
-large as the pixel's footprint on the surface. Where views overlap, the smallest disks are kept. Colors do not depend on
-the viewing direction. Under different lightings, the Gaussians of one set of views differ in color alone.
+These Gaussians are not fitted to photos. Each is made from one pixel of a view rendered from a filmed pose: it is a
+disk as large as the pixel's footprint on the surface. Where views overlap, the smallest disk is kept. The colors do not
+depend on the viewing direction. Gaussians of one set of views have the same geometry under every lighting; only their
+colors differ.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,13 +23,13 @@ from twin.types import Array
 
 VIEWS, WIDTH = 60, 320
 """Number of rendered views, and their width [px]."""
-FAR = 100.0  # [m] depth beyond which geometry becomes background
+FAR = 100.0  # [m] geometry at a larger depth becomes background
 _BACKGROUND = 150.0  # [m] distance of the background's splats
-_MIN_SKY, _MAX_SKY = 500, 50_000  # least and largest number of pixels to which the sky's color is fitted
-_SKY_TOLERANCE = 30.0  # rms difference from the sky's color over lightings and channels (0 to 255) of a sky pixel
-_BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3  # the same for pixels that blend sky and leaves; [px] from a sky pixel
-_MIN_CELL = 0.01  # [m] side of the smallest cells in which one Gaussian is kept
-_DISK, _THICKNESS = 0.8, 0.2  # standard deviations along the surface and perpendicular to it [pixel widths]
+_MIN_SKY, _MAX_SKY = 500, 50_000  # number of pixels that the sky's color is fitted to
+_SKY_TOLERANCE = 30.0  # of 255; a color is the sky's if their rms difference (lightings, channels) is smaller
+_BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3  # larger tolerance, which holds up to so many pixels beside the sky's [px]
+_MIN_CELL = 0.01  # [m] side of the smallest thinning cell; each cell keeps one Gaussian
+_DISK, _THICKNESS = 0.8, 0.2  # standard deviations along the surface and across it [pixel widths]
 _MAX_ELONGATION = 4.0  # length / width of a disk seen at a grazing angle
 _OPACITY = 0.97
 _SH_CONSTANT = 0.28209479177387814  # spherical harmonic of degree 0, 1 / (2 √π)
@@ -39,7 +40,7 @@ class Gaussians:
     """k disks, each with a normal along its z axis."""
 
     positions: NDArray[np.float32]
-    """[m], shape (k, 3)."""
+    """Centers [m], shape (k, 3)."""
     rotations: NDArray[np.float32]
     """Quaternions w, x, y, z, shape (k, 4)."""
     scales: NDArray[np.float32]
@@ -84,13 +85,12 @@ _MAX_COORDINATE = 1e6  # [m]
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Reads a binary `.ply` as written by 3DGS trainers, in the file's coordinate frame.
+    """Reads a binary `.ply` as 3DGS trainers and viewers write it; the coordinate frame is that of the file.
 
-    Of the color, only the constant term is read, not the higher spherical harmonics. Gaussians with numbers that are
-    not finite are left out.
+    Only the constant color is kept; higher spherical harmonics are ignored. Gaussians that are not finite are left out.
 
     Raises:
-        InputError: there is no such file, it has another format, or it is cut off.
+        InputError: The file does not exist, has another format, or is cut off.
     """
     content = read_bytes(path, _MAX_PLY)
     cure = "expected a 3D Gaussian splat .ply (binary, little endian), as 3DGS trainers write"
@@ -141,7 +141,7 @@ _COLUMNS = {"f_dc": 3, "scale": 3, "rot": 4}
 
 
 def views_by_lighting(field: ColorField, cameras: Cameras, lightings: Sequence[str]) -> dict[str, Views]:
-    """Views without fog under each of the lightings, from which Gaussians are made; all have the same depth.
+    """Views under each lighting, in air without fog, from which Gaussians are made; all have the same depth.
 
     Raises:
         InputError: unknown lighting.
@@ -155,7 +155,7 @@ def views_by_lighting(field: ColorField, cameras: Cameras, lightings: Sequence[s
 
 
 def gaussians_by_lighting(views: Mapping[str, Views]) -> dict[str, Gaussians]:
-    """Gaussians for each lighting of `views_by_lighting`; they differ in color alone."""
+    """Gaussians under each lighting of `views_by_lighting`; they differ in color only."""
     splats, pixel = gaussians_of_views(next(iter(views.values())), _BACKGROUND)
     return {name: replace(splats, rgb=_colors(one, pixel)) for name, one in views.items()}
 
@@ -163,10 +163,10 @@ def gaussians_by_lighting(views: Mapping[str, Views]) -> dict[str, Gaussians]:
 def sky_on_surfaces(views: Sequence[Views]) -> NDArray[np.bool_]:
     """Mask of pixels (n, h, w) that have the sky's color but a nearer depth, such as gaps in the crown of a tree.
 
-    As Gaussians they would look like blue clumps from other directions, so they belong to the background. The sky's
-    color is fitted to the background's pixels as a quadratic function of the direction. A pixel above the horizon is
-    selected if its rms difference from that color, over all lightings, is small. Pixels next to selected ones may
-    differ more, since they blend sky and leaves.
+    Seen from elsewhere, Gaussians of such pixels would look like blue clumps; they belong to the background. The sky's
+    color under each lighting is a quadratic function of the direction, fitted to the pixels of the background. A pixel
+    above the horizon is in the mask if its mean square difference from that color, over all lightings, is small. For
+    pixels beside it the limit is larger, since they blend the sky's color with that of leaves.
 
     Args:
         views: The same views under each filmed lighting.
@@ -198,7 +198,7 @@ def gaussians_of_views(views: Views, background: float) -> tuple[Gaussians, NDAr
     Pixels of depth 0 are skipped; depths are limited to `background` [m].
 
     Returns:
-        k Gaussians, and the pixel of each as an index into the views' (n · h · w) pixels, shape (k,).
+        k Gaussians, and for each the index (k,) of its pixel among the n · h · w pixels of the views.
     """
     columns: list[list[NDArray]] = []
     for i in range(len(views)):
@@ -240,7 +240,7 @@ def _colors(views: Views, pixel: NDArray[np.int64]) -> NDArray[np.float32]:
 
 
 def _surface_normals(points: Array) -> Array:
-    """Unit normals (h, w, 3) of a grid of points, from differences to the nearer neighbor along each axis."""
+    """Unit normals (h, w, 3) of a grid of points, from the differences to the nearer neighbor along each grid axis."""
 
     def difference(axis: int) -> Array:
         step = np.diff(points, axis=axis)
@@ -254,10 +254,9 @@ def _surface_normals(points: Array) -> Array:
 
 
 def select_sharpest(points: Array, width: Array) -> NDArray[np.int64]:
-    """Indices of the points (k, 3) to keep, by their widths (k,) [m].
+    """Indices of the points (k, 3) to keep: the point of smallest width (k,) [m] in each cell that has no finer point.
 
-    A point's cell has the point's width as its size, rounded up to `_MIN_CELL` times a power of two. In each cell, the
-    point with the smallest width is kept, unless the cell contains a kept point with smaller cells.
+    The side of a point's cell is its width, rounded up to `_MIN_CELL` times a power of two.
     """
     level = np.maximum(np.ceil(np.log2(width / _MIN_CELL)), 0).astype(int)
     kept: list[NDArray[np.int64]] = []

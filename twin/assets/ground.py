@@ -1,7 +1,7 @@
 """Ground height field, fitted to rendered depth, sparse points and the camera path.
 
-A height datum is a height z ± σ measured at (x, y). There are three kinds of data: `field` (rendered pixels on
-near-level surfaces), `points` (structure from motion) and `path` (camera centers minus the camera height).
+A height datum is a height z ± σ measured at (x, y). There are three kinds: `field` (from rendered pixels on near-level
+surfaces), `points` (from structure from motion) and `path` (camera centers lowered by the camera height).
 """
 
 from dataclasses import dataclass, replace
@@ -43,17 +43,14 @@ class Ground:
         return _interpolate(self.height, self.origin, self.cell, xy, order=1)
 
     def coarsened(self, cell: float) -> "Ground":
-        """Every n-th node, where n = cell / self.cell, rounded; a remainder at the far edges is cut off."""
+        """Ground with every n-th node, n = cell / self.cell, rounded. A remainder at the far edges is cut off."""
         n = max(1, round(cell / self.cell))
         rows, columns = ((size - 1) // n * n + 1 for size in self.height.shape)
         nodes = np.s_[:rows:n, :columns:n]
         return Ground(self.height[nodes], self.origin, self.cell * n, self.measured[nodes], self.rgb[nodes])
 
     def triangles(self, cell: float, max_faces: int) -> tuple[Array, NDArray[np.int64]]:
-        """Vertices (v, 3) [m], and faces (f, 3) that face upwards, on every n-th node.
-
-        Triangles are about `cell` [m] wide, or wider if there would be more than about `max_faces`.
-        """
+        """Vertices (v, 3) [m] and upward faces (f, 3) about `cell` [m] wide, or wider to limit them to `max_faces`."""
         rows, columns = self.height.shape
         step = max(1, round(cell / self.cell), int(np.ceil(np.sqrt(2 * rows * columns / max_faces))))
         row, column = (np.unique(np.append(np.arange(0, n, step), n - 1)) for n in (rows, columns))
@@ -71,7 +68,7 @@ class Ground:
 
     @staticmethod
     def load(folder: Path) -> "Ground":
-        """Reads `ground.npz`. Raises InputError: it is missing or damaged."""
+        """Reads `ground.npz`. Raises InputError if it is missing or damaged."""
         path = folder / "ground.npz"
         with wrap_read_errors(path, "build the scene again"):
             data = load_arrays(path)
@@ -100,15 +97,15 @@ def _interpolate(height: Array, origin: Array, cell: float, xy: Array, order: in
 # ---- height data
 
 DATA_KINDS = ("field", "points", "path")
-_MIN_UPRIGHT = 0.94  # z of a normal (20° from vertical); steeper surfaces are not ground
-_GATE, _GATE_PER_METER = 0.25, 0.05  # [m] largest height difference to the path: at the path, and added per meter away
-_SIGMA_FIELD = 0.03  # [m] σ of the median rendered height in a cell, near the lens
-_SIGMA_POINTS = 0.04  # [m] σ of the median height of the sparse points in a cell
-_SIGMA_PATH = 0.012  # [m] σ of the path of a rigidly mounted camera
-_LATERAL_OFFSETS = (-0.6, -0.3, 0.0, 0.3, 0.6)  # [m] offsets of path data to the left, as wide as the wheels' track
-_CROSS_SLOPE = 0.02  # σ of the cross slope of a road, which the path does not measure
-_DATA_CELL = 0.25  # [m] side of the square cells with one datum each
-_MAX_DEPTH = 18.0  # [m] farther ground is not used, since it fills only a few pixel rows
+_MIN_UPRIGHT = 0.94  # least z of a unit normal (20° from vertical); steeper surfaces are not ground
+_GATE, _GATE_PER_METER = 0.25, 0.05  # [m, m/m] largest height difference to the path; added per meter of distance
+_SIGMA_FIELD = 0.03  # [m] σ of the median of a cell's rendered heights, near the lens
+_SIGMA_POINTS = 0.04  # [m] σ of the median height of a cell's sparse points
+_SIGMA_PATH = 0.012  # [m] σ of path data if the camera is rigidly mounted
+_LATERAL_OFFSETS = (-0.6, -0.3, 0.0, 0.3, 0.6)  # [m] positions of data beside the path, where the wheels drove
+_CROSS_SLOPE = 0.02  # possible cross slope of a road, which the path does not measure
+_DATA_CELL = 0.25  # [m] side of the squares with one datum each
+_MAX_DEPTH = 18.0  # [m] ground beyond this depth fills only a few pixel rows
 
 
 @dataclass(frozen=True)
@@ -134,7 +131,7 @@ class HeightData:
 def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData:
     """One datum per occupied square of side `cell` [m]: mean x and y, median z and smallest σ of its points.
 
-    σ does not fall with the number of points, since errors of neighbors are correlated.
+    More points do not make σ smaller than the smallest σ, since errors of neighbors are correlated.
     """
     if len(xyz) == 0:
         return HeightData.empty()
@@ -153,8 +150,7 @@ def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData
 
 
 def _field_data(views: Views) -> tuple[HeightData, Array, NDArray[np.uint8]]:
-    """Data from rendered pixels on near-level surfaces, one datum per cell; also the points (k, 3) and colors (k, 3) of
-    these pixels."""
+    """Returns one datum per cell, from near-level rendered pixels, and the points and colors (k, 3) of these pixels."""
     points, sigmas, colors = [], [], []
     for i in range(len(views)):
         depth = views.depth[i]
@@ -170,17 +166,12 @@ def _field_data(views: Views) -> tuple[HeightData, Array, NDArray[np.uint8]]:
 def _path_data(
     cameras: Cameras, ground_height: Array | None, camera_height: float
 ) -> tuple[HeightData, dict[str, dict]]:
-    """Data from the camera path minus the camera height; σ depends on how steadily each source's camera was carried.
+    """Data from the camera path, lowered by the camera height. Their σ shows how steadily the source was carried.
 
     Args:
         cameras: n metric cameras.
-        ground_height: Ground height below each camera according to the other kinds of data [m], shape (n,); None =
-            unknown.
-        camera_height: The camera height that set the scale [m]; 0 = use each source's median height above
-            `ground_height`.
-
-    Returns:
-        The data, and for each source its height and variations [m], for the report.
+        ground_height: Ground height below each camera, from the other kinds of data [m], shape (n,); None = unknown.
+        camera_height: The height that set the scale [m]; 0 = each source's median height above `ground_height`.
     """
     parts, metrics = [], {}
     for index in source_frames(cameras):
@@ -209,7 +200,7 @@ def _path_data(
 
 
 def _path_strip(xyz: Array, sigma: float) -> HeightData:
-    """Data on the path and beside it, about every 0.25 m except across gaps in the film."""
+    """Data on the path and beside it, about every 0.25 m; none across gaps in the film."""
     step = np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1)
     typical = np.median(step[step > 0.02]) if (step > 0.02).any() else 0.0
     points, sigmas = [], []
@@ -227,7 +218,7 @@ def _path_strip(xyz: Array, sigma: float) -> HeightData:
 
 
 def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> float:
-    """Median height of data above the nearest path data, over pairs within `reach` [m]; 0 with fewer than ten pairs."""
+    """Median height of data above the nearest path data, if at most `reach` [m] away; 0 for fewer than ten pairs."""
     if len(path.xyz) == 0 or len(data.xyz) == 0:
         return 0.0
     away, nearest = cKDTree(path.xyz[:, :2]).query(data.xyz[:, :2], distance_upper_bound=reach)
@@ -237,14 +228,14 @@ def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> floa
 
 # ---- fit
 
-_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m], and largest numbers of nodes
+_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m]; most nodes
 _MAX_CELLS = 1_500_000
-_SMOOTHING_LENGTH = 0.5  # [m] shorter structure is smoothed, as noise
-_EXTRAPOLATION_LENGTH = 8.0  # [m] distance over which slopes continue where there are no data
+_SMOOTHING_LENGTH = 0.5  # [m] structures shorter than this are smoothed away as noise
+_EXTRAPOLATION_LENGTH = 8.0  # [m] distance over which a slope continues without data
 _REWEIGHTINGS = 6
-_COLOR_WIDTHS = (0.1, 0.4, 1.6, 6.4)  # [m] σ of the Gaussian windows for mean colors
-_COLOR_WEIGHT = 0.1  # fraction of a window's cells with a color, from which its mean has full weight
-_MIN_DATA = 50  # with fewer data, the ground is flat
+_COLOR_WIDTHS = (0.1, 0.4, 1.6, 6.4)  # [m] σ of the Gaussian windows over which colors are averaged
+_COLOR_WEIGHT = 0.1  # a mean counts in full if at least this share of its window has colors
+_MIN_DATA = 50  # with fewer data the ground is flat
 
 
 @dataclass(frozen=True)
@@ -275,10 +266,7 @@ class HeightGrid:
         return self.origin + self.cell * np.stack([x, y], -1)
 
     def sample(self, height: Array, xy: Array, order: int = 1) -> Array:
-        """Heights [m] at points (..., 2), interpolated between nodes `height` (rows, columns) by splines of `order`.
-
-        Points outside the grid get the height at its edge.
-        """
+        """Heights [m] at points (..., 2), by splines through the nodes' (rows, columns); clamped to the edge."""
         return _interpolate(height, self.origin, self.cell, xy, order)
 
 
@@ -289,8 +277,8 @@ def fit_height(
 
         Σ ρ((h(xᵢ, yᵢ) − zᵢ) / σᵢ) + λ Σ |second differences of h|² + μ Σ |first differences of h|²
 
-    with the Geman-McClure loss ρ, by iteratively reweighted least squares with sparse factorization. The second term
-    smooths bumps but not slopes; the last term limits how far a slope continues without data.
+    where ρ is the Geman-McClure loss. The method is iteratively reweighted least squares with sparse factorization. The
+    second term smooths bumps but not slopes; the last one limits how far a slope continues without data.
 
     At least one datum must be inside the grid. If heights `initial` (rows, columns) [m] are given, the first robust
     weights are computed from them; otherwise the first robust weights are all 1. Returns heights (rows, columns) [m],
@@ -304,12 +292,12 @@ def fit_height(
     robust = np.ones(len(z))
     for iteration in range(iterations):
         if height is not None:
-            # The width of the loss shrinks from 2.5 σ to 2 σ, so that a poor first solution does not reject good data.
+            # The width of the loss shrinks from 3 σ to 2 σ, so that a poor first solution does not reject good data.
             width = (max(3.0 - iteration / 2, 2.0) if initial is None else 2.0) * sigma
             robust = (1.0 + ((height[node] - z) / width) ** 2) ** -2
         weight = robust / sigma**2
         system = (smooth + sparse.diags_array(np.bincount(node, weight, count))).tocsc()
-        # Symmetric positive definite: without pivoting, and with an ordering of Aᵀ + A, it is 4 times as fast.
+        # The matrix is symmetric positive definite: no pivoting and an ordering of Aᵀ + A make this 4 times as fast.
         factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         height = factors.solve(np.bincount(node, weight * z, count))
     assert height is not None
@@ -319,7 +307,7 @@ def fit_height(
 
 
 def _smoothness_matrix(grid: HeightGrid) -> sparse.csr_array:
-    """λ D₂ᵀD₂ + μ D₁ᵀD₁ on the nodes; λ penalizes structure of length `_SMOOTHING_LENGTH` as much as σ = 3 cm."""
+    """λ D₂ᵀD₂ + μ D₁ᵀD₁ on the nodes. λ weighs a structure of length `_SMOOTHING_LENGTH` like a datum of σ = 3 cm."""
     rows, columns = grid.rows, grid.columns
 
     def difference(n: int, order: int) -> sparse.csr_array:
@@ -337,7 +325,7 @@ def _smoothness_matrix(grid: HeightGrid) -> sparse.csr_array:
 
 
 def fit_low_passed(data: HeightData, low: Array, high: Array, config: MeshConfig) -> tuple[Array, HeightGrid, Array]:
-    """Coarse-to-fine fit over the box `low` to `high` (x, y), low-passed by `ground_smoothing`.
+    """Coarse-to-fine fit over the box from `low` to `high` (x, y), then low-passed by `ground_smoothing`.
 
     Returns heights [m] on a grid of `ground_cell`, the grid, and the weight of each datum.
     """
@@ -361,10 +349,10 @@ def build_ground(
     config: MeshConfig,
     height: float | None,
 ) -> tuple[Ground, dict[str, Any]]:
-    """Fits the ground over a box, given by its low and high corners (x, y) [m]; also returns metrics for the report.
+    """Fits the ground over a box, given by its low and high corners (x, y) [m]. Also returns metrics for the report.
 
-    `height` is the camera height that set the scale [m]; 0 = estimate it per source; None = do not use the path,
-    because the camera moved around an object.
+    `height` is the camera height that set the scale [m]; 0 = estimate it per source; None = do not use the path
+    (because the film goes around an object).
     """
     low, high = box
     coarse = HeightGrid.covering(low, high, _COARSE_CELL, _COARSE_NODES)
@@ -415,7 +403,7 @@ def build_ground(
 
 
 def _mean_colors(grid: HeightGrid, points: Array, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Mean color of each cell, shape (rows, columns, 3) uint8, over windows that widen where there are few pixels."""
+    """Mean color per cell. A cell with few pixels around it gets a mean over a wider window."""
     node, inside = grid.index(points[:, :2])
     count = np.bincount(node[inside], minlength=grid.rows * grid.columns)
     if not count.any():

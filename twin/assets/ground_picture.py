@@ -1,6 +1,6 @@
-"""Picture of the ground from above, for the texture of MuJoCo's ground. It is composed of renderings at filmed poses.
+"""Picture of the ground from above, the texture of MuJoCo's ground. It is composed of renderings at filmed poses.
 
-A texel takes its color from the pose that sees it best: the texel lies ahead of it, about `_BEST_DISTANCE` away.
+A texel takes its color from the pose that sees it best: the texel is ahead, about `_BEST_DISTANCE` away.
 """
 
 import numpy as np
@@ -12,20 +12,17 @@ from twin.assets.ground import Ground
 from twin.geometry.cameras import Cameras, project, scaled_intrinsics
 from twin.nerf.rendering import RenderableField
 
-_TEXEL = 0.025  # [m]
+_TEXEL = 0.025  # [m] side of a texel
 _BEST_DISTANCE = 3.5  # [m] from the lens to a texel; nearer texels are seldom in the image
-_MAX_DISTANCE = 12.0  # [m] from the lens to a texel; farther texels keep the ground's mean color
+_MAX_DISTANCE = 12.0  # [m]; farther ground keeps its mean color
 _WIDTH = 640  # [px] of the renderings
 _MAX_TEXELS = 12_000_000
-_DEPTH_TOLERANCE = 0.15  # a texel is visible if its depth and the rendered depth differ by less, relatively
+_DEPTH_TOLERANCE = 0.15  # a texel is visible if the relative difference of depth is smaller
 
 
 def ground_picture(field: RenderableField, cameras: Cameras, ground: Ground, lighting: str) -> NDArray[np.uint8]:
-    """Colors of the ground under one lighting, shape (rows · k, columns · k, 3).
-
-    The height field has rows × columns cells, each with k² texels. Row 0 is at the lowest y. Texels that no pose sees
-    well have the mean color of their cell (`Ground.rgb`).
-    """
+    """Colors of the ground under one lighting, shape (rows · k, columns · k, 3). The height field has rows × columns
+    cells of k² texels each. Row 0 is at the lowest y. Texels that no pose sees well have the ground's mean color."""
     rows, columns = (n - 1 for n in ground.height.shape)
     k = max(1, round(ground.cell / _TEXEL))
     while k > 1 and rows * columns * k * k > _MAX_TEXELS:

@@ -1,9 +1,12 @@
 """Stage `mesh`: collision and visual geometry in meters from the radiance field.
 
-Renders views of the field, fits the ground, fuses a distance field above it, extracts surface and solids, decomposes
-the solids into convex parts, and clears the corridor. Writes `visual.npz` (colored triangles), `ground.npz` (height
-field), `ground.png` (its picture), `parts.npz` (convex parts of the obstacles) and, for a drive, `route.npz` (the
-filmed path on the ground).
+The stage renders views of the field, fits the ground, fuses a distance field above it, extracts surface and solids,
+decomposes the solids into convex parts, and clears the corridor. It writes:
+
+- `visual.npz`: colored triangles
+- `ground.npz`, `ground.png`: the ground as a height field, and its picture from above
+- `parts.npz`: convex parts of the obstacles
+- `route.npz`: for a drive, the route on the ground
 """
 
 import time
@@ -31,14 +34,14 @@ from twin.scene import SceneDir
 from twin.types import Array
 
 _VISUAL_FACES = 150_000
-_MARGIN_ABOVE = 2.0  # [m] the visual mesh extends this far above the highest possible obstacle
-_MARGIN_BELOW = 1.0  # [m] the visual mesh extends this far below the lowest ground
+_MARGIN_ABOVE = 2.0  # [m] margin of the visual mesh's box above the highest obstacle
+_MARGIN_BELOW = 1.0  # [m] margin of the visual mesh's box below the lowest ground
 _VISUAL_GROUND_CELL = 0.4  # [m] smallest width of the ground triangles
 _SPECK_AREA = 0.25  # [m²] smaller components are floaters
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = None) -> dict[str, Any]:
-    """Runs the stage; see `twin.build`. Raises InputError: the scene needs a route, but the camera hardly moved."""
+    """Runs the stage, see `twin.build`. Raises InputError if a route is wanted but the camera hardly moved."""
     from twin.nerf.field import RadianceField
 
     field = RadianceField.load(scene.stage("field"), device)
@@ -106,13 +109,13 @@ def build_assets(
 
 
 def _camera_height(config: SceneConfig) -> float:
-    """The given height of the camera [m]; 0 if none is given or sources differ, so that it is estimated per source."""
+    """The given height of the camera [m]; 0 (estimate it per source) if none is given or if the sources differ."""
     heights = {source.camera_height or config.metric.camera_height for source in config.source}
     return heights.pop() if len(heights) == 1 else 0.0
 
 
 def _surface_points(views: Views, ground: Ground, box: Array, far: float) -> Array:
-    """Rendered points in the box and above the ground, shape (k, 3) [m]."""
+    """Rendered points (k, 3) [m] that are in the box and above the ground."""
     hits = []
     for i in range(len(views)):
         points = views.points(i)[(views.depth[i] > 0) & (views.depth[i] < far)]
@@ -122,7 +125,7 @@ def _surface_points(views: Views, ground: Ground, box: Array, far: float) -> Arr
 
 
 def _visual_mesh(volume: tsdf.Volume, views: Views, ground: Ground) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Colored triangles of the surfaces that views see above the ground, and of the ground itself; also metrics."""
+    """Returns colored triangles (of the seen surfaces above the ground, and of the ground itself), and metrics."""
     vertices, faces = tsdf.zero_level(volume.distance, volume.origin, volume.voxel)
     above = vertices[:, 2] - ground.at(vertices[:, :2]) > 0.05
     vertices, faces = tsdf.compact(vertices, faces[above[faces].any(1)])
@@ -196,8 +199,7 @@ def _save_parts(
 
 
 def _roughness(ground: Ground, route: Array | None) -> dict[str, float | None]:
-    """RMS slope of the measured ground; with a route, also RMS slope and curvature along it, and the measured fraction
-    of the ground within 1.5 m of it."""
+    """RMS slope of the measured ground; for a route its RMS slope and curvature, and the measured share near it."""
     dy, dx = np.gradient(ground.height, ground.cell)
     slope = np.hypot(dx, dy)[ground.measured]
     metrics: dict[str, float | None] = {"slope_rms": float(np.sqrt(np.mean(slope**2))) if len(slope) else None}

@@ -1,9 +1,9 @@
 """Closed meshes of the obstacles for the convex decomposition, and the corridor that is kept free of them.
 
-The solid is the space where the distance field is negative, and the hidden space up to `_HIDDEN_DEPTH` behind it: a
-film from a road shows only the fronts of obstacles, but a wall needs thickness for collisions. The corridor is the
-space within a half width of the filmed route, up to `HEADROOM` above the ground; it is free, since the camera passed
-through it.
+The solid consists of the negative part of the distance field and of the hidden space up to `_HIDDEN_DEPTH` behind it.
+(A film from a road shows fronts only, and a wall without thickness cannot be collided with.) The corridor is the space
+up to a half width beside the route and up to `HEADROOM` above the ground. It is free, since the camera passed through
+it.
 """
 
 from dataclasses import dataclass
@@ -23,15 +23,15 @@ from twin.geometry.route import distance_to_route
 from twin.types import Array
 
 HEADROOM = 1.5  # [m] height of the corridor above the ground
-_GROUND_CLEARANCE = 0.1  # [m] above the height field; everything lower is ground
-_MAX_GROUND_GAP = 0.6  # [m] smaller gaps between obstacles and the ground are closed, so that nothing hovers
-_EMBEDDING = 0.15  # [m] depth to which parts extend below the ground
-_TILE_SIZE = 3.0  # [m] side of the square columns that large obstacles are divided into
-_MIN_VOXELS = 8  # components with fewer voxels are noise
-_MIN_HOVERING_VOXELS = 64  # components that hover above the ground are noise if they have fewer voxels
-_HIDDEN_DEPTH = 0.3  # [m] hidden space up to this far behind a surface is solid
+_GROUND_CLEARANCE = 0.1  # [m] everything less than this above the height field is ground
+_MAX_GROUND_GAP = 0.6  # [m] smaller gaps to the ground are closed, so that nothing hovers
+_EMBEDDING = 0.15  # [m] depth of parts below the ground
+_TILE_SIZE = 3.0  # [m] large obstacles are divided into square columns with this side
+_MIN_VOXELS = 8  # smaller components are noise
+_MIN_HOVERING_VOXELS = 64  # smaller components are noise if they hover
+_HIDDEN_DEPTH = 0.3  # [m] hidden space is solid up to this distance behind a surface
 _MAX_GAP = 0.45  # [m] narrower gaps in the solid are closed
-_SMOOTHING = 0.7  # voxels
+_SMOOTHING = 0.7  # [voxels] σ of the low-pass of the distance field
 _EROSION = 0.06  # [m] inward offset of surfaces: blur moves edges outwards, and convex hulls add volume
 _CERTAIN_DEPTH = 0.02  # [m] voxels deeper than this behind a seen surface are never eroded
 _CORRIDOR_SLACK = 0.02  # [m] added to the corridor's half width, against rounding in later stages
@@ -50,11 +50,11 @@ class Corridor:
 def solid_pieces(
     volume: Volume, ground: Ground, corridor: Corridor | None, cameras: Cameras, config: MeshConfig
 ) -> tuple[list[SolidPiece], dict[str, int]]:
-    """Closed meshes, at most one tile wide, of all components that reach `obstacle_height` above the ground.
+    """Closed meshes of all components that reach `obstacle_height` above the ground, cut into pieces of a tile's width.
 
     Returns:
-        Pieces, nearest to the path first; and the number of components used (`standing`), and of those left out because
-        they are small (`specks`) or low (`low`).
+        The pieces, nearest to the path first; and the numbers of components by kind: `standing` ones, of which the
+        pieces are made, and `specks` and `low` ones, which are left out.
     """
     voxel = volume.voxel
     columns = volume.distance.shape[:2]
@@ -110,10 +110,10 @@ def solid_pieces(
 
 
 def _solid_distance(volume: Volume) -> NDArray[np.float32]:
-    """Distance field [m] of the solid, clipped to one voxel, smoothed, and eroded by `_EROSION`.
+    """Distance field [m] of the solid. Near seen surfaces it is the fused field, clipped to ± 1 voxel; all is eroded.
 
-    Gaps narrower than `_MAX_GAP`, as in foliage and noise, are closed: the robot cannot pass them, and each one would
-    lengthen the decomposition.
+    Gaps narrower than `_MAX_GAP`, as in foliage and noise, are closed. The robot cannot pass through them, and each gap
+    would lengthen the decomposition.
     """
     voxel = volume.voxel
     seen = np.nan_to_num(volume.distance, nan=np.inf) < 0
@@ -126,12 +126,12 @@ def _solid_distance(volume: Volume) -> NDArray[np.float32]:
     field = np.where(np.isfinite(volume.distance), np.clip(volume.distance, -voxel, voxel), smooth)
     field = np.where(closed & ~seen, np.minimum(field, smooth), field)
     field = gaussian_filter(field, _SMOOTHING) + _EROSION
-    # Erosion must not remove obstacles as thin as a lamp post.
+    # Erosion must not remove obstacles that are as thin as a lamp post.
     return np.where(volume.distance < -_CERTAIN_DEPTH, np.minimum(field, -0.1 * voxel), field).astype(np.float32)
 
 
 def _close_downwards(field: NDArray, above: NDArray, voxel: float) -> None:
-    """Fills each column of `field`, in place, from its lowest solid voxel to the ground if the gap is small."""
+    """Fills the gap between each column's lowest solid voxel and the ground, if it is small. Works in place."""
     matter = field < 0
     lowest = np.where(matter, above, np.inf).min(-1)
     fill = (lowest < _MAX_GROUND_GAP)[..., None] & (above < lowest[..., None]) & (above > -_EMBEDDING - voxel)
@@ -139,10 +139,7 @@ def _close_downwards(field: NDArray, above: NDArray, voxel: float) -> None:
 
 
 def _block_piece(values: NDArray, volume: Volume, start: NDArray) -> SolidPiece | None:
-    """The closed surface of a block of the field, with the values `values` and its first voxel at `start`.
-
-    None if the block is empty.
-    """
+    """The closed surface of a block of the field, whose first voxel is `start`; None if it is empty."""
     voxel = volume.voxel
     padded = np.pad(values, 1, constant_values=0.5 * voxel)
     origin = volume.origin + voxel * (start - 1)
@@ -159,10 +156,10 @@ def _block_piece(values: NDArray, volume: Volume, start: NDArray) -> SolidPiece 
 def clear_corridor(
     parts: list[ConvexPart], corridor: Corridor, ground: Ground
 ) -> tuple[list[tuple[int, ConvexPart]], int]:
-    """Cuts convex parts that are below the headroom along tangents of the corridor, until they are outside it.
+    """Cuts what is below the headroom off convex parts, along tangents of the corridor, until they are clear of it.
 
     Returns:
-        The remaining parts, each with the index of its original, and the number of parts that were cut or dropped.
+        The remaining parts, each with the index of its original; and the number of parts that were cut or dropped.
     """
     out: list[tuple[int, ConvexPart]] = []
     clipped = 0
@@ -204,13 +201,12 @@ def clip_part(part: ConvexPart, normal: Array, offset: float) -> ConvexPart | No
 
 
 def _sagitta(reach: float) -> float:
-    """Largest error [m] if a distance is measured to the route's points, `SPACING` apart, instead of to its line."""
+    """Largest error [m] if distances are measured from the route's points (`SPACING` apart), not from its line."""
     return SPACING**2 / (8 * reach)
 
 
 def _intrusion(part: ConvexPart, route: Array, reach: float, ground: Ground) -> tuple[float, Array, Array]:
-    """Depth [m] to which a part reaches into the corridor (≤ 0: it is outside), the route point where it is deepest,
-    and the unit vector from that point to the part."""
+    """Depth [m] of a part inside the corridor (≤ 0: clear), the nearest route point, and a unit vector to the part."""
     clear = (-1.0, np.zeros(2), np.zeros(2))
     low, high = part.vertices[:, :2].min(0) - reach, part.vertices[:, :2].max(0) + reach
     near = route[((route >= low) & (route <= high)).all(1)]
@@ -237,7 +233,7 @@ def _intrusion(part: ConvexPart, route: Array, reach: float, ground: Ground) -> 
 
 
 def _distance_to_outline(points: Array, outline: Array) -> tuple[Array, Array]:
-    """Distance (k,) of points (k, 2) to a convex polygon, 0 inside, and the nearest points (k, 2) on its edges."""
+    """For points (k, 2): distances (k,) to a convex polygon, 0 inside; and the nearest points (k, 2) on its edges."""
     along = np.roll(outline, -1, axis=0) - outline
     toward = points[:, None] - outline
     fraction = np.einsum("kij,ij->ki", toward, along) / np.maximum((along**2).sum(1), 1e-18)

@@ -1,10 +1,10 @@
 """Fusion of depth maps into a truncated signed distance field (TSDF), and triangle meshes from it.
 
-*Signed distance* [m]: positive in free space, negative behind a surface, valid within ± `band` of the surface. At each
-voxel, a view votes `near` if its surface is within the band, and `free` if its surface is further away (Curless & Levoy
-1996, eqs. 3 and 4, with votes for free space). So the few views that show a floater are outvoted by those that see
-through it. At a depth edge, the radiance field has a false, slanted surface between the near and the far side. The view
-sees this surface edge-on, so its votes have little weight, and views from elsewhere outvote it.
+*Signed distance* [m]: positive in free space, negative behind a surface, valid within ± `band` of it. At each voxel a
+view votes `near` if the surface that it sees is within the band, and `free` if it sees further. (This is the method of
+Curless & Levoy 1996, eqs. 3 and 4, with votes for free space added.) So the many views through a floater outvote the
+few that show it. At a depth edge the radiance field has a false, slanted surface from the near to the far side. The
+view sees this surface edge-on, so its `near` votes have little weight, and views from elsewhere outvote them.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -25,15 +25,15 @@ from twin.geometry.poses import inverse_pose
 from twin.types import Array
 from twin.warp_runtime import wp
 
-FREE_SPACE_REACH = 2.5  # largest depth of free votes / largest depth of surface votes
-_HALF_WEIGHT_DEPTH = 5.0  # [m] depth at which a vote has half weight, since pixels and errors grow with depth
-_CLEARANCE = 0.1  # beyond `far`, a voxel is free only if the surface is further by this fraction of the voxel's depth
+FREE_SPACE_REACH = 2.5  # free votes reach this many times as far as surface votes
+_HALF_WEIGHT_DEPTH = 5.0  # [m] a vote at this depth has half weight, since pixels and errors grow with depth
+_CLEARANCE = 0.1  # share of depth: beyond `far`, a voxel is free only if the surface is further by this
 _SAME_SURFACE_RATIO = 1.1  # largest depth ratio of neighboring pixels on one surface
 
 
 @wp.func
 def _project(point: wp.vec3, pose: wp.mat44, k: wp.vec4):
-    """Pixel (u, v) and z-depth of a world point."""
+    """Vector of the pixel (u, v) and the z-depth of a world point."""
     local = wp.transform_point(pose, point)
     z = wp.max(local[2], 1.0e-6)
     return wp.vec3(k[0] * local[0] / z + k[2], k[1] * local[1] / z + k[3], local[2])
@@ -82,7 +82,7 @@ def _fuse_kernel(
                 high = wp.max(wp.max(a, b), wp.max(c, d))
                 surface = depth[view, nearest_row, nearest_column]
                 if low > 0.0 and high < one_surface * low:
-                    # The four pixels are on one surface, so inverse depth is bilinear.
+                    # The four pixels show one surface, on which inverse depth is bilinear.
                     s = u - float(column)
                     t = v - float(row)
                     surface = 1.0 / ((1.0 - t) * ((1.0 - s) / a + s / b) + t * ((1.0 - s) / c + s / d))
@@ -122,7 +122,7 @@ def _color_kernel(
     for view in range(depth.shape[0]):
         seen = _project(point, world_to_camera[view], intrinsics[view])
         z = seen[2]
-        # Only surfaces that face the lens; 0.1 (6°) keeps walls beside a forward-looking camera.
+        # Only surfaces that face the lens get a color. A limit of 0.1 (6°) keeps walls beside a forward-looking camera.
         if z > 0.35 and wp.dot(normals[i], wp.normalize(centers[view] - point)) > 0.1:
             column = int(wp.floor(seen[0]))
             row = int(wp.floor(seen[1]))
@@ -144,9 +144,10 @@ def _color_kernel(
 
 
 def fuse(points: Array, views: Views, band: float, far: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Fuses all views at points (k, 3): signed distance [m] (NaN without near votes), near and free votes, shapes (k,).
+    """Fuses all views at points (k, 3). Returns signed distances [m], `near` votes and `free` votes, each (k,).
 
-    Views vote for surfaces up to the depth `far` [m], and for free space up to `FREE_SPACE_REACH` times as far.
+    A distance is NaN if there are no `near` votes. Views vote for surfaces up to the depth `far` [m], and for free
+    space up to `FREE_SPACE_REACH` times as far.
     """
     with wp.ScopedDevice("cpu"):
         distance = wp.full(len(points), float("nan"), dtype=wp.float32)
@@ -161,10 +162,10 @@ def fuse(points: Array, views: Views, band: float, far: float) -> tuple[NDArray,
 def color_points(
     points: Array, normals: Array, views: Views, tolerance: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Colors (k, 3) of surface points (k, 3) with normals (k, 3), and a mask (k,) of the points that a view sees.
+    """Returns colors (k, 3) of surface points (k, 3) with normals (k, 3), and a mask (k,) of the points that views see.
 
-    Colors are weighted means in which the nearest views dominate. A view sees a point if the surface faces the view,
-    and the view's depth at its pixel agrees with the point's depth within `tolerance` [m] plus 5 %.
+    The nearest views dominate a color. A view sees a point if the point faces it and the view's depth there agrees with
+    the point's within `tolerance` [m] plus 5 %.
     """
     with wp.ScopedDevice("cpu"):
         colors = wp.zeros(len(points), dtype=wp.vec3)
@@ -189,11 +190,11 @@ def _camera_arrays(points: Array, views: Views) -> list[wp.array]:
 
 # ---- block-sparse volume
 
-_BLOCK = 4  # voxels
+_BLOCK = 4  # [voxels] side of a block
 _MAX_VOXELS = 60_000_000
-_BAND_VOXELS = 2.0  # half width of the band around a surface [voxels]
+_BAND_VOXELS = 2.0  # [voxels] half width of the band around a surface
 _VOXELS_PER_LAUNCH = 400_000
-_FREE_MAJORITY = 0.75  # a surface is removed where more than this fraction of the votes is free
+_FREE_MAJORITY = 0.75  # a surface is removed if a larger fraction of votes is `free`
 
 
 @dataclass(frozen=True)
@@ -201,9 +202,9 @@ class Volume:
     """Grid of signed distances; voxel (i, j, k) is at origin + voxel · (i, j, k) [m]."""
 
     distance: NDArray[np.float32]
-    """[m], shape (x, y, z); NaN where no surface is near, or where no view has a vote."""
+    """Signed distances [m], shape (x, y, z); NaN where no surface is near or no view votes."""
     hidden: NDArray[np.bool_]
-    """Mask of voxels near a surface but without votes, which may be solid; shape (x, y, z)."""
+    """Mask of the voxels near a surface that got no votes; they may be solid."""
     origin: Array
     """Position of voxel (0, 0, 0) [m], shape (3,)."""
     voxel: float
@@ -217,7 +218,7 @@ class Volume:
 
 
 def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float) -> Volume:
-    """Fuses views over a box, in those blocks of 4³ voxels that are near the surface points `hits` (k, 3).
+    """Fuses views in a box (low and high corner, shape (2, 3)): in its blocks of 4³ voxels near surface points (k, 3).
 
     `box` has the low and the high corner, shape (2, 3) [m]. The spacing `voxel` [m] grows if the box would have more
     than 60 million voxels. For `far` see `fuse`.
@@ -240,7 +241,7 @@ def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float)
         through = (near > 0) & (free > _FREE_MAJORITY * (near + free))
         outvoted += int((through & (value < band)).sum())
         value = np.where(through, np.fmax(value, 0.5 * voxel), value)
-        # Where all votes are for free space, the voxel is outside every surface.
+        # If all votes at a voxel are `free`, it is outside every surface.
         value = np.where((near == 0) & (free > 0), band, value)
         distance[tuple(part.T)] = value
         hidden[tuple(part.T)] = (near == 0) & (free == 0)
@@ -255,7 +256,7 @@ def zero_level(distance: NDArray, origin: Array, voxel: float) -> tuple[Array, N
     if not ((distance < 0).any() and (distance > 0).any()):
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent", allow_degenerate=False)
-    # On a grid edge with an unknown end the vertex is NaN; its triangles are dropped.
+    # A vertex on an edge with an unseen end is NaN; its triangles are dropped.
     faces = faces[np.isfinite(vertices).all(1)[faces].all(1)]
     return compact(origin + voxel * vertices.astype(np.float64), faces.astype(np.int64))
 
@@ -267,7 +268,7 @@ def compact(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray[np.int6
 
 
 def remove_specks(vertices: Array, faces: NDArray, min_area: float) -> tuple[Array, NDArray[np.int64], int]:
-    """Removes connected components smaller than `min_area` [m²]; also returns their number."""
+    """Removes connected components smaller than `min_area` [m²]; also returns the number of removed components."""
     if len(faces) == 0:
         return vertices, faces, 0
     start, end = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]).T
@@ -290,7 +291,7 @@ def decimate(vertices: Array, faces: NDArray, max_faces: int) -> tuple[Array, ND
 
 
 def vertex_normals(vertices: Array, faces: NDArray) -> Array:
-    """Unit normals of the vertices, weighted by face area, shape (v, 3)."""
+    """Unit normals (v, 3) of the vertices: means of their faces' normals, weighted by face area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     out = np.stack([np.bincount(faces.ravel(), np.repeat(normal[:, k], 3), len(vertices)) for k in range(3)], -1)

@@ -1,7 +1,7 @@
 """Color and depth rendered from the radiance field at training poses: the input of ground, mesh and splats.
 
-A *view* is the rendering at one pose. The *slant* of a pixel is |n · r|, with the surface normal n and the ray r of
-unit z-depth: a point 1 m of z-depth behind the surface is `slant` meters away from the surface.
+A view is one rendered pose. The slant of a pixel is |n · r|, where n is the surface normal and r the ray, scaled to
+unit z-depth. A point whose z-depth is 1 m larger than that of the surface is `slant` meters away from it.
 """
 
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from twin.types import Array
 
 _BATCH = 8
 _METERS_PER_RADIAN = 3.0  # [m per rad] weight of direction in the distance between views
-_FLYING_PIXEL_STEP = 0.06  # relative step of inverse depth; with larger ones to both neighbors, a pixel is suspect
+_FLYING_PIXEL_STEP = 0.06  # a pixel with larger relative steps of inverse depth to both neighbors is on no surface
 _MIN_OPACITY = 0.5
-_MIN_SLANT = 0.12  # below this, normals from depth are unreliable
+_MIN_SLANT = 0.12  # smaller slants are set to this, since normals from depth are unreliable there
 _MIN_DEPTH = 0.3  # [m] from the lens; nearer depth is discarded
 
 
@@ -43,17 +43,17 @@ class Views:
     rgb: NDArray[np.uint8]
     """Shape (n, h, w, 3)."""
     depth: NDArray[np.float32]
-    """z-depth [m], shape (n, h, w); 0 where unreliable; larger than the depth of any surface for the background."""
+    """z-depth [m], shape (n, h, w); 0 where unreliable. The background has a larger depth than any surface."""
     slant: NDArray[np.float32]
     """Slant of each pixel, shape (n, h, w), at least `_MIN_SLANT`."""
     upward: NDArray[np.float32]
-    """z of the unit surface normal that faces the lens, shape (n, h, w)."""
+    """z components (n, h, w) of the unit surface normals that point toward the lens."""
 
     def __len__(self) -> int:
         return len(self.depth)
 
     def points(self, i: int, depth: NDArray | None = None) -> Array:
-        """World points (h, w, 3) [m] of the pixels of view i, at its own or the given z-depth (h, w)."""
+        """World points (h, w, 3) [m] of the pixels of view i, at its own z-depth or at a given one (h, w)."""
         height, width = self.depth.shape[1:]
         rays = unproject(pixel_grid(width, height), self.intrinsics[i])
         local = rays * (self.depth[i] if depth is None else depth)[..., None]
@@ -99,9 +99,8 @@ def select_spread_frames(cameras: Cameras, count: int) -> NDArray[np.int64]:
 def reliable_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.float32]:
     """Sets depth (n, h, w) to 0 where a pixel is too near, half transparent or between two surfaces.
 
-    Pixels with depth beyond `far` [m] and nearly transparent pixels become background, with the depth 10 · far. The
-    inverse depth of a plane is linear in the image, so second differences distinguish a pixel between two surfaces from
-    a pixel on a slope.
+    Pixels with depth beyond `far` [m] and nearly transparent pixels become background, with depth 10 · far. The inverse
+    depth of a plane is linear in the image, so second differences distinguish pixels between surfaces from slopes.
     """
     out = np.where((depth > far) | (opacity < 0.1) | ~np.isfinite(depth), 10.0 * far, depth).astype(np.float32)
     bad = (out < _MIN_DEPTH) | ((opacity < _MIN_OPACITY) & (out < far))
@@ -110,7 +109,7 @@ def reliable_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.f
         across = np.moveaxis(inverse, axis, -1)
         step = np.diff(across)
         first, second = step[..., :-1], step[..., 1:]
-        # Selects pixels with an inverse depth between those of their neighbors, far from both, and off their line.
+        # Bad pixels: their inverse depth is between those of their neighbors, far from both, and off the line.
         steep = np.minimum(np.abs(first), np.abs(second)) > _FLYING_PIXEL_STEP * across[..., 1:-1]
         bent = np.abs(first - second) > 0.3 * np.abs(first + second)
         np.moveaxis(bad, axis, -1)[..., 1:-1] |= steep & bent & (first * second > 0)
@@ -119,7 +118,7 @@ def reliable_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.f
 
 
 def surface_slant(depth: NDArray, intrinsics: Array, camera_to_world: Array) -> tuple[NDArray, NDArray]:
-    """Slant, and upward component of the normal, shapes (n, h, w), from central differences of inverse depth.
+    """Slants and upward components of the normals, each (n, h, w), from central differences of inverse depth.
 
     A plane n · x = c seen along r = (x, y, 1) has inverse depth q = (n · r) / c, hence n ∝ (∂ₓ, ∂ᵧ, q − x ∂ₓ − y ∂ᵧ).
     """
@@ -133,7 +132,7 @@ def surface_slant(depth: NDArray, intrinsics: Array, camera_to_world: Array) -> 
         gx, gy = du * intrinsics[i, 0], dv * intrinsics[i, 1]
         normal = np.stack([gx, gy, inverse - rays[..., 0] * gx - rays[..., 1] * gy], -1)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
-        # n · r has the sign of the inverse depth, so n points away from the lens and −n towards it.
+        # n · r has the sign of the inverse depth, so n points away from the lens, and −n toward it.
         slant[i] = np.nan_to_num(np.maximum((normal * rays).sum(-1), _MIN_SLANT), nan=_MIN_SLANT)
         upward[i] = np.nan_to_num(-(normal @ camera_to_world[i, :3, :3].T)[..., 2], nan=0.0)
     return slant, upward

@@ -1,7 +1,7 @@
 """Writes `report.html`: what a build did, how good the result is, and how to improve it.
 
-The page is self-contained except for the review video beside it. Pictures come from the stage folders. Figures show
-data from these folders and from the report. The text comes from `twin.report.build_sections`.
+The page is self-contained except for the review video, a file beside it. Pictures come from the stage folders. Figures
+show data from these folders and from the report. The text comes from `twin.report.build_sections`.
 """
 
 import shlex
@@ -21,8 +21,8 @@ from twin.report.html import Chart, Picture, command, data_url, duration, flatte
 from twin.report.video_layout import load_footprints
 from twin.scene import SceneDir, stage_result
 
-_MAX_REPROJECTION = 4.0  # [px] right end of the histogram
-_MAX_TRACK_LENGTH = 30.0  # [frames] right end of the histogram
+_MAX_REPROJECTION = 4.0  # [px] right end of the histogram of reprojection errors
+_MAX_TRACK_LENGTH = 30.0  # [frames] right end of the histogram of track lengths
 
 
 def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
@@ -36,7 +36,7 @@ def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
 
 
 def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
-    """Map of the reconstruction, and map of the ground's height with the solid parts."""
+    """Two maps: of the reconstruction, and of the ground's height with the solid parts."""
     folder, mesh = scene.stage("metric"), scene.stage("mesh")
     if not (folder / "cameras.npz").exists():
         return []
@@ -100,7 +100,7 @@ def _field_charts(report: dict[str, Any]) -> list[Chart]:
 
 
 def _drive_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
-    """Curves along the drive and, if the build was compared with ground truth, along the films."""
+    """Curves along the drive; also curves along the films, if the build was compared with ground truth."""
     out = []
     along_route = "distance along the route [m]"
     trace = pick(report, "review.trace")
@@ -137,8 +137,8 @@ def load_truth_comparison(scene: SceneDir) -> dict[str, Any] | None:
     """Loads the comparison of this build with ground truth, written by `python -m twin.reality compare`.
 
     Returns:
-        `figures` (see `twin.reality.comparison`), and `camera_errors_m`, a list per source [m]; None if this build was
-        not compared.
+        A dictionary with `figures` (see `twin.reality.comparison`) and `camera_errors_m` (a list per source [m]); None
+        if this build was not compared.
     """
     if not scene.truth_json.exists():
         return None
@@ -211,7 +211,7 @@ def _kicker(report: dict[str, Any]) -> str:
 
 
 def _pictures(scene: SceneDir) -> list[Picture]:
-    """Pictures for the page, which the review stage saved."""
+    """The pictures that the review stage saved for the page."""
     folder = scene.stage("review")
     if not (folder / "review.json").exists():
         return []

@@ -22,11 +22,11 @@ from twin.report.html import (
 )
 from twin.report.visual_vs_collision import LARGE_ERROR, MAX_DEPTH
 
-_MIN_REGISTERED = 0.9  # share of frames; if fewer were placed, there is a caution
-_LARGE_SCALE_UNCERTAINTY = 0.03  # relative
+_MIN_REGISTERED = 0.9  # a caution is given if a smaller share of frames was placed
+_LARGE_SCALE_UNCERTAINTY = 0.03  # [relative] a caution is given if it is larger
 _LOW_PSNR = 18.0  # [dB]
-_FEW_HELD_OUT = 3  # frames per lighting; fewer get a caution
-_LOW_LIGHTING_AGREEMENT = 0.7  # share of places; 0.5 is chance
+_FEW_HELD_OUT = 3  # a caution is given if a lighting has fewer held-out frames
+_LOW_LIGHTING_AGREEMENT = 0.7  # [share of places] 0.5 is chance
 _LARGE_MEMORY = 4.0  # [GiB]
 
 _SCALE_SOURCES = {
@@ -42,7 +42,7 @@ _SCALE_SOURCES = {
 Row = tuple[str, str, str, str]
 """Path of a number in the report, its name, its format, and its meaning."""
 Limit = tuple[str, float, str, str]
-"""Path of a number in the report, its limit, the caution if its magnitude exceeds the limit, and the cure."""
+"""Path of a number in the report, its limit, and the caution and its cure if the magnitude exceeds the limit."""
 
 
 def _facts(report: dict[str, Any], *rows: Row) -> list[Fact]:
@@ -52,7 +52,7 @@ def _facts(report: dict[str, Any], *rows: Row) -> list[Fact]:
 def _above(report: dict[str, Any], *limits: Limit) -> list[Caution]:
     """Cautions about the numbers whose magnitude exceeds their limit.
 
-    Each caution's text is a format string for the number's magnitude and the limit.
+    The text of a limit is a format string; the number's magnitude and the limit are inserted.
     """
     found = [(_numeric(pick(report, path)), limit, what, cure) for path, limit, what, cure in limits]
     return [
@@ -262,7 +262,7 @@ def field_section(report: dict[str, Any]) -> Section:
 
 
 def cross_lighting_facts(report: dict[str, Any]) -> tuple[list[Fact], list[Caution]]:
-    """Facts and cautions on rendering places in a lighting in which they were not filmed (`twin.nerf.evaluate`)."""
+    """Facts and cautions on places that are rendered in a lighting without film of them (`twin.nerf.evaluate`)."""
     cross = pick(report, "field.cross_lighting") or {}
     follows, own, shown = (numbers(cross.get(key)) for key in ("colour_follows", "to_filmed_rms", "to_shown_rms"))
     facts, cautions = [], []
@@ -332,7 +332,7 @@ def mesh_section(report: dict[str, Any]) -> Section:
 
 
 def _route_choice(report: dict[str, Any]) -> str:
-    """Text on the origin of the route: passes that it follows, way points, or the filmed path."""
+    """Text that says where the route comes from: the passes that it follows, way points, or the filmed path."""
     route = pick(report, "mesh.route")
     if not isinstance(route, dict) or not route.get("passes"):
         return "the filmed path"
@@ -424,7 +424,7 @@ SECTIONS: dict[str, Callable[[dict[str, Any]], Section]] = {
 
 
 def geometry_section(report: dict[str, Any]) -> Section:
-    """Comparison of visual and collision geometry by the review stage (`twin.report.visual_vs_collision`)."""
+    """The review stage's comparison of visual with collision geometry (`twin.report.visual_vs_collision`)."""
     name, title = "seen_touched", "Visual and collision geometry"
     found = pick(report, name)
     if not isinstance(found, dict):
@@ -574,7 +574,7 @@ def sections(report: dict[str, Any]) -> list[Section]:
 
 
 def headline_sections(report: dict[str, Any]) -> list[Section]:
-    """Sections that have a headline: the review first, because the twin is made for driving; then in page order."""
+    """The sections with a headline. The review is first, because the twin is made for driving; the others follow."""
     with_headline = [section for section in sections(report) if section.headline]
     return sorted(with_headline, key=lambda section: section.name != "review")
 

@@ -1,7 +1,7 @@
 """Writes drives as a LeRobot dataset (version 3.0), for imitation learning and offline reinforcement learning.
 
 Each drive has one video and one row in `meta/episodes`; one table contains the frames of all drives. A frame has the
-robot's picture, its motion and pose, the action that followed, and the reward and outcome of that action. The format is
+robot's picture, motion and pose; the action that followed; and the reward and outcome of that action. The format is
 described at huggingface.co/docs/lerobot under "LeRobotDataset v3.0".
 """
 
@@ -40,8 +40,8 @@ class DriveDataset:
     """Collects drives in a folder; `finish` completes the dataset.
 
     Raises:
-        InputError: pyarrow is not installed, the frame rate [1/s] is not a whole number, or the pictures' width or
-            height is odd (videos need even ones).
+        InputError: Pyarrow is not installed, the frame rate [1/s] is not a whole number, or the width or height of the
+            pictures is odd (videos need even numbers).
     """
 
     folder: Path
@@ -50,7 +50,7 @@ class DriveDataset:
     timestep: float
     """Time between two pictures [s]."""
     actions: Mapping[str, tuple[float, float]]
-    """Components of an action, each with its lowest and highest value in the environment."""
+    """Component of an action → its lowest and highest value in the environment."""
     instruction: str
     """The task in words, for language-conditioned policies."""
     _rows: list[dict[str, NDArray]] = field(default_factory=list)
@@ -230,7 +230,7 @@ def require_pyarrow() -> None:
 
 
 def _statistics(values: NDArray) -> dict[str, Array]:
-    """LeRobot's statistics of a column of shape (k,) or (k, n); all but `count` have shape (n,), or (1,) for (k,)."""
+    """LeRobot's statistics of a column (k, n) or (k,). All but `count` have shape (n,), for (k,) shape (1,)."""
     table = values.reshape(len(values), -1).astype(np.float64)
     return _summary(table.min(0), table.max(0), table.mean(0), table.std(0), len(table))
 
@@ -262,7 +262,7 @@ def _merged(stats: list[dict[str, Array]]) -> dict[str, Array]:
 
 
 def _task_table(tasks: list[str]) -> "pyarrow.Table":
-    """Table of tasks with pandas' metadata, which make the task's text the index when LeRobot reads it with pandas."""
+    """Table of tasks. Its metadata for pandas make the task's text the index when LeRobot reads the table."""
     import pyarrow as pa
 
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})

@@ -72,7 +72,7 @@ def write_episode_video(
         ground_and_parts: Ground and outlines of solid parts, for the map.
         title: Title in the header.
         width: Width of a panel [px].
-        every: Control steps per frame; the video plays this many times faster than real time.
+        every: Control steps per video frame. The video plays this many times faster than real time.
     """
     layout = FrameLayout.for_pictures(width, observations[0].shape[0] / observations[0].shape[1])
     fps = max(1, round(1.0 / float(np.median(np.diff(episode.times))))) if len(episode.times) > 1 else 10
@@ -121,10 +121,10 @@ def write_episode_video(
 def draw_curves(
     canvas: Image, box: Box, rows: Sequence[tuple[str, Array, Color]], times: Array, now: int, size: int
 ) -> None:
-    """Draws curves over `times` [s], shape (k,), into a box, one above the other, up to index `now`.
+    """Draws curves over `times` [s], shape (k,), one above the other into a box. They end at index `now`.
 
-    `rows` contains name, values (k,) and color of each curve. A curve's scale covers all its values, so it is the same
-    in all frames of a video.
+    `rows` contains name, values (k,) and color of each curve. A curve's scale covers all its values, so the scale
+    is the same in all frames of a video.
     """
     x, y, width, height = box
     canvas[y : y + height, x : x + width] = PANEL_BACKGROUND

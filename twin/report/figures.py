@@ -34,9 +34,9 @@ _DASHES = ("-", "-.", ":")
 _VARIABLES = {INK: "--ink", MUTED: "--muted", LINE: "--line", CARD: "--card"}
 _VARIABLES |= {color: f"--c{i + 1}" for i, color in enumerate(SERIES)}
 
-_WIDTH = 4.8  # [in]; 8.5 pt text is legible even if a figure of this width is scaled to a phone's screen
+_WIDTH = 4.8  # [in] if a figure of this width is scaled to a phone's screen, 8.5 pt text is still legible
 _RASTER_DPI = 200
-_MAX_POINTS = 20_000  # per map
+_MAX_POINTS = 20_000  # most points drawn in a map
 _LEGEND_LETTERS = 55  # letters per row of a legend; a marker counts as four letters
 _STYLE: dict[str, Any] = {
     "font.size": 8.5,
@@ -67,12 +67,12 @@ _STYLE: dict[str, Any] = {
     "text.parse_math": False,
 }
 styled = matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]
-"""Decorator for functions that draw. It applies the common style, which matplotlib reads as it creates each element."""
+"""Decorator for functions that draw. It sets the common style, which matplotlib reads when it creates an element."""
 
 
 @styled
 def svg(figure: Figure) -> str:
-    """Returns a figure as an inline SVG element with CSS color variables and ids that are unique to the figure."""
+    """Returns a figure as an inline SVG element. Its colors are CSS variables; its ids are unique to the figure."""
     buffer = io.BytesIO()
     FigureCanvasSVG(figure)
     no_metadata = {"Date": None, "Creator": None}
@@ -87,7 +87,7 @@ def svg(figure: Figure) -> str:
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
     for color, variable in _VARIABLES.items():
         text = text.replace(color, f"var({variable})")
-    # Keep referenced ids only, with a prefix unique to the figure.
+    # Keep only ids that are referred to, and give them a prefix that is unique to the figure.
     referred = set(re.findall(r"#([\w.-]+)[\")]", text))
     prefix = "f" + hashlib.sha256(text.encode()).hexdigest()[:8]
     text = re.sub(r' id="([^"]+)"', lambda m: f' id="{prefix}{m[1]}"' if m[1] in referred else "", text)
@@ -106,7 +106,7 @@ def new_figure(height: float, width: float = _WIDTH) -> tuple[Figure, Axes]:
 
 @styled
 def add_legend(figure: Figure) -> None:
-    """Adds a legend for the first axes below the figure, in as many columns as fit."""
+    """Adds a legend of the first axes. It is below the figure and has as many columns as fit."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
     fitting = max(1, _LEGEND_LETTERS // (max(map(len, labels)) + 4))
     figure.legend(handles, labels, loc="outside lower center", ncols=min(fitting, len(labels)))
@@ -130,7 +130,7 @@ def map_bounds(path: Array, margin: float = 8.0) -> tuple[Array, Array]:
 
 
 def corridor_outline(route: Array, half_width: float) -> Array:
-    """Polygon of a route (m, 2) widened by `half_width` to both sides, shape (2 m, 2)."""
+    """Polygon (2 m, 2) of a route (m, 2) that is widened by `half_width` to both sides."""
     along = np.gradient(route, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     side = np.stack([-along[:, 1], along[:, 0]], 1) * half_width
@@ -211,7 +211,7 @@ def ground_map(ground: Ground, path: Array, route: Array | None, half_width: flo
 
 
 def _draw_passes(axes: Axes, passes: Sequence[FilmedPass]) -> None:
-    """Draws passes with their names, if a source has several. A cross marks a pass that ends before its film does."""
+    """Draws the passes with their names if a source has several. A cross marks a pass that ends before its film."""
     if len(passes) == len({one.source for one in passes}):
         return
     for k, one in enumerate(passes):
@@ -270,7 +270,7 @@ def curve_chart(
 
 @styled
 def bar_chart(values: dict[str, float], counts: dict[str, int], unit: str, label: str) -> Figure:
-    """Horizontal bars with value and, where known, number of samples."""
+    """Horizontal bars, each with its value and (where known) its number of samples."""
     figure, axes = new_figure(0.55 + 0.36 * max(1, len(values)))
     axes.grid(False, axis="y")
     axes.barh(range(len(values)), list(values.values()), color=SERIES[0], height=0.62)
@@ -284,7 +284,7 @@ def bar_chart(values: dict[str, float], counts: dict[str, int], unit: str, label
 
 @styled
 def histogram(values: NDArray, label: str, counted: str, highest: float, integer: bool = False) -> Figure:
-    """Histogram of nonnegative values (n,) with their median; values above `highest` are counted in the last bin.
+    """Histogram of nonnegative values (n,) with their median. The last bin also counts the values above `highest`.
 
     `counted` is the label of the vertical axis. If `integer` is True, each integer has its own bin.
     """
@@ -308,9 +308,9 @@ HALF_WIDTH, FULL_WIDTH = 4.8, 7.2
 """Figure widths [in] for half and for the full width of the page."""
 
 _ROW_HEIGHT = 0.28  # [in] per row
-_LETTER_WIDTH, _LABEL_HEIGHT = 0.075, 0.35  # [in] width of a letter; height of the axis label
+_LETTER_WIDTH, _LABEL_HEIGHT = 0.075, 0.35  # [in] of a letter; of the axis label
 _MAX_HORIZONTAL_LETTERS = 3  # longer column names are set vertically
-_MIN_ALPHA, _MAX_ALPHA = 0.08, 0.58  # opacity at strength 0 and 1; text is legible in light and dark mode
+_MIN_ALPHA, _MAX_ALPHA = 0.08, 0.58  # opacity of a cell at strength 0 and 1; its text is legible in both modes
 _CELL_HALF_SIZE = np.array([0.48, 0.46])  # in units of the cell spacing
 _MIN_FONT, _MAX_FONT = 4.5, 7.0  # [pt]; texts smaller than `_MIN_FONT` are left out
 _DIGIT_WIDTH = 0.8  # width of a digit with its gap, in units of the font size
@@ -330,8 +330,8 @@ def heatmap(
     Args:
         strength: Color strength in [−1, 1], shape (n, m). The sign selects one of two colors; NaN leaves a cell empty.
         rows: n row names.
-        columns: m column names; all are set vertically if one of them is long.
-        texts: Cell texts, shape (n, m); all are left out if they would be too small.
+        columns: m column names. If one of them is long, all are set vertically.
+        texts: Cell texts, shape (n, m). If they would be too small, all are left out.
         label: Label of the column axis.
         width: `HALF_WIDTH` or `FULL_WIDTH`.
     """
@@ -380,12 +380,12 @@ def difference_texts(difference: Array, certain: Array) -> NDArray[np.str_]:
 RATE_AXIS: dict[str, Any] = {"xlim": (-0.04, 1.04), "xticks": (0.0, 0.25, 0.5, 0.75, 1.0)}
 """Limits and ticks of a horizontal axis of rates."""
 
-_RATE_SPACING = 0.18  # distance between the rates of a policy, in units of the distance between two policies
+_RATE_SPACING = 0.18  # distance between two rates of one policy; the distance between policies is 1
 _RATE_HEIGHT = 0.17  # [in] per rate of a policy
 _MAX_NAME_LENGTH = 26  # characters of a name
 
 Rate = tuple[str, float, float, float]
-"""Policy, its rate, and the ends of the interval."""
+"""Policy, its rate, and the low and high end of the rate's interval."""
 
 
 @styled
@@ -412,9 +412,9 @@ def shorten_name(name: str) -> str:
 
 
 def lighting_labels(lightings: Sequence[str]) -> tuple[list[str], str]:
-    """Returns column names of lightings, and an axis label.
+    """Returns the column names for lightings, and an axis label.
 
-    If all lightings are randomized, the label says so instead of the names; otherwise it is empty.
+    If all lightings are randomized, the label says so, and the names omit it; otherwise the label is empty.
     """
     conditions = [Condition.parse(name) for name in lightings]
     common = all(one.randomised for one in conditions)

@@ -1,4 +1,4 @@
-"""Writes the forecast's page, `forecast.html`, with its figures; its text comes from `twin.report.forecast_text`."""
+"""Writes `forecast.html`, the forecast's page, with figures. The page's text comes from `twin.report.forecast_text`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -47,17 +47,17 @@ from twin.report.html import MAX_TABLE_ROWS, Chart, command, render
 
 # ---- figures
 
-_MAX_LABELS = 3  # named points per figure
+_MAX_LABELS = 3  # most named points in a figure
 _LABEL_SIZE = (0.5, 0.06)  # assumed width and height of a name, in axis units
 _SQUARE_SIZE = 4.6  # [in]
 
 
 @styled
 def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "success in the twin") -> Figure:
-    """Success rates of the driven candidates on the road (vertical) and in `field` (horizontal), colored by task.
+    """Success rates of the driven candidates, colored by task: on the road (vertical), and as in `field` (horizontal).
 
-    `field` is the attribute "twin" or "corrected" (predicted from the other candidates), and `label` is the label
-    of its axis. On the diagonal both rates are equal.
+    `field` is an attribute: "twin" for rates in the twin, or "corrected" for rates predicted from the other candidates.
+    `label` is the label of its axis. On the diagonal both rates are equal.
     """
     figure, axes = new_figure(_SQUARE_SIZE)
     axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
@@ -81,7 +81,7 @@ def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "su
 
 
 def _error_bars(estimates: Sequence[Estimate]) -> tuple[np.ndarray, np.ndarray]:
-    """Values, shape (n,), and the lengths of their intervals below and above the value, shape (2, n)."""
+    """Returns the values (n,), and how far their intervals extend below and above them (2, n)."""
     value, low, high = np.array([_interval(e) for e in estimates]).T
     return value, np.maximum([value - low, high - value], 0.0)
 
@@ -92,7 +92,7 @@ def _interval(e: Estimate) -> tuple[float, float, float]:
 
 
 def _label_outliers(axes: Axes, points: list[tuple[str, float, float]]) -> None:
-    """Writes names beside the points (name, x, y) farthest from the diagonal, at most `_MAX_LABELS` without overlap."""
+    """Names the points (name, x, y) farthest from the diagonal: `_MAX_LABELS` at most, whose names do not overlap."""
     named: list[tuple[float, float]] = []
     width, height = _LABEL_SIZE
     for name, x, y in sorted(points, key=lambda p: -abs(p[2] - p[1])):
@@ -107,9 +107,9 @@ def _label_outliers(axes: Axes, points: list[tuple[str, float, float]]) -> None:
 
 @styled
 def calibration_chart(group: Agreement) -> Figure:
-    """Success rate on the road over the probability that the twin predicts, one point per bin of this probability.
+    """Chart of the success rate on the road over the success probability that the twin predicts.
 
-    The area of a point shows the number of trials in the bin.
+    There is one point per bin of this probability; its area shows the number of trials in the bin.
     """
     figure, axes = new_figure(_SQUARE_SIZE)
     axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
@@ -127,7 +127,7 @@ def calibration_chart(group: Agreement) -> Figure:
 
 
 def rank_heatmap(candidates: Sequence[Candidate]) -> Figure:
-    """Probability of every rank in the twin, one row per candidate."""
+    """Probabilities of the ranks in the twin: one row per candidate, one column per rank."""
     n = len(candidates)
     chance = np.array([c.twin_ranks for c in candidates])
     ranks = [str(k + 1) if k % -(-n // 12) == 0 else "" for k in range(n)]
@@ -152,7 +152,7 @@ def _rate_heatmap(candidates: Sequence[Candidate], rates: dict[tuple[str, str], 
 
 
 def difference_heatmap(candidates: Sequence[Candidate], pairs: Sequence[CellPair]) -> Figure:
-    """Success rate on the road minus that in the twin [percentage points]; in parentheses and pale if within chance."""
+    """Success rate on the road minus that in the twin [percentage points]. Those within chance are pale and in ()."""
     policies = [c.policy for c in candidates if c.driven]
     lightings = list(dict.fromkeys(pair.lighting for pair in pairs))
     bias = matrix({(pair.policy, pair.lighting): pair.bias.value for pair in pairs}, policies, lightings)
@@ -172,7 +172,7 @@ def write_forecast_page(forecast: Forecast, folder: Path) -> None:
 
 
 def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
-    """The HTML of the page; `root` is the scene's folder, for the commands that the page shows."""
+    """The HTML of the page. `root` is the scene's folder, which the commands on the page contain."""
     policies = len({c.policy for c in forecast.candidates})
     tasks = f"{len(forecast.tasks)} tasks" if len(forecast.tasks) > 1 else "one task"
     measured = [group for group in forecast.groups if not group.missing]

@@ -1,4 +1,4 @@
-"""The text of the forecast (verdicts, limitations, next trials, the printed summary), and the table `forecast.csv`.
+"""The forecast's text (verdicts, limitations, next trials, printed summary) and its table, `forecast.csv`.
 
 The text says how well the twin predicts the road, which policy is best, and how certain these answers are. The numbers
 come from `twin.evaluation.forecasting`.
@@ -18,9 +18,9 @@ from twin.evaluation.trials import csv_text
 from twin.report.html import Caution, Verdict
 
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
-"""Rank correlations from which on twin and road rank policies alike, or roughly alike."""
+"""Twin and road rank policies alike, or roughly alike, if the rank correlation is at least this."""
 SMALL_REGRET = 0.05
-_SMALL_GAP = 0.1  # a reliable order is good news only if it starts at this difference of twin scores, or below
+_SMALL_GAP = 0.1  # an order is good news only if it is reliable from this difference of twin scores on, or less
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
@@ -43,7 +43,7 @@ STATISTICS = (
     ("twin_error", "twin is off by", "mean over the policies of the absolute difference of the rates"),
     ("mean_real", "mean on the road", "of policies such as these, driven or not (prediction-powered estimate)"),
 )
-"""Field of `Agreement`, its short name, and its meaning."""
+"""Name of a field of `Agreement`, its short name on the page, and its meaning."""
 PERCENT_STATISTICS = ("winner_regret", "bias", "coverage", "corrected_coverage", "twin_error", "mean_real")
 """Statistics shown in percent."""
 
@@ -53,7 +53,7 @@ INTERVALS_NOTE = (
     "one training, or more trials on the same day, hardly do. No interval is given where there are too few of them for "
     "a reliable one."
 )
-"""Note that accompanies all intervals of the agreement of twin and road.
+"""Note on all intervals of the numbers in `Agreement`.
 
 `benchmarks/intervals.py` measures the coverage of these intervals.
 """
@@ -65,7 +65,7 @@ CSV_COLUMNS = (
 )
 
 _RELIABLE = 0.95  # the twin's order may be believed if the road confirms it in at least this share of pairs
-_ENOUGH_PAIRS = 10  # fewer pairs confirm no order
+_ENOUGH_PAIRS = 10  # fewer pairs do not suffice to confirm an order
 _POSSIBLY_BEST = 0.05  # policies with at least this probability of being the best are worth further trials
 _TRIALS_NEEDED = (
     f"drive {MIN_POLICIES} policies or more of different quality, {MIN_TRIALS} times or more under each lighting; "
@@ -95,7 +95,7 @@ def percentage_points(share: float) -> str:
 
 
 def format_probability(probability: float) -> str:
-    """Formats an estimated probability in percent; up to 0.5% as <1%, from 99.5% as >99%."""
+    """Formats an estimated probability in percent: "<1%" for 0.5% or less, ">99%" for 99.5% or more."""
     if probability >= 0.995:
         return ">99%"
     return "<1%" if probability <= 0.005 else f"{probability:.0%}"
@@ -117,7 +117,7 @@ def verdicts(forecast: Forecast) -> list[Verdict]:
 
 
 def believable(group: Agreement) -> Verdict:
-    """Verdict on how far the scores of two policies in the twin must differ for the road to confirm their order."""
+    """Verdict: by how much must the twin's scores of two policies differ, so that the road confirms their order?"""
     pairs = [(it.low, it.pairs, it.right) for it in group.ordered]
     many, days = _count(group.trainings, "training"), _count(group.days, "day")
     where = f"measured on {days} and {many}"
@@ -161,7 +161,7 @@ def _agreement(group: Agreement) -> Verdict:
     text = f"The twin {how} these {group.policies} {what} as the road does: Spearman {format_estimate(rank)} {where}."
     if rank.no_interval:
         text = f"{text.removesuffix('.')}; {rank.no_interval}."
-    # A high value is good news only if its interval excludes poor correlations.
+    # A high correlation is good news only if its interval contains no poor ones.
     return Verdict(text, "mixed" if mood == "good" and (rank.low or 0.0) < FAIR_CORRELATION else mood)
 
 
@@ -191,7 +191,7 @@ def _bias(group: Agreement) -> Verdict:
 def _skill(group: Agreement) -> list[Verdict]:
     """Verdict: does the twin predict single days better than the mean of the other policies does?
 
-    Empty if the scores are missing.
+    The list is empty if the scores are missing.
     """
     gains = {it.predictor: it.gain for it in group.scores}
     gain = gains.get(OTHERS)
@@ -303,7 +303,7 @@ def next_trials(forecast: Forecast) -> list[str]:
 
 
 def allocation_text(allocation: TrialAllocation) -> str:
-    """Numbers of further real trials that find the best policy, and the order of all policies, as text."""
+    """Text with two numbers of further real trials: to find the best policy, and to find the order of all."""
     if allocation.policies < 2:
         return f"{allocation.task}: one policy; there is nothing to rank."
 
@@ -352,7 +352,7 @@ def summary_text(forecast: Forecast) -> str:
 
 
 def _score_lines(group: Agreement) -> list[str]:
-    """Lines of a table with the scores of each predictor, over the cells of a group."""
+    """Lines of a table with each predictor's scores over the cells of a group."""
     width = max(len(it.predictor) for it in group.scores)
     row = f"  {{:<{width}}}  {{:<7}}  {{:<7}}  {{}}".format
     lines = [row(f"{group.task}: scores, 0 is best", "Brier", "log", "the twin's log score is better by")]
@@ -363,7 +363,7 @@ def _score_lines(group: Agreement) -> list[str]:
 
 
 def candidates_csv(forecast: Forecast) -> str:
-    """`forecast.csv`: one row per candidate; a cell is empty if its number is missing."""
+    """Content of `forecast.csv`: one row per candidate. A cell is empty if its number is missing."""
     rows = []
     for c in forecast.candidates:
         numbers = [

@@ -1,8 +1,8 @@
-"""Parts that the reports share: their content, number formatting, and the Jinja environment of their pages.
+"""Parts that the reports share: types of their content, number formatting, and the Jinja environment of their pages.
 
-A report consists of sections with verdicts, facts and cautions; numbers that a stage did not report are "not measured".
-A summary repeats the headlines and cautions of the sections, so it is never more favorable than they are. The templates
-of the pages are `templates/*.html`; they escape every text unless it is `Markup`.
+A report consists of sections with verdicts, facts and cautions. A number that a stage did not report is shown as "not
+measured". A summary repeats the headlines and cautions of the sections, so it is never more favorable than they are.
+The templates of the pages are `templates/*.html`; they escape every text that is not `Markup`.
 """
 
 import base64
@@ -26,7 +26,7 @@ MOOD_WORDS = {"good": "good", "mixed": "caution", "bad": "bad", "plain": ""}
 
 @dataclass(frozen=True)
 class Verdict:
-    """A finding in one sentence for newcomers, and its mood: how good or bad the finding is."""
+    """A finding in one sentence for newcomers. Its mood says how good or bad the finding is."""
 
     text: str
     mood: str = "plain"
@@ -55,7 +55,7 @@ class Caution:
 
 @dataclass(frozen=True)
 class Section:
-    """A stage of the build, or a topic beside the stages, in the report."""
+    """A report's section on a stage of the build, or on a topic beside the stages."""
 
     name: str
     """Name of the stage or topic, as in `report.json`; the topics are "seen_touched", "truth" and "costs"."""
@@ -71,7 +71,7 @@ class Section:
 
     @property
     def headline(self) -> Verdict | None:
-        """The verdict; without one, the title if there are cautions, else None.
+        """The verdict. If there is none: the title if there are cautions, else None.
 
         If there are cautions, the mood is "mixed", or "bad" if the verdict's mood is "bad".
         """
@@ -90,7 +90,7 @@ def pick(report: Any, path: str) -> Any:
 
 
 def number(value: Any, form: str = "{:.3g}") -> str:
-    """Formats a number, for instance with "{:.1f} m"; "not measured" for anything else."""
+    """Formats a number, for instance with "{:.1f} m". Returns "not measured" for anything that is not a number."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return NOT_MEASURED
     return form.format(value).replace("-", "−") if value < 0 else form.format(value)
@@ -109,7 +109,7 @@ def duration(seconds: Any) -> str:
 def flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:
     """Lists the numbers and words of a JSON value with their dotted paths.
 
-    For a long or nested list, only its length is listed.
+    Of a long or nested list, only the length is given.
     """
     if isinstance(value, dict):
         return [
@@ -160,9 +160,9 @@ def follower_verdict(report: dict[str, Any]) -> Verdict:
 # ---- HTML
 
 MAX_TABLE_ROWS = 24
-"""Tables with more rows are collapsed; a figure above them shows the same data."""
+"""A table with more rows is collapsed; a figure above it shows the same data."""
 
-_STRIP_ASPECT = 2.4  # pictures with a larger width / height span the page
+_STRIP_ASPECT = 2.4  # pictures with a larger ratio of width to height span the page
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 A card says how a policy was trained, and how often it reached the goal in the twin under each lighting and on the real
 road. Every number comes from the records of `twin train`, `twin validate` and `twin forecast`; each of these commands
-writes the card again. The card names measurements that are missing.
+rewrites the card. If measurements are missing, the card names them.
 """
 
 import json
@@ -27,8 +27,8 @@ _CHOICE = "choice.json"
 def write_policy_cards(scene: SceneDir, runs: Iterable[str]) -> list[Path]:
     """Writes the cards of runs and returns their paths.
 
-    Names that are not a run of the scene, such as `module:function`, are skipped. Raises InputError if a record is
-    damaged.
+    Names that do not belong to runs of the scene, such as `module:function`, are skipped. Raises InputError if a record
+    is damaged.
     """
     cells = tally(read_trials(scene.episodes_csv)) if exists(scene.episodes_csv) else []
     forecast = Forecast.load(scene.forecast) if exists(scene.forecast / "forecast.json") else None
@@ -38,7 +38,7 @@ def write_policy_cards(scene: SceneDir, runs: Iterable[str]) -> list[Path]:
         folder = scene.root / "runs" / run
         if not _is_run(folder):
             continue
-        # If the run was trained further after its validation, the results are those of an earlier policy.
+        # If the run was trained further after its validation, the results belong to an earlier policy and are left out.
         same = digest_file(folder / JSON) == digests.get(run)
         mine = [cell for cell in cells if same and cell.policy == run]
         known = [one for one in forecast.candidates if same and one.policy == run] if forecast else []
@@ -49,7 +49,7 @@ def write_policy_cards(scene: SceneDir, runs: Iterable[str]) -> list[Path]:
 
 
 def card(policy: Policy, folder: Path, cells: Sequence[Cell], known: Sequence[Candidate]) -> str:
-    """The card's text, from a policy, its folder, its episodes in the twin and its entries in the forecast."""
+    """The card's text, made from a policy, its folder, its results in the twin, and its entries in the forecast."""
     trained, (width, height), control = policy.trained, policy.size, policy.control
     facts = {
         "scene": trained.get("scene"),
@@ -100,7 +100,7 @@ def card(policy: Policy, folder: Path, cells: Sequence[Cell], known: Sequence[Ca
 def _is_run(folder: Path) -> bool:
     try:
         return exists(folder / JSON)
-    except InputError:  # not a valid name of a file; tables may contain any name
+    except InputError:  # tables may contain names that are not valid file names
         return False
 
 

@@ -5,8 +5,8 @@ world/driven                              the robot's path so far
 world/robot                               the robot's pose and size
 world/robot/camera                        the front camera with its pictures
 world/obstacles                           positions of the obstacles
-speed/wanted, yaw_rate/wanted             commands of the driver
-speed/driven, yaw_rate/driven             motion of the robot
+speed/wanted, yaw_rate/wanted             speed and yaw rate that the driver commands
+speed/driven, yaw_rate/driven             speed and yaw rate of the robot
 cross_track, progress, trust, reward      one curve each
 events                                    lighting, randomization, and how the drive ended
 """
@@ -65,7 +65,7 @@ def write_rerun_recording(
         pictures: The robot's picture at each instant, k arrays of shape (height, width, 3).
         motion: Speed [m/s] and yaw rate [rad/s] at each instant, shape (k, 2).
         commands: Commanded speed [m/s] and yaw rate [rad/s] at each instant, shape (k, 2).
-        camera_to_base: Pose of the front camera, OpenCV axes, shape (4, 4).
+        camera_to_base: Pose of the front camera (OpenCV axes) on the robot, shape (4, 4).
         world: The world of the episode.
         half_width: Half width of the corridor [m].
         name: Name of the recording.

@@ -59,7 +59,7 @@ from twin.types import Array, Image
 # ---- studio
 
 _PICTURE_WIDTH = 1000  # [px] greatest width of pictures for the page
-_PICTURE_QUALITY = 82
+_PICTURE_QUALITY = 82  # of their JPEG files
 
 
 @dataclass
@@ -75,9 +75,9 @@ class Studio:
     out: Path
     render_width: int
     path: Array
-    """Path on the map [m], shape (n, 2): the route; if there is none, the camera positions of the longest source."""
+    """Path (n, 2) on the map [m]: the route if there is one, else the camera positions of the longest source."""
     pictures: list[dict[str, str]] = with_default(default_factory=list)
-    """Pictures for the page, each with its file within the stage folder, its section and its caption."""
+    """Pictures for the page: each one's file (relative to the stage folder), section and caption."""
     renders: int = 0
     render_seconds: float = 0.0
 
@@ -109,7 +109,7 @@ class Studio:
         return self.render(cameras.camera_to_world[i], cameras.intrinsics[i], size, light, width)
 
     def real_frame(self, i: int) -> Image:
-        """The undistorted frame i, with its masked part in gray stripes."""
+        """The undistorted frame i; its masked part has gray stripes."""
         image = read_image(self.cameras.image_path(i))
         mask = self.cameras.mask_path(i)
         return image if mask is None else gray_out(image, read_image(mask)[..., 0] == 0)
@@ -130,7 +130,7 @@ class Studio:
 
 
 def gray_out(image: Image, ignored: NDArray[np.bool_]) -> Image:
-    """Shows the ignored part of an image, shape (h, w), in gray stripes."""
+    """Returns the image with gray stripes where the mask `ignored` (h, w) is True."""
     v, u = np.indices(ignored.shape)
     width = max(4, len(ignored) // 40)
     stripes = np.where((u + v) // width % 2 == 0, 0.55, 0.4)[..., None]
@@ -139,7 +139,7 @@ def gray_out(image: Image, ignored: NDArray[np.bool_]) -> Image:
 
 
 def evenly_spaced(indices: Sequence[int] | NDArray, count: int) -> list[int]:
-    """At most `count` indices, evenly spaced, with the first and the last; if `count` is 1, the middle one."""
+    """At most `count` of the indices, evenly spaced from the first to the last; if `count` is 1, the middle one."""
     if count >= len(indices):
         return [int(i) for i in indices]
     if count <= 1:
@@ -148,7 +148,7 @@ def evenly_spaced(indices: Sequence[int] | NDArray, count: int) -> list[int]:
 
 
 def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
-    """At most `count` frames of a lighting's longest source, in order; half of them held out if there are enough."""
+    """At most `count` frames of a lighting's longest source, in order. Half are held-out frames if there are enough."""
     of_lighting = [i for i, name in enumerate(cameras.lightings) if name == lighting]
     sources = [cameras.sources[i] for i in of_lighting]
     if not sources:
@@ -164,8 +164,8 @@ def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
 def appearance_of_frame(cameras: Cameras, i: int) -> str:
     """Appearance of frame i, as a lighting for the field.
 
-    A training frame has its own embedding. A held-out frame gets the embedding interpolated between the training frames
-    before and after it in its film, so that the drift of light and exposure during a film does not count as an error.
+    A training frame has its own embedding. A held-out frame gets an embedding interpolated between those of the
+    training frames before and after it in its film, so that drifts of light and exposure do not count as errors.
     At an end of the film, it gets the embedding of its only neighbor.
     """
     if not cameras.held_out[i]:
@@ -184,9 +184,9 @@ def appearance_of_frame(cameras: Cameras, i: int) -> str:
 
 # ---- first and second chapter
 
-PANEL_SIZE = 320  # [px] longer side of each panel and of the render
-MAX_ERROR = 0.3  # share of full brightness at the end of the color scale
-_DEPTH_TICKS = (2.0, 5.0, 10.0, 25.0)  # [m] between the ends of the depth scale
+PANEL_SIZE = 320  # [px] longer side of each panel and of the rendered view
+MAX_ERROR = 0.3  # [share of full brightness] end of the color scale of errors
+_DEPTH_TICKS = (2.0, 5.0, 10.0, 25.0)  # [m] labels between the ends of the depth scale
 COMPARISON_STRIP = (0.3, 0.42, 0.28)  # shares of the strip: depth, map, facts
 LIGHTING_STRIP = (0.62, 0.38)  # shares of the strip: slider, map
 _CARD_SECONDS = 2.5
@@ -200,7 +200,7 @@ def write_title_card(studio: Studio, title: str, lines: list[str], seconds: floa
 
 
 def comparison_frames(studio: Studio, budget: int) -> dict[str, list[int]]:
-    """Frames of chapter 1 by lighting, for `budget` renders, of which one per lighting is for the page."""
+    """Lighting → its frames in chapter 1. One of the `budget` renders per lighting is reserved for the page."""
     share = max(1, budget // max(1, len(studio.field.lightings)) - 1)
     return {name: frames_to_compare(studio.cameras, name, share) for name in studio.field.lightings}
 
@@ -282,7 +282,7 @@ def comparison_row(studio: Studio, i: int) -> tuple[Image, float]:
     height, width = depth.shape[:2]
     film = resize(read_image(cameras.image_path(i)), width, height) / 255.0
     path = cameras.mask_path(i)
-    # A pixel of the resized mask is valid only if all the pixels that it covers are valid.
+    # A pixel of the smaller mask is valid only if it covers valid pixels only.
     mask = None if path is None else resize((read_image(path)[..., 0] > 0).astype(np.float32), width, height) > 0.999
     score = psnr(rgb, film, mask)
     error = error_colors(np.abs(rgb - film).mean(-1), mask)
@@ -305,7 +305,7 @@ def comparison_row(studio: Studio, i: int) -> tuple[Image, float]:
 
 
 def error_colors(error: NDArray, mask: NDArray[np.bool_] | None = None) -> Image:
-    """Colors of an error, shape (h, w), given as a share of full brightness.
+    """Colors of errors (h, w), which are given as shares of full brightness.
 
     Small errors are dark. Pixels where `mask` is False are gray.
     """
@@ -322,7 +322,7 @@ def map_with_pose(map_view: MapView, pose: NDArray[np.float64], dots: NDArray[np
 
 
 def lighting_steps(lightings: int, budget: int) -> int:
-    """Number of views per transition between two lightings, at least 2; the budget also includes the final view."""
+    """Number of views per transition between two lightings, at least 2. The budget also pays for the final view."""
     return max(2, (budget - 1) // max(1, lightings - 1))
 
 
@@ -384,7 +384,7 @@ T = TypeVar("T")
 
 DRIVE_STRIP = (0.62, 0.38)  # shares of the strip: map, facts
 _MAX_DRIVE_SECONDS = 14.0  # [s] in the video; longer drives are sped up
-_CROSSFADE_SHARE = 0.25  # the last share of a lighting's route segment, in which it blends into the next lighting
+_CROSSFADE_SHARE = 0.25  # in this last share of a lighting's route segment, it blends into the next lighting
 _CONTROL_RATE = 10  # control steps per second of a RecordedDrive
 
 
@@ -398,7 +398,7 @@ def smoothed_speed(drive: RecordedDrive) -> Array:
 
 
 def lighting_at(lightings: tuple[str, ...], share: float) -> tuple[str, str]:
-    """Lighting at a share of the route: name for the field, and label for viewers; all lightings get equal segments."""
+    """Lighting at a share of the route: its name for the field, and its label. Lightings get equal segments."""
     index = min(int(share * len(lightings)), len(lightings) - 1)
     within = share * len(lightings) - index
     if index == len(lightings) - 1 or within <= 1.0 - _CROSSFADE_SHARE:
@@ -409,14 +409,14 @@ def lighting_at(lightings: tuple[str, ...], share: float) -> tuple[str, str]:
 
 
 def frame_timing(drive: RecordedDrive, fps: int) -> tuple[int, int]:
-    """Control steps per picture, and video frames per picture, so that the video takes `_MAX_DRIVE_SECONDS` at most."""
+    """Returns control steps and video frames per picture, so that the drive takes `_MAX_DRIVE_SECONDS` at most."""
     speedup = max(1.0, float(drive.times[-1]) / _MAX_DRIVE_SECONDS)
     every = max(1, math.ceil(speedup * _CONTROL_RATE / fps - 1e-9))
     return every, max(1, int(fps * every / (_CONTROL_RATE * speedup) + 1e-9))
 
 
 def rendered_instants(instants: list[T], budget: int) -> list[T]:
-    """At most `budget` of the instants, for which the field is rendered; at the others, the last view is repeated."""
+    """Instants for which the field is rendered, at most `budget`. At the other instants, the last view is repeated."""
     return instants[:: max(1, -(-len(instants) // max(1, budget)))]
 
 
@@ -429,9 +429,9 @@ def write_drive_chapter(
     budget: int,
     progress: tqdm,
 ) -> None:
-    """Chapter 3: the drive from the robot's camera and from behind.
+    """Chapter 3: the drive, seen by the robot's camera and from behind the robot.
 
-    `chase` has one picture per shot of `chase_shots`; at most `budget` views of the field are rendered.
+    `chase` contains one picture per shot of `chase_shots`. At most `budget` views of the field are rendered.
     """
     layout = studio.layout
     every, hold = frame_timing(drive, studio.fps)

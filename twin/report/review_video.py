@@ -1,7 +1,7 @@
 """Stage `review`: the review video, metrics of a scripted drive, and pictures for the report page.
 
-The video has up to three chapters: real and rendered frames; changing light, if there are several lightings; and
-the Husky driven along the route by a scripted follower, if there is a route.
+The video has up to three chapters. The first compares real and rendered frames. The second, if there are several
+lightings, shows changing light. The third, if there is a route, shows a scripted follower that drives the Husky.
 """
 
 import queue
@@ -69,11 +69,11 @@ from twin.scene import SceneDir
 from twin.types import Array, Image
 
 Shot = tuple[Array | None, Array]
-"""A robot configuration (MuJoCo's qpos; None for the initial one) and a camera pose (OpenCV)."""
+"""The robot's configuration (MuJoCo's qpos; None for the initial one), and a camera pose (OpenCV axes)."""
 
 _RENDER_SHARES = (0.25, 0.2, 0.55)  # shares of `review.renders` for the chapters
-_PREFETCH_BYTES = 64 * 2**20  # [bytes] of prefetched MuJoCo pictures
-_GAP_ROWS = 3  # views for which the page shows the gap between visual and collision geometry
+_PREFETCH_BYTES = 64 * 2**20  # [bytes] most memory of prefetched MuJoCo pictures
+_GAP_ROWS = 3  # number of views whose gap between visual and collision geometry is on the page
 _CRF = 24  # about 5 MB for the demo's video
 _MOOD_COLORS = {"good": GREEN, "mixed": AMBER, "bad": RED, "plain": AMBER}
 
@@ -87,9 +87,10 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         out: Receives `review.mp4`, `review.json` and `pictures/*.jpg`.
 
     Returns:
-        Metrics for the report: `follower` (None without a route; `not_applicable` then contains the reason), `frames`,
-        `duration_s`, `renders`, `render_seconds_per_frame`. With a route also `trust` (see `trust_metrics`), `trace`
-        (see `drive_trace`) and `seen_touched` (see `twin.report.visual_vs_collision.compare_geometry`).
+        Metrics for the report: `follower`, `frames`, `duration_s`, `renders`, `render_seconds_per_frame`. With a route
+        also `trust` (see `trust_metrics`), `trace` (see `drive_trace`) and `seen_touched` (see
+        `twin.report.visual_vs_collision.compare_geometry`). Without one, `follower` is None, and `not_applicable`
+        contains the reason.
     """
     return write_review_video(scene, config, out, BakedField.load(scene.stage("field")))
 
@@ -149,7 +150,7 @@ def _write_chapters(
     strip, panel = studio.layout.strip, studio.layout.panel
     views, model = _scene_shots(studio, scene, world)
     behind = chase_shots(drive, frame_timing(drive, studio.fps)[0]) if drive else []
-    # Warp compiles kernels at first use; compile those of the field before the second thread compiles the scene's.
+    # Warp compiles kernels at first use: those of the field now, before the second thread compiles those of the scene.
     field.render(cameras.select(np.array([0])), field.lightings[0], (16, 8))
     total = sum(map(len, chosen.values())) + len(rendered_instants(behind, drives))
     total += lighting_steps(len(field.lightings), turns) * (len(field.lightings) - 1) + 1 if turns else 0
@@ -197,7 +198,7 @@ def _scene_shots(studio: Studio, scene: SceneDir, world: World | None) -> tuple[
 
 
 def load_ground_and_parts(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
-    """Ground of the mesh stage (None if there is none), and outlines of its low parts, for the map."""
+    """For the map: the ground of the mesh stage (None if there is none), and the outlines of its low parts."""
     folder = scene.stage("mesh")
     ground = Ground.load(folder) if (folder / "ground.npz").exists() else None
     return ground, load_footprints(folder / "parts.npz", ground)
@@ -220,7 +221,7 @@ def _save_capture_pictures(studio: Studio) -> None:
 
 # ---- numbers of the drive
 
-_TRACE_SAMPLES = 200  # per drive
+_TRACE_SAMPLES = 200  # most samples of a drive
 
 
 def drive_metrics(drive: RecordedDrive) -> dict[str, Any]:
@@ -248,8 +249,8 @@ def drive_trace(drive: RecordedDrive) -> dict[str, list[float]]:
 # ---- shots of the MuJoCo scene
 
 
-_OVERVIEW_BEHIND, _OVERVIEW_ABOVE, _OVERVIEW_AHEAD = 9.0, 7.0, 10.0  # [m] camera behind and above, look-at point ahead
-_OVERVIEW_POSITIONS = (0.0, 0.45)  # of the overviews, as shares of the route's length
+_OVERVIEW_BEHIND, _OVERVIEW_ABOVE, _OVERVIEW_AHEAD = 9.0, 7.0, 10.0  # [m] camera: behind, above; target: ahead
+_OVERVIEW_POSITIONS = (0.0, 0.45)  # places of the overviews, as shares of the route's length
 
 
 def overview_pose(route: Array, s: float) -> Array:
@@ -275,7 +276,7 @@ def camera_shots(cameras: Cameras) -> list[Shot]:
 
 
 def chase_shots(drive: RecordedDrive, every: int) -> list[Shot]:
-    """Shots from behind the driving robot, one every `every` control steps and one at the last step."""
+    """Shots from behind the driving robot: one in every `every` control steps, and one at the last step."""
     poses = chase_poses(drive.base_to_world)
     return [(drive.qpos[i], poses[i]) for i in frame_indices(len(drive.times), every)]
 
@@ -294,17 +295,17 @@ def render_shots(world: World, shots: list[Shot], size: tuple[int, int]) -> Iter
 
 # ---- map of the trust estimate
 
-_TRUST_STEP = 1.5  # [m] along the route
-_OFFSETS = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # lateral, left positive, in corridor half widths
+_TRUST_STEP = 1.5  # [m] along the route, between two views
+_OFFSETS = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # [half widths of the corridor] sideways, left positive
 _TRUST_SIZE = (80, 45)  # [px] of the rendered views
 _BATCH = 32
 _LOW_TRUST = 0.5  # views below this count as untrusted
-_CELL = (18, 16)  # [px] width of a cell if there are 40 columns, height of a cell
-_MARGIN_ROWS, _MARGIN_RIGHT = 26, 40  # [px] margin above and below; margin at the right, for the last label
+_CELL = (18, 16)  # [px] width of a cell if there are 40 columns; its height
+_MARGIN_ROWS, _MARGIN_RIGHT = 26, 40  # [px] above and below; at the right, for the last label
 
 
 def trust_grid(field: RenderableField, cameras: Cameras, world: World) -> tuple[Array, Array, Array]:
-    """Estimates the trust in views of the front camera that look along the route, from the route and from beside it.
+    """Estimates the trust in views of the front camera on and beside the route, with headings along the route.
 
     Returns:
         Arc lengths [m], shape (k,); lateral offsets, left positive [m], shape (m,); trust in [0, 1], shape (m, k).
@@ -338,7 +339,7 @@ def trust_metrics(s: Array, offsets: Array, trust: Array) -> dict[str, Any]:
 
 
 def trust_picture(s: Array, offsets: Array, trust: Array) -> Image:
-    """Draws the trust grid: arc length increases to the right, the route's left is at the top, high trust is bright."""
+    """Draws the trust grid. Arc length increases to the right; the route's left is at the top; high trust is bright."""
     wide, high = max(2, _CELL[0] * 40 // max(len(s), 1)), _CELL[1]
     body = cv2.resize(
         colored("viridis", trust[::-1]), (wide * len(s), high * len(offsets)), interpolation=cv2.INTER_NEAREST
@@ -358,11 +359,11 @@ def trust_picture(s: Array, offsets: Array, trust: Array) -> Image:
 
 T = TypeVar("T")
 
-_POLL_INTERVAL = 0.2  # [s] between checks whether the `with` block was left
+_POLL_INTERVAL = 0.2  # [s] time between two checks for the end of the `with` block
 
 
 class Prefetcher(Generic[T]):
-    """Iterates over `items`, which a thread computes up to `depth` items ahead.
+    """Iterates over `items`. A thread computes them, up to `depth` items ahead of the consumer.
 
     The thread starts when the `with` block is entered, and stops when the block is left. Warp kernels release the GIL,
     so the thread uses a second core. If computing an item fails, the iteration raises the exception at that item.

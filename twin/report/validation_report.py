@@ -1,9 +1,9 @@
 """The summary of a validation, and `validation.html`: how often policies reach the goal, and why they fail.
 
 `results` is the content of `summary.json`: the result of `summarize`, and entries that `twin.validate` adds. Paired
-episodes share lighting and seed. For two policies, the exact McNemar test compares the number of episodes in which only
-the first succeeded with the number in which only the second did. Videos are files beside the page; their posters are
-embedded in the page.
+episodes share lighting and seed. Two policies are compared by the exact McNemar test on two numbers: that of the
+episodes in which only the first succeeded, and that of the episodes in which only the second did. Videos are files
+beside the page; their posters are embedded in the page.
 """
 
 from collections import Counter
@@ -49,11 +49,11 @@ from twin.report.html import MAX_TABLE_ROWS, Caution, Chart, Picture, Verdict, c
 from twin.scene import SceneDir
 
 MAX_P_VALUE = 0.1
-"""Paired differences with a larger p-value are reported as within chance."""
+"""A paired difference with a larger p-value is reported as within chance."""
 FEW_EPISODES = 30
 """A cell with fewer episodes gets a caution about wide intervals."""
 TRUSTED = 0.8
-"""Episodes with a lower mean trust of their pictures are counted separately."""
+"""An episode is counted separately if the mean trust in its pictures is lower."""
 FAILURES = {
     "collision": ("hit something", "touched anything solid except the ground"),
     "out_of_bounds": ("left the corridor", "its center was more than half the corridor’s width off the route"),
@@ -79,7 +79,7 @@ def success_rate(trials: Sequence[Trial]) -> dict[str, Any]:
 
 
 def summarize(trials: Sequence[Trial]) -> dict[str, Any]:
-    """Success and causes of failure per policy, task and lighting, and paired comparisons."""
+    """Counts successes and causes of failure per policy, task and lighting, and compares policies in pairs."""
     cells = []
     for cell in tally(trials):
         own = [t for t in trials if (t.policy, t.task, t.lighting) == cell.key]
@@ -94,7 +94,7 @@ def summarize(trials: Sequence[Trial]) -> dict[str, Any]:
 
 
 def compare_pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """Compares every two policies of a task on the episodes that both drove; leaves out pairs without such episodes."""
+    """Compares every two policies of a task on the episodes that both drove. Pairs without any are left out."""
     by_policy: dict[tuple[str, str], dict[tuple[str, int], bool]] = {}
     for t in trials:
         by_policy.setdefault((t.task, t.policy), {})[t.lighting, t.seed] = t.success
@@ -113,7 +113,7 @@ def compare_pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
 
 
 def typical_episode(trials: Sequence[Trial]) -> Trial:
-    """The episode with the median progress; if the number of episodes is even, the upper of the two in the middle."""
+    """The episode with the median progress. For an even number of episodes, it is the upper one of the middle two."""
     return sorted(trials, key=lambda t: t.progress)[len(trials) // 2]
 
 
@@ -176,7 +176,7 @@ def p_value_text(p: float) -> str:
 
 
 def verdicts(results: dict[str, Any]) -> list[Verdict]:
-    """The headlines: the best policy of every task with its worst lighting, and the number of untrusted episodes."""
+    """The headlines: each task's best policy with its worst lighting, and the number of untrusted episodes."""
     out = [_task_verdict(task, [c for c in results["cells"] if c["task"] == task]) for task in tasks(results)]
     low, of = (sum(c[k]["trials"] for c in results["cells"]) for k in ("low_trust", "trusted"))
     if low:
@@ -189,7 +189,7 @@ def _task_verdict(task: str, cells: list[dict[str, Any]]) -> Verdict:
     lightings: dict[str, set[str]] = {}
     for c in cells:
         lightings.setdefault(c["policy"], set()).add(c["lighting"])
-    # Policies are compared only in lightings in which all of them drove.
+    # Policies are compared only in the lightings that all of them drove in.
     common = set.intersection(*lightings.values())
     if not common:
         return Verdict(f"On {task} no lighting was used for all policies: there is no best one.", "mixed")
@@ -272,7 +272,7 @@ def summary_lines(results: dict[str, Any]) -> list[str]:
 # ---- figures
 
 MAX_PLOTTED_LIGHTINGS = 4
-"""Largest number of lightings whose rates are plotted with intervals; more are shown as a heatmap."""
+"""Rates are plotted with intervals for up to so many lightings; those of more are shown as a heatmap."""
 
 _BIN = 2.0  # [m] width of the failure histogram's bins along the route
 _FAILURE_LOOKS = {  # cause → color and hatching
@@ -285,7 +285,7 @@ _FAILURE_LOOKS = {  # cause → color and hatching
 
 
 def rate_figure(cells: Sequence[dict[str, Any]]) -> Figure:
-    """Success rates on a task with intervals: one row per policy, one color per lighting."""
+    """Success rates on a task, with intervals: one row per policy, one color per lighting."""
     rates: dict[str, list[tuple[str, float, float, float]]] = {}
     for c in cells:
         rates.setdefault(c["lighting"], []).append((c["policy"], c["rate"], c["low"], c["high"]))
@@ -296,8 +296,8 @@ def rate_figure(cells: Sequence[dict[str, Any]]) -> Figure:
 def rate_heatmap(cells: Sequence[dict[str, Any]], trained: Mapping[str, float | None]) -> Figure:
     """Success rates on a task [%]: one row per policy, one column per lighting.
 
-    The first columns are the rate in training, if any is known, and the mean over the lightings in which all policies
-    drove.
+    The first column is the rate in training, unless none is known. The next is the mean over the lightings in which
+    all policies drove.
     """
     policies, lightings = (list(dict.fromkeys(c[key] for c in cells)) for key in ("policy", "lighting"))
     rate = matrix({(c["policy"], c["lighting"]): c["rate"] for c in cells}, policies, lightings)
@@ -315,8 +315,8 @@ def pair_heatmap(pairs: Sequence[dict[str, Any]]) -> Figure:
     """Paired comparisons of a task's policies: the row's policy is better (blue), worse (red), or within chance (pale).
 
     A cell's number is the number of shared episodes in which only the row's policy succeeded, minus the number in which
-    only the column's policy did. It is in parentheses if the difference is within chance. Rows are sorted by
-    significant wins minus losses; columns have the same order.
+    only the column's policy did. It is in parentheses if the difference is within chance. Rows and columns are
+    sorted by the number of significant wins minus that of significant losses.
     """
     policies = list(dict.fromkeys(p[key] for p in pairs for key in ("a", "b")))
     ahead, surely = (np.full((len(policies), len(policies)), np.nan) for _ in range(2))
@@ -350,7 +350,7 @@ def training_figure(steps: NDArray[np.int64], success: NDArray[np.int64], saved:
 
 
 def failure_map(path: Path, trials: Sequence[Trial], world: World, segment: tuple[float, float]) -> None:
-    """Plots the places on the route where failed episodes of a task ended, as a picture at `path`.
+    """Writes a picture to `path`: the places on the route at which failed episodes of a task ended.
 
     `segment` contains the arc lengths of the task's start and end on the route [m].
     """

@@ -1,7 +1,8 @@
-"""Layout of video frames (a header, two *panels* side by side, and a *strip* below them), and drawing on them.
+"""Layout of video frames, and functions that draw on them.
 
-Pictures are RGB uint8, shape (height, width, 3). A *box* is x, y, width, height [px] within the canvas. Functions that
-take a canvas draw in place.
+A frame has a header, two *panels* side by side, and a *strip* below the panels. Pictures are RGB uint8,
+shape (height, width, 3). A *box* is x, y, width, height [px] within the canvas. Functions that take a canvas draw in
+place.
 """
 
 import functools
@@ -42,7 +43,7 @@ NEAREST_DEPTH, FARTHEST_DEPTH = 1.0, 60.0  # [m], ends of the depth color scale
 
 @functools.cache
 def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """The DejaVu Sans font that matplotlib contains, so that videos look the same on all machines."""
+    """DejaVu Sans as contained in matplotlib, so that videos look the same on all machines."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size)
 
@@ -61,7 +62,7 @@ def shorten(text: str, width: int, size: int, bold: bool = False) -> str:
 
 
 def wrap(text: str, width: int, size: int, bold: bool = False) -> list[str]:
-    """Breaks text into lines of at most `width` [px]; shortens single words that are wider."""
+    """Breaks text into lines of at most `width` [px]. A single word that is wider is shortened."""
     lines: list[str] = []
     for word in text.split():
         if lines and text_width(f"{lines[-1]} {word}", size, bold) <= width:
@@ -74,14 +75,14 @@ def wrap(text: str, width: int, size: int, bold: bool = False) -> list[str]:
 def draw_text(
     canvas: Image, text: str, x: int, y: int, size: int, color: Color = INK, bold: bool = False, align: str = "left"
 ) -> None:
-    """Draws one line with its top at y; `align` ("left", "middle" or "right") says which of its points is at x."""
+    """Draws one line of text with its top at y. Its left end, middle or right end is at x, as `align` says."""
     width, height = text_width(text, size, bold) + 2, round(size * 1.35)
     x -= {"left": 0, "middle": width // 2, "right": width}[align]
     left, top = max(x, 0), max(y, 0)
     right, bottom = min(x + width, canvas.shape[1]), min(y + height, canvas.shape[0])
     if right <= left or bottom <= top:
         return
-    # PIL copies the picture that it draws on, so it gets only the patch under the text.
+    # PIL copies the picture on which it draws, so it gets only the patch under the text.
     patch = PILImage.fromarray(canvas[top:bottom, left:right])
     ImageDraw.Draw(patch).text((x - left, y - top), text, font=font(size, bold), fill=color)
     canvas[top:bottom, left:right] = np.asarray(patch)
@@ -114,7 +115,7 @@ def to_uint8(rgb: NDArray) -> Image:
 
 
 def colored(name: str, shares: NDArray) -> Image:
-    """Shares in [0, 1], shape (h, w), in the colors of a matplotlib colormap."""
+    """Colors of shares (h, w) in [0, 1], from the matplotlib colormap `name`."""
     return to_uint8(colormaps[name](shares)[..., :3])
 
 
@@ -134,7 +135,7 @@ def fit(picture: NDArray, size: tuple[int, int]) -> Image:
 
 
 def depth_colors(depth: NDArray, opacity: NDArray | None = None) -> Image:
-    """Colors of depths [m], shape (h, w): near is bright, far is dark, on a logarithmic scale.
+    """Colors of depths [m], shape (h, w), on a logarithmic scale: near is bright, far is dark.
 
     Pixels with `opacity` below one half get the color of an empty panel.
     """
@@ -145,7 +146,7 @@ def depth_colors(depth: NDArray, opacity: NDArray | None = None) -> Image:
 
 
 def depth_scale(depth: NDArray | float) -> NDArray[np.float64]:
-    """Position of depths [m] on the scale of `depth_colors`, 0 at the near and 1 at the far end."""
+    """Positions of depths [m] on the scale of `depth_colors`: 0 is its near end, 1 its far end."""
     clipped = np.clip(np.nan_to_num(depth, nan=1e9), NEAREST_DEPTH, FARTHEST_DEPTH)
     return np.log(clipped / NEAREST_DEPTH) / np.log(FARTHEST_DEPTH / NEAREST_DEPTH)
 
@@ -159,7 +160,7 @@ class FrameLayout:
 
     @staticmethod
     def for_pictures(width: int, aspect: float) -> "FrameLayout":
-        """Layout for pictures of height / width = `aspect`, clipped to [0.4, 1]; panels are `width` [px] wide."""
+        """Layout with panels `width` [px] wide. Their height / width is `aspect`, clipped to [0.4, 1]."""
         return FrameLayout((even(max(width, 160)), even(round(max(width, 160) * float(np.clip(aspect, 0.4, 1.0))))))
 
     @property
@@ -265,7 +266,7 @@ def draw_depth_legend(canvas: Image, box: Box, size: int) -> None:
 
 
 def draw_slider(canvas: Image, box: Box, lightings: tuple[str, ...], at: float, size: int) -> None:
-    """Draws a slider with a stop per lighting; the knob is at `at`: 0 is the first stop, 1 the second, and so on."""
+    """Draws a slider with a stop per lighting. `at` is the knob's position: 0 is the first stop, 1 the second, ..."""
     x, y, width, height = box
     canvas[y : y + height, x : x + width] = PANEL_BACKGROUND
     left, right, middle = x + round(0.08 * width), x + round(0.92 * width), y + height // 2
@@ -292,7 +293,7 @@ _LINE_HEIGHT = 30  # [px] height of a line of text above or below a panel
 
 
 def scale_bar(width: int, ramp: Image, labels: list[tuple[float, str]]) -> Image:
-    """Draws a color bar with labels at shares of its length; labels that would overlap others are left out."""
+    """Draws a color bar with labels at shares of its length. Labels that would overlap others are left out."""
     out = np.full((2 * _LINE_HEIGHT - 10, width, 3), BACKGROUND, np.uint8)
     bar = ramp.shape[1]
     left = (width - bar) // 2
@@ -324,7 +325,7 @@ def titled_panel(picture: Image, title: str, note: str, below: Image) -> Image:
     if note and free > 20:
         draw_text(head, shorten(note, free, _TEXT), width - 4, 5, _TEXT, MUTED, align="right")
     body = picture.copy()
-    body[[0, -1]] = PANEL_BACKGROUND  # marks the edge of pictures as dark as the background
+    body[[0, -1]] = PANEL_BACKGROUND  # shows the edge of a picture that is as dark as the background
     return np.concatenate([head, body, below])
 
 
@@ -356,8 +357,8 @@ def footprints(
 ) -> list[Array]:
     """Outlines of convex parts from above, each shape (k, 2) [m], counterclockwise.
 
-    Part i has the vertices (v, 3) [m] from `vertex_start[i]` to `vertex_start[i + 1]`. Parts that start more than
-    `max_height` [m] above the ground are dropped, because the robot does not reach them.
+    The vertices (v, 3) [m] of part i are those from `vertex_start[i]` to `vertex_start[i + 1]`. Parts that are
+    entirely more than `max_height` [m] above the ground are dropped, because the robot does not reach them.
     """
     outlines = []
     for start, end in pairwise(vertex_start):
@@ -372,7 +373,7 @@ def footprints(
 
 
 def load_footprints(path: Path, ground: Ground | None) -> list[Array]:
-    """Footprints of the mesh stage's `parts.npz`; empty if the file does not exist."""
+    """Footprints of the parts in `parts.npz` of the mesh stage; an empty list if there is no such file."""
     if not path.exists():
         return []
     with np.load(path, allow_pickle=False) as data:
@@ -380,7 +381,7 @@ def load_footprints(path: Path, ground: Ground | None) -> list[Array]:
 
 
 def map_rotation(path: Array) -> Array:
-    """Rotation, shape (2, 2), that turns the longest extent of a path (n, 2) to the x axis, its start at the left."""
+    """Rotation (2, 2) that turns the longest extent of a path (n, 2) to the x axis, with its start at the left."""
     centered = path - path.mean(0)
     axis = np.linalg.svd(centered, full_matrices=False)[2][0] if len(path) > 1 else np.array([1.0, 0.0])
     if (path[-1] - path[0]) @ axis < 0:
@@ -409,7 +410,7 @@ class MapView:
     ) -> "MapView":
         """Draws the static map, centered on a path (n, 2) [m], for an image of `size` (width, height) [px].
 
-        `parts` are outlines from `footprints`; the corridor around the path is not drawn if its half width [m] is 0.
+        `parts` are outlines from `footprints`. If the half width [m] of the corridor is 0, the corridor is not drawn.
         """
         to_pixel = _map_transform(path, size)
         scale = float(np.hypot(*to_pixel[:, 0]))
@@ -435,7 +436,7 @@ class MapView:
     def with_marker(
         self, position: Array, heading: Array, trail: Array | None = None, dots: Array | None = None
     ) -> Image:
-        """Returns a copy of the picture with an arrow at `position` [m] in direction `heading`, both of shape (≥2,).
+        """Returns a copy of the picture with an arrow at `position` [m], pointing along `heading`, both of shape (≥2,).
 
         `trail` [m], shape (n, 2), is drawn as a line, and `dots` [m], shape (n, 2), as dots.
         """
@@ -458,7 +459,7 @@ class MapView:
 
 
 def _map_transform(path: Array, size: tuple[int, int]) -> Array:
-    """Affine map from [m] to [px], shape (2, 3), that fits the rotated path with a margin into `size`."""
+    """Affine map (2, 3) from [m] to [px]. It rotates the path and fits it with a margin into `size`."""
     turn = map_rotation(path)
     turned = path @ turn.T
     low, high = turned.min(0) - _MAP_MARGIN, turned.max(0) + _MAP_MARGIN

@@ -1,7 +1,7 @@
 """Writes and reads H.264 mp4 videos with PyAV; needs no display and no system codec.
 
-Frames are RGB uint8, shape (height, width, 3). Videos are yuv420p in BT.709, which every browser plays. Their width
-and height are even. Their index is stored first, so that playback starts before the download ends.
+Frames are RGB uint8, shape (height, width, 3). Videos are yuv420p in BT.709, which every browser plays; their width
+and height are even. A video's index is stored first, so that playback can start before the download ends.
 """
 
 import io
@@ -22,7 +22,7 @@ _THREADS = 4  # threads of x264, a fixed number because the encoded bytes depend
 
 
 def even(size: int) -> int:
-    """Largest even number up to `size`, at least 2; 4:2:0 chroma subsampling needs even sides."""
+    """Largest even number up to `size`, but at least 2. Chroma subsampling (4:2:0) needs even sides."""
     return max(2, size // 2 * 2)
 
 
@@ -98,7 +98,7 @@ class VideoWriter:
 
 
 def frame_indices(count: int, every: int) -> list[int]:
-    """Every `every`-th index from 0 on, and the last one, `count` − 1; `count` is at least 1."""
+    """Every `every`-th index from 0 on, and the last index, `count` − 1. `count` must be at least 1."""
     indices = list(range(0, count, every))
     return indices if indices[-1] == count - 1 else [*indices, count - 1]
 

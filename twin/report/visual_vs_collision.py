@@ -2,14 +2,15 @@
 
 *Gap*: z-depth of the collision geometry minus that of the field, along a pixel's ray. *Visual-only* geometry ("leak" in
 the report's keys) is visible but cannot be collided with. *Collision-only* geometry ("ghost") can be collided with but
-is not visible. On the ground, differences are measured as heights, since along a ray at a low angle a centimeter of
-height becomes decimeters. For obstacles, they are distances to the nearest surface of the other geometry. In the
-corridor, visual-only geometry is measured by its height above the collision ground, and collision-only parts by their
-gap.
+is not visible. Differences are measured in three ways:
+
+- on the ground: as heights, since a centimeter of height is decimeters along a ray at a low angle
+- on obstacles: as distances to the nearest surface of the other geometry
+- in the corridor: visual-only geometry by its height above the collision ground, collision-only parts by their gap
 
 Frames are matched within a film, so the field's depth is determined only where one film shows a place from two
-directions. Elsewhere (mainly just ahead of a drive's first frame) the depth may differ from build to build.
-Collision-only geometry there is reported separately, as `unfilmed_ghost_m`.
+directions. At other places (mainly just ahead of a drive's first frame) the depth may differ from build to build.
+Collision-only geometry at such places is reported separately, as `unfilmed_ghost_m`.
 """
 
 from collections.abc import Callable
@@ -41,28 +42,28 @@ from twin.report.video_layout import (
 from twin.runtime import track
 from twin.types import Array, Image
 
-VIEW_SPACING = 2.0  # [m] of the drive between two views
+VIEW_SPACING = 2.0  # [m] way of the robot between two views
 MAX_DEPTH = 10.0  # [m] maximum compared depth
-LARGE_ERROR = 0.2  # [m]; larger differences are counted or get a caution
+LARGE_ERROR = 0.2  # [m] larger differences are counted or get a caution
 
 _MIN_OPACITY = 0.5  # pixels of lower opacity count as empty
 _THINNING_CELL = 0.05  # [m]; point clouds are thinned to one point per cell
 _MIN_OBSTACLE_HEIGHT = 0.2  # [m] above the ground
-_ROUTE_STEP = 0.05  # [m]
-_BIN = 1.0  # [m] of the route per bin of the figure
-_MIN_PARALLAX = 1.0  # [°] smallest angle between two viewing directions that determine the depth of a point
+_ROUTE_STEP = 0.05  # [m] between the places on the route to which points are assigned
+_BIN = 1.0  # [m] length on the route of a bin of the figure
+_MIN_PARALLAX = 1.0  # [°] two views determine a point's depth if their directions differ by at least this
 
 
 @dataclass(frozen=True)
 class GeometryViews:
-    """n views of both geometries. Depths are z-depths [m], FAR where nothing is hit, shape (n, height, width)."""
+    """n views of both geometries. Depths (n, height, width) are z-depths [m]; they are FAR where nothing is hit."""
 
     camera_to_world: Array
     """Shape (n, 4, 4)."""
     visual_depth: Array
     collision_depth: Array
     is_ground: NDArray[np.bool_]
-    """True for pixels whose ray first hits the ground of the collision geometry, shape (n, height, width)."""
+    """Mask (n, height, width) of the pixels whose ray hits the ground first, among the collision geometry."""
     rgb: NDArray[np.float32]
     """Colors of the field, shape (n, height, width, 3)."""
 
@@ -120,7 +121,7 @@ def compare_geometry(
     Held-out cameras do not count as filmed, because the field was not trained on them.
 
     Returns:
-        Lengths are in [m]; a median, quantile or share of no points is None.
+        Lengths are in [m]. A median, quantile or share is None if there are no points for it.
 
         - `views`, `pixels`: numbers of views and of compared pixels. Their visible geometry is closer than `MAX_DEPTH`
           and not higher above the ground than the highest part.
@@ -179,7 +180,7 @@ def compare_geometry(
 
 
 def _in_corridor(world: World, points: Array, among: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-    """Stations (arc lengths on the route) [m] of points (..., 3), and a mask of those in the corridor.
+    """Returns the stations (arc lengths on the route) [m] of points (..., 3), and a mask of the points in the corridor.
 
     Only the points selected by the mask `among` are looked up; the others have station −1. The corridor ends at the
     route's ends.
@@ -189,16 +190,16 @@ def _in_corridor(world: World, points: Array, among: NDArray[np.bool_]) -> tuple
     distance, index = cKDTree(point_at(world.route[:, :2], stations)).query(points[among][:, :2])
     station, inside = np.full(among.shape, -1.0), np.zeros(among.shape, bool)
     station[among] = stations[index]
-    # Points beyond an end of the route have that end as their nearest point, so they are excluded.
+    # Points whose nearest point is an end of the route are excluded, since they may be beyond it.
     inside[among] = (distance <= world.half_width) & (index > 0) & (index < len(stations) - 2)
     return station, inside
 
 
 def _depth_determined(cameras: Cameras, points: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask of those points (..., 3) of `among` that a film shows from directions at least `_MIN_PARALLAX` apart.
+    """Mask of points (..., 3): in `among`, and shown by one film from directions at least `_MIN_PARALLAX` apart.
 
-    Only training frames count, and each is compared with the first one that shows the point. Occlusions and image masks
-    are ignored.
+    Only training frames count. Each is compared with the film's first frame that shows the point. Occlusions and image
+    masks are ignored.
     """
     selected = points[among]
     found = np.zeros(len(selected), bool)
@@ -211,7 +212,7 @@ def _depth_determined(cameras: Cameras, points: Array, among: NDArray[np.bool_])
             shown = left[(depth > 0.0) & (pixels >= 0.0).all(1) & (pixels <= cameras.sizes[i]).all(1)]
             ray = cameras.positions[i] - selected[shown]
             ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-            # Compares chords, because the arc cosine is imprecise for small angles; False where `first` is NaN.
+            # Chords are compared, because the arc cosine is imprecise for small angles. NaN in `first` gives False.
             found[shown] = np.linalg.norm(ray - first[shown], axis=1) >= 2.0 * np.sin(np.radians(_MIN_PARALLAX) / 2.0)
             new = np.isnan(first[shown, 0])
             first[shown[new]] = ray[new]
@@ -238,7 +239,7 @@ def _quantile(values: Array, share: float) -> float | None:
 
 
 def _by_bin(edges: Array, station: Array, values: Array, reduce: Callable[[Array], Any], empty: float | None) -> list:
-    """Reduces the values at stations [m] to one per bin of the route; bins without values get `empty`."""
+    """Reduces values at stations [m] to one value per bin of the route. A bin without values gets `empty`."""
     which = np.clip(np.digitize(station, edges) - 1, 0, len(edges) - 2)
     found = [values[which == k] for k in range(len(edges) - 1)]
     return [round(float(reduce(v)), 4) if len(v) else empty for v in found]
