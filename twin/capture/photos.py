@@ -1,4 +1,4 @@
-"""Reads image sets as kept frames, with focal length, GPS and time from the EXIF headers.
+"""Reads image sets as `KeptFrames`, with focal length, GPS and time from the EXIF headers.
 
 A *posed* set has a camera and a pose per image. A *stored* image is unrotated, as in the file; an *upright* image is
 rotated by its EXIF orientation. A focal length *prior* comes from the header; structure from motion refines it.
@@ -31,7 +31,8 @@ from twin.types import Array, Image
 
 _FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # [mm]
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
-_MAX_FOCAL_SPREAD = 0.05  # relative; a source's photos whose focal lengths differ more were zoomed
+# Photos of a source count as zoomed if their focal lengths differ by more than this fraction.
+_MAX_FOCAL_SPREAD = 0.05
 
 
 # ---- EXIF
@@ -112,7 +113,7 @@ def _gps(gps: Any) -> tuple[float, float, float]:
 
 
 def _degrees(angle: Any, reference: Any, negative: str) -> float:
-    """Degrees from (degrees, minutes, seconds), negative if `reference` is `negative`; NaN if malformed."""
+    """Degrees from (degrees, minutes, seconds); below 0 if `reference` is the letter `negative`, NaN if malformed."""
     try:
         total = sum(float(part) / 60.0**i for i, part in enumerate(angle))
     except (TypeError, ValueError, ZeroDivisionError):
@@ -233,7 +234,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
 def _load_ahead(
     pool: ThreadPoolExecutor, paths: tuple[Path, ...], lenses: tuple[Lens, ...] | None, chosen: list[int]
 ) -> Iterator[tuple[int, tuple[Image, PhotoExif]]]:
-    """The chosen photos with their indices, in order, loaded in threads at most `QUEUE_SIZE` ahead of the consumer."""
+    """Yields index and photo of the chosen photos in order. Threads load at most `QUEUE_SIZE` photos in advance."""
     waiting: list[tuple[int, Future[tuple[Image, PhotoExif]]]] = []
     for i in chosen:
         waiting.append((i, pool.submit(load_photo, paths[i], lenses[i] if lenses else None)))
@@ -245,15 +246,15 @@ def _load_ahead(
 
 
 def _in_kept_segments(task: SourceTask, images: ImageSet) -> NDArray[np.int64]:
-    """Indices of the photos inside the segments of the source to use; all photos without segments."""
+    """Indices of the photos to use: those inside the source's segments, or all if the source has no segments."""
     count = len(images.paths)
     if not task.segments:
         return np.arange(count)
     clock = [read_exif(path).time for path in images.paths]
     if not _strictly_rising(clock):
         raise InputError(
-            f"{task.path}: keep is in seconds, but these photos' EXIF times are missing or do not increase in "
-            "file-name order; put the photos to be used into a folder of their own, and give keep to the films only"
+            f"{task.path}: keep is given in seconds, but these photos' EXIF times are missing or do not increase in "
+            "file-name order; put the photos to use into a folder of their own, and set keep only for films"
         )
     times = np.array(photo_times(clock, list(range(count))))
     used = np.flatnonzero(in_segments(times, task.segments))
