@@ -10,7 +10,7 @@ Topics are found by message type:
 - commands: geometry_msgs/Twist or TwistStamped
 - wheel speeds: sensor_msgs/JointState, with joints named like a Husky's wheels
 - poses: nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped; topics with a word of `FROM_WHEELS`
-  in their name are used only if there are no others
+  in their name are used only if no other topic has `MIN_POSES`
 - accelerations: sensor_msgs/Imu
 - pictures: sensor_msgs/Image or CompressedImage
 - calibration: the sensor_msgs/CameraInfo topic whose name has the longest common beginning with that of the pictures'
@@ -239,7 +239,7 @@ def picture_of(message: Any) -> "RawPicture | CompressedPicture":
 
 
 def header_time(message: Any) -> int:
-    """The stamp of a message's header [ns]; 0 for a message without it."""
+    """The stamp of a message's header [ns]; 0 for a message without a stamp."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return stamp.sec * 10**9 + stamp.nanosec if stamp is not None else 0
 
