@@ -48,7 +48,7 @@ class Road:
     points: NDArray[np.int64]  # indices of its points, shape (k,)
     drop: float  # median height of the cameras above it
     spread: float  # robust standard deviation of the drops of its points
-    reach: float  # largest offset of its points [drops]. At 1 they lie under the path, at larger values on verges
+    reach: float  # largest offset of its points [drops]: at 1 they are below the path, at more on verges, too
 
     @property
     def reliable(self) -> bool:
@@ -109,9 +109,9 @@ def find_road(points: Array, centers: Array, up: Array) -> Road | None:
     The support of a layer at drop h is the number of points within ±6 % of h whose offset is below h. Such points are
     seen more than 45° below the horizon. The road is the lowest layer with at least half of the best support, since
     nothing solid lies below a road. A layer with many points far below it is no road; such a layer occurs when the
-    camera circles an object. If it has fewer than `MIN_ROAD_POINTS`, as on a road without texture, larger
+    camera circles an object. If the road has fewer than `MIN_ROAD_POINTS`, because it is without texture, larger
     offsets are allowed step by step, so that the verges count, too. If no step gives enough points, the layer with the
-    most points is returned; that of a larger step is preferred only if it has more than twice the points.
+    most points is returned, but that of a larger step only if it has more than twice as many.
     """
     if not len(points):
         return None
@@ -165,9 +165,9 @@ def up_from_ground(camera_to_world: Array, points: Array) -> tuple[Gravity, Road
 
 
 def _road_normal(road: Array, centers: Array, up: Array) -> Array | None:
-    """Mean normal of the road points, each relative to the camera above it, so that a climbing road counts as level.
+    """Mean normal of the road; None if its points lie on a line.
 
-    None if the points lie on a line.
+    Each point is taken relative to the camera above it, so that a climbing road counts as level.
     """
     nearest, _, _ = below_path(road, centers, up)
     local = road - centers[nearest]

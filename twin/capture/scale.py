@@ -23,12 +23,12 @@ _SCALE_OPTIONS = (
 )
 _PIXEL_ERROR = 1.0  # [px] standard deviation of a point marked by hand
 _GPS_TRIALS = 400
-_STRETCH = 2.0  # [m] length of odometry compared with the cameras' path; heading hardly drifts within it
+_STRETCH = 2.0  # [m] length of the compared stretches of odometry; the heading hardly drifts over this length
 _STRAIGHT = 0.7  # smallest ratio of end-to-end distance to length of a compared stretch
 _MIN_STRETCHES = 5
 _MAX_STRETCH_SPREAD = 0.3  # largest relative spread of the stretches' scales
 _MIN_SIDE = 10  # road points needed on each side of the path to compare the two sides
-_MIN_ANGLE = np.radians(2.0)  # [rad] needed between the rays of two frames to a marker
+_MIN_ANGLE = np.radians(2.0)  # [rad] smallest sufficient angle between the rays of two frames to a marker
 
 
 @dataclass(frozen=True)
@@ -163,8 +163,8 @@ def _ground_errors(cameras: Cameras, up: Gravity, road: Array, drop: float) -> t
     """Two relative errors of the camera height above the road points (k, 3).
 
     The first comes from the error of up: it is the angle of this error times the mean horizontal offset of the points,
-    divided by the camera height. The second comes from camber or a kerb: it is half the
-    difference between the heights above the points to the left and to the right of the path.
+    divided by the camera height. The second comes from camber or a kerb: it is half the difference between the heights
+    above the points to the left and to the right of the path, divided by the camera height.
     """
     nearest, height, _ = below_path(road, cameras.positions, up.direction)
     away = road - cameras.positions[nearest]
@@ -266,9 +266,9 @@ def local_east_north_up(gps: Array) -> Array:
 def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generator) -> tuple[Scale, Array]:
     """Scale and horizontal east axis (3,) from GPS positions by a robust similarity fit in the horizontal plane.
 
-    Altitudes are not used: they are several times less accurate than positions, and up is known already. `gps` (n, 3)
-    holds latitude [°], longitude [°] and altitude [m] per camera center, NaN where unknown. `rng` draws the pairs of
-    cameras for the first fits.
+    Altitudes are not used: they are several times less accurate than latitude and longitude, and up is known already.
+    `gps` (n, 3) holds latitude [°], longitude [°] and altitude [m] per camera center, NaN where unknown. `rng` draws
+    the pairs of cameras for the first fits.
 
     Raises InputError: fewer than 3 positions, or positions that do not spread beyond their own error.
     """
