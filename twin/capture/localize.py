@@ -34,7 +34,7 @@ _MAX_SIZE = 1280  # [px] longer side of the image from which features are extrac
 _GUESSED_FOCAL = 1.2  # [longer sides]
 _FEATURES = 4000
 _FIRST_FRAMES = 48  # scene frames matched first, evenly spaced over all films
-_BEST_FRAMES = 4  # of these, the frames with the most matches; their neighbors are matched next
+_BEST_FRAMES = 4  # number of those with the most matches; their neighbors are matched next
 _NEIGHBOR_FRAMES = 8  # number of frames, of any lighting, that are matched near each best frame
 _TRACKING_FRAMES = 12  # scene frames near the film's last localized frame that are matched first
 _TRUSTED_FRAMES = 24  # frames with the most matches; matches in other frames are mostly wrong and are not used
@@ -243,7 +243,7 @@ def _localize(
 
 
 def _match_similar_frames(scene_map: LocalizationMap, descriptors: NDArray, show_bars: bool) -> list[NDArray[np.int64]]:
-    """Matches of a photo with each frame of a coarse-to-fine search, shapes (m, 2): photo feature, sparse point."""
+    """A photo's matches with each frame of a coarse-to-fine search, shapes (m, 2), as in `match_frame`."""
     found: dict[int, NDArray[np.int64]] = {}
 
     def match(frames: list[int]) -> None:
@@ -268,7 +268,9 @@ def match_frame(
     points: SparsePoints,
     i: int,
 ) -> NDArray[np.int64]:
-    """Mutual, distinctive matches of a photo with the landmarks of frame i, shape (m, 2): photo feature, sparse point.
+    """Mutual, distinctive matches of a photo with the landmarks of frame i, shape (m, 2).
+
+    A match holds the indices of the photo's feature and of the sparse point.
 
     `positions` [px] (n, 2) and unit `descriptors` (n, 128) are the frame's features; `photo` (k, 128) holds the unit
     descriptors of the photo.
@@ -391,7 +393,7 @@ def solve_film(job: dict[str, Any], work: Path) -> None:
 def _film_matches(
     scene_map: LocalizationMap, descriptors: NDArray[np.float32], last: _LocalizedFrame | None
 ) -> Iterator[list[NDArray[np.int64]]]:
-    """Yields matches of a film's frame: those near the last localized frame, if any, then those of the whole scene."""
+    """Yields a film frame's matches near the last localized frame, if any, then those found in the whole scene."""
     if last:
         position = camera_to_world(last.camera_from_world)[None, :3, 3]
         near = sorted(scene_map.nearest_frames(position, _TRACKING_FRAMES))

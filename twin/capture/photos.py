@@ -73,7 +73,7 @@ def read_exif(path: Path) -> PhotoExif:
 
 
 def focal_from_exif(photo: Any, width: int, height: int) -> float | None:
-    """Focal length over the image's longer side from the Exif block of a header, or None.
+    """Focal length as a multiple of the image's longer side, from the Exif block of a header; None if unknown.
 
     It is computed from the 35 mm equivalent, which is defined by the image diagonal (CIPA DCG-001), or else from focal
     length and sensor resolution.
@@ -93,7 +93,7 @@ def focal_from_exif(photo: Any, width: int, height: int) -> float | None:
 
 
 def _focal_from_model(path: Path, width: int, height: int) -> float | None:
-    """Focal length over the longer side by COLMAP's table of sensor sizes per camera model, or None."""
+    """Focal length as a multiple of the longer side, by COLMAP's table of the camera models' sensor sizes, or None."""
     try:
         camera = pycolmap.infer_camera_from_image(str(path))
     except (RuntimeError, ValueError):
@@ -272,7 +272,7 @@ def load_photo(path: Path, lens: Lens | None) -> tuple[Image, PhotoExif]:
     The lens of a posed image usually describes the stored image, so a posed image is rotated upright only if the stored
     image does not fit its lens.
 
-    Raises InputError: the file is missing, empty, truncated or undecodable, or its aspect differs from its lens's.
+    Raises InputError: the file is missing, empty, truncated or undecodable, or has another aspect than its lens.
     """
     stored = _stored_size(path)
     exif = read_exif(path)
@@ -326,7 +326,7 @@ def evenly_spaced(count: int, limit: int) -> NDArray[np.int64]:
 
 
 def _focal_prior(focals: list[float], size: tuple[int, int], name: str) -> Lens | None:
-    """A lens with the median of the photos' focal lengths [longer sides]; None without any."""
+    """A lens with the median of the photos' focal lengths [longer sides]; None if none is known."""
     if not focals:
         return None
     median = float(np.median(focals))
