@@ -1,10 +1,9 @@
 """Stage `cameras`: camera poses and sparse points by structure from motion, and images without lens distortion.
 
 The output has the coordinate system of the reconstruction. Its rotation, origin and scale are arbitrary, unless the
-input has poses.
-The stage runs `solve_mapping` in a worker process. A *model* is a COLMAP reconstruction. Global mapping (Pan et al.
-2024) is tried first, since the incremental mapper gets stuck on forward motion. Frames off the path of their neighbors
-are removed and registered once more against all others, and left out if they are again off the path.
+input has poses. The stage runs `solve_mapping` in a worker process. A *model* is a COLMAP reconstruction. Global
+mapping (Pan et al. 2024) is tried first, since the incremental mapper gets stuck on forward motion. Frames off the path
+of their neighbors are removed and registered once more against all others, and left out if they are again off the path.
 """
 
 import os

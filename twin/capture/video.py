@@ -40,7 +40,7 @@ _STILL_DIFFERENCE = 1.5
 BLANK_STD = 2.0  # an image with a smaller standard deviation of its brightness [gray levels] counts as blank
 _LUMA_FIRST = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 _DEINTERLACE = "mode=send_frame:parity=auto:deint=interlaced"
-_MIN_DECODED_FRACTION = 0.98  # of the declared frames; if fewer can be decoded, the user gets a note
+_MIN_DECODED_FRACTION = 0.98  # the user gets a note if a smaller fraction of the declared frames can be decoded
 
 
 # ---- sharpness and motion, on small gray images (uint8, shape (h, w)) so that a frame takes about a millisecond
