@@ -10,10 +10,11 @@ Topics are found by message type:
 - commands: geometry_msgs/Twist or TwistStamped
 - wheel speeds: sensor_msgs/JointState, with joints named like a Husky's wheels
 - poses: nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped; topics with a word of `FROM_WHEELS`
-  in their name are used only if there are no others
+  in their name are used only if no other topic has `MIN_POSES`
 - accelerations: sensor_msgs/Imu
 - pictures: sensor_msgs/Image or CompressedImage
-- calibration: the sensor_msgs/CameraInfo topic that shares the most leading parts of its name with the pictures' topic
+- calibration: the sensor_msgs/CameraInfo topic whose name has the longest common beginning with that of the pictures'
+  topic, counted in parts between slashes
 
 Times are nanoseconds.
 """
@@ -51,10 +52,11 @@ TYPES = {
 FROM_WHEELS = ("platform", "wheel", "velocity_controller")
 """A topic with one of these words in its name is taken for odometry computed from the wheels."""
 MIN_POSES = 10
-"""Topics with fewer poses, such as those that an operator clicks on a map, are used only if there are no others."""
+"""A topic with fewer poses, such as one with the goals that an operator clicks on a map, is used only if no topic has
+this many."""
 # A topic with one of these words in its name is used for pictures only if it is given explicitly.
 _OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")
-# Headers whose times differ more from the recording times, in the median, have another clock [ns].
+# [ns] If header and recording times differ by more than this in the median, the headers count as of another clock.
 _CLOCK = 1_000_000_000
 _MAX_METADATA = 16 << 20  # [bytes] largest accepted metadata.yaml
 _MAX_CHUNK = 1 << 30  # [bytes] largest accepted MCAP chunk, uncompressed
@@ -97,7 +99,8 @@ class Bag:
 def open_bag(path: Path, cure: str = "record it anew") -> Iterator[Bag]:
     """Opens a bag.
 
-    Raises InputError: rosbags is not installed, or the path is no bag or a damaged one; `cure` ends the message.
+    Raises InputError if rosbags is not installed, if the path is not a bag, or if the bag is damaged. The message on a
+    damaged bag ends with `cure`, the advice to the user.
     """
     try:
         from rosbags import rosbag1, rosbag2
@@ -157,7 +160,7 @@ def topic_names(connections: Iterable[Any]) -> str:
 
 
 def messages_by_topic(connections: Iterable[Any], types: Sequence[str]) -> dict[str, int]:
-    """Topic → number of messages, for topics that have messages and one of the message types `types`."""
+    """Topic → number of messages, for the topics with a message type in `types` and at least one message."""
     counts: dict[str, int] = {}
     for one in connections:
         if one.msgtype in types and one.msgcount:
@@ -186,19 +189,19 @@ def choose_pictures(connections: Sequence[Any], path: Path, topic: str = "") -> 
 
 
 def choose_camera_info(connections: Iterable[Any], pictures: str) -> str | None:
-    """The CameraInfo topic that shares the most leading parts with the pictures' topic; None without a CameraInfo."""
+    """The CameraInfo topic nearest in name to the pictures' topic, see `_common`; None without a CameraInfo."""
     found = messages_by_topic(connections, (CAMERA_INFO,))
     return max(found, key=lambda topic: _common(topic, pictures), default=None)
 
 
 def _common(one: str, other: str) -> int:
-    """Number of leading parts, separated by slashes, that two topics share."""
+    """Number of equal parts, separated by slashes, with which the names of two topics begin."""
     pairs = list(zip(one.split("/"), other.split("/"), strict=False))
     return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
 
 
 def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYPES)) -> dict[str, Any]:
-    """The best connection of each kind, a key of `TYPES`. Raises InputError if a kind other than imu has none."""
+    """Kind → its best connection, for `kinds`, keys of `TYPES`. Raises InputError if a kind other than imu has none."""
     chosen = {}
     for kind in kinds:
         types = TYPES[kind]
@@ -236,7 +239,7 @@ def picture_of(message: Any) -> "RawPicture | CompressedPicture":
 
 
 def header_time(message: Any) -> int:
-    """The stamp of a message's header [ns]; 0 for a message without it."""
+    """The stamp of a message's header [ns]; 0 for a message without a stamp."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return stamp.sec * 10**9 + stamp.nanosec if stamp is not None else 0
 
@@ -284,4 +287,10 @@ def _imu(message: Any) -> tuple[float, ...]:
 
 
 VALUES: dict[str, Callable[[Any], Any]] = {"commands": _twist, "wheels": _wheels, "poses": _pose, "imu": _imu}
-"""Kind → function that extracts a message's numbers: v, ω; wheel speeds per side; x, y, yaw; accelerations in x, y."""
+"""Kind → function that extracts a message's numbers.
+
+- commands: linear and angular speed
+- wheels: mean speed of the left and of the right wheels, or None if a side is missing
+- poses: x, y and yaw
+- imu: accelerations along x and y
+"""

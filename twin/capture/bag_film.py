@@ -2,8 +2,8 @@
 
 A picture's *stamp* is its time as selected by `message_times`. Only pictures with a later stamp than all pictures
 before them are used. A *fix* is a satellite position. The *seat* is the camera's pose on the robot: the transform in
-`/tf_static` from the frame named in the pictures' headers to `base_link`. Odometry gives the positions of the lens, in
-the odometry's own frame.
+`/tf_static` from the frame named in the pictures' headers to `base_link`. Odometry gives the positions of the lens in
+the odometry's own coordinate frame.
 """
 
 from array import array
@@ -43,7 +43,7 @@ from twin.robot import BASE_HEIGHT, CAMERA_AHEAD
 from twin.types import Array, Image
 
 _MAX_UNORDERED = 0.02  # largest fraction of pictures that are left out because of their stamps
-_MAX_FIX_GAP, _MAX_POSE_GAP = 2.5, 0.5  # [s] between two fixes or poses; there is no interpolation across longer gaps
+_MAX_FIX_GAP, _MAX_POSE_GAP = 2.5, 0.5  # [s] longest gaps across which fixes and poses are interpolated
 _BASE, _GROUND = "base_link", "base_footprint"
 _MAX_FRAMES = 10_000  # largest number of coordinate frames read from /tf_static
 _MAX_PIXELS = 1 << 28  # largest accepted size of a compressed picture
@@ -119,7 +119,7 @@ class BagContents:
 
 
 class _Rows:
-    """Numbers of a topic's messages, in compact arrays because there may be many."""
+    """The numbers in a topic's messages, in compact arrays because there may be many messages."""
 
     def __init__(self) -> None:
         self.times = array("q")  # header and recording time [ns] of each message
@@ -134,8 +134,8 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
         topic: Topic of the pictures; empty for the topic with the most pictures.
 
     Raises:
-        InputError: the path is no bag or a damaged one, or the bag has no pictures, an unknown encoding, an unsupported
-            camera model, or stamps out of order.
+        InputError: the path is not a bag; the bag is damaged or has no pictures; or it has an unknown encoding, an
+            unsupported camera model, or stamps out of order.
     """
     with open_bag(path) as bag:
         topics = _topics(bag.connections, path, topic)
@@ -208,7 +208,7 @@ def _values(kind: str, message: Any) -> tuple[float, ...]:
 def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Positions and stamps of the pictures whose stamp is later than all stamps before.
 
-    One other picture, or a fraction of `_MAX_UNORDERED`, is allowed. Raises InputError if there are more.
+    The others are left out. Raises InputError if they are more than one and more than the fraction `_MAX_UNORDERED`.
     """
     latest = np.maximum.accumulate(times)
     late = np.append(False, times[1:] <= latest[:-1])
@@ -284,7 +284,7 @@ def _checked(picture: Any) -> Any:
 
 
 def _decode(contents: BagContents, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:
-    """Yields time [s] and frame of each picture; omits and counts damaged ones. Raises InputError if all are."""
+    """Yields time [s] and frame of each picture; counts damaged ones instead. Raises InputError if all are damaged."""
     topic, used, shown = contents.topics["pictures"], iter(contents.position.tolist()), 0
     where = f"{contents.path}: {topic}"
     wanted, problem = next(used, None), None
@@ -407,7 +407,10 @@ def _is_named(frame: str, name: str) -> bool:
 
 
 def _lens_positions(poses: Array, arm: Array) -> Array:
-    """Positions of the lens (p, 3) from base positions and quaternions (p, 7) and the lens in the base frame (3,)."""
+    """Positions of the lens, shape (p, 3); NaN for impossible poses.
+
+    `poses` (p, 7) holds position and quaternion of the base; `arm` (3,) is the position of the lens in the base frame.
+    """
     good = np.isfinite(poses).all(1) & (np.linalg.norm(poses[:, 3:], axis=1) > 0.5)
     out = np.full((len(poses), 3), np.nan)
     if good.any():

@@ -167,7 +167,7 @@ class SourceTask:
         return SourceInfo(self.name, self.lighting, self.kind, *size, model, params, calibrated, height)
 
     def mask(self, keys: tuple[str, ...], width: int, height: int) -> Image | None:
-        """The mask (height, width) of a frame, or None; in a mask folder, its file is named like one of the keys."""
+        """The mask (height, width) of a frame, or None. In a mask folder, it is a file named like one of `keys`."""
         path = self.masks
         if path and path.is_dir():
             files = (path / f"{key}{suffix}" for key in keys for suffix in (".png", ".jpg", ".PNG", ".JPG"))
@@ -195,8 +195,8 @@ class KeptFrames:
     gps: list[tuple[float, float, float]]
     metrics: dict[str, Any]
     poses: list[Array]  # camera_to_world (4, 4) per frame; empty for a source without poses
-    intrinsics: list[Array]  # fx, fy, cx, cy [px] at the kept size per pose
-    odometry: list[tuple[float, float, float]] | None = None  # positions of the lens [m] in a bag, else None
+    intrinsics: list[Array]  # fx, fy, cx, cy [px] at the kept size, one per pose
+    odometry: list[tuple[float, float, float]] | None = None  # positions of the lens [m]; None without a bag
 
 
 class FrameWriter:

@@ -19,15 +19,16 @@ from twin.geometry.images import resize
 from twin.types import Array
 
 _SAMPLES = 60
-_WIDTH = 320  # [px] to which frames are scaled down for the check
+_WIDTH = 320  # [px] width of the scaled-down frames that are checked
 _MIN_SIDE = 640  # [px] smallest good length of the longer side
 _DARK = 35.0  # [gray levels] smallest good median brightness
-# Gray level from which a pixel is clipped; largest good share of clipped pixels.
+# A pixel is clipped from this gray level on. The second number is the largest good share of clipped pixels.
 _CLIPPED, _CLIPPED_SHARE = 250, 0.15
-# Fraction of the 90 % quantile of sharpness below which a frame is blurred; largest good share of blurred frames.
+# A frame is blurred if its sharpness is below this fraction of the 90 % quantile of all samples. The second number is
+# the largest good share of blurred frames.
 _BLURRED, _BLURRED_SHARE = 0.35, 0.3
 _EXPOSURE_RANGE = 2.0  # largest good ratio of the 95 % to the 5 % quantile of brightness
-_TINT_RANGE = 1.3  # largest good ratio of the same quantiles of red over blue
+_TINT_RANGE = 1.3  # largest good ratio of the 95 % to the 5 % quantile of the color ratio red / blue
 _GAP = 0.5  # [s] shorter times without a picture are not reported
 _UNEVEN = 1.5  # largest good ratio of the 95 % quantile to the median of the time between frames
 _MIN_TRUSTED = 8  # fewest samples from which shares and quantiles are computed
@@ -44,12 +45,14 @@ def check_film(path: Path) -> list[str]:
     if len(frames) < _MIN_TRUSTED:
         frames = _samples(path, "DEFAULT")
     if not frames:
-        return [*notes, "no frame can be decoded; copy it again from the camera"]
+        return [*notes, "no frame can be decoded; copy the film again from the camera"]
     first = frames[0]
     if transfer := hdr_transfer(first):
         notes.append(f"HDR ({NAMES[transfer]}): converted to SDR by a fixed curve; turn HDR off for the next film")
     if first.interlaced_frame:
-        notes.append("interlaced: deinterlaced, at a loss of detail; film with progressive frames (p, not i)")
+        notes.append(
+            "interlaced: the build deinterlaces the film, at a loss of detail; film in a progressive mode (p, not i)"
+        )
     if max(first.width, first.height) < _MIN_SIDE:
         notes.append(f"{first.width}x{first.height}: small pictures make a soft twin; film in 1920x1080")
     return notes + _picture_notes(frames)
@@ -64,11 +67,11 @@ def _timing_notes(timing: FilmTiming) -> list[str]:
     if steps[longest] > max(_GAP, 3.0 * timing.interval):
         at = f"{timing.times[longest]:.1f} s"
         notes.append(
-            f"no picture for {steps[longest]:.1f} s from {at} on; film in one go, or cut it there into two films"
+            f"no picture for {steps[longest]:.1f} s from {at} on; film in one go, or cut the film at the gap into two"
         )
     if float(np.quantile(steps, 0.95)) > _UNEVEN * timing.interval:
         notes.append(
-            "varying frame rate: frames are taken by their time stamps; a fixed rate is better, as in a camera app"
+            "varying frame rate: frames are taken by their time stamps; better set a fixed rate in the camera app"
         )
     return notes
 
@@ -102,7 +105,9 @@ def _picture_notes(frames: list[av.VideoFrame]) -> list[str]:
     if float(np.median([np.median(one) for one in gray])) < _DARK:
         notes.append("dark: half of the picture is nearly black; lock a longer exposure, and walk slower against blur")
     if float(np.median([(one >= _CLIPPED).mean() for one in gray])) > _CLIPPED_SHARE:
-        notes.append("overexposed: much of the picture is white; lock a shorter exposure, on the road and not the sky")
+        notes.append(
+            "overexposed: much of the picture is white; lock a shorter exposure, measured on the road, not the sky"
+        )
     if len(frames) < _MIN_TRUSTED:
         return notes
     detail = np.array([sharpness(one) for one in gray])

@@ -123,7 +123,7 @@ def source_files(path: Path, kind: str, images: Path | None = None) -> list[Path
 
 
 def source_names(paths: list[str]) -> list[str]:
-    """A unique folder name for each source, derived from its path, of ASCII letters, digits and `-_.`."""
+    """Unique folder names for the sources, derived from their paths; only ASCII letters, digits and `-_.` occur."""
     names: list[str] = []
     for path in paths:
         base = _source_name(path)

@@ -1,11 +1,14 @@
 """Estimates the up direction and the road below the cameras, in the unit of the poses (no metric scale is needed).
 
-*Up* is the unit normal of the ground. Three kinds of evidence are combined, weighted by their uncertainties: the
-*right* axes of the cameras (horizontal if the camera is upright, at any pitch), the *path* (parallel to the ground if
-the camera has a constant height) and the *road* (points of the layer below the path). A straight path does not
-constrain the rotation of up about the path; a path with turns constrains both angles. Camber limits the evidence of a
-road to about a degree. The *drop* of a point is its depth below the horizontally nearest camera; its *offset* is the
-horizontal distance from that camera.
+*Up* is the unit normal of the ground. Three kinds of evidence are combined, weighted by their uncertainties:
+
+- *right* axes of the cameras: horizontal if the cameras are upright, whatever their pitch
+- *path*: parallel to the ground if the camera has a constant height. A straight path does not constrain the rotation of
+  up about the path; a path with turns constrains both angles
+- *road*: the layer of points below the path. Because of camber it determines up only to about 1°
+
+The *drop* of a point is its depth below the horizontally nearest camera; its *offset* is the horizontal distance from
+that camera.
 """
 
 from dataclasses import dataclass
@@ -31,8 +34,8 @@ _LAYER = 0.06  # half thickness of the road layer [fraction of the drop], for un
 _MAX_TILT = np.radians(25.0)  # largest angle between the road's normal and the cameras' mean up axis [rad]
 MIN_ROAD_POINTS = 20  # road points needed for a reliable road
 _REACHES = (1.0, 2.0, 4.0, 8.0)  # largest offsets [drops] of the points of the road layer, tried in this order
-_MIN_CAMERA_FRACTION = 0.2  # heights per camera need road points below at least this fraction of cameras
-_DEEPER_THAN = 1.25  # [drops] from which points are far below a layer
+_MIN_CAMERA_FRACTION = 0.2  # smallest fraction of the cameras that need a height in `heights_above_road`
+_DEEPER_THAN = 1.25  # points are far below a layer if their drop exceeds this multiple of the layer's drop
 _MAX_DEEPER_FRACTION = 0.1
 """A layer is not the ground if the number of points far below it exceeds this fraction of its own points: ground
 hides what lies below it."""
@@ -45,7 +48,7 @@ class Road:
     points: NDArray[np.int64]  # indices of its points, shape (k,)
     drop: float  # median height of the cameras above it
     spread: float  # robust standard deviation of the drops of its points
-    reach: float  # largest offset of its points [drops]. At 1 they lie under the path, at larger values on verges
+    reach: float  # largest offset of its points [drops]: at 1 they are below the path, at more on verges, too
 
     @property
     def reliable(self) -> bool:
@@ -68,9 +71,9 @@ def camera_up(camera_to_world: Array) -> Array:
 
 
 def up_from_path(camera_to_world: Array) -> tuple[Array, Array]:
-    """Up (3,) from the cameras' right axes and path, and the evidence (3, 3).
+    """Returns up (3,), estimated from the cameras' right axes and path, and the matrix (3, 3) of this evidence.
 
-    The evidence is a matrix E such that n·E·n is the squared error of an up vector n in standard deviations.
+    It is a matrix E such that n·E·n is the squared error of an up vector n in standard deviations.
     """
     right = camera_to_world[:, :3, 0]
     evidence = right.T @ right / len(right) / _SIGMA_RIGHT**2
@@ -106,8 +109,9 @@ def find_road(points: Array, centers: Array, up: Array) -> Road | None:
     The support of a layer at drop h is the number of points within ±6 % of h whose offset is below h. Such points are
     seen more than 45° below the horizon. The road is the lowest layer with at least half of the best support, since
     nothing solid lies below a road. A layer with many points far below it is no road; such a layer occurs when the
-    camera circles an object. If no layer has enough points, as on a road without texture, larger offsets are tried,
-    where the verges are. If none of them has enough, the best supported layer is returned.
+    camera circles an object. If the road has fewer than `MIN_ROAD_POINTS`, because it is without texture, larger
+    offsets are allowed step by step, so that the verges count, too. If no step gives enough points, the layer with the
+    most points is returned, but that of a larger step only if it has more than twice as many.
     """
     if not len(points):
         return None
@@ -145,7 +149,7 @@ def _layer(drop: Array, offset: Array, reach: float) -> Road | None:
 
 
 def up_from_ground(camera_to_world: Array, points: Array) -> tuple[Gravity, Road | None]:
-    """Up from cameras, path and road, and the road below the path, from poses (n, 4, 4) and sparse points (m, 3)."""
+    """Returns the up direction and the road below the path, computed from poses (n, 4, 4) and sparse points (m, 3)."""
     prior_up = camera_up(camera_to_world)
     centers = camera_to_world[:, :3, 3]
     up, evidence = up_from_path(camera_to_world)
@@ -161,9 +165,9 @@ def up_from_ground(camera_to_world: Array, points: Array) -> tuple[Gravity, Road
 
 
 def _road_normal(road: Array, centers: Array, up: Array) -> Array | None:
-    """Mean normal of the road points, each relative to the camera above it, so that a climbing road counts as level.
+    """Mean normal of the road; None if its points lie on a line.
 
-    None if the points lie on a line.
+    Each point is taken relative to the camera above it, so that a climbing road counts as level.
     """
     nearest, _, _ = below_path(road, centers, up)
     local = road - centers[nearest]
@@ -179,9 +183,11 @@ def _road_normal(road: Array, centers: Array, up: Array) -> Array | None:
 
 
 def heights_above_road(points: Array, centers: Array, up: Array, drop: float, min_points: int = 6) -> Array | None:
-    """Height of each camera center (n, 3) above the road points (k, 3) within the horizontal distance `drop`, (n,).
+    """Heights (n,) of the camera centers (n, 3) above the road.
 
-    NaN for cameras with fewer than `min_points`; None if fewer than a fifth of the cameras have a height.
+    Each is the median height above the road points (k, 3) whose horizontal distance from the camera is at most `drop`,
+    or NaN if there are fewer than `min_points`. Returns None if fewer than three cameras, or fewer than a fifth, have a
+    height.
     """
     flat = np.eye(3) - np.outer(up, up)
     tree = cKDTree(points @ flat)

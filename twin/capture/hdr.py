@@ -1,12 +1,13 @@
 """Converts HDR films of phones and cameras (HLG and PQ of ITU-R BT.2100) to SDR pictures with the colors of BT.709.
 
-A frame's signal is converted to display light, the light that a screen of 1,000 cd/m² shows, as BT.2100 defines it:
+A frame's signal is converted to display light L [cd/m²] by the formulas of BT.2100:
 
-    HLG: E = inverse OETF of the signal, L = 1000 Yˢ^0.2 E with Yˢ the luminance of E (OOTF, system gamma 1.2)
+    HLG: E = inverse OETF of the signal;   L = 1000 Yˢ^0.2 E (OOTF)
     PQ:  L = EOTF of the signal
 
-Diffuse white is 203 cd/m² in both (BT.2408). x = L / 203 is converted from the primaries of BT.2020 to those
-of BT.709 (BT.2087). Then highlights are compressed, and the SDR signal is x^(1/2.4), the inverse of BT.1886:
+Yˢ is the luminance of E. For HLG a screen with a peak of 1,000 cd/m² is assumed; its system gamma is 1.2. Diffuse white
+is 203 cd/m² in both (BT.2408). x = L / 203 is converted from the primaries of BT.2020 to those of BT.709 (BT.2087).
+Then highlights are compressed, and the SDR signal is x^(1/2.4), the inverse of BT.1886:
 
     x → x up to 0.8;   x → 0.8 + 0.2 tanh((x − 0.8) / 0.2) above
 

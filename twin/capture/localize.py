@@ -34,8 +34,8 @@ _MAX_SIZE = 1280  # [px] longer side of the image from which features are extrac
 _GUESSED_FOCAL = 1.2  # [longer sides]
 _FEATURES = 4000
 _FIRST_FRAMES = 48  # scene frames matched first, evenly spaced over all films
-_BEST_FRAMES = 4  # of these, the frames with the most matches; their neighbors are matched next
-_NEIGHBOR_FRAMES = 8  # neighbors of each best frame that are matched, under any lighting
+_BEST_FRAMES = 4  # number of those with the most matches; their neighbors are matched next
+_NEIGHBOR_FRAMES = 8  # number of frames, of any lighting, that are matched near each best frame
 _TRACKING_FRAMES = 12  # scene frames near the film's last localized frame that are matched first
 _TRUSTED_FRAMES = 24  # frames with the most matches; matches in other frames are mostly wrong and are not used
 _RATIO = 0.8  # largest ratio of the best to the second best distance, Lowe 2004
@@ -91,8 +91,9 @@ def register_photo(photo: Image, exif: PhotoExif, scene: SceneDir, seed: int = 0
 def candidate_lenses(size: tuple[int, int], exif: PhotoExif, scene: SceneDir) -> list[tuple[Lens, bool, str]]:
     """Candidate lenses of a photo, most likely first.
 
-    Returns tuples: the lens at `size`, True if it is held fixed, and its origin: the photo's EXIF header, a camera of
-    the scene with the same aspect, or a guess.
+    Each entry consists of the lens at `size`, whether it stays fixed, and its origin. The origin is the photo's EXIF
+    header, the calibration or the estimated camera of a source with the same aspect, or a guess. Only calibrated lenses
+    stay fixed.
     """
 
     def simple(focal: float) -> Lens:
@@ -140,7 +141,7 @@ class LocalizationMap:
         return positions, values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
 
     def matches(self, descriptors: NDArray[np.float32], i: int) -> NDArray[np.int64]:
-        """Matches of a photo, given by its descriptors (k, 128), with frame i, see `match_frame`."""
+        """Matches frame i with the photo that has these descriptors (k, 128), see `match_frame`."""
         if i not in self._features:
             self._features[i] = self.features(self.cameras.image_path(i))
         return match_frame(*self._features[i], descriptors, self.cameras, self.points, i)
@@ -242,7 +243,7 @@ def _localize(
 
 
 def _match_similar_frames(scene_map: LocalizationMap, descriptors: NDArray, show_bars: bool) -> list[NDArray[np.int64]]:
-    """Matches of a photo with each frame of a coarse-to-fine search, shapes (m, 2): photo feature, sparse point."""
+    """A photo's matches with each frame of a coarse-to-fine search, shapes (m, 2), as in `match_frame`."""
     found: dict[int, NDArray[np.int64]] = {}
 
     def match(frames: list[int]) -> None:
@@ -267,9 +268,12 @@ def match_frame(
     points: SparsePoints,
     i: int,
 ) -> NDArray[np.int64]:
-    """Mutual, distinctive matches of a photo with the landmarks of frame i, shape (m, 2): photo feature, sparse point.
+    """Mutual, distinctive matches of a photo with the landmarks of frame i, shape (m, 2).
 
-    The frame has feature positions [px] (n, 2) and unit descriptors (n, 128), the photo unit descriptors (k, 128).
+    A match holds the indices of the photo's feature and of the sparse point.
+
+    `positions` [px] (n, 2) and unit `descriptors` (n, 128) are the frame's features; `photo` (k, 128) holds the unit
+    descriptors of the photo.
     """
     observed = points.point[points.frame == i]
     if not len(observed) or len(positions) < 2 or not len(photo):
@@ -312,9 +316,9 @@ def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, 
     """Localizes the frames of a film in a scene and, without a given lens, estimates their focal length.
 
     Each frame is first matched with scene frames near the previous localized frame; if that fails, the whole scene is
-    searched. The focal length is estimated per frame. With its median all frames are localized again, and a joint fit
-    to all inliers gives the final value. The principal point is assumed at the center. Frames are RGB (h, w, 3), in
-    order, of one camera without distortion.
+    searched. The focal length is estimated per frame. All frames are localized again with the median of these
+    estimates, and a joint fit to all inliers gives the final value. The principal point is assumed at the center.
+    Frames are RGB (h, w, 3), in order, of one camera without distortion.
 
     Raises InputError: no frame could be localized, or the focal length is not determined.
     """
@@ -389,7 +393,7 @@ def solve_film(job: dict[str, Any], work: Path) -> None:
 def _film_matches(
     scene_map: LocalizationMap, descriptors: NDArray[np.float32], last: _LocalizedFrame | None
 ) -> Iterator[list[NDArray[np.int64]]]:
-    """Yields matches of a film's frame: those near the last localized frame, if any, then those of the whole scene."""
+    """Yields a film frame's matches near the last localized frame, if any, then those found in the whole scene."""
     if last:
         position = camera_to_world(last.camera_from_world)[None, :3, 3]
         near = sorted(scene_map.nearest_frames(position, _TRACKING_FRAMES))

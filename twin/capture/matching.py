@@ -99,7 +99,7 @@ def _nearest_words(features: NDArray[np.float32], words: NDArray[np.float32]) ->
 
 
 def probe_pairs(source_index: NDArray[np.int64], signatures: Array) -> set[Pair]:
-    """Pairs of distant frames that may show the same place, across sources and where a source returns to a place.
+    """Pairs of frames that may show the same place: of two sources, or of one source that may have returned to a place.
 
     Each probed frame is paired with four frames of every later source: the frame equally far along it, and the three
     most similar frames. Within its own source, it is paired with the two most similar frames beyond the sequence steps.
@@ -164,10 +164,11 @@ def expanded_pairs(
 def near_pairs(
     camera_to_world: Array, frames: NDArray[np.int64], tried: set[Pair], reach: float, most: int
 ) -> set[Pair]:
-    """Pairs of each camera with up to `most` of the nearest cameras in `reach` with a viewing direction within 60°.
+    """Pairs each frame with up to `most` of the frames nearest to it.
 
-    Poses (k, 4, 4) belong to the frames (k,); `reach` is in their unit. No pair is returned whose two frames are each
-    at most two frames away from those of a tried pair.
+    These are at most `reach` away, in the unit of the poses, and their viewing directions differ by less than 60°. The
+    poses (k, 4, 4) belong to `frames` (k,). A pair (i, j) is left out if a tried pair (a, b) is close: i is at most two
+    frames from a, and j from b.
     """
     centers, forward = camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
     offsets = list(itertools.product(_CROSS_OFFSETS, _CROSS_OFFSETS))
@@ -229,7 +230,7 @@ class Matcher:
             if median < _MIN_FEATURES:
                 raise InputError(
                     f"source {source.name!r}: {median:.0f} features per frame in the median (need {_MIN_FEATURES}); "
-                    "film with more texture and light in view, in focus, or mask less"
+                    "film a scene with more texture and light, in focus, or mask less of the picture"
                 )
 
     def descriptors(self) -> list[NDArray[np.uint8]]:

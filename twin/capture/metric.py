@@ -31,7 +31,7 @@ from twin.scene import SceneDir
 from twin.types import Array
 
 _INITIAL_FRACTION = 0.08
-"""First part of the first source's path that gives the initial driving direction [fraction of the path's length]."""
+"""The initial driving direction is that of this first fraction of the first source's path."""
 _FLOOR_QUANTILE = 0.02  # without a road the floor is at this quantile of the points' heights
 
 
@@ -120,7 +120,7 @@ def _ground_level(cameras: Cameras, points: Array, up: Array, road: Road | None)
 
 
 def _level_frame(cameras: Cameras, up: Array, level: float, scale: float, east: Array | None, keep: bool) -> Similarity:
-    """The similarity from the reconstruction to the level frame; `keep` keeps the reconstruction's axes."""
+    """The similarity from the reconstruction to the level frame; `keep` keeps its axes and horizontal origin."""
     first = cameras.positions[0]
     if keep:
         return Similarity(scale, np.eye(3), np.array([0.0, 0.0, -scale * level]))

@@ -1,4 +1,4 @@
-"""Reads image sets as kept frames, with focal length, GPS and time from the EXIF headers.
+"""Reads image sets as `KeptFrames`, with focal length, GPS and time from the EXIF headers.
 
 A *posed* set has a camera and a pose per image. A *stored* image is unrotated, as in the file; an *upright* image is
 rotated by its EXIF orientation. A focal length *prior* comes from the header; structure from motion refines it.
@@ -31,7 +31,8 @@ from twin.types import Array, Image
 
 _FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # [mm]
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
-_MAX_FOCAL_SPREAD = 0.05  # relative; a source's photos whose focal lengths differ more were zoomed
+# Photos of a source count as zoomed if their focal lengths differ by more than this fraction.
+_MAX_FOCAL_SPREAD = 0.05
 
 
 # ---- EXIF
@@ -72,7 +73,7 @@ def read_exif(path: Path) -> PhotoExif:
 
 
 def focal_from_exif(photo: Any, width: int, height: int) -> float | None:
-    """Focal length over the image's longer side from the Exif block of a header, or None.
+    """Focal length as a multiple of the image's longer side, from the Exif block of a header; None if unknown.
 
     It is computed from the 35 mm equivalent, which is defined by the image diagonal (CIPA DCG-001), or else from focal
     length and sensor resolution.
@@ -92,7 +93,7 @@ def focal_from_exif(photo: Any, width: int, height: int) -> float | None:
 
 
 def _focal_from_model(path: Path, width: int, height: int) -> float | None:
-    """Focal length over the longer side by COLMAP's table of sensor sizes per camera model, or None."""
+    """Focal length as a multiple of the longer side, by COLMAP's table of the camera models' sensor sizes, or None."""
     try:
         camera = pycolmap.infer_camera_from_image(str(path))
     except (RuntimeError, ValueError):
@@ -112,7 +113,7 @@ def _gps(gps: Any) -> tuple[float, float, float]:
 
 
 def _degrees(angle: Any, reference: Any, negative: str) -> float:
-    """Degrees from (degrees, minutes, seconds), negative if `reference` is `negative`; NaN if malformed."""
+    """Degrees from (degrees, minutes, seconds); below 0 if `reference` is the letter `negative`, NaN if malformed."""
     try:
         total = sum(float(part) / 60.0**i for i, part in enumerate(angle))
     except (TypeError, ValueError, ZeroDivisionError):
@@ -233,7 +234,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
 def _load_ahead(
     pool: ThreadPoolExecutor, paths: tuple[Path, ...], lenses: tuple[Lens, ...] | None, chosen: list[int]
 ) -> Iterator[tuple[int, tuple[Image, PhotoExif]]]:
-    """The chosen photos with their indices, in order, loaded in threads at most `QUEUE_SIZE` ahead of the consumer."""
+    """Yields index and photo of the chosen photos in order. Threads load at most `QUEUE_SIZE` photos in advance."""
     waiting: list[tuple[int, Future[tuple[Image, PhotoExif]]]] = []
     for i in chosen:
         waiting.append((i, pool.submit(load_photo, paths[i], lenses[i] if lenses else None)))
@@ -245,15 +246,15 @@ def _load_ahead(
 
 
 def _in_kept_segments(task: SourceTask, images: ImageSet) -> NDArray[np.int64]:
-    """Indices of the photos inside the segments of the source to use; all photos without segments."""
+    """Indices of the photos to use: those inside the source's segments, or all if the source has no segments."""
     count = len(images.paths)
     if not task.segments:
         return np.arange(count)
     clock = [read_exif(path).time for path in images.paths]
     if not _strictly_rising(clock):
         raise InputError(
-            f"{task.path}: keep is in seconds, but these photos' EXIF times are missing or do not increase in "
-            "file-name order; put the photos to be used into a folder of their own, and give keep to the films only"
+            f"{task.path}: keep is given in seconds, but these photos' EXIF times are missing or do not increase in "
+            "file-name order; put the photos to use into a folder of their own, and set keep only for films"
         )
     times = np.array(photo_times(clock, list(range(count))))
     used = np.flatnonzero(in_segments(times, task.segments))
@@ -271,7 +272,7 @@ def load_photo(path: Path, lens: Lens | None) -> tuple[Image, PhotoExif]:
     The lens of a posed image usually describes the stored image, so a posed image is rotated upright only if the stored
     image does not fit its lens.
 
-    Raises InputError: the file is missing, empty, truncated or undecodable, or its aspect differs from its lens's.
+    Raises InputError: the file is missing, empty, truncated or undecodable, or has another aspect than its lens.
     """
     stored = _stored_size(path)
     exif = read_exif(path)
@@ -325,7 +326,7 @@ def evenly_spaced(count: int, limit: int) -> NDArray[np.int64]:
 
 
 def _focal_prior(focals: list[float], size: tuple[int, int], name: str) -> Lens | None:
-    """A lens with the median of the photos' focal lengths [longer sides]; None without any."""
+    """A lens with the median of the photos' focal lengths [longer sides]; None if none is known."""
     if not focals:
         return None
     median = float(np.median(focals))

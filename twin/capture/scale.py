@@ -18,17 +18,17 @@ from twin.types import Array
 
 _SCALE_OPTIONS = (
     "metric.camera_height = 0.5 (lens above the ground [m]), [metric.distance] (two marked image points and the metres "
-    "between them), metric.gps = true (positions in EXIF or a bag), metric.odometry = true (a bag's), [metric.marker] "
-    "(a printed ArUco or AprilTag marker), or metric.poses_are_metric = true"
+    "between them), metric.gps = true (positions in EXIF or a bag), metric.odometry = true (odometry in a bag), "
+    "[metric.marker] (a printed ArUco or AprilTag marker), or metric.poses_are_metric = true"
 )
 _PIXEL_ERROR = 1.0  # [px] standard deviation of a point marked by hand
 _GPS_TRIALS = 400
-_STRETCH = 2.0  # [m] length of odometry compared with the cameras' path; heading hardly drifts within it
+_STRETCH = 2.0  # [m] length of the compared stretches of odometry; the heading hardly drifts over this length
 _STRAIGHT = 0.7  # smallest ratio of end-to-end distance to length of a compared stretch
 _MIN_STRETCHES = 5
 _MAX_STRETCH_SPREAD = 0.3  # largest relative spread of the stretches' scales
 _MIN_SIDE = 10  # road points needed on each side of the path to compare the two sides
-_MIN_ANGLE = np.radians(2.0)  # [rad] needed between the rays of two frames to a marker
+_MIN_ANGLE = np.radians(2.0)  # [rad] smallest sufficient angle between the rays of two frames to a marker
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ def combine_scales(scales: dict[str, Scale]) -> Scale:
 
     If the scales differ by more than their uncertainties explain, the combined uncertainty grows by the Birge ratio
     (Birge 1932). A scale with uncertainty 0, from poses that are given as metric, is used unchanged. The notes of all
-    scales are merged. If there are several, the notes also contain `scales`, each scale relative to the result, and
-    `scale_disagreement`, the largest difference between two scales in standard deviations.
+    scales are merged. Several scales add two entries: `scales` holds each scale divided by the result, and its
+    uncertainty; `scale_disagreement` is the largest difference between two scales in standard deviations.
     """
     names = list(scales)
     notes: dict[str, Any] = {}
@@ -104,8 +104,9 @@ def scale_from_height(
     """Scale from the known height of the cameras above the road; `points` (m, 3) are all sparse points.
 
     `own` holds the camera height of each source [m]; a source with 0 uses that of `metric`. The uncertainty combines
-    four errors: of the measured height, of its repetition along the path, of the up direction, and of the assumption
-    that the ground is level across the path. Raises InputError without a road.
+    four errors: that of the height as measured by hand, the variation of the reconstructed heights along the path and
+    between sources, that of the up direction, and that of the assumption that the ground is level across the path.
+    Raises InputError without a road.
     """
     if road is None:
         raise InputError(
@@ -137,7 +138,8 @@ def scale_from_height(
     value = float(np.average(scales, weights=weights))
     layer = road.spread / road.drop / np.sqrt(len(road.points))
     between = float(np.std(scales) / value) if len(scales) > 1 else 0.0
-    # Few points, or points on the verge only, add an error of 5 %: a kerb is a tenth of the usual camera height.
+    # A road with few points, or with points on the verge only, adds an error of 5 %, since the verge may be higher than
+    # the road by a kerb, about a tenth of the usual camera height.
     few = 0.0 if road.reliable else 0.05
     repeat = np.average(np.square(sigmas), weights=weights) + layer**2 + between**2 + few**2
     # One person measures all heights with one method, so averaging does not reduce their error.
@@ -158,10 +160,11 @@ def scale_from_height(
 
 
 def _ground_errors(cameras: Cameras, up: Gravity, road: Array, drop: float) -> tuple[float, float]:
-    """Relative errors of the cameras' height above road points (k, 3): by a tilt of up, and by camber or a kerb.
+    """Two relative errors of the camera height above the road points (k, 3).
 
-    A tilt changes the height by its angle times the mean horizontal offset of the points. The second error is half the
-    difference between the heights above the points to the left and to the right of the path.
+    The first comes from the error of up: it is the angle of this error times the mean horizontal offset of the points,
+    divided by the camera height. The second comes from camber or a kerb: it is half the difference between the heights
+    above the points to the left and to the right of the path, divided by the camera height.
     """
     nearest, height, _ = below_path(road, cameras.positions, up.direction)
     away = road - cameras.positions[nearest]
@@ -212,7 +215,7 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
     sigma = float(np.sqrt(0.5 * np.sum((lengths - measured) ** 2)) / measured)
     if not np.isfinite(sigma) or sigma > 0.5:
         raise InputError(
-            "metric.distance: one pixel changes it by half; mark points further apart, or in frames further apart"
+            "metric.distance: errors of 1 px change it by more than half; mark points further apart, or in other frames"
         )
     return Scale(distance.metres / measured, sigma, {"distance_units": measured})
 
@@ -253,16 +256,19 @@ def _meeting_point(first: tuple[Array, Array], second: tuple[Array, Array]) -> A
 
 
 def local_east_north_up(gps: Array) -> Array:
-    """East, north, up [m] relative to the first row from latitude [°], longitude [°], altitude [m] (WGS 84), (n, 3)."""
+    """East, north and up [m] (n, 3) of positions given as latitude [°], longitude [°], altitude [m] (WGS 84) (n, 3).
+
+    The first position is the origin.
+    """
     return np.asarray(pycolmap.GPSTransform().ellipsoid_to_enu(gps, *gps[0]))
 
 
 def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generator) -> tuple[Scale, Array]:
     """Scale and horizontal east axis (3,) from GPS positions by a robust similarity fit in the horizontal plane.
 
-    Altitudes are not used: they are several times less accurate than positions, and up is known already. `gps` (n, 3)
-    holds latitude [°], longitude [°] and altitude [m] per camera center, NaN where unknown. `rng` draws the pairs of
-    cameras for the first fits.
+    Altitudes are not used: they are several times less accurate than latitude and longitude, and up is known already.
+    `gps` (n, 3) holds latitude [°], longitude [°] and altitude [m] per camera center, NaN where unknown. `rng` draws
+    the pairs of cameras for the first fits.
 
     Raises InputError: fewer than 3 positions, or positions that do not spread beyond their own error.
     """
@@ -308,7 +314,8 @@ def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generat
             f"metric.gps: positions fit within {np.median(residual):.1f} m but spread over {extent:.1f} m only; film "
             "a longer way, or give the scale another way"
         )
-    # The fit rotates the plane's axes to east and north, so its conjugate is the east axis in the plane.
+    # The rotation maps coordinates along (first, second) to (east, north), so its complex conjugate is the east axis in
+    # coordinates along (first, second).
     rotation = fit / abs(fit)
     east = first * rotation.real - second * rotation.imag
     notes = {
@@ -320,10 +327,13 @@ def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generat
 
 
 def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> Scale:
-    """Scale from the cameras' positions by odometry [m], in one frame per source, shape (n, 3), NaN where unknown.
+    """Scale from `odometry`, the camera positions [m] measured by the robot, shape (n, 3), NaN where unknown.
+
+    Each source has its own coordinate frame.
 
     The heading of odometry drifts, most for the wheels of a skid-steered robot, but its lengths are right to a few
-    percent. So the distance between the ends of each stretch of `_STRETCH` is compared, whatever its direction.
+    percent. So the path is divided into stretches of `_STRETCH`, and the distances between the ends of each,
+    by odometry and in the reconstruction, are compared, whatever their directions.
     `tolerance` is the relative standard deviation of the error that all stretches share; their spread adds to it.
 
     Raises InputError: too few stretches, or stretches that contradict each other.

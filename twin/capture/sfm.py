@@ -1,9 +1,9 @@
 """Stage `cameras`: camera poses and sparse points by structure from motion, and images without lens distortion.
 
-The output frame is that of the reconstruction, with arbitrary rotation, origin and scale, unless the input has poses.
-The stage runs `solve_mapping` in a worker process. A *model* is a COLMAP reconstruction. Global mapping (Pan et al.
-2024) is tried first, since the incremental mapper gets stuck on forward motion. Frames off the path of their neighbors
-are removed and registered once more against all others, and dropped if they are off again.
+The output has the coordinate system of the reconstruction. Its rotation, origin and scale are arbitrary, unless the
+input has poses. The stage runs `solve_mapping` in a worker process. A *model* is a COLMAP reconstruction. Global
+mapping (Pan et al. 2024) is tried first, since the incremental mapper gets stuck on forward motion. Frames off the path
+of their neighbors are removed and registered once more against all others, and left out if they are again off the path.
 """
 
 import os
@@ -39,13 +39,15 @@ from twin.scene import SceneDir
 from twin.types import Array
 
 _MAX_THREADS = 16
-_MAX_POINT_ERROR = 20.0  # [px] limit for points; those that bundle adjustment moved behind a camera exceed it by far
+# [px] Points with a larger reprojection error are left out, such as those that bundle adjustment moved behind a camera.
+_MAX_POINT_ERROR = 20.0
 _MIN_FRAMES = 3
 _PROBE_INLIERS = 25
-_NEAR_STEPS = 3.0  # distance [median steps] up to which cameras that were never matched are matched in the second round
+_NEAR_STEPS = 3.0  # [median steps] largest distance between two cameras that the second round matches
 _NEAR_PAIRS = 4
 _POSED_PAIRS = 10
-_REMAPPING_FRACTION = 0.05  # newly verified pairs [fraction of all] from which the second round maps again
+# The reconstruction is repeated if the second round verifies more new pairs than this fraction of the earlier ones.
+_REMAPPING_FRACTION = 0.05
 _TRACKS_PER_VIEW = 300  # point tracks in the first solution, to save 40 % of the time; retriangulation adds others
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
 _MIN_ANGLE = 0.5  # [°] smallest angle between the rays to a point
@@ -242,7 +244,7 @@ def _reconstruct(matcher: Matcher, job: dict[str, Any], work: Path, summary: dic
         matcher.match(near, "near pairs")
         fresh = len(matcher.verified()) - before
         if fresh > _REMAPPING_FRACTION * before:
-            send_message(say=f"  {fresh} more pairs hold: mapping again")
+            send_message(say=f"  {fresh} new verified pairs: reconstructing again")
             again = mapper.best(summary)
             model = again if again.num_reg_images() >= model.num_reg_images() else model
     model = mapper.without_outliers(model, job["max_outlier"], summary)
@@ -359,7 +361,7 @@ class _Mapper:
     def without_outliers(
         self, model: pycolmap.Reconstruction, limit: float, summary: dict[str, Any]
     ) -> pycolmap.Reconstruction:
-        """Registers the missing frames and those off the path once more; drops the frames that are off again."""
+        """Registers the missing frames and those off the path again; removes the frames that are then off the path."""
         matcher = self._matcher
         names = matcher.capture.names
         off = _off_path_frames(model, matcher, limit)

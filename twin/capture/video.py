@@ -35,11 +35,12 @@ SHARPNESS_WIDTH = 640  # [px] image width at which sharpness is measured; at ful
 _CORNERS = 200
 _MIN_TRACKED = 12  # corners needed to judge the motion of the whole image
 _MAX_RETURN_ERROR = 0.5  # [px] largest forward-backward tracking error
-_STILL_DIFFERENCE = 1.5  # [gray levels after contrast stretching] below it two frames without texture count as equal
+# [gray levels after contrast stretching] Two frames without texture count as equal if they differ by less.
+_STILL_DIFFERENCE = 1.5
 BLANK_STD = 2.0  # an image with a smaller standard deviation of its brightness [gray levels] counts as blank
 _LUMA_FIRST = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 _DEINTERLACE = "mode=send_frame:parity=auto:deint=interlaced"
-_MIN_DECODED_FRACTION = 0.98  # of the declared frames; if fewer can be decoded, the user gets a note
+_MIN_DECODED_FRACTION = 0.98  # the user gets a note if a smaller fraction of the declared frames can be decoded
 
 
 # ---- sharpness and motion, on small gray images (uint8, shape (h, w)) so that a frame takes about a millisecond
@@ -182,7 +183,7 @@ def in_segments(times: Array, segments: tuple[tuple[float, ...], ...]) -> NDArra
 def _joined_segments(
     timing: FilmTiming, segments: tuple[tuple[float, ...], ...], path: Path
 ) -> tuple[FilmTiming, NDArray[np.int64]]:
-    """The timing of the kept segments joined, and each film frame's position in them (−1 if cut out)."""
+    """The timing of a film of the kept segments only, and each original frame's position in it (−1 if cut out)."""
     used = in_segments(timing.times, segments)
     if segments and used.sum() < 2:
         raise InputError(
@@ -260,7 +261,7 @@ def read_film(
     """Yields a film's kept frames in order: the sharpest of each slot, without duplicates of a standing camera.
 
     `count` is filled while reading. `mask_of` maps a frame's index, kept width and kept height to its mask or None.
-    `segments` are [from, to] each [s]; empty for the whole film.
+    `segments` holds pairs (from, to) of times [s]; empty for the whole film.
 
     Raises InputError: the film is unreadable, or has fewer than two frames or only blank ones.
     """
@@ -342,7 +343,7 @@ def _sharpest_per_slot(
 def format_note(path: Path, count: FilmStatistics) -> str | None:
     """A note for the user if a film was converted from HDR or deinterlaced, else None."""
     done = [f"HDR ({count.hdr}), converted to SDR"] if count.hdr else []
-    done += ["interlaced, deinterlaced at a loss of detail"] if count.interlaced else []
+    done += ["interlaced, so it was deinterlaced, which costs detail"] if count.interlaced else []
     return f"{path.name}: {'; '.join(done)}; film without it if you can" if done else None
 
 

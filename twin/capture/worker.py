@@ -1,7 +1,7 @@
 """Runs structure from motion in a separate process, because some failures inside COLMAP abort the whole process.
 
-The parent starts the *worker*, `python -m twin.capture.worker MODULE:FUNCTION JOB`, which calls the function with the
-*job*, a dictionary in the file JOB, and the folder of that file. The parent shows the worker's progress and turns an
+The parent starts the *worker*, `python -m twin.capture.worker MODULE:FUNCTION JOB`, which calls the function with
+the *job* (a dictionary in the file JOB) and that file's folder. The parent shows the worker's progress and turns an
 abort into an error with a cure. A *message* is one line of JSON on the worker's standard output: {"bar": name,
 "total": n} starts a progress bar, {"step": n} advances it, {"say": text} prints a line, {"error": text} reports bad
 input. COLMAP writes its own log to standard error; the parent copies it to a file.
@@ -126,7 +126,7 @@ class _ProgressBars:
         return message
 
     def log(self, line: str) -> None:
-        """Advances the mapping bar if a line of COLMAP's log ends one of its steps."""
+        """Advances the mapping bar if a line of COLMAP's log reports the end of a step."""
         finished = "fixed-rotation" not in line and any(part in line for part in _MAPPING_LOG_STEPS)
         with self._lock:
             if finished and self._mapping and self._bar is not None and self._bar.n < self._bar.total:
