@@ -1,7 +1,7 @@
 """Evaluation of policies on numbered episodes of a task, on this machine or a Ray cluster.
 
-Seed and lighting determine an *episode*: start, robot and light depend neither on the policy nor on the machine or
-other episodes. So all policies drive the same episodes, and *chunks* of a campaign can run in any order.
+An *episode* is determined by its seed and lighting: start, robot and light do not depend on the policy, the machine or
+other episodes. So all policies drive the same episodes, and the *chunks* of a campaign can run in any order.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from twin.runtime import die_with_parent, ignore_terminal_signals, signals_held,
 CHUNK = 16
 """Largest number of episodes in a chunk; one process drives a chunk."""
 
-_ENVS = 8  # episodes driven at once
+_ENVS = 8  # number of episodes driven at once
 _SAMPLED_LIGHTING = re.compile(r"drawn_(\d+)")
 
 
@@ -46,13 +46,16 @@ class EpisodeChunk:
     """See `load_policy`."""
     trust: bool
     condition: Condition
-    """Its lighting may be `drawn_<number>`, see `with_sampled_lighting`."""
+    """The condition's lighting may be `drawn_<number>`, see `with_sampled_lighting`."""
     seeds: tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """An episode's result: progress [m], mean trust over its pictures, sum of its rewards, lighting as sampled."""
+    """Result of an episode: among others, progress [m], mean trust of its pictures, and sum of its rewards.
+
+    `lighting` is the sampled lighting.
+    """
 
     seed: int
     cause: str
@@ -64,7 +67,10 @@ class EpisodeResult:
 
 
 def run_chunk(chunk: EpisodeChunk) -> list[EpisodeResult]:
-    """Results of a chunk, in the order of its seeds. Raises InputError: unknown policy, scene, task or lighting."""
+    """Drives a chunk; returns results in the order of its seeds.
+
+    Raises InputError: the policy, scene, task or lighting is unknown.
+    """
     envs = _vector_env(chunk.scene, chunk.task, chunk.source, chunk.trust, chunk.condition)
     return run_episodes(_policy(chunk.source, chunk.trust), envs, chunk.seeds)
 
@@ -75,9 +81,9 @@ def run_episodes(
     seeds: Sequence[int],
     watch: Callable[[], object] = lambda: None,
 ) -> list[EpisodeResult]:
-    """Results of an episode per seed, in that order, driven in all environments at once.
+    """Drives one episode per seed, in all environments at once; returns results in the order of the seeds.
 
-    `envs` need pictures, and their current episodes are abandoned. `watch` is called after every episode.
+    `envs` must have pictures; their current episodes are abandoned. `watch` is called after every episode.
     """
     assert envs.pixels is not None
     waiting = list(range(len(seeds)))
@@ -95,7 +101,8 @@ def run_episodes(
         for i in which:
             trusts[driving[i]].append(float(envs.pixels.trust[i]))
         pictures = envs.observation()
-        # One by one: in a batch the order of sums differs, and the last bit can decide whether a robot hits the kerb.
+        # Stacks are passed one by one, since sums in a batch have another order, and the last bit of an action can
+        # decide whether a robot hits the kerb.
         out = envs.step(np.stack([policy(pictures[i]) for i in which]), which)
         rewards[[driving[i] for i in which]] += out.reward
         for i in [i for i, ended in zip(which, out.over, strict=True) if ended]:
@@ -108,14 +115,15 @@ def run_episodes(
 
 
 def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[list[EpisodeResult]]:
-    """Drives chunks in worker processes on this machine, which end with this one; yields their results in order.
+    """Drives chunks in worker processes on this machine; yields the chunks' results in order.
 
-    Raises InputError: an error of `run_chunk`, or a process ended, most likely because memory ran out.
+    The workers end with this process. Raises InputError: as in `run_chunk`, or because a worker ended, most likely
+    since memory ran out.
     """
     if processes == 1:
         yield from map(run_chunk, chunks)
         return
-    # Spawned, since the threads of Warp and MuJoCo do not survive a fork.
+    # Workers are spawned, since the threads of Warp and MuJoCo do not survive a fork.
     count = min(processes, max(1, len(chunks)))
     pool = ProcessPoolExecutor(count, get_context("spawn"), _init_worker, (os.getpid(),))
     try:
@@ -133,11 +141,11 @@ def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[lis
 
 
 def with_sampled_lighting(factory: EnvFactory, number: int) -> EnvFactory:
-    """Adds a lighting `drawn_<number>` to the factory's field, sampled from the filmed ones with that seed."""
+    """Adds a lighting `drawn_<number>` to the factory's field: sampled from the filmed ones, with `number` as seed."""
     assert factory.field is not None
     name = f"drawn_{number}"
     if name not in factory.field.lightings:
-        # From the filmed ones, so that the result does not depend on lightings sampled before.
+        # Sampled from the filmed lightings only, so that lightings sampled before have no effect.
         filmed = factory.field.lightings_by_name.filmed()
         factory.field.add_lightings({name: filmed.sample(np.random.default_rng(number))})
     return factory
@@ -171,15 +179,15 @@ def _vector_env(scene: str, task: str, source: str, trust: bool, condition: Cond
 
 # ---- campaigns on a Ray cluster
 
-_CORES = 2  # that a chunk uses
+_CORES = 2  # number of CPU cores that a chunk uses
 _CONNECT_TIMEOUT = 5.0  # [s]
 
 
 def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[list[EpisodeResult]]:
-    """`campaign` on a Ray cluster (address `auto`: the one on this machine).
+    """Does the same as `campaign` on a Ray cluster; the address `auto` stands for the cluster on this machine.
 
-    Its nodes need `twin`, and scene and policies under the same paths. Raises InputError: Ray is not installed, there
-    is no such cluster, or an error of `run_chunk`.
+    Every node needs `twin`, and needs scene and policies under the same paths as here. Raises InputError: Ray is not
+    installed, or there is no such cluster; also as in `run_chunk`.
     """
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # silences a warning of Ray on GPUs
     try:
@@ -196,7 +204,7 @@ def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[li
         first = str(error).splitlines()[0]
         raise InputError(f"--ray {address}: no cluster there ({first}); start one with `ray start --head`") from None
     try:
-        # No more cores than the largest node has, or the tasks would wait for ever.
+        # A task that asks for more cores than the largest node has would wait for ever.
         cores = max((node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0)
         if cores < 1:
             raise InputError(f"--ray {address}: no node of the cluster has a core to give; start one with `ray start`")
