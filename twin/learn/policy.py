@@ -168,8 +168,8 @@ def load_policy(source: str | Path, trust: bool = False) -> Policy:
     """Loads a policy from
 
     - a policy folder (or its policy.json), such as the folder of a run or of a checkpoint;
-    - an ONNX file with one input and one output: the input is uint8 or float32 with values 0 to 255, shape (n,
-      3 · stack, height, width), the output has shape (n, 1 or 2) and values in [-1, 1];
+    - an ONNX file with one input, uint8 or float32 (n, 3 · stack, height, width) with values 0 to 255, and one output
+      (n, 1 or 2) with values in [-1, 1];
     - `module:function`: the user's own function, which receives one stack, uint8 (3 · stack, height, width);
     - a zip file of stable-baselines3; `trust` must be True, since loading the file runs code from it.
 
