@@ -33,7 +33,7 @@ class WandbRun(KVWriter):
 
     def __init__(self, run: "wandb.Run") -> None:
         self._run = run
-        # Steps are logged as their own metric. wandb's built-in steps must not decrease, but those of a training do when
+        # Steps are logged as their own metric. wandb's built-in steps must not decrease, but a training's steps do when
         # it was killed and continues from its last saved state.
         run.define_metric(_STEP)
         run.define_metric("*", step_metric=_STEP)
