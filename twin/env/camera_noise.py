@@ -10,8 +10,8 @@ from twin.types import Array, Array32
 
 _VIBRATION_TIME = 0.05  # [s] correlation time of the vibration
 _DRIFT_TIME = 5.0  # [s] correlation time of the exposure
-_MAX_SHUTTER = 0.5  # largest fraction of the time between two pictures for which the shutter is open
-_KNEE = 0.75  # film colors above this value are compressed towards 1
+_MAX_SHUTTER = 0.5  # the shutter is open for at most this fraction of the time between two pictures
+_KNEE = 0.75  # film colors above this value are compressed so that none exceeds 1
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class CameraNoise:
         """
         step = np.inf if self._time is None else max(time - self._time, 0.0)
         self._time = time
-        # Ornstein-Uhlenbeck process, exact for any step.
+        # This update of an Ornstein-Uhlenbeck process is exact for any time step.
         keep = np.exp(-step / np.array([_VIBRATION_TIME, _DRIFT_TIME]))
         fresh = np.sqrt(1.0 - keep**2)
         self._tilt = keep[0] * self._tilt + fresh[0] * self._rng.normal(size=3)
@@ -79,9 +79,10 @@ class CameraNoise:
 def motion_blur(
     rgb: Array32, depth: Array32, pose: Array, before: Array, share: float, rays: Array, intrinsics: Array, samples: int
 ) -> Array32:
-    """Returns a picture averaged over the last fraction `share` of the camera's motion from `before` to `pose`.
+    """Returns a picture with motion blur: the mean over the camera's motion while the shutter is open.
 
-    The world is assumed to be static. Shapes and units as in `CameraNoise.apply`.
+    This is the last fraction `share` of the motion from `before` to `pose`. The world is assumed to be static. Shapes
+    and units as in `CameraNoise.apply`.
     """
     to_before = inverse_pose(before) @ pose
     points = (rays * depth[..., None]) @ to_before[:3, :3].T + to_before[:3, 3]

@@ -1,9 +1,8 @@
 """Compositor: a radiance field rendered with obstacles, other robots and the robot's own body in it.
 
-Objects are shaded with the field's irradiance and throw contact shadows. In every pixel that an object covers,
-the field is rendered a second time, only up to the object's depth. The object is blended in behind this foreground with
-the remaining transmittance, so leaves in front of it hide it. Uncovered pixels, and uncovered parts of pixels at edges,
-show the field.
+Objects are shaded with the field's irradiance and throw contact shadows. In every pixel that an object covers, the
+field is rendered a second time, only up to the object's depth. This foreground is drawn over the object according to
+its opacity: leaves in front of an object hide it. Pixels, or parts of pixels, that no object covers show the field.
 """
 
 import threading
@@ -33,8 +32,8 @@ from twin.warp_runtime import wp
 
 # ---- objects
 
-_NEAR_PLANE = 0.02  # [m] geoms that lie entirely nearer than this z-depth are not drawn
-_SMALL_MASK = 800  # [px] masks up to this size are supersampled everywhere: finding edges would cost more time
+_NEAR_PLANE = 0.02  # [m] geoms whose z-depth is smaller than this everywhere are not drawn
+_SMALL_MASK = 800  # [px] masks up to this size are supersampled everywhere, since finding edges would take longer
 _SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] offsets of the samples at edges
 
 
@@ -55,16 +54,16 @@ class RenderedObjects:
 class ObjectRenderer:
     """Draws obstacles and robots of one model, one env at a time. Not thread-safe.
 
-    It casts rays into a second model that has only these geoms, through the pixels that the geoms' bounding boxes may
-    cover: one ray per pixel, and four at edges, for smooth outlines. The lights of the second model are chosen so that
-    the color a ray returns encodes the surface's normal. An object's shaded color is its own color times the irradiance
-    of the normal.
+    It casts rays into a second model, which has only the geoms of obstacles and robots. There is one ray in each pixel
+    that a geom's bounding box may cover; pixels at edges have four, for smooth outlines. The lights of the second model
+    are chosen so that the color that a ray returns encodes the surface's normal. An object's shaded color is its own
+    color times the irradiance of this normal.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: int, size: tuple[int, int]):
         """
         Args:
-            model: Its geoms in the obstacles' group and in the robot's visual group are drawn.
+            model: The model; its geoms in the obstacles' group and in the robot's visual group are drawn.
             camera: Index of the camera in the model.
             size: Width, height of the picture [px].
         """
@@ -106,13 +105,17 @@ class ObjectRenderer:
         self._subpixel_rays = np.stack([self._rays(pixels + offset) for offset in _SUBPIXELS], 1)
 
     def visible_mask(self, data: mujoco.MjData, pose: Array) -> NDArray[np.bool_] | None:
-        """Pixels that geoms may cover, shape (height, width), seen from an OpenCV pose; None if no geom is in view."""
+        """Mask (height, width) of the pixels that geoms may cover in the view from an OpenCV pose.
+
+        None if no geom is in view.
+        """
         if len(self.geoms) == 0:
             return None
         turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         middles = data.geom_xpos[self.geoms] - pose[:3, 3] + np.einsum("nij,nj->ni", turns, self._centers)
         planes = self._planes @ pose[:3, :3].T
-        # Reach of a box into a half space: position of its center along the normal, plus projection of its half sides.
+        # A box reaches this far into a half space: its center's position along the normal, plus the projection of its
+        # half sides onto the normal.
         reach = middles @ planes.T + np.einsum("npj,nj->np", np.abs(planes @ turns), self._halves)
         reach[:, -1] -= _NEAR_PLANE
         seen = np.flatnonzero((reach > 0.0).all(1))
@@ -184,7 +187,8 @@ class ObjectRenderer:
     def _cast(self, rays: Array32) -> tuple[NDArray[np.int32], Array32, Array32]:
         """Casts rays (n, 3).
 
-        Returns the drawn geom that each ray hits (−1: none), the unit normal and the z-depth [m] (0: none).
+        Returns, for each ray, the drawn geom that it hits (−1: none), the unit normal there, and the z-depth [m] (0 if
+        it hits none).
         """
         count, most = len(rays), self._caster.max_rays
         if count > most:  # more rays than fit into one cast
@@ -200,7 +204,10 @@ class ObjectRenderer:
     def _shader(
         self, data: mujoco.MjData, irradiance: Irradiance | None
     ) -> Callable[[NDArray[np.int32], Array32], Array32]:
-        """Returns a function from drawn geoms (n,) and normals (n, 3) to colors (n, 3), 0 where the geom is −1."""
+        """Returns a function that converts drawn geoms (n,) and normals (n, 3) to colors (n, 3).
+
+        The color is 0 where the geom is −1.
+        """
         ground = irradiance.ground(data.xpos[self._bodies, :2]) if irradiance else None
 
         def shade(geom: NDArray[np.int32], normals: Array32) -> Array32:
@@ -225,7 +232,7 @@ def _geom_rgba(model: mujoco.MjModel) -> Array:
 
 
 def _geoms_only_model(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> mujoco.MjModel:
-    """Returns a model that has only these geoms, and a camera; its lights give a surface the color (1 + normal) / 2."""
+    """Returns a model with only these geoms and a camera; its lights give a surface the color (1 + normal) / 2."""
     spec = mujoco.MjSpec()
     spec.visual.headlight.active = 0
     meshes: set[int] = set()
@@ -262,9 +269,9 @@ def _copy_mesh(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: int) -> None:
 
 
 def _mesh_frames(small: mujoco.MjModel) -> tuple[Array, Array]:
-    """Position (n, 3) and rotation (n, 3, 3) of each geom's frame in the frame that its mesh had before compilation.
+    """Positions (n, 3) and rotations (n, 3, 3) of the geoms' frames relative to the frames of the uncompiled meshes.
 
-    They differ because MuJoCo moves a mesh to its inertial frame.
+    The frames differ because MuJoCo moves a mesh to its inertial frame.
     """
     turns = np.empty((small.ngeom, 9))
     for i in range(small.ngeom):
@@ -318,8 +325,8 @@ class Compositor:
         # Warp's default device is global to the process, and worker threads change it.
         wp.set_device("cpu")
         count = min(max_envs, available_cores()) if field.device == "cpu" else 1
-        # On a GPU, all threads would share one CUDA stream, so there is one worker. Workers are created here, not in
-        # threads, since Warp compiles kernels at their first use.
+        # On a GPU there is one worker, since all threads would share one CUDA stream. Workers are created here and not
+        # in the threads, since Warp compiles kernels at their first use.
         self._workers = [_CompositorWorker(model, field, self._camera, size) for _ in range(count)]
         self._pool = ThreadPoolExecutor(count) if count > 1 else None
         self._shadows = ContactShadows(model, self._workers[0].renderer.geoms)
@@ -403,12 +410,12 @@ class _CompositorWorker:
         self._fields: OrderedDict[tuple[int, int], BakedField] = OrderedDict()
 
     def foreground(self, pose: Array, drawn: RenderedObjects, lighting: Lighting) -> Rendering:
-        """The part of the field in front of drawn objects, in their window, arrays (height, width)."""
+        """The part of the field in front of the drawn objects: arrays (height, width) for the objects' window."""
         left, top, width, height = drawn.window
         across, down = (-(-n // _WINDOW_STEP) * _WINDOW_STEP for n in (width, height))
         stop = np.zeros((1, down, across), np.float32)
         stop[0, :height, :width] = drawn.depth
-        # One copy of the field per window size, since a field keeps render targets of few sizes.
+        # There is one copy of the field per window size, since a field keeps render targets of few sizes.
         if (across, down) not in self._fields:
             self._fields[across, down] = self._field.single_threaded()
             if len(self._fields) > _MAX_WINDOWS:
@@ -427,7 +434,7 @@ def composite(out: Rendering, inner: tuple, drawn: RenderedObjects, front: Rende
         out: Rendering of the field alone.
         inner: Index that selects the window in the arrays of `out`.
         drawn: Objects in the window.
-        front: The field up to `drawn.depth`, with colors not premultiplied, arrays (height, width).
+        front: The field up to `drawn.depth`, arrays (height, width); its colors are not premultiplied.
     """
     cover = drawn.coverage[..., None]
     held = front.opacity[..., None]

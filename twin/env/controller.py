@@ -1,11 +1,11 @@
 """The Husky's wheel controller: turns commands into wheel speeds, for one robot or for many at once.
 
 A *command* is forward speed v [m/s] and yaw rate ω [rad/s]. A command arrives `command_latency` after it was given.
-The controller runs periodically and uses the newest command that has arrived; if that one is older than its time-out,
-the controller stops the robot (by default 10 Hz and 0.25 s, see `twin.robot.CONTROLLERS`). It limits v and ω, then
-their change per period, converts them to the speeds of the two sides, and scales both down if one exceeds
-`max_wheel_speed`. This reproduces Clearpath's controller: ROS's diff_drive_controller with its speed limiter, then
-husky_hardware's limit.
+The controller runs periodically, by default at 10 Hz, and uses the newest command that has arrived. If this command is
+older than the time-out, by default 0.25 s, the controller stops the robot (see `twin.robot.CONTROLLERS`). It limits v
+and ω, and then their changes per period. It converts them to the speeds of the two sides, and scales both speeds down
+if one exceeds `max_wheel_speed`. This reproduces Clearpath's controller: ROS's diff_drive_controller with its speed
+limiter, followed by the limit of husky_hardware.
 """
 
 from collections import deque
@@ -103,10 +103,10 @@ class Controller:
 
 @dataclass(frozen=True)
 class SubstepSchedules:
-    """Wheel speeds of n robots over one control step of `steps` physics substeps, in at most p segments per robot.
+    """Wheel speeds of n robots in one control step, which consists of `steps` physics substeps.
 
-    A segment is a run of substeps with constant wheel speeds; contacts are checked at its end. Segments differ between
-    robots whose controllers have different phases.
+    A segment is a run of substeps with constant wheel speeds; contacts are checked at its end. Each robot has at most p
+    segments; they differ between robots whose controllers have different phases.
     """
 
     speeds: Array
@@ -120,7 +120,7 @@ class SubstepSchedules:
 
 
 class VectorController:
-    """Controllers of n robots that differ only in `command_latency`; gives the results of `HuskyPhysics.schedule`."""
+    """Controllers of n robots that differ only in `command_latency`; results are those of `HuskyPhysics.schedule`."""
 
     def __init__(self, params: HuskyParams, count: int, period: float, timestep: float, check_steps: int) -> None:
         """
@@ -150,23 +150,24 @@ class VectorController:
         """
         self._latency[which], self._steps_to_update[which], self.time[which] = latency, steps_to_update, 0.0
         missing = int(np.ceil(self._latency.max() / self._period)) + 2 - len(self._commands)
-        if missing > 0:  # grow the buffers to the largest possible number of pending commands
+        if missing > 0:  # the buffers grow to the largest possible number of pending commands
             n = len(self._latency)
             self._arrivals = np.concatenate([np.full((missing, n), -np.inf), self._arrivals])
             self._commands = np.concatenate([np.zeros((missing, n, 2)), self._commands])
         self._arrivals[:, which], self._limited[which], self._speeds[which] = -np.inf, 0.0, 0.0
 
     def schedules(self, which: NDArray[np.int64], commands: Array) -> SubstepSchedules:
-        """Gives k robots commands, v [m/s] and ω [rad/s], shape (k, 2), and runs their controllers for a control step.
+        """Gives commands to k robots and runs their controllers for one control step.
 
-        The time of the other robots does not advance; their schedules are undefined.
+        The commands are v [m/s] and ω [rad/s], shape (k, 2). The time of the other robots does not advance;
+        their schedules are undefined.
         """
         for ring, new in ((self._arrivals, self.time[which] + self._latency[which]), (self._commands, commands)):
             ring[:-1, which] = ring[1:, which]
             ring[-1, which] = new
         n = len(self.time)
         speeds, times = np.zeros((self.max_segments, n, 2)), np.full((self.max_segments, n), np.inf)
-        checks = np.zeros((self._steps + 1, n), np.int32)  # shifted by one: its cumulative sum numbers the segments
+        checks = np.zeros((self._steps + 1, n), np.int32)  # shifted by one, so its cumulative sum numbers segments
         left = np.zeros(n, int)
         left[which] = self._steps
         robots = np.arange(n)

@@ -1,10 +1,14 @@
 """Domain randomization: the robot, the weather and distractor objects differ from episode to episode.
 
-The randomized quantities are the robot's tire friction, payload, latency, camera pose and wheels; fog, directional
-relighting and cast shadows of the pictures (see `weather.py`); and distractor objects beside the corridor. `Ranges`
-states the bounds; a `RandomizationSample` has the values of one episode, each uniform in its range and independent of
-the others. With `Ranges.hold_known`, measured parameters of the robot are not sampled, and the weather is randomized
-less when a photo of the day is available.
+The randomized quantities are:
+
+- robot: tire friction, payload, latency, camera pose and wheels;
+- pictures: fog, directional relighting and cast shadows (see `weather.py`);
+- place: distractor objects beside the corridor.
+
+`Ranges` contains the bounds, a `RandomizationSample` the values of one episode. Each value is uniform in its range and
+independent of the others. With `Ranges.hold_known`, measured parameters of the robot are not sampled, and the weather
+is randomized less when a photo of the day is available.
 """
 
 from dataclasses import asdict, dataclass, fields, replace
@@ -26,19 +30,20 @@ VERSION = 4
 """Version of a sample's effects. Raise it if the same sample gives different fog, relighting, shadows, distractors."""
 
 KNOWN_WEATHER_FRACTION = 0.6
-"""Fraction of the sun and shadow randomization kept when a photo of the day is available.
+"""When a photo of the day is available, the strengths of sun and shadows are multiplied by this fraction.
 
-Measured by `benchmarks/day.py` with the twelve finished policies that are forecast on the known-truth world, on ten of
-its days: the five stated weathers and days 1 to 5, not 6 to 15. So a forecast for these policies and days is not
-independent of this value. The benchmark compares the policies' steering on two sets of pictures: those of the twin
-with a photo's appearance and fog, and those of the photo's day. The difference is 0.8 (0.6 to 0.96) times the change
-that the full randomization causes. Relative to the change that the randomization with this fraction causes, it is 1.1
-(0.8 to 1.4) times in the part that is constant over a day, and 1.2 (1.0 to 1.4) times in the part that varies along the
-route."""
+It was measured by `benchmarks/day.py`, which compares the steering of policies on two sets of pictures: those of the
+twin with a photo's appearance and fog, and those of the day of the photo. The policies are the twelve finished ones
+whose success on the known-truth world is forecast. The days are ten days of that world: the five stated weathers and
+days 1 to 5, but not days 6 to 15. So a forecast for these policies and days is not independent of this value.
+
+The difference in steering is 0.8 (0.6 to 0.96) times the change that the full randomization causes. The randomization
+with this fraction causes a smaller change. Compared with that one, the part of the difference that is constant over a
+day is 1.1 (0.8 to 1.4) times as large, and the part that varies along the route 1.2 (1.0 to 1.4) times."""
 
 _PAYLOAD_SIDE = 0.3  # [m] the payload has the inertia of a cube with this side
 _TIRE_SUFFIX = "_tyre"
-_PER_AXIS = ("camera_shift", "camera_turn")  # sampled for each axis; each axis may be held at a value of its own
+_PER_AXIS = ("camera_shift", "camera_turn")  # sampled separately for each axis; a held axis may have its own value
 _MAX_BOUND = 1e6
 _ABOVE_ZERO = float(np.nextafter(0.0, 1.0))
 _BOUNDS = {
@@ -57,8 +62,8 @@ _RANGES_BY_PARAMETER = {
     "camera_height": ("camera_shift",),
     "camera_yaw": ("camera_turn",),
 }
-"""Ranges held fixed when a parameter of `HuskyParams` was measured. The camera's yaw is measured from a film by the
-camera itself, which also determines pitch and roll. With a measured height, the camera's whole offset counts as exact.
+"""Measured parameter of `HuskyParams` → ranges that are then held fixed. If the camera's yaw was measured, so were its
+pitch and roll, since the same film determines them. If its height was measured, its whole offset counts as exact.
 """
 _MODEL_FIELDS = ("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "bvh_aabb", "cam_pos", "cam_quat")
 
@@ -68,7 +73,7 @@ class Ranges:
     """Lowest and highest value of each quantity. Equal bounds hold it fixed."""
 
     friction: Range = (0.7, 1.3)
-    """Tire friction, as a factor of the robot's own."""
+    """Factor by which the robot's own tire friction is multiplied."""
     payload: Range = (0.0, 20.0)
     """Mass on the top plate [kg]."""
     latency: Range = (0.0, 0.1)
@@ -78,13 +83,13 @@ class Ranges:
     camera_turn: Range = (-1.0, 1.0)
     """Rotation of the front camera about each of its axes [°]."""
     wheel_radius: Range = (0.98, 1.02)
-    """Wheel radius, as a factor of the robot's own; the controller always uses the nominal radius."""
+    """Factor by which the robot's own wheel radius is multiplied; the controller always uses the nominal radius."""
     wheel_difference: Range = (-0.006, 0.006)
-    """Right minus left wheel radius, relative to their mean; it makes the robot drift without visual feedback."""
+    """Difference of the right and left wheel radius, relative to their mean; a robot that ignores its images drifts."""
     extinction: Range = (0.0, 0.05)
     """Extinction of the fog [1/m], added to the film's; 0.05 is a visibility of 60 m."""
     airlight: Range = (0.85, 1.15)
-    """Brightness of the fog, as a factor of the sky's at the horizon."""
+    """Ratio of the fog's brightness to that of the sky at the horizon."""
     sunlight: Range = (0.0, 0.7)
     """Strength of `DirectionalRelighting`."""
     shade: Range = (0.0, 0.75)
@@ -92,8 +97,8 @@ class Ranges:
     bystanders: Range = (0, 4)
     """Number of distractor objects beside the corridor: cones, boxes, bollards in any color."""
     hold_known: bool = False
-    """Holds measured parameters of the robot fixed (see `for_robot`), and weakens the weather in lightings fitted to a
-    photo (see `RandomizationSample.for_known_weather`)."""
+    """True: measured parameters of the robot are held fixed (see `for_robot`), and under lightings that were fitted to
+    a photo, the weather is weaker (see `RandomizationSample.for_known_weather`)."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a value is not a range, or lies outside the allowed bounds."""
@@ -120,7 +125,7 @@ class Ranges:
         """These ranges for a scene's robot. With `hold_known`, measured parameters are held at the robot's values.
 
         A parameter counts as measured if `robot.toml` or `[robot]` gives a value other than the published one. Real
-        trials use one robot; success rates over many sampled robots would measure robustness, not its success.
+        trials use one robot; a success rate over many sampled robots would measure robustness, not its success.
         """
         if not self.hold_known:
             return self
@@ -160,7 +165,7 @@ class RandomizationSample:
     bystanders: int = 0
 
     def for_known_weather(self) -> "RandomizationSample":
-        """The sample for a day whose appearance and fog a photo shows: no sampled fog, weaker sun and shadows."""
+        """This sample without fog and with weaker sun and shadows, for days whose appearance and fog a photo shows."""
         sun, shade = KNOWN_WEATHER_FRACTION * self.sunlight, KNOWN_WEATHER_FRACTION * self.shade
         return replace(self, extinction=0.0, airlight=1.0, sunlight=sun, shade=shade)
 
@@ -170,9 +175,9 @@ class RandomizationSample:
 
 
 EVALUATION_RANGES = Ranges(sunlight=(0.35, 0.7), shade=(0.35, 0.75), hold_known=True)
-"""Ranges for evaluating policies: measured parameters of the scene's robot are held, and the sun always differs from
-the film's. Training samples sun and shadows from zero up, to ease learning; in a forecast, such mild days would
-overestimate success on the road."""
+"""Ranges for evaluating policies. Measured parameters of the scene's robot are held fixed, and sun and shadows always
+differ from those in the film. Training also has episodes with little sun and shadow, to ease learning; in a forecast,
+such mild days would overestimate the success on the road."""
 
 
 def measured_parameters(robot: HuskyParams) -> list[str]:
@@ -207,7 +212,7 @@ class NominalModel:
         model.geom_friction[tires, 0] = nominal["geom_friction"][tires, 0] * sample.friction
         radius = sample.wheel_radius * (1.0 + np.where(self._right, 0.5, -0.5) * sample.wheel_difference)
         model.geom_size[tires] = nominal["geom_size"][tires] * np.stack([radius, np.ones_like(radius), radius], 1)
-        # MuJoCo's bounds of a geom may be larger than the geom, but not smaller.
+        # The bounds that MuJoCo stores for a geom may be larger than the geom, but not smaller.
         scale = max(1.0, float(radius.max()))
         model.geom_rbound[tires] = nominal["geom_rbound"][tires] * scale
         model.geom_aabb[tires] = nominal["geom_aabb"][tires] * scale

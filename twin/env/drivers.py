@@ -1,11 +1,11 @@
 """Drivers: they convert poses or images to commands or actions.
 
-`PurePursuit` (Coulter 1992) follows a route from poses alone; `follow_route` records such a drive, without images and
-without dm_control. `PurePursuit` steers along a circle through a point of the route ahead. A skid-steered robot turns
-faster or slower than commanded, by a factor that depends on ground and load. So the yaw rate is multiplied by a gain
-that follows the measured ratio of commanded to achieved curvature.
+`PurePursuit` (Coulter 1992) needs only poses: it steers along a circle through a point of the route ahead.
+`follow_route` records such a drive, without images and without dm_control. A skid-steered robot turns faster or slower
+than commanded, by a factor that depends on ground and load. So the yaw rate is multiplied by a gain, which is updated
+from the measured ratio of commanded to achieved curvature.
 
-The *drivers of an environment* receive it and its newest `dm_env.TimeStep`, and return an action within its
+The *drivers of an environment* receive the environment and its newest `dm_env.TimeStep`, and return an action within
 `action_spec`. Drivers that use poses serve as references; a policy uses images only.
 """
 
@@ -35,8 +35,8 @@ if TYPE_CHECKING:  # without dm_control, route followers still work
 
 GOAL_RADIUS = 1.0  # [m]
 
-_LOOKAHEAD = 1.0  # [m] along the route
-_GAIN_RATE = 0.15  # fraction of the gain's error corrected per control step
+_LOOKAHEAD = 1.0  # [m] distance along the route of the point to steer to
+_GAIN_RATE = 0.15  # fraction of the gain's error that is corrected per control step
 _GAIN_RANGE = (0.5, 2.5)
 _GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; at smaller yaw rates the measured ratio is noise
 _SEARCH_WINDOW = (1.0, 3.0)  # [m] of route behind and ahead of the last foot point
@@ -44,7 +44,7 @@ _SEARCH_WINDOW = (1.0, 3.0)  # [m] of route behind and ahead of the last foot po
 
 @dataclass(frozen=True)
 class RecordedDrive:
-    """A recorded drive of k instants, one per control step of 0.1 s; at the first one, the robot rests at the start."""
+    """A recorded drive of k instants, one per control step of 0.1 s. At the first, the robot rests at the start."""
 
     times: Array
     """[s], shape (k,)."""
@@ -55,7 +55,7 @@ class RecordedDrive:
     qpos: Array
     """MuJoCo's positions, shape (k, nq), for rendering the drive again."""
     commands: Array
-    """v [m/s], ω [rad/s] commanded at each instant (the last row is zero), shape (k, 2)."""
+    """Commands v [m/s], ω [rad/s] at each instant, shape (k, 2); the last row is zero."""
     cross_track: Array
     """Signed distance from the route, positive to the left [m], shape (k,)."""
     progress: Array
@@ -91,7 +91,13 @@ class PurePursuit:
     """Converts a sequence of poses to commands that follow the route."""
 
     def __init__(self, route: Array, speed: float, max_yaw_rate: float, start: float = 0.0) -> None:
-        """Route [m], shape (m, ≥2); speed [m/s]; largest yaw rate [rad/s]; arc length of the start [m]."""
+        """
+        Args:
+            route: [m], shape (m, ≥2).
+            speed: [m/s].
+            max_yaw_rate: Largest yaw rate [rad/s].
+            start: Arc length of the start [m].
+        """
         self._route, self._speed, self._max_yaw_rate = route[:, :2], speed, max_yaw_rate
         self._length = float(arc_lengths(route)[-1])
         self.s = start
@@ -100,7 +106,7 @@ class PurePursuit:
         self._last: tuple[Array, tuple[float, float]] | None = None
 
     def update(self, pose: Array) -> tuple[float, float]:
-        """Updates `s` from a pose (x, y, yaw); returns its foot point's arc length and cross-track error [m]."""
+        """Updates `s` from a pose (x, y, yaw); returns the foot point's arc length, and the cross-track error [m]."""
         foot, error = nearest_on_route(self._route, pose[:2], (self.s - _SEARCH_WINDOW[0], self.s + _SEARCH_WINDOW[1]))
         self.s = max(self.s, float(foot))
         return float(foot), float(error)
@@ -164,7 +170,7 @@ def _outcome(world: World, pose: Array, s: float, length: float, error: float, t
     """The drive's outcome; empty while the drive goes on."""
     if touched:
         return "touched"
-    # A route may also pass near its goal long before its end; that is no success.
+    # A route may pass near its goal long before its end; a robot there has not succeeded.
     if np.linalg.norm(pose[:2] - world.goal[:2]) < GOAL_RADIUS and s > length - 2 * GOAL_RADIUS:
         return "goal"
     if error > world.half_width:
@@ -181,7 +187,7 @@ def _pursuit_target(route: Array, s: float, length: float) -> Array:
 
 
 def _updated_gain(gain: float, previous: Array, pose: Array, command: tuple[float, float]) -> float:
-    """Moves the gain towards the ratio of commanded to achieved curvature, which is not 1 for skid steering."""
+    """Moves the gain towards the ratio of commanded to achieved curvature. With skid steering, this ratio is not 1."""
     turned = float(heading_error(pose[2], previous[2])) / CONTROL_PERIOD
     moved = float(np.linalg.norm(pose[:2] - previous[:2])) / CONTROL_PERIOD
     v, yaw_rate = command
@@ -194,7 +200,7 @@ def _updated_gain(gain: float, previous: Array, pose: Array, command: tuple[floa
 # ---- drivers of an environment
 
 Policy = Callable[[NDArray[np.uint8]], NDArray]
-"""Maps images (3 · stack, height, width), the newest three channels last, to one number in [-1, 1] per action."""
+"""Converts images (3 · stack, height, width), the newest last, to one number in [-1, 1] per component of an action."""
 
 
 class Driver(Protocol):

@@ -20,7 +20,7 @@ _ARRAY_FIELDS = ("times", "base_to_world", "qpos", "actions", "rewards", "speed"
 
 @dataclass(frozen=True)
 class Episode:
-    """A recorded episode of k instants, one per control step; at the first one, the robot rests at its start."""
+    """A recorded episode of k instants, one per control step. At the first, the robot rests at its start."""
 
     times: Array
     """[s], shape (k,)."""
@@ -29,7 +29,7 @@ class Episode:
     qpos: Array
     """MuJoCo's positions, shape (k, nq)."""
     actions: Array
-    """Action at each instant in the units of the action spec, shape (k, actions); the last row is zero."""
+    """Action at each instant, shape (k, actions), in the units of the action spec; the last row is zero."""
     rewards: Array
     """Reward of the step that ended at each instant, shape (k,); the first is zero."""
     speed: Array
@@ -47,7 +47,7 @@ class Episode:
     """Names of the geoms touched in the last step."""
     task: str
     lighting: str
-    """Empty without images."""
+    """Name of the lighting; empty without images."""
     seed: int
     """Seed of this episode."""
     randomisation: dict[str, Any]

@@ -2,13 +2,13 @@
 
     "sun"                a lighting by its name, or that of a frame (`sun/000012`)
     "sun:night:0.3"      a mixture: 30 % of the way from sun to night
-    ("sun", "night")     one of these, sampled for every episode; each may be a mixture
+    ("sun", "night")     one of several lightings or mixtures, sampled for every episode
     "any"                any lighting that could have been filmed, sampled by `field.sample_lighting`
     "training"           sampled from the training set
     "held-out"           sampled from the held-out set
 
-With drift, the lighting of an episode changes over the drift's duration into a second one, which is sampled in the same
-way; if a single lighting is named, the second one is another filmed lighting.
+With drift, the lighting of an episode changes gradually into a second lighting, which is sampled in the same way. If
+the option names a single lighting, the second is another filmed lighting.
 """
 
 from collections.abc import Sequence
@@ -26,12 +26,12 @@ from twin.nerf.fog import Fog, mixed
 from twin.types import Array32
 
 VERSION = 2
-"""Version of the sampling from a set. Raise it when the same random generator gives other lightings."""
+"""Version of the sampling from a set. Raise it if a change gives other lightings for the same random generator."""
 
 _SEED = 20_240_315  # random seed of the anchors; constant, so that all runs with a build have the same sets
 _POOL_SIZE = 200  # random lightings among which anchors are chosen
 _EXTRA_ANCHORS = 8  # number of anchors besides the filmed lightings
-# A lighting of a set is more than this many times as far from the other set's nearest anchor as from its own set's.
+# A lighting belongs to a set if the other set's nearest anchor is more than this many times as far as the set's own.
 _MARGIN = 1.25
 _MAX_TRIES = 60  # proposals per sample; about one in ten is near the chosen anchor
 
@@ -41,7 +41,7 @@ class EpisodeLighting:
     """Lighting of one episode: an appearance embedding with its fog, or a drift between two."""
 
     name: str
-    """The requested name, or how it was sampled."""
+    """The requested name, or a text that says how the lighting was sampled."""
     start: Array32
     """Embedding at the beginning, shape (dim,)."""
     end: Array32 | None = None
@@ -81,13 +81,14 @@ class Anchors:
 
 
 class LightingSets:
-    """Training and held-out lightings of one field: disjoint regions of the space of lightings, the same for all seeds.
+    """Training and held-out lightings of one field: disjoint sets, which are the same for all seeds.
 
     The distance of two lightings is the rms difference of the probes' colors (see `nerf/appearance_prior.py`). The
-    filmed lightings are the first anchors and belong to the training set. Further anchors are chosen among random
-    lightings of a fixed seed, each as far as possible from the anchors before it; the first, third, fifth and so on of
-    these are held out. A lighting belongs to the set of its nearest anchor, or to no set if an anchor of the other set
-    is nearly as near. All anchors of a set are sampled equally often, since night would be rare otherwise.
+    first anchors are the filmed lightings; they belong to the training set. Further anchors are chosen one by one from
+    random lightings of a fixed seed: each is as far as possible from all anchors before it. The first, third, fifth and
+    so on of these further anchors are held out. A lighting belongs to the set of its nearest anchor, or to no set if an
+    anchor of the other set is nearly as near. All anchors of a set are sampled equally often, since night would be rare
+    otherwise.
     """
 
     def __init__(self, field: BakedField) -> None:
@@ -97,7 +98,7 @@ class LightingSets:
 
     @cached_property
     def anchors(self) -> Anchors:
-        """Raises InputError: the field has no probes to compare lightings by."""
+        """The anchors of both sets. Raises InputError: the field has no probes, so lightings cannot be compared."""
         filmed = list(self._filmed.vectors)
         rng = np.random.default_rng(_SEED)
         pool = [self._filmed.sample(rng) for _ in range(_POOL_SIZE)]
@@ -113,7 +114,7 @@ class LightingSets:
         return Anchors(np.stack(chosen), np.stack(chosen_colors), (extra >= 0) & (extra % 2 == 0))
 
     def sample(self, which: str, rng: np.random.Generator) -> Array32:
-        """A random lighting of a set, shape (dim,): near one of its anchors, which are equally likely.
+        """A random lighting of a set, shape (dim,). It is near one of the set's anchors, which are equally likely.
 
         Raises:
             InputError: no lighting of the set is found.
@@ -121,7 +122,7 @@ class LightingSets:
         own = np.flatnonzero(self.anchors.held_out == (which == HELD_OUT))
         anchor = int(rng.choice(own))
         prior = self._filmed.prior
-        # The anchor itself is the fallback where samples are rare, such as at the edge of the filmed lightings.
+        # If no sample is near the anchor, for example at the edge of the filmed lightings, the anchor itself is used.
         for embedding in chain((prior.propose(rng) for _ in range(_MAX_TRIES)), [self.anchors.embeddings[anchor]]):
             # Most proposals are plausible, but few are near the anchor, so nearness is tested first.
             if self.set_and_anchor(embedding) == (which, anchor) and not prior.violations(embedding):
@@ -132,7 +133,10 @@ class LightingSets:
         )
 
     def set_and_anchor(self, embedding: Array32) -> tuple[str | None, int]:
-        """Set of a lighting (dim,) (`TRAINING`, `HELD_OUT`, or None), and index of the anchor nearest to it."""
+        """The set to which a lighting (dim,) belongs, and the index of its nearest anchor.
+
+        The set is `TRAINING`, `HELD_OUT` or, if it belongs to neither, None.
+        """
         distance = _distance(self.anchors.probe_colors, self._probe_colors(embedding))
         held_out, nearest = self.anchors.held_out, int(distance.argmin())
         to_training, to_held_out = float(distance[~held_out].min()), float(distance[held_out].min())
@@ -158,9 +162,9 @@ def check_lighting_names(lighting: str | Sequence[str], field: BakedField) -> No
 def sample_lighting(
     lighting: str | Sequence[str], drift: bool, duration: float, sets: LightingSets, rng: np.random.Generator
 ) -> EpisodeLighting:
-    """Samples the lighting of an episode; with `drift` it changes over `duration` [s].
+    """Samples the lighting of an episode. With `drift`, it changes during `duration` [s].
 
-    A single named lighting drifts into another filmed one.
+    A single named lighting drifts into another filmed lighting.
 
     Raises:
         InputError: a lighting is unknown, or none is found.

@@ -3,8 +3,8 @@
     gymnasium.make("twin:twin/Drive-v0", scene="scenes/demo", task="right_turn", lighting="night")
     gymnasium.make_vec("twin:twin/Drive-v0", 8, vectorization_mode="vector_entry_point", scene="scenes/demo")
 
-`twin:` makes Gymnasium import `twin`, which registers the environment; new processes, such as those of
-stable-baselines3's SubprocVecEnv, need this prefix.
+The prefix `twin:` makes Gymnasium import `twin`, which registers the environment. New processes, such as those of
+stable-baselines3's SubprocVecEnv, need it.
 
 Actions in [-1, 1] span the action range of the dm_control environment. Observations are images: uint8, shape
 (3 · stack, height, width), the newest three channels last. With `pixels=False`, they are the privileged state of
@@ -13,8 +13,8 @@ a dict of images (`pixels`) and numbers (`state`).
 
 `info` contains `cause` (why the episode ended; empty before its end), `is_success`, `progress` [m], `start` [m] (offset
 of the start along the route segment), `cross_track` [m], `lighting`, `trust`, `randomisation`, `episode_seed`, `speed`
-[m/s] and `touched`. `lighting` is the name of the episode's lighting; if it was sampled, the name of the set and the
-nearest mixture of filmed lightings: `training: sun 0.62, night 0.38`.
+[m/s] and `touched`. `lighting` is the name of the episode's lighting. If the lighting was sampled, this is the name of
+the set, followed by the nearest mixture of filmed lightings: `training: sun 0.62, night 0.38`.
 """
 
 from collections.abc import Sequence
@@ -73,7 +73,7 @@ def of_one(observations: NDArray | dict[str, NDArray], i: int) -> NDArray | dict
 
 
 def _info(envs: LocalVectorEnv | ProcessVectorEnv, i: int) -> dict[str, Any]:
-    """Info of environment i; `lighting` is the sampled lighting, if there is one, instead of the name in tables."""
+    """Info of environment i. If its lighting was sampled, `lighting` is the sampled one, not its name in tables."""
     info = envs.info(i)
     return info | {"lighting": info.pop("sampled_lighting")} if "sampled_lighting" in info else info
 
@@ -118,10 +118,10 @@ class DriveEnv(gymnasium.Env):
             scene: See `twin.load`.
             task: See `twin.load`.
             render_mode: None or rgb_array.
-            render_size: Width and height of the pictures of `render` [px]; None: those of the observation, and
-                640 × 360 for the chase view.
-            render_view: robot (what the robot's camera sees) or chase (MuJoCo's picture of the scene from behind the
-                robot, with collision parts, as in the videos of `twin film`).
+            render_size: Width and height of the pictures of `render` [px]; None: the size of the observation's images
+                or, for the chase view, 640 × 360.
+            render_view: `robot` shows the view of the robot's camera. `chase` shows MuJoCo's picture of the scene from
+                behind the robot, with collision parts, as in the videos of `twin film`.
             options: See `twin.env.options.Options`.
         """
         self.render_mode = _check_render_mode(render_mode)
@@ -159,10 +159,10 @@ class DriveEnv(gymnasium.Env):
     def render(self) -> NDArray | None:
         """A picture, uint8 (height, width, 3).
 
-        By default it is the newest image of the observation; None without pixels. With `render_size`, the same view is
-        rendered at that size, with the episode's lighting, obstacles and weather, but without camera noise. The chase
-        view shows the robot's present pose, even if the camera has a latency. Rendering changes no observation and no
-        random draw.
+        By default, it is the newest image of the observation, or None without pixels. With `render_size`, the same view
+        is rendered at that size, with the episode's lighting, obstacles and weather, but without camera noise. The
+        chase view shows the robot's present pose, even if the camera has a latency. Rendering has no effect on
+        observations or random numbers.
         """
         if self.render_mode is None:
             return None
@@ -193,8 +193,8 @@ class DriveEnv(gymnasium.Env):
 
 
 class DriveVectorEnv(VectorEnv):
-    """n environments. An environment whose episode ends is reset in the same step; the last observation and info of the
-    ended episode are in `final_obs` and `final_info`."""
+    """n environments. At its end, an episode's environment is reset in the same step; `final_obs` and `final_info` have
+    the last observation and info of the ended episode."""
 
     metadata = {**DriveEnv.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 

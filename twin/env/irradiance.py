@@ -1,14 +1,14 @@
 """Light on objects in a radiance field: irradiance, estimated from the field for any lighting, and contact shadows.
 
 A field stores colors, not light. *Irradiance* is the color that a perfectly white surface with a given normal would
-have in a film under a lighting: an object's own color times the irradiance is its color in the picture. The irradiance
-of a horizontal surface is the *ground irradiance*: the color of the reconstructed ground nearby, divided by an assumed
-albedo.
+have in a film under a lighting. An object's color in the picture is its own color times the irradiance. The irradiance
+of a horizontal surface is called *ground irradiance*. It is estimated as the color of the reconstructed ground nearby,
+divided by an assumed albedo.
 
-The irradiance of other normals is fitted to *probes*, surface points of the field. Each upright probe is compared with
-itself under the mean of the filmed lightings, which cancels its albedo; that mean is assumed to be the light of a
-uniform sky over dim ground. The light from each direction of `SIDE_DIRECTIONS` has two parts: one proportional to the
-ground irradiance, like that of a lamp or the sun, and a constant one, like that of the sky.
+The irradiance of other normals is fitted to *probes*, which are surface points of the field. The color of an upright
+probe is divided by the same probe's color under the mean of the filmed lightings, which cancels its albedo. That mean
+is assumed to be the light of a uniform sky over dim ground. The light from each direction of `SIDE_DIRECTIONS` has two
+parts: one is proportional to the ground irradiance, as with a lamp or the sun; the other is constant, as with the sky.
 
 The composited features of the probes are stored, so that any embedding gives their colors in a millisecond.
 """
@@ -40,20 +40,20 @@ SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], 
 """Horizontal directions; the light is split into parts from each of them, shape (4, 3)."""
 
 _CAMERA_HEIGHT, _CAMERA_PITCH = 1.0, 8.0  # [m], [°] height and downward pitch of the views from which probes are taken
-_CAMERA_STEP = 2.0  # [m] along the route, between two views
+_CAMERA_STEP = 2.0  # [m] distance along the route between two views
 _VIEW_SIZE, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
 _MAX_GROUND_DEPTH, _MAX_DEPTH = 7.0, 12.0  # [m] largest z-depth of ground probes and of all probes
 _GROUND_TOLERANCE = 0.12  # [m] ground probes are at most this far above or below the route, plus 5 % of their distance
-_MIN_UPRIGHT_HEIGHT = 0.3  # [m] above the ground; only probes higher than this count as upright
+_MIN_UPRIGHT_HEIGHT = 0.3  # [m] only probes at more than this height above the ground count as upright
 _MAX_GROUND_PROBES, _MAX_UPRIGHT_PROBES = 3000, 1500
 _KERNEL_STD = 1.5  # [m] standard deviation of the Gaussian weights of ground probes around a position
 _BOUNCE = 0.25  # radiosity of the ground over that of the sky, in the mean of the filmed lightings
 _UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky; facing up it is 1
 _MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # limits of the sun's share of light and of its elevation's cotangent
 _MIN_COLOR = 0.02  # a probe whose mean color is darker is not used
-_MAX_BRIGHTNESS = 1.5  # times the brightest ground irradiance; brighter probes are not used, since they emit light
+_MAX_BRIGHTNESS = 1.5  # probes above this multiple of the brightest ground irradiance emit light and are not used
 _NEIGHBORS = 8  # number of ground probes that give the ground irradiance at an upright one
-_MIN_PROBES = 50  # fewer on the ground are an error; with fewer upright ones, a uniform sky is assumed
+_MIN_PROBES = 50  # fewer ground probes are an error; with fewer upright probes, a uniform sky is assumed
 _LIGHTINGS_CACHED, _POSITIONS_CACHED = 64, 1000
 
 
@@ -66,9 +66,9 @@ class Irradiance:
     up: Array
     """Ground irradiance at these positions, shape (k, 3)."""
     constant: Array
-    """Constant part of the light: on normals that do not face up (row 0), and from `SIDE_DIRECTIONS`, shape (5, 3)."""
+    """Constant part of light, shape (5, 3). Row 0: on normals that do not face up; others: from `SIDE_DIRECTIONS`."""
     proportional: Array
-    """Part of the light proportional to the ground irradiance, as a factor of it; rows as in `constant`, (5, 3)."""
+    """Ratio of the proportional part of light to the ground irradiance, shape (5, 3); rows as in `constant`."""
     _cache: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
     """Cached ground irradiance at recent positions, since most objects stand still."""
 
@@ -89,17 +89,18 @@ class Irradiance:
         return found
 
     def irradiance(self, ground: Array, normals: Array) -> Array:
-        """Irradiance of unit normals (n, 3) where the ground irradiance is (n, 3), shape (n, 3)."""
+        """Irradiance, shape (n, 3), of unit normals (n, 3) at places with the ground irradiance `ground` (n, 3)."""
         basis = _basis(normals)
         up = np.maximum(normals[:, 2:], 0.0)
         return up * ground + basis @ self.constant + (basis @ self.proportional) * ground
 
     def sun(self, xy: Array) -> tuple[float, Array]:
-        """Share of the light at a position (2,) that comes from one direction, and that direction, shape (3,).
+        """The sun's share of the light at a position (2,), and the direction to the sun, shape (3,).
 
-        On average over all azimuths, an upright surface gets `_UPRIGHT_SKY` of the ground irradiance of a uniform sky,
-        and cot e / π of that of a sun at elevation e. Only the sun lights one side more than the opposite one, by cot e
-        of its ground irradiance. So both its share and e follow from the light on upright surfaces.
+        The irradiance of an upright surface, averaged over all azimuths, has two parts. The sky contributes
+        `_UPRIGHT_SKY` times the sky's ground irradiance. A sun at elevation e contributes cot e / π times the sun's
+        ground irradiance. Only the sun lights one side more than the opposite side: by cot e times the sun's ground
+        irradiance. So the light on upright surfaces gives both the sun's share and e.
         """
         ground = self.ground(np.asarray(xy)[None])[0]
         parts = (self.constant + self.proportional * ground).mean(1) / max(float(ground.mean()), 1e-6)
@@ -113,7 +114,10 @@ class Irradiance:
 
 
 def _basis(normals: Array) -> Array:
-    """One minus the upward part of normals (n, 3), and their clipped cosines to `SIDE_DIRECTIONS`, shape (n, 5)."""
+    """Values, shape (n, 5), by which the light's parts are weighted for normals (n, 3).
+
+    The first is one minus the normal's upward part; the others are its clipped cosines to `SIDE_DIRECTIONS`.
+    """
     return np.column_stack([1.0 - np.maximum(normals[:, 2], 0.0), np.maximum(normals @ SIDE_DIRECTIONS.T, 0.0)])
 
 
@@ -121,7 +125,10 @@ class IrradianceEstimator:
     """Estimates the irradiance of any lighting of a field."""
 
     def __init__(self, baked: BakedField, route: Array):
-        """Renders the field once from along a route on the ground (m, 3) [m]. Raises InputError: no ground is seen."""
+        """Renders views of the field along a route on the ground, shape (m, 3) [m].
+
+        Raises InputError: no ground is seen.
+        """
         self._field = baked
         self._lock = threading.Lock()
         self._cache: OrderedDict[bytes, Irradiance] = OrderedDict()
@@ -178,7 +185,7 @@ class IrradianceEstimator:
         for c in range(3):
             usable = (self._mean[:, c] > _MIN_COLOR) & (seen[:, c] < _MAX_BRIGHTNESS * up[:, c].max())
             rows = np.concatenate([self._rows, self._rows * ground[:, c : c + 1]], 1)[usable]
-            # The Cholesky factor of the normal equations replaces the many rows; the minimum is the same.
+            # The many rows are replaced by the Cholesky factor of the normal equations, which has the same minimum.
             square = np.linalg.cholesky(rows.T @ rows + 1e-6 * len(rows) * np.eye(10))
             found[:, c], _ = nnls(square.T, np.linalg.solve(square, rows.T @ sides[usable, c]))
         return Irradiance(self._xy, up, found[:5], found[5:])
@@ -204,7 +211,7 @@ class _SurfacePoints:
 
 
 def _surface_points(field: BakedField, route: Array) -> _SurfacePoints:
-    """Surface points in views of the field along the route; pixels at depth edges are left out."""
+    """Surface points that are visible in views along the route; pixels at depth edges are left out."""
     width, height = _VIEW_SIZE
     poses = []
     for s in np.arange(0.0, arc_lengths(route)[-1], _CAMERA_STEP):
@@ -291,8 +298,8 @@ BOX_CORNERS = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).resha
 """Corners of a box around the origin, in half sides, shape (8, 3)."""
 
 _PENUMBRA = 0.03, 0.10
-"""Half width of the penumbra at the foot [m], and its growth per meter behind the foot. They account for the size of
-the sun's disk and halo, and for the error of the estimated direction."""
+"""Half width of the penumbra at an obstacle's foot [m], and its growth per meter behind the foot. They account for the
+size of the sun's disk and halo, and for the error of the estimated direction."""
 _FILL = 0.85  # fraction of a box's sides that an obstacle really fills
 _SKY_LOSS_BELOW = 0.75  # fraction of the sky's light lost straight below an obstacle, which does not fill its box
 _SKY_REACH = 1.2  # [m] an obstacle's side hides part of the sky from ground up to this distance
@@ -304,10 +311,10 @@ _MAX_DISTANCE = 25.0  # [m] shadows further from the camera than this are not dr
 class ContactShadows:
     """Soft shadows of a model's obstacles on the reconstructed ground.
 
-    The light is that of a uniform sky and one sun, whose direction and share `Irradiance.sun` estimates. The ground
-    beside an obstacle loses the part of the sky that the obstacle hides; the ground behind it loses the sunlight within
-    the obstacle's shadow, whose penumbra widens with the distance. An obstacle is approximated by two upright boxes,
-    around its lower and its upper geoms.
+    The light is assumed to come from a uniform sky and from one sun; `Irradiance.sun` estimates the sun's direction and
+    share. Ground beside an obstacle loses the light of the part of the sky that the obstacle hides. Ground in the
+    obstacle's shadow also loses the sunlight; the shadow's penumbra widens with the distance. An obstacle is
+    approximated by two upright boxes: one around its lower geoms, one around its upper geoms.
     """
 
     def __init__(self, model: mujoco.MjModel, geoms: NDArray[np.int64]):
@@ -374,13 +381,13 @@ def _light_loss(boxes: Array, points: Array, turn: Array, share: float, sun: Arr
     hidden = np.zeros(len(points))
     for low, high in boxes:
         center, half = 0.5 * (low + high)[:2], 0.5 * _FILL * (high - low)[:2]
-        # Sky, weighted with the cosine: an endless wall hides half of it, a box less, depending on its size.
+        # Loss of the sky's light: an endless wall hides half of it (weighted with the cosine), a box hides less.
         gap = np.linalg.norm(np.maximum(np.abs(local - center) - half, 0.0), axis=1)
         wide = np.arctan2(float(half.mean()), gap) / np.pi
         gap2 = gap**2 + 1e-6
         rise = high[2] ** 2 / (high[2] ** 2 + gap2) - low[2] ** 2 / (low[2] ** 2 + gap2)
         hidden = np.maximum(hidden, np.where(gap > 0.0, wide, _SKY_LOSS_BELOW) * rise)
-        # Sun: the box projected onto the ground.
+        # Loss of sunlight: it is lost where the box, projected onto the ground, casts its shadow.
         middle = turn @ center
         axes = turn * half  # columns: half sides in the world
         across = float(np.abs(np.array([-azimuth[1], azimuth[0]]) @ axes).sum())
@@ -399,7 +406,10 @@ def _smooth_step(x: Array) -> Array:
 
 
 def _bounding_boxes(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.int64], body: int) -> Array:
-    """Boxes around an obstacle's lower and upper geoms, in its frame: lowest and highest corners, shape (2, 2, 3)."""
+    """Two boxes in an obstacle's frame, around its lower and its upper geoms.
+
+    They are given by their lowest and highest corners, shape (2, 2, 3).
+    """
     local = model.geom_aabb[geoms, None, :3] + BOX_CORNERS * model.geom_aabb[geoms, None, 3:]
     turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
     world = local @ turns.transpose(0, 2, 1) + data.geom_xpos[geoms, None]

@@ -1,8 +1,8 @@
 """Pictures of a MuJoCo scene by `mujoco_warp`'s ray caster on the CPU, without OpenGL.
 
-`SceneRenderer` renders the front camera's view with MuJoCo's own shading: the standard pipeline that radiance fields
-are compared with. `SceneCamera` renders from free poses, with the convex collision parts half transparent over the
-visual geometry; the *chase camera* follows the robot from behind and above.
+`SceneRenderer` renders the front camera's view with MuJoCo's own shading; radiance fields are compared with this
+standard pipeline. `SceneCamera` renders from free poses, and draws the convex collision parts half transparent over the
+visual geometry. The *chase camera* follows the robot from behind and above.
 """
 
 import copy
@@ -34,7 +34,7 @@ from twin.warp_runtime import wp
 FRONT_CAMERA = "front"
 """Name of the policy's camera in a model."""
 
-# Poses that a picture depends on.
+# Names of the arrays of poses on which a picture depends.
 _POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")
 _SCENE_SETTINGS: dict[str, Any] = {  # collision parts are not drawn
     "enabled_geom_groups": [0, 1, 2, OBSTACLE_GROUP],
@@ -58,7 +58,7 @@ def camera_intrinsics(model: mujoco.MjModel, camera: int, size: tuple[int, int])
 
 
 def camera_poses(datas: Sequence[mujoco.MjData], camera: int, noise: Sequence[CameraNoise] | None) -> Array:
-    """camera_to_world of a camera in n envs, with the vibration of `noise` if given, shape (n, 4, 4)."""
+    """Poses camera_to_world of a camera in n envs, shape (n, 4, 4); if `noise` is given, with its vibration."""
     poses = np.stack([camera_pose(data, camera) for data in datas])
     if noise is None:
         return poses
@@ -102,7 +102,10 @@ class RayCaster:
         return rgb, self._context.depth_data.numpy()[0, :count].copy()
 
     def hit_geoms(self) -> NDArray[np.int32]:
-        """Index of the geom that each ray of the last cast hit, −1 for none, shape (k,); needs `render_seg=True`."""
+        """Indices of the geoms that the rays of the last cast hit, shape (k,); −1 where a ray hit none.
+
+        This needs `render_seg=True`.
+        """
         return self._context.seg_data.numpy()[0, : self._context.total_rays, 0].copy()
 
 
@@ -118,15 +121,18 @@ def mujoco_rays(rays: Array) -> Array32:
 class SceneRenderer:
     """Renders the front cameras' views with MuJoCo's own shading; has the interface of `Compositor`.
 
-    Obstacles and the robot are lit by the model's own lights. The place is drawn either as the visual mesh in its
-    filmed colors with the ground, or as Gaussian splats. Splats and geoms occlude each other, and the ground shows
-    through the gaps between splats.
+    Obstacles and the robot are lit by the model's own lights. The place is drawn either as ground and visual mesh, in
+    the filmed colors, or as Gaussian splats. Splats and geoms occlude each other, and the ground shows through the gaps
+    between splats.
     """
 
     def __init__(
         self, model: mujoco.MjModel, size: tuple[int, int], max_envs: int, splats: Gaussians | None = None
     ) -> None:
-        """`model` is from `episode_spec` with visuals; splats replace its visual mesh; the rest as in `Compositor`."""
+        """`model` was made by `episode_spec` with visuals; `splats`, if given, replace its visual mesh.
+
+        The other arguments are those of `Compositor`.
+        """
         self.size = size
         self._camera = model.camera(FRONT_CAMERA).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
@@ -135,7 +141,7 @@ class SceneRenderer:
         model.geom_group[camera_mount_geoms(model, self._camera)] = ROBOT_COLLISION_GROUP  # not drawn
         if splats is not None:
             model.geom_pos[model.geom("ground").id, 2] -= _GROUND_BELOW_SPLATS
-        # Created one after the other, since Warp compiles kernels at their first use.
+        # Workers are created one after the other, since Warp compiles kernels at their first use.
         threads = min(max_envs, available_cores())
         settings = _SCENE_SETTINGS if splats is None else _SPLAT_SETTINGS | splats.render_settings()
         self._workers = [_SceneWorker(model, size, self._rays, settings) for _ in range(threads)]
@@ -193,7 +199,10 @@ class _SceneWorker:
         self.render(self._data, camera_pose(self._data, self._camera))  # compiles the kernels
 
     def render(self, data: mujoco.MjData, pose: Array) -> tuple[Array32, Array32]:
-        """Colors (height, width, 3) in [0, 1] and z-depth (height, width) [m], 0 for sky, from an OpenCV pose."""
+        """Renders from an OpenCV pose; returns colors (height, width, 3) in [0, 1] and z-depth (height, width) [m].
+
+        The z-depth of the sky is 0.
+        """
         mine = self._data
         mine.qpos[:], mine.mocap_pos[:], mine.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
         mujoco.mj_kinematics(self._model, mine)
@@ -214,7 +223,7 @@ _SMOOTHING = 0.15  # low-pass gain of the camera heading per control step (0.1 s
 _PART_GROUPS = [3]
 _PART_ALPHA = 0.45
 _EDGE_RGB = (20, 20, 30)
-_OCCLUSION_TOLERANCE = 0.6  # [m] a part at most this far behind the visible surface is drawn, too
+_OCCLUSION_TOLERANCE = 0.6  # [m] parts are also drawn if they are at most this far behind the visible surface
 
 
 class SceneCamera:
@@ -273,9 +282,10 @@ class SceneCamera:
 
 
 def blend_parts(rgb: Image, depth: NDArray, part_rgb: Image, part_depth: NDArray, identity: NDArray) -> Image:
-    """Blends visible collision parts, with outlines, over a picture (h, w, 3); z-depths [m] have shape (h, w).
+    """Draws the visible collision parts half transparent, with outlines, over a picture (h, w, 3).
 
-    `depth` is 0 where nothing is hit; `identity` is the id of the nearest part, −1 for none.
+    z-depths [m] have the shape (h, w); `depth` is 0 where nothing is hit. `identity` is the id of the nearest part, −1
+    where there is none.
     """
     visible = (identity >= 0) & ((depth <= 0) | (part_depth <= depth + _OCCLUSION_TOLERANCE))
     edge = np.zeros_like(visible)

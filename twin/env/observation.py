@@ -1,6 +1,6 @@
-"""Pixel observations of n envs: one call of the renderer gives the images of all envs, which are kept in frame stacks.
+"""Pixel observations of n envs: one call renders the images of all envs; each env has a stack of its newest images.
 
-The newest frame of a stack is the last. At the beginning of an episode, its first frame fills the stack.
+The newest frame of a stack is the last one. At the beginning of an episode, the first frame fills the whole stack.
 """
 
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
@@ -43,7 +43,7 @@ class PixelObserver:
         """
         Args:
             renderer: Renders the envs.
-            field: Contains the lightings; None: MuJoCo renders the mesh, or splats, under its own lights.
+            field: Contains the lightings; None: MuJoCo renders the mesh, or splats, under MuJoCo's lights.
             trust: Computes the trust of images from the filmed frames.
             options: Options of the envs.
             envs: Physics and task of every env.
@@ -143,8 +143,8 @@ def _push_frames(
 ):
     """Adds frames to the stacks of some envs, or fills the stacks with them.
 
-    `below` accumulates, over the lower half of each frame (pixels from `lower` on), the opacity and the number of
-    pixels whose opacity is less than `sky`.
+    `below` accumulates two numbers over the lower half of each frame (pixels from `lower` on): the opacity, and the
+    number of pixels whose opacity is less than `sky`.
     """
     k, pixel = wp.tid()
     env, depth = which[k], stacks.shape[1]
@@ -181,7 +181,10 @@ class GpuPixelObserver(PixelObserver):
         self.trust = np.zeros(n)
         self._noise, self._weather = [None] * n, [None] * n
         self.camera_poses: CameraPoses = self._camera_poses
-        """Function from indices of k envs to OpenCV poses (k, 4, 4) and times (k,) [s] of their newest frames."""
+        """Function that receives indices of k envs and returns data of their newest frames.
+
+        These are the OpenCV poses (k, 4, 4) and times (k,) [s].
+        """
 
     @property
     def stacks(self) -> Image:  # type: ignore[override]

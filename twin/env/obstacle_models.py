@@ -1,8 +1,8 @@
 """Obstacle geometry: primitives and convex hulls in uniform colors, without mesh or texture files.
 
-In an obstacle's frame, x points to its front, y to its left and z up; the origin is on the ground below its center. Its
-geoms are in group `OBSTACLE_GROUP` and are both visible and solid; collision-only geoms are in the robot's collision
-group.
+In an obstacle's frame, x points to its front, y to its left and z up; the origin is on the ground below its center. An
+obstacle's geoms are in group `OBSTACLE_GROUP`, and are both visible and solid. Geoms that are solid but invisible are
+in the robot's collision group.
 """
 
 from collections.abc import Callable, Sequence
@@ -67,7 +67,7 @@ class ObstacleModel:
         name = f"{self.body.name}_{self.count}"
         mesh = self.spec.add_mesh(name=name)
         mesh.uservert = points.astype(np.float32).ravel()
-        # MuJoCo recenters a mesh and offsets its geom, so the points stay in place.
+        # MuJoCo recenters the mesh, but also moves its geom by the opposite offset, so the points stay in place.
         self.add(mujoco.mjtGeom.mjGEOM_MESH, color, meshname=name)
 
     def frustum(self, low: float, high: float, radii: tuple[float, float], color: Color, sides: int = 20) -> None:
@@ -198,7 +198,7 @@ _BUILDERS: dict[str, Callable[..., None]] = {
 def add_obstacle_geoms(
     shape: ObstacleModel, kind: str, color: Sequence[float] = (), size: Sequence[float] = ()
 ) -> None:
-    """Adds the geoms of an obstacle to a body; see `ObstacleConfig` for kind, color and size."""
+    """Adds an obstacle's geoms to a body; `ObstacleConfig` explains kind, color and size."""
     red, green, blue = color or _COLORS[kind]
     build = partial(_BUILDERS[kind], size=size) if kind == "box" else _BUILDERS[kind]
     build(shape, (red, green, blue))

@@ -1,8 +1,8 @@
-"""Obstacles on the route: they are added to a model before it is compiled, sampled per episode, moved in simulation.
+"""Obstacles on the route: added to a model before it is compiled, sampled for each episode, and moved in simulation.
 
 *Station* is the arc length on the route [m], *lateral* the signed distance from it, positive to the left [m]. An
 obstacle is a mocap body `obstacle_<name>`, which forces do not move; its geoms are `obstacle_<name>_<number>`. One
-model serves many episodes: `place` sets the poses of an episode's obstacles and parks the others far below the ground.
+model serves many episodes: `place` sets the poses of an episode's obstacles, and parks the others far below the ground.
 The model stores the route as the numeric `obstacle_route`.
 """
 
@@ -28,11 +28,11 @@ _PARKED_HEIGHT = -100.0  # [m], far below the ground
 _ROBOT_HALF_WIDTH = 0.34  # [m]
 _CLEARANCE = 0.15  # [m] gap between a random obstacle and a robot that passes it within the corridor
 _RANDOM_MARGIN = 0.5  # [m] random obstacles stand at most this far beyond the corridor's edge
-_MAX_TRIES = 20  # samples of a distractor object's position, after which it is left out
-_ROBOT_RADIUS = 0.6  # [m] from its base to the farthest corner
+_MAX_TRIES = 20  # if this many samples give no free position for a distractor object, it is left out
+_ROBOT_RADIUS = 0.6  # [m] distance from the robot's base to its farthest corner
 _DISTRACTOR_STRIP = 2.5  # [m] width of the strip beside the corridor where distractor objects stand
-_FREE_ENDS = (4.0, 3.0)  # [m] at the route's start and end without random obstacles
-_SPACING = 4.0  # [m] along the route between random obstacles; less on routes that are too short for it
+_FREE_ENDS = (4.0, 3.0)  # [m] lengths at the route's start and end in which there are no random obstacles
+_SPACING = 4.0  # [m] smallest distance along the route between random obstacles; smaller if the route is too short
 _SINK_DEPTH = 0.01  # [m] obstacles are sunk this far into the ground, to avoid a visible gap below
 
 
@@ -135,7 +135,9 @@ def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
 def random_obstacles(
     world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
 ) -> tuple[ObstacleConfig, ...]:
-    """Samples static obstacles `random_<number>` along the route, with gaps, and room to pass within the corridor.
+    """Samples static obstacles `random_<number>` along the route, with gaps between them.
+
+    A robot can pass each of them within the corridor.
 
     Raises:
         InputError: the route is too short for `count` obstacles.
@@ -174,7 +176,7 @@ def random_distractors(
         for _ in range(_MAX_TRIES):
             station = float(rng.uniform(0.0, length))
             lateral = float(rng.uniform(nearest, nearest + _DISTRACTOR_STRIP) * rng.choice([-1.0, 1.0]))
-            # In a bend, a point beside one part of the route may lie on another part.
+            # At a bend, a point beside one part of the route may be on another part of it.
             if np.linalg.norm(route - _route_point(route, station, lateral), axis=1).min() >= nearest:
                 out.append(ObstacleConfig(f"random_{k}", kind, station, lateral, float(rng.uniform(-180.0, 180.0))))
                 break
@@ -188,9 +190,10 @@ _ROUTE_STEP = 0.25  # [m] between points of a segment's route
 
 
 class EpisodeObstacles:
-    """Obstacles of a task's episodes: configured ones, random ones along the segment, and distractor objects.
+    """Obstacles of a task's episodes: configured ones, or random ones along the segment, and distractor objects.
 
-    No bodies can be added to a compiled model, so it contains a *pool* with the largest number of every kind.
+    Bodies cannot be added to a compiled model. So the model contains a *pool*: as many obstacles of each kind as an
+    episode may need.
     """
 
     def __init__(
@@ -198,7 +201,7 @@ class EpisodeObstacles:
     ) -> None:
         """
         Args:
-            wanted: Number of random obstacles per episode, or the obstacles of all episodes.
+            wanted: Number of random obstacles per episode, or the obstacles that all episodes have.
             world: Contains route and corridor.
             segment: Route segment along which random obstacles stand.
             beside: Largest number of distractor objects.

@@ -30,7 +30,10 @@ CPU, CUDA = "cpu", "cuda"
 
 @dataclass(frozen=True)
 class Rewards:
-    """Reward terms. The last step gets the term named after the cause of the episode's end; the goal, also `step`."""
+    """Reward terms. The last step of an episode gets the term that is named after the cause of the episode's end.
+
+    If this cause is the goal, the last step also gets `step`.
+    """
 
     step: float = 0.1
     """Reward of each step that does not end the episode."""
@@ -45,7 +48,7 @@ class Rewards:
     cross_track: float = 0.0
     """Reward per step at or beyond the corridor's edge; within it, proportional to the distance from the route."""
     steering: float = 0.0
-    """Reward per step at the largest yaw rate; proportional to the square of the commanded yaw rate."""
+    """Reward per step at the largest yaw rate; in general, it is proportional to the square of the commanded one."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +68,9 @@ class Options:
     """Numbers observed besides the images: `odometry` (speed [m/s], yaw rate [rad/s]), `privileged` (the state of
     `RewardAndTermination.state`, which needs the map), or None."""
     action: str = TWIST
-    """twist (v [m/s], ω [rad/s]) or steering (ω [rad/s] at fixed speed)."""
+    """`twist`: v [m/s] and ω [rad/s]; `steering`: ω [rad/s] only, at a fixed speed."""
     speed: float = 1.0
-    """Highest speed of a twist; the fixed speed for steering [m/s]."""
+    """For `twist`, the highest speed [m/s]; for `steering`, the fixed speed [m/s]."""
     yaw_rate: float = 1.0
     """Largest yaw rate to either side [rad/s]."""
     half_width: float | None = None
@@ -75,14 +78,15 @@ class Options:
     time_limit: float | None = None
     """Time limit [s]; None: twice the time that the route segment takes at `speed`."""
     start_offset: float = 0.3
-    """The start's distance from the route is uniform within ± this [m]."""
+    """The start's distance from the route is sampled uniformly within ± this [m]."""
     start_heading: float = 10.0
-    """The start's heading relative to the route is uniform within ± this [°]."""
+    """The start's heading relative to the route is sampled uniformly within ± this [°]."""
     start_along: float = 0.0
-    """Half of the episodes start further along the route segment, by a uniform fraction of it between 0 and this."""
+    """Half of the episodes start further along the route segment. The offset is a fraction of the segment's length,
+    sampled uniformly between 0 and this."""
     observe: str = NERF
-    """nerf: images of the field; simulator: MuJoCo's images of the extracted mesh, under MuJoCo's lights; splats:
-    MuJoCo's images of a file's Gaussian splats, with obstacles and robot under MuJoCo's lights."""
+    """Origin of the images. `nerf`: the field. `simulator`: MuJoCo's renderer with the extracted mesh, under MuJoCo's
+    lights. `splats`: MuJoCo's renderer with the Gaussian splats of a file; obstacles and robot have MuJoCo's lights."""
     splats: str | Path | None = None
     """A 3DGS .ply in the scene's frame (meters, z up), for `observe="splats"`; all episodes have its lighting."""
     lighting: str | Sequence[str] = TRAINING
@@ -90,7 +94,8 @@ class Options:
     lighting_drift: bool = False
     """The lighting changes during an episode."""
     obstacles: str | int | Sequence[ObstacleConfig] = "scene"
-    """`scene`: the obstacles of scene.toml; a number: that many static ones, sampled per episode; a list: these."""
+    """`scene`: the obstacles of scene.toml. A number: so many static obstacles, sampled for each episode. A list: the
+    obstacles of all episodes."""
     camera: CameraOptions | None = None
     """Camera noise: vibration, exposure, blur. None: no noise."""
     randomise: Ranges | None = None
@@ -104,7 +109,7 @@ class Options:
 _MAX_NUMBER, _MAX_SIDE, _MAX_STACK, _MAX_OBSTACLES = 1e6, 4096, 64, 1000
 
 Check = tuple[Callable[[Any], bool], str]
-"""A function that returns True for valid values, and the text that an error gives as the expectation."""
+"""A function that returns True for valid values, and the text with which an error describes such values."""
 
 
 def _is_number(value: Any) -> bool:
@@ -216,7 +221,7 @@ def parse_options(given: dict[str, Any]) -> Options:
 
 
 def state_size(options: Options) -> int:
-    """Number of components of the privileged state, counted from the first, that are observed besides images."""
+    """Number of components of the privileged state that are observed besides images; they are its first ones."""
     return {None: 0, ODOMETRY: 2}.get(options.state, sum(STATE_SIZES.values()))
 
 

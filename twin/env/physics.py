@@ -1,9 +1,9 @@
 """Physics of the Husky, driven by commands: forward speed v [m/s] and yaw rate ω [rad/s].
 
-A *control step* is the time between two commands, usually 0.1 s, and consists of many MuJoCo substeps. Contacts
-are checked several times within it, so that short contacts are not missed. *Touched* geoms are geoms in contact with
-the robot; the ground is not one of them. A command reaches the controller after `command_latency`. The newest image is
-`camera_latency` old: it shows robot and obstacles at the time when it was taken.
+A *control step* is the time between two commands, usually 0.1 s; it consists of many MuJoCo substeps. Contacts are
+checked several times per control step, so that short contacts are not missed. *Touched* geoms are geoms in contact with
+the robot, except for the ground. A command reaches the controller after `command_latency`. The newest image was taken
+`camera_latency` ago, and shows robot and obstacles as they were then.
 """
 
 from bisect import bisect_right
@@ -21,9 +21,9 @@ from twin.types import Array
 
 TIME_TOLERANCE = 1e-6  # [s] simulation times that differ by less count as equal, because of rounding
 
-_CHECK_PERIOD = 0.01  # [s] between two contact checks, which also record all poses
-_SETTLE_TIME = 0.3  # [s] simulated in `set_pose`, for the robot to settle on the ground
-_RAY_START = 50.0  # [m] smallest height above the ground's origin from which rays find the ground's height
+_CHECK_PERIOD = 0.01  # [s] time between two contact checks; all poses are recorded then, too
+_SETTLE_TIME = 0.3  # [s] time that `set_pose` simulates, so that the robot settles on the ground
+_RAY_START = 50.0  # [m] rays that find the ground's height start at least this high above the ground's origin
 
 
 class _Snapshot(NamedTuple):
@@ -39,7 +39,7 @@ class HuskyPhysics:
     """Steps one Husky in one model."""
 
     move_obstacles: Callable[[float], None] | None = None
-    """Sets the poses of moving obstacles; called before a run of substeps with the time [s] at which it ends."""
+    """Sets the poses of moving obstacles at a time [s]. Called before a run of substeps, with the end of the run."""
 
     def __init__(
         self, model: mujoco.MjModel, params: HuskyParams | None = None, data: mujoco.MjData | None = None
@@ -48,7 +48,7 @@ class HuskyPhysics:
         Args:
             model: A model that contains the Husky of `add_husky`; its keyframe `spawn`, if any, is the start.
             params: Parameters of the robot in the model; None: the published ones.
-            data: State to step, from its present values on; None: a new one, at the start.
+            data: State to step; it keeps its present values. None: a new state, at the start.
         """
         self.model = model
         self.params = params or HuskyParams()
@@ -137,8 +137,9 @@ class HuskyPhysics:
     def schedule(self, period: float) -> list[tuple[int, Array]]:
         """Runs the controller for the next `period` [s].
 
-        Returns the segments in order: the number of substeps and the speeds of the left and right wheels [rad/s], shape
-        (2,), of each. A segment ends at a contact check, at an update of the controller, or at the end of the period.
+        Returns the segments in order. Each is given by its number of substeps and by the speeds of the left and right
+        wheels [rad/s], shape (2,). A segment ends at a contact check, at an update of the controller, or at the end of
+        the period.
         """
         out, time = [], self.time
         left = round(period / self.model.opt.timestep)
@@ -158,7 +159,8 @@ class HuskyPhysics:
 
         Args:
             touched: Geoms touched during the last control step.
-            snapshots: Time [s], `qpos`, `mocap_pos`, `mocap_quat` of the last contact checks, for delayed cameras.
+            snapshots: Time [s], `qpos`, `mocap_pos` and `mocap_quat` at each of the last contact checks; cameras with a
+                latency need them.
         """
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
@@ -231,11 +233,11 @@ class HuskyPhysics:
 
     @property
     def delayed_data(self) -> mujoco.MjData:
-        """State when the newest image was taken: `camera_latency` ago, but not before the episode's start.
+        """State at the time when the newest image was taken: `camera_latency` ago, but not before the episode's start.
 
-        Without latency, it is the present data. With latency, it contains only time, positions and the results of
-        `mj_kinematics` and `mj_camlight`, valid until the next access; positions are interpolated linearly between
-        contact checks.
+        Without latency, it is the present data. With latency, it contains only the time, the positions, and the results
+        of `mj_kinematics` and `mj_camlight`; positions are interpolated linearly between contact checks. The state is
+        valid until the next access to this property.
         """
         if not self.params.camera_latency:
             return self.data

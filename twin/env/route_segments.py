@@ -34,7 +34,7 @@ class RouteSegment:
 class _StandardTask:
     length: float  # [m]
     turn: tuple[float, float]  # lowest and highest total turn [rad], positive to the left
-    max_excursion: float  # [rad] the heading may leave the range between its first and last value by this much
+    max_excursion: float  # [rad] the heading may exceed the range between its first and last value by at most this
 
 
 _STANDARD_SPECS = {
@@ -44,7 +44,7 @@ _STANDARD_SPECS = {
 STANDARD_TASKS = tuple(_STANDARD_SPECS)
 """Names of the standard tasks."""
 
-_LENGTH_TOLERANCE = 0.05  # relative shortfall allowed for a standard task: scale and smoothing shorten a route
+_LENGTH_TOLERANCE = 0.05  # relative shortfall allowed for a standard task, since scale and smoothing shorten a route
 _STEP = 0.25  # [m]
 
 
@@ -95,7 +95,7 @@ def scene_tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[s
 
 
 def _fitting_starts(route: Array, standard: _StandardTask, length: float) -> Array:
-    """Arc lengths [m] at which a fitting segment of this length starts, the one whose turn is most central first."""
+    """Arc lengths [m] at which fitting segments of a length start, sorted: the more central the turn, the earlier."""
     total = float(arc_lengths(route)[-1])
     s = np.append(np.arange(0.0, total, _STEP), total)
     heading = np.unwrap(heading_at(route, s))

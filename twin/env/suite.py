@@ -129,14 +129,14 @@ def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
     """Returns a digest of everything that determines an episode, except for seed and driver.
 
     It covers the field, the MJCF scene with its robot, the task's route segment, the obstacles of `scene.toml`, and the
-    photo lightings that the condition names; for conditions that sample them, also the version of the lighting sets and
-    the randomization.
+    photo lightings that the condition names. If the condition samples lightings, it also covers the version of the
+    lighting sets; if it randomizes, also the randomization.
 
     Raises:
         InputError: see `EnvFactory.open`.
     """
     world, config = twin.world(), load_config(twin.scene.config_file)
-    ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # those of training and of evaluation
+    ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # of training and of evaluation
     randomization = {"version": VERSION, "ranges": ranges} if condition.randomised else {}
     photos = [
         path for name in condition.lighting.split(":") if (path := twin.scene.lightings / f"{name}.json").exists()
@@ -221,14 +221,14 @@ def load(
 
 # ---- model of an episode
 
-_REACH = 1.5  # [m] reach of a robot beyond the corridor's edge: its half length plus its motion in a control step
+_REACH = 1.5  # [m] a robot may reach this far beyond the corridor's edge: half its length, and a control step's motion
 
 
 def episode_spec(world: World, start: float, end: float, half_width: float, visuals: bool = False) -> mujoco.MjSpec:
     """Returns the model of episodes between two arc lengths [m] of a scene's route.
 
-    An episode ends when the robot leaves the corridor, so parts beyond the robot's reach are never touched. Removing
-    them changes no result and saves a fifth of the physics' time and most of its memory.
+    An episode ends when the robot leaves the corridor, so the robot never touches parts beyond its reach. Such parts
+    are removed, which changes no result, but saves a fifth of the physics' time and most of its memory.
 
     Args:
         world: The scene.

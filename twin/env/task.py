@@ -1,9 +1,9 @@
-"""Driving along a route segment in dm_control: physics and task, with start, state, reward and termination; no images.
+"""Driving along a route segment in dm_control, without images: physics, start, state, reward and termination.
 
 In an *episode*, the robot starts at rest near the segment's start; the episode ends with one of `CAUSES`. The discount
-at the end is 0, except at a timeout: it is 1 there, since the episode is only truncated. An episode's seed determines
-all its randomness. Start, robot, lighting, obstacles, camera and weather have separate generators: changing one leaves
-the others unchanged, so policies can be compared on the same episodes.
+at the end is 0; only after a timeout it is 1, since the episode is truncated. An episode's seed determines all its
+randomness. Start, robot, lighting, obstacles, camera and weather have separate random generators. So a change in the
+sampling of one leaves the others unchanged, and policies can be compared on the same episodes.
 """
 
 import sys
@@ -46,7 +46,7 @@ except ModuleNotFoundError as error:
 EnvIndices = Sequence[int] | NDArray[np.int64]
 
 _CODES = {cause: code for code, cause in enumerate(CAUSES, 1)}  # 0: the episode goes on
-BUMPER_OFFSET = 0.5  # [m] the bumper is this far ahead of the base; at the goal, the bumper reaches the segment's end
+BUMPER_OFFSET = 0.5  # [m] the bumper is this far ahead of the base; the goal is reached when it is at the segment's end
 _SEARCH_WINDOW = (1.0, 3.0)  # [m] of route behind and ahead of the last foot
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
@@ -79,8 +79,8 @@ class RewardAndTermination:
     """Reward, termination and state of n drives along one route segment.
 
     A task uses it for one drive, a GPU vector environment for all of its drives. `which` selects k of the n drives. The
-    *foot* is the arc length of the route's point nearest to the robot's base; progress is the foot's distance from the
-    segment's start.
+    *foot* is the point of the route that is nearest to the robot's base, given by its arc length. Progress is the arc
+    length from the segment's start to the foot.
     """
 
     def __init__(self, world: World, segment: RouteSegment, options: Options, count: int = 1) -> None:
@@ -95,7 +95,7 @@ class RewardAndTermination:
         self._cause = np.zeros(count, int)
         self._route = world.route[:, :2]
         self._previous_foot, self._steering = np.zeros(count), np.zeros(count)
-        # Position and time of each robot when it had last moved by STUCK_DISTANCE.
+        # Position and time at which each robot had last moved by STUCK_DISTANCE.
         self._anchor, self._anchor_time = np.zeros((count, 2)), np.zeros(count)
         terms = options.rewards
         speed, yaw_rate = (_STATE_MARGIN * x for x in (world.robot.max_wheel_speed, world.robot.max_yaw_rate))
@@ -159,8 +159,8 @@ class RewardAndTermination:
         [rad] (the robot's heading minus the route's) and `turns` [rad] (changes of the route's heading until 1, 2 and
         4 m ahead).
 
-        The state is clipped to `state_bounds`. This has an effect only if the robot moves ten times as fast as its
-        controller allows, as in a fall.
+        The state is clipped to `state_bounds`. This changes it only if the robot moves more than ten times as fast as
+        its controller allows, for example when it falls.
         """
         foot = self.foot[which]
         heading = heading_at(self._route, foot)
@@ -183,7 +183,7 @@ class DrivePhysics(dm_mujoco.Physics):
 
     @staticmethod
     def of(model: mujoco.MjModel, params: HuskyParams) -> "DrivePhysics":
-        """Returns physics that steps this model, not a copy; `episode_spec` made it for this robot."""
+        """Returns physics that steps `model` itself, not a copy; `episode_spec` must have made it for this robot."""
         physics = DrivePhysics(wrapper.MjData(wrapper.MjModel(model)))
         physics.set_robot(params)
         return physics
@@ -222,7 +222,7 @@ class DrivePhysics(dm_mujoco.Physics):
         with self.check_invalid_state():
             self.robot.step(nstep * self.timestep())
 
-    # Quantities of `HuskyPhysics`; the camera's pose is the one from which the newest image is taken.
+    # Quantities of `HuskyPhysics`. The camera's pose is the pose from which the newest image was taken.
     planar_pose = property(attrgetter("robot.planar_pose"))
     base_to_world = property(attrgetter("robot.base_to_world"))
     delayed_data = property(attrgetter("robot.delayed_data"))
@@ -260,7 +260,7 @@ class DriveTask(control.Task):
             obstacles: Samples an episode's obstacles; its pool is in the model.
             model: The compiled model before randomization; physics steps a copy.
             seed: Seed of the sequence of episodes; None: unpredictable.
-            evaluator: Reward and termination of many drives, and the index of this drive; None: its own.
+            evaluator: Reward and termination of many drives, and the index of this drive; None: one for this drive.
         """
         self.world, self.segment, self.options = world, segment, options
         self._evaluator, self._index = evaluator or (RewardAndTermination(world, segment, options), 0)

@@ -2,8 +2,8 @@
 
     {"format": "twin task", "version": 1, "name": "straight", "line": [[x, y, z], ...], "half_width": 1.0, ...}
 
-The rules are those of `twin.env.task.RewardAndTermination`, as numbers, so that other programs can evaluate drives
-without its code.
+The file contains the rules of `twin.env.task.RewardAndTermination` as numbers, so that other programs can evaluate
+drives by the same rules.
 """
 
 import math
@@ -24,9 +24,15 @@ def task_table(world: World, segment: RouteSegment, options: Options) -> dict[st
 
     `line` (m, 3) is on the ground, in driving order; a *station* is a horizontal arc length along it. Trials start at
     the station `start`, up to `offset` beside the line and turned by up to `heading` from its direction. They succeed
-    at the station `goal`. They end without success when the base is further than `half_width` from the line, when the
-    robot touches an object, tilts by more than `max_tilt` or moves by less than `stuck.distance` in `stuck.time`, and
-    after `time_limit`. Commands come every `control_timestep` and are bounded by `limits`.
+    at the station `goal`. They fail
+
+    - when the base is further than `half_width` from the line;
+    - when the robot touches an object;
+    - when the robot tilts by more than `max_tilt`;
+    - when the robot moves by less than `stuck.distance` in `stuck.time`;
+    - after `time_limit`.
+
+    Commands come every `control_timestep` and are bounded by `limits`.
     """
     rules = RewardAndTermination(world, segment, options)
     return {

@@ -1,11 +1,12 @@
-"""Trust: estimated reliability of a rendered picture, from the distance of its camera to the filmed frames and from
-the completeness of the reconstruction in view.
+"""Trust: the estimated reliability of a rendered picture.
 
-The trust of a picture is the smallest of three numbers in [0, 1]:
+It is high if the picture's camera is near the filmed frames, and if the reconstruction in view is complete. The trust
+is the smallest of three numbers in [0, 1]:
 
 *pose*: 1 if the offset to the most similar filmed frame is at most `_NEAR`, 0 if it is at least `_FAR`, linear in
-between; the offset is the distance [m] plus `_PER_TURN` · (1 − cos of the angle between the optical axes);
-*opacity*: the mean opacity of the lower half of the picture, where only ground and objects should be;
+between. The offset of two cameras is their distance [m] plus `_PER_TURN` · (1 − cos α), where α is the angle between
+their optical axes;
+*opacity*: the mean opacity of the lower half of the picture, where only ground and objects should be visible;
 *sky in the road*: 1 minus `_SKY_WEIGHT` times the fraction of that half whose opacity is below `SKY_OPACITY`.
 """
 
@@ -36,7 +37,7 @@ class Trust:
         self._candidates = min(_CANDIDATES, len(poses))
 
     def offset(self, camera_to_world: Array) -> Array:
-        """Offset to the most similar filmed frame [m] of OpenCV poses (n, 4, 4), shape (n,)."""
+        """Offsets [m] of OpenCV poses (n, 4, 4) to their most similar filmed frames, shape (n,)."""
         distance, frame = self._tree.query(camera_to_world[:, :3, 3], self._candidates)
         distance, frame = distance.reshape(len(camera_to_world), -1), frame.reshape(len(camera_to_world), -1)
         cosine = (self._axes[frame] * camera_to_world[:, None, :3, 2]).sum(-1)
@@ -48,6 +49,6 @@ class Trust:
         return self.from_opacity(camera_to_world, lower.mean((1, 2)), (lower < SKY_OPACITY).mean((1, 2)))
 
     def from_opacity(self, camera_to_world: Array, mean_opacity: Array, sky_share: Array) -> Array:
-        """Trust of pictures whose lower half has a mean opacity and a fraction of sky pixels, each shape (n,)."""
+        """Trust of pictures, from the mean opacity and the fraction of sky pixels of their lower halves; all (n,)."""
         near_film = np.clip((_FAR - self.offset(camera_to_world)) / (_FAR - _NEAR), 0.0, 1.0)
         return np.minimum(np.minimum(near_film, mean_opacity), np.clip(1.0 - _SKY_WEIGHT * sky_share, 0.0, 1.0))

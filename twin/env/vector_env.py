@@ -1,8 +1,8 @@
 """Vector environments: `make_vector_env` steps n environments in one process, in several processes, or on a GPU.
 
-Much of a step is Python (visibility, contacts, reward), which the interpreter's lock confines to one core per process.
-So a `ProcessVectorEnv` starts *child* processes. Each child has a `LocalVectorEnv` and executes its parent's requests.
-Requests and replies are sent as pickles over a socket. The number of processes does not change any result.
+Much of a step is Python code (visibility, contacts, reward), for which the interpreter's lock allows only one core per
+process. So a `ProcessVectorEnv` starts *child* processes. Each child has a `LocalVectorEnv` and executes its parent's
+requests. Requests and replies are sent as pickles over a socket. The number of processes changes no result.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ from twin.errors import InputError
 from twin.loading import Twin
 from twin.runtime import available_cores
 
-_MIN_ENVS, _MAX_PROCESSES = 2, 8  # by default: fewest environments per process; most processes (each takes memory)
+_MIN_ENVS, _MAX_PROCESSES = 2, 8  # defaults: least number of environments per process; largest number of processes
 _CHILD_CODE = "from twin.env.vector_env import serve; serve()"  # not -m, which would pickle classes as part of __main__
 _PARENT_CHECK_PERIOD = 2.0  # [s] between two checks whether the parent still runs
 
@@ -146,7 +146,10 @@ class ProcessVectorEnv:
         self._end()
 
     def _split(self, some: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64], list[int]]]:
-        """Yields each child that has some of these environments, their positions in `some`, and their indices in it."""
+        """Yields (child, positions, indices) for each child that has some of the environments `some`.
+
+        `positions` are those of the child's environments in `some`; `indices` are theirs in the child.
+        """
         locations = np.array([self._location[i] for i in some.tolist()]).reshape(-1, 2)
         for c in np.unique(locations[:, 0]).tolist():
             at = np.flatnonzero(locations[:, 0] == c)
@@ -169,7 +172,7 @@ class ProcessVectorEnv:
                 for c, message in messages.items():
                     self._children[c].send(message)
                 replies = {c: self._children[c].receive() for c in requests}  # all, even if one is an error
-            except BaseException:  # some requests may have been sent, and replies may be pending
+            except BaseException:  # some requests may have been sent, and their replies may be pending
                 self.close()
                 raise
         for error, _ in replies.values():
@@ -178,7 +181,7 @@ class ProcessVectorEnv:
         return {c: result for c, (_, result) in replies.items()}
 
     def _store(self, which: NDArray[np.int64], message: StepMessage, fill: bool) -> None:
-        """Stores a reply; `fill` repeats the new image in the whole stack."""
+        """Stores a reply. With `fill`, the new image fills the whole stack."""
         if self.pixels and message.images is not None:
             stacks, new = self.pixels.stacks, message.images[:, None]
             stacks[which] = new if fill else np.concatenate([stacks[which][:, 1:], new], 1)
@@ -281,13 +284,15 @@ def serve() -> None:
     """Serves a parent's requests; arguments of the process: socket, process id of the parent, number of cores."""
     socket, parent, share = map(int, sys.argv[1:])
     os.set_inheritable(socket, False)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it may reach all processes; the parent saves, then ends this one
+    # The signal may reach all processes; the parent saves its state, and then ends this process.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     runtime.limit_cores(share)
     server = VectorEnvServer()
     with Connection(socket) as pipe, contextlib.suppress(EOFError, OSError):  # the parent closed the pipe
         while True:
             while not pipe.poll(_PARENT_CHECK_PERIOD):
-                if os.getppid() != parent:  # the parent ended; a process that it forked may keep the socket open
+                # If the parent has ended, a process that it forked may keep the socket open.
+                if os.getppid() != parent:
                     return
             pipe.send_bytes(server.answer(pipe.recv_bytes()))
 

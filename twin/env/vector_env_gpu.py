@@ -68,7 +68,7 @@ def _record_positions(
     qpos: wp.array2d(dtype=float),
     history: wp.array3d(dtype=float),
 ):
-    """Records positions at the end of each segment: each substep overwrites those of the substep before it."""
+    """Records the positions at the end of each segment: each substep overwrites what the substep before it recorded."""
     env, i = wp.tid()
     history[segment[k, env], env, i] = qpos[env, i]
 
@@ -99,11 +99,11 @@ def _mark_contacts(
 class GpuSimulation:
     """Steps the physics of n environments of one compiled scene; their models may differ in randomized fields.
 
-    The state (positions, velocities, the solver's last accelerations) is kept in arrays over all environments. A
-    control step uploads it, runs the substeps under the controllers' schedules, and downloads it with the touched
-    geoms. The environments' own `MjData` are updated only by `sync`, which takes far longer. The device computes in
-    single precision with another solver: episodes resemble those of MuJoCo but are not bit-identical. On a GPU they are
-    not repeatable either, since the order of contacts varies.
+    The state (positions, velocities, the solver's last accelerations) is kept in arrays that contain all environments.
+    A control step uploads it, runs the substeps with the controllers' schedules, and downloads the new state and the
+    touched geoms. Only `sync` updates the environments' own `MjData`, which takes far longer. The device computes in
+    single precision with another solver: episodes are similar to those of MuJoCo, but not bit-identical. On a GPU, they
+    are not repeatable either, since the order of contacts varies.
     """
 
     def __init__(self, envs: Sequence[DrivePhysics], period: float, device: str) -> None:
@@ -160,7 +160,7 @@ class GpuSimulation:
         for name, values in self._randomized.items():
             values[which] = [getattr(robot.model, name) for robot in robots]
             array = getattr(self._model, name)
-            # Warp stores a vector or quaternion as one element.
+            # In Warp's arrays, a vector or quaternion is one element.
             array.assign(values.reshape(array.shape + getattr(array.dtype, "_shape_", ())))
         for name, values in self._state.items():
             values[which] = [getattr(robot.data, name) for robot in robots]
@@ -216,7 +216,7 @@ class GpuSimulation:
         return tuple(sorted(model.geom(k).name for k in np.flatnonzero(self._touched[i])))
 
     def camera_poses(self, which: Indices) -> tuple[Array, Array]:
-        """Front cameras' poses (OpenCV axes), shape (k, 4, 4), and times [s], shape (k,), of the newest images."""
+        """Camera poses (OpenCV axes), shape (k, 4, 4), and times [s], shape (k,), of the newest images."""
         qpos, time = self._state["qpos"][which, :7], self._controllers.time[which]
         if len(self._snapshot_times):
             qpos, time = self._delayed_base_poses(which)

@@ -1,9 +1,9 @@
-"""Vector environment in one process: physics on a thread pool, images of all environments in one call of the renderer.
+"""Vector environment in one process: a thread pool runs the physics, and one call renders the images of all.
 
 Each environment has its own model and sequence of episodes, and is stepped by the same code as an environment of
-`twin.load`: on a CPU, their results are bit-identical. Threads are used because `mujoco.batch.Batch` supports neither
-contact checks nor a controller between substeps. See `vector_env.py` for several processes and `vector_env_gpu.py` for
-a GPU.
+`twin.load`. On a CPU, the results of both are bit-identical. `mujoco.batch.Batch` is not used, since it cannot check
+contacts or run a controller between substeps. See `vector_env.py` for several processes, and `vector_env_gpu.py` for a
+GPU.
 """
 
 import dataclasses
@@ -138,8 +138,8 @@ class LocalVectorEnv:
     def info(self, i: int) -> dict[str, Any]:
         """Info of environment i's episode so far, JSON-able.
 
-        With images, `lighting` is the condition's name in tables, such as `training`; `sampled_lighting` is that name
-        followed by the sampled mixture: `training: sun 0.62, night 0.38`, see `mixture_text`.
+        With images, `lighting` is the name that tables use, such as `training`. `sampled_lighting` is this name, then
+        the sampled mixture: `training: sun 0.62, night 0.38`, see `mixture_text`.
         """
         return self.tasks[i].info(self._physics[i]) | self._pixel_info(i)
 
@@ -197,13 +197,13 @@ class LocalVectorEnv:
 def mixture_text(embedding: Array32, filmed: Lightings) -> str:
     """Text of the mixture of filmed lightings that is nearest to an embedding (dim,), such as `sun 0.62, night 0.38`.
 
-    The fractions are nonnegative and add up to 1; those below 0.005 are omitted. A sampled embedding also deviates from
-    the mixture, as the embedding of a single frame does; the text omits this deviation.
+    The fractions are nonnegative and add up to 1; those below 0.005 are omitted. A sampled embedding differs somewhat
+    from this mixture, as the embedding of a single frame does; the text does not show the difference.
     """
     from scipy.optimize import nnls  # slow to import
 
     vectors = filmed.vectors.astype(np.float64)
-    sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # weight of the equation: fractions add up to 1
+    sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # weight of the equation that the fractions add up to 1
     equations = np.vstack([vectors.T, np.full(len(vectors), sum_weight)])
     parts, _ = nnls(equations, np.append(embedding, sum_weight))
     order = np.argsort(-parts, kind="stable")

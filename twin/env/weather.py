@@ -1,6 +1,6 @@
-"""Weather randomization of pictures: directional relighting, cast shadows, and fog from a photo or a sample.
+"""Weather randomization of pictures: directional relighting, cast shadows, and fog (sampled or fitted to a photo).
 
-All three modify a rendered picture with the help of its depth; the field itself is not changed.
+All three modify a rendered picture, using its depth; the field itself does not change.
 """
 
 import cv2
@@ -20,11 +20,11 @@ _MIN_HORIZON_SHARE = 0.01  # fraction of pixels that must be beyond `_HORIZON_DI
 class FogSample:
     """Fog sampled for one episode; see `nerf/fog.py` for the model.
 
-    The airlight has the color of the sky near the horizon, under the episode's own appearance, in its first picture.
+    The airlight has the color of the sky near the horizon in the episode's first picture.
     """
 
     def __init__(self, extinction: float, airlight: float = 1.0) -> None:
-        """`extinction` is in [1/m]; `airlight` is the fog's brightness as a factor of the horizon's."""
+        """`extinction` [1/m]; `airlight` is the ratio of the fog's brightness to the horizon's."""
         self._extinction, self._gain = extinction, np.float32(airlight)
         self._fog: Fog | None = None
 
@@ -50,7 +50,7 @@ def _horizon_color(rgb: Array32, distance: Array32) -> Array32:
 
 RELIGHT_REACH = 40.0  # [m] depth beyond which normals are not used
 _NEAR = 25.0  # [m] up to this depth, surfaces are relit by their normals alone
-_WARMTH = (0.0, 0.5)  # range of the fraction by which red has more gain than green, and blue less
+_WARMTH = (0.0, 0.5)  # range of the fraction by which the strength is higher in red, and lower in blue, than in green
 _SKY, _TINT = 0.6, 0.15  # standard deviations of the sky's brightness and color, as fractions of the strength
 _HEIGHT_RAMP = (-0.4, 0.0)  # [m] above the lens: no relighting below the first height, full relighting above the second
 _SMOOTHING = 3  # [px] side of the window over which points are averaged before normals are computed
@@ -62,15 +62,16 @@ class DirectionalRelighting:
     A surface with normal n under a sun in direction s gets the gain exp(strength · (n · s − s_z)). The strength is
     higher in red than in blue, since the light of a low sun is warm. Horizontal ground keeps its brightness. Normals
     come from the picture's depth, and are inaccurate within three pixels of an outline. Surfaces more than 0.4 m below
-    the lens, curbs included, are not relit, since a field's ground is rough; surfaces above the lens get the full gain.
-    Far surfaces and the sky get a gain of random brightness and color that does not depend on normals and is higher
-    towards the sun. The two gains blend between 25 and 40 m.
+    the lens, also curbs, are not relit, since a field's ground is rough; surfaces above the lens get the full gain. The
+    gain of far surfaces and the sky does not depend on normals: its brightness and color are random, and it is
+    higher towards the sun. Between 25 and 40 m, the two gains are blended.
     """
 
     def __init__(self, strength: float, sun: Array, rng: np.random.Generator) -> None:
         """
         Args:
-            strength: With 0.7 and a sun 15° high, a wall facing it gets 1.6 times as bright, the opposite 0.4 times.
+            strength: For example, with 0.7 and a sun at 15° elevation, a wall that faces the sun gets 1.6 times as
+                bright, and a wall that faces away from it 0.4 times.
             sun: Unit vector towards the sun, shape (3,).
             rng: Random generator of the episode.
         """
@@ -97,7 +98,10 @@ class DirectionalRelighting:
 
 
 def _normals(points: Array32) -> Array32:
-    """Unit normals, towards the camera, of the surface through points relative to it, shape (height, width, 3)."""
+    """Unit normals, shape (height, width, 3), of the surface through points relative to the camera.
+
+    They point towards the camera.
+    """
     smooth = cv2.blur(points, (_SMOOTHING, _SMOOTHING), borderType=cv2.BORDER_REPLICATE)
     down, across = np.gradient(smooth, axis=(0, 1))
     normal = np.cross(down, across)
@@ -116,16 +120,16 @@ _PATCH_COVER = (0.2, 0.6)  # smallest and largest fraction of the plane that pat
 _HOUSES, _HOUSE_SIDE = (1, 4), (3.0, 12.0)
 _POSTS, _POST_WIDTH, _POST_LENGTH = (0, 8), (0.1, 0.5), (2.0, 10.0)
 _OVERSAMPLING = 4  # resolution factor at which solid shadows are drawn, for smooth edges
-_SHADOW_TINT = np.array([1.0, 0.95, 0.85], np.float32)  # blue loses less: a shadow keeps the sky's bluer light
+_SHADOW_TINT = np.array([1.0, 0.95, 0.85], np.float32)  # blue loses less, since the sky's bluer light remains
 
 
 class CastShadows:
     """Random cast shadows that were not filmed, fixed in the world, for one episode.
 
     A periodic pattern in the plane z = 0 is projected along the rays of the episode's sun onto ground, curbs and walls.
-    It consists of patches, which may be dappled like shadows of leaves, of shadows with straight edges like those of
-    houses and posts, or of both. A policy can mistake straight edges for curbs and lines. A lower sun stretches the
-    pattern.
+    It consists of patches, of shadows with straight edges, or of both. Patches may be dappled, like shadows of leaves.
+    Straight edges are like those of shadows of houses and posts; a policy can mistake them for curbs and lines. The
+    lower the sun is, the more it stretches the pattern.
     """
 
     def __init__(self, strength: float, sun: Array, rng: np.random.Generator) -> None:
@@ -156,7 +160,10 @@ class CastShadows:
 
 
 def _solid_shadows(rng: np.random.Generator) -> Array32:
-    """Shadows of houses at random angles and of posts along the sun's direction, 1 in the dark, shape (side, side)."""
+    """Pattern (side, side) of the shadows of houses and posts, 1 where it is dark.
+
+    Houses have random angles; the shadows of posts lie along the sun's direction.
+    """
     side = _SIDE * _OVERSAMPLING
     canvas = np.zeros((side, side), np.uint8)
     houses = [(rng.uniform(*_HOUSE_SIDE, 2), rng.uniform(0.0, np.pi)) for _ in range(rng.integers(*_HOUSES))]
@@ -172,7 +179,10 @@ def _solid_shadows(rng: np.random.Generator) -> Array32:
 
 
 def _patches(rng: np.random.Generator, radius: float, cover: float) -> Array32:
-    """Patches of about a radius [texels] that cover a fraction `cover`, 1 in the dark, shape (side, side)."""
+    """Pattern (side, side) of patches, 1 where it is dark, which have about the radius `radius` [texels].
+
+    They cover the fraction `cover` of the plane.
+    """
     # The smoothing is periodic, so that the pattern repeats without a seam.
     frequency = np.fft.fftfreq(_SIDE)[:, None] ** 2 + np.fft.rfftfreq(_SIDE) ** 2
     smooth = np.exp(-2.0 * (np.pi * radius) ** 2 * frequency)

@@ -1,12 +1,13 @@
 """Trained policies: reading, writing and running them, without torch and stable-baselines3.
 
     policy = load_policy("scenes/demo/runs/night_owl")
-    action = policy(pixels)                 # uint8 (12, 90, 160), the newest picture last → numbers in [-1, 1]
+    action = policy(pixels)                 # from uint8 (12, 90, 160), the newest picture last; numbers in [-1, 1]
     v, yaw_rate = policy.command(action)    # m/s, rad/s
 
-A *policy folder* contains `policy.json` (control, sizes of the network, its training), `policy.safetensors` (weights)
-and `policy.onnx` (both in one file, for a robot that has ONNX Runtime but not this package). Loading a file runs no
-code from it unless the user trusts it; `load_policy` lists the other formats.
+A *policy folder* contains three files. `policy.json` describes the control, the network's sizes and the training.
+`policy.safetensors` contains the weights. `policy.onnx` contains all of this in one file, for robots with ONNX Runtime
+but without this package. `load_policy` lists the other formats. Loading a file runs code from it only if the user
+trusts it.
 """
 
 import contextlib
@@ -35,9 +36,9 @@ ActFunction = Callable[[Image], Array32]
 JSON, WEIGHTS, ONNX = "policy.json", "policy.safetensors", "policy.onnx"
 FORMAT, VERSION = "twin policy", 2
 
-_MAX_SIDE, _MAX_STACK = 4096, 64  # side of a picture [px], pictures in a stack
-_MAX_BYTES = 256 << 20  # largest file
-_METADATA_KEY = "twin"  # key of twin's entry in an ONNX file's metadata
+_MAX_SIDE, _MAX_STACK = 4096, 64  # largest side of a picture [px]; largest number of pictures in a stack
+_MAX_BYTES = 256 << 20  # largest size of a file
+_METADATA_KEY = "twin"  # name of the policy's description in an ONNX file's metadata
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,9 @@ class Control:
     """Meaning and timing of a policy's actions. The defaults apply to policies of unknown origin."""
 
     action: str = STEERING
-    """With `steering`, an action is one number, the yaw rate; with `twist`, two numbers, speed and yaw rate."""
+    """`steering`: an action is the yaw rate. `twist`: an action is speed and yaw rate."""
     speed: float = 1.0
-    """[m/s]. With `steering`, the constant speed; with `twist`, the speed at action 1 (action -1 is standstill)."""
+    """For `steering`, the constant speed [m/s]. For `twist`, the speed at action 1 [m/s]; at action -1, it is 0."""
     yaw_rate: float = 1.0
     """Yaw rate at action 1, positive to the left [rad/s]."""
     control_timestep: float = 0.1
@@ -74,18 +75,18 @@ class Policy:
 
     name: str
     act: ActFunction
-    """The network. Its output is not checked; the method `actions` checks it."""
+    """Runs the network without checking its output; `actions` checks it."""
     control: Control
     size: tuple[int, int] = (160, 90)
     """Width, height of the pictures [px]."""
     stack: int = 4
     trained: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Scene, task, run, step and so on of the training; empty if unknown."""
+    """Description of the training, such as scene, task, run and step; empty if unknown."""
 
     def actions(self, stacks: Image) -> Array32:
-        """Stacks uint8 (n, 3 · stack, height, width) → actions (n, actions), each number in [-1, 1].
+        """Actions (n, actions), each component in [-1, 1], for stacks uint8 (n, 3 · stack, height, width).
 
-        Raises InputError: stacks of another shape or type, or an output of another shape or that is not finite.
+        Raises InputError: the stacks have another shape, or the network's output is not a valid action.
         """
         width, height = self.size
         expected = (3 * self.stack, height, width)
@@ -103,11 +104,11 @@ class Policy:
         return np.clip(out, -1.0, 1.0)
 
     def __call__(self, stack: Image) -> Array32:
-        """One stack uint8 (3 · stack, height, width) → its action (actions,)."""
+        """The action (actions,) for one stack, uint8 (3 · stack, height, width)."""
         return self.actions(stack[None])[0]
 
     def command(self, action: Array32) -> tuple[float, float]:
-        """An action (actions,) as speed [m/s] and yaw rate [rad/s]."""
+        """Speed [m/s] and yaw rate [rad/s] that an action (actions,) stands for."""
         c = self.control
         v = c.speed if c.action == STEERING else (float(action[0]) + 1.0) / 2.0 * c.speed
         return v, float(action[-1]) * c.yaw_rate
@@ -137,13 +138,13 @@ def save_policy(
 
 
 def copy_policy(source: Path, folder: Path) -> None:
-    """Replaces the files of the policy folder `folder` by those of `source`."""
+    """Replaces the policy in `folder` by the one in `source`."""
     _replace_policy(folder, {name: read_bytes(source / name) for name in (WEIGHTS, ONNX, JSON)})
 
 
 def _replace_policy(folder: Path, files: dict[str, bytes]) -> None:
-    """Replaces files, policy.json last; if the disk is full, the old policy remains complete."""
-    with contextlib.ExitStack() as stack:  # on exit, the temporary files are renamed in reverse order of entry
+    """Replaces files, policy.json last. If the disk is full, the old policy remains complete."""
+    with contextlib.ExitStack() as stack:  # at its end, the temporary files are renamed, the last created first
         temporary = {name: stack.enter_context(atomic_path(folder / name)) for name in reversed(files)}
         for name, content in files.items():
             temporary[name].write_bytes(content)
@@ -151,10 +152,10 @@ def _replace_policy(folder: Path, files: dict[str, bytes]) -> None:
 
 
 def find_policy(root: Path, source: str) -> str:
-    """Converts a policy's name or path to a `source` for `load_policy`.
+    """Converts a name from a table (`run` or `run/checkpoint`) to its folder in `runs/`, for `load_policy`.
 
-    Names as in tables (`run`, `run/checkpoint`) become folders in `runs/`. Paths that exist become absolute, since
-    nodes of a cluster have other working folders; other sources are unchanged.
+    Existing paths become absolute, since nodes of a cluster have other working folders. Any other source is returned
+    unchanged.
     """
     run, _, checkpoint = source.partition("/")
     folder = root / "runs" / run
@@ -166,11 +167,11 @@ def find_policy(root: Path, source: str) -> str:
 def load_policy(source: str | Path, trust: bool = False) -> Policy:
     """Loads a policy from
 
-    - a policy folder, such as a run or a checkpoint of a run (or the folder's policy.json);
-    - an ONNX file with one input, uint8 or float32 (n, 3 · stack, height, width) of values 0 to 255, and one output
-      (n, 1 or 2) in [-1, 1];
-    - `module:function`, the user's own function of one stack uint8 (3 · stack, height, width);
-    - a zip file of a SAC of stable-baselines3, only with `trust`, since loading it can run code from the file.
+    - a policy folder (or its policy.json), such as the folder of a run or of a checkpoint;
+    - an ONNX file with one input, uint8 or float32 (n, 3 · stack, height, width) with values 0 to 255, and one output
+      (n, 1 or 2) with values in [-1, 1];
+    - `module:function`: the user's own function, which receives one stack, uint8 (3 · stack, height, width);
+    - a zip file of stable-baselines3; `trust` must be True, since loading the file runs code from it.
 
     Raises InputError: there is no such policy, or it is damaged or has another format.
     """
@@ -221,19 +222,19 @@ def _from_onnx(path: Path) -> Policy:
 
     try:
         model = onnx.load_model_from_string(_read(path))
-        # Must come before the check of the model, which would open these files.
+        # External files are refused before the checker runs, which would open them.
         if any(one.data_location == onnx.TensorProto.EXTERNAL for one in _tensors(model)):
             raise InputError(f"{path}: its weights are in other files; save it with its weights inside")
         onnx.checker.check_model(model)
     except InputError:
         raise
-    except Exception as error:  # from protobuf, the checker, or Python's recursion limit
+    except Exception as error:  # errors of protobuf or of the checker, or a RecursionError
         raise InputError(f"{path}: not an ONNX file: {type(error).__name__}: {error}") from None
     names = {one.name for one in model.graph.initializer}
     inputs = [one for one in model.graph.input if one.name not in names]
     shapes = [[d.dim_value for d in one.type.tensor_type.shape.dim] for one in (*inputs, *model.graph.output)]
     fits = len(inputs) == 1 and [len(shape) for shape in shapes] == [4, 2]
-    # A dynamic axis has size 0.
+    # Here a dynamic axis has size 0.
     if not fits or shapes[0][1] % 3 or 0 in shapes[0][1:] or shapes[0][0] > 1 or shapes[1][1] not in (1, 2):
         raise InputError(
             f"{path}: inputs and outputs {shapes}; expected one input (n, 3 · stack, height, width) and one output "
@@ -270,7 +271,7 @@ def _tensors(model: Any) -> Iterator[Any]:
 
 
 def _from_callable(name: str) -> Policy:
-    # Imported here, so that policy files load without the environments.
+    # Imported only here, so that policy files load without the environments.
     from twin.env.drivers import find_callable
 
     function = find_callable(name)
@@ -278,7 +279,7 @@ def _from_callable(name: str) -> Policy:
     def output_of(stack: Image) -> Array32:
         try:
             return np.asarray(function(stack), np.float32)
-        except (Exception, SystemExit) as error:  # any error of the user's own code
+        except (Exception, SystemExit) as error:  # the user's code may raise anything
             raise InputError(f"policy {name}: raised {type(error).__name__}: {error}") from error
 
     def act(stacks: Image) -> Array32:
@@ -304,7 +305,7 @@ def _from_zip(path: Path) -> Policy:
         raise InputError(f"{path}: needs stable-baselines3; pip install twin[learn]") from None
     try:
         model = SAC.load(path, device="cpu")
-    except Exception as error:  # any error of a zip or a pickle
+    except Exception as error:  # damaged zips and pickles raise many kinds of errors
         raise InputError(f"{path}: not a SAC of stable-baselines3: {type(error).__name__}: {error}") from None
     shape, actions = model.observation_space.shape, model.action_space.shape
     if shape is None or len(shape) != 3 or shape[0] % 3 or actions not in ((1,), (2,)):
@@ -321,7 +322,7 @@ def _session(model: bytes, path: Path) -> ActFunction:
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
-    # One thread, since environments run in parallel, and so that the order of sums is fixed.
+    # One thread, since environments already run in parallel, and since it fixes the order of sums.
     settings.intra_op_num_threads = settings.inter_op_num_threads = 1
     settings.log_severity_level = 4
     try:

@@ -1,8 +1,7 @@
 """Evaluation of policies on numbered episodes of a task, on this machine or a Ray cluster.
 
-Seed and lighting determine an *episode*: its start, robot and light depend neither on the policy nor on the machine or
-other episodes. So all policies drive the same episodes. A *campaign* is a sequence of *chunks* of episodes, which can
-run in any order.
+An *episode* is determined by its seed and lighting: start, robot and light do not depend on the policy, the machine or
+other episodes. So all policies drive the same episodes, and the *chunks* of a campaign can run in any order.
 """
 
 import dataclasses
@@ -33,7 +32,7 @@ from twin.runtime import die_with_parent, ignore_terminal_signals, signals_held,
 CHUNK = 16
 """Largest number of episodes in a chunk; one process drives a chunk."""
 
-_ENVS = 8  # episodes driven at once
+_ENVS = 8  # number of episodes driven at once
 _SAMPLED_LIGHTING = re.compile(r"drawn_(\d+)")
 
 
@@ -47,15 +46,15 @@ class EpisodeChunk:
     """See `load_policy`."""
     trust: bool
     condition: Condition
-    """Its lighting may be `drawn_<number>`, see `with_sampled_lighting`."""
+    """The condition's lighting may be `drawn_<number>`, see `with_sampled_lighting`."""
     seeds: tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """An episode's result: cause of its end, progress [m], mean trust over its pictures, sum of its rewards.
+    """Result of an episode: among others, progress [m], mean trust of its pictures, and sum of its rewards.
 
-    `lighting` is the lighting as sampled; see `LocalVectorEnv.info`.
+    `lighting` is the sampled lighting.
     """
 
     seed: int
@@ -68,7 +67,7 @@ class EpisodeResult:
 
 
 def run_chunk(chunk: EpisodeChunk) -> list[EpisodeResult]:
-    """Results of a chunk, in the order of its seeds.
+    """Drives a chunk; returns results in the order of its seeds.
 
     Raises InputError: the policy, scene, task or lighting is unknown.
     """
@@ -82,7 +81,7 @@ def run_episodes(
     seeds: Sequence[int],
     watch: Callable[[], object] = lambda: None,
 ) -> list[EpisodeResult]:
-    """Drives one episode per seed, in parallel in all environments; returns the results in the order of the seeds.
+    """Drives one episode per seed, in all environments at once; returns results in the order of the seeds.
 
     `envs` must have pictures; their current episodes are abandoned. `watch` is called after every episode.
     """
@@ -102,7 +101,8 @@ def run_episodes(
         for i in which:
             trusts[driving[i]].append(float(envs.pixels.trust[i]))
         pictures = envs.observation()
-        # One by one: in a batch the order of sums differs, and the last bit can decide whether a robot hits the kerb.
+        # Stacks are passed one by one, since sums in a batch have another order, and the last bit of an action can
+        # decide whether a robot hits the kerb.
         out = envs.step(np.stack([policy(pictures[i]) for i in which]), which)
         rewards[[driving[i] for i in which]] += out.reward
         for i in [i for i, ended in zip(which, out.over, strict=True) if ended]:
@@ -115,15 +115,15 @@ def run_episodes(
 
 
 def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[list[EpisodeResult]]:
-    """Drives chunks in worker processes on this machine; yields their results in order.
+    """Drives chunks in worker processes on this machine; yields the chunks' results in order.
 
-    The workers end with the calling process. Raises InputError: an error of `run_chunk`, or a worker ended, most
-    likely because memory ran out.
+    The workers end with this process. Raises InputError: as in `run_chunk`, or because a worker ended, most likely
+    since memory ran out.
     """
     if processes == 1:
         yield from map(run_chunk, chunks)
         return
-    # Spawned, since the threads of Warp and MuJoCo do not survive a fork.
+    # Workers are spawned, since the threads of Warp and MuJoCo do not survive a fork.
     count = min(processes, max(1, len(chunks)))
     pool = ProcessPoolExecutor(count, get_context("spawn"), _init_worker, (os.getpid(),))
     try:
@@ -141,11 +141,11 @@ def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[lis
 
 
 def with_sampled_lighting(factory: EnvFactory, number: int) -> EnvFactory:
-    """Adds a lighting `drawn_<number>` to the factory's field, sampled from the filmed ones with the seed `number`."""
+    """Adds a lighting `drawn_<number>` to the factory's field: sampled from the filmed ones, with `number` as seed."""
     assert factory.field is not None
     name = f"drawn_{number}"
     if name not in factory.field.lightings:
-        # From the filmed ones, so that the result does not depend on lightings sampled before.
+        # Sampled from the filmed lightings only, so that lightings sampled before have no effect.
         filmed = factory.field.lightings_by_name.filmed()
         factory.field.add_lightings({name: filmed.sample(np.random.default_rng(number))})
     return factory
@@ -179,15 +179,15 @@ def _vector_env(scene: str, task: str, source: str, trust: bool, condition: Cond
 
 # ---- campaigns on a Ray cluster
 
-_CORES = 2  # cores reserved per chunk
+_CORES = 2  # number of CPU cores that a chunk uses
 _CONNECT_TIMEOUT = 5.0  # [s]
 
 
 def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[list[EpisodeResult]]:
-    """`campaign` on a Ray cluster (address `auto`: the cluster on this machine).
+    """Does the same as `campaign` on a Ray cluster; the address `auto` stands for the cluster on this machine.
 
-    Every node must have `twin` installed, and the scene and the policies under the same paths. Raises InputError: Ray
-    is not installed, there is no such cluster, or an error of `run_chunk`.
+    Every node needs `twin`, and needs scene and policies under the same paths as here. Raises InputError: Ray is not
+    installed, or there is no such cluster; also as in `run_chunk`.
     """
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # silences a warning of Ray on GPUs
     try:

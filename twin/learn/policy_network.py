@@ -1,11 +1,12 @@
-"""The policy network, from a stack of pictures to an action, and its export as an ONNX graph.
+"""The policy network, which converts a stack of pictures to an action, and its export as an ONNX graph.
 
-A *stack* is uint8 (3 · stack, height, width), the newest picture last. Preprocessing averages blocks of `pool` × `pool`
-pixels and normalizes each color of each picture to a fixed mean and standard deviation in the lower half, where the
-ground is; this removes exposure, white balance and most of the lighting. Both steps return uint8, so that training and
-driving use the same values. Then come convolutions with ReLU, a linear layer with layer normalization and tanh (the
-encoder of DrQ, Kostrikov et al. 2020, with other sizes), hidden layers with ReLU, and an output layer with tanh, for
-actions in [-1, 1].
+A *stack* is uint8 (3 · stack, height, width), the newest picture last. Preprocessing has two steps. First, blocks of
+`pool` × `pool` pixels are averaged. Then each color of each picture is scaled so that the lower half, where the ground
+is, has a fixed mean and standard deviation; this removes exposure, white balance and most of the lighting. Both steps
+return bytes, so that training and driving use the same values.
+
+The *encoder* is that of DrQ (Kostrikov et al. 2020) at another size: convolutions with ReLU, then a linear layer with
+layer normalization and tanh. Hidden layers with ReLU follow, and a tanh that gives actions in [-1, 1].
 """
 
 from dataclasses import dataclass
@@ -20,8 +21,8 @@ NORM_EPSILON = 1e-5
 GROUND_MEAN, GROUND_STD = 128.0, 48.0
 """Mean and standard deviation of a normalized color in the lower half of a picture."""
 NOISE_STD = 4.0
-"""Added to the standard deviation of a color, so that normalization does not amplify noise in uniform pictures."""
-_OPSET, _IR = 17, 8  # old versions of the format, which old versions of ONNX Runtime on a robot can read
+"""Added to the measured standard deviation of a color, so that normalization amplifies no noise in plain pictures."""
+_OPSET, _IR = 17, 8  # old enough for the ONNX Runtime on a robot
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,9 @@ class Architecture:
     """Width, height of the pictures [px]."""
     stack: int = 4
     pool: int = 2
-    """Side of the averaged blocks [px]: 1, 2 or 4, for which the average is exact in floating point."""
+    """Side of the averaged blocks [px]: 1, 2 or 4, since these averages are exact in floating point."""
     convolutions: tuple[tuple[int, int, int], ...] = ((32, 4, 4), (64, 3, 2))
-    """Channels, kernel and stride of each convolution."""
+    """Number of channels, side of the kernel and stride of each convolution."""
     features: int = 64
     """Size of the encoder's output."""
     hidden: tuple[int, ...] = (256, 256)
@@ -42,7 +43,7 @@ class Architecture:
     actions: int = 1
 
     def __post_init__(self) -> None:
-        """Raises ValueError: sizes that do not fit together, or are too large for a robot's computer."""
+        """Raises ValueError: the sizes do not fit together, or are too large for a robot's computer."""
         if len(self.size) != 2:
             raise ValueError(f"size = {self.size}: expected (width, height)")
         numbers = [*self.size, self.stack, self.features, self.actions, *self.hidden, *sum(self.convolutions, ())]
@@ -102,7 +103,10 @@ def average_pool(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
 
 
 def normalize_colors(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Scales channels (..., height, width) to mean `GROUND_MEAN` and std of about `GROUND_STD` in the lower half."""
+    """Scales channels (..., height, width) so that the lower half of each has the mean `GROUND_MEAN`.
+
+    Its standard deviation becomes `GROUND_STD`, or less because of `NOISE_STD`.
+    """
     ground = pictures[..., pictures.shape[-2] // 2 :, :].astype(np.float32)
     mean, std = ground.mean((-2, -1), keepdims=True), ground.std((-2, -1), keepdims=True)
     scaled = (pictures.astype(np.float32) - mean) * (np.float32(GROUND_STD) / (std + np.float32(NOISE_STD)))
@@ -110,14 +114,14 @@ def normalize_colors(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def preprocess(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
-    """Input of the convolutions: pooled and normalized; shapes (..., h, w) → (..., h/pool, w/pool)."""
+    """Pools and normalizes pictures for the convolutions; shapes (..., h, w) → (..., h/pool, w/pool)."""
     return normalize_colors(average_pool(pictures, pool))
 
 
 def onnx_bytes(architecture: Architecture, weights: dict[str, Array32], notes: dict[str, str]) -> bytes:
-    """Network and preprocessing as an ONNX file, from `pixels` to `action`.
+    """Returns the contents of an ONNX file with preprocessing and network.
 
-    The input `pixels` is uint8 (n, 3 · stack, height, width), the output `action` (n, actions).
+    Its input is `pixels`, uint8 (n, 3 · stack, height, width); its output is `action`, (n, actions).
 
     Args:
         architecture: Sizes of the network.

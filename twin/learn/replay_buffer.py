@@ -1,11 +1,10 @@
-"""A replay buffer of single pictures instead of stacks, and color augmentation of its samples.
+"""A replay buffer that stores single pictures instead of stacks, and color augmentation of its samples.
 
-Each environment's pictures are written once, in order, to a ring buffer in a file. A *transition* stores the number of
-the newest picture before it, and its *age*: the steps since its episode began. The stack before the transition consists
-of that picture and its predecessors; if the episode has too few, its first picture is repeated. The stack after the
-transition ends with the next picture of the ring. After an episode's last picture, the ring continues with the next
-episode's first. A buffer that stored both stacks of every transition, of four pictures each, would need eight times the
-memory.
+Each environment has a *ring* in a file, to which its pictures are written once, in order; the first picture of an
+episode follows the last one of the episode before. A *transition* stores its *age*, the number of steps since its
+episode began, and the index of the newest picture before it. The stack before the transition ends with this picture,
+the stack after it with the next picture of the ring. If the episode has too few pictures for a stack, its first one is
+repeated. A buffer that stores both stacks, of four pictures each, would take eight times the memory.
 """
 
 from pathlib import Path
@@ -24,26 +23,26 @@ from twin.files import allocate
 
 # ---- color augmentation
 
-_GAMMA, _CONTRAST, _TINT = 0.25, 0.25, 0.08  # standard deviations of logarithms
-_KNOTS, _SHADING = (3, 5), 0.4  # brightness pattern: knots down and across, standard deviation of the logarithm
-_MAX_COVERS, _COVER_SIDES = 4, (0.1, 0.5)  # fewer rectangles than this; range of side / the picture's side
+_GAMMA, _CONTRAST, _TINT = 0.25, 0.25, 0.08  # standard deviations of their logarithms
+_KNOTS, _SHADING = (3, 5), 0.4  # brightness pattern: knots down and across; standard deviation of the logarithm
+_MAX_COVERS, _COVER_SIDES = 4, (0.1, 0.5)  # there are fewer rectangles than this; their sides over the picture's
 _LEVELS = np.arange(256) / 255.0
 
 
 def augment_colors(stacks: NDArray[np.uint8], strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Randomizes the colors of stacks, to simulate skies and shadows that no lighting of the field shows.
+    """Randomizes the colors of stacks, to prepare policies for skies and shadows that no lighting of the field shows.
 
     The policy's normalization removes brightness, contrast and tint of the whole ground; this function randomizes what
-    remains. Every stack is changed differently. All pictures of a stack are changed alike, which preserves motion:
+    remains. Each stack is changed in its own way, but all pictures of a stack alike, which preserves motion:
 
-        tone     v → v^gamma, then a change of contrast about mid-gray
-        tint     a gain per color
+        tone     v → v^gamma, then a change of contrast about the middle
+        tint     one gain per color
         shading  a smooth pattern of brightness
-        covers   rectangles of one color, so that steering does not rely on a single object in the background
+        covers   rectangles in uniform colors, so that steering does not rely on a single object in the background
 
     Args:
-        stacks: Shape (k, 3 · stack, height, width); the three channels of a picture are adjacent.
-        strength: Factor of the standard deviations; 0 changes nothing.
+        stacks: Shape (k, 3 · stack, height, width), the colors of one picture next to each other.
+        strength: Factor by which the standard deviations are multiplied; 0 changes nothing.
     """
     count, channels, height, width = stacks.shape
     curves = _curves(count, strength, rng)
@@ -63,7 +62,7 @@ def augment_colors(stacks: NDArray[np.uint8], strength: float, rng: np.random.Ge
 
 
 def _curves(count: int, strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A tone curve per stack and color, shape (count, 3, 256)."""
+    """Tone curves, one per sample and color, shape (count, 3, 256)."""
 
     def factors(deviation: float, colors: int) -> NDArray[np.float64]:
         return np.exp(strength * deviation * rng.normal(size=(count, colors, 1)))
@@ -74,12 +73,12 @@ def _curves(count: int, strength: float, rng: np.random.Generator) -> NDArray[np
 
 # ---- the buffer
 
-_SHORT = 8  # steps; if episodes are shorter than this on average, the ring has no room for all transitions
+_SHORT = 8  # [steps] the ring has room for all transitions if episodes have on average at least this length
 _ROWS = ("actions", "rewards", "ends", "newest", "age", "states", "states_after")
 
 
 class ReplaySamples(NamedTuple):
-    """Samples as in stable-baselines3, and the privileged states before and after each transition."""
+    """Samples as in stable-baselines3, with privileged states besides."""
 
     observations: torch.Tensor
     actions: torch.Tensor
@@ -91,10 +90,10 @@ class ReplaySamples(NamedTuple):
 
 
 class FrameReplayBuffer(ReplayBuffer):
-    """Transitions of n environments whose observations are stacks (3 · stack, height, width), the newest picture last.
+    """Transitions of n environments; observations are stacks (3 · stack, height, width), the newest picture last.
 
-    The ring has room for more pictures than the transitions need, see `slack`. So pictures written after a save do not
-    overwrite those of the saved transitions, and a killed training resumes with all saved transitions.
+    The rings are longer than the transitions need. So pictures written after a save do not overwrite those of the saved
+    transitions, and a killed training resumes with all saved transitions. `slack` sets the additional length.
     """
 
     def __init__(
@@ -114,17 +113,17 @@ class FrameReplayBuffer(ReplayBuffer):
     ) -> None:
         """
         Args:
-            buffer_size: Transitions of all environments together.
+            buffer_size: Number of transitions, of all environments together.
             observation_space: uint8 (3 · stack, height, width).
-            file: File for the pictures; None: they stay in memory. An existing file is kept, see `set_state`.
+            file: File of the pictures; None: they are in memory. An existing file is kept, see `set_state`.
             slack: Largest number of transitions, of all environments together, added between two saves.
-            shift: Largest random shift of a sampled stack in each direction [px]; edge pixels are repeated (DrQ,
-                Kostrikov et al. 2020).
-            color_strength: Strength of `augment_colors`, which is applied to half of the stacks before transitions.
-            state_size: Size of the privileged `state` in an `info`.
+            shift: Samples are shifted at random, by at most this in each direction [px]; edge pixels are repeated
+                (DrQ, Kostrikov et al. 2020).
+            color_strength: Strength of `augment_colors`, which changes half of the stacks before transitions.
+            state_size: Number of components of the `state` in an `info`.
 
         Raises:
-            InputError: the file has another size.
+            InputError: an existing file has another size.
             OSError: the disk has no room for the whole file.
         """
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
@@ -138,13 +137,13 @@ class FrameReplayBuffer(ReplayBuffer):
         self.rewards, self.ends = np.zeros(size, np.float32), np.zeros(size, np.float32)
         self.newest, self.age = np.zeros(size, np.int64), np.zeros(size, np.int64)
         self.states = np.zeros((*size, state_size), np.float32)
-        """The robot's state before each transition; NaN for an environment's first transition after `break_off`."""
+        """The robot's state before each transition; NaN for the first transition after `break_off`."""
         self.states_after = np.zeros((*size, state_size), np.float32)
         self._state = np.full((n_envs, state_size), np.nan, np.float32)
         slack = -(-2 * slack // n_envs)
         self._reach = self.buffer_size + self.buffer_size // _SHORT + self.stack + 2
         self.length = self._reach + slack
-        """Number of pictures that a ring holds."""
+        """Number of pictures in a ring."""
         shape = (n_envs, self.length, 3, height, width)
         if file is None:
             self.frames = np.zeros(shape, np.uint8)
@@ -152,11 +151,11 @@ class FrameReplayBuffer(ReplayBuffer):
             bytes_needed = int(np.prod(shape))
             if file.exists() and file.stat().st_size != bytes_needed:
                 raise InputError(f"{file} has {file.stat().st_size} bytes; expected {bytes_needed}: damaged")
-            allocate(file, bytes_needed)  # raises an error if the disk is full; otherwise SIGBUS would follow later
+            allocate(file, bytes_needed)  # a full disk causes an error now, not a SIGBUS hours later
             self.frames = np.memmap(file, np.uint8, "r+", shape=shape)
         self.written = np.zeros(n_envs, np.int64)
-        """Number of pictures written to each ring so far, overwritten ones included."""
-        self._ages = np.full(n_envs, -1)  # steps since each environment's episode began; -1: no episode yet
+        """Number of pictures written to each ring so far."""
+        self._ages = np.full(n_envs, -1)  # steps since each environment's episode began; -1: no episode
 
     def add(
         self,
@@ -167,9 +166,9 @@ class FrameReplayBuffer(ReplayBuffer):
         done: NDArray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """Adds a transition of every environment.
+        """Adds one transition per environment.
 
-        Until `done` or `break_off`, an environment's observations must be consecutive.
+        An environment's observations must be consecutive until its episode is `done`, or until `break_off`.
         """
         for i in range(self.n_envs):
             if self._ages[i] < 0:
@@ -184,14 +183,14 @@ class FrameReplayBuffer(ReplayBuffer):
                 self._state[i] = infos[i]["first_state" if done[i] else "state"]
         self.actions[self.pos] = action.reshape(self.n_envs, self.action_dim)
         self.rewards[self.pos] = reward
-        # An episode cut by its time limit does not end in a terminal state.
+        # An episode cut off by its time limit does not end in a terminal state.
         self.ends[self.pos] = [d and not info.get("TimeLimit.truncated") for d, info in zip(done, infos, strict=True)]
         self.pos += 1
         if self.pos == self.buffer_size:
             self.full, self.pos = True, 0
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplaySamples:  # type: ignore[override]
-        """Samples transitions uniformly among those for which `is_complete`; stacks are uint8."""
+        """Samples uniformly from the complete transitions (see `is_complete`); stacks are uint8."""
         filled = self.buffer_size if self.full else self.pos
         row, env_index = np.empty(0, int), np.empty(0, int)
         while len(row) < batch_size:
@@ -203,7 +202,7 @@ class FrameReplayBuffer(ReplayBuffer):
         if self.shift:
             before, after = self._shifted(before), self._shifted(after)
         if self.color_strength:
-            # Stacks after transitions, from which the targets are computed, stay unchanged (SVEA, Hansen et al. 2021).
+            # Targets are computed from the stacks after transitions, which stay unchanged (SVEA, Hansen et al. 2021).
             half = batch_size // 2
             before[:half] = augment_colors(before[:half], self.color_strength, self.rng)
         rest = self.actions[row, env_index], after, self.ends[row, env_index, None], self.rewards[row, env_index, None]
@@ -211,12 +210,12 @@ class FrameReplayBuffer(ReplayBuffer):
         return ReplaySamples(*(torch.as_tensor(part, device=self.device) for part in parts))
 
     def is_complete(self, row: NDArray, env_index: NDArray) -> NDArray[np.bool_]:
-        """Mask of transitions whose pictures are all still in the ring, shapes (k,) → (k,)."""
+        """True for each transition whose pictures are all still in the ring; shapes (k,) → (k,)."""
         oldest = self.newest[row, env_index] - np.minimum(self.age[row, env_index], self.stack - 1)
         return oldest >= self.written[env_index] - self._reach
 
     def stacks(self, row: NDArray, env_index: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Stacks before and after transitions, shapes (k,) → (k, 3 · stack, height, width) each."""
+        """The stacks before, and the stacks after, k transitions; each has the shape (k, 3 · stack, height, width)."""
         newest, age = self.newest[row, env_index], self.age[row, env_index]
         back = np.arange(self.stack - 1, -1, -1)
         first = (newest - age)[:, None]
@@ -227,14 +226,17 @@ class FrameReplayBuffer(ReplayBuffer):
         return out[0], out[1]
 
     def state(self) -> tuple[dict[str, NDArray], dict[str, Any]]:
-        """The buffer's state without pictures, as arrays and JSON-able values; flushes the pictures to their file."""
+        """Returns the buffer's state except for the pictures: arrays, and JSON-able values.
+
+        The pictures are flushed to their file.
+        """
         if isinstance(self.frames, np.memmap):
             self.frames.flush()
         arrays = {name: getattr(self, name) for name in _ROWS} | {"written": self.written}
         return arrays, {"pos": self.pos, "full": self.full, "rng": self.rng.bit_generator.state}
 
     def set_state(self, arrays: dict[str, NDArray], rest: dict[str, Any]) -> None:
-        """Restores what `state` returned. The pictures must be in the file; all environments begin new episodes."""
+        """Restores a state; the pictures are already in the file. All environments begin new episodes."""
         for name in (*_ROWS, "written"):
             getattr(self, name)[:] = arrays[name]
         self.pos, self.full = rest["pos"], rest["full"]
@@ -242,7 +244,7 @@ class FrameReplayBuffer(ReplayBuffer):
         self.break_off()
 
     def break_off(self) -> None:
-        """Marks that all environments begin new episodes with the next transition."""
+        """Call this before the next transition if all environments begin new episodes with it."""
         self._ages[:], self._state[:] = -1, np.nan
 
     def _write(self, env_index: int, picture: NDArray) -> None:

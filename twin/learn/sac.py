@@ -1,12 +1,12 @@
 """SAC from pixels (Haarnoja et al. 2018) on stable-baselines3, and the saved states of a training.
 
-Actor and critics share one encoder, which maps stacks to features. Only the critics' loss and that of the state head
-train it (Yarats et al. 2019; Kostrikov et al. 2020), and it has no target network (Yarats et al. 2021, DrQ-v2). An
-update runs the encoder forward twice and backward once. The separate encoders of stable-baselines3 would run forward
-five times and backward three times.
+Actor and critics share one encoder, which converts stacks to features. The actor's loss does not train it (Yarats et
+al. 2019; Kostrikov et al. 2020), and it has no target network (Yarats et al. 2021, DrQ-v2). An update has two forward
+passes and one backward pass of the encoder; with the separate encoders of stable-baselines3, it would have five and
+three.
 
-The critics also receive the robot's privileged *state* (Pinto et al. 2018, asymmetric actor-critic); the actor never
-does. A linear *state head* predicts the state from the features, as an auxiliary loss for the encoder.
+The critics, but not the actor, also receive the robot's privileged *state* (asymmetric actor-critic, Pinto et al.
+2018). A linear *state head* predicts the state from the features; its error is an auxiliary loss for the encoder.
 """
 
 import copy
@@ -41,13 +41,13 @@ from twin.learn.replay_buffer import FrameReplayBuffer
 from twin.types import Array32
 
 _LOGGED = ("critic_loss", "actor_loss", "state_loss", "ent_coef", "value")
-_MAX_STATE = 3.0  # states are clamped at this multiple of their scale
-_AVERAGING_RATE = 1e-3  # weight of the newest actor in the averaged actor, per update
+_MAX_STATE = 3.0  # states are clamped to ± this multiple of their scales
+_AVERAGING_RATE = 1e-3  # fraction of the actor that each update mixes into the averaged actor
 _STATE, _TENSORS, _REPLAY = "state.json", "tensors.safetensors", "replay.npz"
 
 
 class Encoder(BaseFeaturesExtractor):
-    """The layers of `Architecture` that map preprocessed stacks, values 0 to 255, to features."""
+    """The layers of `Architecture` that convert preprocessed stacks, with values 0 to 255, to features."""
 
     def __init__(self, observation_space: spaces.Box, architecture: Architecture) -> None:
         super().__init__(observation_space, architecture.features)
@@ -63,7 +63,7 @@ class Encoder(BaseFeaturesExtractor):
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
         """Shapes (n, 3 · stack, h, w) → (n, features)."""
-        # Scaling the first convolution's weights, instead of the pictures, saves a third of an update's time.
+        # The first convolution's weights are scaled instead of the pictures, which saves a third of an update's time.
         weight = self.first.weight
         bias = self.first.bias - 0.5 * weight.sum((1, 2, 3))  # type: ignore[operator]
         out = nn.functional.conv2d(pictures.float(), weight / 255.0, bias, self.first.stride)
@@ -71,14 +71,14 @@ class Encoder(BaseFeaturesExtractor):
 
 
 class DrivePolicy(SACPolicy):
-    """Actor and critics that share an encoder; the critics' optimizer trains it."""
+    """Actor and critics that share an encoder, which the critics' optimizer trains."""
 
     def __init__(self, *arguments: Any, state_size: int = 0, **rest: Any) -> None:
         self._state_size = state_size
         super().__init__(*arguments, **rest)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        """Returns critics whose inputs are features, states and actions."""
+        """Returns critics whose inputs are features and states."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         kwargs["features_dim"] += self._state_size
         return ContinuousCritic(**kwargs).to(self.device)
@@ -96,12 +96,14 @@ class PixelSAC(SAC):
     """SAC with a shared encoder and privileged states."""
 
     averaged_actor: Actor
-    """Running mean of the actor and its encoder; this is the policy that is saved. The actor itself fluctuates between
-    updates, and a single state of it may leave the road."""
+    """Running mean of the actor and its encoder; it is saved as the policy. The actor itself fluctuates from update to
+    update: if it were saved at a bad moment, the policy would leave the road."""
 
     def __init__(self, *arguments: Any, state_scales: tuple[float, ...] = (), **rest: Any) -> None:
-        """`state_scales`: typical magnitudes of the privileged state's numbers; empty: no privileged state. The other
-        arguments are those of `SAC`."""
+        """`state_scales`: typical magnitude of each component of the privileged state; empty: no state is used.
+
+        The other arguments are those of `SAC`.
+        """
         self._scales = state_scales
         super().__init__(*arguments, **rest)
 
@@ -168,7 +170,7 @@ class PixelSAC(SAC):
             self.logger.record(f"train/{name}", value)
 
     def break_off_episodes(self) -> None:
-        """Begins new episodes in all environments with the next step, so that they can be used for something else."""
+        """Makes all environments begin new episodes at the next step; meanwhile they may be used for anything."""
         assert isinstance(self.replay_buffer, FrameReplayBuffer)
         self.replay_buffer.break_off()
         self._last_obs = None
@@ -177,7 +179,7 @@ class PixelSAC(SAC):
         return (states / self._scale).clamp(-_MAX_STATE, _MAX_STATE)
 
     def _state_loss(self, features: torch.Tensor, states: torch.Tensor) -> torch.Tensor:
-        """Mean squared error of the state head over samples with a known state."""
+        """Mean squared error of the state head's predictions, over the samples whose state is known."""
         known = ~states.isnan().any(1)
         if not (self._scales and known.any()):
             return features.new_zeros(())
@@ -192,7 +194,7 @@ class PixelSAC(SAC):
 
 
 def actor_weights(model: PixelSAC, architecture: Architecture) -> dict[str, Array32]:
-    """Weights of the deterministic averaged actor, by the names in `Architecture.shapes`."""
+    """Weights of the averaged actor without its exploration; the names are those of `Architecture.shapes`."""
     actor = model.averaged_actor
     encoder = actor.features_extractor
     assert isinstance(encoder, Encoder)
@@ -210,13 +212,13 @@ def actor_weights(model: PixelSAC, architecture: Architecture) -> dict[str, Arra
 
 # ---- saved states
 #
-# A state contains the whole training, in files that run no code when they are loaded: tensors as safetensors, the
-# replay buffer without its pictures as npz, the rest as JSON. `state.json` is written last and names the folder
-# `state_<steps>` that is complete, so a killed training always leaves one complete state.
+# A saved state contains the whole training. Loading it runs no code: tensors are in a safetensors file, the replay
+# buffer without its pictures in an npz file, the rest in a JSON file. These files are in a folder `state_<steps>`. The
+# file `state.json` names this folder and is written last, so a killed training leaves one complete state.
 
 
 def save_state(folder: Path, model: PixelSAC, more: dict[str, Any]) -> None:
-    """Writes a state, together with the JSON-able values `more`, then removes the previous state.
+    """Writes a state, with the JSON-able values `more`, and then removes the previous state.
 
     Raises OSError: the disk is full; the previous state is intact.
     """
@@ -228,7 +230,7 @@ def save_state(folder: Path, model: PixelSAC, more: dict[str, Any]) -> None:
         write_bytes(folder / name / _TENSORS, tensor_bytes(_tensors(model)))
         arrays, replay = model.replay_buffer.state()
         save_arrays(folder / name / _REPLAY, arrays)
-    except OSError:  # frees space on the disk, so that the error can be logged
+    except OSError:  # free some space, so that the error can be logged
         remove(folder / name)
         raise
     counts = {"steps": model.num_timesteps, "updates": model._n_updates, "episodes": model._episode_num}
@@ -245,13 +247,13 @@ def has_state(folder: Path) -> bool:
 
 
 def saved_steps(folder: Path) -> int:
-    """Control steps of the saved state."""
+    """Number of control steps done when the state was saved."""
     with wrap_read_errors(folder / _STATE, "train anew under another name"):
         return int(read_json(folder / _STATE)["steps"])
 
 
 def load_state(folder: Path, model: PixelSAC) -> dict[str, Any]:
-    """Restores the saved state in a new model and returns the `more` given to `save_state`.
+    """Restores the saved state in a new model; returns the values given to `save_state` as `more`.
 
     Raises InputError: files are missing or damaged, or belong to another network.
     """
@@ -287,7 +289,7 @@ def _tensors(model: PixelSAC) -> dict[str, torch.Tensor]:
             out |= {f"optimizer.{name}.{i}.{key}": value for key, value in values.items()}
     if torch.cuda.is_available():
         out["rng.cuda"] = torch.cuda.get_rng_state()
-    # Copies, since the shared encoder has several names and safetensors does not store shared tensors.
+    # The tensors are copied: the shared encoder has several names, and safetensors does not store shared tensors.
     return {name: value.detach().cpu().clone().contiguous() for name, value in out.items()}
 
 

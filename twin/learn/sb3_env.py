@@ -14,11 +14,11 @@ from twin.loading import Twin
 
 
 class DriveVecEnv(VecEnv):
-    """n environments. An episode's last step resets its environment; the `info` then has the last observation.
+    """n environments. The last step of an episode also resets its environment; `info` has the last observation.
 
-    Every `info` has the privileged `state`. At an episode's end, it also has `first_state`, the state at the start of
-    the next episode. `lighting` is the lighting's name in tables; `sampled_lighting` corresponds to `lighting` of
-    Gymnasium's `info`.
+    Every `info` has the privileged `state`; at the end of an episode, it also has `first_state`, the state at the start
+    of the next episode. `lighting` is the name of the lighting in tables; `sampled_lighting` is the entry that
+    Gymnasium's `info` has as `lighting`.
     """
 
     def __init__(
@@ -30,7 +30,10 @@ class DriveVecEnv(VecEnv):
         processes: int | None = None,
         **options: Any,
     ) -> None:
-        """`seed`: environment i has the episodes of seed + i; None: random. Other arguments: see `make_vector_env`."""
+        """`seed`: environment i has the seed `seed` + i; None: unpredictable seeds.
+
+        The other arguments are those of `make_vector_env`.
+        """
         self.vector_env = make_vector_env(scene, task, options, [None] * n_envs, processes)
         super().__init__(n_envs, *make_spaces(self.vector_env))
         self._returns, self._lengths = np.zeros(n_envs), np.zeros(n_envs, int)

@@ -1,6 +1,6 @@
 """Configuration of a training, with presets for a CPU and for a GPU.
 
-*Steps* are control steps of all environments together, *updates* steps of the optimizers.
+*Steps* are control steps, counted over all environments together; *updates* are steps of the optimizers.
 """
 
 import dataclasses
@@ -15,8 +15,8 @@ from twin.learn.policy import Control
 from twin.learn.policy_network import Architecture
 
 _STATE_SCALES = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3, 0.3)
-"""Typical magnitudes of the privileged state: speed [m/s], yaw rate [rad/s], cross-track and heading error [m, rad],
-turns 1, 2 and 4 m ahead [rad]."""
+"""Typical magnitudes of the privileged state's components: speed [m/s], yaw rate [rad/s], cross-track error [m],
+heading error [rad], and the turns up to 1, 2 and 4 m ahead [rad]."""
 
 _LIMITS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**63 - 1),
@@ -48,7 +48,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "success": (0, 1),
     "save_every": (1, 10**10),
 }
-"""Limits of each number, beyond which arithmetic fails, memory runs out or a training never ends."""
+"""Lowest and highest value of each number. Beyond them, arithmetic fails, memory runs out, or a training never ends."""
 _CHOICES = {"observe": (NERF, SIMULATOR), "action": (STEERING, TWIST), "device": (CPU, CUDA)}
 
 _ROBOT_ONLY = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
@@ -56,7 +56,7 @@ _ROBOT_ONLY = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0
 
 
 def _numbers(value: Any) -> list[Any]:
-    """All numbers in a number, a tuple, or a tuple of tuples."""
+    """All numbers in `value`: a number, a tuple of numbers, or a tuple of such tuples."""
     groups = value if isinstance(value, tuple | list) else (value,)
     return [number for group in groups for number in (group if isinstance(group, tuple | list) else (group,))]
 
@@ -67,9 +67,9 @@ class TrainConfig:
 
     task: str = "straight"
     observe: str = NERF
-    """nerf, or simulator: MuJoCo's rendering of the extracted mesh."""
+    """`nerf`: pictures of the field; `simulator`: MuJoCo's pictures of the extracted mesh."""
     lighting: str = TRAINING
-    """See `env/episode_lighting.py`; the default is sampled for every episode."""
+    """See `env/episode_lighting.py`; by default, a lighting is sampled for every episode."""
     seed: int = 0
     success: float = 0.95
     """Success rate at which the training ends (`selection.py`)."""
@@ -77,7 +77,7 @@ class TrainConfig:
     """Largest number of steps."""
     worlds: int = 8
     action: str = STEERING
-    """This field and the next two are those of `Control`."""
+    """See `Control` for `action`, `speed` and `yaw_rate`."""
     speed: float = 1.0
     yaw_rate: float = 1.0
     centring: float = 1.0
@@ -85,18 +85,18 @@ class TrainConfig:
     steering: float = 0.5
     """Fraction of the step reward that is lost at full steering."""
     entropy: float = -0.5
-    """Target entropy per component of an action [nat]. For components in [-1, 1], -0.5 corresponds to a standard
-    deviation of 0.15, and -1 to 0.09."""
+    """Target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 corresponds to a
+    standard deviation of 0.15, and -1 to 0.09."""
     start_along: float = 0.9
-    """Every second episode starts within this first fraction of the segment, beside the route and at an angle to it, so
-    that a policy practices returning to the middle."""
+    """Half of the episodes start at a random point of this first fraction of the segment, not only at its beginning.
+    Starts are beside the route and at an angle to it, so that a policy practices returning to the middle."""
     randomise: bool = True
-    """Randomizes the robot in every episode and, where the lighting varies, weather and distractor objects."""
+    """Randomizes the robot in every episode; if the lighting varies, also the weather and distractor objects."""
     privileged: bool = True
-    """The critics, but not the policy, receive the robot's state, which the encoder learns to predict (`sac.py`)."""
+    """The critics, but not the policy, receive the robot's state; the encoder learns to predict it (`sac.py`)."""
     pool: int = 2
     convolutions: tuple[tuple[int, int, int], ...] = ((16, 5, 3), (32, 3, 2), (32, 3, 1))
-    """Channels, kernel and stride of each convolution."""
+    """Number of channels, side of the kernel and stride of each convolution."""
     features: int = 64
     hidden: tuple[int, ...] = (256, 256)
     batch: int = 128
@@ -105,14 +105,13 @@ class TrainConfig:
     starts: int = 1_000
     """Number of steps with random actions before learning begins."""
     updates: float = 0.5
-    """Updates per step."""
+    """Number of updates per step."""
     gamma: float = 0.97
-    """Discount per step; a reward 33 steps (3 s) ahead counts about a third."""
+    """Discount per step; at 0.97, a reward 36 steps (3.6 s) ahead counts a third."""
     learning_rate: float = 5e-4
     """Largest learning rate; see `training.cycle_rate`."""
     cycle: int = 12_000
-    """Length of a cycle of the learning rate [steps]. At its end the rate is lowest; the next cycle starts at the
-    largest rate."""
+    """Number of steps in a cycle of the learning rate, which falls within each cycle and starts high in the next."""
     tau: float = 0.01
     """Averaging rate of the target critics, per update."""
     shift: int = 2
@@ -120,18 +119,17 @@ class TrainConfig:
     colours: float = 1.0
     """Strength of color augmentation in updates (`replay_buffer.py`); applied only if the lighting varies."""
     checkpoints: int = 20
-    """Number of policies that are saved during the training, at equal intervals."""
+    """Number of policies saved during the training."""
     test_every: int = 3_000
-    """Steps between two tests of the policy (`selection.py`)."""
+    """Number of steps between two tests of the policy (`selection.py`)."""
     settle: int = 2_000
-    """Number of steps, with a falling learning rate, after a test that reached `success` or the last of several tests
-    without improvement (`selection.py`)."""
+    """Number of steps, with a falling learning rate, that follow when tests end a training (`selection.py`)."""
     save_every: int = 4_000
-    """Steps between two saved states."""
+    """Number of steps between two saved states."""
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        """Raises InputError: a value out of range, or a lighting that is reserved for validation."""
+        """Raises InputError: a value is out of range, or the lighting is reserved for validation."""
         for name, (low, high) in _LIMITS.items():
             given = getattr(self, name)
             for value in _numbers(given):
@@ -158,7 +156,7 @@ class TrainConfig:
 
     @property
     def state_scales(self) -> tuple[float, ...]:
-        """Typical magnitudes of the privileged state; empty without one."""
+        """Typical magnitudes of the privileged state's components; empty if no state is used."""
         return _STATE_SCALES if self.privileged else ()
 
     @property
@@ -168,9 +166,8 @@ class TrainConfig:
 
     def options(self) -> dict[str, Any]:
         """Options of the environment."""
-        # The goal is worth as much as the step rewards of an endless episode; otherwise it would pay to wait before the
-        # goal. The reward lost beside the route keeps policies away from the kerb, where a single disturbance can end
-        # an episode.
+        # The goal's reward equals that of surviving for ever: if it were less, a policy would linger before the goal.
+        # The loss of reward beside the route keeps policies away from the kerb, where one disturbance ends an episode.
         goal = Rewards.step * self.gamma / (1.0 - self.gamma)
         rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
         ranges = Ranges() if self.lighting_varies else _ROBOT_ONLY
@@ -187,7 +184,7 @@ class TrainConfig:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "cpu": {},
-    # The input has the paper's full resolution. This preset has not been measured on a GPU.
+    # Pictures have the full resolution, as in the paper. This preset was not measured on a GPU yet.
     "gpu": {
         "pool": 1,
         "convolutions": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),

@@ -1,9 +1,10 @@
-"""Logs a training as a run of Weights & Biases (wandb.ai), by the optional package `wandb`.
+"""Shows a training as a run of Weights & Biases (wandb.ai), if the package `wandb` is installed.
 
-The run contains the training's configuration and its numbers over the training's steps: those of `tensorboard/` under
-the same names, those of `episodes.csv`, `log.csv` and `tests.json` as `episodes/...`, `log/...` and `tests/...`. At the
-end of the training, the curve of successes and a film of the kept policy are added. A resumed training continues its
-run. wandb's own environment variables apply: with `WANDB_MODE=offline`, the run stays in `runs/<name>/wandb`.
+The run gets the training's configuration, and these numbers as functions of the training's steps: those of
+`tensorboard/` under the same names, and those of `episodes.csv`, `log.csv` and `tests.json` as `episodes/...`,
+`log/...` and `tests/...`. At the end, it gets the curve of successes and a film of the kept policy. A resumed training
+continues its run. wandb's own environment variables apply: with `WANDB_MODE=offline`, the run is only written to
+`runs/<name>/wandb`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,19 +23,18 @@ if TYPE_CHECKING:
     import wandb
 
 ID_FILE = "wandb.json"
-"""File in the training's folder with the project and id by which a resumed training finds its run of Weights & Biases.
-"""
+"""File in the training's folder with project and id of its run of Weights & Biases, so that it can be continued."""
 
 _STEP = "step"
 
 
 class WandbRun(KVWriter):
-    """An output of stable-baselines3's logger that writes to a run of Weights & Biases."""
+    """Writes to a run of Weights & Biases; can be used as an output of stable-baselines3's logger."""
 
     def __init__(self, run: "wandb.Run") -> None:
         self._run = run
-        # Steps are logged as an ordinary number. wandb's own step must not decrease, but a training that was killed
-        # continues from the step of its last saved state.
+        # Steps are logged as their own metric. wandb's built-in steps must not decrease, but a training's steps do when
+        # it was killed and continues from its last saved state.
         run.define_metric(_STEP)
         run.define_metric("*", step_metric=_STEP)
 
@@ -60,15 +60,15 @@ class WandbRun(KVWriter):
 
 @contextmanager
 def wandb_run(project: str, folder: Path, config: Mapping[str, Any]) -> Iterator[WandbRun]:
-    """Opens the run of the training in `folder`, and closes it on exit; an exception marks the run as failed.
+    """Opens the run of the training in `folder`, and closes it at the end; an exception marks it as failed.
 
     Args:
         project: Name of the project, or `entity/project`.
-        folder: The training's folder. A folder `wandb` and the file `ID_FILE` are created in it.
+        folder: The training's folder, in which a folder `wandb` and the file `ID_FILE` are created.
         config: Shown as the run's configuration.
 
     Raises:
-        InputError: wandb is not installed, or it cannot start a run, for example because nobody is logged in.
+        InputError: wandb is not installed, or it reports an error, for example that nobody is logged in.
     """
     try:
         import wandb
@@ -84,7 +84,7 @@ def wandb_run(project: str, folder: Path, config: Mapping[str, Any]) -> Iterator
             resume="allow",
             dir=str(folder),
             config=dict(config),
-            settings=wandb.Settings(console="off"),  # capturing the console would break the progress bar
+            settings=wandb.Settings(console="off"),  # otherwise wandb captures the progress bar
         )
     except wandb.Error as error:
         cure = "wandb login, or set WANDB_MODE=offline"
@@ -95,7 +95,7 @@ def wandb_run(project: str, folder: Path, config: Mapping[str, Any]) -> Iterator
 
 
 def _earlier_id(folder: Path, project: str) -> str | None:
-    """Id of the Weights & Biases run that a saved training continues; None: a new run is created."""
+    """Id of the run that a saved training continues; None: there is none, so a new run begins."""
     path = folder / ID_FILE
     if not path.exists() or not has_state(folder / "state"):
         return None
