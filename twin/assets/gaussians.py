@@ -26,8 +26,10 @@ VIEWS, WIDTH = 60, 320
 FAR = 100.0  # [m] geometry at a larger depth becomes background
 _BACKGROUND = 150.0  # [m] distance of the background's splats
 _MIN_SKY, _MAX_SKY = 500, 50_000  # number of pixels that the sky's color is fitted to
-_SKY_TOLERANCE = 30.0  # of 255; a color is the sky's if their rms difference (lightings, channels) is smaller
-_BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3  # larger tolerance, which holds up to so many pixels beside the sky's [px]
+# A pixel has the sky's color if its rms difference from it, over all lightings and channels, is below the tolerance.
+_SKY_TOLERANCE = 30.0  # of 255
+# The tolerance [of 255] is larger near such pixels, up to the reach [px] from them.
+_BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3
 _MIN_CELL = 0.01  # [m] side of the smallest thinning cell; each cell keeps one Gaussian
 _DISK, _THICKNESS = 0.8, 0.2  # standard deviations along the surface and across it [pixel widths]
 _MAX_ELONGATION = 4.0  # length / width of a disk seen at a grazing angle
@@ -141,7 +143,9 @@ _COLUMNS = {"f_dc": 3, "scale": 3, "rot": 4}
 
 
 def views_by_lighting(field: ColorField, cameras: Cameras, lightings: Sequence[str]) -> dict[str, Views]:
-    """Views under each lighting, in air without fog, from which Gaussians are made; all have the same depth.
+    """Renders the views for Gaussians under each lighting, without fog.
+
+    The depth images are the same under every lighting.
 
     Raises:
         InputError: unknown lighting.
@@ -163,10 +167,11 @@ def gaussians_by_lighting(views: Mapping[str, Views]) -> dict[str, Gaussians]:
 def sky_on_surfaces(views: Sequence[Views]) -> NDArray[np.bool_]:
     """Mask of pixels (n, h, w) that have the sky's color but a nearer depth, such as gaps in the crown of a tree.
 
-    Seen from elsewhere, Gaussians of such pixels would look like blue clumps; they belong to the background. The sky's
-    color under each lighting is a quadratic function of the direction, fitted to the pixels of the background. A pixel
-    above the horizon is in the mask if its mean square difference from that color, over all lightings, is small. For
-    pixels beside it the limit is larger, since they blend the sky's color with that of leaves.
+    From other viewpoints, Gaussians of such pixels would look like blue clumps, so `views_by_lighting` moves these
+    pixels to the background. The sky's color under each lighting is a quadratic function of the direction, fitted to
+    the pixels of the background. A pixel above the horizon is in the mask if its mean square difference from that
+    color, over all lightings and channels, is small. Up to `_BLEND_REACH` pixels from such a pixel the limit is larger,
+    since pixels there blend the sky's color with that of leaves.
 
     Args:
         views: The same views under each filmed lighting.
@@ -254,9 +259,10 @@ def _surface_normals(points: Array) -> Array:
 
 
 def select_sharpest(points: Array, width: Array) -> NDArray[np.int64]:
-    """Indices of the points (k, 3) to keep: the point of smallest width (k,) [m] in each cell that has no finer point.
+    """Indices of the points to keep, given their positions (k, 3) [m] and widths (k,) [m].
 
-    The side of a point's cell is its width, rounded up to `_MIN_CELL` times a power of two.
+    The side of a point's cell is its width, rounded up to `_MIN_CELL` times a power of two. Cells are filled from the
+    smallest size up. Each keeps its point of smallest width, unless it contains a point kept at a smaller cell size.
     """
     level = np.maximum(np.ceil(np.log2(width / _MIN_CELL)), 0).astype(int)
     kept: list[NDArray[np.int64]] = []

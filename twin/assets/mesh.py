@@ -130,7 +130,8 @@ def _visual_mesh(volume: tsdf.Volume, views: Views, ground: Ground) -> tuple[dic
     above = vertices[:, 2] - ground.at(vertices[:, :2]) > 0.05
     vertices, faces = tsdf.compact(vertices, faces[above[faces].any(1)])
     colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, volume.band)
-    # Removes the rear boundary of the band of valid distances, which is not a surface and which no view sees.
+    # Valid distances form a band around each surface. The rear boundary of that band also yields triangles. They are no
+    # surface, and no view sees them, so they are removed.
     vertices, faces = tsdf.compact(vertices, faces[seen[faces].all(1)])
     vertices, faces, floaters = tsdf.remove_specks(vertices, faces, _SPECK_AREA)
     vertices, faces = tsdf.decimate(vertices, faces, _VISUAL_FACES * 2 // 3)
@@ -199,7 +200,10 @@ def _save_parts(
 
 
 def _roughness(ground: Ground, route: Array | None) -> dict[str, float | None]:
-    """RMS slope of the measured ground; for a route its RMS slope and curvature, and the measured share near it."""
+    """RMS slope of the measured ground.
+
+    With a route, also the RMS slope and curvature along it, and the share of the ground near it that was measured.
+    """
     dy, dx = np.gradient(ground.height, ground.cell)
     slope = np.hypot(dx, dy)[ground.measured]
     metrics: dict[str, float | None] = {"slope_rms": float(np.sqrt(np.mean(slope**2))) if len(slope) else None}

@@ -168,9 +168,10 @@ class RadianceField:
         depth_reach: float = 1.0,
         log_offset: float = 1.0,
     ) -> None:
-        """Gradients of opacity, features and Σwᵢ/tᵢ per ray → gradients of the network outputs.
+        """Loss gradients with respect to opacity, features and Σwᵢ/tᵢ per ray → with respect to network outputs.
 
-        The last four arguments are weights and scales of two regularizers, see `composite.composite_backward`.
+        The samples of a ray have weights wᵢ and distances tᵢ [m]. The last four arguments are weights and scales of two
+        regularizers, see `composite.composite_backward`.
         """
         wp.launch(
             volume.composite_backward,
@@ -270,7 +271,10 @@ class RadianceField:
 
     @contextmanager
     def workspace(self, rays: int, samples: int, extra: int = 0) -> Iterator[Workspace]:
-        """Lends a spare or new workspace of this size. It is thread-safe, as each list operation is atomic."""
+        """Lends a spare or new workspace of this size.
+
+        Several threads may call this at the same time, since each dict and list operation is atomic.
+        """
         spares = self._spare.setdefault((rays, samples, extra), [])
         try:
             ws = spares.pop()
