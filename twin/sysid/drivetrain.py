@@ -19,8 +19,8 @@ from twin.sysid.estimation import Fit, Kinds, Parameter, fit_parameters, negativ
 from twin.sysid.logs import PERIOD, SAMPLES, Windows
 from twin.types import Array
 
-CONTROL_STEP = 0.01  # samples after a window's end, for poses measured after it
-EXTRA_SAMPLES = 5  # samples beyond a window's end, for poses measured later than logged
+CONTROL_STEP = 0.01  # [s] of the simulation
+EXTRA_SAMPLES = 5  # samples after a window's end, for poses measured after it
 
 _HISTORY = 20  # samples of the previous window from which delayed commands are taken
 _CHAIN = 3  # previous windows over which a ramp is simulated: six seconds
