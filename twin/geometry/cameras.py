@@ -144,7 +144,9 @@ class Viewpoints:
 
 
 def intrinsics_for_size(cameras: PosedCameras, size: tuple[int, int] | None) -> tuple[Array, tuple[int, int]]:
-    """Returns intrinsics (n, 4) for one image size, and that size. It is `size` if given, else the size of all cameras.
+    """Returns intrinsics (n, 4) scaled to one image size, and that size.
+
+    The size is `size` if given, else the one that all cameras share.
 
     Raises InputError: no size is given and the cameras' sizes differ.
     """

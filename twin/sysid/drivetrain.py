@@ -139,7 +139,7 @@ def _wheel_speeds(drivetrain: Drivetrain, ramped: Array, speed: Array) -> tuple[
 
 
 def at_samples(fine: Array) -> Array:
-    """Picks every `PERIOD` [s] from values that are `CONTROL_STEP` [s] apart; the result has shape (n, k, 2)."""
+    """Picks a value every `PERIOD` [s] from values `CONTROL_STEP` [s] apart; the result has shape (n, k, 2)."""
     return fine[:, : SAMPLES * _PER_SAMPLE : _PER_SAMPLE]
 
 
