@@ -144,7 +144,9 @@ class Viewpoints:
 
 
 def intrinsics_for_size(cameras: PosedCameras, size: tuple[int, int] | None) -> tuple[Array, tuple[int, int]]:
-    """Intrinsics (n, 4) scaled to one image size, and that size: `size`, or by default the cameras' common size.
+    """Returns intrinsics (n, 4) scaled to one image size, and that size.
+
+    The size is `size` if given, else the one that all cameras share.
 
     Raises InputError: no size is given and the cameras' sizes differ.
     """

@@ -18,7 +18,7 @@ from twin.types import Array
 
 SCENE_XML = "scene.xml"
 GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4
-"""Geom groups; the last one is the site group of route, corridor and goal."""
+"""Geom groups of the ground, the visual mesh and the parts, and the site group of route, corridor and goal."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,11 @@ def point_at(route: Array, s: Array | float) -> Array:
 
 
 def heading_at(route: Array, s: Array | float, window: float = 1.0) -> Array:
-    """Heading [rad] at arc lengths s [m], shape as s: that of a chord over `window` [m] around s."""
+    """Heading [rad] at arc lengths s [m], in the shape of s.
+
+    It is the direction of the chord from s - window / 2 to s + window / 2; near the route's ends, of the first or last
+    chord that lies on the route.
+    """
     length = arc_lengths(route)[-1]
     window = min(window, length)
     middle = np.clip(s, window / 2, length - window / 2)
@@ -143,7 +147,7 @@ def nearest_on_route(
     """
     knots, xy = arc_lengths(route), np.asarray(xy)
     low, high = (knots[0], knots[-1]) if around is None else around
-    # Indices of the segments that overlap each range, padded to the largest number of them.
+    # Indices of the segments that overlap each range of `around`, padded to the largest number of segments in a range.
     first = np.broadcast_to(np.searchsorted(knots[1:], low), xy.shape[:-1])
     last = np.broadcast_to(np.searchsorted(knots[:-1], high, "right"), xy.shape[:-1])
     run = first[..., None] + np.arange(np.max(last - first, initial=1))

@@ -230,7 +230,7 @@ def require_pyarrow() -> None:
 
 
 def _statistics(values: NDArray) -> dict[str, Array]:
-    """LeRobot's statistics of a column (k, n) or (k,). All but `count` have shape (n,), for (k,) shape (1,)."""
+    """LeRobot's statistics of a column (k, n) or (k,). All but `count` have shape (n,), or (1,) for a column (k,)."""
     table = values.reshape(len(values), -1).astype(np.float64)
     return _summary(table.min(0), table.max(0), table.mean(0), table.std(0), len(table))
 
@@ -262,7 +262,7 @@ def _merged(stats: list[dict[str, Array]]) -> dict[str, Array]:
 
 
 def _task_table(tasks: list[str]) -> "pyarrow.Table":
-    """Table of tasks. Its metadata for pandas make the task's text the index when LeRobot reads the table."""
+    """Table of tasks. Its pandas metadata tell LeRobot to use the text of the task as the index."""
     import pyarrow as pa
 
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})

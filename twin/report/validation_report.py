@@ -1,9 +1,9 @@
 """The summary of a validation, and `validation.html`: how often policies reach the goal, and why they fail.
 
 `results` is the content of `summary.json`: the result of `summarize`, and entries that `twin.validate` adds. Paired
-episodes share lighting and seed. Two policies are compared by the exact McNemar test on two numbers: that of the
-episodes in which only the first succeeded, and that of the episodes in which only the second did. Videos are files
-beside the page; their posters are embedded in the page.
+episodes share lighting and seed. Two policies are compared by the exact McNemar test. It takes two counts: the episodes
+in which only policy A succeeded, and those in which only policy B succeeded. Videos are files beside the page; their
+posters are embedded in the page.
 """
 
 from collections import Counter
@@ -51,7 +51,7 @@ from twin.scene import SceneDir
 MAX_P_VALUE = 0.1
 """A paired difference with a larger p-value is reported as within chance."""
 FEW_EPISODES = 30
-"""A cell with fewer episodes gets a caution about wide intervals."""
+"""A cell (one policy on one task in one lighting) with fewer episodes gets a caution that its interval is wide."""
 TRUSTED = 0.8
 """An episode is counted separately if the mean trust in its pictures is lower."""
 FAILURES = {
@@ -94,7 +94,7 @@ def summarize(trials: Sequence[Trial]) -> dict[str, Any]:
 
 
 def compare_pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """Compares every two policies of a task on the episodes that both drove. Pairs without any are left out."""
+    """Compares every two policies of a task on the episodes that both drove, unless there are none."""
     by_policy: dict[tuple[str, str], dict[tuple[str, int], bool]] = {}
     for t in trials:
         by_policy.setdefault((t.task, t.policy), {})[t.lighting, t.seed] = t.success
@@ -272,7 +272,7 @@ def summary_lines(results: dict[str, Any]) -> list[str]:
 # ---- figures
 
 MAX_PLOTTED_LIGHTINGS = 4
-"""Rates are plotted with intervals for up to so many lightings; those of more are shown as a heatmap."""
+"""Up to this number of lightings, rates are plotted with intervals; with more, they are shown as a heatmap."""
 
 _BIN = 2.0  # [m] width of the failure histogram's bins along the route
 _FAILURE_LOOKS = {  # cause → color and hatching

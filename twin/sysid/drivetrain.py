@@ -1,11 +1,12 @@
 """Drivetrain model, fitted to a log: how the robot's controller and servos turn commands into wheel speeds.
 
 The model applies the limits of `twin.env.controller` to many windows at once, every 0.01 s instead of every 0.1 s, so
-that it is smooth in its parameters. (A real controller waits for its next period, and then changes speed for a whole
-period at once; on average these two effects cancel.) *Mean* and *half* speed are the mean of the two sides and half
-their difference [rad/s at the wheels]. Wheel commands may be in units of another robot (DRIVE's log assumes a Husky
-with wheels of 0.3 m), so they have a gain for the mean and one for the half speed. For commands v and ω, the gain of
-the mean speed is 1, and that of the half speed is the controller's separation multiplier.
+that it is smooth in its parameters. (A real controller reacts up to one period late, but then changes the speed in one
+step by as much as the limit allows per period. On average the delay and the early step cancel.) *Mean* and *half*
+speed are the mean of the two sides and half their difference [rad/s at the wheels]. Wheel commands may be in units of
+another robot (DRIVE's log assumes a Husky with wheels of 0.3 m), so they have a gain for the mean and one for the half
+speed. For commands v and ω, the gain of the mean speed is 1, and that of the half speed is the controller's separation
+multiplier.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from twin.sysid.logs import PERIOD, SAMPLES, Windows
 from twin.types import Array
 
 CONTROL_STEP = 0.01  # [s] of the simulation
-EXTRA_SAMPLES = 5  # samples beyond a window's end, for poses measured later than logged
+EXTRA_SAMPLES = 5  # samples after a window's end, for poses measured after it
 
 _HISTORY = 20  # samples of the previous window from which delayed commands are taken
 _CHAIN = 3  # previous windows over which a ramp is simulated: six seconds
@@ -56,7 +57,10 @@ class Drivetrain:
         )
 
     def robot_fields(self, params: HuskyParams, twist: bool) -> dict[str, float]:
-        """Its values of `HuskyParams` fields; for wheel commands the separation multiplier is that of `params`."""
+        """Converts the drivetrain to fields of `HuskyParams`.
+
+        If commands are wheel speeds (not `twist`), the separation multiplier is copied from `params`.
+        """
         multiplier = self.half_gain if twist else params.separation_multiplier
         half = multiplier * TRACK / 2 / WHEEL_RADIUS
         return {
@@ -73,9 +77,9 @@ class Drivetrain:
 def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array, Array]:
     """Servo targets and the resulting wheel speeds, starting from each window's first wheel speeds.
 
-    A window that follows others starts with their delayed commands and with the state of their acceleration ramps;
-    it cannot be read from the wheel speeds, which lag behind the ramps. In other windows the wheels keep their speed
-    until the first command arrives.
+    A window that follows another one starts with that window's delayed commands and with the end state of its
+    acceleration ramp. That state cannot be read from the wheel speeds, which lag behind the ramp. In other windows the
+    wheels keep their speed until the first command arrives.
 
     Returns:
         Targets and lagged wheel speeds, left and right [rad/s], each of shape (n, (k + EXTRA_SAMPLES) · 5, 2),
@@ -104,7 +108,8 @@ def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array
             begin[follows] = ended[follows - 1]
         return _wheel_speeds(drivetrain, _ramped(drivetrain, arrived, begin), speed)
 
-    # Between two whole delays, the results are interpolated, not the commands: ramps are not linear in their input.
+    # If the delay is not a whole number of steps, the results for the two nearest whole numbers are interpolated, not
+    # the commands, because ramps are not linear in their input.
     one, other = delayed_by(whole), delayed_by(whole + 1)
     return (1 - share) * one[0] + share * other[0], (1 - share) * one[1] + share * other[1]
 
@@ -119,9 +124,9 @@ def _ramped(drivetrain: Drivetrain, commanded: Array, now: Array) -> Array:
 
 
 def _wheel_speeds(drivetrain: Drivetrain, ramped: Array, speed: Array) -> tuple[Array, Array]:
-    """Servo targets for mean and half speeds (n, steps, 2), and the wheel speeds that lag behind them, from `speed`.
+    """Converts mean and half speeds (n, steps, 2) to servo targets and to wheel speeds that lag behind the targets.
 
-    Both are left and right [rad/s], shape (n, steps, 2).
+    The wheel speeds start at `speed` (n, 2). Both results are left and right [rad/s], shape (n, steps, 2).
     """
     sides = np.stack([ramped[..., 0] - ramped[..., 1], ramped[..., 0] + ramped[..., 1]], -1)
     targets = limit_sides(sides, drivetrain.wheel_limit)
@@ -134,7 +139,7 @@ def _wheel_speeds(drivetrain: Drivetrain, ramped: Array, speed: Array) -> tuple[
 
 
 def at_samples(fine: Array) -> Array:
-    """Values `CONTROL_STEP` [s] apart, taken every `PERIOD` [s] of a window, shape (n, k, 2)."""
+    """Picks a value every `PERIOD` [s] from values `CONTROL_STEP` [s] apart; the result has shape (n, k, 2)."""
     return fine[:, : SAMPLES * _PER_SAMPLE : _PER_SAMPLE]
 
 
