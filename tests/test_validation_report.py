@@ -158,7 +158,7 @@ def test_the_headline_compares_what_all_have_driven():
         and verdict.mood == "mixed"
     )
     apart = [trial("a", 0, light="day"), trial("b", 0, light="night")]
-    assert "there is no best one" in verdicts(told(apart))[0].text
+    assert "the best policy is not known" in verdicts(told(apart))[0].text
     alike = [trial("a", 0), trial("b", 0)]
     assert "most often" not in verdicts(told(alike))[0].text and "“b” as often" in verdicts(told(alike))[0].text
 
@@ -183,7 +183,7 @@ def test_numbers_have_intervals_and_what_is_missing_is_not_made_up(tmp_path):
     text = page(tmp_path, told([trial("my_module:act")])).text
     assert "not known" in text and "nan" not in text and "None" not in text
     assert "There is no such episode here" in text and "No videos" in text
-    for absent in ("Which policy is better", "The worst light that", "How they were trained"):
+    for absent in ("Which policy is better", "The worst light that", "How the policies were trained"):
         assert (absent in text) == (absent == "The worst light that")
 
 
@@ -225,7 +225,7 @@ def test_the_verb_writes_a_page_that_needs_nothing_else(fresh):
     assert json.loads((folder / "summary.json").read_text()) == said
     assert list(said["training"]) == ["ahead"]  # the other's run has no episodes
     won = [success for step, success in EPISODES if step <= TRAINED["step"]][-RECENT_EPISODES:]
-    assert rate_text(rate_summary(sum(won), len(won))) in shown.text and "How they were trained" in shown.text
+    assert rate_text(rate_summary(sum(won), len(won))) in shown.text and "How the policies were trained" in shown.text
     assert f"python -m twin.forecast {fresh} --real real.csv" in shown.text and "ahead,ahead,LIGHT" in shown.text
     assert html.count("<svg") == html.count('<svg role="img" aria-label="') > 0
 
@@ -324,9 +324,9 @@ def test_a_robot_without_identified_parameters_gives_a_caution():
     def cautions(light: str, **more) -> str:
         return " ".join(c.what for c in limitations(told([trial(light=light)], **more)))
 
-    assert "every episode has a robot with other random parameters" in cautions("held-out+randomised", robot_known=[])
-    assert "random parameters" not in cautions("held-out+randomised", robot_known=["friction"])
-    assert "random parameters" not in cautions("held-out", robot_known=[])
+    assert "parameters are random in each episode" in cautions("held-out+randomised", robot_known=[])
+    assert "parameters are random" not in cautions("held-out+randomised", robot_known=["friction"])
+    assert "parameters are random" not in cautions("held-out", robot_known=[])
 
 
 @pytest.mark.filterwarnings("error::UserWarning")

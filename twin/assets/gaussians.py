@@ -116,7 +116,8 @@ def read_ply(path: Path) -> Gaussians:
     wanted = ["x", "y", "z", "opacity", *(f"{kind}_{c}" for kind, n in _COLUMNS.items() for c in range(n))]
     missing = [name for name in wanted if name not in dict(names)]
     if missing or len(dict(names)) < len(names):
-        raise InputError(f"{path} lacks {missing or 'different names of its properties'}; {cure}")
+        what = f"lacks {missing}" if missing else "has two properties of the same name"
+        raise InputError(f"{path} {what}; {cure}")
     row = np.dtype(names)
     start = len(head) + len(found)
     if len(content) - start < count * row.itemsize:

@@ -534,7 +534,9 @@ class BakedField:
         head = read_json(path)
         with wrap_read_errors(path, "build the scene again"):
             if head.get("format") != _FORMAT:
-                raise InputError(f"{path}: format {short_repr(head.get('format'))}, expected {_FORMAT}; build it anew")
+                raise InputError(
+                    f"{path}: format {short_repr(head.get('format'))}, expected {_FORMAT}; build the scene again"
+                )
             layout: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in head["layout"].items()}
             bricks = BrickLayout(**layout)
             names, frames = tuple(map(require_text, head["lightings"])), tuple(map(require_text, head["frames"]))

@@ -317,7 +317,9 @@ class RadianceField:
         head = read_json(path)
         with wrap_read_errors(path, "build the scene again"):
             if head.get("format") != _FORMAT:
-                raise InputError(f"{path}: format {short_repr(head.get('format'))}, expected {_FORMAT}; build it anew")
+                raise InputError(
+                    f"{path}: format {short_repr(head.get('format'))}, expected {_FORMAT}; build the scene again"
+                )
             layout = Layout(**(head["layout"] | {key: tuple(head["layout"][key]) for key in ("centre", "half")}))
             names, frames = tuple(map(require_text, head["lightings"])), tuple(map(require_text, head["frames"]))
             frame_lighting, about = np.array(head["frame_lighting"], np.int64), dict(head["about"])

@@ -65,7 +65,7 @@ FAILURES = {
 LIGHTING_SETS = {
     HELD_OUT: "another light for every episode, sampled from those reserved for evaluation",
     TRAINING: "another light for every episode, sampled from those used in training",
-    ANY: "another light for every episode, sampled from all that could have been filmed",
+    ANY: "another light for every episode, sampled from all plausible lights",
 }
 """Name of a set of lightings → its meaning."""
 
@@ -143,9 +143,9 @@ def lighting_text(lighting: str) -> str:
     condition = Condition.parse(lighting)
     if condition.randomised:
         return (
-            f"{lighting_text(condition.lighting)}; and for every episode another sun, other shadows, "
-            "haze unless a photo determines it, objects beside the corridor, and other robot parameters except for the "
-            "identified ones"
+            f"{lighting_text(condition.lighting)}. Each episode also has its own sun, shadows, "
+            "objects beside the corridor, and values of the robot parameters that were not identified; the haze varies "
+            "too, unless a photo determines it"
         )
     if lighting.startswith("drawn_"):
         return f"light number {lighting[6:]} of those sampled in the search"
@@ -192,7 +192,7 @@ def _task_verdict(task: str, cells: list[dict[str, Any]]) -> Verdict:
     # Policies are compared only in the lightings that all of them drove in.
     common = set.intersection(*lightings.values())
     if not common:
-        return Verdict(f"On {task} no lighting was used for all policies: there is no best one.", "mixed")
+        return Verdict(f"On {task} no lighting was used for all policies, so the best policy is not known.", "mixed")
     shared = {policy: [c for c in cells if c["policy"] == policy and c["lighting"] in common] for policy in lightings}
     means = {policy: sum(c["rate"] for c in mine) / len(common) for policy, mine in shared.items()}
     best = max(means, key=lambda policy: means[policy])
@@ -215,7 +215,7 @@ def _task_verdict(task: str, cells: list[dict[str, Any]]) -> Verdict:
 def limitations(results: dict[str, Any]) -> list[Caution]:
     """Limits of the validation, with cures."""
     cells = results["cells"]
-    what = "These rates are success in the twin. Success on the road was not measured here."
+    what = "These are success rates in the twin. Success on the road was not measured here."
     out = [Caution(what, "drive some of the policies on the road and run python -m twin.forecast.")]
     if few := [c["trials"] for c in cells if c["trials"] < FEW_EPISODES]:
         what = (
@@ -226,8 +226,8 @@ def limitations(results: dict[str, Any]) -> list[Caution]:
     drawn = dict.fromkeys(c["lighting"] for c in cells if Condition.parse(c["lighting"]).randomised)
     if drawn and not results.get("robot_known"):
         what = (
-            f"The result may differ for your robot: under {join_names(drawn)} every episode has a robot with other "
-            "random parameters, because none of yours are identified."
+            f"The result may differ for your robot: under {join_names(drawn)} the robot's parameters are random in "
+            "each episode, because those of your robot have not been identified."
         )
         cure = "log five minutes of driving, run python -m twin.align, build again and validate again."
         out.append(Caution(what, cure))
@@ -263,8 +263,8 @@ def summary_lines(results: dict[str, Any]) -> list[str]:
         )
     for w in results.get("worst", []):
         out.append(
-            f"{w['policy']}, {w['task']}: of {w['of']} sampled lights the worst is {w['lighting']}, in new "
-            f"episodes {w['successes']}/{w['trials']} ({w['low']:.2f} to {w['high']:.2f})"
+            f"{w['policy']}, {w['task']}: of {w['of']} sampled lights the worst is {w['lighting']}; "
+            f"tested there again: {w['successes']}/{w['trials']} new episodes ({w['low']:.2f} to {w['high']:.2f})"
         )
     return out
 
@@ -416,9 +416,9 @@ def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: S
         "better": "Which policy is better?" if results["pairs"] else "",
         "worst": "The worst light" if results["worst"] else "",
         "trust": "Are the pictures reliable?",
-        "where": "Where do they fail?",
+        "where": "Where do the policies fail?",
         "films": "Videos",
-        "training": "How they were trained" if curves else "",
+        "training": "How the policies were trained" if curves else "",
         "unknown": "Limitations",
         "next": "What to do next",
     }
@@ -466,11 +466,11 @@ def _task(results: dict[str, Any], task: str) -> dict[str, Any]:
         title, figure = f"Share of episodes that reached the goal, with 90% intervals ({each})", rate_figure(mine)
     else:
         trained = {policy: rate["rate"] for policy, rate in results["training"].items()}
-        title = f"Episodes that reached the goal [%] ({each}); the mean is over the common lights"
+        title = f"Episodes that reached the goal [%] ({each}); the mean is over the lights that all policies drove in"
         figure = rate_heatmap(mine, trained)
     pair_title = (
-        "Number of episodes in which only the row’s policy reached the goal, minus those of the column’s: blue and + "
-        "is better, red and − is worse, pale and in parentheses is within chance"
+        "Number of episodes in which only the row’s policy reached the goal, minus the number in which only the "
+        "column’s did. Blue, +: the row’s policy is better; red, −: worse; pale, in parentheses: within chance"
     )
     return {
         "name": task,
@@ -502,11 +502,14 @@ def _next_steps(results: dict[str, Any], root: Path) -> list[tuple[str, list[str
         ),
         (
             "Write real.csv, with a line for each policy and light: the light’s name, how often you drove, and how "
-            "often the goal was reached. If the twin has no light of that name, name the one to compare with in a "
-            "further column twin_lighting, such as held-out.",
+            "often the goal was reached. If the twin has no light of that name, add a column twin_lighting with "
+            "the twin’s light to compare with, for instance held-out.",
             [*table, *(["…"] if len(policies) > 2 else [])],
         ),
-        ("Forecast how all of them do on the road:", [command("forecast", root, "--real", "real.csv")]),
+        (
+            "Forecast how often each policy reaches the goal on the road:",
+            [command("forecast", root, "--real", "real.csv")],
+        ),
     ]
 
 
