@@ -74,7 +74,7 @@ def trial(
 
 
 def told(trials, **more) -> dict:
-    """What `summary.json` would hold."""
+    """Contents of `summary.json`, summarized from trials."""
     return summarize(trials) | {"training": {}, "worst": [], "films": []} | more
 
 

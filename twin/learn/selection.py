@@ -1,20 +1,19 @@
-"""Tests of policies between segments of a training; they decide when it ends, and which policy is kept.
+"""Decides when a training ends and which of its policies is kept, by tests between segments of the training.
 
-A *test* drives the newest policy, without exploration, in whole episodes from the segment's start. All tests of a run
-have the same episodes; the training never has them. A test is broken off as soon as more of its episodes have failed
-than the asked success rate allows. The training ends
+A *test* drives the newest policy, without exploration, in whole episodes like those of the training. All tests of a run
+use the same episodes, and the training never uses these. A test is broken off once more episodes have failed than the
+required success rate `config.success` allows. The training ends
 
-- when a test *reaches* the asked rate;
-- when `PATIENCE` tests in a row improved neither the success rate nor the distance along the route;
+- when a test *reaches* the required rate;
+- when `PATIENCE` tests in a row have improved neither the success rate nor the mean distance along the route;
 - at the largest number of steps.
 
-In the first two cases, `config.settle` more steps with a falling learning rate (`training.py`) and a last test follow.
-If no policy reached the asked rate, the best `_FINALISTS` policies drive whole tests. Then the policy with the most
-successes in a whole test is kept; if several have as many, the one of these with the highest mean reward.
-
-The kept policy was partly lucky in its test. So its success is measured once more, in fresh episodes: the *last word*.
-If the lighting varies, these episodes have held-out lightings and everything randomized, as in `twin validate` by
-default.
+In the first two cases the training first continues for `config.settle` steps with a falling learning rate
+(`training.py`), followed by one more test. The policy that is kept is the one with most successes among those that
+drove a whole test; ties are broken by the mean reward. If no policy reached the required rate, the best `_FINALISTS`
+drive whole tests before the choice. The best of several results is biased upwards by luck. So the kept policy drives
+fresh episodes, which no decision used, in a *final test*. If the lighting varies, these episodes have held-out
+lightings and everything randomized, as in `twin validate` by default.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,33 +41,33 @@ from twin.loading import Twin
 
 TESTS_FILE = "tests.json"
 FRESH_EPISODES = 40
-"""Number of episodes in the last word."""
+"""Number of episodes of the final test."""
 PATIENCE = 4
 REACHED, NO_BETTER, ALL_STEPS = ENDS = ("reached", "no better", "steps")
 """Reasons to end a training."""
 
-_BATCHES = (8, 12, 20)  # number of episodes in each part of a test; it may be broken off after each part
+_BATCHES = (8, 12, 20)  # numbers of episodes; a test may be broken off after each batch
 _TEST_EPISODES = sum(_BATCHES)
-_BETTER = 0.02  # least increase that counts as better: of the success rate, or relative of the mean distance
+_BETTER = 0.02  # least improvement: of the success rate, absolute; of the mean distance along the route, relative
 _FINALISTS = 3
-_STREAM = 7  # part of the seeds of tests; see `training._TRAINING_STREAM`
-_PLACE = 5.0  # [m] length of the parts of the route in which failures are counted
+_STREAM = 7  # see `training._TRAINING_STREAM`
+_PLACE = 5.0  # [m] length of the route sections in which failures are counted
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A test episode in which the robot did not reach the goal."""
+    """An episode of a test in which the robot did not reach the goal."""
 
     cause: str
     progress: float
     """[m]"""
     lighting: str
-    """The sampled lighting; see `LocalVectorEnv.info`."""
+    """As sampled; see `LocalVectorEnv.info`."""
 
 
 @dataclass(frozen=True)
 class PolicyTest:
-    """A test of the policy that was saved at a step, in the first `trials` of the test episodes."""
+    """A test of the policy saved at a step, in the first `trials` test episodes."""
 
     step: int
     trials: int
@@ -84,7 +83,7 @@ class PolicyTest:
         return self.successes / self.trials
 
     def reached(self, success: float) -> bool:
-        """True if all test episodes were driven, and the success rate is at least `success`."""
+        """True if all episodes were driven, and the rate is at least `success`."""
         return self.trials == _TEST_EPISODES and self.rate >= success
 
     @staticmethod
@@ -101,7 +100,7 @@ class PolicyTest:
 
 
 def next_segment(config: TrainConfig, tests: Sequence[PolicyTest]) -> Segment:
-    """The segment of the training to run after these tests."""
+    """The segment that follows the tests so far."""
     last = tests[-1].step if tests else 0
     settled = min(last + config.settle, config.steps)
     if tests and tests[-1].reached(config.success):
@@ -118,9 +117,9 @@ def next_segment(config: TrainConfig, tests: Sequence[PolicyTest]) -> Segment:
 
 
 def earlier_choice(twin: Twin, folder: Path, config: TrainConfig) -> dict[str, Any] | None:
-    """The choice of an ended training, as `train_until_learnt` returns it; None: training must start or go on.
+    """The choice of a training that has ended, as `train_until_learnt` returns it; None: more training is needed.
 
-    Raises InputError: the folder has a run with another configuration, or a damaged one.
+    Raises InputError: an existing run has another configuration or is damaged.
     """
     if has_state(folder / "state"):
         check_same(folder, run_settings(twin, config))
@@ -137,16 +136,16 @@ def train_until_learnt(
     processes: int | None = None,
     writers: Sequence[KVWriter] = (),
 ) -> dict[str, Any]:
-    """Trains and tests until the training ends (see the module), and keeps the best policy in the run's folder.
+    """Trains and tests until the training ends (see the module), and saves the kept policy as that of the run.
 
-    An earlier choice is returned unchanged, unless `config` asks for more steps or a higher success rate. If a call was
-    killed, the next call resumes the training. Arguments and errors are those of `train`; `writers` also receive the
-    scores of tests, as `tests/...`.
+    An earlier choice is returned unchanged unless `config` asks for more steps or a higher success rate. If a call was
+    killed, the next one resumes its training. Arguments and errors are those of `train`; `writers` also receive the
+    tests' scores, as `tests/...`.
 
     Returns:
-        The contents of `choice.json`. Among them are the steps, the asked success rate, whether it was reached, the
-        reason why the training ended, the tests, the last word with its condition (`chosen`), and a summary of where
-        and why episodes failed (`failures`).
+        The contents of `choice.json`: the number of steps; the required success rate and whether it is reached; the
+        reason why the training ended; the tests; `chosen`, the final test, with its condition; and a sentence on where
+        and why episodes failed.
     """
     if before := earlier_choice(twin, folder, config):
         return before
@@ -208,7 +207,7 @@ def _choose(
 
 
 def failure_summary(failures: Sequence[Failure]) -> str:
-    """Text that says where, why and in which light failures were most frequent; empty without failures."""
+    """A sentence on where, why and in which light most of the failures happened; empty without failures."""
     if not failures:
         return ""
     bins = [int(one.progress // _PLACE) for one in failures]
@@ -220,19 +219,19 @@ def failure_summary(failures: Sequence[Failure]) -> str:
 
 
 def _main_light(lighting: str) -> str:
-    """The filmed lighting with the largest share in a sampled lighting: sun for `training: sun 0.62, night 0.38`."""
+    """The filmed lighting with the largest weight in a sampled one: sun in `training: sun 0.62, night 0.38`."""
     _, _, mixture = lighting.partition(": ")
     return mixture.split(" ")[0] if mixture else lighting
 
 
 def _most(values: list[Any]) -> tuple[Any, int]:
-    """The most frequent value and its count; of several equally frequent values, the first."""
+    """The most frequent value (the first one if several are tied), and its count."""
     best = max(values, key=values.count)
     return best, values.count(best)
 
 
 def _test(config: TrainConfig, step: int, drive: Callable[[Sequence[int]], list[EpisodeResult]]) -> PolicyTest:
-    """Tests a policy in batches of episodes; stops when more failed than the asked success rate allows."""
+    """Tests a policy in batches of episodes; stops once more have failed than the required success rate allows."""
     allowed = int(_TEST_EPISODES * (1.0 - config.success) + 1e-9)
     seeds, driven = _seeds(config), list[EpisodeResult]()
     for start, end in pairwise(np.cumsum([0, *_BATCHES]).tolist()):
@@ -243,7 +242,7 @@ def _test(config: TrainConfig, step: int, drive: Callable[[Sequence[int]], list[
 
 
 def _seeds(config: TrainConfig) -> tuple[int, ...]:
-    """Seeds of the test episodes, followed by those of the fresh episodes."""
+    """Seeds of the test episodes, then of the fresh ones."""
     sequence = np.random.SeedSequence([config.seed, _STREAM])
     return tuple(int(seed) for seed in sequence.generate_state(_TEST_EPISODES + FRESH_EPISODES))
 
@@ -253,7 +252,7 @@ def _checkpoint(folder: Path, step: int) -> Path:
 
 
 def read_choice(folder: Path) -> dict[str, Any] | None:
-    """The earlier choice that belongs to the training's saved state; None if there is none."""
+    """The choice saved for the training's present state; None if there is none."""
     path = folder / CHOICE_FILE
     if not path.exists() or not has_state(folder / "state"):
         return None
@@ -271,7 +270,7 @@ def read_choice(folder: Path) -> dict[str, Any] | None:
 
 
 def read_tests(folder: Path) -> list[PolicyTest]:
-    """Results of the tests so far, without those of policies that are not saved."""
+    """Tests made so far, up to the step of the training's saved state."""
     path = folder / TESTS_FILE
     if not path.exists() or not has_state(folder / "state"):
         return []

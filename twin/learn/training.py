@@ -3,10 +3,11 @@
 runs/<name>/
   config.json                             the configuration
   policy.json .safetensors .onnx          the newest policy (`policy.py`); after the training, the selected one
-  tests.json, choice.json                 tests of policies; the selection (`selection.py`)
+  tests.json, choice.json                 tests of policies, and the selection (`selection.py`)
   checkpoints/<steps>/                    policies saved during the training
   episodes.csv                            episodes driven in training
-  log.csv, tensorboard/                   speed, memory and losses at every save
+  log.csv                                 speed, memory, entropy coefficient and value at every save
+  tensorboard/                            losses and other values logged by stable-baselines3
   state/                                  the saved state (`sac.py`) and the replay buffer's pictures
 """
 
@@ -62,46 +63,45 @@ TRAINING_EPISODE_COLUMNS = (
 )
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
 Watch = Callable[[int, Sequence[bool]], None]
-"""Receives the number of steps done, and the successes of recent episodes.
-
-These are the last `RECENT_EPISODES` of the episodes that started at the beginning of the route segment.
-"""
+"""Receives the steps done, and the success of the last `RECENT_EPISODES` episodes that started at the beginning of the
+task's route segment."""
 
 Drive = Callable[[Path, Sequence[int], Callable[[], object]], list[EpisodeResult]]
-"""Drives the policy of a folder in the training's environments, one whole episode per seed; see `run_episodes`."""
+"""Drives the policy of a folder in whole episodes like those of the training, one per seed; see `run_episodes`."""
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Part of a training."""
+    """A part of a training."""
 
     until: int
-    """Number of steps done at the segment's end, where a checkpoint is saved."""
+    """Steps at its end, where a checkpoint is saved."""
     settle_from: int | None
-    """From this step, the learning rate falls to its lowest value at the segment's end; None: it follows its cycle."""
+    """Step from which the learning rate falls, to its lowest value at the segment's end; None: it follows its cycle."""
     why: str = ""
-    """Reason to end the training after this segment; empty: the training goes on."""
+    """Reason to end the training after this segment; empty: the training continues."""
 
 
 Referee = Callable[[int, Drive], Segment | None]
-"""Receives the number of steps done; returns the next segment, or None to end the training. It may drive policies."""
+"""Receives the number of steps done and a function that drives policies. Returns the next segment, or None to end the
+training."""
 
-_NO_CURVES = ("step", "seed", "lighting", "cause")  # columns that are not sent to writers
-_FINAL_RATE = 0.1  # lowest learning rate over the largest
-# Seeds derive from the run's seed, this number and the number of resumptions; `selection.py` has another number. So no
-# random stream is used twice.
+_NO_CURVES = ("step", "seed", "lighting", "cause")  # columns that are not sent to the writers as curves
+_FINAL_RATE = 0.1  # lowest learning rate / `config.learning_rate`
+# Seeds derive from the run's seed, the number of resumptions and this number, which differs from `selection._STREAM`.
+# So no random stream is used twice.
 _TRAINING_STREAM = 6
 
 
 class PreprocessedVecEnv(VecEnvWrapper):
-    """Environments with the policy's preprocessing; while they step, networks can be updated."""
+    """Environments with the policy's preprocessing; a function such as the networks' updates can run during a step."""
 
     def __init__(self, envs: DriveVecEnv, pool: int) -> None:
         channels, height, width = envs.observation_space.shape  # type: ignore[misc]
         super().__init__(envs, spaces.Box(0, 255, (channels, height // pool, width // pool), np.uint8))
         self._pool, self._thread = pool, ThreadPoolExecutor(1)
         self.meanwhile: Callable[[], None] = lambda: None
-        """Updates the networks; called while the environments step. The step must not depend on it."""
+        """Called while the environments step, for the updates of the networks; the step must not depend on it."""
 
     def reset(self) -> NDArray:
         return preprocess(np.asarray(self.venv.reset()), self._pool)
@@ -133,14 +133,14 @@ def train(
     On SIGINT, SIGTERM and SIGHUP, it saves the state and raises `Stopped`, a KeyboardInterrupt.
 
     Args:
-        config: If the run exists, it must have the same configuration, except for `steps` and `success`.
+        config: Must equal that of an existing run, except for `steps` and `success`.
         processes: See `make_vector_env`; the number does not change the result.
-        referee: Plans the training's segments; by default, there is one segment of `config.steps`.
+        referee: Plans the training; by default, the training is one segment of `config.steps`.
         writers: Also receive the numbers that are written to `tensorboard/`, `episodes.csv` and `log.csv`.
 
     Raises:
-        InputError: an existing run has another configuration or is damaged, or the folder has files but is not a run;
-            also as in `twin.load`.
+        InputError: an existing run has another configuration or is damaged, the folder is neither empty nor a run, or
+            an error of `twin.load`.
         OSError: the disk is full; the last saved state is intact.
     """
     settings = run_settings(twin, config)
@@ -193,7 +193,7 @@ def train(
                 left = segment.until - model.num_timesteps
                 if left <= 0:
                     continue
-                (folder / CHOICE_FILE).unlink(missing_ok=True)  # a selection is invalid once the training goes on
+                (folder / CHOICE_FILE).unlink(missing_ok=True)  # more steps invalidate the selection
                 model.lr_schedule = partial(_learning_rate, config, model, segment)
                 model.learn(left, recorder, log_interval=10, reset_num_timesteps=False)
                 recorder.end()
@@ -217,7 +217,7 @@ def _model(envs: PreprocessedVecEnv, config: TrainConfig, pictures: Path) -> Pix
         tau=config.tau,
         gamma=config.gamma,
         train_freq=1,
-        gradient_steps=0,  # `meanwhile` runs the updates
+        gradient_steps=0,  # updates run in `meanwhile`
         ent_coef="auto_0.1",
         target_entropy=config.entropy * config.control.actions,
         replay_buffer_class=FrameReplayBuffer,
@@ -235,7 +235,7 @@ def _model(envs: PreprocessedVecEnv, config: TrainConfig, pictures: Path) -> Pix
             "features_extractor_kwargs": {"architecture": config.architecture},
             "net_arch": list(config.hidden),
             "share_features_extractor": True,
-            "normalize_images": False,  # the encoder scales the pictures
+            "normalize_images": False,  # the encoder scales the pixel values
             "state_size": len(config.state_scales),
         },
         seed=config.seed,
@@ -246,7 +246,7 @@ def _model(envs: PreprocessedVecEnv, config: TrainConfig, pictures: Path) -> Pix
 
 
 def _learning_rate(config: TrainConfig, model: PixelSAC, segment: Segment, _: float) -> float:
-    """Learning rate of the next update; in a settling segment, it falls to its lowest value at the segment's end."""
+    """Learning rate of the next update; in a settling segment, it falls linearly to its lowest value at the end."""
     step, lowest = model.num_timesteps, _FINAL_RATE * config.learning_rate
     if segment.settle_from is None or step <= segment.settle_from:
         return cycle_rate(config, step)
@@ -255,11 +255,10 @@ def _learning_rate(config: TrainConfig, model: PixelSAC, segment: Segment, _: fl
 
 
 def cycle_rate(config: TrainConfig, step: int) -> float:
-    """Learning rate at a step, if the training does not settle.
+    """Learning rate at a step, without settling: constant in the first half of each cycle, then falling linearly.
 
-    It is constant in the first half of each cycle, then it falls linearly. Cycles have about `config.cycle` steps and
-    divide `config.steps` evenly. The fall was measured in three trainings of 12,000 steps in one place: of 40 test
-    episodes, 40 and 37 reached the goal after two trainings with the fall, 35 after one without it; see
+    Cycles have about `config.cycle` steps and divide `config.steps` evenly. After 12,000 steps in one place, 40 and 37
+    of 40 test episodes succeeded in two trainings with the falling rate, and 35 in one with a constant rate; see
     docs/findings.md.
     """
     length = config.steps / max(1, round(config.steps / config.cycle))
@@ -268,9 +267,9 @@ def cycle_rate(config: TrainConfig, step: int) -> float:
 
 
 def prepare_folder(folder: Path) -> None:
-    """Creates a run's folder with a folder `state` in it, by which runs are recognized.
+    """Creates a run's folder and in it the folder `state`, by which runs are recognized.
 
-    A training deletes and replaces files. So this raises InputError if the folder has files but is not a run.
+    Raises InputError if the folder exists and is neither empty nor a run, since a training deletes and replaces files.
     """
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise InputError(f"{folder} is not a folder; move it away, or give another --run")
@@ -282,7 +281,10 @@ def prepare_folder(folder: Path) -> None:
 
 
 def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
-    """Settings that must be the same in all calls of a run, as its file gives them: configuration and road."""
+    """Settings that must be equal in all calls of a run: the configuration and the fingerprint of the road.
+
+    The values are JSON types, as read from `config.json`.
+    """
     road = fingerprint(twin, config.task, Condition(config.lighting, config.randomise))
     return dict(json.loads(json.dumps({**dataclasses.asdict(config), "road": road})))
 
@@ -336,7 +338,7 @@ class _RunRecorder(BaseCallback):
         return self._wall + time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
-        # The configuration is written only now: if no environment starts with it, it is not valid.
+        # Written only now: if no environment starts with a configuration, it is invalid and must not be saved.
         write_json(self._folder / "config.json", self._settings)
         self._saved = self._first = self.model.num_timesteps
         self._first_updates = self.model._n_updates
@@ -345,7 +347,7 @@ class _RunRecorder(BaseCallback):
         _keep_rows(self._folder / "log.csv", LOG_COLUMNS, self._saved)
 
     def _on_rollout_start(self) -> None:
-        # Here, unlike in `_on_step`, the buffer contains all transitions so far.
+        # Here the buffer contains all collected transitions; in _on_step the newest are missing.
         if self._stop.number or self.model.num_timesteps - self._saved >= self._config.save_every:
             self.save()
         if self._stop.number:
@@ -372,7 +374,7 @@ class _RunRecorder(BaseCallback):
         self.save()
 
     def save(self) -> None:
-        """Saves the policy, the state and a row of the log, if any step was done since the last save."""
+        """Saves the policy, the state and a row of the log, unless no step was done since the last save."""
         if self.model.num_timesteps == self._saved:
             return
         model, elapsed = self.model, max(time.monotonic() - self._started, 1e-9)
@@ -390,7 +392,7 @@ class _RunRecorder(BaseCallback):
         self._saved = model.num_timesteps
 
     def _append(self, table: str, columns: tuple[str, ...], rows: list[tuple]) -> None:
-        """Adds rows to a table of the run; writers receive the numbers of the rows as `<table>/<column>`."""
+        """Appends rows to a table of the run, and sends their numbers to the writers, as `<table>/<column>`."""
         if not rows:
             return
         with (self._folder / f"{table}.csv").open("a", newline="", encoding="utf-8") as file:
@@ -416,10 +418,9 @@ class _RunRecorder(BaseCallback):
 
 
 def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> list[bool]:
-    """Creates a table or, if it exists, removes its rows after `steps`.
+    """Creates a table, or drops its rows after `steps`.
 
-    Returns the successes of the kept episodes that started at the segment's beginning. The list is empty if the table
-    has no column `success`.
+    Returns the success of the kept episodes that started at the segment's beginning; empty for a table without success.
     """
     rows: list[list[str]] = []
     if path.exists():
