@@ -292,7 +292,7 @@ def fit_height(
     robust = np.ones(len(z))
     for iteration in range(iterations):
         if height is not None:
-            # The width of the loss shrinks from 3 σ to 2 σ, so that a poor first solution does not reject good data.
+            # The width of the loss shrinks from 2.5 σ to 2 σ, so that a poor first solution does not reject good data.
             width = (max(3.0 - iteration / 2, 2.0) if initial is None else 2.0) * sigma
             robust = (1.0 + ((height[node] - z) / width) ** 2) ** -2
         weight = robust / sigma**2
