@@ -541,6 +541,11 @@ def _reality(parser: argparse.ArgumentParser) -> None:
         "--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; those of a drawn place"
     )
     command.add_argument("--tiny", action="store_true", help="12 m in 320x180 under two lightings, for tests")
+    command.add_argument(
+        "--traffic",
+        action="store_true",
+        help="walkers and cars move through the films, and parked cars have left in the last lighting",
+    )
     command = add("compare", "compare a build of a filmed place with its truth, and show it in the build's report")
     command.add_argument("scene", type=Path, help="folder of a built scene")
     command = add("drive", "the real test: drive policy files in weather that was not filmed")

@@ -40,6 +40,7 @@ from twin.reality.place_sampling import draw
 from twin.reality.place_spec import PlaceSpec, tasks
 from twin.reality.real_test import Setup
 from twin.reality.road_task import RoadTask, read_task
+from twin.reality.traffic import parked_cars
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth
 from twin.scene import SceneDir, require_stage
 
@@ -54,8 +55,11 @@ def _tiny(plan: FilmingPlan) -> FilmingPlan:
     return replace(plan, lightings=plan.lightings[:2], length=12.0, width=320, height=180)
 
 
-def film(plan: FilmingPlan, out: Path, number: int = 0) -> Truth:
+def film(plan: FilmingPlan, out: Path, number: int = 0, traffic: bool = False) -> Truth:
     """Films every pass and lighting of a plan into a scene folder and saves the truth beside it.
+
+    With `traffic`, walkers and cars move through every film, and cars are parked in all lightings but the last. The
+    truth does not contain them.
 
     Raises:
         InputError: `out` is not empty and was not written by this function.
@@ -66,11 +70,13 @@ def film(plan: FilmingPlan, out: Path, number: int = 0) -> Truth:
         )
     (out / "input").mkdir(parents=True, exist_ok=True)
     place = build_number(number) if number else places.build()
+    parked = parked_cars(place, plan.start, plan.length) if traffic else []
     films, lightings = {}, {}
     for lighting in plan.lightings:
+        there = replace(place, objects=[*place.objects, *(parked if lighting != plan.lightings[-1] else [])])
         for one in plan.passes:
             name = film_name(lighting, one)
-            times, poses = film_pass(lighting, place, plan, out / "input" / f"{name}.mp4", one)
+            times, poses = film_pass(lighting, there, plan, out / "input" / f"{name}.mp4", one, traffic)
             films[name] = TrueFilm(times, poses, *depth_maps(lighting, place, plan, poses))
             lightings[name] = lighting
     size = plan.width, plan.height
@@ -134,7 +140,7 @@ def command(options: argparse.Namespace) -> None:
             plan = _tiny(plan) if options.tiny else plan
         _check_lightings(options.lightings or [], plan.lightings if options.place else LIGHTINGS)
         plan = replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan
-        film(plan, options.out, options.place)
+        film(plan, options.out, options.place, options.traffic)
     elif options.command == "compare":
         scene = SceneDir(options.scene)
         figures = compare(scene)["figures"]

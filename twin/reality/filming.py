@@ -4,7 +4,7 @@ A *film* is a sequence of frames at a fixed rate under one lighting; the true po
 has its own speed, lateral wander and shake, so that no two films share a viewpoint.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from twin.reality import SEED, true_world
 from twin.reality.lighting import Lighting, apply_haze
 from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.place_spec import PassSpec, PlaceSpec
+from twin.reality.traffic import Mover, movers
 from twin.runtime import track
 from twin.types import Array
 from twin.warp_runtime import wp
@@ -138,13 +139,15 @@ def _pose(position: Array, yaw: float, pitch: float, roll: float) -> Array:
 class Renderer:
     """Renders the place under one lighting from any pose with `mujoco_warp`'s ray tracer."""
 
-    def __init__(self, lighting: str, place: KnownPlace, plan: FilmingPlan) -> None:
-        spec = true_world.world_spec(lighting, place)
+    def __init__(self, lighting: str, place: KnownPlace, plan: FilmingPlan, movers: Sequence[Mover] = ()) -> None:
+        self._movers = movers
+        spec = true_world.world_spec(lighting, place, {one.name: one.part for one in movers})
         camera = spec.camera("film")
         camera.fovy = float(np.rad2deg(2 * np.arctan(plan.height / 2 / plan.intrinsics[1])))
         model = spec.compile()
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
+        self._host = model, data
         self._out = (plan.width, plan.height)
         self._size = (round(plan.oversize * plan.width), round(plan.oversize * plan.height))
         with wp.ScopedDevice("cpu"):
@@ -164,6 +167,20 @@ class Renderer:
                 samples_per_pixel=plan.samples,
                 enable_specular=False,
             )
+
+    def move_to(self, time: float) -> None:
+        """Places the movers as they are at a time of the film [s]."""
+        model, data = self._host
+        for mover in self._movers:
+            foot, yaw = mover.pose(time)
+            body = model.body(mover.name).mocapid[0]
+            data.mocap_pos[body] = foot
+            data.mocap_quat[body] = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+        mujoco.mj_kinematics(model, data)
+        with wp.ScopedDevice("cpu"):
+            self._data.geom_xpos.assign(data.geom_xpos[None].astype(np.float32))
+            self._data.geom_xmat.assign(data.geom_xmat.reshape(1, -1, 3, 3).astype(np.float32))
+            mujoco_warp.refit_bvh(self._model, self._data, self._context)
 
     def __call__(self, camera_to_world: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """RGB (h, w, 3) in [0, 1] and z-depth (h, w) [m] for an OpenCV pose (4, 4).
@@ -209,23 +226,28 @@ def exposures(lighting: Lighting, times: Array) -> Array:
 
 
 def film_pass(
-    lighting: str, place: KnownPlace, plan: FilmingPlan, path: Path, one: PassSpec = OUT
+    lighting: str, place: KnownPlace, plan: FilmingPlan, path: Path, one: PassSpec = OUT, traffic: bool = False
 ) -> tuple[Array, Array]:
-    """Writes the film of one pass under one lighting; returns its times (n,) [s] and poses (n, 4, 4)."""
+    """Writes the film of one pass under one lighting; returns its times (n,) [s] and poses (n, 4, 4).
+
+    With `traffic`, walkers and cars move through the film.
+    """
     name = film_name(lighting, one)
     times, poses = trajectory(plan, place.route, name, one)
     light = place.lightings[lighting]
     gains = exposures(light, times)
     rng = np.random.default_rng([SEED, 13, sum(map(ord, name))])
-    render = Renderer(lighting, place, plan)
-    steps = track(list(zip(poses, gains, strict=True)), f"film {name}", unit="frame")
+    render = Renderer(lighting, place, plan, movers(place, name, times, poses) if traffic else ())
+    steps = track(list(zip(times, poses, gains, strict=True)), f"film {name}", unit="frame")
     rays = unproject(pixel_grid(plan.width, plan.height), plan.intrinsics)
 
-    def frame(pose: Array, gain: float) -> NDArray[np.uint8]:
+    def frame(time: float, pose: Array, gain: float) -> NDArray[np.uint8]:
+        if traffic:
+            render.move_to(time)
         ground = float(place.route.ground_height(pose[:2, 3]))
         return sensor_image(rng, apply_haze(*render(pose), rays, pose, light, ground), light, gain)
 
-    write_video((frame(pose, float(gain)) for pose, gain in steps), plan, path)
+    write_video((frame(float(time), pose, float(gain)) for time, pose, gain in steps), plan, path)
     return times, poses
 
 

@@ -1,5 +1,7 @@
 """The known-truth world as a MuJoCo model for rendering: it has visual geoms only, and nothing in it collides."""
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from twin.reality import lighting as lightings
 from twin.reality import primitives, textures
 from twin.reality.lighting import Lighting
 from twin.reality.place_objects import KnownPlace, up
+from twin.reality.primitives import MeshPart
 from twin.types import Array
 
 # ---- ambient occlusion of the ground
@@ -49,10 +52,12 @@ def ground_visibility(place: KnownPlace) -> dict[str, Array]:
 # ---- model
 
 
-def world_spec(lighting: Lighting | str, place: KnownPlace) -> mujoco.MjSpec:
+def world_spec(
+    lighting: Lighting | str, place: KnownPlace, moving: Mapping[str, MeshPart] | None = None
+) -> mujoco.MjSpec:
     """The world under one lighting, with textures, lights and a camera named `film`; nothing in it collides.
 
-    Geoms are in groups 0 (ground) and 1.
+    Geoms are in groups 0 (ground) and 1. Each of `moving`, name → mesh, is a mocap body of that name.
     """
     light = place.lightings[lighting] if isinstance(lighting, str) else lighting
     model = mujoco.MjSpec()
@@ -79,24 +84,30 @@ def world_spec(lighting: Lighting | str, place: KnownPlace) -> mujoco.MjSpec:
     for obj in place.objects:
         if obj.texture == ("windows_by_day" if after_dark else "windows_by_night"):
             continue
-        mesh = model.add_mesh(name=obj.name)
-        mesh.uservert = obj.part.vertices.astype(np.float32).ravel()
-        mesh.userface = obj.part.faces.ravel()
-        mesh.usertexcoord = obj.part.uv.astype(np.float32).ravel()
-        mesh.userfacetexcoord = obj.part.faces.ravel()
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        model.worldbody.add_geom(
-            name=obj.name,
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=obj.name,
-            material=obj.texture,
-            contype=0,
-            conaffinity=0,
-            group=0 if obj.kind == "ground" else 1,
-        )
+        _add_geom(model.worldbody, model, obj.name, obj.part, obj.texture, group=0 if obj.kind == "ground" else 1)
+    for name, part in (moving or {}).items():
+        _add_geom(model.worldbody.add_body(name=name, mocap=True), model, name, part, "atlas", group=1)
     lightings.add_lights(model, light, np.array(place.lamp_heads))
     model.worldbody.add_camera(name="film", pos=[0, 0, 1.2])
     return model
+
+
+def _add_geom(body: mujoco.MjsBody, model: mujoco.MjSpec, name: str, part: MeshPart, material: str, group: int) -> None:
+    mesh = model.add_mesh(name=name)
+    mesh.uservert = part.vertices.astype(np.float32).ravel()
+    mesh.userface = part.faces.ravel()
+    mesh.usertexcoord = part.uv.astype(np.float32).ravel()
+    mesh.userfacetexcoord = part.faces.ravel()
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname=name,
+        material=material,
+        contype=0,
+        conaffinity=0,
+        group=group,
+    )
 
 
 def _darkened(image: NDArray[np.uint8], factor: NDArray[np.float64]) -> NDArray[np.uint8]:
