@@ -91,6 +91,22 @@ class TrainingPixels:
         self.path = self._depths_of_path(camera_height) if camera_height > 0.0 else join_depths([])
         self.stereo = join_depths([])  # set from `stereo.stereo_depths`
 
+    def exclude(self, marked: list[NDArray[np.bool_]]) -> None:
+        """Excludes more pixels from training, and the depth supervision on them; `marked` has a frame's size each.
+
+        A frame that would lose every pixel keeps them all.
+        """
+        parts = np.split(self.unmasked, self.start[1:-1])
+        kept = [part & ~mark.ravel() for part, mark in zip(parts, marked, strict=True)]
+        self.unmasked = np.concatenate([new if new.any() else old for old, new in zip(parts, kept, strict=True)])
+        self.unmasked_index = None if self.unmasked.all() else np.flatnonzero(self.unmasked)
+        self.points, self.path, self.stereo = map(self._on_unmasked, (self.points, self.path, self.stereo))
+
+    def _on_unmasked(self, depths: DepthSupervision) -> DepthSupervision:
+        u, v = depths.pixel.astype(int).T
+        keep = self.unmasked[self.start[depths.frame] + v * self.width[depths.frame] + u]
+        return DepthSupervision(depths.frame[keep], depths.pixel[keep], depths.distance[keep])
+
     def _depths_in_frame(self, i: int, xyz: NDArray) -> DepthSupervision:
         """Depth supervision of training frame i from those of the points (k, 3) [m] that lie on unmasked pixels."""
         pixel, depth = project(xyz, self.cameras.camera_to_world[i], self.intrinsics[i])

@@ -1,0 +1,245 @@
+"""Transients: what moved while a film was made, and what stands in some films only. Their pixels are not trained on.
+
+A frame is divided into *cells* of a few pixels. Cells show surfaces whose depth is known from a field in training.
+
+*Movers*: a surface point is looked up in the other frames of the same lighting that see it. If these agree on a color,
+and the frame's own differs from it, something was in front of the surface in this frame alone.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from twin.geometry.cameras import project, unproject
+from twin.nerf.dataset import TrainingPixels
+from twin.types import Array, Array32
+
+_GRID_CELLS = 80  # cells along a frame's longer side
+_FAR = 300.0  # [m] greatest depth; the sky is taken to be there
+_NEIGHBORS = 14  # frames in which a surface is looked up
+_MIN_SEEN = 3  # least number of frames that must see a surface
+_DEPTH_TOLERANCE = 0.1  # a surface is visible in a frame whose own depth there is at most this fraction smaller
+_MIN_DIFFERENCE = 0.06  # least difference of a mover's color from the surface's
+_SPREADS = 4.0  # least difference, as a multiple of the frames' median deviation from their median
+
+
+@dataclass(frozen=True)
+class Cells:
+    """A training frame's cells."""
+
+    pixel: Array
+    """Centers (u, v) [px], shape (rows, columns, 2)."""
+    color: Array32
+    """Mean colors in [0, 1], shape (rows, columns, 3)."""
+    depth: Array32
+    """z-depth [m], shape (rows, columns)."""
+
+
+def cell_size(pixels: TrainingPixels) -> int:
+    """Side of a cell [px]."""
+    return max(1, round(float(max(pixels.width.max(), pixels.height.max())) / _GRID_CELLS))
+
+
+def cell_centers(width: int, height: int, side: int) -> Array:
+    """Centers (u, v) of a frame's whole cells [px], shape (rows, columns, 2)."""
+    v, u = np.mgrid[: height // side, : width // side]
+    return (np.stack([u, v], -1) + 0.5) * side
+
+
+def frame_cells(pixels: TrainingPixels, i: int, side: int, depth: Array32) -> Cells:
+    """Cells of training frame i, with the z-depths (rows, columns) [m] at their centers."""
+    width, height = int(pixels.width[i]), int(pixels.height[i])
+    image = pixels.colors[pixels.start[i] : pixels.start[i + 1]].reshape(height, width, 3)
+    centers = cell_centers(width, height, side)
+    rows, columns = centers.shape[:2]
+    color = image[: rows * side, : columns * side].reshape(rows, side, columns, side, 3).mean((1, 3)) / 255.0
+    return Cells(centers, color.astype(np.float32), np.minimum(depth, np.float32(_FAR)))
+
+
+def neighbors(pixels: TrainingPixels, i: int) -> NDArray[np.int64]:
+    """Up to 14 other frames of frame i's lighting, nearest first."""
+    lightings = np.array(pixels.cameras.lightings)
+    others = np.flatnonzero((lightings == lightings[i]) & (np.arange(len(lightings)) != i))
+    distance = np.linalg.norm(pixels.cameras.positions[others] - pixels.cameras.positions[i], axis=1)
+    return others[np.argsort(distance, kind="stable")[:_NEIGHBORS]]
+
+
+def consensus(pixels: TrainingPixels, cells: list[Cells], i: int, side: int) -> tuple[Array32, Array32, NDArray]:
+    """Colors of the surfaces in frame i's cells as other frames see them.
+
+    Returns:
+        Median color, shape (rows, columns, 3); median deviation from it, shape (rows, columns); number of frames that see
+        the surface, shape (rows, columns).
+    """
+    own = cells[i]
+    shape = own.depth.shape
+    rays = unproject(own.pixel.reshape(-1, 2), pixels.intrinsics[i])
+    pose = pixels.cameras.camera_to_world[i]
+    points = (rays / rays[:, 2:] * own.depth.reshape(-1, 1)) @ pose[:3, :3].T + pose[:3, 3]
+    seen = []
+    for j in neighbors(pixels, i):
+        other = cells[j]
+        rows, columns = other.depth.shape
+        pixel, z = project(points, pixels.cameras.camera_to_world[j], pixels.intrinsics[j])
+        at = (pixel / side - 0.5).astype(np.float32)
+        inside = (z > 0.1) & (at > -0.5).all(1) & (at < np.array([columns, rows]) - 0.5).all(1)
+        at = np.where(inside[:, None], at, np.float32(0.0))
+        color = cv2.remap(other.color, at[:, 0], at[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        nearest = np.clip(np.rint(at).astype(int), 0, [columns - 1, rows - 1])
+        visible = inside & (z < (1.0 + _DEPTH_TOLERANCE) * other.depth[nearest[:, 1], nearest[:, 0]])
+        if visible.any():  # exposure and white balance drift from frame to frame
+            color += np.median((own.color.reshape(-1, 3) - color)[visible], 0)
+        seen.append(np.where(visible[:, None], color, np.float32(np.nan)))
+    stack = np.array(seen)
+    count = np.isfinite(stack[..., 0]).sum(0)
+    median = _median(stack, count)
+    spread = _median(np.abs(stack - median).mean(-1, keepdims=True), count)[:, 0]
+    return median.reshape(*shape, 3), spread.reshape(shape), count.reshape(shape)
+
+
+def _median(stack: Array32, count: NDArray) -> Array32:
+    """Median over the first axis of (k, n, c), whose entries are nan but for `count` (n,) of the k; nan if none."""
+    if not len(stack):
+        return np.full(stack.shape[1:], np.nan, np.float32)
+    ordered = np.sort(stack, 0)
+    middle = np.maximum(count - 1, 0)
+    index = np.arange(len(count))
+    return 0.5 * (ordered[middle // 2, index] + ordered[(middle + 1) // 2, index])
+
+
+def mover_cells(pixels: TrainingPixels, cells: list[Cells], side: int) -> list[NDArray[np.bool_]]:
+    """True in the cells of every training frame that show a mover, or a shadow that moves, shapes (rows, columns)."""
+
+    def find(i: int) -> NDArray[np.bool_]:
+        median, spread, count = consensus(pixels, cells, i, side)
+        difference = np.abs(cells[i].color - median).mean(-1)
+        other = (count >= _MIN_SEEN) & (difference > np.maximum(_MIN_DIFFERENCE, _SPREADS * spread))
+        return cleaned(other)
+
+    return [find(i) for i in range(len(cells))]
+
+
+def cleaned(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Drops cells with fewer than three marked neighbors, closes gaps, and adds a margin of one cell."""
+    around = cv2.boxFilter(cells.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_REPLICATE)
+    kept = (cells & (around >= 4.0)).astype(np.uint8)
+    closed = cv2.morphologyEx(kept, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    return cv2.dilate(closed, np.ones((3, 3), np.uint8)) > 0
+
+
+# ---- objects that stand in some films only
+
+_VOXEL = 0.25  # [m] side
+_REACH = 18.0  # [m] from the camera, within which stereo is accurate enough
+_BEHIND = (0.5, 0.08)  # surface this far behind a voxel shows that it is empty: [m], and as a fraction of the depth
+_AT = (0.3, 0.04)  # surface this far from a voxel shows that it is occupied: the same units
+_MIN_FRAMES = 3  # least number of frames that show a voxel empty, and occupied
+_MIN_VOXELS = 24  # smaller objects are left alone: noise of stereo looks like them
+_MIN_EXTENT = 0.6  # [m] least extent along the second longest axis
+
+
+@dataclass(frozen=True)
+class LeftObject:
+    """Something that stands in the films of some lightings, and is missing in others."""
+
+    voxels: Array
+    """Centers of its voxels [m], shape (k, 3)."""
+    present: tuple[str, ...]
+    """Lightings that show it."""
+    absent: tuple[str, ...]
+    """Lightings that show its space empty."""
+
+    @property
+    def center(self) -> Array:
+        """Center of its bounding box [m], shape (3,)."""
+        return 0.5 * (self.voxels.min(0) + self.voxels.max(0))
+
+    @property
+    def size(self) -> Array:
+        """Size of its bounding box [m], shape (3,)."""
+        return np.ptp(self.voxels, axis=0) + _VOXEL
+
+
+def depth_maps(pixels: TrainingPixels, side: int) -> list[Array32]:
+    """Known z-depths [m] of every training frame on its grid of cells, nan where unknown, shapes (rows, columns)."""
+    maps = []
+    for i in range(len(pixels.cameras)):
+        known = np.full((int(pixels.height[i]) // side, int(pixels.width[i]) // side), np.nan, np.float32)
+        own = pixels.stereo.frame == i
+        pixel = pixels.stereo.pixel[own]
+        z = pixels.stereo.distance[own] / np.linalg.norm(unproject(pixel, pixels.intrinsics[i]), axis=1)
+        column, row = np.minimum((pixel // side).astype(int), [known.shape[1] - 1, known.shape[0] - 1]).T
+        known[row, column] = z
+        maps.append(known)
+    return maps
+
+
+def left_objects(pixels: TrainingPixels) -> list[LeftObject]:
+    """Finds objects that stand in the films of some lightings only, from the films' stereo depths."""
+    lightings = tuple(dict.fromkeys(pixels.cameras.lightings))
+    if len(lightings) < 2 or not len(pixels.stereo.frame):
+        return []
+    voxels = _voxels(pixels)
+    side = max(1, round(float(max(pixels.width.max(), pixels.height.max())) / 160))
+    maps = depth_maps(pixels, side)
+    index = np.array([lightings.index(name) for name in pixels.cameras.lightings])
+    occupied, empty = (np.zeros((len(voxels), len(lightings)), np.int32) for _ in range(2))
+    for i, known in enumerate(maps):
+        near = np.flatnonzero(((voxels - pixels.cameras.positions[i]) ** 2).sum(1) < _REACH**2)
+        pixel, z = project(voxels[near], pixels.cameras.camera_to_world[i], pixels.intrinsics[i])
+        column, row = np.floor(pixel / side).astype(int).T
+        inside = (z > 0.5) & (row >= 1) & (column >= 1) & (row < known.shape[0] - 1) & (column < known.shape[1] - 1)
+        near, z, row, column = near[inside], z[inside], row[inside], column[inside]
+        window = np.stack([known[row + a, column + b] for a in (-1, 0, 1) for b in (-1, 0, 1)])
+        at = np.nanmin(np.where(np.isnan(window), np.inf, np.abs(window - z)), 0) < np.maximum(_AT[0], _AT[1] * z)
+        some = (~np.isnan(window)).sum(0) >= 3
+        nearest = np.where(np.isnan(window), np.inf, window).min(0)
+        behind = some & (nearest > z + np.maximum(_BEHIND[0], _BEHIND[1] * z))
+        occupied[near, index[i]] += at
+        empty[near, index[i]] += behind
+    is_there = (occupied >= _MIN_FRAMES) & (occupied > 2 * empty)
+    is_empty = (empty >= _MIN_FRAMES) & (empty > 6 * occupied)
+    found = []
+    chosen = np.flatnonzero(is_there.any(1) & is_empty.any(1))
+    for part in _components(voxels[chosen]):
+        own = chosen[part]
+        extent = np.sort(np.ptp(voxels[own], axis=0) + _VOXEL)
+        if len(own) < _MIN_VOXELS or extent[1] < _MIN_EXTENT:
+            continue
+        there, gone = is_there[own].sum(0), is_empty[own].sum(0)
+        present = tuple(name for k, name in enumerate(lightings) if there[k] > gone[k])
+        absent = tuple(name for k, name in enumerate(lightings) if gone[k] > there[k])
+        if present and absent:
+            found.append(LeftObject(voxels[own], present, absent))
+    return found
+
+
+def _voxels(pixels: TrainingPixels) -> Array:
+    """Centers of the voxels that contain stereo points near their camera [m], shape (n, 3)."""
+    near = pixels.stereo.distance < _REACH
+    frame, pixel = pixels.stereo.frame[near], pixels.stereo.pixel[near]
+    keys = []
+    for i in range(len(pixels.cameras)):
+        own = frame == i
+        rays = unproject(pixel[own], pixels.intrinsics[i])
+        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True) * pixels.stereo.distance[near][own, None]
+        pose = pixels.cameras.camera_to_world[i]
+        keys.append(np.unique(np.floor((rays @ pose[:3, :3].T + pose[:3, 3]) / _VOXEL).astype(np.int64), axis=0))
+    found, frames = np.unique(np.concatenate(keys), axis=0, return_counts=True)
+    return (found[frames >= _MIN_FRAMES] + 0.5) * _VOXEL
+
+
+def _components(points: Array) -> list[NDArray[np.int64]]:
+    """Groups of voxels that touch each other or have one voxel between them, as indices."""
+    if not len(points):
+        return []
+    tree = cKDTree(points)
+    pairs = tree.query_pairs(2.1 * _VOXEL, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points), len(points)))
+    labels = connected_components(graph, directed=False)[1]
+    return [np.flatnonzero(labels == k) for k in range(labels.max() + 1)]
