@@ -110,7 +110,7 @@ def test_sampling_fails_with_a_reason(monkeypatch):
     mine = lightings(DAY_AND_DUSK)
     monkeypatch.setattr(AppearancePrior, "violations", lambda self, embedding: ["brightness 9 (filmed: 0 to 1)"])
     with pytest.raises(
-        InputError, match=rf"among {appearance_prior._MAX_TRIES} sampled; the last is brightness 9 .*nerf\.steps"
+        InputError, match=rf"among {appearance_prior._MAX_TRIES} sampled; the last has brightness 9 .*nerf\.steps"
     ):
         mine.sample(np.random.default_rng(0))
 

@@ -60,7 +60,7 @@ def export(
     task_file: Path | None = None,
     task: str | None = None,
 ) -> list[str]:
-    """Writes the given files and folders, in colors without fog; returns a summary line for each.
+    """Writes the given files and folders; returns a summary line for each. Colors are without the fog of lightings.
 
     Raises:
         InputError: nothing to write, the scene is not built, the lighting or task is unknown, an output folder does not
@@ -86,7 +86,7 @@ def export(
     lines = _field_files(twin, lighting, usd_file, glb, ply) if files else []
     if task_file and task:
         if not twin.scene.has_route:
-            raise InputError(f"{twin.scene.root}: its build has no route (mjcf.route), so it has no tasks")
+            raise InputError(f"{twin.scene.root}: has no route, so no tasks; set mjcf.route = true and build it again")
         world = twin.world()
         segment = find_task(task, world, load_config(twin.scene.config_file).task)
         write_task(task_file, world, segment, Options())

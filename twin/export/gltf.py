@@ -26,7 +26,7 @@ from twin.types import Array, Image
 from twin.warp_runtime import wp
 
 VIEWS, WIDTH, FAR = 96, 640, 100.0
-"""Number of views that the texture is baked from, their width [px], and the depth beyond which is background [m]."""
+"""Number of views that the texture is baked from, their width [px], and the z-depth where background starts [m]."""
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 _SIDE = 4096  # [px] side of the texture; every viewer supports this size
 _MIN_TEXEL = 0.01  # [m]

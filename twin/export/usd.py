@@ -37,14 +37,14 @@ SUFFIXES = (".usdz", ".usd", ".usdc")
 _SH_CONSTANT = 0.28209479177387814  # spherical harmonic of degree 0, 1 / (2 √π)
 _APERTURE = 20.955  # [tenths of a meter] width of a camera's film; only its ratio to the focal length has an effect
 _CLIPPING = 0.01, 1000.0  # [m] nearest and farthest depth that cameras show
-_RING, _SHOULDER, _SHOULDER_OFFSET = 32, 16, 0.6  # vertices around a tire's middle and sides; offset / half width
+_RING, _SHOULDER, _SHOULDER_OFFSET = 32, 16, 0.6  # vertices around a tire's middle and shoulder; offset / half width
 _CURVE_WIDTH, _GOAL_RADIUS = 0.05, 0.2  # [m]
 _SUN_INTENSITY, _SKY_INTENSITY = 1500.0, 600.0  # [nit]
-_SPLAT_EXTENT = 3.0  # standard deviations around a splat that count to its extent
+_SPLAT_EXTENT = 3.0  # standard deviations of a splat that its extent includes
 
 
 def require_usd() -> None:
-    """Raises InputError: the package usd-core is missing or too old."""
+    """Raises InputError if the package usd-core is missing or too old."""
     try:
         from pxr import UsdVol
     except ImportError as error:
@@ -81,7 +81,7 @@ def write_usd(
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: expected a file ending in {', '.join(SUFFIXES)}")
     if len({variant_name(name) for name in splats}) < len(splats):
-        raise InputError(f"of the lightings {', '.join(splats)} two have one name in USD; give another name to one")
+        raise InputError(f"two of the lightings {', '.join(splats)} have the same name in USD; rename one")
     require_usd()
     from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
@@ -212,7 +212,7 @@ def _friction(stage: Any, path: str, value: float) -> Any:
 
 
 def _collide(prim: Any, material: Any, approximation: str | None = None) -> None:
-    """Makes a prim a collider; `approximation` is USD's name of how a mesh is approximated."""
+    """Makes a prim a collider; `approximation` is USD's name for the approximation of a mesh."""
     from pxr import UsdPhysics, UsdShade
 
     UsdPhysics.CollisionAPI.Apply(prim)
@@ -390,7 +390,7 @@ def _add_camera(stage: Any, parent: str, model: mujoco.MjModel, index: int) -> N
     out.CreateProjectionAttr(UsdGeom.Tokens.perspective)
     out.CreateFocalLengthAttr(float(fx) * scale)
     out.CreateHorizontalApertureAttr(_APERTURE)
-    # A USD camera has one focal length. If pixels are not square, the film's height is scaled instead.
+    # A USD camera has one focal length. So if pixels are not square, the height of the film is scaled.
     stretch = scale * float(fx / fy)
     out.CreateVerticalApertureAttr(float(sensor[1]) * stretch)
     # MuJoCo counts the principal point's offset from the center positive to the left and up; USD shifts the film in

@@ -30,8 +30,8 @@ class Appearance:
     ):
         """
         Args:
-            lightings: Names of the `vectors` (lightings, dim).
-            frames: Names of the training frames, of the `residuals` (n, dim).
+            lightings: Names of the lightings, whose embeddings are `vectors` (lightings, dim).
+            frames: Names of the training frames, whose residuals are `residuals` (n, dim).
             frame_lighting: Index of each frame's lighting, shape (n,).
             stale: See `Lightings.stale`.
         """
@@ -76,7 +76,7 @@ _PRIOR = 1e-3  # weight of the squared distance from the initial embedding; the 
 _INITIAL_EXTINCTION = 2.5e-3  # [1/m]
 _EXTINCTION_RATE, _AIRLIGHT_RATE = 0.3, 0.05  # learning rates of the logarithm of extinction and of the airlight
 _MAX_EXTINCTION = 0.1  # [1/m], a visibility of 30 m; a thicker veil in a photo probably lies on the lens
-_FARTHEST_SHARE = 0.25  # the mean color of this share of the rays, the farthest, initializes the airlight
+_FARTHEST_SHARE = 0.25  # share of the rays, the farthest ones, whose mean color initializes the airlight
 
 
 def fit_appearance(
@@ -88,9 +88,9 @@ def fit_appearance(
     steps: int = _STEPS,
     distances: torch.Tensor | None = None,
 ) -> tuple[Array32, Fog]:
-    """Fits the embedding (dim,) and the fog under which traced rays have given colors (n, 3) in [0, 1].
+    """Fits an embedding (dim,) and fog, such that traced rays get the given colors (n, 3) in [0, 1].
 
-    `parameters` are the weights of the field's networks and stay fixed. Features (n, CHANNELS − 1) and harmonics
+    `parameters`, the weights of the field's networks, stay fixed. Features (n, CHANNELS − 1) and harmonics
     (n, 16) come from `RadianceField.trace`. The embedding starts at `start`, the mean of its prior. Fog is fitted only
     if `distances` along the rays [m], shape (n,), are given.
     """

@@ -2,9 +2,9 @@
 
 In DriveEnv-NeRF, a person picks the sampled embeddings that look right. Here, a rule with two parts checks the
 *picture* of an embedding: the colors that it gives to *probes*, rays through the training frames with known features.
-First, light is additive: in linear light, the picture must be close to a sum of the filmed lightings' pictures with
-non-negative weights. More sun, street lamps at noon and longer exposure are such sums; green walls are not. Second,
-statistics of brightness, contrast and color must lie in the slightly widened range of the filmed lightings and frames.
+First, since light is additive, the picture must be close to a weighted sum of the filmed lightings' pictures in linear
+light, with non-negative weights. More sun, street lamps at noon and longer exposure are such sums; green walls are not.
+Second, statistics of brightness, contrast and color must lie in the widened range of the filmed lightings and frames.
 """
 
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ from twin.errors import InputError
 from twin.types import Array32
 
 _GAMMA = 2.2  # approximate tone curve of the films
-_MAX_MISFIT = 0.06  # greatest rms color error of the nearest sum of lights [full scale = 1]
-_OUTLIER_ERROR = 0.2  # color error from which a probe is an outlier [full scale = 1]
+_MAX_MISFIT = 0.06  # greatest rms color difference from the nearest sum of lights [full scale = 1]
+_OUTLIER_ERROR = 0.2  # color difference above which a probe is an outlier [full scale = 1]
 _MAX_OUTLIER_SHARE = 0.02  # greatest share of outliers among the probes
 _RANGE_MARGIN = (0.02, 0.1)  # at both ends, filmed ranges grow by the first value plus the second times their width
-_CLIPPED = (0.02, 0.98)  # a color with all channels below the first is black, above the second burnt out
+_CLIPPED = (0.02, 0.98)  # all channels below the first value: black; all above the second: burnt out
 _CONCENTRATION = 0.7  # of the Dirichlet distribution; values below 1 favor single lightings over even mixtures
 _RESIDUAL_SCALE = 2.0  # scale of sampled frame residuals; the rule rejects implausible ones
 _MAX_TRIES = 200
@@ -67,14 +67,14 @@ class AppearancePrior:
         low, high = filmed.min(0), filmed.max(0)
         margin = _RANGE_MARGIN[0] + _RANGE_MARGIN[1] * (high - low)
         self._low, self._high = low - margin, high + margin
-        # A frame's lighting is the nearest one, as training keeps residuals small.
+        # Training keeps residuals small, so the lighting of a frame is the nearest one.
         nearest = np.linalg.norm(frame_vectors[:, None] - vectors, axis=-1).argmin(1)
         self._vectors, self._residuals = vectors, frame_vectors - vectors[nearest]
 
     def propose(self, rng: np.random.Generator) -> Array32:
         """Samples an unchecked embedding (dim,) that resembles the learned ones.
 
-        It is a random mixture of the lightings plus a normal deviate with the covariance of the frame residuals.
+        It is a random mixture of the lightings plus a normal deviate with the scaled covariance of the frame residuals.
         """
         embedding = rng.dirichlet(np.full(len(self._vectors), _CONCENTRATION)) @ self._vectors
         count = len(self._residuals)
@@ -84,9 +84,9 @@ class AppearancePrior:
         return embedding.astype(np.float32)
 
     def color_error(self, picture: NDArray) -> NDArray[np.float64]:
-        """Color errors of the probes against the nearest non-negative sum of the filmed lights, shape (k,).
+        """Color errors (rms over channels) of the probes against the nearest sum of filmed lights, shape (k,).
 
-        Each is the rms over the channels.
+        The weights of the sum are non-negative.
         """
         from scipy.optimize import nnls
 
@@ -103,7 +103,7 @@ class AppearancePrior:
             if not violations:
                 return embedding
         raise InputError(
-            f"no plausible lighting among {_MAX_TRIES} sampled; the last is {'; '.join(violations)}; "
+            f"no plausible lighting among {_MAX_TRIES} sampled; the last has {'; '.join(violations)}; "
             "train the field longer (nerf.steps), or render the filmed lightings and their mixtures"
         )
 
@@ -114,9 +114,9 @@ class AppearancePrior:
         misfit, wrong = float(np.sqrt((error**2).mean())), float((error > _OUTLIER_ERROR).mean())
         found = []
         if not misfit <= _MAX_MISFIT:
-            found.append(f"{misfit:.3f} from any sum of the filmed lights (at most {_MAX_MISFIT})")
+            found.append(f"an rms error of {misfit:.3f} from any sum of the filmed lights (at most {_MAX_MISFIT})")
         if not wrong <= _MAX_OUTLIER_SHARE:
-            found.append(f"{wrong:.1%} of the probes off by {_OUTLIER_ERROR} (at most {_MAX_OUTLIER_SHARE:.0%})")
+            found.append(f"{wrong:.1%} of the probes off by over {_OUTLIER_ERROR} (at most {_MAX_OUTLIER_SHARE:.0%})")
         for name, value, low, high in zip(_STATISTICS, picture_statistics(picture), self._low, self._high, strict=True):
             if not low <= value <= high:
                 found.append(f"{name} {value:.3f} (filmed: {low:.3f} to {high:.3f})")

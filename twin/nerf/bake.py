@@ -30,8 +30,8 @@ _VIEW_WIDTH = 112  # [px] width of these views
 _SAMPLES = 24  # samples per ray
 _MIN_WEIGHT = 0.004  # a sample with a greater compositing weight lies on a surface
 _MIN_CELL = 0.03  # [m] least side of near cells
-_COARSENING = 1.15  # least factor by which cells grow per attempt
-_LARGE_CELL = 0.15  # [m] above this near side, _EXTRA_BRICKS times the bricks are allowed, which costs 7 % of speed
+_COARSENING = 1.15  # least growth of cells per attempt to fit `max_bricks`
+_LARGE_CELL = 0.15  # [m] if near cells are larger, _EXTRA_BRICKS times as many bricks are allowed; costs 7 % of speed
 _EXTRA_BRICKS = 1.39
 _FAR_CELL_RATIO = 4.0  # side of far cells over that of near cells
 _EMPTY_RAW_DENSITY = -8.0  # raw density outside all bricks
@@ -61,8 +61,8 @@ def bake(
     near, far = _surface_positions(field, pixels)
     if not len(near) and not len(far):
         raise InputError(
-            "no training camera sees anything in the trained field, so there is nothing to bake; raise nerf.steps, or "
-            "lower nerf.near_plane or set nerf.near_half_extent = 0 where these were changed"
+            "no training camera sees anything in the trained field, so there is nothing to bake; raise nerf.steps; if "
+            "nerf.near_plane or nerf.near_half_extent was changed, restore its default"
         )
     layout, slots = _layout(field, near, far, max_bricks)
     if layout.near_side.max() / kernels.CELLS > _LARGE_CELL:
@@ -139,7 +139,7 @@ def _layout(
 
 
 def _bricks_around(spots: NDArray, shape: NDArray) -> NDArray[np.int64]:
-    """Sorted bricks (s, 3) that contain positions in [0, 1)³ or lie less than a cell away from them."""
+    """Sorted bricks (s, 3) that contain one of the positions in [0, 1)³ or are less than a cell away from one."""
     marked = np.zeros(shape, bool)
     at = spots * shape
     margin = 1.0 / kernels.CELLS
@@ -277,7 +277,7 @@ def _probes(field: RadianceField, pixels: TrainingPixels, seed: int) -> dict[str
 def _quantized(
     values: torch.Tensor, slots: tuple[NDArray, NDArray], field: RadianceField, layout: BrickLayout
 ) -> dict[str, NDArray]:
-    """Arrays of a `BakedField`. Overwrites the values."""
+    """The arrays of a `BakedField`, with values as bytes. Overwrites `values`."""
     flat = values.view(-1, volume.CHANNELS)
     dense = torch.nonzero(flat[:, 0] > 0.0)[:, 0]
     some = flat[dense[:: max(1, len(dense) // 200_000)] if len(dense) else slice(None, None, 100)].cpu().numpy()

@@ -107,7 +107,7 @@ def _stored_skips(index: NDArray[np.int32], distance: NDArray[np.uint8]) -> tupl
 def skip_distances(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str, NDArray[np.uint8]]:
     """Skip distances (see `kernels/march.py`) of all blocks of both grids, as arrays `near_leap` and `far_leap`.
 
-    A block is occupied if a cell with the density of one of the block's samples blocks more than `_MAX_EMPTY_OPACITY`.
+    A block is occupied if one of its samples has a density at which a cell blocks more than `_MAX_EMPTY_OPACITY`.
     """
     from scipy.ndimage import distance_transform_cdt
 
@@ -172,7 +172,7 @@ def _check_arrays(layout: BrickLayout, arrays: dict[str, NDArray], dim: int) -> 
     for name, index, shape in (("near", near, layout.near_shape), ("far", far, layout.far_shape)):
         inside = not len(index) or (index.min() >= 0 and (index < np.array(shape)).all())
         if not inside or len(np.unique(np.ravel_multi_index(tuple(index.T), shape))) < len(index):
-            raise ValueError(f"{name}: a brick outside the grid of {shape} bricks, or one twice")
+            raise ValueError(f"{name}: a brick is outside the grid of {shape} bricks or occurs twice")
 
 
 # ---- detail
@@ -272,7 +272,7 @@ def detail_grid(detail: Detail, device: str) -> Any:
 # ---- field
 
 _FORMAT = 2
-_MAX_TARGETS = 4  # kept render targets at most; a vector env uses one for all its envs and one for those in reset
+_MAX_TARGETS = 4  # render targets kept at most; a vector env uses one for all its envs and one for those that reset
 
 
 class BakedField:
@@ -427,7 +427,7 @@ class BakedField:
         """Renders as `render` does and passes the result to `consume` without copying it to the host.
 
         `consume` receives two Warp arrays on the field's device: colors (n, height · width) of vec3, and opacities
-        (n, height · width). Both are overwritten after it returns.
+        (n, height · width). Both are valid only until it returns.
         """
         with self._lock:
             target = self._render(cameras, lighting)
@@ -464,7 +464,7 @@ class BakedField:
         self._targets.clear()
 
     def single_threaded(self) -> "BakedField":
-        """A field on the same arrays with its own render targets and lock, which renders on the calling thread.
+        """A field on the same arrays with its own render targets and lock. It renders on the calling thread.
 
         Several such fields render at the same time, each in a thread of the caller.
         """

@@ -152,9 +152,9 @@ def opacity_grid_sizes(near_box: NearBox) -> list[tuple[tuple[int, ...], float]]
 
 
 def level_cells(near_box: NearBox, levels: int, growth: float) -> NDArray[np.float32]:
-    """Cells per axis of every hash level, shape (levels, 3); each level has `growth` times more than the one before.
+    """Cells per axis of every hash level, shape (levels, 3); each level has `growth` times as many as the one before.
 
-    Cells are cubes inside the near box.
+    Inside the near box, cells are cubes.
     """
     sides = 4.0 * np.array(near_box.half)
     per_meter = COARSEST_CELLS * growth ** np.arange(levels) / sides.max()
@@ -197,7 +197,7 @@ class Layout:
 class Workspace:
     """Arrays for `rays` rays with `samples` samples each, followed by `extra` points; all batches reuse them.
 
-    Names with `w_` are Warp views of the torch tensors; those with `w_ray_` have a row per ray and no extra points.
+    Attributes `w_*` are Warp views of the torch tensors; those named `w_ray_*` have a row per ray and no extra points.
     """
 
     def __init__(self, layout: Layout, rays: int, samples: int, device: str, extra: int = 0, training: bool = False):

@@ -1,8 +1,8 @@
 """Training data of a field: pixels of the training frames, and depth supervision.
 
-Depth supervision consists of pixels (not rounded) with a known distance along their rays. It has three kinds: sparse
-points in the frames in which they were matched, the ground under the camera path ahead (if the camera height is
-constant), and stereo.
+Depth supervision consists of image points (not rounded to pixels) with a known distance along their rays. It has three
+kinds: sparse points in the frames in which they were matched, the ground under the camera path ahead (if the camera
+height is constant), and stereo.
 """
 
 from dataclasses import dataclass
@@ -108,7 +108,7 @@ class TrainingPixels:
         return DepthSupervision(depths.frame[keep], depths.pixel[keep], depths.distance[keep])
 
     def _depths_in_frame(self, i: int, xyz: NDArray) -> DepthSupervision:
-        """Depth supervision of training frame i from those of the points (k, 3) [m] that lie on unmasked pixels."""
+        """Depth supervision of frame i from points (k, 3) [m]; drops points outside the frame or on masked pixels."""
         pixel, depth = project(xyz, self.cameras.camera_to_world[i], self.intrinsics[i])
         inside = (depth > 0) & (pixel > 0.5).all(1) & (pixel < [self.width[i] - 0.5, self.height[i] - 0.5]).all(1)
         xyz, pixel = xyz[inside], pixel[inside]
@@ -151,8 +151,8 @@ class TrainingPixels:
     def batch(self, rng: np.random.Generator, shards: int, triples: int, singles: int, supervised: int) -> RayBatch:
         """Samples random rays, shard after shard.
 
-        Each shard holds `triples` × 3 rays through equally spaced pixels in a line, then `singles` pixels, then
-        `supervised` rays in equal shares of the available kinds: sparse points, path, stereo.
+        Each shard holds `triples` × 3 rays, a triple through equally spaced pixels in a line; then `singles` rays
+        through random pixels; then `supervised` rays in equal shares from the available kinds of depth supervision.
         """
         kinds = [pool for pool in (self.points, self.path, self.stereo) if len(pool.frame)]
         if not kinds:
@@ -185,7 +185,7 @@ class TrainingPixels:
     def _triples(self, rng: np.random.Generator, n: int) -> tuple[NDArray, ...]:
         """Triples of pixels in a line, the middle one second.
 
-        If a pixel of a triple is masked or outside the frame, all three are the middle one.
+        If one of the three is masked or outside the frame, the middle one replaces both others.
         """
         middle = self._random(rng, n)
         frame, row, column = self._place(middle)

@@ -1,8 +1,8 @@
 """Fits the detail of a baked field to the training frames; `kernels/surface_detail.py` defines the terms.
 
 Bricks blur surfaces that are seen at grazing angles, most of all the ground: a ray passes through many cells before it
-is blocked. But the point where it meets the surface is known more precisely: on the ground to a few centimeters, as the
-height of the ground is smooth. So detail adds features at that point, which correct those of the bricks.
+is blocked. The point where it meets the surface is known more precisely: on the ground to a few centimeters, as the
+height of the ground is smooth. Detail adds features at that point, which correct those of the bricks.
 """
 
 from dataclasses import dataclass, replace
@@ -33,10 +33,10 @@ _HEIGHT_CELL = 0.25  # [m] spacing of the height map
 _HEIGHT_VIEW = 160  # [px] width of the rendered views in which the ground is searched
 _REACH = 12.0  # [m] greatest z-depth at which ground is searched in a view
 _MIN_UPRIGHT = 0.94  # least z of the ground's unit normal (20° from level)
-_MIN_SEEN = 8  # least number of pixels in a cell whose height is known
-_MIN_OPACITY = 0.98  # least opacity of a ray that shows a surface and nothing behind it
+_MIN_SEEN = 8  # least number of rendered points that determine a height
+_MIN_OPACITY = 0.98  # rays of greater opacity show a surface and nothing behind it
 _MIN_HITS = 24  # least number of training pixels in a stored tile
-_MAX_HITS = 8_000_000  # approximate greatest number of training pixels that are kept, 0.5 GB
+_MAX_HITS = 8_000_000  # upper limit of the training pixels used (approximate), 0.5 GB
 _SHARDS = 4
 _RAYS = 16384  # rays per step
 _RATE, _FINAL_RATE = 0.04, 0.05  # initial learning rate, and the final one as a share of it
@@ -171,7 +171,7 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
             parts.append([hit[at], base, ray.astype(np.float16), pixels.colors[rows][at], frame])
             progress.update()
     order = rng.permutation(sum(len(part[0]) for part in parts))
-    # Columns are joined one by one, as a second copy of all of them would be the build's peak of memory.
+    # Joins one column at a time: a second copy of all columns would set the build's peak memory.
     return SurfacePixels(*(np.concatenate([part.pop(0) for part in parts])[order] for _ in range(5)))
 
 
@@ -233,7 +233,7 @@ class _DetailFitter:
         return float(-10 * np.log10(np.mean(errors[:some]))), float(-10 * np.log10(np.mean(errors[-some:])))
 
     def _backward(self, shard: int, rows: slice) -> float:
-        """Gradient of the loss with respect to the added features of a shard, and its sum of squared errors."""
+        """Writes the loss gradient of a shard's added features; returns the shard's sum of squared errors."""
         count = rows.stop - rows.start
         low, high = shard * count // _SHARDS, (shard + 1) * count // _SHARDS
         mine = slice(rows.start + low, rows.start + high)

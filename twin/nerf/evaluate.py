@@ -1,10 +1,10 @@
 """Evaluation of a field on held-out frames, and a control experiment: filmed poses rendered under other lightings.
 
-The embedding of a held-out frame is fitted on the left or right half of the image, starting from the embedding of its
-lighting, and scored on the other half; the score is the mean over both halves. *Unfitted* scores use the embedding of
-the lighting itself; *wrong* scores use the embeddings of the other lightings, unfitted. *Small* scores use images of
-the size that policies see, each half rendered under the embedding that was fitted on the other half. If there is a
-baked field, it is scored instead of the trained one, since users see the baked one.
+An embedding is fitted on one half of a held-out frame, left or right, starting from the embedding of its lighting; the
+other half is scored. A score is the mean over both halves. *Unfitted* scores use the embedding of the lighting itself;
+*wrong* scores use the embeddings of the other lightings, unfitted. *Small* scores use images of the size that policies
+see, each half rendered under the embedding that was fitted on the other half. If there is a baked field, it is scored
+instead of the trained one, since users see the baked one.
 """
 
 from functools import cache
@@ -80,7 +80,7 @@ def score_frame(
         fitted.append(fit_appearance(field.parameters, features[some], harmonics[some], colors[some], start)[0])
         shown = picture(fitted[-1])
         psnrs.append(psnr(shown, image, score_on))
-        # Masked pixels are made equal, which affects SSIM only in windows that contain them.
+        # SSIM takes no mask. Copying masked pixels from the frame limits their effect to windows that contain them.
         shown[~mask] = image[~mask]
         side = slice(width // 2, None) if half is left else slice(None, width // 2)
         ssims.append(ssim(shown[:, side], image[:, side]))
@@ -175,9 +175,9 @@ def cross_lighting(
     * `filmed_colour[i]`: mean color of the film at the poses of lighting i.
     * `mean_colour[i][j]`: mean color of the poses of lighting i, rendered under j.
     * `to_shown_rms[j]`: rms distance between `filmed_colour[j]` and the poses of other lightings, rendered under j.
-    * `to_filmed_rms[j]`: rms distance between these images and `filmed_colour` of the lighting of their pose.
+    * `to_filmed_rms[j]`: rms distance between these images and `filmed_colour` of the lighting of their own frame.
     * `colour_follows[j]`: share of these images that are closer to the nearest frame filmed under j than to their own
-      filmed frame: 1 if the lighting decides the color, 0 if the pose does; a tie counts one half.
+      filmed frame; a tie counts one half. 1: the lighting decides the color; 0: the pose decides it.
     * `follows_by_pair[i][j]`: the same for the poses of lighting i alone.
     * `depth_moves_m`: greatest change of any pixel's depth between two lightings [m], 0 by construction.
     """
@@ -220,7 +220,7 @@ def cross_lighting(
         rows = np.flatnonzero(light != j)
         nearest = [nearest_frame(trained, poses[row], name) for row in rows]
         there = np.array([filmed(i) for i in nearest if i is not None])  # never None: each lighting has a frame
-        # Differences below a thousandth of a byte are rounding, and count as a tie.
+        # Differences below 5e-7 are rounding errors and count as a tie.
         nearer = np.round(_distance(shown[rows, j], own[rows]) - _distance(shown[rows, j], there), 6)
         for key, reference in (("to_shown_rms", film[j]), ("to_filmed_rms", film[light[rows]])):
             rms = np.sqrt((_distance(shown[rows, j], reference) ** 2).mean())

@@ -168,7 +168,7 @@ class RadianceField:
         depth_reach: float = 1.0,
         log_offset: float = 1.0,
     ) -> None:
-        """Loss gradients with respect to opacity, features and Σwᵢ/tᵢ per ray → with respect to network outputs.
+        """Loss gradients of opacity, features and Σwᵢ/tᵢ per ray → loss gradients of network outputs.
 
         The samples of a ray have weights wᵢ and distances tᵢ [m]. The last four arguments are weights and scales of two
         regularizers, see `composite.composite_backward`.
@@ -335,7 +335,7 @@ class RadianceField:
 
 
 def untrained_field(layout: Layout, appearance: Appearance, seed: int, device: str) -> RadianceField:
-    """The field before its first training step: nearly transparent everywhere."""
+    """The field before its first training step, whose density is low and almost uniform."""
     generator = torch.Generator().manual_seed(seed)
     table = (torch.rand(layout.levels, 2**layout.log2_table, hashgrid.FEATURES, generator=generator) - 0.5) * 2e-2
     parameters = network.initial_parameters(

@@ -1,7 +1,7 @@
 """Homogeneous fog, applied to an image by its depth (Koschmieder 1924).
 
-Over a distance d, a share exp(−extinction · d) of a surface's light is kept; the rest of the color is the *airlight*,
-which the air scatters towards the camera. The meteorological visibility, at which 5 % are kept, is 3 / extinction.
+Over a distance d, fog keeps a share exp(−extinction · d) of a surface's light; the rest of the color is the *airlight*,
+which the air scatters towards the camera. The meteorological visibility, at which fog keeps 5 %, is 3 / extinction.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 from twin.types import Array32
 
 REACH = 100.0
-"""Greatest distance [m] over which fog accumulates: as fog lies low, it does not hide the sky."""
+"""Greatest distance [m] over which fog accumulates: fog lies low and does not hide the sky."""
 
 
 @dataclass(frozen=True)

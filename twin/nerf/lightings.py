@@ -35,7 +35,7 @@ class Lightings:
     frame_vectors: Array32
     """Shape (frames, dim)."""
     probes: appearance_prior.Probes | None = None
-    """Rays on which random lightings are checked; a baked field has them."""
+    """Rays that check random lightings, see `appearance_prior.py`; only a baked field has them."""
     stale: tuple[str, ...] = ()
     """Added lightings that are refused, since they were fitted to another build of the field or by an older twin."""
     count_added: int = 0

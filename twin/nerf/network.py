@@ -41,7 +41,7 @@ def spherical_harmonics(d: torch.Tensor) -> torch.Tensor:
 
 
 def trunk(p: dict[str, torch.Tensor], features: torch.Tensor, hidden: torch.Tensor, out: torch.Tensor) -> None:
-    """Writes raw density and features of samples to `out` (n, CHANNELS), and `hidden` (n, width) for backward."""
+    """Writes raw density and features to `out` (n, CHANNELS), and the hidden layer to `hidden` (n, width)."""
     torch.mm(features, p["trunk.0"], out=hidden)
     hidden.relu_()
     torch.mm(hidden, p["trunk.1"], out=out)
@@ -76,7 +76,7 @@ def head(
     """Colors in [0, 1], shape (n, 3), of rays under embeddings of shape (n, dim) or (dim,)."""
     f, s = features.shape[1], harmonics.shape[1]
     w = p["head.0"]
-    # An embedding of shape (dim,) adds the same bias to all rays.
+    # The product with an embedding (dim,) is one bias for all rays.
     x = features @ w[:f] + harmonics @ w[f : f + s] + (embedding @ w[f + s :] + p["head.0.bias"])
     x = torch.relu(torch.relu(x) @ p["head.1"] + p["head.1.bias"])
     return torch.sigmoid(x @ p["head.2"] + p["head.2.bias"])

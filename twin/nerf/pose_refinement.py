@@ -30,8 +30,7 @@ class PoseRefinement:
     def __init__(self, camera_to_world: Array, intrinsics: Array, near: float, ws: Workspace) -> None:
         """Starts at poses (n, 4, 4) with intrinsics (n, 4) [px of a training frame].
 
-        `near` is the distance of near surfaces [m], which converts pixels to translations; `ws` is the training's
-        workspace.
+        `near`, the distance of near surfaces [m], converts pixels to translations. `ws` is the workspace of training.
         """
         n, device = len(camera_to_world), ws.device
         self.rotation = torch.zeros(n, 3, device=device, requires_grad=True)

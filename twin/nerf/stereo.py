@@ -2,7 +2,7 @@
 
 A *source* of a frame is another frame of the same film that shows nearly the same view from a few degrees to the side.
 A frame is divided into *cells* of a few pixels. PatchMatch stereo (Bleyer et al. 2011; for several views Galliani et
-al. 2015) fits a plane to every cell, such that the sources, mapped by the plane, look like the frame. A cell is used if
+al. 2015) fits a plane to every cell, such that the sources, warped by the plane, look like the frame. A cell is used if
 enough sources find the same point. Surfaces without texture get no depth.
 """
 
@@ -24,11 +24,11 @@ from twin.warp_runtime import wp
 _GRID_CELLS = 160  # cells along a frame's longer side
 _MAX_SOURCES = 4  # sources per frame
 _ROUNDS = 4  # PatchMatch rounds after the first
-_BEST_ANGLE = 5.0  # [°] between two views of a point: smaller angles are imprecise, larger ones change the appearance
+_BEST_ANGLE = 5.0  # [°] between two views of a point: less makes depth imprecise, more changes the appearance
 _WINDOW_SPACING = 240  # a frame's longer side is this many times the spacing of a window's pixels
 _MAX_COST = 0.5  # greatest 1 − NCC of a used cell
 _TOLERANCE = 0.04  # relative difference of inverse depth within which two frames agree
-_MIN_PARALLAX = 0.3  # [px] least motion of the pixel in a voting source when inverse depth changes by the tolerance
+_MIN_PARALLAX = 0.3  # [px] least shift in a voting source if inverse depth changes by the tolerance
 _MIN_VOTES = 2  # sources that must agree
 _MIN_POINTS = 20  # least number of sparse points from which a frame's depth range is estimated
 
@@ -48,7 +48,7 @@ class StereoGeometry:
 def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[DepthSupervision, dict[str, Any]]:
     """Depth supervision for every frame that has sources, and a summary; the same seed gives the same depths.
 
-    Sparse points give the range of depths to search; with fewer than 20, or fewer than 3 frames, nothing is found.
+    Sparse points give the range of depths to search. With fewer than 20 points or 3 frames, the result is empty.
     """
     n = len(pixels.cameras)
     none = join_depths([])
@@ -214,7 +214,7 @@ def _cell_pixels(step: int, shape: tuple[int, ...]) -> Array:
 
 
 def _planes_at_points(pixels: TrainingPixels, i: int, step: int, shape: tuple[int, ...]) -> Array:
-    """Fronto-parallel planes (rows, columns, 3) at the depth of the nearest sparse point; q = 0 without points."""
+    """Fronto-parallel planes (rows, columns, 3) at the depth of the nearest sparse point; zeros without points."""
     from scipy.spatial import cKDTree
 
     own = pixels.points.frame == i
@@ -228,7 +228,7 @@ def _planes_at_points(pixels: TrainingPixels, i: int, step: int, shape: tuple[in
 
 
 def _ground_planes(pixels: TrainingPixels, i: int, step: int, shape: tuple[int, ...]) -> Array:
-    """The ground plane z = 0 in every cell, shape (rows, columns, 3); q ≤ 0 above the horizon."""
+    """The ground plane z = 0 in every cell, shape (rows, columns, 3); inverse depth ≤ 0 above the horizon."""
     pose, (fx, fy, cx, cy) = pixels.cameras.camera_to_world[i], pixels.intrinsics[i]
     height = pose[2, 3]
     # A ray at depth d reaches z = height + d · (row 3 of R) · ray, which is 0 on the ground.

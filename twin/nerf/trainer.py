@@ -1,8 +1,7 @@
 """Stage `field`: trains a radiance field on metric cameras, bakes it, adds detail, and evaluates the result.
 
-The number of training steps is fixed (`nerf.steps`), and nothing depends on a clock, so on a CPU the same input gives
-the same field bit for bit. Every batch of rays comes with *free points*: random points around the camera path, where
-space is empty.
+Training takes `nerf.steps` steps, however long they last. On a CPU, the same input gives the same field bit for bit.
+Each step also penalizes density at *free points*: random points near the camera path, where space must be empty.
 """
 
 import math
@@ -47,14 +46,14 @@ from twin.runtime import bar
 from twin.scene import SceneDir
 from twin.warp_runtime import wp
 
-# ---- losses; distortion and depth are in `kernels/composite.py`
+# ---- losses; those of distortion and depth are in `kernels/composite.py`
 
 _EDGE_SHARPNESS = 10.0  # a color contrast of 1/10 divides the plane loss by e
-_MAX_BEND = 0.5  # greatest relative bend that counts: a larger one is a depth edge, whatever the colors are
-_HORIZON_SINE = 0.03  # rays this close to level are neither above nor below the horizon
+_MAX_BEND = 0.5  # upper limit of the relative second difference of inverse depth: a larger one is a depth edge
+_HORIZON_SINE = 0.03  # sine of the elevation within which a ray is neither above nor below the horizon
 # Weights of the loss terms beside the color error.
 _DISTORTION = 0.005
-_DEPTH, _DEPTH_REACH = 0.25, 0.5  # with a weight of 1.0, errors of stereo blur near surfaces, at a loss of 0.6 dB
+_DEPTH, _DEPTH_REACH = 0.25, 0.5  # a weight of 1.0 costs 0.6 dB: errors of stereo blur near surfaces
 _PLANE = 0.01
 _FREE = 1e-3
 _SKY, _GROUND = 1e-2, 1e-2
@@ -64,8 +63,8 @@ _RESIDUAL = 1e-3
 def plane_loss(inverse_depth: torch.Tensor, color: torch.Tensor) -> torch.Tensor:
     """Edge-aware planarity loss of triples of rays, from inverse z-depths (3k,) [1/m] and colors (3k, 3).
 
-    The inverse z-depth of a plane is affine in the pixel, so its second difference is zero. The loss spreads the few
-    known depths over the road, which has little texture.
+    The inverse z-depth of a plane is affine in the pixel, so its second difference is zero. On the road,
+    which has little texture, the loss carries the few known depths to the pixels between them.
     """
     d = inverse_depth.view(-1, 3)
     c = color.view(-1, 3, 3)
@@ -77,8 +76,8 @@ def plane_loss(inverse_depth: torch.Tensor, color: torch.Tensor) -> torch.Tensor
 def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
     """Mean cost of opacity above the horizon and of transparency below it.
 
-    The sky needs this cost, since a surface of a plain color would fit it at any distance. Takes the opacity of rays
-    (n,) and the vertical component `up` (n,) of their directions.
+    Without it, training would put surfaces into the sky, since a uniform color fits at any distance. Arguments are the
+    opacity (n,) of rays and the vertical component `up` (n,) of their directions.
     """
     above, below = (up > _HORIZON_SINE).float(), (up < -_HORIZON_SINE).float()
     return (_SKY * above * opacity + _GROUND * below * (1.0 - opacity)).mean()
@@ -87,17 +86,17 @@ def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
 # ---- training
 
 _SHARDS = 4  # shards per batch
-_CELL_PIXELS = 2.0  # side of the finest cell at the distance of near surfaces [px of a training frame]
-_GROWTH_RANGE = (1.3, 2.2)  # limits of the growth of the cells per axis from one hash level to the next
+_CELL_PIXELS = 2.0  # projected side of the finest hash cell at the distance of near surfaces [px of a training frame]
+_GROWTH_RANGE = (1.3, 2.2)  # limits of the factor between the cells per axis of consecutive hash levels
 _HIDDEN = 64  # units per hidden layer
 _TRIPLE_SHARE = 0.3  # share of the rays that come in triples, for the plane loss
 _FREE_POINTS = 256  # free points per shard and step
 _NETWORK_RATE = 1e-2  # initial learning rate of networks and embeddings
 _FINAL_RATE = 0.03  # final learning rates, as a share of the initial ones
-_RISE, _FALL = 0.3, 0.1  # rates at which opacity grid cells follow higher and lower samples
-_LOG_OFFSET = 0.05  # offset in the distortion's logarithmic distance [share of the near box's longest half side]
+_RISE, _FALL = 0.3, 0.1  # step of an opacity grid cell toward a more or a less opaque sample [share of the difference]
+_LOG_OFFSET = 0.05  # added to distances in the distortion loss's logarithm [share of the near box's longest half side]
 _WARM_UP = 20  # steps of rising learning rate
-_EXPLORATION_SHARE = 0.15  # sampling narrows down over this share of the steps; cameras are refined only afterwards
+_EXPLORATION_SHARE = 0.15  # share of the steps in which sampling narrows down to surfaces; cameras are refined after it
 
 
 class Trainer:
@@ -154,12 +153,12 @@ class Trainer:
                 tensor.requires_grad_(True)
         learned = list(self.torch_parameters.values())
         self.optimizer = torch.optim.Adam(learned, lr=_NETWORK_RATE, betas=(0.9, 0.99), eps=1e-12)
-        # The table's gradient, and its first and second moment.
+        # The hash table's gradient, and Adam's first and second moment of it.
         self.moments = [warp_view(torch.zeros_like(f.table), hashgrid.Feature) for _ in range(3)]
         self.steps_done = 0
 
     def _growth(self, near_box: NearBox) -> float:
-        """Growth of the cells per hash level, such that the finest cell is `_CELL_PIXELS` wide."""
+        """Factor between the cells per axis of consecutive hash levels: makes the finest cell `_CELL_PIXELS` wide."""
         cell = _CELL_PIXELS * self._near_distance(near_box) / float(np.median(self.pixels.intrinsics[:, 0]))
         ratio = 4.0 * near_box.scale / cell / COARSEST_CELLS
         return float(np.clip(ratio ** (1.0 / max(1, self.config.levels - 1)), *_GROWTH_RANGE))
@@ -207,7 +206,7 @@ class Trainer:
         return sum(r[0] for r in results) / _SHARDS
 
     def _shard(self, shard: int, color: torch.Tensor, triples: int, free: bool) -> tuple[float, list[torch.Tensor]]:
-        """Forward and backward pass of one shard: its error, and the gradients in the order of `torch_parameters`."""
+        """Runs a shard; returns its mean squared error, and its gradients in the order of `torch_parameters`."""
         f, ws = self.field, self.ws
         count = self.rays // _SHARDS
         start = shard * count
@@ -228,7 +227,7 @@ class Trainer:
         features = network.ray_features(f.parameters, composited, harmonics)
         rgb = network.head(f.parameters, features, harmonics, f.appearance.of_frames(frame))
         error = rgb - color[rays]
-        # The losses of the shards sum to a mean over the batch.
+        # Terms are divided by the number of shards: the losses of all shards then sum to the mean over the batch.
         loss = torch.nn.functional.smooth_l1_loss(rgb, color[rays], beta=0.1) / _SHARDS
         loss = loss + _RESIDUAL * (residuals[frame] ** 2).mean() / _SHARDS
         loss = loss + horizon_loss(composited[:, 0], ws.directions[rays, 2]) / _SHARDS
@@ -262,7 +261,7 @@ class Trainer:
 
     @property
     def _refines(self) -> bool:
-        """True while cameras are refined; false at first, as long as the field is less accurate than the cameras."""
+        """True if this step refines cameras: not at first, while the field is less accurate than the cameras."""
         return self.refinement is not None and self.steps_done >= _EXPLORATION_SHARE * self.config.steps
 
     def _trunk_backward(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
@@ -279,7 +278,7 @@ class Trainer:
     def _free_backward(self, start: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Gradients of the loss `_FREE` · mean(log(1 + σ·scale)) over free points of density σ.
 
-        The gradient saturates at high density.
+        With respect to raw density, the gradient saturates at high density.
         """
         f, ws = self.field, self.ws
         f.query(ws, start, _FREE_POINTS)
@@ -292,7 +291,7 @@ class Trainer:
     def _update(self, task: int, rate: float) -> None:
         """Accumulates the gradient of hash level `task` and takes an Adam step on that level.
 
-        The two tasks after those of the levels update half of the cells of the opacity grids each.
+        The last two tasks instead update the opacity grids, each one half of the cells.
         """
         f, ws = self.field, self.ws
         levels = self.config.levels
@@ -324,7 +323,7 @@ class Trainer:
         )
 
     def _free_points(self, n: int) -> torch.Tensor | None:
-        """Grid positions of random points that must be empty, shape (n, 3); None without free segments."""
+        """Grid positions of random free points, shape (n, 3); None without free segments."""
         if not len(self.free):
             return None
         pick = self.free[self.rng.integers(len(self.free), size=n)]
@@ -332,7 +331,7 @@ class Trainer:
         offset *= self.config.near_plane * self.rng.random((n, 1)) ** (1 / 3) / np.linalg.norm(offset, axis=1)[:, None]
         x = pick[:, 0] + (pick[:, 1] - pick[:, 0]) * self.rng.random((n, 1)) + offset
         layout = self.field.layout
-        u = (x - np.array(layout.centre)) / np.array(layout.half)  # camera positions lie in the near box
+        u = (x - np.array(layout.centre)) / np.array(layout.half)  # not contracted: the path is in the near box
         return torch.as_tensor((u * 0.25 + 0.5).clip(0.0, 1.0 - 1e-6).astype(np.float32), device=self.device)
 
     def finish(self) -> RadianceField:
@@ -345,7 +344,7 @@ class Trainer:
 def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
     """Straight segments of the camera path, shape (k, 2, 3) [m]; space closer to them than `near_plane` is empty.
 
-    A segment much longer than the median of its source is a jump between photos, so only its ends count.
+    A segment of 3 times its source's median length or more is a jump between photos: only its ends count.
     """
     pieces = [np.repeat(cameras.positions[:, None], 2, 1)] if near_plane > 0 else []
     for source in dict.fromkeys(cameras.sources):
@@ -368,7 +367,7 @@ def train_field(
     """Trains a field; returns it, the training metrics, and the cameras, refined if so configured.
 
     `camera_height` [m] is the constant height of the camera above the ground, 0 if it is not constant; for `device` see
-    `buffers.resolve_device`.
+    `buffers.resolve_device`. Raises InputError if training diverges.
     """
     trainer = Trainer(cameras, points, config, seed, resolve_device(device), camera_height=camera_height)
     curve: list[list[float]] = []
@@ -414,7 +413,7 @@ _HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is n
 
 
 def constant_height(metric: dict[str, Any]) -> float:
-    """Camera height above the ground [m] if the metric stage found it known and constant, else 0."""
+    """Camera height above the ground [m] if stage `metric` found a reliable, constant one, else 0."""
     height, spread = metric.get("camera_height_median_m"), metric.get("local_height_spread_m")
     if not height or not (metric.get("road_reliable") or metric.get("scale_source") == "camera_height"):
         return 0.0
@@ -422,7 +421,7 @@ def constant_height(metric: dict[str, Any]) -> float:
 
 
 def without_timings(metrics: dict[str, Any]) -> dict[str, Any]:
-    """Metrics without timings, so that equal fields have equal files and lightings fitted to them stay valid."""
+    """Metrics without timings: a rebuild then gives equal files, and lightings fitted to the field stay valid."""
     return {
         name: without_timings(value) if isinstance(value, dict) else value
         for name, value in metrics.items()
@@ -431,9 +430,10 @@ def without_timings(metrics: dict[str, Any]) -> dict[str, Any]:
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = None) -> dict[str, Any]:
-    """Runs stage `field`: trains, bakes, evaluates on held-out frames, and saves both fields; returns the metrics.
+    """Runs stage `field`: trains and bakes a field, adds detail, evaluates it on held-out frames, and saves it.
 
-    Raises InputError without a training frame, on an unreadable frame, or on an unavailable device.
+    Saves both the trained and the baked field; returns the metrics. Raises InputError without a training frame, on an
+    unreadable frame, on an unavailable device, or if training diverges.
     """
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))

@@ -22,9 +22,9 @@ SAMPLES = CORNERS**3
 HALF_CORNERS = CORNERS // 2 + 1
 """Samples along z of half a brick."""
 DENSITIES = CORNERS * 2 * CORNERS * HALF_CORNERS
-"""Number of a brick's density bytes. Their axes, slowest first, are x, half along z (the two halves share the samples
-between them, which are stored twice), y, and z in the half. So the four corners of a cell's face normal to x lie within
-eight bytes, and a cache line holds many cells."""
+"""Number of a brick's density bytes. Their axes, slowest first, are x, half of the brick along z, y, and z in the half;
+samples on the border of the halves are stored twice. In this order, the four corners of a cell's face normal to x lie
+within eight bytes, and a cache line holds many cells."""
 
 Bytes = wp.types.vector(length=CHANNELS, dtype=wp.uint8)
 

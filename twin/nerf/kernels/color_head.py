@@ -1,7 +1,7 @@
 """Color head on baked fields: composited features → colors, by the head and background networks of `network.py`.
 
-The *bias* of the first layer includes the appearance. Every camera of a launch has its own bias, so it can have its own
-lighting.
+The *bias* of the first layer includes the appearance embedding. Every camera of a launch has its own bias, and so its
+own lighting.
 """
 
 # Warp reads annotations as values.

@@ -16,7 +16,7 @@ CHANNELS = 16
 Channels = wp.types.vector(length=CHANNELS, dtype=wp.float32)
 
 RAW_LIMIT = 14.0
-"""Raw densities are clamped to this, which is opaque at any sampling distance."""
+"""Upper limit of raw density, at which a stratum of any usual length is opaque."""
 
 
 @wp.struct
@@ -57,7 +57,7 @@ def composite(
     inverse_distance: wp.array(dtype=wp.float32),
     median_distance: wp.array(dtype=wp.float32),
 ):
-    """Opacity and features per ray, Σwᵢ/tᵢ [1/m], and the distance [m] by which half the light is blocked.
+    """Opacity and features per ray, Σwᵢ/tᵢ [1/m], and the distance [m] at which half the light is blocked.
 
     The distance is −1 if less than half is blocked.
     """

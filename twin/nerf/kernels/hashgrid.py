@@ -1,9 +1,8 @@
 """Multi-resolution hash encoding (Müller et al. 2022, section 3): forward, hand-written backward, and optimizer.
 
-*Grid position*: see `kernels/space.py`. *Level*: one of several grids of vertices, ordered from coarse to fine; levels
-that fit into their table are stored densely, the others are hashed. *Table*: features of all levels, `FEATURES` floats
-per vertex. The backward pass is launched level by level: on a CPU, one thread then sums a whole level in a fixed order,
-whatever the number of threads.
+*Grid position*: see `kernels/space.py`. *Level*: one of several grids of vertices, ordered from coarse to fine. A level
+that fits into its table is stored densely, others are hashed. *Table*: features of all levels, `FEATURES` floats per
+vertex. The backward pass is launched level by level: on a CPU, one thread then sums a whole level in fixed order.
 """
 
 # Warp reads annotations as values.
@@ -108,7 +107,7 @@ def encode_backward(
     k, i = wp.tid()
     level = first_level + k
     g = features_grad[i, level]
-    if wp.dot(g, g) == 0.0:  # zero behind an opaque sample; small gradients count, as Adam normalizes them
+    if wp.dot(g, g) == 0.0:  # as behind an opaque sample; small gradients count, as Adam normalizes them
         return
     cell = cell_at(positions[i], levels.cells[level])
     for n in range(8):

@@ -198,8 +198,8 @@ def features_at(bricks: Bricks, slot: wp.int32, p0: wp.float32, p1: wp.float32, 
 def exit_distance(p: wp.float32, slowness: wp.float32, first: wp.int32, size: wp.int32, skip: wp.int32):
     """Distance [m] after which a ray leaves the blocks that it may skip, along one axis.
 
-    The ray is at `p` [blocks] and needs `slowness` [m/block]. It may skip `size` blocks from `first` on, and skip − 1
-    more on both sides.
+    The ray is at `p` [blocks]; `slowness` is its inverse velocity [m/block]. It may skip `size` blocks from `first` on,
+    and skip − 1 more on both sides.
     """
     return (float(wp.where(slowness > 0.0, first + size + skip - 1, first + 1 - skip)) - p) * slowness
 
@@ -275,7 +275,7 @@ def cone_march(bricks: Bricks, image: ImageBuffers, first: wp.int32, start: wp.a
 def march_kernel(lanes: int) -> Any:
     """Builds the marching kernel for packets of `lanes` rays, 1, 8 or 16.
 
-    It is launched over cameras and the packets of some tiles, `TILE`² / lanes each. It writes opacity and composited
+    It is launched over cameras and packets, `TILE`² / lanes of them per tile. It writes opacity and composited
     features (cameras, CHANNELS, pixels), and the z-depth [m] at which half the light is blocked (−1 if less is).
     """
     Floats = wp.types.vector(length=lanes, dtype=wp.float32)

@@ -2,7 +2,8 @@
 
 A *plane* at a pixel is (q, ∂q/∂u, ∂q/∂v): inverse z-depth q [1/m] and its slopes [1/(m px)]. This is exact, since the
 inverse depth of a plane is affine in the pixel. A *window* is 5 × 5 pixels `spacing` apart around the pixel; the plane
-maps it to a source frame. The cost is 1 − NCC, with greater weights for window pixels that resemble the middle one.
+maps it to a source frame. The cost is 1 − NCC (normalized cross-correlation), in which window pixels weigh more if they
+resemble the middle one.
 Only the two sources of lowest cost are used, since a point may be hidden in the others (Gipuma, Galliani et al. 2015).
 """
 
@@ -42,7 +43,7 @@ class SourceViews:
 
 @wp.func
 def cell_center(row: int, column: int, step: int) -> wp.vec2:
-    """Center of a grid cell's pixel."""
+    """Center of a cell's middle pixel [px]."""
     return wp.vec2(float(column * step + step // 2) + 0.5, float(row * step + step // 2) + 0.5)
 
 
@@ -177,7 +178,7 @@ def sweep(
     planes: wp.array2d(dtype=wp.vec3),
     costs: wp.array2d(dtype=wp.float32),
 ):
-    """Sets every second cell, by `parity`, to the best of its own plane, its neighbors' planes and some guesses.
+    """Sets the cells of one `parity` (checkerboard) to the best of their own plane, the neighbors' planes and guesses.
 
     Round 0 tries `first`, `second` (q = 0: none) and a random depth; later rounds try the planes of the four neighbors
     (which are of the other parity) and two perturbations that shrink from round to round.
@@ -257,8 +258,8 @@ def count_votes(
 ):
     """Counts the sources that found the same point: their planes have its inverse depth and map it back to its pixel.
 
-    A source in which the pixel moves less than `parallax` [px] for a change of depth by `tolerance` does not vote, as
-    it does not measure the depth.
+    A source does not vote if a relative change of inverse depth by `tolerance` moves the pixel less than `parallax`
+    [px] in it: such a source does not measure the depth.
     """
     row, column = wp.tid()
     votes[row, column] = 0

@@ -2,9 +2,8 @@
 
 *Opacity grid*: stores for each cell the fraction of light that the cell blocks, averaged over the samples in it. (With
 mean density instead, a cell that contains only a thin post would be opaque.) A fine grid covers the near box, and a
-coarse one covers the contracted cube. *Bin*: one step of the march through the grids. *Stratum*: one of the K intervals
-into which a ray is divided such that the bins' weights in each have the same sum; it is sampled once, and the sample
-represents the whole stratum.
+coarse one covers the contracted cube. *Bin*: one weighted step of the march through the grids. *Stratum*: one of
+K intervals of a ray that contain equal weight; it is sampled once, and the sample represents the whole stratum.
 """
 
 # Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
@@ -18,7 +17,7 @@ BINS = 256
 _FAR = 100.0  # unit positions beyond this count as the horizon
 _MAX_OPACITY = 0.99  # greatest opacity of a cell
 _STEP = 0.75  # bin length [cells]
-_BINS_BEHIND = 2  # number of bins behind an opaque one
+_BINS_BEHIND = 2  # bins that the march takes behind an opaque one
 _OPAQUE = 0.02  # a ray with less transmittance counts as blocked
 # A grazing ray passes for meters through cells that contain ground before it reaches the ground. So _DOUBT_SHARE of the
 # weight is distributed as if the opacities of cells were multiplied by _DOUBT.

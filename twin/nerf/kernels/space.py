@@ -3,9 +3,9 @@
 *Near box*: axis-aligned box [m] that is mapped without distortion. *Unit position* u: per axis, the offset from the
 center of the near box divided by its half side; the near box is [−1, 1]³. *Contracted position*: u inside the near box,
 (2 − 1/|u|)·u/|u| outside (Barron et al. 2022, eq. 10, but with the maximum norm), so all of space is in (−2, 2)³.
-*Grid position*: contracted position scaled to [0, 1]³. *Contracted meter*: a meter inside the near box; outside it, a
-length that is contracted to that of a meter inside, see `expansion`. Density is per contracted meter, so before
-training, the far field is no more opaque than the near field.
+*Grid position*: contracted position scaled to [0, 1]³. *Contracted meter*: inside the near box, a meter; outside
+it, the length that contracts to a meter, see `expansion`. Density is per contracted meter; so before training, the far
+field is no more opaque than the near field.
 """
 
 # Warp reads annotations as values.
@@ -17,7 +17,7 @@ _TOP = 1.0 - 1.0e-6  # greatest coordinate of a grid position
 
 @wp.struct
 class Contraction:
-    """The near box, by the two values that the contraction uses."""
+    """The near box, in the form that the contraction uses."""
 
     center: wp.vec3f
     """[m]"""

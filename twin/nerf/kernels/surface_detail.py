@@ -1,12 +1,11 @@
 """Detail: features finer than those of bricks, added to a ray's features at the point where it meets a surface.
 
-On the ground, detail is stored as a texture, elsewhere as a hash grid. A height map on a regular grid gives the ground.
-A *texel* holds features at a node of a grid in (x, y); there are `LEVELS` such grids, each with texels twice as wide as
-the one before (a mipmap, Williams 1983). *Tile*: a square of `TILE`² texels of the finest level, and the coarser texels
-in that square; the texels of all levels of a tile are stored together, the finest first. *Slot*: row of a stored tile;
-the *index* maps each tile to its slot, or to −1 if it is not stored. The hash grid (Müller et al. 2022) has one level;
-its *vertices* share the rows of a table. *Footprint*: width of a pixel on the surface [m]; it determines the levels
-that a ray uses.
+On the ground, detail is stored as a texture, elsewhere as a hash grid. A height map locates the ground. A *texel* holds
+features at a node of a grid in (x, y); there are `LEVELS` such grids, each with texels twice as wide as the one before
+(a mipmap, Williams 1983). *Tile*: a square of `TILE`² texels of the finest level, and the coarser texels in the square;
+the texels of all levels of a tile are stored together, the finest first. *Slot*: row of a stored tile; the *index* maps
+each tile to its slot, or to −1 if it is not stored. The hash grid (Müller et al. 2022) has one level; its *vertices*
+share the rows of a table. *Footprint*: width of a pixel on the surface [m]; it determines the levels that a ray uses.
 """
 
 # Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
@@ -29,10 +28,10 @@ NO_GROUND = 1.0e6
 """Height of nodes where the ground is unknown [m]."""
 
 MAX_FOOTPRINT = 1.5
-"""Greatest footprint of a pixel that a level serves [texels]."""
+"""Greatest footprint at which a level is used [texels]."""
 _UNKNOWN = 1.0e3  # [m] a greater interpolated height comes from a node without ground
 _MIN_DESCENT = 0.01  # least descent per meter along a ray that can meet the ground
-_TOLERANCE, _TOLERANCE_PER_METER = 0.08, 0.01  # [m] greatest offset of a surface that counts as ground
+_TOLERANCE, _TOLERANCE_PER_METER = 0.08, 0.01  # [m], [m/m] a surface this close to the height map is ground
 _MAX_STRETCH = 4.0  # if a pixel's image on the ground is longer than this times its width, the footprint grows
 _PRIME_Y = wp.uint32(2654435761)
 _PRIME_Z = wp.uint32(805459861)
@@ -49,14 +48,14 @@ class DetailGrid:
     origin: wp.vec2f
     """Lowest corner [m]."""
     heights: wp.array(dtype=wp.float32)
-    """[m], (along x, along y) and flat; `NO_GROUND` where it is unknown."""
+    """[m], flattened from (along x, along y); `NO_GROUND` where it is unknown."""
     heights_x: wp.int32
     """Nodes along x."""
     heights_y: wp.int32
     per_height_cell: wp.float32
     """Nodes per meter."""
     tiles: wp.array(dtype=wp.int32)
-    """Slots, (along x, along y) and flat."""
+    """Slots, flattened from (along x, along y)."""
     tiles_x: wp.int32
     tiles_y: wp.int32
     texel: wp.float32
@@ -74,7 +73,7 @@ class DetailGrid:
 Hit = wp.vec4f
 
 
-# Native access, as in `march.py`: makes known to the compiler that the array is contiguous.
+# Native access shows the compiler that the array is contiguous, see `march.py`.
 @wp.func_native("return array.data[i];")
 def height_of(array: wp.array(dtype=wp.float32), i: wp.int32) -> wp.float32: ...
 
@@ -217,7 +216,7 @@ def interpolate_detail(
     start: wp.int32,
     outputs: wp.array(dtype=Channels),
 ):
-    """Features at hits [start, start + dim): the sum over levels of texels, or vertices of the hash grid."""
+    """Features at hits [start, start + dim): interpolated texels summed over levels, or vertices off the ground."""
     i = start + wp.tid()
     hit = hits[i]
     total = Channels()
@@ -247,8 +246,7 @@ def interpolate_detail_backward(
     texels_grad: wp.array(dtype=Channels),
     vertices_grad: wp.array(dtype=Channels),
 ):
-    """Adds the gradient of `interpolate_detail`; launched once per `part` of tiles and rows, which fixes the order of
-    sums."""
+    """Adds the gradient of `interpolate_detail`; one launch per `part` of tiles and rows fixes the order of sums."""
     i = wp.tid()
     g = outputs_grad[i]
     if wp.dot(g, g) < _MIN_GRADIENT:
