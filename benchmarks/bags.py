@@ -4,9 +4,10 @@
 
 SCENE is a generated place (`twin reality film`). For each film, FOLDER/bags gets a ROS 2 bag with the film's pictures
 (raw, so that both builds read the same pixels) and their camera_info. The bag also contains other data that a robot
-records, made from the true poses: odometry that is 2 % too long and drifts by a degree per metre, GPS fixes with an
-error that wanders by a metre, and /tf_static. Both scenes get their scale from the camera's height; then the bags'
-scene gets it from odometry, and from GPS. Prints the figures of both builds, and the error of each scale.
+records, made from the true poses: odometry that is 2 % too long and drifts by a degree per meter, GPS fixes whose error
+is a random walk with a standard deviation of 1 m, and /tf_static. Both scenes get their scale from the camera's height.
+Then the bags' scene gets its scale from odometry, and then from GPS. Prints the figures of both builds, and the error
+of each scale.
 With --again, the scene is built from the films twice, which shows how much two builds from the same input differ.
 """
 
@@ -154,7 +155,7 @@ def _transform(types: Any, header: Any, child: str, pose: np.ndarray) -> Any:
 
 
 def figures(root: Path, report: dict[str, Any]) -> dict[str, Any]:
-    """Figures of a build that are compared, by name."""
+    """The compared figures of a build, by name."""
     scene = SceneDir(root)
     cameras = Cameras.load(scene.stage("metric"))
     errors: dict[str, Any] = camera_errors(cameras.camera_to_world, matched_poses(Truth.load(scene.truth), cameras))
@@ -228,9 +229,7 @@ def main() -> int:
         cameras = Cameras.load(SceneDir(scenes["bags"]).stage("metric"))
         error = camera_errors(cameras.camera_to_world, matched_poses(truth, cameras))["scale_error"]
         scales[name] = {"scale_error": error, "uncertainty": metric["scale_uncertainty"]}
-        print(
-            f"scale by {name}: {error:+.2%} from the truth, said to be uncertain by {metric['scale_uncertainty']:.2%}"
-        )
+        print(f"scale by {name}: {error:+.2%} from the truth, stated uncertainty {metric['scale_uncertainty']:.2%}")
     if options.json:
         save(options.json, {"builds": results, "same_frames": same, "scales": scales}, options.replace_record)
     return 0

@@ -1,12 +1,12 @@
-"""Appearance gap between the twin and another day, given a photo of the day, compared with weather randomisation.
+"""Appearance gap between the twin and another day, given a photo of the day, compared with weather randomization.
 
     python benchmarks/day.py SCENE [--days NAME ...] [--policies RUN ...] [--json FILE] [--pictures FOLDER]
 
 The scene was built from the film of the known-truth world and has a lighting from one photo of each day
-(`benchmarks/table1`, step `photos`). Images of every day from eight other stations of the road are compared with
-renderings from the same poses under the photo's appearance and fog, in PSNR and in the change of the policies'
-steering. The change of steering is compared with the change that randomised sun and shadows cause. *Lasting* change:
-rms over days of the mean over stations. *Local* change: rms of the deviations from this mean.
+(`benchmarks/table1`, step `photos`). From eight other stations of the road, images of every day are compared with
+renderings from the same poses under the photo's appearance and fog. The figures are PSNR, and the change of the
+policies' steering divided by the change that randomized sun and shadows cause. *Lasting* change: rms over days of the
+mean over stations. *Local* change: rms of the deviations from this mean.
 """
 
 import argparse
@@ -38,7 +38,7 @@ STRAIGHT = 4  # number of stations on the straight segment
 SIZE = (160, 90)
 DRAWS = 8  # weather samples per day
 RESAMPLED = 500  # bootstrap samples for 90 % intervals
-SCALES = (1.0, 0.8, 0.7, KNOWN_WEATHER_FRACTION, 0.5)  # fractions of the sun and shadow randomisation
+SCALES = (1.0, 0.8, 0.7, KNOWN_WEATHER_FRACTION, 0.5)  # fractions of the sun and shadow randomization
 
 Pictures = NDArray[np.float32]  # (days, stations, height, width, 3)
 
@@ -70,11 +70,11 @@ def steering(policy: Callable, pictures: Pictures) -> NDArray:
 
 
 def ratios(gaps: list[NDArray], randomised: list[NDArray], rng: np.random.Generator | None = None) -> NDArray:
-    """Ratios of lasting and local changes to those under randomised weather, geometric means over policies.
+    """Ratios of lasting and local changes to those under randomized weather, geometric means over policies.
 
     Args:
         gaps: Steering changes between twin and truth, (days, stations) per policy.
-        randomised: Steering changes under randomised weather, (samples, stations) per policy.
+        randomised: Steering changes under randomized weather, (samples, stations) per policy.
         rng: Resamples policies and days for a bootstrap, if given.
     """
     policies = np.arange(len(gaps))

@@ -1,4 +1,4 @@
-"""Sections of `env.py`. Each takes a built scene and `quick`, which shortens it, and returns figures by name."""
+"""Sections of `env.py`. Each takes a built scene and a flag `quick` for a shorter run, and returns figures by name."""
 
 import json
 import os
@@ -64,7 +64,7 @@ def driver(scene: Path, quick: bool) -> dict[str, Any]:
     """Success rate of the scripted driver and of the blind one, without obstacles, by task.
 
     Each rate is over `driver.n` episodes with seeds 0, 1, ...; in `driver.random_robot` the robot is sampled from the
-    default ranges of domain randomisation.
+    default ranges of domain randomization.
     """
     import twin
     from twin.env.drivers import BlindDriver, RouteDriver
@@ -104,7 +104,7 @@ def audit(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def soak(scene: Path, quick: bool) -> dict[str, Any]:
-    """Endurance: NaNs and memory growth over random steps with pixels, with everything randomised per episode."""
+    """Endurance: NaNs and memory growth over random steps with pixels, with everything randomized per episode."""
     return worker("soak", scene, 400 if quick else 100_000, cores=2)
 
 

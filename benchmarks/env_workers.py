@@ -26,7 +26,7 @@ def standard_tasks(scene: Path) -> list[str]:
 
 
 def one_obstacle(scene: Path) -> dict[str, Any]:
-    """Options of an environment with a cone that stays in view for the first twenty metres."""
+    """Options of an environment with a cone that stays in view for the first 20 m."""
     from twin.config import ObstacleConfig
 
     return {"obstacles": (ObstacleConfig("it", "cone", 24.0, 0.9),), "start_offset": 0.0, "start_heading": 0.0}

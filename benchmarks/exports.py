@@ -3,8 +3,8 @@
     python benchmarks/exports.py --scene scenes/demo --only mesh      # the .glb, against colors per vertex
     python benchmarks/exports.py --scene scenes/demo --only splats    # the .ply in MuJoCo Warp's splat renderer
 
-`mesh` scores only pixels that show the mesh. Both meshes have the same geometry and thus cover the same pixels. The
-texture is read back from the exported file.
+`mesh` scores only pixels that show the mesh. The textured mesh and the one with colors per vertex have the same
+geometry, and thus cover the same pixels. The texture is read back from the exported file.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -171,8 +171,8 @@ def main() -> None:
     parser.add_argument("--scene", default="scenes/demo")
     parser.add_argument("--only", choices=("mesh", "splats"), required=True)
     parser.add_argument("--lighting", nargs="+", default=["sun"])
-    parser.add_argument("--size", type=int, nargs=2, default=[640, 360], help="of the pictures [px]")
-    parser.add_argument("--frames", type=int, default=4, help="of splats")
+    parser.add_argument("--size", type=int, nargs=2, default=[640, 360], help="size of the pictures [px]")
+    parser.add_argument("--frames", type=int, default=4, help="number of held-out frames that score the splats")
     given = parser.parse_args()
     twin, size = load_scene(given.scene), (given.size[0], given.size[1])
     for lighting in given.lighting:

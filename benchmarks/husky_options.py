@@ -87,7 +87,7 @@ CASES: dict[str, Edit | None] = {
 
 @dataclass(frozen=True)
 class Cost:
-    """Behaviour of a model, and the number of faults that `check` finds in it."""
+    """Behavior of a model, and the number of faults that `check` finds in it."""
 
     yaw_rate: float
     """Yaw rate of a turn on the spot on a plane [rad/s]."""

@@ -8,8 +8,8 @@ p succeeds on day d at the rate
     road: logit = s (q_p + day_d + cell_pd)            twin: the same with a sharpness, bias and noise of its own
 
 where q_p is a setup's mean plus the effects of place, training and checkpoint. Day and cell effects are correlated
-between twin and road: a low sun, for example, makes both harder. With a large sharpness s a policy succeeds in all
-trials of a day or in none, as in 706 of the 720 cells of Table 1, to which the kind `recorded` is fitted.
+between twin and road: a low sun, for example, makes both harder. With a large sharpness s, a policy succeeds in all
+trials of a day or in none, as in 706 of the 720 cells of Table 1. The kind `recorded` is fitted to Table 1.
 
 An interval must contain its *estimand* in 90 % of the worlds. The estimands are:
 
@@ -17,16 +17,17 @@ An interval must contain its *estimand* in 90 % of the worlds. The estimands are
   other trainings, days and trials, at the same place or, if the shape has several places, at other places.
 - policy: a policy's rate on the road over all days of this kind; coverage is averaged over the policies. *policy,
   middling*: the same, only for policies whose rate is between 0.1 and 0.9.
-- setup: the rate on the road of a setup's finished policies, over all trainings and days of the kind. With several
-  places also over all places; the interval's units then are the places.
+- setup: the rate on the road of a setup's finished policies, over all trainings and days of the kind. If the shape has
+  several places, the rate is also over all places, and the units of the interval are the places.
 - setup, these trainings: the rate over all days of the finished policies that drove (`rate_over_days`), at one place.
 - setups' difference: the difference of two setups' rates, from pairs of trainings at one place, or from several places.
 - twin: a policy's rate in the twin over all days of this kind.
 - predicted: the observed real rate of a policy, predicted from its rate in the twin and from the other trainings.
 
-Prints coverage, or – if a forecast of that shape has no such interval. Worlds whose units do not determine an interval
-are not counted, because a forecast prints none for them, either; *refused* is their largest fraction. In shapes of more
-than ten policies, rates are estimated in a quarter of the worlds. The seed is fixed. Takes ten minutes on one core.
+Prints coverage; a dash means that a forecast of that shape has no such interval. A world without an interval does not
+count: a forecast would print none, because its units do not determine one. *refused* is the largest fraction of such
+worlds over the agreement statistics. In shapes of more than ten policies, rates are estimated in a quarter of the
+worlds. The seed is fixed. Takes ten minutes on one core.
 """
 
 import argparse
@@ -57,7 +58,7 @@ from record import add_record_options, save
 WORLDS = 1000
 _MEAN_OVER = 6000  # worlds that estimate the mean of a statistic
 _BATCH = 250
-_RATE_WORLDS = 250  # of `WORLDS`, those whose rates are estimated if there are more policies than `_USERS_POLICIES`
+_RATE_WORLDS = 250  # worlds of `WORLDS` in which rates are estimated, for more policies than `_USERS_POLICIES`
 _USERS_POLICIES = 10
 _QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)
 
@@ -81,7 +82,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Kind:
-    """Distribution of policies, days and the twin's errors; effects in logit divided by the sharpness.
+    """Distribution of policies, days and the twin's errors; the unit of effects is a logit divided by the sharpness.
 
     `training`, `place`, `day` and `cell` are standard deviations.
     """
@@ -91,7 +92,7 @@ class Kind:
     training: float
     place: float
     checkpoint: float
-    """By how much the first checkpoint is worse than the last one; the standard deviation is a third of it."""
+    """Mean difference in quality between the last and the first checkpoint; its standard deviation is a third of it."""
     day: float
     cell: float
     shared: float
@@ -219,7 +220,7 @@ Where a world has several such intervals, the value is their mean.
 
 
 def coverage(kind: Kind, shape: Shape, worlds: int, seed: int = 0) -> dict[str, float]:
-    """Coverage of each interval; nan if no world has it. *refused*: the largest fraction of worlds without one."""
+    """Coverage of each interval; nan if no world has it. *refused*: largest fraction of worlds without an interval."""
     rng = np.random.default_rng(seed)
     truth = expected(kind, shape, rng)
     parts = [

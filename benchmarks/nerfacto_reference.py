@@ -2,9 +2,9 @@
 
 Nerfacto is described in Tancik et al. 2023, "Nerfstudio" (arXiv 2302.04264), its hash grid in Müller et al. 2022,
 "Instant NGP", its proposal networks and contraction of space in Barron et al. 2022, "Mip-NeRF 360". The sizes are the
-published ones; the weights are random, as only time is measured. The code follows the papers without optimisation:
+published ones; the weights are random, as only time is measured. The code follows the papers without optimization:
 every sample passes through every network on concatenated inputs, as in nerfstudio's torch implementation.
-`nerfacto_tuned.py` renders the same image with optimised torch code.
+`nerfacto_tuned.py` renders the same image with optimized torch code.
 
 Shapes: r rays, s samples on each, s + 1 *edges* that bound them. *Spacing* is the coordinate in [0, 1] along a ray;
 it is uniform in distance up to one unit, and in inverse distance beyond.

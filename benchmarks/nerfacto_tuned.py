@@ -1,6 +1,6 @@
-"""Nerfacto of `nerfacto_reference.py`, optimised for one core in plain torch: same weights, same image.
+"""Nerfacto of `nerfacto_reference.py`, optimized for one core in plain torch: same weights, same image.
 
-Optimisations: chunks of few rays, which fit the cache; samples are columns, so a layer is one matrix product; coarse
+Optimizations: chunks of few rays, which fit the cache; samples are columns, so a layer is one matrix product; coarse
 levels are stored densely; both features of a vertex are gathered as one number; terms that are constant along a ray or
 over a frame are computed once. Shapes: n samples in all, r rays.
 """
@@ -23,7 +23,7 @@ def tuned(proposals: tuple[Proposal, ...], field: Field) -> Nerfacto:
 
 
 class TunedGrid:
-    """Optimised `HashGrid`."""
+    """Optimized `HashGrid`."""
 
     def __init__(self, grid: HashGrid):
         self.levels = []  # (resolution, True if dense, both features of each entry as one number)
@@ -62,7 +62,7 @@ class TunedGrid:
 
 
 class TunedProposal:
-    """Optimised `Proposal`."""
+    """Optimized `Proposal`."""
 
     def __init__(self, plain: Proposal):
         self.grid = TunedGrid(plain.grid)
@@ -75,7 +75,7 @@ class TunedProposal:
 
 
 class TunedField:
-    """Optimised `Field`."""
+    """Optimized `Field`."""
 
     def __init__(self, plain: Field):
         self.grid = TunedGrid(plain.grid)

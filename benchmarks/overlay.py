@@ -76,7 +76,7 @@ class TrueWorld:
         with wp.ScopedDevice("cpu"):
             self.device_model = mujoco_warp.put_model(self.model)
             self.device = mujoco_warp.put_data(self.model, self.data)
-            # The first is as in `twin.reality.filming.Renderer`; the second one samples pixel centers, for the depth.
+            # The first context is as in `twin.reality.filming.Renderer`; the second samples pixel centers, for depth.
             self.contexts = [
                 mujoco_warp.create_render_context(
                     self.model,

@@ -1,13 +1,12 @@
-"""Benchmark of the real test: speed of its rasteriser, difference from the film's renderer, and places of its tasks.
+"""Benchmark of the real test: speed of its rasterizer, difference from the film's renderer, and errors of a route.
 
     python benchmarks/reality.py [--scene BUILT_SCENE_WITH_TRUTH] [--json FILE] [--pictures FOLDER]
     python benchmarks/reality.py --sheet docs/places.jpg
 
-Rasterised pictures of 160×90, without the sensor model, are compared with frames that the film's renderer draws in the
+Rasterized pictures of 160×90, without the sensor model, are compared with frames that the film's renderer draws in the
 film's size and that are then reduced to 160×90. The poses lie on the film's path, at the height of a robot's camera.
-*small*: the same comparison for frames that the film's renderer draws at 160×90. With a scene, its route is compared
-with the true one. `--sheet` instead writes one picture with a frame of each of the places 1 to
-30.
+*small*: the same comparison, with the film's renderer at 160×90 in place of the rasterizer. With a scene, its route is
+compared with the true one. `--sheet` instead writes one picture with a frame of each of the places 1 to 30.
 """
 
 import argparse

@@ -85,7 +85,7 @@ def write_record(path: Path, record: dict[str, Any], replace: bool | None = Fals
     Args:
         path: The file.
         record: A JSON object; may contain NaN and infinity.
-        replace: True overwrites a record even if the new one lacks entries; None is False for a script without
+        replace: True overwrites a record even if the new one lacks entries. None means False in a script that has no
             `--replace-record`.
 
     Raises:

@@ -48,7 +48,7 @@ _QUICK = {
 
 
 def endurance(steps: int, folder: Path) -> dict[str, Any]:
-    """Drives eight small environments at random, with every randomisation switched on.
+    """Drives eight small environments at random, with every randomization switched on.
 
     Args:
         steps: Control steps of all environments together.
@@ -102,7 +102,7 @@ def kills(times: int, folder: Path, only: str | None = None, seed: int = 0) -> d
     """Kills builds, trainings and validations at random times, resumes them, and compares them with undisturbed ones.
 
     Args:
-        times: Number of kills of each.
+        times: Number of kills of each verb.
         folder: Folder for the scenes.
         only: "build", "train" or "validate" kills only this verb; None kills all three.
         seed: Seed of the kill times.

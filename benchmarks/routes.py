@@ -51,7 +51,7 @@ class Filming:
     lines: tuple[Array, ...]
     """True lines (m, 2) [m]; those across a permitted gap are included."""
     longest: float
-    """Longest way filmed without interruption [m], without turning manoeuvres."""
+    """Longest way filmed without interruption [m], without turning maneuvers."""
 
 
 def drawn_line(rng: np.random.Generator, length: float) -> Array:

@@ -1,13 +1,13 @@
-"""Benchmark of the real trials that the twin saves: n real trials with and without the twin, on Table 1's record.
+"""Benchmark of the real trials that the twin saves: estimates from n trials of Table 1, with and without the twin.
 
     python benchmarks/trials_saved.py [--results benchmarks/table1/results.json] [--json FILE] [--picture FILE]
 
 The recorded days are the population, and a policy's rate over all of them is the truth. An *experiment* draws days from
-it with replacement. On some of these days the policies drive on the road, five trials each. For twenty further days
-there is only a photo, so that the policies drive only in the twin. A policy's rate is then estimated in four ways:
+it with replacement. On some of these days the policies drive on the road, five trials each. Twenty further days have
+only a photo: there, the policies drive only in the twin. A policy's rate is then estimated in four ways:
 
 - alone: from the real trials, by the model of `twin.evaluation.rate_model`.
-- twin: the same with the policy's rate in the twin as covariate, so that the estimate is shrunk towards the twin's.
+- twin: the same model with the policy's rate in the twin as covariate, which shrinks the estimate towards this rate.
 - mean: the mean real rate over the driven days; its interval is Student's t over days.
 - powered: prediction-powered inference (PPI++, `prediction_powered_mean`): the same mean plus λ times the
   difference between the twin's rates on the further days and on the driven days. It is unbiased even if the twin is
@@ -15,7 +15,7 @@ there is only a photo, so that the policies drive only in the twin. A policy's r
 
 Prints, by number of real trials per policy: width and coverage of the 90 % intervals, root mean square error, and how
 often the policy with the highest estimate is within 5 points of the best of its task. *Middling* policies have a
-rate of 2 to 98 %; for the others a few trials suffice with or without the twin. The seed is fixed; takes two minutes.
+rate of 2 to 98 %; for the others a few trials suffice even without the twin. The seed is fixed. Takes two minutes.
 """
 
 import argparse

@@ -37,7 +37,7 @@ TARGETS = {
 """Figure → comparison and target."""
 
 _SIZE = (960, 540)  # of the page [px]; the panel leaves 640×540 of it to the picture
-# Counts the picture's images only: a script sets their property `src`. The panel's images have it as an attribute.
+# Counts images of the picture only: a script sets their property `src`. Images of the panel have an attribute `src`.
 _COUNT = """
 window.pictures = 0;
 const source = Object.getOwnPropertyDescriptor(HTMLImageElement.prototype, "src");
@@ -243,7 +243,7 @@ def measure(scene: Path, minutes: float) -> dict[str, Any]:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, required=True, help="a built scene")
-    parser.add_argument("--minutes", type=float, default=5.0, help="of random clicking")
+    parser.add_argument("--minutes", type=float, default=5.0, help="minutes of random clicking (default %(default)g)")
     add_record_options(parser)
     given = parser.parse_args(arguments)
     if find_chromium() is None:

@@ -288,7 +288,7 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
     ):
         real_test.run([left], "straight", ["rain"], 4, out, setup=Setup(robot=1))
     out.with_name("results_setup.json").unlink()
-    with pytest.raises(InputError, match="was driven in the reality of version 1; this is 2; give another --out"):
+    with pytest.raises(InputError, match="has trials of version 1 of the real test; this is version 2; give another"):
         real_test.run([left], "straight", ["rain"], 4, out)
 
 

@@ -8,14 +8,15 @@ are defined in `place_scores.py`. Steps at a place, each a command of `twin` tha
 
 - film: generates the place from its number, and films it under its lightings.
 - build: builds the twin; aligns the robot to a drive log and a film of its own camera; builds again with this robot.
-- photos: adds each day's lighting to the twin, from one photo by the robot's camera. If a photo cannot be placed,
-  held-out lightings stand for its day.
+- photos: adds each day's lighting to the twin, from one photo by the robot's camera. If the photo cannot be placed (its
+  pose is not found), held-out lightings replace that day's lighting.
 - train: trains one policy per setup, and records the policies' digests before any of them drives.
 - validate: drives every policy in the twin, under the lighting of each day and under held-out lightings.
 - drive: drives every policy in the reality, on each day, on the task that the twin exported.
 
 WORK holds the scenes (1 GB a place). After a kill, or when `--minutes` are over, the same command continues. A place of
-60 m takes about two hours of two cores. Results never lose a row. A command that fails stops its place, with its error.
+60 m takes about two hours on two cores. Results never lose a row. If a command fails, its place is left unfinished, and
+the next one begins.
 """
 
 import argparse
@@ -231,7 +232,9 @@ def main() -> int:
     parser.add_argument("--protocol", type=Path, default=PROTOCOL, help="default: protocol.toml beside this file")
     parser.add_argument("--results", type=Path, default=RESULTS, help="default: results beside this file")
     parser.add_argument("--places", type=int, nargs="+", metavar="NUMBER", help="of the protocol's (default: all)")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop; the same command goes on")
+    parser.add_argument(
+        "--minutes", type=float, default=float("inf"), help="stop after this time; the same command continues"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="processes at once, one core each")
     parser.add_argument("--ray", metavar="ADDRESS", help="a Ray cluster that validates")
     parser.add_argument("--tables", action="store_true", help="drive nothing")
@@ -262,7 +265,7 @@ def _run(protocol: Protocol, given: argparse.Namespace) -> None:
         try:
             run_place(PlaceRun(protocol, place, given.work, given.results, commands, given.jobs), given.ray)
         except TimeIsUp:
-            print(f"stopped at place {place}; the same command goes on", flush=True)
+            print(f"stopped at place {place}; the same command continues", flush=True)
             return
         except InputError as error:
             print_error(error)

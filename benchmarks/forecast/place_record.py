@@ -27,7 +27,7 @@ HELD_OUT_CONDITION = str(Condition(HELD_OUT, True))
 
 
 def by_photo(day: str) -> str:
-    """The twin's condition for a day: lit as in its photo, the rest randomised."""
+    """The twin's condition for a day: lit as in its photo, the rest randomized."""
     return str(Condition(day, True))
 
 

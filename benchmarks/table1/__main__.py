@@ -6,7 +6,8 @@ Steps, each a command of `twin` that resumes where it was interrupted:
 
 - build: films the known-truth world and builds the twin in SCENE; aligns the robot to a drive log and an onboard film.
 - train: trains the three setups on both tasks.
-- validate: drives every policy in the twin under held-out lightings, as filmed and with everything else randomised.
+- validate: drives every policy in the twin under held-out lightings with everything else randomized, and finished
+  policies also with nothing else randomized.
 - photos: drives every policy in the twin under a lighting from one photo of each test day.
 - real: drives every policy in the known-truth world under weather that was not filmed.
 - forecast: forecasts real success, once from held-out lightings, once from the photos.
@@ -14,7 +15,7 @@ Steps, each a command of `twin` that resumes where it was interrupted:
 The defaults are the published plan; the same call with more seeds adds runs. `results.json` beside this file records
 every run. It is never overwritten by a record with fewer runs, policies, days or trials: the command then ends with
 status 2, the new record is in `results.json.partial`, and `--results` names another file for it. `plan.py` defines
-setups, sizes and checkpoints. The first tables printed are those of `scores.py`, which needs only `results.json`.
+setups, sizes and checkpoints. The command first prints the tables of `scores.py`, which needs only `results.json`.
 """
 
 import argparse
@@ -94,9 +95,9 @@ def real(scene: Path, run: Run) -> None:
 
 
 def forecast(scene: Path) -> None:
-    """Forecasts from held-out lightings, then from photos for the policies that were validated under these.
+    """Forecasts from held-out lightings, then from photos, for the policies that were validated under their lightings.
 
-    The first forecast is then kept in `HELD_OUT_FORECAST`.
+    The second forecast replaces the first, of which `HELD_OUT_FORECAST` keeps a copy.
     """
     tables = sorted(path for path in (scene / "real").glob("*_*.csv") if path.stem.split("_")[0] in TASKS)
     rows = [row for path in tables if not path.stem.endswith("_trials") for row in _rows(path)]

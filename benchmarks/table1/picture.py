@@ -2,9 +2,9 @@
 
     python benchmarks/table1/picture.py SCENE docs/forecast.jpg
 
-Shows randomised episodes of the twin, test days of the known-truth world, the twin under lightings from a photo of
-each, success on the road against success in the twin for every policy, and a training's success curve. SCENE holds the
-results of `benchmarks/table1`.
+Shows randomized episodes of the twin, test days of the known-truth world, the twin under lightings from a photo of each
+of these days, success on the road against success in the twin for every policy, and a training's success curve. SCENE
+holds the results of `benchmarks/table1`.
 """
 
 import argparse

@@ -23,7 +23,7 @@ SETUPS: dict[str, tuple[str, ...]] = {
 }
 """Name → options of `twin.train`."""
 STEPS = {"straight": 12_000, "right": 16_000}
-"""Largest number of steps. Published runs used all; a training now ends once it has learnt (`twin.learn.selection`)."""
+"""Largest number of steps. Published runs used all; trainings now end once they have learned (`learn.selection`)."""
 SHARES = (0.25, 0.5)
 """Fractions of a run's steps at which checkpoints are taken for the forecast."""
 EPISODES = 50
@@ -31,7 +31,7 @@ EPISODES = 50
 LIGHTINGS = {"final": (HELD_OUT, str(Condition(HELD_OUT, True))), "checkpoint": (str(Condition(HELD_OUT, True)),)}
 """Lightings in the twin for finished policies and for checkpoints.
 
-Forecasts use the randomised condition. The paper's table, which has only finished policies, uses the other one.
+Forecasts use the randomized condition. The paper's table, which has only finished policies, uses the other one.
 """
 PHOTOS = tuple(str(Condition(name, True)) for name in WEATHER)
 """Lightings of the twin from a photo of each test day, for forecasts per weather."""

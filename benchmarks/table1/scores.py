@@ -2,15 +2,15 @@
 
     python benchmarks/table1/scores.py [--results FILE]
 
-Prints success on the road by groups of days; how well the twin's rates rank the policies there; how well the twin
-predicts single days, in proper scores, compared with baselines that do not use the twin; and its false alarms and
-missed failures. Rates on the road have intervals over days. Ranking and scores have a forecast's intervals, which hold
-for further trainings and days on this street (`twin/evaluation/jackknife.py`; coverage in this shape:
-`benchmarks/intervals.py`). A *rule* that does not use the twin is a baseline of the ranking; see `rule`.
+Prints, by groups of days: success on the road; how well the twin's rates rank the policies; proper scores of the twin's
+predictions of single days, beside those of baselines that do not use the twin; and the twin's false alarms and missed
+failures. Rates on the road have intervals over days. Ranking and scores have a forecast's intervals, which hold for
+further trainings and days on this street (`twin/evaluation/jackknife.py`; coverage in this shape:
+`benchmarks/intervals.py`). The *rule* is a baseline of the ranking that does not use the twin; see `rule`.
 
-A *choice* is a decision made while trials or images of a day were known: the training methods, developed in the five
-stated weathers, and the fraction of the weather randomisation that is kept if there is a photo, measured on images of
-these weathers and of days 1 to 5. Days 6 to 15 were driven after everything was fixed.
+A *choice* is a decision made while trials or images of a day were known. There were two. The training methods were
+developed in the five stated weathers. The fraction of the weather randomization that is kept if there is a photo was
+measured on images of these weathers and of days 1 to 5. Days 6 to 15 were driven after everything was fixed.
 """
 
 import argparse
@@ -83,7 +83,7 @@ class PolicyRecord:
     twin: Counts
     """Counts in the twin under a lighting from a photo of each day."""
     held_out: float
-    """Success rate in the twin under held-out lightings with everything else randomised."""
+    """Success rate in the twin under held-out lightings with everything else randomized."""
     real: Counts
 
 
@@ -154,7 +154,8 @@ class Scores:
     cells: float | None
     """Fraction of the cells whose predicted and real counts are compatible; None if the predictor has no counts."""
     corrected: tuple[int, int]
-    """Number of policies in their interval predicted from the task's other trainings, and number of intervals."""
+    """Number of policies whose real rate is in its interval predicted from the task's other trainings, and number of
+    such intervals."""
 
 
 def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> Scores | None:

@@ -10,8 +10,8 @@
     python -m twin.reality photo --lighting dawn --out dawn.png
 
 `film` writes a scene folder: `scene.toml`, `input/<lighting>.mp4` and `truth/`. `compare` measures a build against that
-truth. `drive` runs the real test. The other verbs write inputs for the twin: `log` a drive log and `onboard` a film by
-the robot's camera, both for `twin.align`; `bag` a robot's recording of a trial, for `twin.trial`; `photo` a photo in
+truth. `drive` runs the real test. `log` writes a drive log, for `twin.align`. `onboard` writes a film from the robot's
+camera, also for `twin.align`. `bag` writes a robot's recording of a trial, for `twin.trial`. `photo` writes a photo in
 the weather of a trial, for `twin.relight`. All seeds are fixed in the code, so the same command writes the same files.
 """
 
@@ -56,13 +56,13 @@ def _tiny(plan: FilmingPlan) -> FilmingPlan:
 
 
 def film(plan: FilmingPlan, out: Path, number: int = 0, traffic: bool = False) -> Truth:
-    """Films every pass and lighting of a plan into a scene folder and saves the truth beside it.
+    """Films every pass of a plan under every lighting into the scene folder `out`, and saves the truth there.
 
     With `traffic`, walkers and cars move through every film, and cars are parked in all lightings but the last. The
     truth does not contain them.
 
     Raises:
-        InputError: `out` is not empty and was not written by this function.
+        InputError: `out` is not empty and has no folder `truth`.
     """
     if out.is_dir() and any(out.iterdir()) and not (out / "truth").is_dir():
         raise InputError(
@@ -99,7 +99,7 @@ def film(plan: FilmingPlan, out: Path, number: int = 0, traffic: bool = False) -
 
 
 def scene_toml(plan: FilmingPlan, name: str, spec: PlaceSpec | None = None) -> str:
-    """The contents of `scene.toml`, as a user would write them; `spec` describes a drawn place."""
+    """The contents of `scene.toml`, as a user would write them; `spec` is None for the campus road."""
     fx, fy, cx, cy = (round(float(v), 4) for v in plan.intrinsics)
     place = f" --place {spec.number}" if spec else ""
     height = f"camera_height = {plan.camera_height}  # metres"
@@ -132,7 +132,7 @@ def _check_lightings(names: list[str], among: Iterable[str]) -> None:
 
 
 def command(options: argparse.Namespace) -> None:
-    """Runs this verb with the options parsed by `twin.commands`."""
+    """Runs the verb in the options parsed by `twin.commands`."""
     if options.command == "film":
         plan = TINY if options.tiny else FilmingPlan()
         if options.place:
@@ -184,7 +184,7 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
 
 
 def _task(given: str, scene: Path | None, place: int) -> str | RoadTask:
-    """The task in a JSON file, transformed from its scene's frame into the true one; a name is returned as given."""
+    """The task in a JSON file, transformed from its scene's frame to the true frame; a task's name stays as it is."""
     if not given.endswith(".json"):
         return given
     if scene is None:

@@ -42,7 +42,7 @@ WALLS = {  # building → brick or plaster, color
 }
 
 WET_TEXTURES = ("road", "kerb", "verge_left", "verge_right", "land")
-"""Ground textures, which rain darkens."""
+"""Ground textures that rain darkens."""
 
 
 @cache

@@ -41,7 +41,7 @@ class RoadLine:
     turn: float = np.pi / 2.0
     """Angle of the turn, to the right [rad]."""
     length: float = 60.0
-    """Length of the drive [m]."""
+    """Driven length [m]."""
 
     @property
     def arc(self) -> float:

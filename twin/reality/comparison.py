@@ -1,9 +1,9 @@
 """Errors of a build against the known truth of a generated scene.
 
 The *twin frame* is the metric frame of the build, the *true frame* that of the generated world. All figures except
-`ate_m`, `ate_max_m` and `scale_error` are measured after a rigid alignment (no scale) of the twin's cameras with the
-true ones, because errors of the twin's scale are errors for a robot, too. Obstacles and meshes are compared only where
-a camera could see them.
+`ate_m`, `ate_max_m` and `scale_error` are measured after a rigid alignment of the twin's cameras with the true ones.
+The alignment has no scale, because an error of the twin's scale is an error for a robot. Obstacles and meshes are
+compared only where a camera could see them.
 """
 
 from pathlib import Path
@@ -76,12 +76,12 @@ def measure(scene: SceneDir) -> dict[str, Any]:
         parts in the corridor), `route_median_m` (twin's route to the true center line), `depth_median_m`,
         `depth_relative` (depth of the field, up to a true depth of 20 m).
 
-        The `mesh_*` figures compare the visual mesh with the true surface. Of both, they use the parts that cameras
-        could see within 10 m of the route, at any height: `mesh_accuracy_median_m`, `mesh_accuracy_mean_m` (mesh to
-        true surface), `mesh_completeness_mean_m` (true surface to mesh), `mesh_completeness_5cm`,
-        `mesh_completeness_10cm` (fraction of the true surface within that distance of the mesh; the latter also per
-        kind of object: `_ground`, `_obstacle`, `_foliage`), `mesh_chamfer_m` (half the sum of the two means). Means
-        count distances above 1 m as 1 m. A figure is None where its stage produced nothing to measure.
+        The `mesh_*` figures compare the visual mesh with the true surface, at any height within 10 m of the route;
+        parts that no camera could see do not count: `mesh_accuracy_median_m`, `mesh_accuracy_mean_m` (mesh to true
+        surface), `mesh_completeness_mean_m` (true surface to mesh), `mesh_completeness_5cm`, `mesh_completeness_10cm`
+        (fraction of the true surface within that distance of the mesh; the latter also per kind of object: `_ground`,
+        `_obstacle`, `_foliage`), `mesh_chamfer_m` (half the sum of the two means). Means count distances above 1 m as
+        1 m. A figure is None where its stage produced nothing to measure.
     """
     truth = Truth.load(scene.truth)
     cameras = Cameras.load(scene.stage("metric"))

@@ -35,7 +35,7 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
 
     Args:
         spec: The description.
-        displaced: True for another day than that of the film: cones, bins, crates and cars have moved.
+        displaced: True for the day of the trials: cones, bins, crates and cars have moved since the film.
     """
     road = DrawnRoad(spec)
     stations = np.arange(road.start, road.end + _STEP / 2, _STEP)
@@ -174,7 +174,7 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
 
 
 class Site:
-    """Ground that is occupied: the road, its mouths, the free corridor, and the footprints of objects placed so far.
+    """Occupied ground: the road, the mouths of side roads, the free corridor, and the footprints of placed objects.
 
     A footprint is a rectangle: its center [m], half sizes [m] and the direction of its first axis [rad].
     """
@@ -369,7 +369,7 @@ def _scatter(
 def _moved(
     other_day: np.random.Generator | None, place: KnownPlace, site: Site, at: tuple[float, float], radius: float
 ) -> tuple[float, float]:
-    """Station and lateral [m] of a movable object: as filmed, or up to 1.5 m along the road on another day."""
+    """Station and lateral [m] of a movable object: as filmed, or on another day up to 1.5 m along the road if free."""
     if other_day is None:
         return at
     moved = at[0] + float(other_day.uniform(-1.5, 1.5)), at[1]

@@ -1,4 +1,4 @@
-"""Films of the known-truth world: camera trajectory on a cart, exposure, sensor noise and video encoding.
+"""Films of the known-truth world: trajectory of a camera on a cart, exposure, sensor noise and video encoding.
 
 A *film* is a sequence of frames at a fixed rate under one lighting; the true pose of every frame is known. Every film
 has its own speed, lateral wander and shake, so that no two films share a viewpoint.
@@ -35,7 +35,7 @@ class FilmingPlan:
 
     lightings: tuple[str, ...] = ("sun", "overcast", "night")
     start: float = 0.0
-    """Station of the first frame [m]."""
+    """Station where the segment begins [m]."""
     length: float = 60.0
     """Length of the segment along the center line [m]."""
     speed: float = 2.0
@@ -44,9 +44,9 @@ class FilmingPlan:
     width: int = 640
     height: int = 360
     samples: int = 2
-    """Rays per pixel and axis."""
+    """Rays per pixel along each axis of the image."""
     oversize: float = 1.0
-    """Frames are rendered at this factor times the film's size, and then shrunk to it."""
+    """Ratio of the size at which a frame is rendered to the film's size; the frame is then shrunk."""
     crf: int = 29
     """Quality of the H.264 film; lower is better."""
     camera_height: float = CAMERA_HEIGHT
@@ -56,13 +56,13 @@ class FilmingPlan:
     fov: float = float(np.deg2rad(85.0))
     """Horizontal field of view [rad]."""
     shake: float = 1.0
-    """Amplitude of the camera's rotations and vertical motion, relative to those on a cart."""
+    """Amplitude of the camera's rotations and vertical motion; 1 is the amplitude on a cart."""
     passes: tuple[PassSpec, ...] = (OUT,)
     """Passes along the road; each is filmed under every lighting."""
 
     @staticmethod
     def of(spec: PlaceSpec) -> "FilmingPlan":
-        """The plan of a drawn place."""
+        """The plan that films a drawn place as its description says."""
         film = spec.film
         return FilmingPlan(
             lightings=tuple(light.name for light in spec.lights),
@@ -71,7 +71,7 @@ class FilmingPlan:
             fps=film.fps,
             width=film.size[0],
             height=film.size[1],
-            samples=1,  # with this oversize: 2.25 rays per pixel; the campus road's films have 4
+            samples=1,  # 1.5² = 2.25 rays per pixel of the film with this oversize; the campus road's films have 4
             oversize=1.5,
             crf=24,
             camera_height=film.camera_height,
@@ -100,7 +100,7 @@ def film_name(lighting: str, one: PassSpec) -> str:
 
 
 def trajectory(plan: FilmingPlan, route: DrivenLine, film: str, one: PassSpec = OUT) -> tuple[Array, Array]:
-    """Times [s], shape (n,), and camera_to_world (OpenCV axes), shape (n, 4, 4), of the film called `film`."""
+    """Times [s], shape (n,), and camera_to_world (OpenCV axes), shape (n, 4, 4), of the film named `film`."""
     rng = np.random.default_rng([SEED, 11, sum(map(ord, film))])
     speed = plan.speed * rng.uniform(0.93, 1.07)
     frames = round(plan.length / speed * plan.fps) + 1
@@ -185,7 +185,7 @@ class Renderer:
     def __call__(self, camera_to_world: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """RGB (h, w, 3) in [0, 1] and z-depth (h, w) [m] for an OpenCV pose (4, 4).
 
-        The depth is that of a pixel's first sample; 0 is the sky.
+        The depth belongs to the pixel's first ray and is 0 for the sky.
         """
         pose = opencv_to_mujoco(camera_to_world)
         width, height = self._size
@@ -211,7 +211,7 @@ def sensor_image(
     y, x = np.mgrid[:height, :width]
     radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width / 2) ** 2
     signal = light * (lighting.exposure * exposure * (1.0 - 0.16 * radius2))[..., None] * np.asarray(lighting.gain)
-    knee = 0.75  # highlights above it roll off towards 1
+    knee = 0.75  # signals above the knee roll off towards 1
     over = np.maximum(signal - knee, 0.0)
     signal = np.minimum(signal, knee) + (1.0 - knee) * (1.0 - np.exp(-over / (1.0 - knee)))
     sigma = lighting.noise * np.sqrt(0.35 + 1.3 * signal)
@@ -220,7 +220,7 @@ def sensor_image(
 
 
 def exposures(lighting: Lighting, times: Array) -> Array:
-    """Relative exposure of each frame, with a slow drift like that of automatic exposure."""
+    """Relative exposure of each frame: it drifts slowly, as under automatic exposure."""
     rng = np.random.default_rng([SEED, 12, sum(map(ord, lighting.name))])
     return np.exp(lighting.drift * smooth_noise(rng, times, 11.0))
 
@@ -252,7 +252,7 @@ def film_pass(
 
 
 def write_video(frames: Iterable[NDArray[np.uint8]], plan: FilmingPlan, path: Path) -> None:
-    """Writes RGB frames (h, w, 3) as H.264; the same frames give the same file."""
+    """Writes RGB frames (h, w, 3) as H.264; equal frames give equal files."""
     # x264's fast paths depend on the processor and on memory alignment; these settings make its output reproducible.
     options = {"crf": str(plan.crf), "preset": "slower", "threads": "1", "x264-params": "cpu-independent=1"}
     with av.open(str(path), "w") as container:
@@ -268,7 +268,7 @@ def depth_maps(
 ) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
     """Indices (k,) of about ten frames and their depth maps [m], shape (k, h, w).
 
-    The maps have a quarter of the film's size, or a third where its height is no multiple of four.
+    The maps have a quarter of the film's width and height, or a third if the height is no multiple of four.
     """
     part = 4 if plan.height % 4 == 0 else 3
     small = replace(plan, width=plan.width // part, height=plan.height // part, samples=1, oversize=1.0)

@@ -187,7 +187,7 @@ def apply_haze(
     lighting: Lighting,
     ground: float,
 ) -> NDArray[np.float32]:
-    """Adds haze to an image: its extinction falls exponentially with height, and it is brighter towards the sun.
+    """Adds haze to an image. The haze's extinction falls exponentially with height; its airlight grows towards the sun.
 
     Args:
         light: Linear RGB, shape (h, w, 3).
@@ -202,7 +202,7 @@ def apply_haze(
     world = rays @ camera_to_world[:3, :3].T
     per_depth = np.linalg.norm(rays, axis=-1)
     length = np.where(depth > 0.0, depth * per_depth, _SKY)
-    # Below the ground, the extinction along a ray would grow without bound.
+    # Without the bound of −3, the extinction along a ray to below the ground could become arbitrarily large.
     rise = np.clip(world[..., 2] / per_depth * length / _HAZE_HEIGHT, -3.0, 60.0)
     start = np.exp(-max(float(camera_to_world[2, 3]) - ground, 0.0) / _HAZE_HEIGHT)
     level = np.abs(rise) < 1e-4
@@ -257,7 +257,7 @@ _HIGH_SUN, _LOW_SUN = (
     np.array([1.0, 0.60, 0.34]),
 )  # colors of a high sun and of one at the horizon
 _REDDENING_ANGLE = 14.0  # [°] of elevation over which the red of a low sun falls to 1/e
-_MEAN_BRIGHTNESS = 0.3  # mean value of an image at which automatic exposure aims
+_MEAN_BRIGHTNESS = 0.3  # mean value of an image for which a day's exposure is chosen
 
 
 def _day(number: int) -> Lighting:
@@ -435,13 +435,13 @@ WEATHER: dict[str, Lighting] = {
 None is filmed; a build sees at most a photo of one. The sun's position and color differ from those in every film, and
 the air may be hazy or the ground wet.
 
-The five designed ones were used during development, and `twin.env.domain_randomization.KNOWN_WEATHER_FRACTION` was
-measured on images of these and of days 1 to 5, so only days 6 to 15 took no part in any choice.
+The five designed ones were used during development. `twin.env.domain_randomization.KNOWN_WEATHER_FRACTION` was measured
+on images of these five and of days 1 to 5. Days 6 to 15 took no part in any choice.
 """
 
 
 def weather(name: str) -> Lighting:
-    """A weather of the real test: one of `WEATHER`, or `day_N` of any number N from 1 on.
+    """The weather with a name: one of `WEATHER`, or `day_N` for any whole number N ≥ 1.
 
     Raises:
         InputError: no such weather.
@@ -456,7 +456,7 @@ def weather(name: str) -> Lighting:
 
 
 def weather_index(name: str) -> int:
-    """Unique number of a weather: its index in `WEATHER`; days beyond those continue the count."""
+    """Unique number of a weather: its index in `WEATHER`; later days continue the count."""
     weather(name)
     if name in WEATHER:
         return list(WEATHER).index(name)
@@ -464,5 +464,5 @@ def weather_index(name: str) -> int:
 
 
 def day_number(name: str) -> str:
-    """The number of a drawn day, as text; empty for the weathers that have names."""
+    """The number N of `day_N`, as text; empty for the designed weathers."""
     return name.removeprefix("day_") if name.startswith("day_") else ""

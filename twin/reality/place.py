@@ -1,7 +1,7 @@
 """The campus road, place 0: the designed place in which the demo was filmed.
 
-Tables give the station and lateral [m] of every object, and the properties that differ between objects of a kind.
-Solid objects stay outside ±1.6 m of the center line.
+The tables give the station and lateral [m] of each object, and the properties that differ between objects of a kind.
+Before station 80 m, no solid object comes within 1.6 m of the center line; barriers and trees close the road's end.
 """
 
 import numpy as np
@@ -45,12 +45,15 @@ _CRATES = (  # station, lateral, side [m]
     *((18.5, -5.0, 1.1), (18.6, -6.3, 0.9), (29.5, -5.6, 1.2)),
     *((45.5, 6.5, 1.0), (54.0, -5.3, 1.15), (65.0, -4.9, 1.0)),
 )
-_MIN_LATERAL = 2.15  # [m] displaced objects come no closer to the center line than this, unless they already were
+_MIN_LATERAL = 2.15  # [m] no displacement moves an object closer to the center line than this
 _CARS = ((31.2, -5.2, "white"), (12.6, -4.9, "blue"), (66.0, 5.4, "red"))
 
 
 def _add_street_furniture(place: KnownPlace, rng: np.random.Generator | None = None) -> None:
-    """Adds all objects beside the road; with a generator, small ones are displaced, as on another day."""
+    """Adds street furniture, cars and the barriers at the road's end.
+
+    With a generator, cones, bins, crates and cars are displaced, as on another day.
+    """
     for k, lamp in enumerate(_LAMPS):
         add_lamp_post(place, k, *lamp)
     for k, (station, lateral, turn) in enumerate(_SIGNS):
@@ -76,9 +79,9 @@ def _add_street_furniture(place: KnownPlace, rng: np.random.Generator | None = N
 def _displaced(
     rng: np.random.Generator | None, station: float, lateral: float, along: float, across: float
 ) -> tuple[float, float]:
-    """Station and lateral, displaced by at most `along` and `across` [m].
+    """Station and lateral, displaced at random by at most `along` and `across` [m]; unchanged without a generator.
 
-    The object comes no closer to the center line than `_MIN_LATERAL`, or than it already was.
+    An object stays at least `_MIN_LATERAL` from the center line. One that was closer moves no closer.
     """
     if rng is None:
         return station, lateral
@@ -156,7 +159,7 @@ def build(route: RoadLine | None = None, displaced: bool = False) -> KnownPlace:
 
     Args:
         route: Center line; the default road where None.
-        displaced: True for another day than that of the film: cones, bins, crates and cars have moved.
+        displaced: True for the day of the trials: cones, bins, crates and cars have moved since the film.
     """
     place = KnownPlace(
         route or RoadLine(), _LAYOUT, campus_textures, LIGHTINGS, lambda lighting: sky_cube_map(lighting, SEED)
@@ -170,9 +173,9 @@ def build(route: RoadLine | None = None, displaced: bool = False) -> KnownPlace:
 
 
 def _road_strip(route: DrivenLine, laterals: list[float], heights: list[float] | None, step: float) -> MeshPart:
-    """A strip along the road through laterals [m], left first, with vertices `step` [m] apart along the road.
+    """A mesh strip along the road, with vertices at the laterals [m], left first, and every `step` [m] along the road.
 
-    Its heights are above the undulation [m]; None puts it on the ground.
+    `heights` [m] are above the undulation; None puts the strip on the ground.
     """
     stations = np.arange(roads.START, roads.END + step / 2, step)
     across = np.asarray(laterals, float)

@@ -32,7 +32,7 @@ class DrivenLine(Protocol):
 
     @property
     def length(self) -> float:
-        """Length of the drive [m]."""
+        """Driven length [m]."""
 
     def heading(self, station: ArrayLike) -> Array:
         """Direction of travel, counterclockwise from +x [rad]; shape as `station`."""

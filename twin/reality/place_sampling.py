@@ -45,7 +45,7 @@ _ASPECTS = (
 )
 """The aspects in the order of their streams; new ones go to the end."""
 
-MAX_FRAMES = 420  # bound of the frames of all films of a place together
+MAX_FRAMES = 420  # upper bound of the number of frames in all films of a place together
 
 
 def stream(number: int, aspect: str, *more: int) -> np.random.Generator:

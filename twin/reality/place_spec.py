@@ -1,7 +1,7 @@
-"""Descriptions of places: plain numbers and names; `place_sampling.py` draws them, `drawn_place.py` builds them.
+"""Descriptions of drawn places: plain numbers and names, which `place_sampling.py` samples.
 
-The *driven line* is the line that the first film follows and that the robot's tasks lie on. Stations and laterals are
-relative to it; the road need not be symmetrical about it.
+`drawn_place.py` builds a place from its description. The *driven line* is the line that the first film follows and that
+the robot's tasks lie on. Stations and laterals are relative to it; the road need not be symmetrical about it.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ Rgb = tuple[float, float, float]
 
 SETTINGS = ("town", "suburb", "village", "works", "park", "forest", "field")
 FREE_HALF_WIDTH = 1.5  # [m] half width of the corridor along the driven line that is free of solid objects
-CLEARANCE = 0.15  # [m] between solid objects and the corridor, the road and each other
+CLEARANCE = 0.15  # [m] least distance of solid objects from the corridor; their usual one from the road or its kerb
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class LineSpec:
     """Standard deviation of the unevenness along the road [m]."""
     mouths: tuple[Mouth, ...]
     relief: float
-    """Height of the land's swells away from the road [m]."""
+    """Standard deviation of the land's swells away from the road [m]."""
 
 
 GRADE_STEP = 20.0  # [m]
@@ -333,9 +333,9 @@ class PlaceSpec:
 def tasks(line: LineSpec) -> dict[str, tuple[float, float]]:
     """The tasks on a driven line, by name: start station and length of a segment [m].
 
-    `whole` is always there; `straight`, `right_turn`, `left_turn`, `s_bend`, `junction` and `slope` if the line has
-    such a segment. All end before the last 4 % and 0.5 m of the line, because a twin's route may be shorter than the
-    true one.
+    `whole` always exists; `straight`, `right_turn`, `left_turn`, `s_bend`, `junction` and `slope` exist if the line has
+    such a segment. No task reaches into the last 4 % + 0.5 m of the line, because a twin's route may be shorter than
+    the true one.
     """
     end = 0.96 * line.length - 0.5
     found: dict[str, tuple[float, float]] = {}

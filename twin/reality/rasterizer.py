@@ -4,10 +4,10 @@ The static world is flattened once into triangles, mip-mapped textures, lights a
 passes over 2 × 2 samples per pixel: the first finds the nearest triangle, the second computes its color. Shading is
 that of `filming.Renderer`, but textures are averaged over the footprint of a sample.
 
-A ray through a sample has direction d with z = 1 in the camera frame. With corners a, b, c in that frame, it hits the
-triangle if d · (b × c), d · (c × a), d · (a × b) have the sign of det = a · (b × c); they are proportional to the
-barycentric coordinates of the hit (Olano and Greer, Triangle scan conversion using 2D homogeneous coordinates, 1997).
-Their sum is d · ((b − a) × (c − a)), and z = det / sum. No clipping is needed.
+A ray through a sample has direction d with z = 1 in the camera frame. The ray hits a triangle with corners a, b, c in
+that frame if d · (b × c), d · (c × a) and d · (a × b) have the sign of det = a · (b × c). These three products are
+proportional to the barycentric coordinates of the hit (Olano and Greer, Triangle scan conversion using 2D homogeneous
+coordinates, 1997). Their sum is d · ((b − a) × (c − a)), and z = det / sum. No clipping is needed.
 """
 
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, type-var, operator"
@@ -29,7 +29,7 @@ from twin.warp_runtime import wp
 
 _MAX_LEVELS = 6
 _MIN_SIDE = 8  # [px] least side of a mip level
-_SMOOTH_COSINE = 0.8  # vertex normals with a smaller cosine to the face normal are not used, as in MuJoCo
+_SMOOTH_COSINE = 0.8  # below this cosine between vertex and face normal, the face normal is used, as in MuJoCo
 
 
 @dataclass(frozen=True)
@@ -37,15 +37,15 @@ class FlatScene:
     """m textured triangles and the lights of a static model."""
 
     corners: Array32
-    """World [m], shape (m, 3, 3)."""
+    """World positions [m], shape (m, 3, 3)."""
     normals: Array32
     """Unit normals at the corners, shape (m, 3, 3)."""
     uvs: Array32
-    """Texture coordinates column, row in [0, 1], shape (m, 3, 2)."""
+    """Texture coordinates (column, row) in [0, 1], shape (m, 3, 2)."""
     textures: NDArray[np.int32]
-    """Texture indices, shape (m,)."""
+    """Index of each triangle's texture, shape (m,)."""
     emissions: Array32
-    """Emission of the triangles' materials, shape (m,)."""
+    """Emission of each triangle's material, shape (m,)."""
     texels: NDArray[np.uint8]
     """RGB of all mip levels of all textures, row by row, shape (bytes,)."""
     mip_levels: NDArray[np.int32]
@@ -63,7 +63,7 @@ class FlatScene:
     lamps: Array32
     """Position [m] and color of the spot lights, which shine straight down, shape (l, 2, 3)."""
     lamp_falloff: Array32
-    """Constant and quadratic [1/m²] attenuation, cosine of the cutoff angle; shape (3,)."""
+    """Constant attenuation, quadratic attenuation [1/m²] and cosine of the cutoff angle of all lamps; shape (3,)."""
 
 
 def flatten(model: mujoco.MjModel) -> FlatScene:
@@ -144,7 +144,7 @@ ShadowRange = tuple[tuple[float, float, float], tuple[float, float, float]]
 SHADOW_RANGE: ShadowRange = (
     (-14.0, -66.0, -1.0),
     (66.0, 24.0, 6.0),
-)  # [m] box that the map covers on the campus road; points outside are lit
+)  # [m] box that the shadow map covers on the campus road; points outside it are lit
 _SHADOW_TEXEL = 0.03  # [m]
 _FAR = 1.0e6  # [m]
 _MAX_BIAS = 12.0  # [texels] bound of the bias against self-shadowing
@@ -152,7 +152,7 @@ _MAX_BIAS = 12.0  # [texels] bound of the bias against self-shadowing
 
 @wp.struct
 class ShadowMap:
-    """Orthographic depth map along the light `sun`: axes, origin [m], and depths along `ray` [m]."""
+    """Orthographic depth map of the directional light number `sun`: axes, origin [m], and depths along `ray` [m]."""
 
     sun: int
     right: wp.vec3
@@ -209,9 +209,9 @@ def _is_lit(shadows: ShadowMap, x: int, y: int, along: float):
 
 @wp.func
 def sun_visibility(shadows: ShadowMap, point: wp.vec3, normal: wp.vec3):
-    """Fraction of sunlight at a surface point [m]: depth tests at the four nearest texels, interpolated."""
+    """Fraction of sunlight that reaches a surface point [m]: interpolated depth tests at the four nearest texels."""
     facing = wp.max(-wp.dot(normal, shadows.ray), 1.0e-3)
-    # Bias against self-shadowing: how far a slanted surface rises towards the light within a texel, and half a texel.
+    # Bias against self-shadowing: the rise of a slanted surface towards the light within a texel, plus half a texel.
     slack = _SHADOW_TEXEL * wp.min(wp.sqrt(1.0 - facing * facing) / facing, _MAX_BIAS) + 0.5 * _SHADOW_TEXEL
     x = (wp.dot(point, shadows.right) - shadows.left_bottom[0]) / _SHADOW_TEXEL
     y = (wp.dot(point, shadows.up) - shadows.left_bottom[1]) / _SHADOW_TEXEL
@@ -224,7 +224,7 @@ def sun_visibility(shadows: ShadowMap, point: wp.vec3, normal: wp.vec3):
 
 
 def render_shadow_map(corners: wp.array, flat: FlatScene, reach: ShadowRange = SHADOW_RANGE) -> ShadowMap:
-    """The map of the first directional light that casts shadows; without one, an empty map with `sun` = −1."""
+    """The map of the first directional light that casts shadows; an empty map with `sun` = −1 if there is none."""
     out = ShadowMap()
     casting = np.flatnonzero(flat.sun_shadows)
     out.sun = int(casting[0]) if len(casting) else -1
@@ -265,7 +265,7 @@ def _reset(nearest_keys: wp.array[wp.int64]):
 
 @wp.func
 def _extend_box_by_edge(box: wp.vec4, a: wp.vec3, b: wp.vec3, intrinsics: wp.vec4):
-    """Extends a box (x0, y0, x1, y1) [samples] by a, and by the intersection of edge a–b with the near plane."""
+    """Extends a box (x0, y0, x1, y1) [samples] to contain a, and the intersection of edge a–b with the near plane."""
     if a[2] >= _NEAR:
         box = _extend_box_by_point(box, a, intrinsics)
     if (a[2] < _NEAR) != (b[2] < _NEAR):
@@ -354,7 +354,7 @@ def _sample_texture(
 ):
     """Mean color over the footprint that two uv steps span.
 
-    Lookups are spread along its longer axis; its shorter axis determines the mip level.
+    The lookups lie along the footprint's longer axis; its shorter axis determines the mip level.
     """
     base = mip_levels[texture, 0]
     size = wp.vec2(float(base[1]), float(base[2]))
@@ -374,7 +374,7 @@ def _sample_texture(
 
 @wp.func
 def _sky(texels: wp.array[wp.uint8], level: wp.vec3i, ray: wp.vec3):
-    """Color of a cube map with six faces stacked in OpenGL's order and its y axis along the world's z."""
+    """Color of a cube map along a world ray; six faces are stacked in OpenGL's order, and y is along the world's z."""
     x, y, z = ray[0], ray[2], -ray[1]
     ax, ay, az = wp.abs(x), wp.abs(y), wp.abs(z)
     face = int(0)  # noqa: RUF046 - int() declares a variable that Warp can change
@@ -445,7 +445,7 @@ def _shade(
         z = wp.dot(a, plane) / wp.dot(d, plane)
         if sample == 0:
             depth[py, px] = z
-        # Barycentric coordinates one sample to the right, here, and one sample down; the uv steps span the footprint.
+        # wx, wy: barycentric coordinates one sample to the right and one sample down. The uv steps span the footprint.
         wx = w + wp.vec3(na[0], nb[0], nc[0]) / intrinsics[0]
         wy = w + wp.vec3(na[1], nb[1], nc[1]) / intrinsics[1]
         here = w / (w[0] + w[1] + w[2])
@@ -527,7 +527,7 @@ class Rasterizer:
     def __call__(self, camera_to_world: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """RGB (h, w, 3) in [0, 1] and z-depth (h, w) [m] for an OpenCV pose (4, 4).
 
-        The depth is that of a pixel's first sample; 0 is the sky.
+        The depth belongs to the pixel's first sample and is 0 for the sky.
         """
         to_camera = wp.mat33(camera_to_world[:3, :3].T.astype(np.float32))
         eye = wp.vec3(*camera_to_world[:3, 3].tolist())

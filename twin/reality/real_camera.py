@@ -68,11 +68,11 @@ class HiddenCamera:
     exposure_target: float
     """Mean brightness at which automatic exposure aims."""
     exposure_range: float
-    """Largest deviation of the logarithm of the exposure from that of the lighting's usual exposure."""
+    """Largest deviation of the logarithm of the exposure from that of `Lighting.exposure`."""
     exposure_rate: float
     """Natural frequency of automatic exposure [rad/s]."""
     exposure_damping: float
-    """Damping ratio of automatic exposure, which overshoots below 1."""
+    """Damping ratio of automatic exposure; below 1 the exposure overshoots."""
     white_drift: float
     """Standard deviation of the logarithms of the gains of red and blue."""
     gamma: float
@@ -84,7 +84,7 @@ class HiddenCamera:
     vignetting: float
     """Fraction of light lost at half a width from the center."""
     bloom: float
-    """Factor on the light that spreads from where it exceeds the sensor's range."""
+    """Factor on the light beyond the sensor's range, which spreads around bright spots."""
     dirt: float
     """Largest opacity of the spots on the lens."""
     spots: float
@@ -122,7 +122,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "noise": (0.4, 1.2),
     "quality": (45.0, 90.0),
 }
-"""Ranges of drawn cameras; each value is uniform in its range."""
+"""Ranges from which `draw_camera` samples uniformly."""
 
 TRAINED: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("shift_forward", "shift_left", "shift_up"), (-0.02, 0.02)),
@@ -191,7 +191,7 @@ _DARK = 1.5  # lightings with a larger `exposure` double the time for which a ro
 
 
 def response(signal: Array32, gamma: float, contrast: float) -> Array32:
-    """The response curve, from light to values in [0, 1]: exponent, S around middle gray, and a soft shoulder.
+    """The response curve from light to values in [0, 1]: soft shoulder, exponent, and an S shape around middle gray.
 
     It rises strictly, and maps 0 to 0.
     """
@@ -206,17 +206,17 @@ class AutoExposure:
     """A second-order loop on the logarithm of the exposure: e'' = ω² (target − e) − 2 ζ ω e'."""
 
     def __init__(self, camera: HiddenCamera, start: float) -> None:
-        """`start` is the mean brightness of the first picture at the lighting's usual exposure."""
+        """`start` is the mean brightness of the first picture at `Lighting.exposure`."""
         self._camera = camera
         self.value = float(np.clip(self._wanted(start), -camera.exposure_range, camera.exposure_range))
-        """Logarithm of the exposure, relative to the lighting's usual one."""
+        """Logarithm of the exposure relative to `Lighting.exposure`."""
         self._rate, self._time = 0.0, 0.0
 
     def _wanted(self, brightness: float) -> float:
         return float(np.log(self._camera.exposure_target / max(brightness, 1e-3)))
 
     def see(self, brightness: float, time: float) -> None:
-        """Takes the mean brightness of a picture at the lighting's usual exposure, at a time [s]."""
+        """Takes the mean brightness that a picture at a time [s] has at `Lighting.exposure`."""
         c, steps = self._camera, max(1, round((time - self._time) / 0.01))
         dt, self._time = (time - self._time) / steps, time
         wanted = float(np.clip(self._wanted(brightness), -c.exposure_range, c.exposure_range))
@@ -311,11 +311,11 @@ class RealCamera:
         return np.asarray(0.6 * cv2.GaussianBlur(over, (0, 0), near) + 0.4 * cv2.GaussianBlur(over, (0, 0), far))
 
     def _read(self, light: Array32, depth: Array32, motion: Array) -> Array32:
-        """Rolling shutter and motion blur: every row as the camera saw it at its own time.
+        """Rolling shutter and motion blur: every row shows what the camera saw while the row was exposed.
 
         A point has the camera coordinates X in the middle of the readout, and X − f (ω × X + t) after the camera has
-        moved by the fraction f of its motion (ω, t). So a pixel in a row that is read then, with the point X on its ray
-        at its depth, takes the color at the projection of X + f (ω × X + t) in the picture of the middle.
+        moved by the fraction f of its motion (ω, t). For a pixel in a row that is read at that time, X is taken as the
+        point on its ray at its depth. The pixel gets the middle picture's color at the projection of X + f (ω × X + t).
         """
         if not np.any(motion):
             return light
@@ -338,7 +338,7 @@ class RealCamera:
 
 
 def motion_between(before: Array, after: Array, middle: Array) -> Array:
-    """Rotation vector [rad] and translation [m] from one camera pose to another, in a third one's axes, shape (6,)."""
+    """Rotation vector [rad] and translation [m] from pose `before` to `after`, in the axes of `middle`, shape (6,)."""
     turn = Rotation.from_matrix(middle[:3, :3].T @ after[:3, :3] @ before[:3, :3].T @ middle[:3, :3]).as_rotvec()
     return np.concatenate([turn, middle[:3, :3].T @ (after[:3, 3] - before[:3, 3])])
 
@@ -361,7 +361,7 @@ def dirt_mask(camera: HiddenCamera, size: tuple[int, int]) -> NDArray[np.float32
 
 
 def compressed(picture: Image, quality: int) -> Image:
-    """A picture (h, w, 3) after JPEG of a quality."""
+    """A picture (h, w, 3) after JPEG compression at a quality."""
     data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     back = cv2.imdecode(data, cv2.IMREAD_COLOR)
     assert back is not None

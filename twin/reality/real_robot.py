@@ -2,8 +2,7 @@
 
 The chassis is a rigid body with three degrees of freedom in the plane of the ground beneath it. Each of four tires has
 its own load and its own slip; one geared motor drives the two tires of a side. Height, pitch and roll follow the ground
-under the tires as lightly damped oscillators, which bumps and the road's texture excite: at 1 m/s the ground changes
-over tenths of a second, and a bounce on the tires takes hundredths.
+under the tires as lightly damped oscillators of 6.5 to 11 Hz, which bumps and the road's texture excite.
 
 Tire: the averaged lumped LuGre model (Canudas de Wit, Tsiotras, Velenis, Basset, Gissinger 2003, Vehicle System
 Dynamics 39(3)) in its anisotropic planar form (Velenis, Tsiotras, Canudas de Wit, Sorine 2005, same journal 43(1)). For
@@ -13,17 +12,18 @@ speed u = |r ω| and the patch's length L:
     dz_i/dt = v_i − (σ₀ |M v| / (μ_i² g) + κ₀ u / L) z_i,    |M v| = √((μ_x v_x)² + (μ_y v_y)²)
     F_i = −(σ₀ z_i + σ₁ dz_i/dt) N,    κ₀ = 7/6 (Deur 2001, IFAC Workshop Advances in Automotive Control)
 
-with g = 1 + (s − 1) exp(−√(|v| / v_s)), where s is the ratio of static to sliding friction (Stribeck). In steady
-sliding the force lies on Coulomb's friction ellipse; a rolling tire creeps in proportion to its force; a tire at rest
-holds like a spring.
+with the load N and g = 1 + (s − 1) exp(−√(|v| / v_s)), where s is the ratio of static to sliding friction and v_s the
+Stribeck speed. In steady sliding the force lies on Coulomb's friction ellipse; a rolling tire creeps in proportion to
+its force; a tire at rest holds like a spring.
 
-Loads: the tires are four equal springs. A tire's load is the sum of its parts of the weight, of the load transfer of
-acceleration (h ΣF/L along, h ΣF/B across) and of the warp of the ground under the four tires. Motor: torque k i,
-current i = (U − k ω) / R within its limit; U is at most the battery's voltage, which sags by its resistance times the
-current drawn. A velocity loop (PI) per side sets U; a controller turns commands into the target speeds of both loops.
-Controller and loops have their own clocks, whose periods jitter.
+Loads: the tires are four equal springs. A tire's load is the sum of its shares of the weight, of the load transfer by
+acceleration (h ΣF / wheelbase along, h ΣF / track across, with the center of mass at height h) and of the load that a
+warp of the ground shifts between the diagonals. Motor: torque k i, current i = (U − k ω) / R within its limit; U is at
+most the battery's voltage, which sags by its resistance times the current drawn. A velocity loop (PI) per side sets U;
+a controller turns commands into the target speeds of both loops. Controller and loops have their own clocks, whose
+periods jitter.
 
-`RANGES` are the ranges of drawn robots; `TRAINED` is a copy of the ranges that the twin's training randomizes.
+`draw_robot` samples robots from `RANGES`; `TRAINED` is a copy of the ranges that the twin's training randomizes.
 """
 
 from collections import deque
@@ -91,7 +91,7 @@ class HiddenRobot:
     patch_length: float = 0.09
     """L [m]."""
     rolling_resistance: float = 0.02
-    """Force / load."""
+    """Ratio of the resisting force to the load."""
     wheel_radius: float = 1.0
     """Mean radius, relative to the nominal one that the controller uses."""
     wheel_difference: float = 0.0
@@ -105,7 +105,7 @@ class HiddenRobot:
     bounce_damping: float = 0.15
     """Damping ratio."""
     shake: float = 0.2
-    """Standard deviation of pitch and roll at 1 m/s from the road's texture [°]."""
+    """Standard deviation of the pitch and roll that the road's texture causes at 1 m/s [°]."""
 
     # Drivetrain.
     torque_constant: float = 0.035
@@ -135,7 +135,7 @@ class HiddenRobot:
     timeout: float = 0.25
     """Time without a command after which the controller stops [s]."""
     jitter: float = 0.1
-    """Largest relative deviation of a period."""
+    """Largest relative deviation of a period of the controller or of a loop."""
     deadband: float = 0.01
     """Speed of a side below which the controller commands standstill [m/s]."""
     command_latency: float = 0.05
@@ -179,7 +179,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "deadband": (0.0, 0.03),
     "command_latency": (0.02, 0.15),
 }
-"""Ranges of drawn robots; each value is uniform in its range."""
+"""Ranges from which `draw_robot` samples uniformly."""
 
 TRAINED: dict[str, tuple[float, float]] = {
     "payload": (0.0, 20.0),
@@ -321,7 +321,7 @@ class RealRobot:
             self._target[i] = 0.0 if abs(speed) < r.deadband else speed / _RADIUS
 
     def _velocity_loop(self) -> None:
-        """Runs the PI loops of both sides; the battery's voltage limits them, and their integrals stop there."""
+        """Runs the PI loops of both sides; at the limit of the battery's voltage, a loop's integral stays constant."""
         r = self.robot
         elapsed = self._time - self._last_loop
         self._last_loop = self._time
@@ -400,7 +400,7 @@ class RealRobot:
         self._yaw += _STEP * self._rate
 
     def _sample_ground(self) -> None:
-        """The plane through the ground under the four tires, and the load that its warp shifts between diagonals."""
+        """Fits a plane to the ground under the four tires, and computes the load that the ground's warp shifts."""
         c, s = cos(self._yaw), sin(self._yaw)
         at = [
             (
@@ -459,7 +459,7 @@ class RealRobot:
         return self._current[0], self._current[1]
 
     def base_to_world(self, at: float) -> Array:
-        """Pose of the base (4, 4), axes forward, left, up, at a past time [s], or the nearest one that is kept."""
+        """Pose of the base (4, 4), axes forward, left, up, at a past time [s] of at most the last 2 s."""
         return pose_matrix(self._pose_at(at))
 
     def _pose_at(self, at: float) -> tuple[float, ...]:

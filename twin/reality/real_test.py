@@ -1,10 +1,10 @@
 """The real test: a policy file drives a robot on the true road, in weather that was never filmed.
 
-A policy receives images only. Its file is the only input from the training side, except that a task may be one that
-the twin wrote as JSON. Robot, camera, haze and judge are implemented independently of the twin (`real_robot.py`,
-`real_camera.py`, `lighting.py`, `real_judge.py`); the renderer is `rasterizer.py`. The twin supplies only the loader of
-policy files and the format of tables. Places, days, robots and cameras have numbers; the results list those values of
-the robot and the camera that lie outside the ranges of training (`outside_training`).
+A policy receives images only. The training side supplies only the policy's file and, optionally, a task as JSON. Robot,
+camera, haze and judge are implemented independently of the twin (`real_robot.py`, `real_camera.py`, `lighting.py`,
+`real_judge.py`); the renderer is `rasterizer.py`. The code of the twin loads policy files and defines the format of
+tables. Places, days, robots and cameras have numbers. The results list the values of the robot and the camera that lie
+outside the ranges of training (`outside_training`).
 
 The k-th trial in a weather has the same seed for every policy, hence the same start, shake and noise, so that policies
 can be compared in pairs.
@@ -250,7 +250,7 @@ def _check_setup(setup: Setup, table: Path, record: Path) -> None:
             raise InputError(f"{table} has trials of {known}; this call has {given}; give another --out")
     elif table.exists():
         raise InputError(
-            f"{table} was driven in the reality of version 1; this is {REALITY_VERSION}; give another --out"
+            f"{table} has trials of version 1 of the real test; this is version {REALITY_VERSION}; give another --out"
         )
     record.parent.mkdir(parents=True, exist_ok=True)
     robot, camera = asdict(draw_robot(setup.robot)), asdict(draw_camera(setup.camera))

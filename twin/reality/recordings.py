@@ -124,9 +124,12 @@ _MAX_TRIES = 40
 def record_log(duration: float, setup: Setup) -> dict[str, Array]:
     """A drive log of `duration` [s] on the straight segment: columns by name, each of shape (rows,).
 
-    Random joystick commands drive the robot forwards, backwards and through turns, but keep it on the asphalt. The log
-    has commands, wheel encoders, an IMU and surveyed poses in the frame of the first one, with the noise of such
-    instruments.
+    Random commands, as from a joystick, drive the robot forwards, backwards and through turns, but keep it on the road.
+    The log has the commands and, with measurement noise, wheel speeds, accelerations and surveyed poses in the frame of
+    the first pose.
+
+    Raises:
+        InputError: `duration` < 10 s.
     """
     if not duration >= 10.0:
         raise InputError(f"duration = {duration:g} s; expected at least 10")
@@ -164,7 +167,7 @@ def write_log(path: Path, columns: dict[str, Array]) -> None:
 
 
 def _sample_command(rng: np.random.Generator, line: DrivenLine, pose: Array, hold: float) -> Array:
-    """A random command that keeps the robot on the asphalt, or a turn on the spot if none is found."""
+    """A random command that keeps the robot on the road, or a turn on the spot if none is found."""
     for _ in range(_MAX_TRIES):
         command = rng.uniform([-_LOG_SPEED, -_YAW_RATE], [_LOG_SPEED, _YAW_RATE])
         if _stays_inside(line, pose, command, hold + 0.3):

@@ -1,8 +1,8 @@
 """A ROS 2 bag of one trial of the real test, as a real Husky would record it, for `twin.trial`.
 
-The robot runs `twin_policy`'s pilot on JPEG pictures of its camera; without a policy, it follows the line. The bag has
-those pictures, camera_info, commands, and poses as accurate as those of RTK, in a frame of their own. Recording
-continues for a moment after the trial's end.
+The robot runs `twin_policy`'s pilot on JPEG pictures of its camera; without a policy, it follows the task's line. The
+bag has those pictures, camera_info, commands, and poses with the accuracy of RTK, in a frame of their own. Recording
+continues for 1.5 s after the trial's end.
 """
 
 import contextlib
@@ -67,7 +67,7 @@ def write_robot_bag(
         raise InputError(f"{path} exists; give another --out, or delete it")
     weather_number, setup = weather_index(lighting), setup or Setup()
     if not 0 <= seed <= MOST_SEED or weather_number >= _WEATHERS:
-        raise InputError(f"seed {seed} under {lighting}; expected a seed from 0 to {MOST_SEED}, and a day up to 980")
+        raise InputError(f"seed {seed} under {lighting}; expected a seed from 0 to {MOST_SEED}, and a day up to 995")
     onnx, limits = None, (1.0, 1.0, 0.1)
     if policy:
         try:
@@ -166,7 +166,7 @@ class BagMessages:
         model: str = "plumb_bob",
         distortion: Sequence[float] = (0.0,) * 5,
     ) -> Any:
-        """`intrinsics` fx, fy, cx, cy [px]; cx, cy from the corner of the first pixel, but in ROS from its center."""
+        """A message with fx, fy, cx, cy [px]; cx, cy are from the first pixel's corner, in ROS from its center."""
         fx, fy, cx, cy = intrinsics
         k = np.array([fx, 0, cx - 0.5, 0, fy, cy - 0.5, 0, 0, 1.0])
         p = np.array([fx, 0, cx - 0.5, 0, 0, fy, cy - 0.5, 0, 0, 0, 1.0, 0])

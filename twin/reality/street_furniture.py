@@ -248,7 +248,7 @@ def add_vehicle(place: KnownPlace, k: int, station: float, lateral: float, turn:
 def add_post(
     place: KnownPlace, name: str, station: float, lateral: float, height: float, radius: float, skin: str
 ) -> None:
-    """Adds an upright post: a bollard, or from 2 m of height a pole for wires."""
+    """Adds an upright post: a bollard if it is lower than 2 m, else a pole for wires."""
     foot = place.spot(station, lateral)
     parts = [place.cell(skin, primitives.tube(foot - up(0.2), foot + up(height), radius, 0.8 * radius, 10))]
     if height < 2.0:

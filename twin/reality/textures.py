@@ -307,7 +307,7 @@ def bark(
 
 
 def leaf(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Array32:
-    """Leaf tones from dark (left) to light (right); `primitives.leaves` gives each leaf a window of it."""
+    """Leaf tones from dark (left) to light (right); `primitives.leaves` gives each leaf a window of this texture."""
     image = tinted(base, fbm(rng, shape, 60, 1.0, 0.85), 0.20, 0.8 * fbm(rng, shape, 30, 6))
     image *= np.linspace(0.35, 1.35, shape[1], dtype=np.float32)[None, :, None]
     return np.clip(image, 0.03, 1.0)

@@ -13,7 +13,7 @@ from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.rasterizer import SHADOW_RANGE
 from twin.types import Array
 
-_LENGTH_TOLERANCE = 0.98  # fraction of the longest path; the first film above it gives the route
+_LENGTH_TOLERANCE = 0.98  # the first film at least this fraction of the longest path long gives the route
 
 
 def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) -> Array:

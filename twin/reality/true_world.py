@@ -18,11 +18,11 @@ from twin.types import Array
 
 _SKY_RAYS = 48
 _OCCLUDER_REACH = 7.0  # [m] objects farther away do not occlude the sky
-_OCCLUSION_STEP = 0.3  # [m] between points of the map
+_OCCLUSION_STEP = 0.3  # [m] between points of a sky-visibility map; the points of the land's map are 1 m apart
 
 
 def sky_visibility(place: KnownPlace, points: Array) -> Array:
-    """Fraction of the cosine-weighted sky that objects nearby leave visible from points (..., 3), shape (...)."""
+    """Fraction of the cosine-weighted sky that no nearby object hides from points (..., 3) [m], shape (...)."""
     part = primitives.join([t.part for t in place.objects if t.kind in ("obstacle", "foliage")])
     k = np.arange(_SKY_RAYS) + 0.5
     # Malley's method: points that fill a disc uniformly are projected up to the hemisphere.
@@ -33,7 +33,7 @@ def sky_visibility(place: KnownPlace, points: Array) -> Array:
 
 
 def ground_visibility(place: KnownPlace) -> dict[str, Array]:
-    """Per ground texture, a coarse sky-visibility map whose rows and columns run along those of the texture."""
+    """A coarse sky-visibility map for each ground texture; its rows and columns run along the texture's."""
     first, last = place.layout.stations
     along = np.linspace(first, last, round((last - first) / _OCCLUSION_STEP))
     grids = {}
@@ -55,9 +55,9 @@ def ground_visibility(place: KnownPlace) -> dict[str, Array]:
 def world_spec(
     lighting: Lighting | str, place: KnownPlace, moving: Mapping[str, MeshPart] | None = None
 ) -> mujoco.MjSpec:
-    """The world under one lighting, with textures, lights and a camera named `film`; nothing in it collides.
+    """A place under one lighting, with textures, lights and a camera named `film`.
 
-    Geoms are in groups 0 (ground) and 1. Each of `moving`, name → mesh, is a mocap body of that name.
+    Ground geoms are in group 0, all others in group 1. Each of `moving`, name → mesh, is a mocap body of that name.
     """
     light = place.lightings[lighting] if isinstance(lighting, str) else lighting
     model = mujoco.MjSpec()
@@ -111,7 +111,7 @@ def _add_geom(body: mujoco.MjsBody, model: mujoco.MjSpec, name: str, part: MeshP
 
 
 def _darkened(image: NDArray[np.uint8], factor: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """A texture multiplied by a coarse map of factors in [0, 1]."""
+    """Multiplies a texture by a coarse map of factors in [0, 1]."""
     fine = textures.resized(factor.astype(np.float32), image.shape[:2], smooth=False)
     return (image * np.clip(fine, 0.0, 1.0)[..., None]).astype(np.uint8)
 

@@ -1,4 +1,4 @@
-"""Ground truth of a generated scene: poses, some depth maps, and the geometry, which is rebuilt from its parameters.
+"""Ground truth of a generated scene: poses, some depth maps, and the place, which is rebuilt from its parameters.
 
 `python -m twin.reality film` writes it to `<scene>/truth`. A build must not read it; `twin/reality/comparison.py`,
 `python -m twin.reality drive`, benchmarks and tests do.
@@ -36,7 +36,7 @@ class TrueFilm:
     times: Array
     """[s], shape (n,)."""
     camera_to_world: Array
-    """OpenCV axes, metres, z up, shape (n, 4, 4)."""
+    """OpenCV axes of the camera, world z up [m], shape (n, 4, 4)."""
     depth_frames: NDArray[np.int64]
     """Indices of the frames with a depth map, shape (k,)."""
     depth: NDArray[np.float16]
