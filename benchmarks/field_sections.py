@@ -44,7 +44,7 @@ def timed_fit(
     from twin.nerf.trainer import train_field
 
     began = time.perf_counter()
-    field, metrics, _ = train_field(cameras, points, replace(config, steps=steps), device=device)
+    field, metrics, *_ = train_field(cameras, points, replace(config, steps=steps), device=device)
     wall = time.perf_counter() - began
     return field, wall, Pace(wall - metrics["seconds_train"], metrics["seconds_train"] / steps)
 

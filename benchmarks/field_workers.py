@@ -156,7 +156,7 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
     cameras = replace(cameras, held_out=np.zeros(len(cameras), bool))
     chosen = np.resize(np.arange(len(cameras)), int(count))  # keeps the frames' indices, to which the points refer
     height = constant_height(read_json(paths.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
-    trained, _, _ = train_field(
+    trained, *_ = train_field(
         cameras.select(chosen), points, replace(config.nerf, steps=int(steps)), config.seed, height, "cpu"
     )
     size = cameras.sizes[0] * min(1.0, config.nerf.max_width / cameras.sizes[0].max())

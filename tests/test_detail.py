@@ -188,7 +188,7 @@ def _level_of(detail: Detail, hits: np.ndarray, level: int) -> np.ndarray:
 def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path):
     cameras = make_cameras(tmp_path)
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, _, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
+    field, *_ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     plain, _ = bake(field, pixels, seed=1, steps=60, max_bricks=1500)
     view = Viewpoints.of(cameras.camera_to_world[2:3], K, (WIDTH, HEIGHT))

@@ -195,7 +195,7 @@ def test_another_seed_gives_another_field(cameras):
 
 def test_training_learns_the_floor_and_both_lightings(cameras):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, metrics, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
+    field, metrics, *_ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
     metrics |= evaluate(field, cameras, WIDTH)
     assert metrics["n"] == {"day": 1, "night": 1}
     assert metrics["train_psnr"] > 17.0
@@ -244,7 +244,7 @@ def bricks(facts) -> int:
 
 def test_baked_field_renders_like_the_field(cameras, monkeypatch):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, _, _ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
+    field, *_ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     baked, facts = bake(field, pixels, seed=1, steps=60, max_bricks=1500)
     again, _ = bake(field, pixels, seed=1, steps=60, max_bricks=1500)
@@ -283,6 +283,6 @@ def test_unavailable_device_is_an_input_error(monkeypatch, value, message):
 
 def test_field_without_visible_surface_is_not_baked(cameras):
     config = replace(CONFIG, steps=2, near_plane=100.0)  # [m] everything is nearer
-    field, _, _ = train_field(cameras, floor_points(cameras), config, device="cpu")
+    field, *_ = train_field(cameras, floor_points(cameras), config, device="cpu")
     with pytest.raises(InputError, match=r"nothing to bake.*near_plane"):
         bake(field, TrainingPixels(cameras, SparsePoints.empty(), WIDTH), steps=1)

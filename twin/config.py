@@ -223,6 +223,8 @@ class NerfConfig:
     pixels."""
     stereo: bool = True
     """Supervise depth from stereo between frames in addition to the sparse points."""
+    transients: bool = True
+    """Leave out what moved while a film was made, and what stands in the films of some lightings only."""
     bake_steps: Annotated[int, Range(1)] = 600
     """Number of fine-tuning steps of the baked field, which renders the images."""
     detail_passes: Annotated[float, Range(0, 100)] = 2.0

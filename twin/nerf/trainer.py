@@ -42,6 +42,7 @@ from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler
 from twin.nerf.pose_refinement import PoseRefinement
 from twin.nerf.stereo import stereo_depths
+from twin.nerf.transients import Transients, cell_centers, cell_size, find_transients
 from twin.runtime import bar
 from twin.scene import SceneDir
 from twin.warp_runtime import wp
@@ -96,6 +97,7 @@ _FINAL_RATE = 0.03  # final learning rates, as a share of the initial ones
 _RISE, _FALL = 0.3, 0.1  # step of an opacity grid cell toward a more or a less opaque sample [share of the difference]
 _LOG_OFFSET = 0.05  # added to distances in the distortion loss's logarithm [share of the near box's longest half side]
 _WARM_UP = 20  # steps of rising learning rate
+_TRANSIENTS_SHARE = 0.3  # share of the steps after which the field is good enough to find transients
 _EXPLORATION_SHARE = 0.15  # share of the steps in which sampling narrows down to surfaces; cameras are refined after it
 
 
@@ -156,6 +158,8 @@ class Trainer:
         # The hash table's gradient, and Adam's first and second moment of it.
         self.moments = [warp_view(torch.zeros_like(f.table), hashgrid.Feature) for _ in range(3)]
         self.steps_done = 0
+        self.transients: Transients | None = None
+        """What is not trained on; None without `nerf.transients`, and before it was looked for."""
 
     def _growth(self, near_box: NearBox) -> float:
         """Factor between the cells per axis of consecutive hash levels: makes the finest cell `_CELL_PIXELS` wide."""
@@ -179,6 +183,9 @@ class Trainer:
 
     def step(self) -> float:
         """Runs one training step and returns the mean squared error of its colors."""
+        if self.config.transients and self.steps_done == int(_TRANSIENTS_SHARE * self.config.steps):
+            self.transients = find_transients(self.pixels, self._cell_depths())
+            self.pixels.exclude(self.transients.masks)
         ws, device = self.ws, self.device
         per_shard = self.rays // _SHARDS
         supervised = int(per_shard * self.config.sightings)
@@ -258,6 +265,17 @@ class Trainer:
                 device=self.device,
             )
             return float((error**2).mean()), [first, second, *gradients[2:]]
+
+    def _cell_depths(self) -> list[NDArray[np.float32]]:
+        """The field's z-depths [m] at the centers of every training frame's cells, shapes (rows, columns)."""
+        side = cell_size(self.pixels)
+        sizes = zip(self.pixels.width, self.pixels.height, strict=True)
+        centers = [cell_centers(int(width), int(height), side) for width, height in sizes]
+        counts = [grid.shape[0] * grid.shape[1] for grid in centers]
+        frame = np.repeat(np.arange(len(centers)), counts)
+        depth = self.field.trace(self.arrays, frame, np.concatenate([grid.reshape(-1, 2) for grid in centers]))[2]
+        parts = np.split(depth.cpu().numpy(), np.cumsum(counts)[:-1])
+        return [part.reshape(grid.shape[:2]) for part, grid in zip(parts, centers, strict=True)]
 
     @property
     def _refines(self) -> bool:
@@ -363,8 +381,8 @@ def train_field(
     seed: int = 0,
     camera_height: float = 0.0,
     device: str | None = None,
-) -> tuple[RadianceField, dict[str, Any], Cameras]:
-    """Trains a field; returns it, the training metrics, and the cameras, refined if so configured.
+) -> tuple[RadianceField, dict[str, Any], Cameras, Transients | None]:
+    """Trains a field; returns it, the training metrics, the cameras, refined if so configured, and what was left out.
 
     `camera_height` [m] is the constant height of the camera above the ground, 0 if it is not constant; for `device` see
     `buffers.resolve_device`. Raises InputError if training diverges.
@@ -400,9 +418,11 @@ def train_field(
             "sightings_path": len(trainer.pixels.path.frame),
             "stereo": trainer.stereo,
             "cameras_moved": moved,
+            "transients": None if trainer.transients is None else trainer.transients.summary(),
             "curve": curve,
         },
         cameras,
+        trainer.transients,
     )
 
 
@@ -438,8 +458,10 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))
     height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
-    field, metrics, cameras = train_field(cameras, points, config.nerf, config.seed, height, device)
+    field, metrics, cameras, transients = train_field(cameras, points, config.nerf, config.seed, height, device)
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
+    if transients is not None:
+        pixels.exclude(transients.masks)
     baked, metrics["bake"] = bake(field, pixels, config.seed, config.nerf.bake_steps, config.nerf.max_bricks)
     if config.nerf.detail_passes > 0.0:
         metrics["detail"] = fit_detail(baked, field.appearance, pixels, config.seed, config.nerf.detail_passes)

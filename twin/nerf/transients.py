@@ -7,6 +7,7 @@ and the frame's own differs from it, something was in front of the surface in th
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,6 +27,57 @@ _MIN_SEEN = 3  # least number of frames that must see a surface
 _DEPTH_TOLERANCE = 0.1  # a surface is visible in a frame whose own depth there is at most this fraction smaller
 _MIN_DIFFERENCE = 0.06  # least difference of a mover's color from the surface's
 _SPREADS = 4.0  # least difference, as a multiple of the frames' median deviation from their median
+
+
+@dataclass(frozen=True)
+class Transients:
+    """The transients of a capture."""
+
+    masks: list[NDArray[np.bool_]]
+    """True where a training frame shows a transient, shape (height, width) each."""
+    moving: float
+    """Fraction of the training pixels that show movers or their shadows."""
+    objects: list["LeftObject"]
+
+    def summary(self) -> dict[str, Any]:
+        """Entries of `report.json`."""
+        objects = [
+            {
+                "center": [round(float(x), 2) for x in one.center],
+                "size": [round(float(x), 2) for x in one.size],
+                "present": list(one.present),
+                "absent": list(one.absent),
+            }
+            for one in self.objects
+        ]
+        return {"moving_share": round(self.moving, 4), "frames": sum(m.any() for m in self.masks), "objects": objects}
+
+
+def find_transients(pixels: TrainingPixels, depths: list[Array32]) -> Transients:
+    """Finds what moved, and what stands in some films only.
+
+    Args:
+        pixels: The training frames, with their stereo depths.
+        depths: z-depths [m] of the surfaces in every training frame's cells (`cell_centers`), shapes (rows, columns).
+    """
+    side = cell_size(pixels)
+    cells = [frame_cells(pixels, i, side, depth) for i, depth in enumerate(depths)]
+    movers = mover_cells(pixels, cells, side)
+    objects = left_objects(pixels)
+    masks = [_enlarged(mark, side, pixels, i) for i, mark in enumerate(movers)]
+    moving = sum(float(mask.sum()) for mask in masks) / len(pixels.colors)
+    for mask, i in zip(masks, range(len(cells)), strict=True):
+        for one in objects:
+            if pixels.cameras.lightings[i] in one.present:
+                mask |= object_mask(pixels, cells[i], i, one)
+    return Transients(masks, moving, objects)
+
+
+def _enlarged(cells: NDArray[np.bool_], side: int, pixels: TrainingPixels, i: int) -> NDArray[np.bool_]:
+    """A frame's marked cells as pixels."""
+    width, height = int(pixels.width[i]), int(pixels.height[i])
+    mask = np.repeat(np.repeat(cells, side, 0), side, 1)
+    return np.pad(mask, ((0, height - mask.shape[0]), (0, width - mask.shape[1])), mode="edge")
 
 
 @dataclass(frozen=True)
@@ -73,8 +125,8 @@ def consensus(pixels: TrainingPixels, cells: list[Cells], i: int, side: int) -> 
     """Colors of the surfaces in frame i's cells as other frames see them.
 
     Returns:
-        Median color, shape (rows, columns, 3); median deviation from it, shape (rows, columns); number of frames that see
-        the surface, shape (rows, columns).
+        Median color, shape (rows, columns, 3); median deviation from it, shape (rows, columns); number of frames that
+        see the surface, shape (rows, columns).
     """
     own = cells[i]
     shape = own.depth.shape
@@ -89,7 +141,8 @@ def consensus(pixels: TrainingPixels, cells: list[Cells], i: int, side: int) -> 
         at = (pixel / side - 0.5).astype(np.float32)
         inside = (z > 0.1) & (at > -0.5).all(1) & (at < np.array([columns, rows]) - 0.5).all(1)
         at = np.where(inside[:, None], at, np.float32(0.0))
-        color = cv2.remap(other.color, at[:, 0], at[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        u, v = at.T.reshape(2, *shape)
+        color = cv2.remap(other.color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(-1, 3)
         nearest = np.clip(np.rint(at).astype(int), 0, [columns - 1, rows - 1])
         visible = inside & (z < (1.0 + _DEPTH_TOLERANCE) * other.depth[nearest[:, 1], nearest[:, 0]])
         if visible.any():  # exposure and white balance drift from frame to frame
@@ -117,11 +170,22 @@ def mover_cells(pixels: TrainingPixels, cells: list[Cells], side: int) -> list[N
 
     def find(i: int) -> NDArray[np.bool_]:
         median, spread, count = consensus(pixels, cells, i, side)
-        difference = np.abs(cells[i].color - median).mean(-1)
+        difference = _least_difference(cells[i].color, median)
         other = (count >= _MIN_SEEN) & (difference > np.maximum(_MIN_DIFFERENCE, _SPREADS * spread))
         return cleaned(other)
 
     return [find(i) for i in range(len(cells))]
+
+
+def _least_difference(color: Array32, median: Array32) -> Array32:
+    """Difference of each cell's color from the most similar surface in its cell or the eight around it.
+
+    Depths and poses are not exact, so textured surfaces are found a cell aside. Shapes (rows, columns, 3) → (rows, columns).
+    """
+    rows, columns = color.shape[:2]
+    wide = np.pad(median, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
+    shifts = [np.abs(color - wide[a : a + rows, b : b + columns]).mean(-1) for a in range(3) for b in range(3)]
+    return np.fmin.reduce(shifts)
 
 
 def cleaned(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -140,6 +204,7 @@ _BEHIND = (0.5, 0.08)  # surface this far behind a voxel shows that it is empty:
 _AT = (0.3, 0.04)  # surface this far from a voxel shows that it is occupied: the same units
 _MIN_FRAMES = 3  # least number of frames that show a voxel empty, and occupied
 _MIN_VOXELS = 24  # smaller objects are left alone: noise of stereo looks like them
+_CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 _MIN_EXTENT = 0.6  # [m] least extent along the second longest axis
 
 
@@ -217,6 +282,27 @@ def left_objects(pixels: TrainingPixels) -> list[LeftObject]:
         if present and absent:
             found.append(LeftObject(voxels[own], present, absent))
     return found
+
+
+_HIDDEN = (
+    0.7  # an object whose nearest voxel is farther than the surface of a cell by more than this [m] is hidden there
+)
+
+
+def object_mask(pixels: TrainingPixels, cells: Cells, i: int, one: LeftObject) -> NDArray[np.bool_]:
+    """True where frame i shows an object, with a margin of a voxel, shape (height, width)."""
+    height, width = int(pixels.height[i]), int(pixels.width[i])
+    mask = np.zeros((height, width), np.uint8)
+    corners = one.voxels[:, None] + _VOXEL * _CORNERS
+    pixel, z = project(corners.reshape(-1, 3), pixels.cameras.camera_to_world[i], pixels.intrinsics[i])
+    ahead = z > 0.3
+    if not ahead.any():
+        return mask > 0
+    hull = cv2.convexHull(np.clip(pixel[ahead], -4.0 * width, 5.0 * width).astype(np.float32))
+    cv2.fillConvexPoly(mask, np.rint(hull).astype(np.int32), 1)
+    hidden = (cells.depth < z[ahead].min() - _HIDDEN).astype(np.uint8)
+    hidden = cv2.resize(hidden, (width, height), interpolation=cv2.INTER_NEAREST)
+    return (mask > 0) & (hidden == 0)
 
 
 def _voxels(pixels: TrainingPixels) -> Array:

@@ -219,6 +219,20 @@ def metric_section(report: dict[str, Any]) -> Section:
     return Section("metric", "Scale and gravity", done, facts, cautions, verdict=verdict)
 
 
+def _transient_facts(field: dict[str, Any]) -> list[Fact]:
+    """Facts about what was left out: movers, and objects that stand in the films of some lightings only."""
+    share, objects = pick(field, "transients.moving_share"), pick(field, "transients.objects") or []
+    if share is None:
+        return []
+    facts = [Fact("moving things", number(share, "{:.1%}"), "of the training pixels; left out, with moving shadows")]
+    for k, one in enumerate(objects, 1):
+        size, (x, y, _) = sorted(one["size"], reverse=True), one["center"]
+        text = f"{size[0]:.1f} m long, at x = {x:.1f}, y = {y:.1f} m"
+        meaning = f"stands in {' and '.join(one['present'])}, not in {' or '.join(one['absent'])}; left out"
+        facts.append(Fact(f"removed object {k}", text, meaning))
+    return facts
+
+
 def field_section(report: dict[str, Any]) -> Section:
     field = pick(report, "field") or {}
     psnr, ssim, n = (numbers(field.get(key)) for key in ("psnr", "ssim", "n"))
@@ -239,6 +253,7 @@ def field_section(report: dict[str, Any]) -> Section:
     if (found := pick(field, "stereo.sightings")) is not None:
         form = "used for depth supervision; {:.0%} of the attempted stereo estimates succeeded"
         facts.append(Fact("stereo depths", number(found, "{:,}"), number(pick(field, "stereo.share"), form)))
+    facts += _transient_facts(field)
     small, lower = (numbers(field.get(key)) for key in ("psnr_small", "psnr_small_lower"))
     for name, value in small.items():
         text = number(value, "{:.1f} dB PSNR") + (f", {lower[name]:.1f} dB in the lower half" if name in lower else "")

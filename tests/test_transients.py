@@ -1,0 +1,140 @@
+"""Transients: movers and objects that left are found, and static places are left alone."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic import AnalyticField, Box
+from test_stereo import HEIGHT, PLACE, WIDTH, K, pattern, points_of, poses
+
+from twin import runtime
+from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, unproject
+from twin.geometry.images import write_image
+from twin.nerf import transients
+from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths
+
+CAR = Box(7.0, -2.0, 3.6, 1.7, 1.4)
+MOVING = slice(30, 66)  # rows of a mover
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    runtime.set_quiet(True)
+
+
+def columns(i: int) -> slice:
+    """Columns of the mover in frame i: it crosses the picture."""
+    return slice(20 + 9 * i, 38 + 9 * i)
+
+
+def film(folder: Path, lighting: str, place: AnalyticField, n: int = 12, mover: bool = False, gain: float = 1.0):
+    """Cameras of a drive through a place, and the true depths of its frames, shape (n, height, width)."""
+    pose = poses(n)
+    depth = place.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), "day").depth
+    names = tuple(f"{lighting}/{i:06d}" for i in range(n))
+    (folder / lighting).mkdir(parents=True, exist_ok=True)
+    rays = unproject(pixel_grid(WIDTH, HEIGHT), K)
+    for i, name in enumerate(names):
+        gray = pattern((rays * depth[i][..., None]) @ pose[i, :3, :3].T + pose[i, :3, 3])
+        gray[depth[i] > 100.0] = 0.8
+        if mover:
+            gray[MOVING, columns(i)] = 0.9
+        exposure = gain * (1.0 + 0.05 * np.sin(i))
+        picture = np.repeat((np.clip(gray * exposure, 0, 1) * 255).astype(np.uint8)[..., None], 3, -1)
+        write_image(folder / f"{name}.png", picture)
+    cameras = Cameras(
+        *(names, pose, np.tile(K, (n, 1)), np.tile([WIDTH, HEIGHT], (n, 1)), (lighting,) * n, (lighting,) * n),
+        *(np.arange(n) / 2.0, np.zeros(n, bool), folder),
+    )
+    return cameras, depth
+
+
+def cell_depths(pixels: TrainingPixels, depth: np.ndarray) -> list[np.ndarray]:
+    """True depths at the centers of the frames' cells."""
+    centers = transients.cell_centers(WIDTH, HEIGHT, transients.cell_size(pixels)).astype(int)
+    return [frame[centers[..., 1], centers[..., 0]].astype(np.float32) for frame in depth]
+
+
+def supervision(pixels: TrainingPixels, depth: np.ndarray) -> DepthSupervision:
+    """True depths of a quarter of the pixels nearer than 25 m."""
+    v, u = (k.ravel() for k in np.mgrid[1:HEIGHT:2, 1:WIDTH:2])
+    parts = []
+    for i, frame in enumerate(depth):
+        z = frame[v, u]
+        near = z < 25.0
+        pixel = np.stack([u, v], 1)[near] + 0.5
+        distance = z[near] * np.linalg.norm(unproject(pixel, K), axis=1)
+        parts.append(DepthSupervision(np.full(near.sum(), i, np.int32), pixel, distance.astype(np.float32)))
+    return join_depths(parts)
+
+
+def joined(one: Cameras, other: Cameras) -> Cameras:
+    arrays = ("camera_to_world", "intrinsics", "sizes", "times", "held_out")
+    texts = ("names", "lightings", "sources")
+    return replace(
+        one,
+        **{name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in arrays},
+        **{name: getattr(one, name) + getattr(other, name) for name in texts},
+    )
+
+
+def test_a_mover_is_found_in_every_frame_and_little_else(tmp_path):
+    cameras, depth = film(tmp_path, "day", PLACE, mover=True)
+    pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
+    found = transients.find_transients(pixels, cell_depths(pixels, depth))
+    mover, around = (np.zeros((len(depth), HEIGHT, WIDTH), bool) for _ in range(2))
+    for i in range(len(depth)):
+        mover[i, MOVING, columns(i)] = True
+        around[i, 22:74, max(0, columns(i).start - 8) : columns(i).stop + 8] = True
+    masks = np.array(found.masks)
+    # At the ends of the film, surfaces near the border of a frame are seen in too few others.
+    assert (masks & mover)[1:-1].sum() > 0.9 * mover[1:-1].sum()
+    assert (masks & ~around).mean() < 0.005
+    assert found.moving == pytest.approx(masks.mean())
+    assert not found.objects
+
+
+def test_nothing_is_left_out_of_a_static_film(tmp_path):
+    cameras, depth = film(tmp_path, "day", PLACE)
+    pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
+    pixels.stereo = supervision(pixels, depth)
+    found = transients.find_transients(pixels, cell_depths(pixels, depth))
+    assert np.array(found.masks).mean() < 0.003 and not found.objects
+
+
+def test_a_car_that_left_is_found_and_excluded_where_it_stands(tmp_path):
+    with_car = AnalyticField(boxes=(*PLACE.boxes, CAR), amplitude=0.0)
+    day, day_depth = film(tmp_path, "day", with_car)
+    night, night_depth = film(tmp_path, "night", PLACE, gain=0.3)
+    cameras, depth = joined(day, night), np.concatenate([day_depth, night_depth])
+    pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
+    pixels.stereo = supervision(pixels, depth)
+    found = transients.find_transients(pixels, cell_depths(pixels, depth))
+    (car,) = found.objects
+    assert car.present == ("day",) and car.absent == ("night",)
+    half = 0.5 * np.array([CAR.length, CAR.width, CAR.top])
+    assert (np.abs(car.voxels - [CAR.x, CAR.y, half[2]]) < half + 0.4).all()
+    assert car.size[0] > 0.8 * CAR.length and car.size[2] > 0.7 * CAR.top  # its far side is not seen
+    shows = day_depth < night_depth - 0.01
+    masks = np.array(found.masks)
+    assert (masks[: len(day)] & shows).sum() > 0.97 * shows.sum()
+    assert not masks[len(day) :].any()
+    assert masks[: len(day)].sum() < 2.0 * shows.sum()
+    facts = found.summary()
+    assert facts["objects"][0]["present"] == ["day"] and facts["moving_share"] == 0.0
+
+
+def test_excluded_pixels_are_neither_sampled_nor_supervised(tmp_path):
+    cameras, depth = film(tmp_path, "day", PLACE)
+    pixels = TrainingPixels(cameras, points_of(cameras), WIDTH)
+    pixels.stereo = supervision(pixels, depth)
+    before = len(pixels.stereo.frame)
+    mask = np.zeros((len(cameras), HEIGHT, WIDTH), bool)
+    mask[:, :, : WIDTH // 2] = True
+    mask[3] = True  # a frame would lose everything: it is kept
+    pixels.exclude(list(mask))
+    batch = pixels.batch(np.random.default_rng(0), 2, 50, 200, 60)
+    inside = batch.frame != 3
+    assert (batch.pixel[inside, 0] > WIDTH // 2 - 1).all() and (batch.frame == 3).any()
+    assert 0 < len(pixels.stereo.frame) < before
