@@ -6,7 +6,7 @@ A frame is divided into *cells* of a few pixels. Cells show surfaces whose depth
 and the frame's own differs from it, something was in front of the surface in this frame alone.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -23,9 +23,14 @@ from twin.types import Array, Array32
 _GRID_CELLS = 80  # cells along a frame's longer side
 _FAR = 300.0  # [m] greatest depth; the sky is taken to be there
 _NEIGHBORS = 14  # frames in which a surface is looked up
-_MIN_SEEN = 3  # least number of frames that must see a surface
+_STRIDE = 1  # every third of the nearest frames is used, so that a mover has time to move away
+_MIN_SEEN = 4  # least number of surfaces that must be found in a cell
 _DEPTH_TOLERANCE = 0.1  # a surface is visible in a frame whose own depth there is at most this fraction smaller
-_MIN_DIFFERENCE = 0.06  # least difference of a mover's color from the surface's
+_MIN_DIFFERENCE, _MIN_CONTRAST = (
+    0.015,
+    0.12,
+)  # least difference of a mover's color: constant, and share of its brightness
+_MIN_CELLS = 8  # least size of a mover in cells
 _SPREADS = 4.0  # least difference, as a multiple of the frames' median deviation from their median
 
 
@@ -50,7 +55,7 @@ class Transients:
             }
             for one in self.objects
         ]
-        return {"moving_share": round(self.moving, 4), "frames": sum(m.any() for m in self.masks), "objects": objects}
+        return {"moving_share": round(self.moving, 4), "frames": sum(bool(m.any()) for m in self.masks), "objects": objects}
 
 
 def find_transients(pixels: TrainingPixels, depths: list[Array32]) -> Transients:
@@ -62,7 +67,7 @@ def find_transients(pixels: TrainingPixels, depths: list[Array32]) -> Transients
     """
     side = cell_size(pixels)
     cells = [frame_cells(pixels, i, side, depth) for i, depth in enumerate(depths)]
-    movers = mover_cells(pixels, cells, side)
+    movers = mover_cells(pixels, cells)
     objects = left_objects(pixels)
     masks = [_enlarged(mark, side, pixels, i) for i, mark in enumerate(movers)]
     moving = sum(float(mask.sum()) for mask in masks) / len(pixels.colors)
@@ -90,6 +95,14 @@ class Cells:
     """Mean colors in [0, 1], shape (rows, columns, 3)."""
     depth: Array32
     """z-depth [m], shape (rows, columns)."""
+    side: int
+    """Side of a cell [px]."""
+
+    def points(self, pixels: TrainingPixels, i: int) -> Array:
+        """The surfaces that the cells of frame i show [m], shape (rows · columns, 3)."""
+        rays = unproject(self.pixel.reshape(-1, 2), pixels.intrinsics[i])
+        pose = pixels.cameras.camera_to_world[i]
+        return (rays / rays[:, 2:] * self.depth.reshape(-1, 1)) @ pose[:3, :3].T + pose[:3, 3]
 
 
 def cell_size(pixels: TrainingPixels) -> int:
@@ -110,7 +123,7 @@ def frame_cells(pixels: TrainingPixels, i: int, side: int, depth: Array32) -> Ce
     centers = cell_centers(width, height, side)
     rows, columns = centers.shape[:2]
     color = image[: rows * side, : columns * side].reshape(rows, side, columns, side, 3).mean((1, 3)) / 255.0
-    return Cells(centers, color.astype(np.float32), np.minimum(depth, np.float32(_FAR)))
+    return Cells(centers, color.astype(np.float32), np.minimum(depth, np.float32(_FAR)), side)
 
 
 def neighbors(pixels: TrainingPixels, i: int) -> NDArray[np.int64]:
@@ -118,10 +131,39 @@ def neighbors(pixels: TrainingPixels, i: int) -> NDArray[np.int64]:
     lightings = np.array(pixels.cameras.lightings)
     others = np.flatnonzero((lightings == lightings[i]) & (np.arange(len(lightings)) != i))
     distance = np.linalg.norm(pixels.cameras.positions[others] - pixels.cameras.positions[i], axis=1)
-    return others[np.argsort(distance, kind="stable")[:_NEIGHBORS]]
+    nearest = others[np.argsort(distance, kind="stable")[: _NEIGHBORS * _STRIDE]]
+    return nearest[::_STRIDE] if len(nearest) >= 2 * _NEIGHBORS else nearest[:_NEIGHBORS]
 
 
-def consensus(pixels: TrainingPixels, cells: list[Cells], i: int, side: int) -> tuple[Array32, Array32, NDArray]:
+def static_depths(pixels: TrainingPixels, cells: list[Cells]) -> list[Array32]:
+    """z-depths [m] of the static surfaces in every frame's cells, shapes (rows, columns).
+
+    A field in training has surfaces in front of the frames that show a mover. So every cell gets the median depth of
+    the surfaces of other frames in it, if there are enough.
+    """
+
+    def find(i: int) -> Array32:
+        own = cells[i]
+        rows, columns = own.depth.shape
+        at, depths = [], []
+        for j in neighbors(pixels, i):
+            points = cells[j].points(pixels, j)
+            pixel, z = project(points, pixels.cameras.camera_to_world[i], pixels.intrinsics[i])
+            u, v = np.floor(pixel / own.side).T
+            inside = (z > 0.1) & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
+            at.append((v[inside] * columns + u[inside]).astype(int))
+            depths.append(z[inside].astype(np.float32))
+        group, depth = np.concatenate(at), np.concatenate(depths)
+        count = np.bincount(group, minlength=rows * columns)
+        first = np.cumsum(count) - count
+        ordered = np.append(depth[np.lexsort((depth, group))], np.float32(0.0))
+        middle = ordered[np.minimum(first + (count - 1) // 2, len(depth))].reshape(rows, columns)
+        return np.where(count.reshape(rows, columns) >= _MIN_SEEN, middle, own.depth)
+
+    return [find(i) for i in range(len(cells))]
+
+
+def consensus(pixels: TrainingPixels, cells: list[Cells], i: int) -> tuple[Array32, Array32, NDArray]:
     """Colors of the surfaces in frame i's cells as other frames see them.
 
     Returns:
@@ -130,15 +172,13 @@ def consensus(pixels: TrainingPixels, cells: list[Cells], i: int, side: int) -> 
     """
     own = cells[i]
     shape = own.depth.shape
-    rays = unproject(own.pixel.reshape(-1, 2), pixels.intrinsics[i])
-    pose = pixels.cameras.camera_to_world[i]
-    points = (rays / rays[:, 2:] * own.depth.reshape(-1, 1)) @ pose[:3, :3].T + pose[:3, 3]
+    points = own.points(pixels, i)
     seen = []
     for j in neighbors(pixels, i):
         other = cells[j]
         rows, columns = other.depth.shape
         pixel, z = project(points, pixels.cameras.camera_to_world[j], pixels.intrinsics[j])
-        at = (pixel / side - 0.5).astype(np.float32)
+        at = (pixel / other.side - 0.5).astype(np.float32)
         inside = (z > 0.1) & (at > -0.5).all(1) & (at < np.array([columns, rows]) - 0.5).all(1)
         at = np.where(inside[:, None], at, np.float32(0.0))
         u, v = at.T.reshape(2, *shape)
@@ -165,22 +205,29 @@ def _median(stack: Array32, count: NDArray) -> Array32:
     return 0.5 * (ordered[middle // 2, index] + ordered[(middle + 1) // 2, index])
 
 
-def mover_cells(pixels: TrainingPixels, cells: list[Cells], side: int) -> list[NDArray[np.bool_]]:
+def mover_cells(pixels: TrainingPixels, cells: list[Cells]) -> list[NDArray[np.bool_]]:
     """True in the cells of every training frame that show a mover, or a shadow that moves, shapes (rows, columns)."""
 
-    def find(i: int) -> NDArray[np.bool_]:
-        median, spread, count = consensus(pixels, cells, i, side)
-        difference = _least_difference(cells[i].color, median)
-        other = (count >= _MIN_SEEN) & (difference > np.maximum(_MIN_DIFFERENCE, _SPREADS * spread))
-        return cleaned(other)
+    static = [replace(one, depth=depth) for one, depth in zip(cells, static_depths(pixels, cells), strict=True)]
+    # Depths of the field miss what is behind a mover, medians miss thin things: a mover differs from both.
+    return [cleaned(differs(pixels, cells, i) & differs(pixels, static, i)) for i in range(len(cells))]
 
-    return [find(i) for i in range(len(cells))]
+
+def differs(pixels: TrainingPixels, cells: list[Cells], i: int) -> NDArray[np.bool_]:
+    """True in the cells of frame i whose color is not that which other frames show there, shape (rows, columns)."""
+    median, spread, count = consensus(pixels, cells, i)
+    color = cells[i].color
+    coarse = np.abs(_mean_around(color) - _mean_around(median)).mean(-1)
+    brightness = np.fmax(color.mean(-1), median.mean(-1))
+    least = np.maximum(_MIN_DIFFERENCE + _MIN_CONTRAST * brightness, _SPREADS * spread)
+    return (count >= _MIN_SEEN) & (np.fmin(_least_difference(color, median), coarse) > least)
 
 
 def _least_difference(color: Array32, median: Array32) -> Array32:
     """Difference of each cell's color from the most similar surface in its cell or the eight around it.
 
-    Depths and poses are not exact, so textured surfaces are found a cell aside. Shapes (rows, columns, 3) → (rows, columns).
+    Depths and poses are not exact, so textured surfaces are found a cell aside. Shapes (rows, columns, 3) →
+    (rows, columns).
     """
     rows, columns = color.shape[:2]
     wide = np.pad(median, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
@@ -188,12 +235,21 @@ def _least_difference(color: Array32, median: Array32) -> Array32:
     return np.fmin.reduce(shifts)
 
 
+def _mean_around(color: Array32) -> Array32:
+    """Means over 3 × 3 cells, without those that are nan."""
+    known = np.isfinite(color)
+    total = cv2.blur(np.where(known, color, np.float32(0.0)), (3, 3))
+    return total / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), np.float32(1e-6))
+
+
 def cleaned(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Drops cells with fewer than three marked neighbors, closes gaps, and adds a margin of one cell."""
-    around = cv2.boxFilter(cells.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_REPLICATE)
-    kept = (cells & (around >= 4.0)).astype(np.uint8)
-    closed = cv2.morphologyEx(kept, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    return cv2.dilate(closed, np.ones((3, 3), np.uint8)) > 0
+    """Closes gaps, drops groups of fewer than eight cells and thin ones, and adds a margin of one cell."""
+    closed = cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= _MIN_CELLS
+    large[0] = False  # the background
+    return cv2.dilate(large[labels].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 # ---- objects that stand in some films only
@@ -274,6 +330,8 @@ def left_objects(pixels: TrainingPixels) -> list[LeftObject]:
     for part in _components(voxels[chosen]):
         own = chosen[part]
         extent = np.sort(np.ptp(voxels[own], axis=0) + _VOXEL)
+        if not _stands(pixels, voxels[own]):
+            continue
         if len(own) < _MIN_VOXELS or extent[1] < _MIN_EXTENT:
             continue
         there, gone = is_there[own].sum(0), is_empty[own].sum(0)
@@ -318,6 +376,13 @@ def _voxels(pixels: TrainingPixels) -> Array:
         keys.append(np.unique(np.floor((rays @ pose[:3, :3].T + pose[:3, 3]) / _VOXEL).astype(np.int64), axis=0))
     found, frames = np.unique(np.concatenate(keys), axis=0, return_counts=True)
     return (found[frames >= _MIN_FRAMES] + 0.5) * _VOXEL
+
+
+def _stands(pixels: TrainingPixels, voxels: Array) -> bool:
+    """True if an object begins below the nearest camera; others are crowns, and lights at night."""
+    positions = pixels.cameras.positions
+    nearest = np.argmin(np.linalg.norm(positions[:, :2] - voxels[:, :2].mean(0), axis=1))
+    return bool(voxels[:, 2].min() < positions[nearest, 2])
 
 
 def _components(points: Array) -> list[NDArray[np.int64]]:

@@ -20,7 +20,8 @@ _MEETING_DISTANCE = (
     5.0,
     12.0,
 )  # [m] range of the distance ahead of the camera at which a walker crosses the center line
-_CROSSING = 7.0  # [m] a walker crosses from this lateral to its opposite
+_CROSSING = 9.0  # [m] a walker crosses from this lateral to its opposite
+_OUT_OF_SIGHT = np.array([0.0, 0.0, -50.0])  # [m] foot of a mover that is not in the place
 _CAR_LATERAL = 2.3  # [m] lateral of moving cars to the left of the filmed line
 _PARKED_GAP = 1.6  # [m] from the center line to the nearer side of a parked car
 _SKINS = ("red", "blue", "white", "dark", "green")
@@ -56,7 +57,8 @@ def movers(place: KnownPlace, film: str, times: Array, cameras: Array) -> list[M
         return float(np.interp(time, times, station))
 
     def pose(at: float, lateral: float, turn: float) -> tuple[Array, float]:
-        at = float(np.clip(at, 0.0, length))
+        if not 0.0 <= at <= length:
+            return _OUT_OF_SIGHT, 0.0
         return place.spot(at, lateral), place.heading(at) + turn
 
     found = []
@@ -68,8 +70,8 @@ def movers(place: KnownPlace, film: str, times: Array, cameras: Array) -> list[M
         def walk(
             time: float, at: float = at, meeting: float = meeting, speed: float = speed, side: float = side
         ) -> tuple[Array, float]:
-            lateral = float(np.clip(speed * (time - meeting), -_CROSSING, _CROSSING))
-            return pose(at, side * lateral, side * 0.5 * np.pi)
+            lateral = speed * (time - meeting)
+            return pose(at, side * lateral, side * 0.5 * np.pi) if abs(lateral) < _CROSSING else (_OUT_OF_SIGHT, 0.0)
 
         found.append(Mover(f"walker_{k}", _walker(place, rng), walk))
     for k in range(_CARS):
