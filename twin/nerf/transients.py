@@ -1,9 +1,13 @@
-"""Transients: what moved while a film was made, and what stands in some films only. Their pixels are not trained on.
+"""Transients: things that move during a film, and objects that stand in some films only.
 
-A frame is divided into *cells* of a few pixels. Cells show surfaces whose depth is known from a field in training.
+Training leaves out the pixels that show them, so that the field contains only what stays.
 
-*Movers*: a surface point is looked up in the other frames of the same lighting that see it. If these agree on a color,
-and the frame's own differs from it, something was in front of the surface in this frame alone.
+*Movers*, and shadows that move: a surface is looked up in other frames of the same lighting. If these agree on a color,
+and the frame's own color differs from it, something else was in front of the surface when the frame was made. Frames
+are divided into *cells* of a few pixels; the depths of the surfaces in them come from a field in training.
+
+*Objects that left*: stereo within each film tells which voxels are occupied, and which are empty since surfaces behind
+them are seen. A group of voxels that is occupied in one lighting and empty in another is such an object.
 """
 
 from dataclasses import dataclass, replace
@@ -17,19 +21,17 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from twin.geometry.cameras import project, unproject
+from twin.nerf.buffers import parallel
 from twin.nerf.dataset import TrainingPixels
 from twin.types import Array, Array32
 
 _GRID_CELLS = 80  # cells along a frame's longer side
 _FAR = 300.0  # [m] greatest depth; the sky is taken to be there
 _NEIGHBORS = 14  # frames in which a surface is looked up
-_STRIDE = 1  # every third of the nearest frames is used, so that a mover has time to move away
 _MIN_SEEN = 4  # least number of surfaces that must be found in a cell
 _DEPTH_TOLERANCE = 0.1  # a surface is visible in a frame whose own depth there is at most this fraction smaller
-_MIN_DIFFERENCE, _MIN_CONTRAST = (
-    0.015,
-    0.12,
-)  # least difference of a mover's color: constant, and share of its brightness
+_MIN_DIFFERENCE = 0.015  # least difference of a mover's color from the surface's, on black
+_MIN_CONTRAST = 0.12  # the same, as a share of the brightness
 _MIN_CELLS = 8  # least size of a mover in cells
 _SPREADS = 4.0  # least difference, as a multiple of the frames' median deviation from their median
 
@@ -55,7 +57,11 @@ class Transients:
             }
             for one in self.objects
         ]
-        return {"moving_share": round(self.moving, 4), "frames": sum(bool(m.any()) for m in self.masks), "objects": objects}
+        return {
+            "moving_share": round(self.moving, 4),
+            "frames": sum(bool(m.any()) for m in self.masks),
+            "objects": objects,
+        }
 
 
 def find_transients(pixels: TrainingPixels, depths: list[Array32]) -> Transients:
@@ -131,8 +137,7 @@ def neighbors(pixels: TrainingPixels, i: int) -> NDArray[np.int64]:
     lightings = np.array(pixels.cameras.lightings)
     others = np.flatnonzero((lightings == lightings[i]) & (np.arange(len(lightings)) != i))
     distance = np.linalg.norm(pixels.cameras.positions[others] - pixels.cameras.positions[i], axis=1)
-    nearest = others[np.argsort(distance, kind="stable")[: _NEIGHBORS * _STRIDE]]
-    return nearest[::_STRIDE] if len(nearest) >= 2 * _NEIGHBORS else nearest[:_NEIGHBORS]
+    return others[np.argsort(distance, kind="stable")[:_NEIGHBORS]]
 
 
 def static_depths(pixels: TrainingPixels, cells: list[Cells]) -> list[Array32]:
@@ -153,14 +158,14 @@ def static_depths(pixels: TrainingPixels, cells: list[Cells]) -> list[Array32]:
             inside = (z > 0.1) & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
             at.append((v[inside] * columns + u[inside]).astype(int))
             depths.append(z[inside].astype(np.float32))
-        group, depth = np.concatenate(at), np.concatenate(depths)
+        group, depth = np.concatenate([np.zeros(0, int), *at]), np.concatenate([np.zeros(0, np.float32), *depths])
         count = np.bincount(group, minlength=rows * columns)
         first = np.cumsum(count) - count
         ordered = np.append(depth[np.lexsort((depth, group))], np.float32(0.0))
         middle = ordered[np.minimum(first + (count - 1) // 2, len(depth))].reshape(rows, columns)
         return np.where(count.reshape(rows, columns) >= _MIN_SEEN, middle, own.depth)
 
-    return [find(i) for i in range(len(cells))]
+    return parallel(find, range(len(cells)), "cpu")
 
 
 def consensus(pixels: TrainingPixels, cells: list[Cells], i: int) -> tuple[Array32, Array32, NDArray]:
@@ -173,7 +178,7 @@ def consensus(pixels: TrainingPixels, cells: list[Cells], i: int) -> tuple[Array
     own = cells[i]
     shape = own.depth.shape
     points = own.points(pixels, i)
-    seen = []
+    seen = [np.full((len(points), 3), np.nan, np.float32)]
     for j in neighbors(pixels, i):
         other = cells[j]
         rows, columns = other.depth.shape
@@ -196,21 +201,17 @@ def consensus(pixels: TrainingPixels, cells: list[Cells], i: int) -> tuple[Array
 
 
 def _median(stack: Array32, count: NDArray) -> Array32:
-    """Median over the first axis of (k, n, c), whose entries are nan but for `count` (n,) of the k; nan if none."""
-    if not len(stack):
-        return np.full(stack.shape[1:], np.nan, np.float32)
-    ordered = np.sort(stack, 0)
-    middle = np.maximum(count - 1, 0)
+    """Median over the first axis of (k, n, c), of which `count` (n,) values are known and the others nan."""
+    ordered = np.sort(stack, 0)  # nan comes last
     index = np.arange(len(count))
-    return 0.5 * (ordered[middle // 2, index] + ordered[(middle + 1) // 2, index])
+    return 0.5 * (ordered[np.maximum(count - 1, 0) // 2, index] + ordered[count // 2, index])
 
 
 def mover_cells(pixels: TrainingPixels, cells: list[Cells]) -> list[NDArray[np.bool_]]:
     """True in the cells of every training frame that show a mover, or a shadow that moves, shapes (rows, columns)."""
-
     static = [replace(one, depth=depth) for one, depth in zip(cells, static_depths(pixels, cells), strict=True)]
     # Depths of the field miss what is behind a mover, medians miss thin things: a mover differs from both.
-    return [cleaned(differs(pixels, cells, i) & differs(pixels, static, i)) for i in range(len(cells))]
+    return parallel(lambda i: cleaned(differs(pixels, cells, i) & differs(pixels, static, i)), range(len(cells)), "cpu")
 
 
 def differs(pixels: TrainingPixels, cells: list[Cells], i: int) -> NDArray[np.bool_]:
