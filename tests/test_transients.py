@@ -9,10 +9,12 @@ from analytic import AnalyticField, Box
 from test_stereo import HEIGHT, PLACE, WIDTH, K, pattern, points_of, poses
 
 from twin import runtime
+from twin.config import NerfConfig
 from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, unproject
 from twin.geometry.images import write_image
 from twin.nerf import transients
 from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths
+from twin.nerf.trainer import Trainer
 
 CAR = Box(7.0, -2.0, 3.6, 1.7, 1.4)
 MOVING = slice(30, 66)  # rows of a mover
@@ -137,3 +139,26 @@ def test_excluded_pixels_are_neither_sampled_nor_supervised(tmp_path):
     inside = batch.frame != 3
     assert (batch.pixel[inside, 0] > WIDTH // 2 - 1).all() and (batch.frame == 3).any()
     assert 0 < len(pixels.stereo.frame) < before
+
+
+def test_training_leaves_out_what_was_found_and_can_be_told_not_to(tmp_path):
+    cameras, _ = film(tmp_path, "day", PLACE, mover=True)
+    config = NerfConfig(steps=10, rays=256, samples=8, levels=3, log2_table=10, max_width=WIDTH, stereo=False)
+    trainer = Trainer(cameras, points_of(cameras), config, 0, "cpu")
+    while not trainer.done:
+        assert (trainer.transients is None) == (trainer.steps_done < 4)
+        trainer.step()
+    excluded = np.concatenate([mask.ravel() for mask in trainer.transients.masks])
+    assert (trainer.pixels.unmasked == ~excluded).all()
+    trainer = Trainer(cameras, points_of(cameras), replace(config, transients=False), 0, "cpu")
+    while not trainer.done:
+        trainer.step()
+    assert trainer.transients is None and trainer.pixels.unmasked.all()
+
+
+def test_photos_of_many_lightings_have_no_transients(tmp_path):
+    cameras, depth = film(tmp_path, "day", PLACE, n=3)
+    cameras = replace(cameras, lightings=("a", "b", "c"))
+    pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
+    found = transients.find_transients(pixels, cell_depths(pixels, depth))
+    assert not np.array(found.masks).any() and found.moving == 0.0

@@ -198,8 +198,9 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
         del settings["metric"]["odometry"], settings["metric"]["odometry_tolerance"]
     if settings.get("route") == dataclasses.asdict(RouteConfig()):
         del settings["route"]
-    if not settings.get("nerf", {}).get("refine_cameras", True):
-        del settings["nerf"]["refine_cameras"]
+    for key in ("refine_cameras", "transients"):
+        if not settings.get("nerf", {}).get(key, True):
+            del settings["nerf"][key]
     return {
         "stage": stage.name,
         "version": stage.version,
