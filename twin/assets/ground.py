@@ -50,7 +50,7 @@ class Ground:
         return Ground(self.height[nodes], self.origin, self.cell * n, self.measured[nodes], self.rgb[nodes])
 
     def triangles(self, cell: float, max_faces: int) -> tuple[Array, NDArray[np.int64]]:
-        """Vertices (v, 3) [m] and upward faces (f, 3) about `cell` [m] wide, or wider to limit them to `max_faces`."""
+        """Vertices (v, 3) [m] and upward faces (f, 3) about `cell` [m] wide, or wider where `max_faces` demands it."""
         rows, columns = self.height.shape
         step = max(1, round(cell / self.cell), int(np.ceil(np.sqrt(2 * rows * columns / max_faces))))
         row, column = (np.unique(np.append(np.arange(0, n, step), n - 1)) for n in (rows, columns))
@@ -83,7 +83,7 @@ class Ground:
                 }
             )
             if not (0.0 < ground.cell < np.inf and np.isfinite(ground.height).all() and rows * columns):
-                raise ValueError(f"cell = {ground.cell}, expected > 0, and finite heights")
+                raise ValueError(f"cell = {ground.cell} m; expected > 0, and one or more heights, all finite")
         return ground
 
 
@@ -324,7 +324,7 @@ def _smoothness_matrix(grid: HeightGrid) -> sparse.csr_array:
 
 
 def fit_low_passed(data: HeightData, low: Array, high: Array, config: MeshConfig) -> tuple[Array, HeightGrid, Array]:
-    """Coarse-to-fine fit over the box from `low` to `high` (x, y), then low-passed by `ground_smoothing`.
+    """Fits heights over the box from `low` to `high` (x, y), coarse to fine; low-passes them by `ground_smoothing`.
 
     Returns heights [m] on a grid of `ground_cell`, the grid, and the weight of each datum.
     """

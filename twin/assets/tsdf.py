@@ -218,7 +218,7 @@ class Volume:
 
 
 def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float) -> Volume:
-    """Fuses views at the voxels of a box, in its blocks of 4³ voxels near the surface points `hits` (k, 3).
+    """Fuses views at the voxels of a box, only in blocks of 4³ voxels near the surface points `hits` (k, 3).
 
     `box` has the low and the high corner, shape (2, 3) [m]. The spacing `voxel` [m] grows if the box would have more
     than 60 million voxels. For `far` see `fuse`.

@@ -199,7 +199,7 @@ def _common(one: str, other: str) -> int:
 
 
 def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYPES)) -> dict[str, Any]:
-    """Kind → its best connection, for `kinds`, keys of `TYPES`. Raises InputError if a kind other than imu has none."""
+    """Maps each of `kinds`, keys of `TYPES`, to its best connection. Raises InputError if one has none, except imu."""
     chosen = {}
     for kind in kinds:
         types = TYPES[kind]

@@ -63,7 +63,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
     Returns metrics, see `_metrics`.
 
-    Raises InputError: too little texture or overlap, or a smaller fraction registered than `cameras.min_registered`.
+    Raises InputError: too little texture or overlap, or a fraction of registered frames below `cameras.min_registered`.
     """
     stage, settings = scene.stage("capture"), config.cameras
     capture = Capture.load(stage)

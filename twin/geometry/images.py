@@ -1,6 +1,6 @@
 """Image files as arrays, resizing and similarity metrics.
 
-RGB order, shape (height, width, 3), float in [0, 1] unless uint8.
+Images are RGB, shape (height, width, 3), float in [0, 1] unless uint8.
 """
 
 import re

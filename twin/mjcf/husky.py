@@ -90,7 +90,7 @@ class WrongOption:
 
 
 def check(model: mujoco.MjModel) -> list[WrongOption]:
-    """Options of a model with a Husky that are wrong for skid steering; empty if all are right.
+    """Lists the options of a model with a Husky that are wrong for skid steering.
 
     When a robot is attached to a scene, MuJoCo keeps the options of the scene, and the scene's ground can override the
     contact parameters of the tires.
@@ -587,7 +587,7 @@ _XML_HEADER = """<!--
 """
 
 
-SCENE = """<!-- The Husky on a plane, made by python -m twin.mjcf.husky; do not edit. It turns with ctrl -3 and 3. -->
+SCENE = """<!-- The Husky on a plane, made by python -m twin.mjcf.husky; do not edit. Controls of -3 and 3 turn it. -->
 <mujoco model="husky scene">
   <include file="husky.xml"/>
 
