@@ -165,7 +165,7 @@ def test_another_cameras_info_is_not_used(tmp_path: Path) -> None:
     contents = read_contents(write(tmp_path / "drive", messages))
     assert (
         contents.lens is None
-        and "is of another camera (rear_optical, the pictures camera_optical)" in contents.lens_note
+        and "is of another camera (frame rear_optical, the pictures have camera_optical)" in contents.lens_note
     )
     zero = MESSAGES.camera_info((0.0, 0.0, 0.5, 0.5), (WIDTH, HEIGHT), START)
     messages[0] = Recorded(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", zero, START)
@@ -283,7 +283,7 @@ BAD = {
     ),
     "unsorted stamps": (
         lambda: _stamped([*range(15), *range(15)]),
-        r"stamps of 15 of 30 pictures are not after .* 1\.400 s",
+        r"15 of 30 pictures have stamps that are not later .* 1\.400 s",
     ),
     "another size": (
         lambda: [camera_info(Lens("PINHOLE", (150.0, 150.0, 50.0, 60.0), 100, 120)), *pictures(views(SHIFTS), TIMES)],

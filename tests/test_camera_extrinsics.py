@@ -373,7 +373,7 @@ def test_the_focal_length_is_found_with_its_error(start):
 
 
 def test_a_frontal_wall_does_not_determine_the_focal_length():
-    with pytest.raises(InputError, match="does not show the camera's focal length; give camera_intrinsics"):
+    with pytest.raises(InputError, match="does not determine the camera's focal length; give camera_intrinsics"):
         _shared_focal(sights(6.0, 6.01), simple(260.0))
 
 

@@ -406,7 +406,7 @@ def test_invalid_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(0))
     cases: list[tuple[dict, str]] = [
         ({}, "no scale given; give one of: metric.camera_height .*distance.*gps.*marker.*poses_are_metric"),
-        ({"camera_height": -1.0}, "metric.camera_height = -1.0; expected metres"),
+        ({"camera_height": -1.0}, "metric.camera_height = -1.0; expected meters"),
         ({"poses_are_metric": True}, "the input brought no poses"),
         ({"camera_height": 1.0, "up": "poses"}, "the input brought no poses"),
         ({"camera_height": 1.0, "up": "north"}, "metric.up = 'north'; expected ground, cameras or poses"),

@@ -111,7 +111,7 @@ def test_heic_photos_are_read_as_other_photos_are(tmp_path):
 def test_without_the_package_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     (tmp_path / "IMG_1.heic").write_bytes(b"x")
-    with pytest.raises(InputError, match=r"HEIC pictures need more: pip install 'twin\[heif\]'"):
+    with pytest.raises(InputError, match=r"HEIC needs pillow-heif: pip install 'twin\[heif\]'"):
         read_image(tmp_path / "IMG_1.heic")
 
 

@@ -1,12 +1,12 @@
 """Convex decomposition of closed meshes by CoACD (Wei et al. 2022), with checked results.
 
-*Piece*: a closed mesh to decompose. *Part*: a closed convex hull. *Protrusion* [m]: the largest
-distance by which a part's surface lies outside its piece. *Uncovered*: the fraction of a piece's surface whose
-distance to every part exceeds the protrusion bound.
+*Piece*: a closed mesh to decompose. *Part*: a closed convex hull. *Protrusion* [m]: the largest distance by which a
+part's surface lies outside its piece. *Uncovered*: the fraction of a piece's surface whose distance to every part
+exceeds the protrusion bound.
 
-CoACD has crashed, enlarged shapes, closed doorways, and returned different results for one seed. So it runs in child
-processes with one thread and a time limit. Its results are cached by a hash of the input. Parts that protrude too far
-are split.
+CoACD may crash, so it runs in child processes with a time limit. Its results may vary from run to run, even with one
+seed, so it uses one thread, and its results are cached by a hash of the input. Its parts may be too large, and even
+close doorways, so parts that protrude too far are split.
 """
 
 import hashlib
@@ -30,10 +30,10 @@ from twin.files import digest_json, load_arrays, save_arrays
 from twin.runtime import child_environment, die_with_parent
 from twin.types import Array
 
-_MAX_COACD_FACES = 400  # larger meshes are decimated for CoACD, since its time grows fast; checks use all faces
+_MAX_COACD_FACES = 400  # larger meshes are decimated for CoACD, which is slow with many faces; checks use all faces
 # Results are checked, so a coarser search than CoACD's defaults suffices.
 _SEARCH = {"resolution": 100, "mcts_nodes": 5, "mcts_iterations": 10, "mcts_max_depth": 2}
-_TIME_LIMIT = 120.0  # [s] per piece; far more than any piece needs, so that a busy machine does not change the result
+_TIME_LIMIT = 120.0  # [s] per piece; far more than a piece needs, so that a slow machine does not change the result
 _PROCESSES = 2
 _MAX_HULL_VERTICES = 32
 _SAMPLE_SPACING = 0.06  # [m] between test points on surfaces
@@ -77,7 +77,6 @@ class SolidPiece:
     samples: Array
     """Shape (s, 3)."""
     tree: cKDTree
-    """Search tree of the samples."""
     inside: Callable[[Array], NDArray[np.bool_]]
     """Maps points (k, 3) to a mask (k,) of those inside the mesh."""
 
@@ -85,7 +84,7 @@ class SolidPiece:
     def from_mesh(
         vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]] | None = None
     ) -> "SolidPiece":
-        """Samples a mesh. `inside` may be given as a faster test than the default, which computes winding numbers."""
+        """Samples the surface of a mesh. `inside` replaces the default test by winding numbers, which is slow."""
         vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
         samples = surface_samples(vertices, faces, _SAMPLE_SPACING)
 
@@ -95,7 +94,7 @@ class SolidPiece:
         return SolidPiece(vertices, faces, samples, cKDTree(samples), inside or by_winding)
 
     def protrusion(self, part: ConvexPart) -> float:
-        """Protrusion of a part [m]. It may be overestimated by up to half the sample spacing."""
+        """Protrusion of a part [m]; 0 below the sample spacing. It may be too large by up to half that spacing."""
         points = surface_samples(part.vertices, part.faces, 2 * _SAMPLE_SPACING)
         away = self.tree.query(points)[0]
         far = away > _SAMPLE_SPACING
@@ -122,9 +121,9 @@ class Decomposition:
 def decompose(pieces: list[SolidPiece], bound: float, cache: Path, seed: int) -> Decomposition:
     """Decomposes closed meshes into convex parts, which are split until they protrude by at most `bound` [m].
 
-    A part that was split `_MAX_SPLITS` times may protrude further. A piece whose hull is within the bound becomes that
-    hull. If CoACD fails on a piece, the piece's hull is split instead. `cache` is the folder of earlier CoACD results,
-    created if missing.
+    A part that was split `_MAX_SPLITS` times may protrude further. A piece whose hull protrudes by at most the bound
+    has this hull as its only part. If CoACD fails on a piece, the piece's hull is split instead. `cache` is the folder
+    of earlier CoACD results, created if missing.
     """
     parts_of: list[list[tuple[ConvexPart, float]]] = []
     for piece in pieces:
@@ -158,8 +157,8 @@ def split_to_bound(
     """Splits a part until no part protrudes by more than `bound` [m], or `max_splits` times; returns the parts with
     their protrusions [m].
 
-    A split takes the samples of the piece's surface inside the part, divides them in the middle of their longest
-    axis, and takes the hull of each half.
+    A split takes the samples of the piece's surface inside the part, divides them at the middle of the coordinate
+    axis along which they extend furthest, and takes the hull of each half.
     """
     protrusion = piece.protrusion(part)
     if max_splits == 0 or protrusion <= bound:

@@ -25,10 +25,10 @@ VIEWS, WIDTH = 60, 320
 """Number of rendered views, and their width [px]."""
 FAR = 100.0  # [m] geometry at a larger depth becomes background
 _BACKGROUND = 150.0  # [m] distance of the background's splats
-_MIN_SKY, _MAX_SKY = 500, 50_000  # number of pixels that the sky's color is fitted to
-# A pixel has the sky's color if its rms difference from it, over all lightings and channels, is below the tolerance.
+_MIN_SKY, _MAX_SKY = 500, 50_000  # least and about the largest number of pixels in the fit of the sky's color
+# A pixel shows the sky if it differs from the sky's color by less than this (rms over lightings and channels).
 _SKY_TOLERANCE = 30.0  # of 255
-# The tolerance [of 255] is larger near such pixels, up to the reach [px] from them.
+# Within this reach [px] of such a pixel, the larger blend tolerance [of 255] holds.
 _BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3
 _MIN_CELL = 0.01  # [m] side of the smallest thinning cell; each cell keeps one Gaussian
 _DISK, _THICKNESS = 0.8, 0.2  # standard deviations along the surface and across it [pixel widths]
@@ -62,7 +62,7 @@ class Gaussians:
         }
 
     def to_ply(self) -> bytes:
-        """Binary `.ply` for 3DGS viewers. Colors are spherical harmonics, opacities logits, scales logarithms."""
+        """Binary `.ply` for 3DGS viewers; stores spherical harmonics, logits of opacities and logarithms of scales."""
         columns = {
             **dict(zip("xyz", self.positions.T, strict=True)),
             **{f"n{axis}": np.zeros(len(self.rgb)) for axis in "xyz"},
@@ -166,13 +166,13 @@ def gaussians_by_lighting(views: Mapping[str, Views]) -> dict[str, Gaussians]:
 
 
 def sky_on_surfaces(views: Sequence[Views]) -> NDArray[np.bool_]:
-    """Mask of pixels (n, h, w) that have the sky's color but a nearer depth, such as gaps in the crown of a tree.
+    """Mask (n, h, w) of pixels with the color of the sky but the depth of a surface, such as gaps in a tree's crown.
 
     From other viewpoints, Gaussians of such pixels would look like blue clumps, so `views_by_lighting` moves these
     pixels to the background. The sky's color under each lighting is a quadratic function of the direction, fitted to
-    the pixels of the background. A pixel above the horizon is in the mask if its mean square difference from that
-    color, over all lightings and channels, is small. Up to `_BLEND_REACH` pixels from such a pixel the limit is larger,
-    since pixels there blend the sky's color with that of leaves.
+    the pixels of the background. A pixel above the horizon is in the mask if it differs little from that color (mean
+    square over lightings and channels). Up to `_BLEND_REACH` pixels from such a pixel the limit is larger, since pixels
+    there blend the sky's color with that of leaves.
 
     Args:
         views: The same views under each filmed lighting.

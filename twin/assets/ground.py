@@ -43,14 +43,14 @@ class Ground:
         return _interpolate(self.height, self.origin, self.cell, xy, order=1)
 
     def coarsened(self, cell: float) -> "Ground":
-        """Ground with every n-th node, n = cell / self.cell, rounded. A remainder at the far edges is cut off."""
+        """Ground with every n-th node, n = cell / self.cell, rounded. Nodes after the last n-th one are cut off."""
         n = max(1, round(cell / self.cell))
         rows, columns = ((size - 1) // n * n + 1 for size in self.height.shape)
         nodes = np.s_[:rows:n, :columns:n]
         return Ground(self.height[nodes], self.origin, self.cell * n, self.measured[nodes], self.rgb[nodes])
 
     def triangles(self, cell: float, max_faces: int) -> tuple[Array, NDArray[np.int64]]:
-        """Vertices (v, 3) [m] and upward faces (f, 3) about `cell` [m] wide, or wider to limit them to `max_faces`."""
+        """Vertices (v, 3) [m] and upward faces (f, 3) about `cell` [m] wide, or wider where `max_faces` demands it."""
         rows, columns = self.height.shape
         step = max(1, round(cell / self.cell), int(np.ceil(np.sqrt(2 * rows * columns / max_faces))))
         row, column = (np.unique(np.append(np.arange(0, n, step), n - 1)) for n in (rows, columns))
@@ -83,7 +83,7 @@ class Ground:
                 }
             )
             if not (0.0 < ground.cell < np.inf and np.isfinite(ground.height).all() and rows * columns):
-                raise ValueError(f"cell = {ground.cell}, expected > 0, and finite heights")
+                raise ValueError(f"cell = {ground.cell} m; expected > 0, and one or more heights, all finite")
         return ground
 
 
@@ -98,14 +98,14 @@ def _interpolate(height: Array, origin: Array, cell: float, xy: Array, order: in
 
 DATA_KINDS = ("field", "points", "path")
 _MIN_UPRIGHT = 0.94  # least z of a unit normal (20° from vertical); steeper surfaces are not ground
-_GATE, _GATE_PER_METER = 0.25, 0.05  # [m, m/m] largest height difference to the path; added per meter of distance
+_GATE, _GATE_PER_METER = 0.25, 0.05  # [m, m/m] largest height above or below the path; its growth with distance
 _SIGMA_FIELD = 0.03  # [m] σ of the median of a cell's rendered heights, near the lens
 _SIGMA_POINTS = 0.04  # [m] σ of the median height of a cell's sparse points
 _SIGMA_PATH = 0.012  # [m] σ of path data if the camera is rigidly mounted
 _LATERAL_OFFSETS = (-0.6, -0.3, 0.0, 0.3, 0.6)  # [m] positions of data beside the path, where the wheels drove
 _CROSS_SLOPE = 0.02  # possible cross slope of a road, which the path does not measure
 _DATA_CELL = 0.25  # [m] side of the squares with one datum each
-_MAX_DEPTH = 18.0  # [m] ground beyond this depth fills only a few pixel rows
+_MAX_DEPTH = 18.0  # [m] deeper pixels are not used: the ground there fills only a few pixel rows
 
 
 @dataclass(frozen=True)
@@ -129,9 +129,9 @@ class HeightData:
 
 
 def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData:
-    """One datum per occupied square of side `cell` [m]: mean x and y, median z and smallest σ of its points.
+    """One datum per occupied square of side `cell` [m]: mean x and y and median z of its n points.
 
-    More points do not make σ smaller than the smallest σ, since errors of neighbors are correlated.
+    Its σ is (1 + 1/n) times the smallest σ of the points: never less than that, since errors of neighbors correlate.
     """
     if len(xyz) == 0:
         return HeightData.empty()
@@ -143,7 +143,6 @@ def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData
     first = np.flatnonzero(np.diff(flat, prepend=-1))
     count = np.diff(np.append(first, len(flat)))
     xy = np.add.reduceat(xyz[:, :2], first, axis=0) / count[:, None]
-    # A single point is less reliable than several.
     smallest = np.minimum.reduceat(sigma, first) * (1.0 + 1.0 / count)
     median = xyz[first + count // 2, 2]
     return HeightData(np.column_stack([xy, median]), smallest, np.full(len(first), kind, np.int8))
@@ -166,12 +165,12 @@ def _field_data(views: Views) -> tuple[HeightData, Array, NDArray[np.uint8]]:
 def _path_data(
     cameras: Cameras, ground_height: Array | None, camera_height: float
 ) -> tuple[HeightData, dict[str, dict]]:
-    """Data from the camera path, lowered by the camera height. Their σ shows how steadily the source was carried.
+    """Data from the camera path, lowered by the camera height. Their σ includes the up-and-down motion of the camera.
 
     Args:
         cameras: n metric cameras.
         ground_height: Ground height below each camera, from the other kinds of data [m], shape (n,); None = unknown.
-        camera_height: The height that set the scale [m]; 0 = each source's median height above `ground_height`.
+        camera_height: The given height of the camera [m]; 0 = each source's median height above `ground_height`.
     """
     parts, metrics = [], {}
     for index in source_frames(cameras):
@@ -218,7 +217,7 @@ def _path_strip(xyz: Array, sigma: float) -> HeightData:
 
 
 def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> float:
-    """Median height of data above the nearest path data, if at most `reach` [m] away; 0 for fewer than ten pairs."""
+    """Median height [m] of data above their nearest path data, at most `reach` [m] away; 0 for under ten pairs."""
     if len(path.xyz) == 0 or len(data.xyz) == 0:
         return 0.0
     away, nearest = cKDTree(path.xyz[:, :2]).query(data.xyz[:, :2], distance_upper_bound=reach)
@@ -228,7 +227,7 @@ def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> floa
 
 # ---- fit
 
-_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m]; most nodes
+_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m]; most nodes of the coarse and the fine grid
 _MAX_CELLS = 1_500_000
 _SMOOTHING_LENGTH = 0.5  # [m] structures shorter than this are smoothed away as noise
 _EXTRAPOLATION_LENGTH = 8.0  # [m] distance over which a slope continues without data
@@ -307,7 +306,7 @@ def fit_height(
 
 
 def _smoothness_matrix(grid: HeightGrid) -> sparse.csr_array:
-    """λ D₂ᵀD₂ + μ D₁ᵀD₁ on the nodes. λ weighs a structure of length `_SMOOTHING_LENGTH` like a datum of σ = 3 cm."""
+    """λ D₂ᵀD₂ + μ D₁ᵀD₁ on the nodes. A bump of length `_SMOOTHING_LENGTH` weighs like a datum of σ = 3 cm."""
     rows, columns = grid.rows, grid.columns
 
     def difference(n: int, order: int) -> sparse.csr_array:
@@ -325,7 +324,7 @@ def _smoothness_matrix(grid: HeightGrid) -> sparse.csr_array:
 
 
 def fit_low_passed(data: HeightData, low: Array, high: Array, config: MeshConfig) -> tuple[Array, HeightGrid, Array]:
-    """Coarse-to-fine fit over the box from `low` to `high` (x, y), then low-passed by `ground_smoothing`.
+    """Fits heights over the box from `low` to `high` (x, y), coarse to fine; low-passes them by `ground_smoothing`.
 
     Returns heights [m] on a grid of `ground_cell`, the grid, and the weight of each datum.
     """
@@ -351,8 +350,8 @@ def build_ground(
 ) -> tuple[Ground, dict[str, Any]]:
     """Fits the ground over a box, given by its low and high corners (x, y) [m]. Also returns metrics for the report.
 
-    `height` is the camera height that set the scale [m]; 0 = estimate it per source; None = do not use the path
-    (because the film goes around an object).
+    `height` is the given height of the camera [m]; 0 = estimate it per source; None = do not use the path (because the
+    film goes around an object).
     """
     low, high = box
     coarse = HeightGrid.covering(low, high, _COARSE_CELL, _COARSE_NODES)
@@ -373,8 +372,7 @@ def build_ground(
     if height is not None and sum(len(data.xyz) for data in visible) >= _MIN_DATA:
         below = coarse.sample(fit_height(HeightData.join(visible), coarse)[0], cameras.positions[:, :2])
         path, path_metrics = _path_data(cameras, below, height)
-        # Data of each kind have a height offset (blurred depth, tilted scale), which would cause a step beside the
-        # path.
+        # Blurred depth or a tilted reconstruction offsets all data of a kind, which would cause a step beside the path.
         bias = [bias_to_path(data, path) for data in visible]
         visible = [replace(d, xyz=d.xyz - [0.0, 0.0, b]) for d, b in zip(visible, bias, strict=True)]
     data = HeightData.join([*visible, path])

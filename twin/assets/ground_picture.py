@@ -1,6 +1,6 @@
 """Picture of the ground from above, the texture of MuJoCo's ground. It is composed of renderings at filmed poses.
 
-A texel takes its color from the pose that sees it best: the texel is ahead, about `_BEST_DISTANCE` away.
+A texel takes its color from the pose that has it ahead, at the distance nearest to `_BEST_DISTANCE`.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ _BEST_DISTANCE = 3.5  # [m] from the lens to a texel; nearer texels are seldom i
 _MAX_DISTANCE = 12.0  # [m]; farther ground keeps its mean color
 _WIDTH = 640  # [px] of the renderings
 _MAX_TEXELS = 12_000_000
-_DEPTH_TOLERANCE = 0.15  # a texel is visible if the relative difference of depth is smaller
+_DEPTH_TOLERANCE = 0.15  # a texel is visible if its depth differs from the rendered one by a smaller fraction
 
 
 def ground_picture(field: RenderableField, cameras: Cameras, ground: Ground, lighting: str) -> NDArray[np.uint8]:

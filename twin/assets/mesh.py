@@ -1,7 +1,7 @@
 """Stage `mesh`: collision and visual geometry in meters from the radiance field.
 
-The stage renders views of the field, fits the ground, fuses a distance field above it, extracts surface and solids,
-decomposes the solids into convex parts, and clears the corridor. It writes:
+The stage renders views of the field, fits the ground, fuses a distance field above it, extracts the visual surface and
+the solids, decomposes the solids into convex parts, and clears the corridor of them. It writes:
 
 - `visual.npz`: colored triangles
 - `ground.npz`, `ground.png`: the ground as a height field, and its picture from above

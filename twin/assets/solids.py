@@ -1,9 +1,9 @@
 """Closed meshes of the obstacles for the convex decomposition, and the corridor that is kept free of them.
 
 The solid consists of the negative part of the distance field and of the hidden space up to `_HIDDEN_DEPTH` behind it.
-(A film from a road shows fronts only, and a wall without thickness cannot be collided with.) The corridor is the space
-up to a half width beside the route and up to `HEADROOM` above the ground. It is free, since the camera passed through
-it.
+(A film from a road shows only the fronts of obstacles, but collision needs walls with thickness.) The corridor is the
+space up to a half width beside the route and up to `HEADROOM` above the ground. The camera passed through it, so it is
+free.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from twin.types import Array
 HEADROOM = 1.5  # [m] height of the corridor above the ground
 _GROUND_CLEARANCE = 0.1  # [m] everything less than this above the height field is ground
 _MAX_GROUND_GAP = 0.6  # [m] smaller gaps to the ground are closed, so that nothing hovers
-_EMBEDDING = 0.15  # [m] depth of parts below the ground
+_EMBEDDING = 0.15  # [m] depth to which parts extend below the ground
 _TILE_SIZE = 3.0  # [m] large obstacles are divided into square columns with this side
 _MIN_VOXELS = 8  # smaller components are noise
 _MIN_HOVERING_VOXELS = 64  # smaller components are noise if they hover
@@ -110,10 +110,10 @@ def solid_pieces(
 
 
 def _solid_distance(volume: Volume) -> NDArray[np.float32]:
-    """Distance field [m] of the solid. Near seen surfaces it is the fused field, clipped to ± 1 voxel; all is eroded.
+    """Distance field [m] of the solid: near seen surfaces, the fused field clipped to ± 1 voxel; all surfaces eroded.
 
-    Gaps narrower than `_MAX_GAP`, as in foliage and noise, are closed. The robot cannot pass through them, and each gap
-    would lengthen the decomposition.
+    Gaps narrower than `_MAX_GAP`, as in foliage and noise, are closed: the robot cannot pass through them, and each
+    lengthens the decomposition.
     """
     voxel = volume.voxel
     seen = np.nan_to_num(volume.distance, nan=np.inf) < 0
@@ -156,7 +156,7 @@ def _block_piece(values: NDArray, volume: Volume, start: NDArray) -> SolidPiece 
 def clear_corridor(
     parts: list[ConvexPart], corridor: Corridor, ground: Ground
 ) -> tuple[list[tuple[int, ConvexPart]], int]:
-    """Cuts what is below the headroom off convex parts, along tangents of the corridor, until they are clear of it.
+    """Clears the corridor: cuts convex parts at the headroom, and below it along tangents of the corridor.
 
     Returns:
         The remaining parts, each with the index of its original; and the number of parts that were cut or dropped.

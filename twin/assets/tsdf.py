@@ -3,8 +3,8 @@
 *Signed distance* [m]: positive in free space, negative behind a surface, valid within ± `band` of it. At each voxel a
 view votes `near` if the surface that it sees is within the band, and `free` if it sees further. (This is the method of
 Curless & Levoy 1996, eqs. 3 and 4, with votes for free space added.) So the many views through a floater outvote the
-few that show it. At a depth edge the radiance field has a false, slanted surface from the near to the far side. The
-view sees this surface edge-on, so its `near` votes have little weight, and views from elsewhere outvote them.
+few that show it. At a depth edge the radiance field has a false, slanted surface between the near and the far
+surface. A view sees it edge-on, so the view's `near` votes have little weight, and views from elsewhere outvote them.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -27,7 +27,7 @@ from twin.warp_runtime import wp
 
 FREE_SPACE_REACH = 2.5  # free votes reach this many times as far as surface votes
 _HALF_WEIGHT_DEPTH = 5.0  # [m] a vote at this depth has half weight, since pixels and errors grow with depth
-_CLEARANCE = 0.1  # share of depth: beyond `far`, a voxel is free only if the surface is further by this
+_CLEARANCE = 0.1  # beyond `far`, a view votes `free` only if the surface is further by this fraction of the depth
 _SAME_SURFACE_RATIO = 1.1  # largest depth ratio of neighboring pixels on one surface
 
 
@@ -218,7 +218,7 @@ class Volume:
 
 
 def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float) -> Volume:
-    """Fuses views in a box (low and high corner, shape (2, 3)): in its blocks of 4³ voxels near surface points (k, 3).
+    """Fuses views at the voxels of a box, only in blocks of 4³ voxels near the surface points `hits` (k, 3).
 
     `box` has the low and the high corner, shape (2, 3) [m]. The spacing `voxel` [m] grows if the box would have more
     than 60 million voxels. For `far` see `fuse`.

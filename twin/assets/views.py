@@ -109,7 +109,7 @@ def reliable_depth(depth: NDArray, opacity: NDArray, far: float) -> NDArray[np.f
         across = np.moveaxis(inverse, axis, -1)
         step = np.diff(across)
         first, second = step[..., :-1], step[..., 1:]
-        # Bad pixels: their inverse depth is between those of their neighbors, far from both, and off the line.
+        # Bad pixels: their inverse depth is between those of their neighbors, far from both, and far from the mean.
         steep = np.minimum(np.abs(first), np.abs(second)) > _FLYING_PIXEL_STEP * across[..., 1:-1]
         bent = np.abs(first - second) > 0.3 * np.abs(first + second)
         np.moveaxis(bad, axis, -1)[..., 1:-1] |= steep & bent & (first * second > 0)

@@ -10,7 +10,7 @@ Topics are found by message type:
 - commands: geometry_msgs/Twist or TwistStamped
 - wheel speeds: sensor_msgs/JointState, with joints named like a Husky's wheels
 - poses: nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped; topics with a word of `FROM_WHEELS`
-  in their name are used only if no other topic has `MIN_POSES`
+  in their name are used only if no other topic has `MIN_POSES` messages
 - accelerations: sensor_msgs/Imu
 - pictures: sensor_msgs/Image or CompressedImage
 - calibration: the sensor_msgs/CameraInfo topic whose name has the longest common beginning with that of the pictures'
@@ -56,7 +56,7 @@ MIN_POSES = 10
 this many."""
 # A topic with one of these words in its name is used for pictures only if it is given explicitly.
 _OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")
-# [ns] If header and recording times differ by more than this in the median, the headers count as of another clock.
+# [ns] If header and recording times differ by more than this in the median, the headers are of another clock.
 _CLOCK = 1_000_000_000
 _MAX_METADATA = 16 << 20  # [bytes] largest accepted metadata.yaml
 _MAX_CHUNK = 1 << 30  # [bytes] largest accepted MCAP chunk, uncompressed
@@ -68,7 +68,6 @@ def is_bag(path: Path) -> bool:
 
 
 def bag_files(path: Path) -> list[Path]:
-    """The files of a bag."""
     return sorted(filter(is_file, path.iterdir())) if path.is_dir() else [path]
 
 
@@ -78,7 +77,7 @@ class Bag:
     def __init__(self, path: Path, reader: Any, deserialize: Callable[[bytes, str], Any], cure: str) -> None:
         self._path, self._reader, self._deserialize, self._cure = path, reader, deserialize, cure
         self.connections: list[Any] = list(reader.connections)
-        """rosbags' connections, with `topic`, `msgtype` and `msgcount`; a topic may have several connections."""
+        """Connections of `rosbags`, with `topic`, `msgtype` and `msgcount`; a topic may have several connections."""
         self.begin = int(reader.start_time)
         """Time of the first message [ns]."""
 
@@ -91,7 +90,6 @@ class Bag:
                 yield connection, recorded, self._deserialize(raw, connection.msgtype)
 
     def on(self, *topics: str) -> list[Any]:
-        """The connections of these topics."""
         return [one for one in self.connections if one.topic in topics]
 
 
@@ -201,7 +199,7 @@ def _common(one: str, other: str) -> int:
 
 
 def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYPES)) -> dict[str, Any]:
-    """Kind → its best connection, for `kinds`, keys of `TYPES`. Raises InputError if a kind other than imu has none."""
+    """Maps each of `kinds`, keys of `TYPES`, to its best connection. Raises InputError if one has none, except imu."""
     chosen = {}
     for kind in kinds:
         types = TYPES[kind]

@@ -113,7 +113,6 @@ class BagContents:
         return _interpolated(times, self.stamps[0], self.odometry_times, self.odometry, _MAX_POSE_GAP)
 
     def film(self) -> Film:
-        """The pictures as a film."""
         times = (self.stamps - self.stamps[0]) * 1e-9
         return Film(self.path, FilmTiming(times, 0.0, self.recorded), partial(_decode, self))
 
@@ -194,7 +193,7 @@ def _topics(connections: list[Any], path: Path, topic: str) -> dict[str, str]:
 
 
 def _values(kind: str, message: Any) -> tuple[float, ...]:
-    """A message's numbers: the fix, or position and quaternion of the pose; none for a picture."""
+    """The numbers kept of a message: the fix, or position and quaternion of the pose; none of a picture."""
     if kind == "fixes":
         return fix_of(message)
     if kind == "odometry":
@@ -206,7 +205,7 @@ def _values(kind: str, message: Any) -> tuple[float, ...]:
 
 
 def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Positions and stamps of the pictures whose stamp is later than all stamps before.
+    """Positions and stamps of the pictures whose stamp is later than all stamps before it.
 
     The others are left out. Raises InputError if they are more than one and more than the fraction `_MAX_UNORDERED`.
     """
@@ -215,8 +214,8 @@ def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], N
     if late.sum() > max(1.0, _MAX_UNORDERED * len(times)):
         back = float((latest[:-1] - times[1:]).max() * 1e-9)
         raise InputError(
-            f"{where}: the stamps of {late.sum()} of {len(times)} pictures are not after the one before, by up to "
-            f"{back:.3f} s; expected increasing stamps: give the topic of one camera, and record under one clock"
+            f"{where}: {late.sum()} of {len(times)} pictures have stamps that are not later than one before, by up "
+            f"to {back:.3f} s; expected increasing stamps: give the topic of one camera, and record under one clock"
         )
     position = np.flatnonzero(~late)
     return position, times[position]
@@ -343,8 +342,8 @@ def _lens(info: Any, topics: dict[str, str], frame: str, size: tuple[int, int], 
         return None, f"{topic} has no calibration; the camera is calibrated from the film"
     if frame and info.header.frame_id and info.header.frame_id != frame:
         return None, (
-            f"{topic} is of another camera ({info.header.frame_id}, the pictures {frame}); the camera is calibrated "
-            "from the film"
+            f"{topic} is of another camera (frame {info.header.frame_id}, the pictures have {frame}); the camera is "
+            "calibrated from the film"
         )
     lens = lens_of(info, "rect" in topics["pictures"], f"{path}: {topic}")
     if not same_aspect((lens.width, lens.height), size):

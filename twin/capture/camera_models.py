@@ -2,8 +2,8 @@
 
 A *lens* is a camera model with its parameters at one image size. Its *intrinsics* are fx, fy, cx, cy [px]; the other
 parameters are its *distortion*. A *raw* image has the distortion; the *pinhole* image shows the same view without it.
-The pinhole's focal length is raised just enough that every pinhole pixel lies inside the raw image, so that
-no pixel is extrapolated.
+The pinhole's focal length is just large enough that every pinhole pixel lies inside the raw image, so that no
+pixel is extrapolated.
 """
 
 import difflib
@@ -110,7 +110,7 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
         hint = f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(CAMERA_MODELS)}"
         raise InputError(f"{where}: unknown camera model {model!r}; {hint}")
     if not (0 < width < _MAX_SIDE and 0 < height < _MAX_SIDE):
-        raise InputError(f"{where}: image size {width}x{height}; give the width and height the calibration is for [px]")
+        raise InputError(f"{where}: image size {width}x{height}; give the size [px] of the calibration images")
     camera = pycolmap.Camera.create_from_model_name(0, model, 1.0, width, height)
     if len(params) != len(camera.params):
         raise InputError(
@@ -122,10 +122,10 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
     fx, fy, cx, cy = lens.intrinsics
     longer = max(width, height)
     if not (0.05 * longer < fx < 100 * longer and 0.05 * longer < fy < 100 * longer):
-        raise InputError(f"{where}: focal length {fx:g}, {fy:g} px for {width}x{height}; expected pixels of that size")
+        raise InputError(f"{where}: focal length {fx:g}, {fy:g} px for {width}x{height}; give it in px of that size")
     if not (-0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
         raise InputError(
-            f"{where}: principal point {cx:g}, {cy:g} px lies far outside {width}x{height}; check the order"
+            f"{where}: principal point {cx:g}, {cy:g} px lies far outside {width}x{height}; check the parameters' order"
         )
     return lens
 

@@ -1,10 +1,10 @@
 """Readers of image sets: plain folders without poses, and COLMAP models and `transforms.json` with cameras and poses.
 
 A COLMAP *model* is the folder with the files `cameras` and `images`; a *workspace* has a model under `sparse/0`. The
-points of a model are not read. `transforms.json` has two variants. nerfstudio's names the camera model and may have
-transformed the world (`applied_transform`); instant-ngp's may give only an angle of view and file names without suffix.
-Both use OpenGL camera axes (y up, looking along −z); poses here have OpenCV axes. nerfstudio's transform of the world
-is undone, so that all sources posed by one reconstruction are in the same world coordinates.
+points of a model are not read. `transforms.json` has two variants. nerfstudio writes the camera model and may transform
+the world (`applied_transform`). instant-ngp may write only an angle of view, and file names without suffix. Both use
+OpenGL camera axes (y up, looking along −z); poses here have OpenCV axes. nerfstudio's transform of the world is undone,
+so that all sources posed by one reconstruction are in the same world coordinates.
 """
 
 import math
@@ -34,7 +34,7 @@ _CURE = "export the model again"
 _MAX_POSE_VALUE = 1e9  # upper limit of the numbers in a COLMAP pose
 _MAX_CAMERA_VALUE = 1e12  # upper limit of a camera's numbers in `transforms.json`
 _MAX_COORDINATE = 1e9  # upper limit of a camera center's coordinates in `transforms.json`
-_RIGID_TOLERANCE = 1e-2  # largest accepted entry of RᵀR − 1; rounding in the file causes smaller ones
+_RIGID_TOLERANCE = 1e-2  # largest accepted entry of RᵀR − I; rounding in the file causes smaller ones
 
 
 # ---- COLMAP models
@@ -255,7 +255,7 @@ def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageS
         world = opencv_to_mujoco(to_original @ pose)  # this flip of axes also converts OpenGL to OpenCV
         world[:3, 3] /= scale
         if not np.abs(world[:3, 3]).max() < _MAX_COORDINATE:
-            raise InputError(f"{where}: transform_matrix lies too far away; export the file again")
+            raise InputError(f"{where}: the position in transform_matrix is too large; export the file again")
         mask = frame.get("mask_path")
         if not isinstance(mask, str | None):
             raise InputError(f"{where}: mask_path = {short_repr(mask)}; expected a path")

@@ -2,7 +2,7 @@
 
 A *source* is one input under one lighting; its *kind* is video, bag, images, colmap or transforms. A *kept* frame is
 upright and scaled to `capture.max_size`, and still has the lens's distortion. Its name is `<source>/<index>`, where the
-index is its position in the film or in the natural order of the image set, whichever other frames are kept.
+index is its position in the whole film, or among all images of the set in natural order.
 *Held-out* frames are never trained on.
 """
 

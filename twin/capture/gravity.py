@@ -23,7 +23,9 @@ _SIGMA_RIGHT = np.radians(1.0)
 """Mounting error of a camera's right axis [rad]; common to all frames, so averaging does not reduce it."""
 _SIGMA_ROAD = np.radians(1.0)  # [rad] camber of roads
 _SIGMA_PATH = np.radians(0.3)  # [rad] slope of a path relative to the ground
-_PATH_SAMPLES = 3.0  # independent heights along a path; far fewer than its frames, since its undulation is smooth
+_PATH_SAMPLES = (
+    3.0  # number of independent heights along a path; far below that of its frames, since it undulates smoothly
+)
 _MIN_VARIANCE_RATIO = 10.0
 """A principal axis of points constrains up only if the variance along it is more than this multiple of the smallest."""
 _MIN_WIDTH = 0.05
@@ -71,9 +73,9 @@ def camera_up(camera_to_world: Array) -> Array:
 
 
 def up_from_path(camera_to_world: Array) -> tuple[Array, Array]:
-    """Returns up (3,), estimated from the cameras' right axes and path, and the matrix (3, 3) of this evidence.
+    """Returns up (3,), estimated from the cameras' right axes and path, and the matrix E (3, 3) of this evidence.
 
-    It is a matrix E such that n·E·n is the squared error of an up vector n in standard deviations.
+    n·E·n is the squared error of a unit vector n as up, in standard deviations.
     """
     right = camera_to_world[:, :3, 0]
     evidence = right.T @ right / len(right) / _SIGMA_RIGHT**2
@@ -110,8 +112,8 @@ def find_road(points: Array, centers: Array, up: Array) -> Road | None:
     seen more than 45° below the horizon. The road is the lowest layer with at least half of the best support, since
     nothing solid lies below a road. A layer with many points far below it is no road; such a layer occurs when the
     camera circles an object. If the road has fewer than `MIN_ROAD_POINTS`, because it is without texture, larger
-    offsets are allowed step by step, so that the verges count, too. If no step gives enough points, the layer with the
-    most points is returned, but that of a larger step only if it has more than twice as many.
+    offsets are allowed step by step, so that the verges count, too. If no step gives enough points, the layer of
+    the first step is returned, unless a later one has more than twice as many points.
     """
     if not len(points):
         return None

@@ -34,7 +34,7 @@ _MAX_SIZE = 1280  # [px] longer side of the image from which features are extrac
 _GUESSED_FOCAL = 1.2  # [longer sides]
 _FEATURES = 4000
 _FIRST_FRAMES = 48  # scene frames matched first, evenly spaced over all films
-_BEST_FRAMES = 4  # number of those with the most matches; their neighbors are matched next
+_BEST_FRAMES = 4  # number of first frames, those with the most matches, whose neighbors are matched next
 _NEIGHBOR_FRAMES = 8  # number of frames, of any lighting, that are matched near each best frame
 _TRACKING_FRAMES = 12  # scene frames near the film's last localized frame that are matched first
 _TRUSTED_FRAMES = 24  # frames with the most matches; matches in other frames are mostly wrong and are not used
@@ -45,7 +45,7 @@ _ESTIMATED = "estimated"
 _DISTORTION_INLIERS = 100  # inliers needed to separate distortion from noise
 _LENS_SWITCH_RATIO = 1.25  # a later candidate lens must give this many times the inliers of an earlier one
 _ROBUST_SCALE = 0.0015  # [longer sides] residual from which the robust loss reduces the weight of an inlier
-_MAX_FOCAL_ERROR = 0.02  # largest accepted relative standard error
+_MAX_FOCAL_ERROR = 0.02  # largest accepted relative standard error of the focal length
 _MAX_ITERATIONS = 12  # of the parabola fit
 _FOCAL_STEPS = np.array([0.98, 0.99, 1.0, 1.01, 1.02])  # relative focal lengths of the parabola fit
 
@@ -419,7 +419,7 @@ def _shared_focal(frames: Sequence[_LocalizedFrame], lens: Lens) -> tuple[float,
             residuals = [frame.refined(trial).residuals(trial) for frame in frames]
             costs[i] = np.mean([robust_scale**2 * np.log1p((e**2).sum(1) / robust_scale**2).mean() for e in residuals])
         curve, lowest = np.polyfit(focals - center, costs, 2), int(costs.argmin())
-        if lowest != len(_FOCAL_STEPS) // 2:  # far from the minimum, the robust cost is no parabola but nearly flat
+        if lowest != len(_FOCAL_STEPS) // 2:  # away from the minimum, the robust cost is nearly flat, not a parabola
             center = float(focals[lowest])
             continue
         if curve[0] > 0.0:
@@ -428,7 +428,7 @@ def _shared_focal(frames: Sequence[_LocalizedFrame], lens: Lens) -> tuple[float,
             if error <= _MAX_FOCAL_ERROR * center:
                 return float(center + offset), error
         break
-    raise InputError("the film does not show the camera's focal length; give camera_intrinsics in [robot]")
+    raise InputError("the film does not determine the camera's focal length; give camera_intrinsics in [robot]")
 
 
 def _with_focal(lens: Lens, focal: float) -> Lens:

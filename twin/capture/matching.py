@@ -1,8 +1,8 @@
 """Selects pairs of frames and computes their features and matches in COLMAP's database.
 
 A *pair* (i, j), i < j, holds indices of the capture's frames. Pairs come from four rules: *sequence* (neighbors in
-time), *probes* (a few distant frames that look alike or lie equally far along two sources), *expansion* (the
-surroundings of a verified probe) and *nearness* (cameras reconstructed close to each other). A pair is *verified* if
+time), *probes* (a few distant frames that look alike or lie equally far along two sources), *expansion* (frames
+near those of a verified probe) and *nearness* (cameras reconstructed close to each other). A pair is *verified* if
 enough of its matches satisfy one two-view geometry. Each source has one database camera; posed input may have one per
 image. A camera is *known* (a given, fixed calibration), has a focal length *prior*, or is *unknown*.
 """
@@ -123,7 +123,7 @@ def probe_pairs(source_index: NDArray[np.int64], signatures: Array) -> set[Pair]
 def expanded_pairs(
     source_index: NDArray[np.int64], probes: set[Pair], inliers: dict[Pair, int], min_inliers: int
 ) -> set[Pair]:
-    """Pairs in the surroundings of the verified probes.
+    """Pairs of frames near those of the verified probes.
 
     Across two sources, the best match of each probed frame is an anchor. Between anchors the position along the other
     source is interpolated, so that films of different speeds are paired frame by frame. With fewer than two anchors the

@@ -1,8 +1,8 @@
 """Stage `metric`: transforms cameras and points to the metric *level frame*.
 
 z points up along the ground's normal; z = 0 is the ground. The origin is on the ground below the first camera. x is the
-initial driving direction, or east if the scale comes from GPS. With metric.up = "poses" the given poses' axes and
-horizontal origin are kept. `gravity.py` estimates up and the road; `scale.py` estimates the scale.
+initial driving direction, or east if the scale comes from GPS. With metric.up = "poses", the level frame keeps the axes
+and the horizontal origin of the given poses. `gravity.py` estimates up and the road; `scale.py` estimates the scale.
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ from twin.scene import SceneDir
 from twin.types import Array
 
 _INITIAL_FRACTION = 0.08
-"""The initial driving direction is that of this first fraction of the first source's path."""
+"""First fraction of the first source's path; it gives the initial driving direction."""
 _FLOOR_QUANTILE = 0.02  # without a road the floor is at this quantile of the points' heights
 
 
@@ -60,7 +60,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         assert config.metric.distance is not None
         if road is None and not config.metric.distance.frame_b:
             raise InputError(
-                "metric.distance: no ground was reconstructed to lay the points on; give frame_b, a2 and b2"
+                "metric.distance: no ground was reconstructed; mark the points in a second image, too: frame_b, a2, b2"
             )
         scales["distance"] = scale_from_distance(cameras, up.direction, level, config.metric.distance)
     row = {name: i for i, name in enumerate(capture.names)}
@@ -120,7 +120,7 @@ def _ground_level(cameras: Cameras, points: Array, up: Array, road: Road | None)
 
 
 def _level_frame(cameras: Cameras, up: Array, level: float, scale: float, east: Array | None, keep: bool) -> Similarity:
-    """The similarity from the reconstruction to the level frame; `keep` keeps its axes and horizontal origin."""
+    """The similarity to the level frame; `keep` keeps the reconstruction's axes and horizontal origin."""
     first = cameras.positions[0]
     if keep:
         return Similarity(scale, np.eye(3), np.array([0.0, 0.0, -scale * level]))

@@ -93,7 +93,7 @@ def focal_from_exif(photo: Any, width: int, height: int) -> float | None:
 
 
 def _focal_from_model(path: Path, width: int, height: int) -> float | None:
-    """Focal length as a multiple of the longer side, by COLMAP's table of the camera models' sensor sizes, or None."""
+    """Focal length as a multiple of the longer side, from COLMAP's table of cameras' sensor sizes; None if unknown."""
     try:
         camera = pycolmap.infer_camera_from_image(str(path))
     except (RuntimeError, ValueError):

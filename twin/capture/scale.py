@@ -17,7 +17,7 @@ from twin.geometry.poses import inverse_pose
 from twin.types import Array
 
 _SCALE_OPTIONS = (
-    "metric.camera_height = 0.5 (lens above the ground [m]), [metric.distance] (two marked image points and the metres "
+    "metric.camera_height = 0.5 (lens above the ground [m]), [metric.distance] (two marked image points and the meters "
     "between them), metric.gps = true (positions in EXIF or a bag), metric.odometry = true (odometry in a bag), "
     "[metric.marker] (a printed ArUco or AprilTag marker), or metric.poses_are_metric = true"
 )
@@ -49,7 +49,7 @@ def select_scale_sources(metric: MetricConfig, source_heights: dict[str, float])
     heights = (metric.camera_height, *source_heights.values())
     if any(height < 0 for height in heights):
         raise InputError(
-            f"metric.camera_height = {metric.camera_height}; expected metres above the ground, such as 0.5"
+            f"metric.camera_height = {metric.camera_height}; expected meters above the ground, such as 0.5"
         )
     options = {
         "camera_height": any(height > 0 for height in heights),
@@ -104,8 +104,9 @@ def scale_from_height(
     """Scale from the known height of the cameras above the road; `points` (m, 3) are all sparse points.
 
     `own` holds the camera height of each source [m]; a source with 0 uses that of `metric`. The uncertainty combines
-    four errors: that of the height as measured by hand, the variation of the reconstructed heights along the path and
-    between sources, that of the up direction, and that of the assumption that the ground is level across the path.
+    four errors: the tolerance of the given heights, the variation of the reconstructed heights along the path and
+    between sources, the error of the up direction, and the height difference of the ground across the path.
+
     Raises InputError without a road.
     """
     if road is None:
@@ -138,8 +139,8 @@ def scale_from_height(
     value = float(np.average(scales, weights=weights))
     layer = road.spread / road.drop / np.sqrt(len(road.points))
     between = float(np.std(scales) / value) if len(scales) > 1 else 0.0
-    # A road with few points, or with points on the verge only, adds an error of 5 %, since the verge may be higher than
-    # the road by a kerb, about a tenth of the usual camera height.
+    # A road with few points, or with points on the verge only, adds an error of 5 %: the verge may be higher than the
+    # road by a curb, about a tenth of the usual camera height.
     few = 0.0 if road.reliable else 0.05
     repeat = np.average(np.square(sigmas), weights=weights) + layer**2 + between**2 + few**2
     # One person measures all heights with one method, so averaging does not reduce their error.
@@ -163,7 +164,7 @@ def _ground_errors(cameras: Cameras, up: Gravity, road: Array, drop: float) -> t
     """Two relative errors of the camera height above the road points (k, 3).
 
     The first comes from the error of up: it is the angle of this error times the mean horizontal offset of the points,
-    divided by the camera height. The second comes from camber or a kerb: it is half the difference between the heights
+    divided by the camera height. The second comes from camber or a curb: it is half the difference between the heights
     above the points to the left and to the right of the path, divided by the camera height.
     """
     nearest, height, _ = below_path(road, cameras.positions, up.direction)
@@ -185,7 +186,7 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
     Raises InputError: an unknown frame, a point outside its image, no positive distance, or rays that do not meet.
     """
     if not distance.metres > 0:
-        raise InputError(f"metric.distance.metres = {distance.metres}; expected the metres between the points a and b")
+        raise InputError(f"metric.distance.metres = {distance.metres}; expected the meters between the points a and b")
     frames = [_marked_frame(cameras, "a", distance.frame_a, distance.a)]
     frames.append(_marked_frame(cameras, "b", distance.frame_a, distance.b))
     pixels = np.array([distance.a, distance.b], np.float64)
@@ -215,7 +216,7 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
     sigma = float(np.sqrt(0.5 * np.sum((lengths - measured) ** 2)) / measured)
     if not np.isfinite(sigma) or sigma > 0.5:
         raise InputError(
-            "metric.distance: errors of 1 px change it by more than half; mark points further apart, or in other frames"
+            "metric.distance: an error of 1 px changes it by over 50 %; mark points further apart, or in other frames"
         )
     return Scale(distance.metres / measured, sigma, {"distance_units": measured})
 
@@ -331,10 +332,10 @@ def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> 
 
     Each source has its own coordinate frame.
 
-    The heading of odometry drifts, most for the wheels of a skid-steered robot, but its lengths are right to a few
-    percent. So the path is divided into stretches of `_STRETCH`, and the distances between the ends of each,
-    by odometry and in the reconstruction, are compared, whatever their directions.
-    `tolerance` is the relative standard deviation of the error that all stretches share; their spread adds to it.
+    The heading of odometry drifts, most on skid-steered wheels, but its lengths are right to a few percent. So the path
+    is divided into stretches of `_STRETCH`. The distance between a stretch's ends by odometry is compared with that in
+    the reconstruction; directions are ignored. `tolerance` is the relative standard deviation of the error that all
+    stretches share; their spread adds to it.
 
     Raises InputError: too few stretches, or stretches that contradict each other.
     """
@@ -360,7 +361,7 @@ def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> 
     spread = 1.4826 * float(np.median(np.abs(logs - middle)))
     if spread > _MAX_STRETCH_SPREAD:
         raise InputError(
-            f"metric.odometry: stretches differ from the film's by factors that vary by {spread:.0%} (expected at most "
+            f"metric.odometry: the ratio of its lengths to the film's varies by {spread:.0%} (expected at most "
             f"{_MAX_STRETCH_SPREAD:.0%}); check the stamps of pictures and odometry, or give the scale another way"
         )
     inliers = np.abs(logs - middle) <= max(3.0 * spread, 1e-3)

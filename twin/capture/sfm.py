@@ -43,12 +43,12 @@ _MAX_THREADS = 16
 _MAX_POINT_ERROR = 20.0
 _MIN_FRAMES = 3
 _PROBE_INLIERS = 25
-_NEAR_STEPS = 3.0  # [median steps] largest distance between two cameras that the second round matches
+_NEAR_STEPS = 3.0  # [median steps] largest distance between the two cameras of a near pair
 _NEAR_PAIRS = 4
 _POSED_PAIRS = 10
-# The reconstruction is repeated if the second round verifies more new pairs than this fraction of the earlier ones.
+# The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
 _REMAPPING_FRACTION = 0.05
-_TRACKS_PER_VIEW = 300  # point tracks in the first solution, to save 40 % of the time; retriangulation adds others
+_TRACKS_PER_VIEW = 300  # point tracks in the first solution, which saves 40 % of its time; others are added later
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
 _MIN_ANGLE = 0.5  # [°] smallest angle between the rays to a point
 _LOSS_SCALE = 0.5  # [px] scale of the Cauchy loss in the last bundle adjustment
@@ -63,7 +63,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
     Returns metrics, see `_metrics`.
 
-    Raises InputError: too little texture or overlap, or a smaller fraction registered than `cameras.min_registered`.
+    Raises InputError: too little texture or overlap, or a fraction of registered frames below `cameras.min_registered`.
     """
     stage, settings = scene.stage("capture"), config.cameras
     capture = Capture.load(stage)

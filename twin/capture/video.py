@@ -203,7 +203,7 @@ def _joined_segments(
 
 @dataclass
 class FilmStatistics:
-    """Counts of decoded, kept and dropped frames; filled while a film is read."""
+    """Counts of decoded and dropped frames, and properties of the film; filled while it is read."""
 
     decoded: int = 0
     damaged: int = 0
@@ -405,7 +405,7 @@ def _intact_frames(path: Path, count: FilmStatistics) -> Iterator[tuple[float | 
     """Frames that are not damaged, and do not depend on damaged ones.
 
     A decoder conceals a damaged frame by a guess and predicts later frames from it. Therefore all frames from a
-    damaged one to the next key frame are skipped, and so are the B frames that precede and depend on the damaged one.
+    damaged one to the next key frame are skipped, and so are the B frames before it that depend on it.
     """
     with av.open(str(path)) as container:
         stream = _video_stream(container, path)

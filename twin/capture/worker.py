@@ -1,10 +1,10 @@
-"""Runs structure from motion in a separate process, because some failures inside COLMAP abort the whole process.
+"""Runs COLMAP in a separate process, because some of its failures abort the whole process.
 
 The parent starts the *worker*, `python -m twin.capture.worker MODULE:FUNCTION JOB`, which calls the function with
-the *job* (a dictionary in the file JOB) and that file's folder. The parent shows the worker's progress and turns an
-abort into an error with a cure. A *message* is one line of JSON on the worker's standard output: {"bar": name,
-"total": n} starts a progress bar, {"step": n} advances it, {"say": text} prints a line, {"error": text} reports bad
-input. COLMAP writes its own log to standard error; the parent copies it to a file.
+the *job* (a dictionary in the file JOB) and that file's folder. The parent shows the worker's progress; if the
+worker aborts, it raises an error with a cure. A *message* is one line of JSON on the worker's standard output: {"bar":
+name, "total": n} starts a progress bar, {"step": n} advances it, {"say": text} prints a line, {"error": text} reports
+bad input. COLMAP writes its own log to standard error; the parent copies it to a file.
 """
 
 import contextlib
@@ -58,7 +58,7 @@ def run_worker(solve: Callable[[dict[str, Any], Path], None], job: dict[str, Any
     job_file.write_text(json.dumps(job), encoding="utf-8")
     process = subprocess.Popen(
         [sys.executable, "-m", "twin.capture.worker", f"{solve.__module__}:{solve.__qualname__}", str(job_file)],
-        stdin=subprocess.PIPE,  # this pipe closes whenever the parent dies; the worker then ends, too
+        stdin=subprocess.PIPE,  # closes when the parent dies in any way, which ends the worker, too
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -1,6 +1,6 @@
 """Image files as arrays, resizing and similarity metrics.
 
-RGB order, shape (height, width, 3), float in [0, 1] unless uint8.
+Images are RGB, shape (height, width, 3), float in [0, 1] unless uint8.
 """
 
 import re
@@ -29,7 +29,7 @@ HEIF_SUFFIXES = (".heic", ".heif")
 """Suffixes of photos from phones; reading them needs the extra `heif`."""
 _HEIF = "HEIF"  # Pillow's name of the format
 _CURE = "replace or remove it"
-warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # from half of MAX_PIXELS on
+warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # Pillow warns from MAX_PIXELS / 2 on
 warnings.filterwarnings("ignore", module="PIL")  # warnings of flawed headers, whose values count as unknown
 
 
@@ -80,7 +80,7 @@ def open_header(path: Path, cure: str = _CURE) -> PillowImage.Image | None:
         try:
             import pillow_heif
         except ImportError:
-            raise InputError(f"{path}: HEIC pictures need more: pip install 'twin[heif]', or convert them") from None
+            raise InputError(f"{path}: HEIC needs pillow-heif: pip install 'twin[heif]', or convert it") from None
         pillow_heif.register_heif_opener()
     try:
         if not regular_file(path).stat().st_size:

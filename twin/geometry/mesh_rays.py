@@ -48,7 +48,7 @@ class Surface:
         self._mesh = wp.Mesh(_vectors(vertices), indices)
 
     def cast(self, origins: Array, rays: Array) -> Array:
-        """First hit along each ray in multiples of the ray's length, negative for a miss; (k, 3), (k, 3) → (k,)."""
+        """Distance to the first hit of each ray [ray lengths], negative for a miss; (k, 3), (k, 3) → (k,)."""
         length = np.linalg.norm(rays, axis=1, keepdims=True)
         return self._launch(_cast, len(origins), _vectors(origins), _vectors(rays / length)) / length[:, 0]
 

@@ -29,11 +29,11 @@ _MIN_JUMP = 5.0  # [m] least length of a jump
 _LONG_JUMP, _LONG_RATIO = 12.0, 3.0  # [m], [typical steps]; a step longer than both is a jump in any case
 _JUMP_WINDOW = 4  # steps before and after from which the typical step is computed
 _MAX_MISSING = 20.0  # [frame intervals] longer gaps in time do not raise the allowed step further
-_BESIDE = 5.0  # [m] a path this close to an earlier part of itself retraces it; a bend of 6 m radius is 12 m wide
+_BESIDE = 5.0  # [m] a path this close to an earlier part of itself retraces it; U-turns of 6 m radius are wider
 _ALONGSIDE = 0.5  # [m] greatest offset, along the path, of the point that it retraces
 _PARALLEL = np.cos(np.deg2rad(40.0))  # cosine of the greatest angle between a path and the part that it retraces
 _MIN_RETRACE = 1.5  # [m] shorter retraces are noise
-_MIN_LAP = 12.0  # [m] a path that goes the same way again has driven at least this far
+_MIN_LAP = 12.0  # [m] least length of a lap
 _MAX_U_TURN = 25.0  # [m] a longer turn is a loop at the end of the road and stays in the pass
 _MIN_PASS = 1.0  # [m] shorter passes are dropped
 _CHORD = 1.0  # [m] length over which headings are measured
@@ -100,9 +100,9 @@ def source_frames(cameras: Cameras) -> list[NDArray[np.int64]]:
 def path_jumps(positions: Array, times: Array, min_jump: float = _MIN_JUMP) -> NDArray[np.int64]:
     """Finds steps much longer than the typical step of a path, as between two passes filmed one after the other.
 
-    A jump is longer than 5 m and than 8 typical steps of its neighborhood, allowing for missing frames; or longer than
-    12 m and 3 typical steps, however many frames are missing. Takes camera centers (n, d) [m] in order of time, with
-    times [s] or indices (n,); returns the indices i of jumps from i to i + 1. `min_jump` replaces the 5 m.
+    A jump is longer than 5 m and than 8 typical steps of its neighborhood (more where frames are missing), or longer
+    than 12 m and than 3 typical steps. Takes camera centers (n, d) [m] in order of time, with times [s] or indices
+    (n,); returns the indices i of jumps from i to i + 1. `min_jump` replaces the 5 m.
     """
     if len(positions) < 3:
         return np.zeros(0, np.int64)
@@ -137,7 +137,7 @@ def _between_retraces(
     cuts = _retraces(path)
     if not cuts:
         return [(frames, path, ending)]
-    # Frames are assigned to passes by their station; frames of a turn belong to no pass.
+    # Frames are assigned to passes by their arc length along the path; frames of a turn belong to no pass.
     station = _frame_stations(positions[frames, :2], path)
     spacing = path_length(path) / (len(path) - 1)
     starts = [0, *(start for _, start, _ in cuts)]
@@ -153,7 +153,7 @@ def _between_retraces(
 def _retraces(path: Array) -> list[tuple[int, int, str]]:
     """Cuts where a path begins to retrace itself.
 
-    Each is the last point of the pass before it, the first point of the pass after it, and `turn` or `lap`.
+    A cut is the index of the pass's last point, that of the next pass's first point, and `turn` or `lap`.
     """
     if len(path) < 3:
         return []
@@ -186,7 +186,7 @@ def _retraces(path: Array) -> list[tuple[int, int, str]]:
 
 
 def _frame_stations(xy: Array, path: Array) -> Array:
-    """Station [m] of frames (n, 2) along their own path; it never decreases, even where the path crosses itself."""
+    """Arc length [m] of frames (n, 2) along their own path; it never decreases, even where the path crosses itself."""
     total = path_length(path)
     kept = _moving(xy)
     raw = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy[kept], axis=0), axis=1))])
@@ -339,8 +339,8 @@ def _piece_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
 def _path_residuals(camera_to_world: Array) -> tuple[Array, Array]:
     """Deviation of each frame from the pose predicted from its neighbors, for poses in order of time (n, 4, 4), n ≥ 5.
 
-    The smaller of two predictions' residuals counts, since either alone fails on correct frames: the chord between
-    neighbors is independent of the speed but cuts corners; the cubic through them follows turns but needs even steps.
+    Two predictions are made, and the smaller residual counts. The chord between neighbors fails in turns; the cubic
+    through them follows turns, but fails where the speed changes.
     Returns residuals of position (unit of the poses) and direction [rad], shapes (n,).
     """
     n = len(camera_to_world)

@@ -70,7 +70,7 @@ def filmed_route(cameras: Cameras, config: RouteConfig | None = None) -> Route:
 
 
 def route_metrics(route: Route) -> dict[str, object]:
-    """The passes and the choice as JSON."""
+    """All passes and the names of the chosen ones, as JSON."""
     return {
         "chosen": list(route.chosen),
         "passes": [
@@ -115,7 +115,7 @@ def _longest_line(passes: list[FilmedPass], max_gap: float) -> tuple[Array, tupl
 
 
 def _continued(line: Array, path: Array, max_gap: float) -> Array | None:
-    """A line extended by a path; None unless the path passes close to its end or starts ahead of it."""
+    """A line extended by a path; None unless the path passes close to the line's end or starts ahead of it."""
     if len(line) < 3 or len(path) < 3:
         return None
     end, ahead = line[-1], path_directions(line)[-1]

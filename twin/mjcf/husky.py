@@ -77,7 +77,7 @@ def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
 
 @dataclass(frozen=True)
 class WrongOption:
-    """An option of a model with which the robot's tires skid unrealistically."""
+    """An option of a model whose value makes the robot's tires skid unrealistically."""
 
     option: str
     found: str
@@ -90,7 +90,7 @@ class WrongOption:
 
 
 def check(model: mujoco.MjModel) -> list[WrongOption]:
-    """Options of a model with a Husky that are wrong for skid steering; empty if all are right.
+    """Lists the options of a model with a Husky that are wrong for skid steering.
 
     When a robot is attached to a scene, MuJoCo keeps the options of the scene, and the scene's ground can override the
     contact parameters of the tires.
@@ -148,7 +148,7 @@ COSTS = {
     "tolerance": "at 1e-2, a parked robot creeps down a slope at 9 mm/s",
     "contact": "with MuJoCo's default contacts the wheels hop (14 m/s²), and the robot turns 28 % slower",
 }
-"""Cost of a wrong option by its name, from `benchmarks/husky_options.py`."""
+"""Option, or `contact` → effect of a wrong value, from `benchmarks/husky_options.py`."""
 
 
 def add_husky(
@@ -571,7 +571,7 @@ def standalone_xml() -> str:
 
 
 _XML_HEADER = """<!--
-  Clearpath Husky A200, made by python -m twin.mjcf.husky; do not edit. Figures: README.md; licence: LICENSE.
+  Clearpath Husky A200, made by python -m twin.mjcf.husky; do not edit. Figures: README.md; license: LICENSE.
 
   body, free joint  base_link
   joints            front_left_wheel, front_right_wheel, rear_left_wheel, rear_right_wheel
@@ -580,14 +580,14 @@ _XML_HEADER = """<!--
   sensors           imu_gyro, imu_accelerometer, imu_orientation (site imu), <wheel>_wheel_position and _velocity,
                     left_torque, right_torque [N m] at the wheels of a side
 
-  Attached to another model, this one's options are not taken over. The tyres need
+  When the robot is attached to another model, MuJoCo ignores the options below. Set them in that model:
     <option timestep="0.002" integrator="implicitfast" cone="elliptic" impratio="10" tolerance="1e-5"/>
-  there as well: with another cone the scrubbing torque is wrong, with Euler the motors' servos are.
+  With another cone the scrubbing torque is wrong; with Euler the speed servos are unstable.
 -->
 """
 
 
-SCENE = """<!-- The Husky on a plane, made by python -m twin.mjcf.husky; do not edit. It turns with ctrl -3 and 3. -->
+SCENE = """<!-- The Husky on a plane, made by python -m twin.mjcf.husky; do not edit. Controls of -3 and 3 turn it. -->
 <mujoco model="husky scene">
   <include file="husky.xml"/>
 

@@ -82,7 +82,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(out.resolve())
     husky.set_options(spec, config.robot)
-    # Sleep saves computing the poses of thousands of static geoms; bodies with motors, such as the robot, never sleep.
+    # MuJoCo computes no poses of sleeping bodies, such as thousands of static geoms; bodies with motors never sleep.
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     _add_sky_and_lights(spec)
     picture = mesh / "ground.png"  # the stage `mesh` writes it; `build_assets` alone does not
@@ -123,7 +123,7 @@ def _load_route(path: Path) -> Array | None:
 
 
 def film_camera(cameras: Cameras) -> PixelCamera:
-    """The physical camera of the first training frame."""
+    """The camera of the first training frame, at that frame's size."""
     first = int(np.argmin(cameras.held_out))
     (width, height), (fx, fy, cx, cy) = cameras.sizes[first].tolist(), cameras.intrinsics[first].tolist()
     return PixelCamera((fx, fy, cx, cy), (width, height))
@@ -288,7 +288,7 @@ def _add_robot(
     """
     length = float(arc_lengths(route)[-1])
     if length < _MIN_ROUTE:
-        raise InputError(f"the filmed route is {length:.2f} m long, expected {_MIN_ROUTE:g} m; set mjcf.route = false")
+        raise InputError(f"the route has {length:.2f} m, expected at least {_MIN_ROUTE:g} m; set mjcf.route = false")
     yaw = float(heading_at(route, 0.0))
     rows, columns = ground.height.shape
     edge = np.minimum(
@@ -316,7 +316,7 @@ def _add_robot(
     if not moved < 0.05 or abs(data.qpos[2] - position[2]) > 0.1:
         raise InputError(
             f"the robot does not rest at the start of the route: moved {moved:.2f} m, "
-            f"{data.qpos[2] - position[2]:+.2f} m up in {_SETTLE_TIME:g} s, expected < 0.05; "
+            f"{data.qpos[2] - position[2]:+.2f} m up in {_SETTLE_TIME:g} s, expected < 0.05 m, ± 0.1 m; "
             "an obstacle is there: raise mesh.obstacle_height"
         )
     spec.add_key(name="spawn", qpos=data.qpos)
@@ -390,15 +390,15 @@ def face_texture(colors: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.float64
 
 _COMPARED_STEPS = 200
 _MAX_DEVIATION = 0.002  # [m] between the robot bases of the compiled model and of the copy
-_XML_PRECISION = 1e-5  # further deviation as a fraction of the coordinates, as the XML keeps six digits
+_XML_PRECISION = 1e-5  # further allowed deviation [fraction of the coordinates], since the XML keeps six digits
 _CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
 
 
 def check_portable(folder: Path, built: mujoco.MjModel) -> dict[str, Any]:
     """Loads a moved copy of the scene in plain MuJoCo and compares its robot's motion with that in the model `built`.
 
-    Returns metrics for the report; `spawn_drift_m` is the creep of the parked robot in 0.4 s, due to soft tires on a
-    slope.
+    Returns metrics for the report. `spawn_drift_m` is the distance that the parked robot creeps in 0.4 s, on soft tires
+    on a slope.
 
     Raises:
         RuntimeError: the copy is a different model or its robot moves differently, which is a bug.

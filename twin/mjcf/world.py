@@ -124,8 +124,8 @@ def point_at(route: Array, s: Array | float) -> Array:
 def heading_at(route: Array, s: Array | float, window: float = 1.0) -> Array:
     """Heading [rad] at arc lengths s [m], in the shape of s.
 
-    It is the direction of the chord from s - window / 2 to s + window / 2; near the route's ends, of the first or last
-    chord that lies on the route.
+    It is the direction of the chord from s - window / 2 to s + window / 2; near an end of the route, that of the chord
+    of this length at the end.
     """
     length = arc_lengths(route)[-1]
     window = min(window, length)
