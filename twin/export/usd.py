@@ -11,8 +11,8 @@
         Sun, Sky, PhysicsScene
 
 Meters, kilograms, z up. Bodies, masses, joints, shapes and cameras are read from the compiled MuJoCo model, so they are
-those of the simulation. USD's own physics has no belt between the wheels of a side: each wheel has a drive with half of
-the side's gain and torque. Splats emit light; sun and sky light the robot and added objects.
+those of the simulation. There, a belt couples the wheels of a side. UsdPhysics has no belt, so each wheel has a drive
+with half of the side's gain and torque. Splats emit light; sun and sky light the robot and added objects.
 """
 
 import shutil

@@ -32,7 +32,7 @@ class Fog:
 
 
 def mixed(one: Fog | None, other: Fog | None, share: float) -> Fog | None:
-    """Interpolated fog, `share` of the way from `one` to `other`; None stands for the air of the film.
+    """Interpolated fog, `share` of the way from `one` to `other`; None stands for no additional fog.
 
     The airlights are weighted by the extinctions.
     """

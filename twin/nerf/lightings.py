@@ -64,7 +64,7 @@ class Lightings:
         raise InputError(f"lighting {lighting!r}: unknown; the field has {', '.join(self.names)}")
 
     def fog(self, lighting: str) -> Fog | None:
-        """Fog of an added lighting or of a mixture with one; None means the air of the film.
+        """Fog of an added lighting or of a mixture with one; None means no additional fog.
 
         Raises InputError for a mixture that is not `a:b:share` with a share from 0 to 1.
         """
