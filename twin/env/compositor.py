@@ -1,8 +1,8 @@
-"""Compositor: a radiance field rendered with obstacles, other robots and the robot's own body in it.
+"""Compositor: draws obstacles, other robots and the robot's own body into renderings of a radiance field.
 
-Objects are shaded with the field's irradiance and throw contact shadows. In every pixel that an object covers, the
-field is rendered a second time, only up to the object's depth. This foreground is drawn over the object according to
-its opacity: leaves in front of an object hide it. Pixels, or parts of pixels, that no object covers show the field.
+Objects are shaded with the irradiance estimated from the field, and obstacles throw contact shadows. In pixels that an
+object covers, the field is rendered a second time, only up to the object's depth. The object is blended with this
+foreground by the foreground's opacity, so that leaves in front of an object hide it.
 """
 
 import threading
@@ -33,20 +33,20 @@ from twin.warp_runtime import wp
 # ---- objects
 
 _NEAR_PLANE = 0.02  # [m] geoms whose z-depth is smaller than this everywhere are not drawn
-_SMALL_MASK = 800  # [px] masks up to this size are supersampled everywhere, since finding edges would take longer
+_SMALL_MASK = 800  # [px] masks up to this size are supersampled in every pixel: finding edges would take longer
 _SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] offsets of the samples at edges
 
 
 @dataclass(frozen=True)
 class RenderedObjects:
-    """Objects in a window of the picture; arrays (height, width), color (height, width, 3)."""
+    """Objects in a rectangular window of the picture; arrays (height, width), `rgb` (height, width, 3)."""
 
     window: tuple[int, int, int, int]
     """Left, top, width, height [px]."""
     coverage: Array32
     """Fraction of a pixel that objects cover."""
     rgb: Array32
-    """Shaded film color; 0 where no object covers the pixel."""
+    """Shaded color; 0 where no object covers the pixel."""
     depth: Array32
     """z-depth of the covered part [m]; 0 where no object covers the pixel."""
 
@@ -63,7 +63,7 @@ class ObjectRenderer:
     def __init__(self, model: mujoco.MjModel, camera: int, size: tuple[int, int]):
         """
         Args:
-            model: The model; its geoms in the obstacles' group and in the robot's visual group are drawn.
+            model: Its geoms in the obstacles' group and in the robot's visual group are drawn.
             camera: Index of the camera in the model.
             size: Width, height of the picture [px].
         """
@@ -114,8 +114,8 @@ class ObjectRenderer:
         turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         middles = data.geom_xpos[self.geoms] - pose[:3, 3] + np.einsum("nij,nj->ni", turns, self._centers)
         planes = self._planes @ pose[:3, :3].T
-        # A box reaches this far into a half space: its center's position along the normal, plus the projection of its
-        # half sides onto the normal.
+        # Largest signed distance of a box's points from a plane: that of its center, plus its half sides projected onto
+        # the plane's normal.
         reach = middles @ planes.T + np.einsum("npj,nj->np", np.abs(planes @ turns), self._halves)
         reach[:, -1] -= _NEAR_PLANE
         seen = np.flatnonzero((reach > 0.0).all(1))
@@ -295,7 +295,7 @@ def _edge_mask(ids: NDArray[np.int32]) -> NDArray[np.bool_]:
 Lighting = str | NDArray
 
 _WINDOW_STEP = 32  # [px] sides of foreground windows are multiples of this, so that few sizes occur
-_MAX_WINDOWS = 16  # number of window sizes whose render targets are kept; pictures of 160×90 px have at most 15
+_MAX_WINDOWS = 16  # number of window sizes whose render targets are kept; pictures of 160×90 px need at most 15
 
 
 class Compositor:
@@ -312,7 +312,7 @@ class Compositor:
     ):
         """
         Args:
-            model: A model that has the camera, compiled after `add_obstacles` was called (even without obstacles).
+            model: A model with this camera, to whose spec `add_obstacles` added obstacles, or at least the route.
             field: Radiance field of the place.
             size: Width, height of the pictures [px].
             max_envs: Largest number of envs per call.
@@ -325,8 +325,8 @@ class Compositor:
         # Warp's default device is global to the process, and worker threads change it.
         wp.set_device("cpu")
         count = min(max_envs, available_cores()) if field.device == "cpu" else 1
-        # On a GPU there is one worker, since all threads would share one CUDA stream. Workers are created here and not
-        # in the threads, since Warp compiles kernels at their first use.
+        # On a GPU there is one worker, since all threads would share one CUDA stream. Workers are created one after the
+        # other: each may compile Warp kernels, and compiling in two threads at once corrupts them.
         self._workers = [_CompositorWorker(model, field, self._camera, size) for _ in range(count)]
         self._pool = ThreadPoolExecutor(count) if count > 1 else None
         self._shadows = ContactShadows(model, self._workers[0].renderer.geoms)
@@ -415,7 +415,7 @@ class _CompositorWorker:
         across, down = (-(-n // _WINDOW_STEP) * _WINDOW_STEP for n in (width, height))
         stop = np.zeros((1, down, across), np.float32)
         stop[0, :height, :width] = drawn.depth
-        # There is one copy of the field per window size, since a field keeps render targets of few sizes.
+        # A field keeps render targets for few sizes, so each window size has its own copy of the field.
         if (across, down) not in self._fields:
             self._fields[across, down] = self._field.single_threaded()
             if len(self._fields) > _MAX_WINDOWS:
@@ -434,7 +434,7 @@ def composite(out: Rendering, inner: tuple, drawn: RenderedObjects, front: Rende
         out: Rendering of the field alone.
         inner: Index that selects the window in the arrays of `out`.
         drawn: Objects in the window.
-        front: The field up to `drawn.depth`, arrays (height, width); its colors are not premultiplied.
+        front: The field up to `drawn.depth`, arrays (height, width); its colors are not multiplied by its opacity.
     """
     cover = drawn.coverage[..., None]
     held = front.opacity[..., None]

@@ -22,7 +22,7 @@ Int32Array = NDArray[np.int32]
 CONTROL_PERIOD = 0.1
 """Usual time between two commands [s]."""
 COMMAND_TIMEOUT = min(timing.timeout for timing in CONTROLLERS.values())
-"""Longest time between two commands [s]: the shortest time-out of all controllers."""
+"""Longest allowed time between two commands [s]: the shortest time-out of all controllers."""
 
 _TIME_TOLERANCE = 1e-9  # [s] times that differ by less count as equal
 
@@ -150,7 +150,7 @@ class VectorController:
         """
         self._latency[which], self._steps_to_update[which], self.time[which] = latency, steps_to_update, 0.0
         missing = int(np.ceil(self._latency.max() / self._period)) + 2 - len(self._commands)
-        if missing > 0:  # the buffers grow to the largest possible number of pending commands
+        if missing > 0:  # make room for all commands that may be pending
             n = len(self._latency)
             self._arrivals = np.concatenate([np.full((missing, n), -np.inf), self._arrivals])
             self._commands = np.concatenate([np.zeros((missing, n, 2)), self._commands])
@@ -167,7 +167,7 @@ class VectorController:
             ring[-1, which] = new
         n = len(self.time)
         speeds, times = np.zeros((self.max_segments, n, 2)), np.full((self.max_segments, n), np.inf)
-        checks = np.zeros((self._steps + 1, n), np.int32)  # shifted by one, so its cumulative sum numbers segments
+        checks = np.zeros((self._steps + 1, n), np.int32)  # row k + 1: substep k; its cumulative sum is the segment
         left = np.zeros(n, int)
         left[which] = self._steps
         robots = np.arange(n)
