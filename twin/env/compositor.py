@@ -55,9 +55,9 @@ class ObjectRenderer:
     """Draws obstacles and robots of one model, one env at a time. Not thread-safe.
 
     It casts rays into a second model, which has only the geoms of obstacles and robots. There is one ray in each pixel
-    that a geom's bounding box may cover; pixels at edges have four, for smooth outlines. The lights of the second model
-    are chosen so that the color that a ray returns encodes the surface's normal. An object's shaded color is its own
-    color times the irradiance of this normal.
+    that a geom's bounding box may cover; pixels at edges have four, for smooth outlines. The second model's lights give
+    surfaces a color that encodes their normal. An object's shaded color is its own color times the irradiance for its
+    normal.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: int, size: tuple[int, int]):
@@ -105,10 +105,7 @@ class ObjectRenderer:
         self._subpixel_rays = np.stack([self._rays(pixels + offset) for offset in _SUBPIXELS], 1)
 
     def visible_mask(self, data: mujoco.MjData, pose: Array) -> NDArray[np.bool_] | None:
-        """Mask (height, width) of the pixels that geoms may cover in the view from an OpenCV pose.
-
-        None if no geom is in view.
-        """
+        """Mask (height, width) of pixels that geoms may cover, seen from an OpenCV pose; None if no geom is in view."""
         if len(self.geoms) == 0:
             return None
         turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
@@ -185,11 +182,7 @@ class ObjectRenderer:
         return mujoco_rays(unproject(pixels, self._intrinsics))
 
     def _cast(self, rays: Array32) -> tuple[NDArray[np.int32], Array32, Array32]:
-        """Casts rays (n, 3).
-
-        Returns, for each ray, the drawn geom that it hits (−1: none), the unit normal there, and the z-depth [m] (0 if
-        it hits none).
-        """
+        """Casts rays (n, 3); returns the drawn geom that each hits (−1: none), the unit normal and the z-depth [m]."""
         count, most = len(rays), self._caster.max_rays
         if count > most:  # more rays than fit into one cast
             parts = [self._cast(rays[k : k + most]) for k in range(0, count, most)]
@@ -204,10 +197,7 @@ class ObjectRenderer:
     def _shader(
         self, data: mujoco.MjData, irradiance: Irradiance | None
     ) -> Callable[[NDArray[np.int32], Array32], Array32]:
-        """Returns a function that converts drawn geoms (n,) and normals (n, 3) to colors (n, 3).
-
-        The color is 0 where the geom is −1.
-        """
+        """Returns a function that converts drawn geoms (n,) and normals (n, 3) to colors (n, 3), 0 for geom −1."""
         ground = irradiance.ground(data.xpos[self._bodies, :2]) if irradiance else None
 
         def shade(geom: NDArray[np.int32], normals: Array32) -> Array32:
@@ -269,9 +259,9 @@ def _copy_mesh(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: int) -> None:
 
 
 def _mesh_frames(small: mujoco.MjModel) -> tuple[Array, Array]:
-    """Positions (n, 3) and rotations (n, 3, 3) of the geoms' frames relative to the frames of the uncompiled meshes.
+    """Positions (n, 3) and rotations (n, 3, 3) of geoms in the frames of their meshes before compilation.
 
-    The frames differ because MuJoCo moves a mesh to its inertial frame.
+    The frames differ because the compiler moves a mesh to its inertial frame.
     """
     turns = np.empty((small.ngeom, 9))
     for i in range(small.ngeom):

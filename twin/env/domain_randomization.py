@@ -32,12 +32,12 @@ VERSION = 4
 KNOWN_WEATHER_FRACTION = 0.6
 """When a photo of the day is available, the strengths of sun and shadows are multiplied by this fraction.
 
-It was tuned with `benchmarks/day.py` in a simulated world whose pictures of each day are known (`twin.reality`). The
-benchmark renders the twin with a photo's appearance and fog. It compares two changes of a policy's steering: (a) from
-these renderings to the true pictures of the day; (b) from them to renderings with sampled sun and shadows, too. The
-ratio of (a) to (b), with 90 % intervals over policies and days, is 0.8 (0.6 to 0.96) for the full randomization. With
-this fraction it is 1.1 (0.8 to 1.4) for the part of the change that is constant over a day, and 1.2 (1.0 to 1.4) for
-the part that varies along the route.
+It was tuned with `benchmarks/day.py` in the simulated world of `twin.reality`, where true pictures of each day are
+available. The benchmark renders the twin with a photo's appearance and fog. It compares two changes of a policy's
+steering: (a) from these renderings to the true pictures of the day; (b) from these renderings to ones with sampled sun
+and shadows. The ratio of (a) to (b), with 90 % intervals over policies and days, is 0.8 (0.6 to 0.96) for the full
+randomization. With this fraction it is 1.1 (0.8 to 1.4) for the part of the change that is constant over a day, and 1.2
+(1.0 to 1.4) for the part that varies along the route.
 
 The policies are the twelve finished ones of Table 1 in docs/benchmarks.md; the days are ten of its twenty days: the
 five stated weathers and days 1 to 5. So a forecast for these policies and days is not independent of this value."""
@@ -125,7 +125,7 @@ class Ranges:
         """These ranges for a scene's robot. With `hold_known`, measured parameters are held at the robot's values.
 
         A parameter counts as measured if `robot.toml` or `[robot]` gives a value other than the published one. Real
-        trials use one robot; a success rate over many sampled robots would measure robustness, not its success.
+        trials use one robot: a success rate over many sampled robots would measure robustness, not that one's success.
         """
         if not self.hold_known:
             return self

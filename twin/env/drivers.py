@@ -109,7 +109,7 @@ class PurePursuit:
         self._last: tuple[Array, tuple[float, float]] | None = None
 
     def update(self, pose: Array) -> tuple[float, float]:
-        """Updates `s` from a pose (x, y, yaw); returns the foot's arc length and the signed distance from it [m]."""
+        """Updates `s` from a pose (x, y, yaw); returns the foot's arc length and the cross-track error [m]."""
         foot, error = nearest_on_route(self._route, pose[:2], (self.s - _SEARCH_WINDOW[0], self.s + _SEARCH_WINDOW[1]))
         self.s = max(self.s, float(foot))
         return float(foot), float(error)

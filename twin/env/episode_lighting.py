@@ -132,10 +132,7 @@ class LightingSets:
         )
 
     def set_and_anchor(self, embedding: Array32) -> tuple[str | None, int]:
-        """The set to which a lighting (dim,) belongs, and the index of its nearest anchor.
-
-        The set is `TRAINING`, `HELD_OUT` or, if it belongs to neither, None.
-        """
+        """The set of a lighting (dim,), `TRAINING`, `HELD_OUT` or None (neither), and its nearest anchor's index."""
         distance = _distance(self.anchors.probe_colors, self._probe_colors(embedding))
         held_out, nearest = self.anchors.held_out, int(distance.argmin())
         to_training, to_held_out = float(distance[~held_out].min()), float(distance[held_out].min())

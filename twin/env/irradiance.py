@@ -53,7 +53,7 @@ _UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a u
 _MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # limits of the sun's share of light and of its elevation's cotangent
 _MIN_COLOR = 0.02  # a probe whose mean color is darker is not used
 _MAX_BRIGHTNESS = 1.5  # probes above this multiple of the highest ground irradiance count as lamps and are not used
-_NEIGHBORS = 8  # number of ground probes that give the ground irradiance at an upright one
+_NEIGHBORS = 8  # number of ground probes that give the ground irradiance at an upright probe
 _MIN_PROBES = 50  # fewer ground probes are an error; with fewer upright probes, a uniform sky is assumed
 _LIGHTINGS_CACHED, _POSITIONS_CACHED = 64, 1000
 
@@ -67,12 +67,9 @@ class Irradiance:
     up: Array
     """Ground irradiance at these positions, shape (k, 3)."""
     constant: Array
-    """Constant part of the light on surfaces that do not face up, shape (5, 3).
-
-    Row 0 is light without direction; rows 1 to 4 are light from `SIDE_DIRECTIONS`.
-    """
+    """Constant light on surfaces that do not face up, shape (5, 3): undirected, then from each of `SIDE_DIRECTIONS`."""
     proportional: Array
-    """Ratio of the proportional part of light to the ground irradiance, shape (5, 3); rows as in `constant`."""
+    """Ratio of the proportional light to the ground irradiance, shape (5, 3); rows as in `constant`."""
     _cache: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
     """Ground irradiance by position: most objects stand still, so positions recur."""
 
@@ -288,10 +285,7 @@ def _nearest_indices(positions: Array, xy: Array) -> NDArray[np.int64]:
 
 
 def _uniform_sky_irradiance(normals: Array) -> Array:
-    """Irradiance of unit normals (n, 3) under a uniform sky over ground of radiosity `_BOUNCE`, shape (n,).
-
-    A surface that faces up has 1.
-    """
+    """Irradiance (n,) for unit normals (n, 3) under a uniform sky over ground of radiosity `_BOUNCE`; 1 facing up."""
     up = normals[:, 2]
     return 0.5 * (1.0 + up) + 0.5 * (1.0 - up) * _BOUNCE
 
@@ -410,10 +404,7 @@ def _smooth_step(x: Array) -> Array:
 
 
 def _bounding_boxes(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.int64], body: int) -> Array:
-    """Lowest and highest corners of two boxes around an obstacle's lower and upper geoms, in its frame.
-
-    The shape is (2, 2, 3): box, corner, xyz.
-    """
+    """Lowest and highest corners of boxes around an obstacle's lower and upper geoms, in its frame, shape (2, 2, 3)."""
     local = model.geom_aabb[geoms, None, :3] + BOX_CORNERS * model.geom_aabb[geoms, None, 3:]
     turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
     world = local @ turns.transpose(0, 2, 1) + data.geom_xpos[geoms, None]

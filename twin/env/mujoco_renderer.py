@@ -102,10 +102,7 @@ class RayCaster:
         return rgb, self._context.depth_data.numpy()[0, :count].copy()
 
     def hit_geoms(self) -> NDArray[np.int32]:
-        """Indices of the geoms that the rays of the last cast hit, shape (k,); −1 where a ray hit none.
-
-        This needs `render_seg=True`.
-        """
+        """Indices of the geoms that the last cast's rays hit, shape (k,), −1 for none; needs `render_seg=True`."""
         return self._context.seg_data.numpy()[0, : self._context.total_rays, 0].copy()
 
 
@@ -199,10 +196,7 @@ class _SceneWorker:
         self.render(self._data, camera_pose(self._data, self._camera))  # compiles the kernels
 
     def render(self, data: mujoco.MjData, pose: Array) -> tuple[Array32, Array32]:
-        """Renders from an OpenCV pose; returns colors (height, width, 3) in [0, 1] and z-depth (height, width) [m].
-
-        The z-depth of the sky is 0.
-        """
+        """Renders from an OpenCV pose; returns colors (h, w, 3) in [0, 1] and z-depth (h, w) [m], 0 for the sky."""
         mine = self._data
         mine.qpos[:], mine.mocap_pos[:], mine.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
         mujoco.mj_kinematics(self._model, mine)

@@ -135,9 +135,7 @@ def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
 def random_obstacles(
     world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
 ) -> tuple[ObstacleConfig, ...]:
-    """Samples static obstacles `random_<number>` along the route, with gaps between them.
-
-    A robot can pass each of them within the corridor.
+    """Samples static obstacles `random_<number>` along the route; a robot can pass each of them within the corridor.
 
     Raises:
         InputError: the route is too short for `count` obstacles.

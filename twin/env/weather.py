@@ -98,10 +98,7 @@ class DirectionalRelighting:
 
 
 def _normals(points: Array32) -> Array32:
-    """Unit normals, shape (height, width, 3), of the surface through points relative to the camera.
-
-    They point towards the camera.
-    """
+    """Unit normals, towards the camera, of the surface through points relative to it, shape (height, width, 3)."""
     smooth = cv2.blur(points, (_SMOOTHING, _SMOOTHING), borderType=cv2.BORDER_REPLICATE)
     down, across = np.gradient(smooth, axis=(0, 1))
     normal = np.cross(down, across)
@@ -179,10 +176,7 @@ def _solid_shadows(rng: np.random.Generator) -> Array32:
 
 
 def _patches(rng: np.random.Generator, radius: float, cover: float) -> Array32:
-    """Pattern (side, side) of dark patches of about the radius `radius` [texels]; 1 where it is dark.
-
-    The patches cover the fraction `cover` of the plane.
-    """
+    """Pattern (side, side) of patches, 1 where dark: radius about `radius` [texels], fraction `cover` of the plane."""
     # The smoothing is periodic, so that the pattern repeats without a seam.
     frequency = np.fft.fftfreq(_SIDE)[:, None] ** 2 + np.fft.rfftfreq(_SIDE) ** 2
     smooth = np.exp(-2.0 * (np.pi * radius) ** 2 * frequency)

@@ -133,7 +133,7 @@ class Agreement:
     winner_agreement: Estimate
     winner_regret: Estimate
     bias: Estimate
-    """Mean over cells of real minus twin rate."""
+    """Mean over policies of real minus twin rate."""
     coverage: Estimate
     """Fraction of cells with `CellPair.within_chance`."""
     corrected_coverage: Estimate

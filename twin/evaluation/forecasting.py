@@ -105,7 +105,7 @@ class TrialAllocation:
     order_now: float | None = None
     """See `RankingConfidence.order`."""
     more_for_winner: int | None = None
-    """Real trials per policy until `RankingConfidence.winner` reaches `sure`; None: more than `ranking.MAX_TRIALS`."""
+    """Further trials per policy until `RankingConfidence.winner` reaches `sure`; None: over `ranking.MAX_TRIALS`."""
     more_for_order: int | None = None
     """The same for `RankingConfidence.order`."""
 

@@ -27,7 +27,7 @@ _MIN_EPISODES = 5  # per point
 
 
 def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Summarizes the trainings of those policies in `runs/` whose files are unchanged since their validation.
+    """Summarizes the trainings of those policies in `runs/` that are unchanged since their validation.
 
     Args:
         root: The scene folder.
