@@ -218,7 +218,7 @@ class DrivePhysics(dm_mujoco.Physics):
         self.robot.begin()
 
     def step(self, nstep: int = 1) -> None:
-        """Runs one control step, from one command to the next, of `nstep` substeps."""
+        """Runs one control step of `nstep` substeps."""
         with self.check_invalid_state():
             self.robot.step(nstep * self.timestep())
 

@@ -256,7 +256,7 @@ def mean_difference_interval(
         raise UndefinedStatistic(f"too few for an interval: {n} pairs, {MIN_PLACES} are needed")
     mean, error = float(np.mean(differences)), float(np.std(differences, ddof=1) / np.sqrt(n))
     if error < 1e-9:
-        raise UndefinedStatistic("no interval: all pairs differ by the same")
+        raise UndefinedStatistic("no interval: all pairs differ by the same amount")
     half = float(student.ppf(0.5 + confidence / 2, n - 1)) * error
     return mean, max(mean - half, limits[0]), min(mean + half, limits[1])
 

@@ -23,11 +23,11 @@ from twin.types import Array
 CONFIDENCE = 0.9
 """Confidence level of every interval."""
 MIN_POLICIES = 5
-"""Number of policies below which no correlation is given."""
+"""Number of policies below which neither agreement nor predictions are given."""
 MIN_PREDICTORS = 7
 """Number of policies below which a prediction has no interval."""
 MIN_TRIALS = 5
-"""Number of trials per cell below which no correlation is given."""
+"""Number of trials per cell below which neither agreement nor predictions are given."""
 
 _MIN_POINTS = 3  # smallest number of policies for a correlation
 _DECIMALS = 12  # scores equal to this many decimals are tied: the order of summation changes further decimals
@@ -119,7 +119,7 @@ def rate_difference(
 
 
 def pearson(*, twin: ArrayLike, real: ArrayLike) -> float:
-    """Pearson's correlation of scores, shapes (n,). Raises UndefinedStatistic: n < 3, or all scores are equal."""
+    """Pearson's correlation, shapes (n,). Raises UndefinedStatistic: n < 3, or all twin or all real scores are equal."""
     twin, real = _validated(twin, real)
     return float(pearson_batched(twin=twin, real=real))
 
@@ -155,7 +155,7 @@ def winner(*, twin: ArrayLike, real: ArrayLike) -> tuple[float, float]:
 
 
 def pearson_batched(*, twin: Array, real: Array) -> Array:
-    """`pearson` over leading axes, shape (..., n) → (...); nan where all scores are equal."""
+    """`pearson` over leading axes, shape (..., n) → (...); nan where all twin or all real scores are equal."""
     x = twin - twin.mean(-1, keepdims=True)
     y = real - real.mean(-1, keepdims=True)
     scale = np.sqrt((x * x).sum(-1) * (y * y).sum(-1))
@@ -164,7 +164,7 @@ def pearson_batched(*, twin: Array, real: Array) -> Array:
 
 
 def spearman_batched(*, twin: Array, real: Array) -> Array:
-    """`spearman` over leading axes, shape (..., n) → (...); nan where all scores are equal."""
+    """`spearman` over leading axes, shape (..., n) → (...); nan where all twin or all real scores are equal."""
     return pearson_batched(twin=rankdata(_rounded(twin), axis=-1), real=rankdata(_rounded(real), axis=-1))
 
 
@@ -194,9 +194,9 @@ def _validated(twin: ArrayLike, real: ArrayLike, needed: int = _MIN_POINTS, vari
     if twin.ndim != 1 or twin.shape != real.shape:
         raise ValueError(f"scores of shapes {twin.shape} and {real.shape}: expected one per policy in each, (n,)")
     if not (np.isfinite(twin).all() and np.isfinite(real).all()):
-        raise ValueError("a score is not a number")
+        raise ValueError("a score is nan or infinite; expected finite numbers")
     if len(twin) < needed:
-        raise UndefinedStatistic(f"{len(twin)} policies; at least {needed} are needed for this to be defined")
+        raise UndefinedStatistic(f"{len(twin)} policies; at least {needed} are needed for this statistic")
     for name, scores in (("in the twin", twin), ("on the road", real)):
         if varied and np.ptp(_rounded(scores)) == 0:
             raise UndefinedStatistic(f"all rates {name} are {scores[0]:.3g}; a correlation needs rates that differ")
