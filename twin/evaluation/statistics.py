@@ -119,7 +119,7 @@ def rate_difference(
 
 
 def pearson(*, twin: ArrayLike, real: ArrayLike) -> float:
-    """Pearson's correlation, shapes (n,). Raises UndefinedStatistic: n < 3, or all twin or all real scores are equal."""
+    """Pearson's correlation of scores (n,). Raises UndefinedStatistic: n < 3, or all scores on one side are equal."""
     twin, real = _validated(twin, real)
     return float(pearson_batched(twin=twin, real=real))
 
