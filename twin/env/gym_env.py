@@ -13,8 +13,8 @@ a dict of images (`pixels`) and numbers (`state`).
 
 `info` contains `cause` (why the episode ended; empty before its end), `is_success`, `progress` [m], `start` [m] (offset
 of the start along the route segment), `cross_track` [m], `lighting`, `trust`, `randomisation`, `episode_seed`, `speed`
-[m/s] and `touched`. `lighting` is the name of the episode's lighting. A sampled one has the name of its set and the nearest
-mixture of filmed lightings: `training: sun 0.62, night 0.38`.
+[m/s] and `touched`. `lighting` is the name of the episode's lighting. A sampled one has the name of its set and the
+nearest mixture of filmed lightings: `training: sun 0.62, night 0.38`.
 """
 
 from collections.abc import Sequence
