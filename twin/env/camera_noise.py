@@ -11,7 +11,7 @@ from twin.types import Array, Array32
 _VIBRATION_TIME = 0.05  # [s] correlation time of the vibration
 _DRIFT_TIME = 5.0  # [s] correlation time of the exposure
 _MAX_SHUTTER = 0.5  # the shutter is open for at most this fraction of the time between two pictures
-_KNEE = 0.75  # film colors above this value are compressed so that none exceeds 1
+_KNEE = 0.75  # colors above this value are compressed so that none exceeds 1
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ def motion_blur(
 ) -> Array32:
     """Returns a picture with motion blur: the mean over the camera's motion while the shutter is open.
 
-    This is the last fraction `share` of the motion from `before` to `pose`. The world is assumed to be static. Shapes
-    and units as in `CameraNoise.apply`.
+    The shutter is open during the last fraction `share` of the motion from `before` to `pose`. The world is assumed to
+    be static. Shapes and units as in `CameraNoise.apply`.
     """
     to_before = inverse_pose(before) @ pose
     points = (rays * depth[..., None]) @ to_before[:3, :3].T + to_before[:3, 3]
@@ -100,6 +100,6 @@ def motion_blur(
 
 
 def soft_clip(rgb: Array32) -> Array32:
-    """Returns film colors of at most 1: values above `_KNEE` are compressed smoothly instead of clipped."""
+    """Returns colors of at most 1: values above `_KNEE` are compressed smoothly instead of clipped."""
     over = np.maximum(rgb - _KNEE, 0.0)
     return np.minimum(rgb, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))

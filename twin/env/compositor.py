@@ -1,8 +1,8 @@
-"""Compositor: a radiance field rendered with obstacles, other robots and the robot's own body in it.
+"""Compositor: draws obstacles, other robots and the robot's own body into renderings of a radiance field.
 
-Objects are shaded with the field's irradiance and throw contact shadows. In every pixel that an object covers, the
-field is rendered a second time, only up to the object's depth. This foreground is drawn over the object according to
-its opacity: leaves in front of an object hide it. Pixels, or parts of pixels, that no object covers show the field.
+Objects are shaded with the irradiance estimated from the field, and obstacles throw contact shadows. In pixels that an
+object covers, the field is rendered a second time, only up to the object's depth. The object is blended with this
+foreground by the foreground's opacity, so that leaves in front of an object hide it.
 """
 
 import threading
@@ -33,20 +33,20 @@ from twin.warp_runtime import wp
 # ---- objects
 
 _NEAR_PLANE = 0.02  # [m] geoms whose z-depth is smaller than this everywhere are not drawn
-_SMALL_MASK = 800  # [px] masks up to this size are supersampled everywhere, since finding edges would take longer
+_SMALL_MASK = 800  # [px] masks up to this size are supersampled in every pixel: finding edges would take longer
 _SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] offsets of the samples at edges
 
 
 @dataclass(frozen=True)
 class RenderedObjects:
-    """Objects in a window of the picture; arrays (height, width), color (height, width, 3)."""
+    """Objects in a rectangular window of the picture; arrays (height, width), `rgb` (height, width, 3)."""
 
     window: tuple[int, int, int, int]
     """Left, top, width, height [px]."""
     coverage: Array32
     """Fraction of a pixel that objects cover."""
     rgb: Array32
-    """Shaded film color; 0 where no object covers the pixel."""
+    """Shaded color; 0 where no object covers the pixel."""
     depth: Array32
     """z-depth of the covered part [m]; 0 where no object covers the pixel."""
 
@@ -55,15 +55,15 @@ class ObjectRenderer:
     """Draws obstacles and robots of one model, one env at a time. Not thread-safe.
 
     It casts rays into a second model, which has only the geoms of obstacles and robots. There is one ray in each pixel
-    that a geom's bounding box may cover; pixels at edges have four, for smooth outlines. The lights of the second model
-    are chosen so that the color that a ray returns encodes the surface's normal. An object's shaded color is its own
-    color times the irradiance of this normal.
+    that a geom's bounding box may cover; pixels at edges have four, for smooth outlines. The second model's lights give
+    surfaces a color that encodes their normal. An object's shaded color is its own color times the irradiance for its
+    normal.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: int, size: tuple[int, int]):
         """
         Args:
-            model: The model; its geoms in the obstacles' group and in the robot's visual group are drawn.
+            model: Its geoms in the obstacles' group and in the robot's visual group are drawn.
             camera: Index of the camera in the model.
             size: Width, height of the picture [px].
         """
@@ -105,17 +105,14 @@ class ObjectRenderer:
         self._subpixel_rays = np.stack([self._rays(pixels + offset) for offset in _SUBPIXELS], 1)
 
     def visible_mask(self, data: mujoco.MjData, pose: Array) -> NDArray[np.bool_] | None:
-        """Mask (height, width) of the pixels that geoms may cover in the view from an OpenCV pose.
-
-        None if no geom is in view.
-        """
+        """Mask (height, width) of pixels that geoms may cover, seen from an OpenCV pose; None if no geom is in view."""
         if len(self.geoms) == 0:
             return None
         turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         middles = data.geom_xpos[self.geoms] - pose[:3, 3] + np.einsum("nij,nj->ni", turns, self._centers)
         planes = self._planes @ pose[:3, :3].T
-        # A box reaches this far into a half space: its center's position along the normal, plus the projection of its
-        # half sides onto the normal.
+        # Largest signed distance of a box's points from a plane: that of its center, plus its half sides projected onto
+        # the plane's normal.
         reach = middles @ planes.T + np.einsum("npj,nj->np", np.abs(planes @ turns), self._halves)
         reach[:, -1] -= _NEAR_PLANE
         seen = np.flatnonzero((reach > 0.0).all(1))
@@ -185,11 +182,7 @@ class ObjectRenderer:
         return mujoco_rays(unproject(pixels, self._intrinsics))
 
     def _cast(self, rays: Array32) -> tuple[NDArray[np.int32], Array32, Array32]:
-        """Casts rays (n, 3).
-
-        Returns, for each ray, the drawn geom that it hits (−1: none), the unit normal there, and the z-depth [m] (0 if
-        it hits none).
-        """
+        """Casts rays (n, 3); returns the drawn geom that each hits (−1: none), the unit normal and the z-depth [m]."""
         count, most = len(rays), self._caster.max_rays
         if count > most:  # more rays than fit into one cast
             parts = [self._cast(rays[k : k + most]) for k in range(0, count, most)]
@@ -204,10 +197,7 @@ class ObjectRenderer:
     def _shader(
         self, data: mujoco.MjData, irradiance: Irradiance | None
     ) -> Callable[[NDArray[np.int32], Array32], Array32]:
-        """Returns a function that converts drawn geoms (n,) and normals (n, 3) to colors (n, 3).
-
-        The color is 0 where the geom is −1.
-        """
+        """Returns a function that converts drawn geoms (n,) and normals (n, 3) to colors (n, 3), 0 for geom −1."""
         ground = irradiance.ground(data.xpos[self._bodies, :2]) if irradiance else None
 
         def shade(geom: NDArray[np.int32], normals: Array32) -> Array32:
@@ -269,9 +259,9 @@ def _copy_mesh(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: int) -> None:
 
 
 def _mesh_frames(small: mujoco.MjModel) -> tuple[Array, Array]:
-    """Positions (n, 3) and rotations (n, 3, 3) of the geoms' frames relative to the frames of the uncompiled meshes.
+    """Positions (n, 3) and rotations (n, 3, 3) of geoms in the frames of their meshes before compilation.
 
-    The frames differ because MuJoCo moves a mesh to its inertial frame.
+    The frames differ because the compiler moves a mesh to its inertial frame.
     """
     turns = np.empty((small.ngeom, 9))
     for i in range(small.ngeom):
@@ -295,7 +285,7 @@ def _edge_mask(ids: NDArray[np.int32]) -> NDArray[np.bool_]:
 Lighting = str | NDArray
 
 _WINDOW_STEP = 32  # [px] sides of foreground windows are multiples of this, so that few sizes occur
-_MAX_WINDOWS = 16  # number of window sizes whose render targets are kept; pictures of 160×90 px have at most 15
+_MAX_WINDOWS = 16  # number of window sizes whose render targets are kept; pictures of 160×90 px need at most 15
 
 
 class Compositor:
@@ -312,7 +302,7 @@ class Compositor:
     ):
         """
         Args:
-            model: A model that has the camera, compiled after `add_obstacles` was called (even without obstacles).
+            model: A model with this camera, to whose spec `add_obstacles` added obstacles, or at least the route.
             field: Radiance field of the place.
             size: Width, height of the pictures [px].
             max_envs: Largest number of envs per call.
@@ -325,8 +315,8 @@ class Compositor:
         # Warp's default device is global to the process, and worker threads change it.
         wp.set_device("cpu")
         count = min(max_envs, available_cores()) if field.device == "cpu" else 1
-        # On a GPU there is one worker, since all threads would share one CUDA stream. Workers are created here and not
-        # in the threads, since Warp compiles kernels at their first use.
+        # On a GPU there is one worker, since all threads would share one CUDA stream. Workers are created one after the
+        # other: each may compile Warp kernels, and compiling in two threads at once corrupts them.
         self._workers = [_CompositorWorker(model, field, self._camera, size) for _ in range(count)]
         self._pool = ThreadPoolExecutor(count) if count > 1 else None
         self._shadows = ContactShadows(model, self._workers[0].renderer.geoms)
@@ -415,7 +405,7 @@ class _CompositorWorker:
         across, down = (-(-n // _WINDOW_STEP) * _WINDOW_STEP for n in (width, height))
         stop = np.zeros((1, down, across), np.float32)
         stop[0, :height, :width] = drawn.depth
-        # There is one copy of the field per window size, since a field keeps render targets of few sizes.
+        # A field keeps render targets for few sizes, so each window size has its own copy of the field.
         if (across, down) not in self._fields:
             self._fields[across, down] = self._field.single_threaded()
             if len(self._fields) > _MAX_WINDOWS:
@@ -434,7 +424,7 @@ def composite(out: Rendering, inner: tuple, drawn: RenderedObjects, front: Rende
         out: Rendering of the field alone.
         inner: Index that selects the window in the arrays of `out`.
         drawn: Objects in the window.
-        front: The field up to `drawn.depth`, arrays (height, width); its colors are not premultiplied.
+        front: The field up to `drawn.depth`, arrays (height, width); its colors are not multiplied by its opacity.
     """
     cover = drawn.coverage[..., None]
     held = front.opacity[..., None]

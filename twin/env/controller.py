@@ -2,10 +2,10 @@
 
 A *command* is forward speed v [m/s] and yaw rate ω [rad/s]. A command arrives `command_latency` after it was given.
 The controller runs periodically, by default at 10 Hz, and uses the newest command that has arrived. If this command is
-older than the time-out, by default 0.25 s, the controller stops the robot (see `twin.robot.CONTROLLERS`). It limits v
-and ω, and then their changes per period. It converts them to the speeds of the two sides, and scales both speeds down
-if one exceeds `max_wheel_speed`. This reproduces Clearpath's controller: ROS's diff_drive_controller with its speed
-limiter, followed by the limit of husky_hardware.
+older than the time-out, by default 0.25 s, the controller stops the robot (see `twin.robot.CONTROLLERS`). The
+controller limits v and ω, and then their changes per period. It converts them to the speeds of the left and right
+wheels, and scales both down if one exceeds `max_wheel_speed`. This reproduces Clearpath's controller: ROS's
+diff_drive_controller with its speed limiter, followed by the limit of husky_hardware.
 """
 
 from collections import deque
@@ -22,7 +22,7 @@ Int32Array = NDArray[np.int32]
 CONTROL_PERIOD = 0.1
 """Usual time between two commands [s]."""
 COMMAND_TIMEOUT = min(timing.timeout for timing in CONTROLLERS.values())
-"""Longest time between two commands [s]: the shortest time-out of all controllers."""
+"""Longest allowed time between two commands [s]: the shortest time-out of all controllers."""
 
 _TIME_TOLERANCE = 1e-9  # [s] times that differ by less count as equal
 
@@ -43,7 +43,7 @@ def limit_change(wanted: Array, previous: Array, step: Array) -> Array:
 
 
 def limit_sides(sides: Array, limit: float) -> Array:
-    """Returns the speeds of both sides, shape (..., 2), both scaled down by one factor if one exceeds the limit."""
+    """Returns the speeds of both sides, shape (..., 2), scaled down by a common factor if one exceeds the limit."""
     return sides / np.maximum(1.0, np.abs(sides).max(-1, keepdims=True) / limit)
 
 
@@ -69,10 +69,7 @@ class Controller:
 
     @property
     def phase(self) -> float:
-        """Time of the first update [s]; the others follow periodically.
-
-        It is chosen so that a command given at time 0 arrives at an update.
-        """
+        """Time of the first update [s], chosen so that a command given at time 0 arrives at an update."""
         period = self.params.timing.period
         phase = self.params.command_latency % period
         return 0.0 if phase > period - _TIME_TOLERANCE else phase
@@ -145,12 +142,11 @@ class VectorController:
     def begin(self, which: NDArray[np.int64], latency: Array, steps_to_update: NDArray[np.int64]) -> None:
         """Resets k robots to rest, without pending commands.
 
-        `latency` is their `command_latency` [s]; `steps_to_update` is the number of substeps until their first update.
-        Both have shape (k,).
+        `latency` (k,) is their `command_latency` [s], `steps_to_update` (k,) the substeps until their first update.
         """
         self._latency[which], self._steps_to_update[which], self.time[which] = latency, steps_to_update, 0.0
         missing = int(np.ceil(self._latency.max() / self._period)) + 2 - len(self._commands)
-        if missing > 0:  # the buffers grow to the largest possible number of pending commands
+        if missing > 0:  # make room for all commands that may be pending
             n = len(self._latency)
             self._arrivals = np.concatenate([np.full((missing, n), -np.inf), self._arrivals])
             self._commands = np.concatenate([np.zeros((missing, n, 2)), self._commands])
@@ -167,7 +163,7 @@ class VectorController:
             ring[-1, which] = new
         n = len(self.time)
         speeds, times = np.zeros((self.max_segments, n, 2)), np.full((self.max_segments, n), np.inf)
-        checks = np.zeros((self._steps + 1, n), np.int32)  # shifted by one, so its cumulative sum numbers segments
+        checks = np.zeros((self._steps + 1, n), np.int32)  # row k + 1: substep k; its cumulative sum is the segment
         left = np.zeros(n, int)
         left[which] = self._steps
         robots = np.arange(n)

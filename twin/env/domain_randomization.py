@@ -27,23 +27,24 @@ PAYLOAD = "payload"
 """Name of a body on the top plate; its mass is zero until an episode sets a payload."""
 
 VERSION = 4
-"""Version of a sample's effects. Raise it if the same sample gives different fog, relighting, shadows, distractors."""
+"""Version of a sample's effects. Raise it if the same sample gives other fog, relighting, shadows or distractors."""
 
 KNOWN_WEATHER_FRACTION = 0.6
 """When a photo of the day is available, the strengths of sun and shadows are multiplied by this fraction.
 
-It was measured by `benchmarks/day.py`, which compares the steering of policies on two sets of pictures: those of the
-twin with a photo's appearance and fog, and those of the day of the photo. The policies are the twelve finished ones
-whose success on the known-truth world is forecast. The days are ten days of that world: the five stated weathers and
-days 1 to 5, but not days 6 to 15. So a forecast for these policies and days is not independent of this value.
+It was tuned with `benchmarks/day.py` in the simulated world of `twin.reality`, where true pictures of each day are
+available. The benchmark renders the twin with a photo's appearance and fog. It compares two changes of a policy's
+steering: (a) from these renderings to the true pictures of the day; (b) from these renderings to ones with sampled sun
+and shadows. The ratio of (a) to (b), with 90 % intervals over policies and days, is 0.8 (0.6 to 0.96) for the full
+randomization. With this fraction it is 1.1 (0.8 to 1.4) for the part of the change that is constant over a day, and 1.2
+(1.0 to 1.4) for the part that varies along the route.
 
-The difference in steering is 0.8 (0.6 to 0.96) times the change that the full randomization causes. The randomization
-with this fraction causes a smaller change. Compared with that one, the part of the difference that is constant over a
-day is 1.1 (0.8 to 1.4) times as large, and the part that varies along the route 1.2 (1.0 to 1.4) times."""
+The policies are the twelve finished ones of Table 1 in docs/benchmarks.md; the days are ten of its twenty days: the
+five stated weathers and days 1 to 5. So a forecast for these policies and days is not independent of this value."""
 
 _PAYLOAD_SIDE = 0.3  # [m] the payload has the inertia of a cube with this side
 _TIRE_SUFFIX = "_tyre"
-_PER_AXIS = ("camera_shift", "camera_turn")  # sampled separately for each axis; a held axis may have its own value
+_PER_AXIS = ("camera_shift", "camera_turn")  # sampled for each axis; bounds may differ between axes
 _MAX_BOUND = 1e6
 _ABOVE_ZERO = float(np.nextafter(0.0, 1.0))
 _BOUNDS = {
@@ -62,9 +63,8 @@ _RANGES_BY_PARAMETER = {
     "camera_height": ("camera_shift",),
     "camera_yaw": ("camera_turn",),
 }
-"""Measured parameter of `HuskyParams` → ranges that are then held fixed. If the camera's yaw was measured, so were its
-pitch and roll, since the same film determines them. If its height was measured, its whole offset counts as exact.
-"""
+"""Parameter of `HuskyParams` → ranges that are held fixed if it was measured. A film that gives the camera's yaw gives
+its pitch and roll, too, so a measured yaw holds all three. A measured height holds the camera's whole position."""
 _MODEL_FIELDS = ("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "bvh_aabb", "cam_pos", "cam_quat")
 
 
@@ -85,7 +85,7 @@ class Ranges:
     wheel_radius: Range = (0.98, 1.02)
     """Factor by which the robot's own wheel radius is multiplied; the controller always uses the nominal radius."""
     wheel_difference: Range = (-0.006, 0.006)
-    """Difference of the right and left wheel radius, relative to their mean; a robot that ignores its images drifts."""
+    """Right minus left wheel radius, relative to their mean; it makes a robot that ignores its images drift."""
     extinction: Range = (0.0, 0.05)
     """Extinction of the fog [1/m], added to the film's; 0.05 is a visibility of 60 m."""
     airlight: Range = (0.85, 1.15)
@@ -97,8 +97,8 @@ class Ranges:
     bystanders: Range = (0, 4)
     """Number of distractor objects beside the corridor: cones, boxes, bollards in any color."""
     hold_known: bool = False
-    """True: measured parameters of the robot are held fixed (see `for_robot`), and under lightings that were fitted to
-    a photo, the weather is weaker (see `RandomizationSample.for_known_weather`)."""
+    """True: measured parameters of the robot are held fixed (see `for_robot`). Under lightings fitted to a photo, the
+    weather is weaker (see `RandomizationSample.for_known_weather`)."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a value is not a range, or lies outside the allowed bounds."""
@@ -125,7 +125,7 @@ class Ranges:
         """These ranges for a scene's robot. With `hold_known`, measured parameters are held at the robot's values.
 
         A parameter counts as measured if `robot.toml` or `[robot]` gives a value other than the published one. Real
-        trials use one robot; a success rate over many sampled robots would measure robustness, not its success.
+        trials use one robot: a success rate over many sampled robots would measure robustness, not that one's success.
         """
         if not self.hold_known:
             return self
@@ -165,7 +165,7 @@ class RandomizationSample:
     bystanders: int = 0
 
     def for_known_weather(self) -> "RandomizationSample":
-        """This sample without fog and with weaker sun and shadows, for days whose appearance and fog a photo shows."""
+        """This sample without fog and with weaker sun and shadows, for a day whose fog and light a photo shows."""
         sun, shade = KNOWN_WEATHER_FRACTION * self.sunlight, KNOWN_WEATHER_FRACTION * self.shade
         return replace(self, extinction=0.0, airlight=1.0, sunlight=sun, shade=shade)
 
@@ -176,8 +176,8 @@ class RandomizationSample:
 
 EVALUATION_RANGES = Ranges(sunlight=(0.35, 0.7), shade=(0.35, 0.75), hold_known=True)
 """Ranges for evaluating policies. Measured parameters of the scene's robot are held fixed, and sun and shadows always
-differ from those in the film. Training also has episodes with little sun and shadow, to ease learning; in a forecast,
-such mild days would overestimate the success on the road."""
+differ from those in the film. Training also has episodes with little sun and shadow, which ease learning, but would
+make a forecast overestimate the success on the road."""
 
 
 def measured_parameters(robot: HuskyParams) -> list[str]:
@@ -192,7 +192,7 @@ def condition_options(condition: Condition) -> dict[str, Any]:
 
 
 class NominalModel:
-    """The model's fields without randomization; `apply` writes the fields of a sample to a copy of the model."""
+    """The model's fields without randomization; `apply` writes a sample's randomized fields to a copy of the model."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         """`model` is the compiled `episode_spec`."""

@@ -1,9 +1,9 @@
 """Drivers: they convert poses or images to commands or actions.
 
 `PurePursuit` (Coulter 1992) needs only poses: it steers along a circle through a point of the route ahead.
-`follow_route` records such a drive, without images and without dm_control. A skid-steered robot turns faster or slower
-than commanded, by a factor that depends on ground and load. So the yaw rate is multiplied by a gain, which is updated
-from the measured ratio of commanded to achieved curvature.
+`follow_route` records a drive by `PurePursuit`, without images and without dm_control. A skid-steered robot turns
+faster or slower than commanded, by a factor that depends on ground and load. So `PurePursuit` multiplies the yaw rate
+by a gain, which it updates from the measured ratio of commanded to achieved curvature.
 
 The *drivers of an environment* receive the environment and its newest `dm_env.TimeStep`, and return an action within
 `action_spec`. Drivers that use poses serve as references; a policy uses images only.
@@ -27,7 +27,7 @@ from twin.errors import InputError, short_repr
 from twin.mjcf.world import World, arc_lengths, heading_error, nearest_on_route, point_at
 from twin.types import Array
 
-if TYPE_CHECKING:  # without dm_control, route followers still work
+if TYPE_CHECKING:  # not imported at run time: `follow_route` works without dm_control
     import dm_env
     from dm_control.rl import control
 
@@ -35,11 +35,11 @@ if TYPE_CHECKING:  # without dm_control, route followers still work
 
 GOAL_RADIUS = 1.0  # [m]
 
-_LOOKAHEAD = 1.0  # [m] distance along the route of the point to steer to
+_LOOKAHEAD = 1.0  # [m] distance along the route to the point that the robot steers to
 _GAIN_RATE = 0.15  # fraction of the gain's error that is corrected per control step
 _GAIN_RANGE = (0.5, 2.5)
-_GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; at smaller yaw rates the measured ratio is noise
-_SEARCH_WINDOW = (1.0, 3.0)  # [m] of route behind and ahead of the last foot point
+_GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; at smaller yaw rates, the measured ratio is mostly noise
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] the foot is searched this far behind and ahead of the last one
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,10 @@ def pursuit_curvature(pose: Array, target: Array) -> float:
 
 
 class PurePursuit:
-    """Converts a sequence of poses to commands that follow the route."""
+    """Converts a sequence of poses to commands that follow the route.
+
+    The *foot* is the point of the route that is nearest to the robot.
+    """
 
     def __init__(self, route: Array, speed: float, max_yaw_rate: float, start: float = 0.0) -> None:
         """
@@ -106,7 +109,7 @@ class PurePursuit:
         self._last: tuple[Array, tuple[float, float]] | None = None
 
     def update(self, pose: Array) -> tuple[float, float]:
-        """Updates `s` from a pose (x, y, yaw); returns the foot point's arc length, and the cross-track error [m]."""
+        """Updates `s` from a pose (x, y, yaw); returns the foot's arc length and the cross-track error [m]."""
         foot, error = nearest_on_route(self._route, pose[:2], (self.s - _SEARCH_WINDOW[0], self.s + _SEARCH_WINDOW[1]))
         self.s = max(self.s, float(foot))
         return float(foot), float(error)
@@ -187,7 +190,7 @@ def _pursuit_target(route: Array, s: float, length: float) -> Array:
 
 
 def _updated_gain(gain: float, previous: Array, pose: Array, command: tuple[float, float]) -> float:
-    """Moves the gain towards the ratio of commanded to achieved curvature. With skid steering, this ratio is not 1."""
+    """Moves the gain towards the ratio of commanded to achieved curvature in the last control step."""
     turned = float(heading_error(pose[2], previous[2])) / CONTROL_PERIOD
     moved = float(np.linalg.norm(pose[:2] - previous[:2])) / CONTROL_PERIOD
     v, yaw_rate = command

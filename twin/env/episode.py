@@ -39,10 +39,9 @@ class Episode:
     progress: Array
     """Distance along the route segment [m], shape (k,)."""
     trust: Array
-    """Estimated reliability of the image at each instant (see `twin.env.trust`), in [0, 1]; nan without images.
-    Shape (k,)."""
+    """Trust of the image at each instant (see `twin.env.trust`), in [0, 1], shape (k,); nan without images."""
     cause: str
-    """One of `CAUSES`; empty if the episode was cut off."""
+    """Cause of the end, one of `CAUSES`; empty if the episode was cut off."""
     touched: tuple[str, ...]
     """Names of the geoms touched in the last step."""
     task: str

@@ -1,4 +1,4 @@
-"""Lighting of an episode: sampling of appearance embeddings. The option `lighting` is one of
+"""Lighting of an episode: an appearance embedding, which may be sampled. The option `lighting` is one of
 
     "sun"                a lighting by its name, or that of a frame (`sun/000012`)
     "sun:night:0.3"      a mixture: 30 % of the way from sun to night
@@ -8,7 +8,7 @@
     "held-out"           sampled from the held-out set
 
 With drift, the lighting of an episode changes gradually into a second lighting, which is sampled in the same way. If
-the option names a single lighting, the second is another filmed lighting.
+the option names a single lighting, the second one is another filmed lighting.
 """
 
 from collections.abc import Sequence
@@ -31,8 +31,7 @@ VERSION = 2
 _SEED = 20_240_315  # random seed of the anchors; constant, so that all runs with a build have the same sets
 _POOL_SIZE = 200  # random lightings among which anchors are chosen
 _EXTRA_ANCHORS = 8  # number of anchors besides the filmed lightings
-# A lighting belongs to a set if the other set's nearest anchor is more than this many times as far as the set's own.
-_MARGIN = 1.25
+_MARGIN = 1.25  # a lighting belongs to a set if the other set's nearest anchor is this many times farther than its own
 _MAX_TRIES = 60  # proposals per sample; about one in ten is near the chosen anchor
 
 
@@ -41,7 +40,7 @@ class EpisodeLighting:
     """Lighting of one episode: an appearance embedding with its fog, or a drift between two."""
 
     name: str
-    """The requested name, or a text that says how the lighting was sampled."""
+    """Name of the lighting or of its set; `<name> → <name>` with drift; the option `observe` without a field."""
     start: Array32
     """Embedding at the beginning, shape (dim,)."""
     end: Array32 | None = None
@@ -85,10 +84,10 @@ class LightingSets:
 
     The distance of two lightings is the rms difference of the probes' colors (see `nerf/appearance_prior.py`). The
     first anchors are the filmed lightings; they belong to the training set. Further anchors are chosen one by one from
-    random lightings of a fixed seed: each is as far as possible from all anchors before it. The first, third, fifth and
-    so on of these further anchors are held out. A lighting belongs to the set of its nearest anchor, or to no set if an
-    anchor of the other set is nearly as near. All anchors of a set are sampled equally often, since night would be rare
-    otherwise.
+    random lightings of a fixed seed: each is as far as possible from all anchors before it. Every second one of these,
+    from the first on, belongs to the held-out set. A lighting belongs to the set of its nearest anchor, or to no set if
+    an anchor of the other set is nearly as near. All anchors of a set are sampled equally often; otherwise night would
+    be rare.
     """
 
     def __init__(self, field: BakedField) -> None:
@@ -114,7 +113,7 @@ class LightingSets:
         return Anchors(np.stack(chosen), np.stack(chosen_colors), (extra >= 0) & (extra % 2 == 0))
 
     def sample(self, which: str, rng: np.random.Generator) -> Array32:
-        """A random lighting of a set, shape (dim,). It is near one of the set's anchors, which are equally likely.
+        """A random lighting of a set, shape (dim,): near one of the set's anchors, all of which are equally likely.
 
         Raises:
             InputError: no lighting of the set is found.
@@ -128,15 +127,12 @@ class LightingSets:
             if self.set_and_anchor(embedding) == (which, anchor) and not prior.violations(embedding):
                 return embedding
         raise InputError(
-            f"lighting {which!r}: none among those sampled; this place was filmed in too few lightings: film another, "
-            "or name the lightings to drive in"
+            f"lighting {which!r}: no sampled lighting belongs to this set, since the place was filmed in too few "
+            "lightings; film it in another, or name the lightings to drive in"
         )
 
     def set_and_anchor(self, embedding: Array32) -> tuple[str | None, int]:
-        """The set to which a lighting (dim,) belongs, and the index of its nearest anchor.
-
-        The set is `TRAINING`, `HELD_OUT` or, if it belongs to neither, None.
-        """
+        """The set of a lighting (dim,), `TRAINING`, `HELD_OUT` or None (neither), and its nearest anchor's index."""
         distance = _distance(self.anchors.probe_colors, self._probe_colors(embedding))
         held_out, nearest = self.anchors.held_out, int(distance.argmin())
         to_training, to_held_out = float(distance[~held_out].min()), float(distance[held_out].min())

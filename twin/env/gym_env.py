@@ -3,8 +3,8 @@
     gymnasium.make("twin:twin/Drive-v0", scene="scenes/demo", task="right_turn", lighting="night")
     gymnasium.make_vec("twin:twin/Drive-v0", 8, vectorization_mode="vector_entry_point", scene="scenes/demo")
 
-The prefix `twin:` makes Gymnasium import `twin`, which registers the environment. New processes, such as those of
-stable-baselines3's SubprocVecEnv, need it.
+The prefix `twin:` makes Gymnasium import `twin`, which registers the environment. Use the prefix in new processes, such
+as those of stable-baselines3's SubprocVecEnv.
 
 Actions in [-1, 1] span the action range of the dm_control environment. Observations are images: uint8, shape
 (3 · stack, height, width), the newest three channels last. With `pixels=False`, they are the privileged state of
@@ -13,8 +13,8 @@ a dict of images (`pixels`) and numbers (`state`).
 
 `info` contains `cause` (why the episode ended; empty before its end), `is_success`, `progress` [m], `start` [m] (offset
 of the start along the route segment), `cross_track` [m], `lighting`, `trust`, `randomisation`, `episode_seed`, `speed`
-[m/s] and `touched`. `lighting` is the name of the episode's lighting. If the lighting was sampled, this is the name of
-the set, followed by the nearest mixture of filmed lightings: `training: sun 0.62, night 0.38`.
+[m/s] and `touched`. `lighting` is the name of the episode's lighting. A sampled one has the name of its set and the
+nearest mixture of filmed lightings: `training: sun 0.62, night 0.38`.
 """
 
 from collections.abc import Sequence
@@ -73,7 +73,7 @@ def of_one(observations: NDArray | dict[str, NDArray], i: int) -> NDArray | dict
 
 
 def _info(envs: LocalVectorEnv | ProcessVectorEnv, i: int) -> dict[str, Any]:
-    """Info of environment i. If its lighting was sampled, `lighting` is the sampled one, not its name in tables."""
+    """Info of environment i; its `lighting` is the `sampled_lighting` of `LocalVectorEnv.info`, if there are images."""
     info = envs.info(i)
     return info | {"lighting": info.pop("sampled_lighting")} if "sampled_lighting" in info else info
 
@@ -85,7 +85,7 @@ def _check_render_mode(render_mode: str | None) -> str | None:
 
 
 def _check_view(size: Any, view: str, pixels: bool) -> tuple[int, int] | None:
-    """Returns the size of rendered pictures; None if the observation's own images are shown."""
+    """Returns the size of rendered pictures; None if `render` returns the observation's own images."""
     if view not in (ROBOT, CHASE):
         raise InputError(f"render_view = {short_repr(view)}; expected {ROBOT!r} or {CHASE!r}")
     if size is None:
@@ -118,8 +118,8 @@ class DriveEnv(gymnasium.Env):
             scene: See `twin.load`.
             task: See `twin.load`.
             render_mode: None or rgb_array.
-            render_size: Width and height of the pictures of `render` [px]; None: the size of the observation's images
-                or, for the chase view, 640 × 360.
+            render_size: Width and height of the pictures of `render` [px]; None: the size of the observed images, or
+                640 × 360 for the chase view.
             render_view: `robot` shows the view of the robot's camera. `chase` shows MuJoCo's picture of the scene from
                 behind the robot, with collision parts, as in the videos of `twin film`.
             options: See `twin.env.options.Options`.
@@ -193,7 +193,7 @@ class DriveEnv(gymnasium.Env):
 
 
 class DriveVectorEnv(VectorEnv):
-    """n environments. At its end, an episode's environment is reset in the same step; `final_obs` and `final_info` have
+    """n environments. The step that ends an episode also resets its environment; `final_obs` and `final_info` contain
     the last observation and info of the ended episode."""
 
     metadata = {**DriveEnv.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012

@@ -5,12 +5,13 @@ have in a film under a lighting. An object's color in the picture is its own col
 of a horizontal surface is called *ground irradiance*. It is estimated as the color of the reconstructed ground nearby,
 divided by an assumed albedo.
 
-The irradiance of other normals is fitted to *probes*, which are surface points of the field. The color of an upright
-probe is divided by the same probe's color under the mean of the filmed lightings, which cancels its albedo. That mean
-is assumed to be the light of a uniform sky over dim ground. The light from each direction of `SIDE_DIRECTIONS` has two
-parts: one is proportional to the ground irradiance, as with a lamp or the sun; the other is constant, as with the sky.
+The irradiance for other normals is fitted to *upright probes*: points of the field on surfaces that rise above the
+ground. A probe's color is divided by its mean color over the field's lightings, which cancels its albedo. The mean
+lighting is assumed to be a uniform sky over dim ground. The light from each direction of `SIDE_DIRECTIONS` has two
+parts: one is proportional to the local ground irradiance, like that of the sun or a lamp; the other is the same
+everywhere, like that of the sky.
 
-The composited features of the probes are stored, so that any embedding gives their colors in a millisecond.
+The estimator stores the probes' composited features; from them, any embedding gives their colors in a millisecond.
 """
 
 import threading
@@ -32,27 +33,27 @@ from twin.nerf.kernels.color_head import harmonics_of
 from twin.types import Array
 
 GROUND_ALBEDO = 0.37
-"""Assumed reflectance of the ground along the route, in film colors: worn asphalt reflects about 11 %, which the tone
-curve of a film (exponent 1 / 2.2) shows as 0.37. With 0.38 (12 %), obstacles at night missed the threshold of
+"""Assumed color of the ground along the route under irradiance 1: worn asphalt reflects about 11 % of the light, which
+the tone curve of a film (exponent 1 / 2.2) shows as 0.37. With 0.38 (12 %), obstacles at night missed the threshold of
 `benchmarks/overlay.py` (6 dB better than unshaded). So that benchmark is no independent test of this value."""
 
 SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-"""Horizontal directions; the light is split into parts from each of them, shape (4, 3)."""
+"""Horizontal directions from which the estimated light comes, shape (4, 3)."""
 
 _CAMERA_HEIGHT, _CAMERA_PITCH = 1.0, 8.0  # [m], [°] height and downward pitch of the views from which probes are taken
 _CAMERA_STEP = 2.0  # [m] distance along the route between two views
 _VIEW_SIZE, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
 _MAX_GROUND_DEPTH, _MAX_DEPTH = 7.0, 12.0  # [m] largest z-depth of ground probes and of all probes
-_GROUND_TOLERANCE = 0.12  # [m] ground probes are at most this far above or below the route, plus 5 % of their distance
+_GROUND_TOLERANCE = 0.12  # [m] largest height of ground probes above or below the route, plus 5 % of the distance to it
 _MIN_UPRIGHT_HEIGHT = 0.3  # [m] only probes at more than this height above the ground count as upright
 _MAX_GROUND_PROBES, _MAX_UPRIGHT_PROBES = 3000, 1500
 _KERNEL_STD = 1.5  # [m] standard deviation of the Gaussian weights of ground probes around a position
-_BOUNCE = 0.25  # radiosity of the ground over that of the sky, in the mean of the filmed lightings
-_UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky; facing up it is 1
+_BOUNCE = 0.25  # ratio of the ground's radiosity to the sky's, in the mean of the field's lightings
+_UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky; that of the ground is 1
 _MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # limits of the sun's share of light and of its elevation's cotangent
 _MIN_COLOR = 0.02  # a probe whose mean color is darker is not used
-_MAX_BRIGHTNESS = 1.5  # probes above this multiple of the brightest ground irradiance emit light and are not used
-_NEIGHBORS = 8  # number of ground probes that give the ground irradiance at an upright one
+_MAX_BRIGHTNESS = 1.5  # probes above this multiple of the highest ground irradiance count as lamps and are not used
+_NEIGHBORS = 8  # number of ground probes that give the ground irradiance at an upright probe
 _MIN_PROBES = 50  # fewer ground probes are an error; with fewer upright probes, a uniform sky is assumed
 _LIGHTINGS_CACHED, _POSITIONS_CACHED = 64, 1000
 
@@ -66,11 +67,11 @@ class Irradiance:
     up: Array
     """Ground irradiance at these positions, shape (k, 3)."""
     constant: Array
-    """Constant part of light, shape (5, 3). Row 0: on normals that do not face up; others: from `SIDE_DIRECTIONS`."""
+    """Constant light on surfaces that do not face up, shape (5, 3): undirected, then from each of `SIDE_DIRECTIONS`."""
     proportional: Array
-    """Ratio of the proportional part of light to the ground irradiance, shape (5, 3); rows as in `constant`."""
+    """Ratio of the proportional light to the ground irradiance, shape (5, 3); rows as in `constant`."""
     _cache: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
-    """Cached ground irradiance at recent positions, since most objects stand still."""
+    """Ground irradiance by position: most objects stand still, so positions recur."""
 
     def ground(self, xy: Array) -> Array:
         """Ground irradiance at positions (n, 2) [m], shape (n, 3)."""
@@ -97,10 +98,10 @@ class Irradiance:
     def sun(self, xy: Array) -> tuple[float, Array]:
         """The sun's share of the light at a position (2,), and the direction to the sun, shape (3,).
 
-        The irradiance of an upright surface, averaged over all azimuths, has two parts. The sky contributes
-        `_UPRIGHT_SKY` times the sky's ground irradiance. A sun at elevation e contributes cot e / π times the sun's
-        ground irradiance. Only the sun lights one side more than the opposite side: by cot e times the sun's ground
-        irradiance. So the light on upright surfaces gives both the sun's share and e.
+        Sky and sun both contribute to the ground irradiance and to the irradiance of upright surfaces. Averaged over
+        all azimuths, an upright surface gets `_UPRIGHT_SKY` times the sky's contribution to the ground, and cot e / π
+        times that of a sun at elevation e. Only the sun lights one side more than the opposite side: by cot e times its
+        contribution to the ground. So the light on upright surfaces gives both the sun's share and e.
         """
         ground = self.ground(np.asarray(xy)[None])[0]
         parts = (self.constant + self.proportional * ground).mean(1) / max(float(ground.mean()), 1e-6)
@@ -114,7 +115,7 @@ class Irradiance:
 
 
 def _basis(normals: Array) -> Array:
-    """Values, shape (n, 5), by which the light's parts are weighted for normals (n, 3).
+    """Weights, shape (n, 5), of the rows of `Irradiance.constant` for normals (n, 3).
 
     The first is one minus the normal's upward part; the others are its clipped cosines to `SIDE_DIRECTIONS`.
     """
@@ -177,7 +178,7 @@ class IrradianceEstimator:
         colors = self._upright.probes.picture(embedding).astype(np.float64)
         seen = colors / np.maximum(self._mean, _MIN_COLOR) * self._reference
         sides = seen - np.maximum(self._upright.normals[:, 2:], 0.0) * ground
-        if len(self._rows) < _MIN_PROBES:  # too few upright surfaces: a uniform sky
+        if len(self._rows) < _MIN_PROBES:  # assume a uniform sky
             return Irradiance(
                 self._xy, up, np.zeros((5, 3)), np.array([_UPRIGHT_SKY, 0.0, 0.0, 0.0, 0.0])[:, None] * np.ones(3)
             )
@@ -185,7 +186,7 @@ class IrradianceEstimator:
         for c in range(3):
             usable = (self._mean[:, c] > _MIN_COLOR) & (seen[:, c] < _MAX_BRIGHTNESS * up[:, c].max())
             rows = np.concatenate([self._rows, self._rows * ground[:, c : c + 1]], 1)[usable]
-            # The many rows are replaced by the Cholesky factor of the normal equations, which has the same minimum.
+            # The Cholesky factor of the normal equations replaces the many rows; the minimum stays the same.
             square = np.linalg.cholesky(rows.T @ rows + 1e-6 * len(rows) * np.eye(10))
             found[:, c], _ = nnls(square.T, np.linalg.solve(square, rows.T @ sides[usable, c]))
         return Irradiance(self._xy, up, found[:5], found[5:])
@@ -284,10 +285,7 @@ def _nearest_indices(positions: Array, xy: Array) -> NDArray[np.int64]:
 
 
 def _uniform_sky_irradiance(normals: Array) -> Array:
-    """Irradiance of unit normals (n, 3) under a uniform sky over ground of radiosity `_BOUNCE`, shape (n,).
-
-    A surface that faces up has 1.
-    """
+    """Irradiance (n,) for unit normals (n, 3) under a uniform sky over ground of radiosity `_BOUNCE`; 1 facing up."""
     up = normals[:, 2]
     return 0.5 * (1.0 + up) + 0.5 * (1.0 - up) * _BOUNCE
 
@@ -302,7 +300,7 @@ _PENUMBRA = 0.03, 0.10
 size of the sun's disk and halo, and for the error of the estimated direction."""
 _FILL = 0.85  # fraction of a box's sides that an obstacle really fills
 _SKY_LOSS_BELOW = 0.75  # fraction of the sky's light lost straight below an obstacle, which does not fill its box
-_SKY_REACH = 1.2  # [m] an obstacle's side hides part of the sky from ground up to this distance
+_SKY_REACH = 1.2  # [m] ground within this distance of an obstacle loses part of the sky's light
 _MAX_SHADOW = 4.0  # [m] largest length of a shadow behind the foot
 _SHADOW_TOLERANCE = 0.15  # [m] surfaces at most this far above or below the foot count as ground
 _MAX_DISTANCE = 25.0  # [m] shadows further from the camera than this are not drawn
@@ -313,8 +311,8 @@ class ContactShadows:
 
     The light is assumed to come from a uniform sky and from one sun; `Irradiance.sun` estimates the sun's direction and
     share. Ground beside an obstacle loses the light of the part of the sky that the obstacle hides. Ground in the
-    obstacle's shadow also loses the sunlight; the shadow's penumbra widens with the distance. An obstacle is
-    approximated by two upright boxes: one around its lower geoms, one around its upper geoms.
+    obstacle's shadow also loses sunlight; the penumbra widens with the distance from the obstacle. Two upright boxes,
+    one around the lower geoms and one around the upper geoms, approximate an obstacle.
     """
 
     def __init__(self, model: mujoco.MjModel, geoms: NDArray[np.int64]):
@@ -381,13 +379,13 @@ def _light_loss(boxes: Array, points: Array, turn: Array, share: float, sun: Arr
     hidden = np.zeros(len(points))
     for low, high in boxes:
         center, half = 0.5 * (low + high)[:2], 0.5 * _FILL * (high - low)[:2]
-        # Loss of the sky's light: an endless wall hides half of it (weighted with the cosine), a box hides less.
+        # Loss of the sky's light: an endless wall hides half of it (weighted by the cosine), a box hides less.
         gap = np.linalg.norm(np.maximum(np.abs(local - center) - half, 0.0), axis=1)
         wide = np.arctan2(float(half.mean()), gap) / np.pi
         gap2 = gap**2 + 1e-6
         rise = high[2] ** 2 / (high[2] ** 2 + gap2) - low[2] ** 2 / (low[2] ** 2 + gap2)
         hidden = np.maximum(hidden, np.where(gap > 0.0, wide, _SKY_LOSS_BELOW) * rise)
-        # Loss of sunlight: it is lost where the box, projected onto the ground, casts its shadow.
+        # Loss of sunlight: within the box's shadow, its projection onto the ground along the sun's rays.
         middle = turn @ center
         axes = turn * half  # columns: half sides in the world
         across = float(np.abs(np.array([-azimuth[1], azimuth[0]]) @ axes).sum())
@@ -406,10 +404,7 @@ def _smooth_step(x: Array) -> Array:
 
 
 def _bounding_boxes(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.int64], body: int) -> Array:
-    """Two boxes in an obstacle's frame, around its lower and its upper geoms.
-
-    They are given by their lowest and highest corners, shape (2, 2, 3).
-    """
+    """Lowest and highest corners of boxes around an obstacle's lower and upper geoms, in its frame, shape (2, 2, 3)."""
     local = model.geom_aabb[geoms, None, :3] + BOX_CORNERS * model.geom_aabb[geoms, None, 3:]
     turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
     world = local @ turns.transpose(0, 2, 1) + data.geom_xpos[geoms, None]

@@ -1,8 +1,8 @@
 """Pictures of a MuJoCo scene by `mujoco_warp`'s ray caster on the CPU, without OpenGL.
 
-`SceneRenderer` renders the front camera's view with MuJoCo's own shading; radiance fields are compared with this
-standard pipeline. `SceneCamera` renders from free poses, and draws the convex collision parts half transparent over the
-visual geometry. The *chase camera* follows the robot from behind and above.
+`SceneRenderer` renders the front camera's view with MuJoCo's own shading, as a baseline for radiance fields.
+`SceneCamera` renders from free poses, and draws the convex collision parts half transparent over the visual geometry.
+The *chase camera* follows the robot from behind and above.
 """
 
 import copy
@@ -34,7 +34,7 @@ from twin.warp_runtime import wp
 FRONT_CAMERA = "front"
 """Name of the policy's camera in a model."""
 
-# Names of the arrays of poses on which a picture depends.
+# Arrays of `MjData` on which a picture depends.
 _POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")
 _SCENE_SETTINGS: dict[str, Any] = {  # collision parts are not drawn
     "enabled_geom_groups": [0, 1, 2, OBSTACLE_GROUP],
@@ -43,7 +43,7 @@ _SCENE_SETTINGS: dict[str, Any] = {  # collision parts are not drawn
     "enable_backface_culling": False,
 }
 _SPLAT_SETTINGS = _SCENE_SETTINGS | {"enabled_geom_groups": [GROUND_GROUP, 1, OBSTACLE_GROUP]}  # no visual mesh
-_GROUND_BELOW_SPLATS = 0.15  # [m] the ground is drawn this much lower, so that it shows only between splats
+_GROUND_BELOW_SPLATS = 0.15  # [m] the ground is lowered by this, so that it shows only through gaps between splats
 
 
 def camera_intrinsics(model: mujoco.MjModel, camera: int, size: tuple[int, int]) -> Array:
@@ -58,7 +58,7 @@ def camera_intrinsics(model: mujoco.MjModel, camera: int, size: tuple[int, int])
 
 
 def camera_poses(datas: Sequence[mujoco.MjData], camera: int, noise: Sequence[CameraNoise] | None) -> Array:
-    """Poses camera_to_world of a camera in n envs, shape (n, 4, 4); if `noise` is given, with its vibration."""
+    """Poses camera_to_world of a camera in n envs, shape (n, 4, 4); `noise`, if given, adds its vibration."""
     poses = np.stack([camera_pose(data, camera) for data in datas])
     if noise is None:
         return poses
@@ -102,10 +102,7 @@ class RayCaster:
         return rgb, self._context.depth_data.numpy()[0, :count].copy()
 
     def hit_geoms(self) -> NDArray[np.int32]:
-        """Indices of the geoms that the rays of the last cast hit, shape (k,); −1 where a ray hit none.
-
-        This needs `render_seg=True`.
-        """
+        """Indices of the geoms that the last cast's rays hit, shape (k,), −1 for none; needs `render_seg=True`."""
         return self._context.seg_data.numpy()[0, : self._context.total_rays, 0].copy()
 
 
@@ -141,7 +138,7 @@ class SceneRenderer:
         model.geom_group[camera_mount_geoms(model, self._camera)] = ROBOT_COLLISION_GROUP  # not drawn
         if splats is not None:
             model.geom_pos[model.geom("ground").id, 2] -= _GROUND_BELOW_SPLATS
-        # Workers are created one after the other, since Warp compiles kernels at their first use.
+        # Workers are created one after the other: each compiles Warp kernels, see `SceneCamera`.
         threads = min(max_envs, available_cores())
         settings = _SCENE_SETTINGS if splats is None else _SPLAT_SETTINGS | splats.render_settings()
         self._workers = [_SceneWorker(model, size, self._rays, settings) for _ in range(threads)]
@@ -199,10 +196,7 @@ class _SceneWorker:
         self.render(self._data, camera_pose(self._data, self._camera))  # compiles the kernels
 
     def render(self, data: mujoco.MjData, pose: Array) -> tuple[Array32, Array32]:
-        """Renders from an OpenCV pose; returns colors (height, width, 3) in [0, 1] and z-depth (height, width) [m].
-
-        The z-depth of the sky is 0.
-        """
+        """Renders from an OpenCV pose; returns colors (h, w, 3) in [0, 1] and z-depth (h, w) [m], 0 for the sky."""
         mine = self._data
         mine.qpos[:], mine.mocap_pos[:], mine.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
         mujoco.mj_kinematics(self._model, mine)
@@ -257,7 +251,7 @@ class SceneCamera:
             self._cast(caster)
 
     def render(self, qpos: Array, camera_to_world: Array, time: float = 0.0) -> Image:
-        """The scene at a time [s], with the robot at `qpos`, from an OpenCV camera pose; shape (h, w, 3)."""
+        """Picture of the scene at a time [s], with the robot at `qpos`, from an OpenCV camera pose; shape (h, w, 3)."""
         self.data.qpos[:] = qpos
         place(self.obstacles, self.data, time)
         mujoco.mj_kinematics(self.model, self.data)
@@ -284,8 +278,8 @@ class SceneCamera:
 def blend_parts(rgb: Image, depth: NDArray, part_rgb: Image, part_depth: NDArray, identity: NDArray) -> Image:
     """Draws the visible collision parts half transparent, with outlines, over a picture (h, w, 3).
 
-    z-depths [m] have the shape (h, w); `depth` is 0 where nothing is hit. `identity` is the id of the nearest part, −1
-    where there is none.
+    The z-depths `depth` and `part_depth` [m] have shape (h, w); `depth` is 0 where rays hit nothing. `identity` is the
+    id of the nearest part, −1 where there is none.
     """
     visible = (identity >= 0) & ((depth <= 0) | (part_depth <= depth + _OCCLUSION_TOLERANCE))
     edge = np.zeros_like(visible)

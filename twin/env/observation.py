@@ -1,4 +1,4 @@
-"""Pixel observations of n envs: one call renders the images of all envs; each env has a stack of its newest images.
+"""Pixel observations of n envs: one call renders all envs; each env has a stack of its newest frames.
 
 The newest frame of a stack is the last one. At the beginning of an episode, the first frame fills the whole stack.
 """
@@ -43,7 +43,7 @@ class PixelObserver:
         """
         Args:
             renderer: Renders the envs.
-            field: Contains the lightings; None: MuJoCo renders the mesh, or splats, under MuJoCo's lights.
+            field: Contains the lightings; None if MuJoCo renders the mesh, or splats, under MuJoCo's lights.
             trust: Computes the trust of images from the filmed frames.
             options: Options of the envs.
             envs: Physics and task of every env.
@@ -86,7 +86,7 @@ class PixelObserver:
         """Sets up the weather of env i's episode under its lighting."""
         o, task = self.options, self.envs[i][1]
         fog = self.lightings[i].fog_at(0.0)  # type: ignore[union-attr]
-        # The weather is also known if a photo shows that there is no fog.
+        # `fog` is None without a photo; a photo of a clear day gives a fog of extinction 0.
         if fog is not None and o.randomise and o.randomise.hold_known:
             task.set_weather(task.sample.for_known_weather())
         has_weather = fog is not None or o.randomise
@@ -143,7 +143,7 @@ def _push_frames(
 ):
     """Adds frames to the stacks of some envs, or fills the stacks with them.
 
-    `below` accumulates two numbers over the lower half of each frame (pixels from `lower` on): the opacity, and the
+    `below` accumulates two sums over the lower half of each frame (pixels from `lower` on): the opacities, and the
     number of pixels whose opacity is less than `sky`.
     """
     k, pixel = wp.tid()
@@ -181,10 +181,7 @@ class GpuPixelObserver(PixelObserver):
         self.trust = np.zeros(n)
         self._noise, self._weather = [None] * n, [None] * n
         self.camera_poses: CameraPoses = self._camera_poses
-        """Function that receives indices of k envs and returns data of their newest frames.
-
-        These are the OpenCV poses (k, 4, 4) and times (k,) [s].
-        """
+        """Returns the OpenCV poses (k, 4, 4) and times (k,) [s] of the newest frames of k envs, given by index."""
 
     @property
     def stacks(self) -> Image:  # type: ignore[override]

@@ -1,8 +1,8 @@
 """Obstacle geometry: primitives and convex hulls in uniform colors, without mesh or texture files.
 
-In an obstacle's frame, x points to its front, y to its left and z up; the origin is on the ground below its center. An
-obstacle's geoms are in group `OBSTACLE_GROUP`, and are both visible and solid. Geoms that are solid but invisible are
-in the robot's collision group.
+In an obstacle's frame, x points to its front, y to its left and z up; the origin is on the ground below its center.
+Geoms that are visible and collide are in group `OBSTACLE_GROUP`; those that only collide are in the robot's collision
+group.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,10 +37,10 @@ _STEEL, _RED, _LAMP = (0.50, 0.51, 0.53), (0.60, 0.08, 0.06), (0.88, 0.87, 0.80)
 
 
 class ObstacleModel:
-    """Adds geoms to one body. All are in one group, and either all are solid or all are visual-only."""
+    """Adds geoms to one body. All are in one group; either all collide (`solid`), or all are visual-only."""
 
     def __init__(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, group: int = OBSTACLE_GROUP, solid: bool = True):
-        """Geoms are named `<body>_<number>`; with `solid=False` they have no contacts."""
+        """Geoms are named `<body>_<number>`."""
         self.spec, self.body, self.group, self.solid, self.count = spec, body, group, solid, 0
 
     def add(self, kind: mujoco.mjtGeom, color: Color, **settings: Any) -> None:

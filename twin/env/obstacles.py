@@ -26,18 +26,18 @@ STATIC_KINDS = ("cone", "box", "bollard")
 _ROUTE_NUMERIC = "obstacle_route"
 _PARKED_HEIGHT = -100.0  # [m], far below the ground
 _ROBOT_HALF_WIDTH = 0.34  # [m]
-_CLEARANCE = 0.15  # [m] gap between a random obstacle and a robot that passes it within the corridor
-_RANDOM_MARGIN = 0.5  # [m] random obstacles stand at most this far beyond the corridor's edge
-_MAX_TRIES = 20  # if this many samples give no free position for a distractor object, it is left out
+_CLEARANCE = 0.15  # [m] smallest gap for a robot that passes a random obstacle within the corridor
+_RANDOM_MARGIN = 0.5  # [m] a random obstacle's near edge is at most this far beyond the corridor's edge
+_MAX_TRIES = 20  # a distractor object is left out if this many samples give it no free position
 _ROBOT_RADIUS = 0.6  # [m] distance from the robot's base to its farthest corner
 _DISTRACTOR_STRIP = 2.5  # [m] width of the strip beside the corridor where distractor objects stand
 _FREE_ENDS = (4.0, 3.0)  # [m] lengths at the route's start and end in which there are no random obstacles
-_SPACING = 4.0  # [m] smallest distance along the route between random obstacles; smaller if the route is too short
+_SPACING = 4.0  # [m] smallest distance along the route between random obstacles; less if the route is too short
 _SINK_DEPTH = 0.01  # [m] obstacles are sunk this far into the ground, to avoid a visible gap below
 
 
 def body_name(obstacle: ObstacleConfig, number: int) -> str:
-    """Body name of the obstacle at index `number` of its list."""
+    """Body name of an obstacle; `number` is its index in the list of obstacles."""
     return PREFIX + (obstacle.name or f"{obstacle.kind}_{number}")
 
 
@@ -135,9 +135,7 @@ def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
 def random_obstacles(
     world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
 ) -> tuple[ObstacleConfig, ...]:
-    """Samples static obstacles `random_<number>` along the route, with gaps between them.
-
-    A robot can pass each of them within the corridor.
+    """Samples static obstacles `random_<number>` along the route; a robot can pass each of them within the corridor.
 
     Raises:
         InputError: the route is too short for `count` obstacles.
@@ -190,7 +188,7 @@ _ROUTE_STEP = 0.25  # [m] between points of a segment's route
 
 
 class EpisodeObstacles:
-    """Obstacles of a task's episodes: configured ones, or random ones along the segment, and distractor objects.
+    """Obstacles of a task's episodes: configured or random ones along the segment, plus distractor objects.
 
     Bodies cannot be added to a compiled model. So the model contains a *pool*: as many obstacles of each kind as an
     episode may need.

@@ -30,9 +30,9 @@ CPU, CUDA = "cpu", "cuda"
 
 @dataclass(frozen=True)
 class Rewards:
-    """Reward terms. The last step of an episode gets the term that is named after the cause of the episode's end.
+    """Reward terms. The last step of an episode gets the term named after the cause of the episode's end.
 
-    If this cause is the goal, the last step also gets `step`.
+    A last step at the goal also gets `step`.
     """
 
     step: float = 0.1
@@ -48,7 +48,7 @@ class Rewards:
     cross_track: float = 0.0
     """Reward per step at or beyond the corridor's edge; within it, proportional to the distance from the route."""
     steering: float = 0.0
-    """Reward per step at the largest yaw rate; in general, it is proportional to the square of the commanded one."""
+    """Reward per step at the largest yaw rate; it is proportional to the square of the commanded yaw rate."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Options:
     stack: int = 4
     """Number of images in an observation, the newest last."""
     pixels: bool = True
-    """True: images are observed; False: the state of `RewardAndTermination.state`, which needs no field."""
+    """True: observations are images; False: they are `RewardAndTermination.state`, which needs no field."""
     state: str | None = None
     """Numbers observed besides the images: `odometry` (speed [m/s], yaw rate [rad/s]), `privileged` (the state of
     `RewardAndTermination.state`, which needs the map), or None."""
@@ -88,13 +88,13 @@ class Options:
     """Origin of the images. `nerf`: the field. `simulator`: MuJoCo's renderer with the extracted mesh, under MuJoCo's
     lights. `splats`: MuJoCo's renderer with the Gaussian splats of a file; obstacles and robot have MuJoCo's lights."""
     splats: str | Path | None = None
-    """A 3DGS .ply in the scene's frame (meters, z up), for `observe="splats"`; all episodes have its lighting."""
+    """3D Gaussian splats (.ply) in the scene's frame (meters, z up), for `observe="splats"`; they have one lighting."""
     lighting: str | Sequence[str] = TRAINING
     """Lighting of the episodes; see `episode_lighting.py`."""
     lighting_drift: bool = False
-    """The lighting changes during an episode."""
+    """True: the lighting changes during an episode."""
     obstacles: str | int | Sequence[ObstacleConfig] = "scene"
-    """`scene`: the obstacles of scene.toml. A number: so many static obstacles, sampled for each episode. A list: the
+    """`scene`: the obstacles of scene.toml. A number: this many static obstacles, sampled for each episode. A list: the
     obstacles of all episodes."""
     camera: CameraOptions | None = None
     """Camera noise: vibration, exposure, blur. None: no noise."""
@@ -109,7 +109,7 @@ class Options:
 _MAX_NUMBER, _MAX_SIDE, _MAX_STACK, _MAX_OBSTACLES = 1e6, 4096, 64, 1000
 
 Check = tuple[Callable[[Any], bool], str]
-"""A function that returns True for valid values, and the text with which an error describes such values."""
+"""A function that returns True for valid values, and the text that describes valid values in an error."""
 
 
 def _is_number(value: Any) -> bool:
@@ -221,7 +221,7 @@ def parse_options(given: dict[str, Any]) -> Options:
 
 
 def state_size(options: Options) -> int:
-    """Number of components of the privileged state that are observed besides images; they are its first ones."""
+    """Number of components of the privileged state observed besides images: the first ones of `STATE_SIZES`."""
     return {None: 0, ODOMETRY: 2}.get(options.state, sum(STATE_SIZES.values()))
 
 

@@ -3,7 +3,7 @@
 A *control step* is the time between two commands, usually 0.1 s; it consists of many MuJoCo substeps. Contacts are
 checked several times per control step, so that short contacts are not missed. *Touched* geoms are geoms in contact with
 the robot, except for the ground. A command reaches the controller after `command_latency`. The newest image was taken
-`camera_latency` ago, and shows robot and obstacles as they were then.
+`camera_latency` ago, so it shows earlier poses of robot and obstacles.
 """
 
 from bisect import bisect_right
@@ -21,9 +21,9 @@ from twin.types import Array
 
 TIME_TOLERANCE = 1e-6  # [s] simulation times that differ by less count as equal, because of rounding
 
-_CHECK_PERIOD = 0.01  # [s] time between two contact checks; all poses are recorded then, too
+_CHECK_PERIOD = 0.01  # [s] time between two contact checks; each check also records all poses
 _SETTLE_TIME = 0.3  # [s] time that `set_pose` simulates, so that the robot settles on the ground
-_RAY_START = 50.0  # [m] rays that find the ground's height start at least this high above the ground's origin
+_RAY_START = 50.0  # [m] least height, above the ground's origin, from which rays are cast to find the ground's height
 
 
 class _Snapshot(NamedTuple):
@@ -39,16 +39,16 @@ class HuskyPhysics:
     """Steps one Husky in one model."""
 
     move_obstacles: Callable[[float], None] | None = None
-    """Sets the poses of moving obstacles at a time [s]. Called before a run of substeps, with the end of the run."""
+    """Sets the poses of moving obstacles at a time [s]. Called before a run of substeps, with the time of its end."""
 
     def __init__(
         self, model: mujoco.MjModel, params: HuskyParams | None = None, data: mujoco.MjData | None = None
     ) -> None:
         """
         Args:
-            model: A model that contains the Husky of `add_husky`; its keyframe `spawn`, if any, is the start.
+            model: Contains the Husky of `add_husky`; its keyframe `spawn`, if any, is the start.
             params: Parameters of the robot in the model; None: the published ones.
-            data: State to step; it keeps its present values. None: a new state, at the start.
+            data: State to step, from its present values on; None: a new state, at the start.
         """
         self.model = model
         self.params = params or HuskyParams()
@@ -96,7 +96,7 @@ class HuskyPhysics:
         self.begin()
 
     def begin(self) -> None:
-        """Starts an episode in the present state: drops commands and forgets earlier contacts."""
+        """Starts an episode in the present state; drops pending commands and earlier contacts."""
         self.controller = Controller(self.params)
         phase_steps = int(np.ceil(self.controller.phase / self.model.opt.timestep - 1e-6))
         self.steps_to_update = phase_steps % self._steps_per_update
@@ -159,8 +159,8 @@ class HuskyPhysics:
 
         Args:
             touched: Geoms touched during the last control step.
-            snapshots: Time [s], `qpos`, `mocap_pos` and `mocap_quat` at each of the last contact checks; cameras with a
-                latency need them.
+            snapshots: Time [s], `qpos`, `mocap_pos` and `mocap_quat` at each of the last contact checks; used only if
+                the camera has a latency.
         """
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)

@@ -1,7 +1,7 @@
 """Tasks of a scene: segments of its route, each between two arc lengths.
 
-The *standard tasks* of DriveEnv-NeRF are `straight` (30 m) and `right_turn` (60 m): segments of the route that have the
-right length and turn. `[[task]]` entries of `scene.toml` define further tasks, and `route` is the whole route.
+The *standard tasks* of DriveEnv-NeRF are `straight` (30 m) and `right_turn` (60 m): segments of the route with a given
+length and total turn. `[[task]]` entries of `scene.toml` define further tasks, and `route` is the whole route.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class RouteSegment:
 class _StandardTask:
     length: float  # [m]
     turn: tuple[float, float]  # lowest and highest total turn [rad], positive to the left
-    max_excursion: float  # [rad] the heading may exceed the range between its first and last value by at most this
+    max_excursion: float  # [rad] largest excess of the heading over the range between its first and last value
 
 
 _STANDARD_SPECS = {
@@ -95,7 +95,7 @@ def scene_tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[s
 
 
 def _fitting_starts(route: Array, standard: _StandardTask, length: float) -> Array:
-    """Arc lengths [m] at which fitting segments of a length start, sorted: the more central the turn, the earlier."""
+    """Arc lengths [m] at which segments of a length that fit a standard task start; the most central turn first."""
     total = float(arc_lengths(route)[-1])
     s = np.append(np.arange(0.0, total, _STEP), total)
     heading = np.unwrap(heading_at(route, s))

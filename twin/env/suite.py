@@ -1,4 +1,4 @@
-"""`twin.load`: a task in a built scene as a dm_control environment.
+"""`twin.load`: loads a task in a built scene as a dm_control environment.
 
 `EnvFactory` reads the scene once and makes any number of environments. `episode_spec` makes their model: ground, robot,
 and the collision parts within the robot's reach. `DriveEnvironment` adds image observations to physics and task.
@@ -128,9 +128,9 @@ class EnvFactory:
 def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
     """Returns a digest of everything that determines an episode, except for seed and driver.
 
-    It covers the field, the MJCF scene with its robot, the task's route segment, the obstacles of `scene.toml`, and the
-    photo lightings that the condition names. If the condition samples lightings, it also covers the version of the
-    lighting sets; if it randomizes, also the randomization.
+    The digest covers the field, the MJCF scene with its robot, the task's route segment, the obstacles of `scene.toml`,
+    and the photo lightings that the condition names. For a condition with sampled lightings, it also covers the version
+    of the lighting sets; for a randomized condition, the version and ranges of the randomization.
 
     Raises:
         InputError: see `EnvFactory.open`.
@@ -178,7 +178,7 @@ class DriveEnvironment(control.Environment):
         return self._with_pixels(step)
 
     def relight(self, step: dm_env.TimeStep, lighting: EpisodeLighting) -> dm_env.TimeStep:
-        """Replaces the lighting of the episode whose first step is given; returns that step in the new lighting."""
+        """Replaces the lighting at an episode's start; returns its first step, `step`, in the new lighting."""
         self.pixels.set_lighting(0, lighting, fill=True)
         return self._with_pixels(step)
 
@@ -221,14 +221,14 @@ def load(
 
 # ---- model of an episode
 
-_REACH = 1.5  # [m] a robot may reach this far beyond the corridor's edge: half its length, and a control step's motion
+_REACH = 1.5  # [m] reach of a robot beyond the corridor's edge: half its length plus the motion of a control step
 
 
 def episode_spec(world: World, start: float, end: float, half_width: float, visuals: bool = False) -> mujoco.MjSpec:
     """Returns the model of episodes between two arc lengths [m] of a scene's route.
 
-    An episode ends when the robot leaves the corridor, so the robot never touches parts beyond its reach. Such parts
-    are removed, which changes no result, but saves a fifth of the physics' time and most of its memory.
+    An episode ends when the robot leaves the corridor, so the robot never touches collision parts beyond its reach.
+    The model lacks these parts. This changes no result, but saves a fifth of the physics' time and most of its memory.
 
     Args:
         world: The scene.
@@ -247,7 +247,7 @@ def episode_spec(world: World, start: float, end: float, half_width: float, visu
         center, radius = _bounding_sphere(assets / f"{geom.get('mesh')}.obj")
         return line.query(center[:2])[0] - radius <= half_width + _REACH
 
-    # Parts are removed from the XML, since removing one from an MjSpec takes milliseconds.
+    # Parts are removed from the XML: removing a single one from an MjSpec takes milliseconds.
     worldbody, kept = root.find("worldbody"), root.find("asset")
     assert worldbody is not None and kept is not None
     for geom in [g for g in worldbody.findall("geom") if g.get("type") == "mesh" and not wanted(g)]:

@@ -1,9 +1,9 @@
 """Driving along a route segment in dm_control, without images: physics, start, state, reward and termination.
 
 In an *episode*, the robot starts at rest near the segment's start; the episode ends with one of `CAUSES`. The discount
-at the end is 0; only after a timeout it is 1, since the episode is truncated. An episode's seed determines all its
-randomness. Start, robot, lighting, obstacles, camera and weather have separate random generators. So a change in the
-sampling of one leaves the others unchanged, and policies can be compared on the same episodes.
+at the end is 0, or 1 after a timeout, which truncates the episode. An episode's seed determines all its randomness, so
+that policies can be compared on the same episodes. Start, robot, lighting, obstacles, camera and weather have separate
+random generators: a change in the sampling of one leaves the others unchanged.
 """
 
 import sys
@@ -46,11 +46,11 @@ except ModuleNotFoundError as error:
 EnvIndices = Sequence[int] | NDArray[np.int64]
 
 _CODES = {cause: code for code, cause in enumerate(CAUSES, 1)}  # 0: the episode goes on
-BUMPER_OFFSET = 0.5  # [m] the bumper is this far ahead of the base; the goal is reached when it is at the segment's end
-_SEARCH_WINDOW = (1.0, 3.0)  # [m] of route behind and ahead of the last foot
+BUMPER_OFFSET = 0.5  # [m] from the base to the bumper; the goal is reached when the bumper is at the segment's end
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] the robot's foot is searched this far behind and ahead of the last foot on the route
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
-_STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, in multiples of the controller's own limits
+_STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, as multiples of the controller's limits
 _LOOKAHEADS = (1.0, 2.0, 4.0)  # [m] along the route; the state contains the change of heading up to these points
 
 
@@ -95,11 +95,11 @@ class RewardAndTermination:
         self._cause = np.zeros(count, int)
         self._route = world.route[:, :2]
         self._previous_foot, self._steering = np.zeros(count), np.zeros(count)
-        # Position and time at which each robot had last moved by STUCK_DISTANCE.
+        # Position and time at which each robot last completed a motion of STUCK_DISTANCE.
         self._anchor, self._anchor_time = np.zeros((count, 2)), np.zeros(count)
         terms = options.rewards
         speed, yaw_rate = (_STATE_MARGIN * x for x in (world.robot.max_wheel_speed, world.robot.max_yaw_rate))
-        # The distance is bounded: an episode ends at most one control step after the robot leaves the corridor.
+        # `cross_track` is bounded, since an episode ends at most one control step after the robot leaves the corridor.
         cross_track = max(self.half_width, options.start_offset) + speed * options.control_timestep
         high = np.array([speed, yaw_rate, cross_track, *[np.pi] * 4], np.float32)
         self.state_bounds = np.stack([-high, high])
@@ -190,7 +190,7 @@ class DrivePhysics(dm_mujoco.Physics):
 
     def _reload_from_data(self, data: Any) -> None:
         mujoco.mj_forward(data.model.ptr, data.ptr)
-        # Set before super() is called, since that ends with `after_reset`.
+        # Set before the call of super(), which calls `after_reset`.
         self.robot = HuskyPhysics(data.model.ptr, self._params, data.ptr)
         super()._reload_from_data(data)
 
@@ -218,11 +218,11 @@ class DrivePhysics(dm_mujoco.Physics):
         self.robot.begin()
 
     def step(self, nstep: int = 1) -> None:
-        """Runs `nstep` substeps, which last from one command to the next."""
+        """Runs one control step of `nstep` substeps."""
         with self.check_invalid_state():
             self.robot.step(nstep * self.timestep())
 
-    # Quantities of `HuskyPhysics`. The camera's pose is the pose from which the newest image was taken.
+    # Quantities of `HuskyPhysics`; `camera_to_world` is the pose from which the newest image was taken.
     planar_pose = property(attrgetter("robot.planar_pose"))
     base_to_world = property(attrgetter("robot.base_to_world"))
     delayed_data = property(attrgetter("robot.delayed_data"))
@@ -258,9 +258,9 @@ class DriveTask(control.Task):
             segment: Route segment to drive.
             options: Options of the environment.
             obstacles: Samples an episode's obstacles; its pool is in the model.
-            model: The compiled model before randomization; physics steps a copy.
+            model: The compiled model before randomization; it is not stepped.
             seed: Seed of the sequence of episodes; None: unpredictable.
-            evaluator: Reward and termination of many drives, and the index of this drive; None: one for this drive.
+            evaluator: Shared reward and termination of many drives, and this drive's index; None: a new one.
         """
         self.world, self.segment, self.options = world, segment, options
         self._evaluator, self._index = evaluator or (RewardAndTermination(world, segment, options), 0)

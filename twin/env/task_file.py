@@ -1,9 +1,9 @@
-"""A task as a JSON file: line, width, limits, start. Programs that share no code with this package can read it.
+"""A task as a JSON file (line, width, limits, start) for programs that do not use this package.
 
     {"format": "twin task", "version": 1, "name": "straight", "line": [[x, y, z], ...], "half_width": 1.0, ...}
 
-The file contains the rules of `twin.env.task.RewardAndTermination` as numbers, so that other programs can evaluate
-drives by the same rules.
+The file contains the numbers of `twin.env.task.RewardAndTermination`, so that other programs can evaluate drives by the
+same rules.
 """
 
 import math

@@ -1,13 +1,13 @@
 """Trust: the estimated reliability of a rendered picture.
 
-It is high if the picture's camera is near the filmed frames, and if the reconstruction in view is complete. The trust
-is the smallest of three numbers in [0, 1]:
+Trust is high if the picture's camera is near the filmed frames and the reconstruction in view is complete. It is the
+smallest of three numbers in [0, 1]:
 
 *pose*: 1 if the offset to the most similar filmed frame is at most `_NEAR`, 0 if it is at least `_FAR`, linear in
 between. The offset of two cameras is their distance [m] plus `_PER_TURN` · (1 − cos α), where α is the angle between
 their optical axes;
 *opacity*: the mean opacity of the lower half of the picture, where only ground and objects should be visible;
-*sky in the road*: 1 minus `_SKY_WEIGHT` times the fraction of that half whose opacity is below `SKY_OPACITY`.
+*sky in the road*: 1 minus `_SKY_WEIGHT` times the fraction of the lower half whose opacity is below `SKY_OPACITY`.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """Vector environments: `make_vector_env` steps n environments in one process, in several processes, or on a GPU.
 
-Much of a step is Python code (visibility, contacts, reward), for which the interpreter's lock allows only one core per
+Much of a step is Python code (visibility, contacts, reward), which the interpreter's lock limits to one core per
 process. So a `ProcessVectorEnv` starts *child* processes. Each child has a `LocalVectorEnv` and executes its parent's
-requests. Requests and replies are sent as pickles over a socket. The number of processes changes no result.
+requests. Requests and replies are sent as pickles over a socket. The number of processes does not affect the results.
 """
 
 import contextlib
@@ -148,7 +148,7 @@ class ProcessVectorEnv:
     def _split(self, some: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64], list[int]]]:
         """Yields (child, positions, indices) for each child that has some of the environments `some`.
 
-        `positions` are those of the child's environments in `some`; `indices` are theirs in the child.
+        `positions` are the places of these environments in `some`; `indices` are their indices within the child.
         """
         locations = np.array([self._location[i] for i in some.tolist()]).reshape(-1, 2)
         for c in np.unique(locations[:, 0]).tolist():
@@ -240,7 +240,7 @@ def serialize(value: Any) -> bytes:
 
 
 class VectorEnvServer:
-    """Executes requests. A request is the name and arguments of a method of this class or of its `LocalVectorEnv`."""
+    """Executes requests: names and arguments of methods of this class or of its `LocalVectorEnv`."""
 
     envs: LocalVectorEnv
 
@@ -291,7 +291,7 @@ def serve() -> None:
     with Connection(socket) as pipe, contextlib.suppress(EOFError, OSError):  # the parent closed the pipe
         while True:
             while not pipe.poll(_PARENT_CHECK_PERIOD):
-                # If the parent has ended, a process that it forked may keep the socket open.
+                # The socket alone does not show that the parent ended: a process forked by the parent may hold it open.
                 if os.getppid() != parent:
                     return
             pipe.send_bytes(server.answer(pipe.recv_bytes()))

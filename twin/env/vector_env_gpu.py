@@ -1,8 +1,8 @@
 """Vector environment on a GPU: `mujoco_warp` steps all environments at once.
 
-Episodes are started on the host, one by one. After each step, reward and termination are computed for all environments
-together. Images that show only the field stay on the device (`GpuPixelObserver`). Tests run this code on the CPU, where
-it is slower than MuJoCo.
+The host starts episodes one by one. After each step, reward and termination are computed for all environments together.
+Images that show only the field stay on the device (`GpuPixelObserver`). Tests run this code on the CPU, where it is
+slower than MuJoCo.
 """
 
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
@@ -31,7 +31,7 @@ _RANDOMIZED_FIELDS = (
     *("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "cam_pos", "cam_quat", "body_mass", "body_inertia"),
     *("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0"),
 )
-"""Model fields that `NominalModel.apply` changes per environment, and those that MuJoCo derives from them."""
+"""Model fields that `NominalModel.apply` changes per environment, and fields that MuJoCo derives from them."""
 
 _UPLOADED_FIELDS = ("qpos", "qvel", "act", "qacc_warmstart")
 _STATE_FIELDS = (*_UPLOADED_FIELDS, "ctrl", "sensordata", "actuator_force")
@@ -68,7 +68,7 @@ def _record_positions(
     qpos: wp.array2d(dtype=float),
     history: wp.array3d(dtype=float),
 ):
-    """Records the positions at the end of each segment: each substep overwrites what the substep before it recorded."""
+    """Records the positions at the end of each segment: each substep overwrites the record of the one before."""
     env, i = wp.tid()
     history[segment[k, env], env, i] = qpos[env, i]
 
@@ -101,9 +101,9 @@ class GpuSimulation:
 
     The state (positions, velocities, the solver's last accelerations) is kept in arrays that contain all environments.
     A control step uploads it, runs the substeps with the controllers' schedules, and downloads the new state and the
-    touched geoms. Only `sync` updates the environments' own `MjData`, which takes far longer. The device computes in
-    single precision with another solver: episodes are similar to those of MuJoCo, but not bit-identical. On a GPU, they
-    are not repeatable either, since the order of contacts varies.
+    touched geoms. The environments' own `MjData` is only updated by `sync`, which takes far longer than a download. The
+    device computes in single precision with another solver: episodes are similar to those of MuJoCo, but not
+    bit-identical. On a GPU, they are not repeatable either, since the order of contacts varies.
     """
 
     def __init__(self, envs: Sequence[DrivePhysics], period: float, device: str) -> None:
@@ -153,7 +153,7 @@ class GpuSimulation:
                 self._graph = capture.graph
 
     def begin(self, which: Indices) -> None:
-        """Takes over the models and states of environments whose episodes have just begun."""
+        """Copies the models and states of environments whose episodes have just begun."""
         if not len(which):
             return
         robots = [self._envs[i].robot for i in which]
@@ -340,7 +340,7 @@ class GpuVectorEnv(LocalVectorEnv):
 
     @property
     def physics(self) -> list[DrivePhysics]:
-        """Present physics of every environment. Reading this property calls `sync` first, which takes long."""
+        """Present physics of every environment. This property calls `sync`, which takes long."""
         self._simulation.sync(np.arange(len(self)))
         return self._physics
 

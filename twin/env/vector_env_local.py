@@ -1,9 +1,8 @@
-"""Vector environment in one process: a thread pool runs the physics, and one call renders the images of all.
+"""Vector environment in one process: a thread pool runs the physics, and one call renders all images.
 
-Each environment has its own model and sequence of episodes, and is stepped by the same code as an environment of
-`twin.load`. On a CPU, the results of both are bit-identical. `mujoco.batch.Batch` is not used, since it cannot check
-contacts or run a controller between substeps. See `vector_env.py` for several processes, and `vector_env_gpu.py` for a
-GPU.
+Each environment has its own model and sequence of episodes. It is stepped by the same code as an environment of
+`twin.load`; on a CPU, the results of both are bit-identical. `mujoco.batch.Batch` is not used, since it cannot check
+contacts or run a controller between substeps. `vector_env.py` is for several processes, `vector_env_gpu.py` for a GPU.
 """
 
 import dataclasses
@@ -52,7 +51,7 @@ class LocalVectorEnv:
         envs = self._make_envs(factory, seeds)
         self.factory = factory
         self._mixtures: list[tuple[EpisodeLighting, str] | None] = [None] * len(envs)
-        """Last lighting of each environment, with the text of its mixture."""
+        """Cache of `_mixture`: last lighting of each environment, with its text."""
         self._physics, self.tasks = [p for p, _ in envs], [t for _, t in envs]
         self.pixels = factory.make_observer(envs)
         self.options = factory.options
@@ -107,7 +106,7 @@ class LocalVectorEnv:
             ValueError: invalid actions; the episodes are unchanged.
         """
         which = range(len(self)) if which is None else which
-        # Computed in float64, as by a driver of a single environment.
+        # Scaled in float64, as in `PolicyDriver`, so that both give the robot the same actions.
         given = check_actions(actions, (len(which), self.action_size))
         wanted = self._low + (np.clip(given, -1.0, 1.0) + 1.0) / 2.0 * (self._high - self._low)
         out = self._advance(wanted, which)
@@ -138,8 +137,8 @@ class LocalVectorEnv:
     def info(self, i: int) -> dict[str, Any]:
         """Info of environment i's episode so far, JSON-able.
 
-        With images, `lighting` is the name that tables use, such as `training`. `sampled_lighting` is this name, then
-        the sampled mixture: `training: sun 0.62, night 0.38`, see `mixture_text`.
+        With images, `lighting` is the name that tables use, such as `training`. `sampled_lighting` also contains the
+        sampled mixture: `training: sun 0.62, night 0.38`, see `mixture_text`.
         """
         return self.tasks[i].info(self._physics[i]) | self._pixel_info(i)
 
@@ -197,13 +196,13 @@ class LocalVectorEnv:
 def mixture_text(embedding: Array32, filmed: Lightings) -> str:
     """Text of the mixture of filmed lightings that is nearest to an embedding (dim,), such as `sun 0.62, night 0.38`.
 
-    The fractions are nonnegative and add up to 1; those below 0.005 are omitted. A sampled embedding differs somewhat
-    from this mixture, as the embedding of a single frame does; the text does not show the difference.
+    The fractions are nonnegative and add up to 1; those below 0.005 are omitted. A sampled embedding deviates somewhat
+    from its mixture, like the embedding of a single frame; the text omits this deviation.
     """
     from scipy.optimize import nnls  # slow to import
 
     vectors = filmed.vectors.astype(np.float64)
-    sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # weight of the equation that the fractions add up to 1
+    sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # weight of the equation Σ fractions = 1
     equations = np.vstack([vectors.T, np.full(len(vectors), sum_weight)])
     parts, _ = nnls(equations, np.append(embedding, sum_weight))
     order = np.argsort(-parts, kind="stable")

@@ -62,15 +62,15 @@ class DirectionalRelighting:
     A surface with normal n under a sun in direction s gets the gain exp(strength · (n · s − s_z)). The strength is
     higher in red than in blue, since the light of a low sun is warm. Horizontal ground keeps its brightness. Normals
     come from the picture's depth, and are inaccurate within three pixels of an outline. Surfaces more than 0.4 m below
-    the lens, also curbs, are not relit, since a field's ground is rough; surfaces above the lens get the full gain. The
-    gain of far surfaces and the sky does not depend on normals: its brightness and color are random, and it is
-    higher towards the sun. Between 25 and 40 m, the two gains are blended.
+    the lens, including curbs, are not relit, since normals of a field's rough ground are noisy; surfaces above the lens
+    get the full gain. Far surfaces and the sky get another gain, which does not depend on normals: it has a random
+    brightness and color, and is higher towards the sun. At depths from 25 to 40 m, the two gains are blended.
     """
 
     def __init__(self, strength: float, sun: Array, rng: np.random.Generator) -> None:
         """
         Args:
-            strength: For example, with 0.7 and a sun at 15° elevation, a wall that faces the sun gets 1.6 times as
+            strength: For example, with 0.7 and a sun at 15° elevation, a wall that faces the sun becomes 1.6 times as
                 bright, and a wall that faces away from it 0.4 times.
             sun: Unit vector towards the sun, shape (3,).
             rng: Random generator of the episode.
@@ -98,10 +98,7 @@ class DirectionalRelighting:
 
 
 def _normals(points: Array32) -> Array32:
-    """Unit normals, shape (height, width, 3), of the surface through points relative to the camera.
-
-    They point towards the camera.
-    """
+    """Unit normals, towards the camera, of the surface through points relative to it, shape (height, width, 3)."""
     smooth = cv2.blur(points, (_SMOOTHING, _SMOOTHING), borderType=cv2.BORDER_REPLICATE)
     down, across = np.gradient(smooth, axis=(0, 1))
     normal = np.cross(down, across)
@@ -116,7 +113,7 @@ _TEXEL = 0.1  # [m] side of a texel, measured across the sun's direction
 _PATCH_RADIUS = (0.4, 2.0)  # [m] smallest and largest radius of patches
 _LEAF_RADIUS = 0.15  # [m] radius of the spots in dappled patches
 _PATCH_COVER = (0.2, 0.6)  # smallest and largest fraction of the plane that patches darken
-# Ranges of counts (without their ends), and of sizes [m] before a low sun stretches the pattern.
+# Ranges of counts (without the upper end), and of sizes [m] before a low sun stretches the pattern.
 _HOUSES, _HOUSE_SIDE = (1, 4), (3.0, 12.0)
 _POSTS, _POST_WIDTH, _POST_LENGTH = (0, 8), (0.1, 0.5), (2.0, 10.0)
 _OVERSAMPLING = 4  # resolution factor at which solid shadows are drawn, for smooth edges
@@ -124,16 +121,16 @@ _SHADOW_TINT = np.array([1.0, 0.95, 0.85], np.float32)  # blue loses less, since
 
 
 class CastShadows:
-    """Random cast shadows that were not filmed, fixed in the world, for one episode.
+    """Random cast shadows, fixed in the world, for one episode.
 
     A periodic pattern in the plane z = 0 is projected along the rays of the episode's sun onto ground, curbs and walls.
     It consists of patches, of shadows with straight edges, or of both. Patches may be dappled, like shadows of leaves.
-    Straight edges are like those of shadows of houses and posts; a policy can mistake them for curbs and lines. The
-    lower the sun is, the more it stretches the pattern.
+    Shadows with straight edges are like those of houses and posts; a policy can mistake the edges for curbs and lines.
+    A lower sun stretches the pattern more.
     """
 
     def __init__(self, strength: float, sun: Array, rng: np.random.Generator) -> None:
-        """`strength` is the fraction of a color lost in full shadow, `sun` a unit vector towards the sun."""
+        """`strength` is the fraction by which full shadow darkens a color, `sun` a unit vector towards the sun."""
         flat = np.linalg.norm(sun[:2])
         along = sun[:2] / flat
         self._slant = sun[:2] / sun[2]
@@ -179,17 +176,13 @@ def _solid_shadows(rng: np.random.Generator) -> Array32:
 
 
 def _patches(rng: np.random.Generator, radius: float, cover: float) -> Array32:
-    """Pattern (side, side) of patches, 1 where it is dark, which have about the radius `radius` [texels].
-
-    They cover the fraction `cover` of the plane.
-    """
+    """Pattern (side, side) of patches, 1 where dark: radius about `radius` [texels], fraction `cover` of the plane."""
     # The smoothing is periodic, so that the pattern repeats without a seam.
     frequency = np.fft.fftfreq(_SIDE)[:, None] ** 2 + np.fft.rfftfreq(_SIDE) ** 2
     smooth = np.exp(-2.0 * (np.pi * radius) ** 2 * frequency)
     noise = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(_SIDE, _SIDE))) * smooth, (_SIDE, _SIDE))
     noise /= noise.std()
-    # Edges as wide as a third of a patch's radius are as soft as those of a tree's shadow some meters away.
-    edge = 0.15
+    edge = 0.15  # edges are about a third of a radius wide: as soft as the shadow of a tree some meters away
     return np.clip((noise - np.quantile(noise, 1.0 - cover)) / edge + 0.5, 0.0, 1.0).astype(np.float32)
 
 
@@ -207,7 +200,7 @@ class Weather:
         elevation, azimuth = np.deg2rad(rng.uniform(*_SUN_ELEVATION)), rng.uniform(0.0, 2.0 * np.pi)
         level = np.cos(elevation)
         sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
-        # Separate random streams, so that relighting and shadows do not depend on each other's presence.
+        # Two random streams, so that relighting is the same with and without shadows, and vice versa.
         relighting_rng, shadow_rng = rng.spawn(2)
         self._relighting = DirectionalRelighting(sample.sunlight, sun, relighting_rng) if sample.sunlight else None
         self._shadows = CastShadows(sample.shade, sun, shadow_rng) if sample.shade else None

@@ -1,10 +1,11 @@
 """Agreement of success rates in the twin and on the road: correlations, bias and scores of predictions.
 
-A *group* is the policies of one task, or of all tasks, that were driven on the road. A *day* is a lighting of the real
-trials; a *training* is a run, with all its checkpoints. Every number is an `Estimate`: a value with its count, or the
-reason why there is no value. It has a 90 % interval if the method is known to have that coverage, or else the reason
-why there is none. Intervals are about the population from which the trainings and days are a sample, not about the
-measured cells (see `jackknife` and `rate_model`; their coverage is measured in `benchmarks/intervals.py`).
+A *group* is the policies of one task, or of all tasks, that were driven on the road. A *cell* is the trials of one
+policy on one task under one lighting. A *day* is a lighting of the real trials; a *training* is a run, with all its
+checkpoints. Every number is an `Estimate`: a value with its count, or the reason why there is no value. The value has a
+90 % interval if `benchmarks/intervals.py` confirmed this coverage, or else the reason why there is none. Intervals are
+about the population from which the trainings and days are a sample, not about the measured cells (see `jackknife` and
+`rate_model`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -56,9 +57,9 @@ from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
 
 DEPENDENT = "none: policies, and their predictions, depend on each other"
-"""The reason why a fraction of policies or cells has no interval."""
+"""Reason why a fraction of policies or cells has no interval."""
 
-_MAXIMUM = "none at one place: it hangs on the best policy alone"
+_MAXIMUM = "none at one place: the value depends on the best policy alone"
 
 Cells = Mapping[tuple[str, str, str], Cell]
 """The twin's cells by `Cell.key`."""
@@ -74,9 +75,9 @@ class Estimate:
     n: int = 0
     """For a rate, the number of trials; for a statistic, the number of policies or cells."""
     missing: str = ""
-    """The reason why there is no value; empty if there is one."""
+    """Reason why there is no value; empty if there is one."""
     no_interval: str = ""
-    """The reason why the value has no interval, and the data that an interval needs; empty if there is an interval."""
+    """Reason why the value has no interval, and the data that an interval needs; empty if there is an interval."""
 
 
 @dataclass(frozen=True)
@@ -108,13 +109,13 @@ class PredictorScore:
 
 @dataclass(frozen=True)
 class OrderedPairs:
-    """Pairs of policies of one task with different real rates, whose twin scores differ by `low` to `high`."""
+    """Pairs of policies of one task whose real rates differ, and whose twin scores differ by `low` to `high`."""
 
     low: float
     high: float
     pairs: int
     right: float
-    """Number of pairs that the twin orders as the road does; a pair tied in the twin counts one half."""
+    """Number of pairs in the same order in the twin and on the road; a pair tied in the twin counts one half."""
 
 
 @dataclass(frozen=True)
@@ -125,20 +126,20 @@ class Agreement:
     policies: int
     cells: int
     missing: tuple[str, ...]
-    """Data that are missing; if any are, the estimates below have no values."""
+    """Data that are needed but missing; if any are, the estimates below have no values."""
     pearson: Estimate
     spearman: Estimate
     mmrv: Estimate
     winner_agreement: Estimate
     winner_regret: Estimate
     bias: Estimate
-    """Mean over cells of real minus twin rate."""
+    """Mean over policies of real minus twin rate."""
     coverage: Estimate
-    """Fraction of cells for which the interval of `CellPair.bias` contains 0."""
+    """Fraction of cells with `CellPair.within_chance`."""
     corrected_coverage: Estimate
-    """Fraction of candidates whose real rate lies in the interval predicted without them."""
+    """Fraction of policies whose real rate lies in the interval predicted from policies of other trainings."""
     mean_real: Estimate
-    """Prediction-powered estimate of the mean real rate of policies like these, driven on the road or not."""
+    """Prediction-powered estimate of the mean real rate of policies like these, including those not driven."""
     trainings: int = 0
     days: int = 0
     twin_error: Estimate = Estimate(missing="not measured")
@@ -154,7 +155,7 @@ class Agreement:
 
 
 def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
-    """Data that are missing for a statistic over these real cells."""
+    """Texts about the data that a statistic over these real cells needs, but that are missing."""
     policies = len({cell.policy for cell in real})
     out = []
     if policies < MIN_POLICIES:
@@ -175,7 +176,7 @@ def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
 
 
 def unit_counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, Indices]:
-    """Successes and trials of each policy's units, shapes (n, k): a unit is a cell if `by_day`, else an episode."""
+    """Successes and trials of each policy's units, shapes (n, k); a unit is a cell if `by_day`, else a trial."""
     if by_day:
         return padded_counts([[(c.successes, c.trials) for c in row] for row in rows])
     won = [sum(c.successes for c in row) for row in rows]
@@ -184,7 +185,7 @@ def unit_counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, 
 
 
 def compare_cells(cell: Cell, mate: Cell) -> CellPair:
-    """Compares a real cell with the twin's cell `mate`, by the interval of the difference of their rates."""
+    """Compares the rate of a real cell with that of the twin's cell `mate`."""
     value, low, high = rate_difference(
         twin_successes=mate.successes,
         twin_trials=mate.trials,
@@ -199,7 +200,7 @@ def compare_cells(cell: Cell, mate: Cell) -> CellPair:
 
 
 def share_estimate(count: int, total: int, no_interval: str) -> Estimate:
-    """A fraction without an interval, and the reason for that."""
+    """A fraction with the reason why it has no interval."""
     return Estimate(count / total, n=total, no_interval=no_interval)
 
 
@@ -257,7 +258,7 @@ def _statistic(name: str, of: Callable[..., float], data: PairedCells) -> Estima
 
 
 def _winner(data: PairedCells) -> dict[str, Any]:
-    """Agreement and regret of the winner, as means over tasks with two policies or more."""
+    """Agreement and regret of the twin's best policy, as means over tasks with two policies or more."""
     n, names = data.policies, ("winner_agreement", "winner_regret")
     if all(len(members) < 2 for members in data.strata):
         return dict.fromkeys(names, Estimate(n=n, missing="no task has two policies"))
@@ -266,7 +267,7 @@ def _winner(data: PairedCells) -> dict[str, Any]:
 
 
 def _corrected_coverage(data: PairedCells) -> Estimate:
-    """Coverage of predictions from other trainings, task by task."""
+    """See `Agreement.corrected_coverage`; predictions are made task by task."""
     hits: list[bool] = []
     rates = data.rates()
     for members in data.strata:
@@ -290,7 +291,7 @@ def _mean_real(data: PairedCells, further: Sequence[float]) -> Estimate:
         mean = prediction_powered_mean(twin=rates["twin"], real=rates["real"], twin_only=further)
     except UndefinedStatistic as refusal:
         return Estimate(missing=str(refusal))
-    alike = "none: it would take a day's trials as independent"
+    alike = "none: it would treat the trials of a day as independent"
     return Estimate(mean.value, n=data.policies + len(further), no_interval=alike)
 
 
@@ -362,7 +363,7 @@ def _trials_and_days(real: Sequence[Cell]) -> tuple[Indices, NDArray[np.object_]
 
 
 def _twin_probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> tuple[Array, bool]:
-    """The twin's probability of success in each real cell; True if a policy is compared with several twin cells."""
+    """The twin's probability of success in each real cell; True if some policy has several twin cells."""
     rows = _real_rows(real)
     mine = [list(dict.fromkeys(cell.twin_key for cell in row)) for row in rows]
     several = max(map(len, mine)) > 1
@@ -376,7 +377,7 @@ def _twin_probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) ->
     return out, several
 
 
-_GAPS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)  # ends of the bins of differences of twin scores
+_GAPS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)  # edges of the bins of `OrderedPairs`
 _ROUNDING = 1e-9
 
 

@@ -57,7 +57,7 @@ class Candidate:
     """The twin's lightings over which its score is averaged."""
     twin: Estimate
     """Twin score. Its interval is over days if real days are compared with several of the twin's lightings, otherwise
-    over episodes under its lightings."""
+    over episodes under these lightings."""
     twin_rank: Estimate
     """Expected rank among the task's candidates (1 is best), and its interval."""
     twin_ranks: tuple[float, ...]
@@ -65,7 +65,7 @@ class Candidate:
     real: Estimate
     """Mean rate over its real cells; the interval is over days."""
     real_ranks: tuple[float, ...]
-    """Probability of each rank on the road among the driven candidates; empty unless it and another one are driven."""
+    """Probability of each rank on the road among driven candidates; empty unless this one and another are driven."""
     corrected: Estimate
     """Real rate, predicted from its twin score and the rates of the driven candidates of other trainings."""
     trained: Estimate = _NOT_KNOWN
@@ -78,7 +78,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class LeftOutLighting:
-    """Prediction of the real rates under one lighting from those under the task's other lightings."""
+    """Prediction of the real rates under one lighting from the rates under the task's other lightings."""
 
     task: str
     lighting: str
@@ -98,15 +98,16 @@ class TrialAllocation:
     task: str
     policies: int
     basis: str
-    """`road`: the trials are added to the real ones. `twin`: fewer than two policies have real trials, so the
-    twin's rates are assumed."""
+    """`road`: the trials are added to the real ones. `twin`: fewer than two policies have real trials, so the road is
+    assumed to have the twin's rates."""
     winner_now: float | None = None
     """See `RankingConfidence.winner`."""
     order_now: float | None = None
     """See `RankingConfidence.order`."""
     more_for_winner: int | None = None
-    """Real trials per policy until `winner_now` is expected to reach `sure`; None: more than `ranking.MAX_TRIALS`."""
+    """Further trials per policy until `RankingConfidence.winner` reaches `sure`; None: over `ranking.MAX_TRIALS`."""
     more_for_order: int | None = None
+    """The same for `RankingConfidence.order`."""
 
 
 @dataclass(frozen=True)
@@ -222,7 +223,7 @@ def _candidates(
         lightings = tuple(name for name in lightings if name in compared)
     policies = list(dict.fromkeys(cell.policy for cell in twin))
     cells = [[c for c in twin if c.policy == p and c.lighting in lightings] for p in policies]
-    # A policy that was not validated under any compared lighting is scored over all of its own lightings instead.
+    # A policy that was not validated under any compared lighting is scored over all its lightings instead.
     cells = [mine or [c for c in twin if c.policy == p] for p, mine in zip(policies, cells, strict=True)]
     driven = [[c for c in real if c.policy == p] for p in policies]
     rng = np.random.default_rng([seed, 1])
@@ -289,7 +290,7 @@ def _scores(real: Sequence[Cell], twin: Cells) -> tuple[float, float]:
 def _sampled_rates(rows: Sequence[Sequence[Cell]], by_day: bool, rng: np.random.Generator) -> Array:
     """Samples of the policies' true rates, shape (samples, n).
 
-    Day effects that are common to all policies are not modeled, since they hardly change ranks.
+    Effects of a day on all policies are not modeled, since they hardly change ranks.
     """
     return RateModel.fit(*unit_counts(rows, by_day), shared_days=False).sample(rng, ranking.SAMPLES)
 
@@ -316,7 +317,7 @@ def _mean_rate(cells: Sequence[Cell]) -> Estimate:
 
 
 def _left_out(task: str, real: Sequence[Cell], twin: Cells) -> list[LeftOutLighting]:
-    """Predicts the real rates under each lighting of a task from those under its other lightings."""
+    """Predicts the real rates under each lighting of a task from the rates under its other lightings."""
     lightings = [cell.lighting for cell in real]
     names = list(dict.fromkeys(lightings))
     twin_rate, real_rate = np.array([_scores([cell], twin) for cell in real]).T

@@ -1,27 +1,29 @@
 """Jackknife intervals of statistics over policies. The units left out are places, or trainings and days.
 
-The *estimand* of an interval is the mean of the statistic over repetitions of the experiment with the same numbers of
-new trainings, new days and new trials, at the same place; if there are several places, with new places as well. For a
+The *estimand* of an interval is the mean of the statistic over repeated experiments at the same place, each with the
+same numbers of new trainings, days and trials. If there are several places, each repetition also has new places. For a
 mean rate or a bias, this is the value in the population. For a correlation, MMRV or regret, it is the average result of
-such an experiment, including the noise of its few days and trials. It says nothing about these policies on these days.
+such an experiment, including the noise of its few days and trials. An interval says nothing about the measured policies
+on the measured days.
 
 Units vary independently of each other: a *training* (checkpoints of a run are one unit), a *day* (a lighting of the
 real trials, left out of the twin and the road together), a *place* (with all its policies and days). With one place,
 trainings and days are crossed, so the variance is that of two-way clustering (Cameron, Gelbach and Miller, J. Bus.
 Econ. Stat. 29, 2011); each part is computed by leaving one unit out (Efron and Stein 1981):
 
-    V = V_training + V_day − V_both / 2
+    V = V_training + V_day − V_both / 2        for the bias, − V_both
 
 V_both is the variance from leaving out one training on one day; V_training and V_day each contain it. For a linear
-statistic of many units all of it is subtracted, as here for the bias. For the other statistics that made intervals too
-narrow where ranks jump, and subtracting nothing made them too wide (`benchmarks/intervals.py`). The interval is the
-estimate ± Student's t times √V on a scale on which the statistic is less skewed, with Satterthwaite's degrees of
-freedom, at least half of those of the trainings (few days made intervals too wide). There is no interval for fewer
-units than its coverage was tested with, nor if leaving units out changes nothing, since the variance cannot be
-estimated then.
+statistic of many units, such as the bias, all of V_both is subtracted. For the other statistics, subtracting all made
+intervals too narrow where ranks jump, and subtracting nothing made them too wide (`benchmarks/intervals.py`).
 
-A bootstrap was worse (coverage 0.5 to 0.8): it samples some policies twice, which raises correlations, and resampled
-trials give twin and real rates that agree less than the observed ones.
+The interval is the estimate ± Student's t times √V, on a scale on which the statistic is less skewed. The degrees of
+freedom are Satterthwaite's, but at least half of those of the trainings, since few days made intervals too wide. There
+is no interval for fewer units than those for which its coverage was tested. There is also none if leaving units out
+changes nothing, since the variance cannot be estimated then.
+
+A bootstrap was worse (coverage 0.5 to 0.8). It samples some policies twice, which raises correlations. And its
+resampled trials give twin and real rates that agree less than the observed ones.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -43,24 +45,24 @@ from twin.types import Array, Indices
 MIN_TRAININGS, MIN_DAYS, MIN_PLACES = 8, 4, 5
 """Number of units below which a correlation or MMRV has no interval."""
 MIN_PEARSON_TRAININGS = 12
-"""Number of trainings below which Pearson's correlation, which can depend on a single policy, has no interval."""
+"""Number of trainings below which Pearson's correlation has no interval, since a single policy may determine it."""
 MIN_BIAS_TRAININGS, MIN_BIAS_DAYS = 5, 3
 """Number of units below which a mean difference has no interval."""
 
 _SHARE_OF_BOTH = 0.5  # fraction of V_both that is subtracted; see the module
-_LARGEST = 0.999  # correlations are clipped to ± this on Fisher's scale
+_LARGEST = 0.999  # correlations are clipped to ± this before Fisher's transform
 
 
 @dataclass(frozen=True)
 class PairedCells:
     """Up to k real cells of each of n policies, and the twin's cells with which they are compared.
 
-    A policy driven on two tasks counts as two policies. Rows with fewer cells are padded with cells of weight 0. Rates
-    may have leading axes, for separate experiments of the same design.
+    A policy driven on two tasks counts as two policies. Policies with fewer cells are padded with cells of weight 0.
+    Rates may have leading axes, for separate experiments of the same design.
     """
 
     twin: Array
-    """For each real cell, the rate of the twin's cell with which it is compared, shape (..., n, k)."""
+    """Rate of the twin's cell with which each real cell is compared, shape (..., n, k)."""
     real: Array
     """Rate of each real cell, shape (..., n, k)."""
     weight: Array
@@ -106,7 +108,7 @@ def training_of(policy: str) -> str:
 
 
 def pair_cells(real: Sequence[Cell], twin: Mapping[tuple[str, str, str], Cell]) -> PairedCells:
-    """Pairs real cells with the twin's cells (by key); policies are in order of first occurrence, task by task."""
+    """Pairs real cells with the twin's cells, given by key; policies are ordered by task, then by first occurrence."""
     tasks = dict.fromkeys(cell.task for cell in real)
     policies = [p for task in tasks for p in dict.fromkeys((c.policy, c.task) for c in real if c.task == task)]
     rows = [[cell for cell in real if (cell.policy, cell.task) == policy] for policy in policies]
@@ -172,8 +174,8 @@ STATISTICS = {
     "mmrv": Statistic(mmrv_batched, _identity, _identity, 0.0, 1.0),
     "bias": Statistic(mean_bias, _identity, _identity, -1.0, 1.0, True, MIN_BIAS_TRAININGS, MIN_BIAS_DAYS),
 }
-"""Statistics that have intervals. Regret and agreement of the winner at one place have none, since they depend on a
-maximum."""
+"""Statistics that have intervals. Regret and agreement of the winner have none at one place, since they depend on the
+best policy alone."""
 
 
 def mean_over_tasks(statistic: Callable[..., tuple[Array, Array]], data: PairedCells) -> tuple[Array, Array]:
@@ -189,7 +191,7 @@ def mean_over_tasks(statistic: Callable[..., tuple[Array, Array]], data: PairedC
 def jackknife_interval(statistic: Statistic, data: PairedCells, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
     """Ends of the interval of a statistic at one place, shapes (...).
 
-    The ends are nan for experiments along leading axes whose units do not determine a variance. Raises
+    Among experiments along leading axes, those whose units do not determine a variance get nan. Raises
     UndefinedStatistic: there are too few units (the message has the number needed); or, for a single experiment, the
     variance is not determined.
     """
@@ -254,7 +256,7 @@ def mean_difference_interval(
         raise UndefinedStatistic(f"too few for an interval: {n} pairs, {MIN_PLACES} are needed")
     mean, error = float(np.mean(differences)), float(np.std(differences, ddof=1) / np.sqrt(n))
     if error < 1e-9:
-        raise UndefinedStatistic("no interval: all pairs differ by the same")
+        raise UndefinedStatistic("no interval: all pairs differ by the same amount")
     half = float(student.ppf(0.5 + confidence / 2, n - 1)) * error
     return mean, max(mean - half, limits[0]), min(mean + half, limits[1])
 
@@ -275,8 +277,8 @@ def _ends(
     variance = np.where(variance > 1e-18, variance, np.nan)
     if np.ndim(variance) == 0 and np.isnan(variance):
         raise UndefinedStatistic(
-            "no interval: without some of the trainings or days all rates are the same, or the "
-            "value does not change, so that its variance cannot be estimated"
+            "no interval: the variance cannot be estimated, since leaving out units does not change the value, or "
+            "leaves rates that are all equal"
         )
     half = student.ppf(0.5 + confidence / 2, freedom) * np.sqrt(variance)
     center = statistic.scale(value)

@@ -3,12 +3,12 @@
 A predictor gives a probability p of success for each cell (policy, day) of the road, in which y of m trials succeed:
 
     Brier score: mean over trials of (p − outcome)²
-    log score: mean over trials of −log of the probability that was given to the outcome
+    log score: mean over trials of −log of the outcome's predicted probability
 
 Both scores are 0 at best and *proper*: the expected score is best if p is the true probability (Gneiting and Raftery,
-J. Am. Stat. Assoc. 102, 2007). To be interpreted, the twin's scores are compared with those of baselines that do not
-use the twin, or do not use its differences between days. Baselines that are fitted to real trials, and the twin's
-recalibration, predict each training from trials of other trainings only.
+J. Am. Stat. Assoc. 102, 2007). The twin's scores are compared with those of baselines: `other_trainings` does not use
+the twin, and `shuffled_days` does not use its differences between days. `other_trainings` and the twin's recalibration
+are fitted to real trials; they predict each training from trials of other trainings only.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,14 +28,14 @@ SCORE_DIFFERENCE = Statistic(
 )
 """Mean over policies of the difference of two scores, as a `Statistic` for `jackknife_interval` on a `score_pair`."""
 
-_LEAST = 0.005  # in log scores and recalibration, probabilities closer to 0 or 1 than this are clipped
+_LEAST = 0.005  # log scores and recalibration clip probabilities to between this and 1 minus this
 _RIDGE = 0.1  # weight of a recalibration's prior, which favors unchanged probabilities
 _NEWTON_STEPS = 30
 
 
 @dataclass(frozen=True)
 class CalibrationBin:
-    """Trials of the cells whose predicted probability lies in a bin."""
+    """Summary of the cells whose predicted probability lies in a bin from `low` to `high`."""
 
     low: float
     high: float
@@ -49,7 +49,7 @@ class CalibrationBin:
 
 @dataclass(frozen=True)
 class DayErrors:
-    """Cells of one day on which the twin and the road disagree about success in most trials."""
+    """The twin's errors in predicting the more frequent outcome of the cells of one day."""
 
     day: str
     cells: int
@@ -81,15 +81,15 @@ def mean_score(data: PairedCells, score: Array) -> float:
 
 
 def twin_probabilities(successes: Array | Indices, trials: Array | Indices) -> Array:
-    """The twin's probability of success in each of its cells, shrunk towards the policy's rate in the twin.
+    """The twin's probability of success in each of its cells, shape (n, k), from its counts (n, k).
 
-    Arguments and result have shape (n, k).
+    A cell's probability is its rate, shrunk towards the policy's rate in the twin.
     """
     return RateModel.fit(successes, trials, shared_days=False, road=False).cell_means()
 
 
 def shuffled_days(probability: Array, weight: Array, rate: Array, score: Callable[[Array, Array], Array]) -> Array:
-    """Expected score of each cell if the twin's days of each policy were permuted at random, shape (n, k).
+    """Expected score of each cell, shape (n, k), if the days of each policy's probabilities were permuted at random.
 
     Args:
         probability: Predicted probability of success in each cell, shape (n, k).
@@ -106,8 +106,8 @@ def shuffled_days(probability: Array, weight: Array, rate: Array, score: Callabl
 def other_trainings(data: PairedCells, groups: Indices) -> Array:
     """Baseline: for each policy, the mean real rate of policies of the same group in other trainings, shape (n,).
 
-    The mean rate of all policies of other trainings is a prior with the weight of one policy. `groups` names the group
-    of each policy, such as its setup. If all are equal, the baseline is the mean over the policies of other trainings.
+    This mean includes, with the weight of one policy, the mean rate of all policies of other trainings. `groups`
+    contains the group of each policy, such as its setup; if all are equal, all policies of other trainings count alike.
     """
     real = data.rates()["real"]
     out = np.full(data.policies, 0.5)
@@ -135,7 +135,7 @@ def recalibrated(probability: Array, data: PairedCells) -> Array:
 
 
 def _logistic_line(x: Array, rate: Array) -> tuple[float, float]:
-    """Intercept and slope of a logistic regression by Newton's method, with a weak prior centered at 0 and 1."""
+    """Intercept and slope of a logistic regression by Newton's method, with a weak prior around (0, 1)."""
     design = np.stack([np.ones_like(x), x], -1)
     start = np.array([0.0, 1.0])
     line = start.copy()
@@ -165,7 +165,7 @@ def calibration(probability: Array, rate: Array, trials: Indices) -> tuple[Calib
 
 
 def errors_by_day(probability: Array, rate: Array, days: Sequence[str]) -> tuple[DayErrors, ...]:
-    """Counts misses and false alarms of cells, shapes (c,), for each day in order of first occurrence."""
+    """Counts misses and false alarms among cells, shapes (c,), for each day in order of first occurrence."""
     out = []
     for day in dict.fromkeys(days):
         of = np.array([other == day for other in days])

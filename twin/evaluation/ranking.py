@@ -1,10 +1,9 @@
 """Bayesian ranking of policies: probabilities of ranks, and how many further trials would settle the ranking.
 
 Samples of the policies' true rates come from the posterior of `twin.evaluation.rate_model`, which shrinks a rate
-towards the other policies and treats trials of one day as correlated. The probability of a policy's rank is the
-fraction of samples in which the policy has that rank. Results hold for the world, twin or road, in which the trials
-were driven: a ranking in the twin is no
-evidence of a ranking on the road.
+towards those of the other policies and treats trials of one day as correlated. The probability of a policy's rank is
+the fraction of samples in which the policy has that rank. Results hold for the world, twin or road, in which the trials
+were driven: a ranking in the twin is no evidence of a ranking on the road.
 """
 
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import numpy as np
 from twin.evaluation.statistics import CONFIDENCE
 from twin.types import Array
 
-SETTLED_PROBABILITY = 0.95  # least expected confidence in a ranking that counts as settled
+SETTLED_PROBABILITY = 0.95  # a ranking is settled when the expected confidence in it is at least this
 MARGIN = 0.05  # policies whose true rates differ by less count as equally good
 MAX_TRIALS = 1000  # largest number of further trials per policy that is considered
 
@@ -45,7 +44,7 @@ class RankingConfidence:
     """Expected confidence in a ranking after further trials, averaged over the posterior of the rates."""
 
     winner: float
-    """Probability that the leading policy's true rate is within `MARGIN` of the best true rate."""
+    """Probability that the true rate of the policy ranked first is within `MARGIN` of the best true rate."""
     order: float
     """Expected fraction of pairs in the right order, among pairs whose true rates differ by more than `MARGIN`."""
 
@@ -53,14 +52,14 @@ class RankingConfidence:
 def expected_confidence(rates: Array, more: int, seed: int, so_far: bool = True) -> RankingConfidence:
     """Expected confidence in the ranking after `more` trials per policy, each on a day of its own.
 
-    The further trials are simulated at the sampled rates, and policies are ranked by their posterior means after these.
+    The further trials are simulated at the sampled rates; then policies are ranked by their updated posterior means.
     Each policy's present posterior is approximated by a Beta distribution with the samples' mean and variance.
 
     Args:
         rates: Samples of the true rates, shape (samples, n).
         more: Further trials per policy.
         seed: Seed of the simulated trials.
-        so_far: If False, the ranking uses the further trials alone; `rates` come from the trials so far in any case.
+        so_far: True: the ranking also uses the trials from which `rates` were sampled; False: the further ones only.
     """
     won = np.random.default_rng(seed).binomial(more, rates)
     if so_far:
@@ -69,7 +68,7 @@ def expected_confidence(rates: Array, more: int, seed: int, so_far: bool = True)
         known = (strength * mean + won) / (strength + more)
     else:
         known = won.astype(float)
-    # Policies tied in the posterior mean are equally likely to be chosen.
+    # Of policies tied in the posterior mean, each is equally likely to be ranked first.
     leading = np.isclose(known, known.max(-1, keepdims=True), rtol=0.0, atol=1e-12)
     good = rates >= rates.max(-1, keepdims=True) - MARGIN
     winner = ((leading & good).sum(-1) / leading.sum(-1)).mean()
@@ -96,7 +95,7 @@ def trials_needed(rates: Array, what: str, seed: int, so_far: bool = True) -> in
         low, high = high, 2 * high
         if low >= MAX_TRIALS:
             return None
-    while high - low > _STEP:  # bisection, as the confidence grows with the trials
+    while high - low > _STEP:  # bisection: the confidence grows with the number of trials
         middle = (low + high) // (2 * _STEP) * _STEP
         low, high = (low, middle) if enough(middle) else (middle, high)
     return high if high <= MAX_TRIALS else None

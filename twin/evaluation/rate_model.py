@@ -10,18 +10,18 @@ on day j, policy i succeeds yᵢⱼ times:
 
 A Beta distribution with mean p and intra-class correlation ρ is Beta(p/ρ − p, (1 − p)/ρ − (1 − p)). With ρ = 1, all
 trials of a day have the same outcome; with ρ = 0, they are independent. τ has a uniform prior, and μ has Jeffreys'. For
-the road, the prior of ρ is Beta(5, 1), since on most days all trials of a policy have the same outcome (706 of 720
-cells in docs/benchmarks.md), and few days do not suffice to estimate ρ: with a uniform prior, intervals from four such
-days had a coverage of 0.79. For the twin's rates (`road=False`), ρ has a uniform prior. All parameters are integrated
-over a grid, so intervals need neither sampling nor a seed. A policy's rate is thus shrunk towards those of the other
-policies, and more strongly the more alike these are, but not towards one half. Policies share ρ, so even two days
-suffice to estimate it if eight policies drove on them. The beta-binomial distribution is Skellam's (J. R. Stat. Soc. B
-10, 1948); for hierarchical models see Gelman et al., Bayesian Data Analysis, section 5.3.
+the twin's rates (`road=False`), ρ has a uniform prior. For the road, its prior is Beta(5, 1): on most days, all trials
+of a policy have the same outcome (706 of 720 cells in docs/benchmarks.md). Few days do not suffice to estimate such a
+ρ: with a uniform prior, 90 % intervals from four days had a coverage of 0.79. All parameters are integrated over a
+grid, so intervals need neither sampling nor a seed. A policy's rate is shrunk towards the rates of the other policies,
+more strongly if these are alike; it is not shrunk towards one half. Policies share ρ, so even two days suffice to
+estimate ρ if eight policies drove on them. The beta-binomial distribution is Skellam's (J. R. Stat. Soc. B 10, 1948);
+for hierarchical models see Gelman et al., Bayesian Data Analysis, section 5.3.
 
 Policies of one experiment drive on the same days, and a bad day is bad for all of them. So their cells are not
 independent, and the product of their likelihoods is a *composite* likelihood. It is raised to the power
 (2k − 1) / (2k + 1) for k days (for such scaling see Ribatet, Cooley and Davison, Statistica Sinica 22, 2012). Without
-this power, intervals from two days had coverages of 0.72 to 0.92.
+this power, 90 % intervals from two days had coverages of 0.72 to 0.92.
 
 The estimand of `interval` is the rate over the *population* of days like those driven, and that of `mean_interval` is
 the rate over the population of policies and days. `cell_means` estimates rates on the days that were driven. For the
@@ -84,9 +84,9 @@ class RateModel:
         Args:
             successes: Successes of each cell.
             trials: Trials of each cell.
-            covariate: xᵢ [logit], shape (n,), from which the mean is subtracted here; None: no covariate.
+            covariate: xᵢ [logit], shape (n,); `fit` subtracts its mean; None: no covariate.
             shared_days: True if the policies drove on the same few days; see the module.
-            road: If True, the prior of ρ is that for the road, otherwise it is uniform.
+            road: True: ρ has the road's prior; False: a uniform one.
 
         Raises:
             ValueError: more successes than trials, negative counts, or shapes that differ.
@@ -146,7 +146,7 @@ class RateModel:
         return out
 
     def cell_means(self) -> Array:
-        """Posterior mean of the rate of each cell, shape (n, k): the cell's rate, shrunk towards the policy's rate."""
+        """Posterior mean of the rate of each cell, shape (n, k): its observed rate, shrunk towards the policy's."""
         joint = self._joint()
         size = 1.0 / _CORRELATIONS - 1.0
         won, driven = self.successes[:, :, None, None], self.trials[:, :, None, None]
@@ -179,7 +179,7 @@ def _likelihood(won: Array, driven: Array) -> Array:
 
 
 def _shortest(mass: Array, edges: Array, confidence: float) -> tuple[float, float]:
-    """Shortest interval with mass `confidence`, for a distribution with the given masses, uniform between the edges."""
+    """Shortest interval with mass `confidence` of a distribution that is uniform between the edges of each bin."""
     below = np.concatenate([[0.0], np.cumsum(mass)])
     below /= below[-1]
     start = np.linspace(0.0, 1.0 - confidence, 201)

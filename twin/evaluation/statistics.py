@@ -2,11 +2,11 @@
 
 A *rate* is successes divided by trials; its interval contains the true rate with probability `CONFIDENCE`. *Twin
 scores* and *real scores* are rates of the same policies in the twin and on the road, in the same order, along the last
-axis; leading axes are separate experiments. The arguments `twin` and `real` are keyword-only, since they are not
-interchangeable (regret and rank violations are differences of real rates).
+axis; leading axes are separate experiments. The arguments `twin` and `real` are keyword-only, since exchanging them
+changes results: regret and rank violations are differences of real rates.
 
-Functions raise `UndefinedStatistic` if the data do not determine a statistic. Functions with a name that ends in
-`_batched` work over leading axes, for resampling, and return nan instead of raising it.
+Functions raise `UndefinedStatistic` if the data do not determine a statistic. Functions whose names end in `_batched`
+work over leading axes, for resampling, and return nan instead of raising it.
 """
 
 from collections.abc import Sequence
@@ -23,14 +23,14 @@ from twin.types import Array
 CONFIDENCE = 0.9
 """Confidence level of every interval."""
 MIN_POLICIES = 5
-"""Number of policies below which no correlation is given."""
+"""Number of policies below which neither agreement nor predictions are given."""
 MIN_PREDICTORS = 7
 """Number of policies below which a prediction has no interval."""
 MIN_TRIALS = 5
-"""Number of trials per cell below which no correlation is given."""
+"""Number of trials per cell below which neither agreement nor predictions are given."""
 
 _MIN_POINTS = 3  # smallest number of policies for a correlation
-_DECIMALS = 12  # scores equal to this many decimals are tied, since the order of summation changes the last bits
+_DECIMALS = 12  # scores equal to this many decimals are tied: the order of summation changes further decimals
 _MIN_VARIANCE = 1e-12  # scores with a smaller variance count as equal
 
 
@@ -42,9 +42,10 @@ class UndefinedStatistic(ValueError):
 
 
 def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
-    """Lower and upper end of a rate's score interval (Wilson 1927); eq. 4 of Brown, Cai and DasGupta, Statistical
-    Science 16 (2001). Unlike SciPy's function, this one accepts arrays, and numbers of successes that are not whole
-    (see `mean_rate`).
+    """Lower and upper end of a rate's score interval (Wilson 1927).
+
+    Eq. 4 of Brown, Cai and DasGupta, Statistical Science 16 (2001). Unlike SciPy's function, this one accepts arrays,
+    and fractional numbers of successes (see `mean_rate`).
     """
     n = np.asarray(trials, float)
     p = np.asarray(successes, float) / n
@@ -57,8 +58,8 @@ def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDEN
 def mean_rate(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
     """Unweighted mean of the rates of k cells, shape (k,), and the ends of its interval.
 
-    The interval is Wilson's for k² / Σ 1/nᵢ trials: with so many trials, a binomial rate has the same variance as the
-    mean if all cells have the same true rate. Cells with unequal rates have less variance, so the interval is then too
+    The interval is Wilson's for k² / Σ 1/nᵢ trials: if all cells have the same true rate, a binomial rate of so many
+    trials has the same variance as the mean. Cells with unequal rates have less variance, for which the interval is too
     wide rather than too narrow.
     """
     n = np.asarray(trials, float)
@@ -81,10 +82,9 @@ def rate_over_days(rates: ArrayLike, confidence: float = CONFIDENCE) -> tuple[fl
 
     Trials of one day share its lighting and weather. The interval assumes that all trials of a day have the same
     outcome: with an intra-class correlation ρ of 1, the design effect 1 + (m − 1) ρ equals the number m of trials of a
-    day (Kish, Survey Sampling, 1965, section 5.4), so k days count as k trials in Wilson's interval. Rates between 0
-    and 1 have less variance than successes and failures with the same mean, so the interval is then too wide rather
-    than too narrow. It holds for further days of the same policies, not for further policies. Raises ValueError: no
-    rate, or one outside [0, 1].
+    day (Kish, Survey Sampling, 1965, section 5.4), so k days count as k trials in Wilson's interval. Days with rates
+    between 0 and 1 have less variance, for which the interval is too wide rather than too narrow. It holds for further
+    days of the same policies, not for further policies. Raises ValueError: no rate, or one outside [0, 1].
     """
     days = np.asarray(rates, float)
     if days.ndim != 1 or not len(days) or not ((days >= 0.0) & (days <= 1.0)).all():
@@ -101,7 +101,7 @@ def rate_difference(
     real_trials: ArrayLike,
     confidence: float = CONFIDENCE,
 ) -> tuple[Array, Array, Array]:
-    """Real minus twin rate in [−1, 1], and the ends of its interval: Newcombe's hybrid score, which SciPy lacks.
+    """Real minus twin rate in [−1, 1], and the ends of Newcombe's hybrid score interval, which SciPy lacks.
 
     Method 10 of R. G. Newcombe, Interval estimation for the difference between independent proportions, Statistics in
     Medicine 17 (1998). All counts have the same shape.
@@ -119,7 +119,7 @@ def rate_difference(
 
 
 def pearson(*, twin: ArrayLike, real: ArrayLike) -> float:
-    """Pearson's correlation of scores, shapes (n,). Raises UndefinedStatistic: n < 3, or all scores are equal."""
+    """Pearson's correlation of scores (n,). Raises UndefinedStatistic: n < 3, or all scores on one side are equal."""
     twin, real = _validated(twin, real)
     return float(pearson_batched(twin=twin, real=real))
 
@@ -133,11 +133,11 @@ def spearman(*, twin: ArrayLike, real: ArrayLike) -> float:
 def mmrv(*, twin: ArrayLike, real: ArrayLike) -> float:
     """Mean maximum rank violation in [0, 1], 0 is best: SIMPLER (Li et al., arXiv 2405.05941), section on metrics.
 
-    If twin and road order a pair of policies differently, the violation is the difference of their real scores:
-    |Rᵢ − Rⱼ| · 1[(Sᵢ < Sⱼ) ≠ (Rᵢ < Rⱼ)]. MMRV is the mean over i of the largest violation over j. It is not symmetric
-    in twin and real, and published code has both orders of the arguments. If two policies are tied in the twin but not
-    on the road, the violation counts for the policy with the lower real score; in the paper's published code, which
-    compares by >, it counts for the one with the higher real score. Raises UndefinedStatistic: fewer than two policies.
+    If twin and road order a pair of policies differently, the violation is the difference of their real scores R:
+    |Rᵢ − Rⱼ| · 1[(Sᵢ < Sⱼ) ≠ (Rᵢ < Rⱼ)], with twin scores S. MMRV is the mean over i of the largest violation over j.
+    It is not symmetric in S and R, and published code has both orders of the arguments. For two policies tied in the
+    twin but not on the road, the violation counts for the policy with the lower real score; in the paper's published
+    code, which compares by >, for the one with the higher score. Raises UndefinedStatistic: fewer than two policies.
     """
     twin, real = _validated(twin, real, needed=2, varied=False)
     return float(mmrv_batched(twin=twin, real=real))
@@ -146,8 +146,8 @@ def mmrv(*, twin: ArrayLike, real: ArrayLike) -> float:
 def winner(*, twin: ArrayLike, real: ArrayLike) -> tuple[float, float]:
     """Agreement and regret of the twin's best policy; if several are tied as best in the twin, the means over them.
 
-    Agreement is 1 if the policy is also the best on the road, else 0. Regret is the real rate of the road's best policy
-    minus the real rate of this policy. Raises UndefinedStatistic: fewer than two policies.
+    Agreement is 1 if the twin's best policy is also the best on the road, else 0. Regret is the real rate of the road's
+    best policy minus that of the twin's best policy. Raises UndefinedStatistic: fewer than two policies.
     """
     twin, real = _validated(twin, real, needed=2, varied=False)
     agreement, regret = winner_batched(twin=twin, real=real)
@@ -155,7 +155,7 @@ def winner(*, twin: ArrayLike, real: ArrayLike) -> tuple[float, float]:
 
 
 def pearson_batched(*, twin: Array, real: Array) -> Array:
-    """`pearson` over leading axes, shape (..., n) → (...); nan where all scores are equal."""
+    """`pearson` over leading axes, shape (..., n) → (...); nan where all twin or all real scores are equal."""
     x = twin - twin.mean(-1, keepdims=True)
     y = real - real.mean(-1, keepdims=True)
     scale = np.sqrt((x * x).sum(-1) * (y * y).sum(-1))
@@ -164,7 +164,7 @@ def pearson_batched(*, twin: Array, real: Array) -> Array:
 
 
 def spearman_batched(*, twin: Array, real: Array) -> Array:
-    """`spearman` over leading axes, shape (..., n) → (...); nan where all scores are equal."""
+    """`spearman` over leading axes, shape (..., n) → (...); nan where all twin or all real scores are equal."""
     return pearson_batched(twin=rankdata(_rounded(twin), axis=-1), real=rankdata(_rounded(real), axis=-1))
 
 
@@ -194,9 +194,9 @@ def _validated(twin: ArrayLike, real: ArrayLike, needed: int = _MIN_POINTS, vari
     if twin.ndim != 1 or twin.shape != real.shape:
         raise ValueError(f"scores of shapes {twin.shape} and {real.shape}: expected one per policy in each, (n,)")
     if not (np.isfinite(twin).all() and np.isfinite(real).all()):
-        raise ValueError("a score is not a number")
+        raise ValueError("a score is nan or infinite; expected finite numbers")
     if len(twin) < needed:
-        raise UndefinedStatistic(f"{len(twin)} policies; at least {needed} are needed for this to be defined")
+        raise UndefinedStatistic(f"{len(twin)} policies; at least {needed} are needed for this statistic")
     for name, scores in (("in the twin", twin), ("on the road", real)):
         if varied and np.ptp(_rounded(scores)) == 0:
             raise UndefinedStatistic(f"all rates {name} are {scores[0]:.3g}; a correlation needs rates that differ")
@@ -206,17 +206,17 @@ def _validated(twin: ArrayLike, real: ArrayLike, needed: int = _MIN_POINTS, vari
 # ---- prediction of real scores
 #
 # Prediction-powered inference (PPI; Angelopoulos et al., arXiv 2301.09633) combines many twin scores with few pairs of
-# twin and real scores. With n paired scores fᵢ and Yᵢ, and N further twin scores f̃ⱼ, the mean real score of such
-# policies is estimated by
+# twin and real scores. From n pairs of twin score fᵢ and real score Yᵢ, and from N further twin scores f̃ⱼ, it estimates
+# the mean real score of such policies as
 #
 #     θ = λ · mean(f̃) + mean(Y − λ f)            eq. 4 of PPI++ (Angelopoulos, Duchi and Zrnic, arXiv 2311.01453)
 #
-# which is unbiased however inaccurate the twin is. Its variance is least for the *power* λ = Cov(Y, f) / ((1 + n/N)
-# Var f) (example 6.1 of PPI++). A single further policy with twin score f̃ is predicted with the λ for N → ∞,
+# This estimate is unbiased however inaccurate the twin is. Its variance is least for the *power* λ = Cov(Y, f) /
+# ((1 + n/N) Var f) (example 6.1 of PPI++). A single further policy with twin score f̃ is predicted with the λ for N → ∞:
 #
-#     Ŷ = λ f̃ + mean(Y − λ f),  λ = Cov(Y, f) / Var f,
+#     Ŷ = λ f̃ + mean(Y − λ f),  λ = Cov(Y, f) / Var f
 #
-# the least-squares line through the paired scores; their residuals give the prediction interval.
+# This is the least-squares line through the pairs; their residuals give the prediction interval.
 
 
 @dataclass(frozen=True)
@@ -241,9 +241,9 @@ def prediction_powered_mean(
     """Estimates the mean real score by PPI++.
 
     For each policy, λ is tuned on the other policies (leave one out), so the estimate is exactly unbiased. With a λ
-    tuned on all of the few policies it would be biased (Mani et al., arXiv 2505.20178). The interval uses Student's t
-    with n − 1 degrees of freedom and is not clipped to [0, 1]. In simulation its coverage is 0.91 to 0.93 for policies
-    of varied quality, but 0.8 for six policies most of which fail.
+    tuned on all policies it would be biased (Mani et al., arXiv 2505.20178). The interval uses Student's t with n − 1
+    degrees of freedom and is not clipped to [0, 1]. In simulation, the coverage of a 90 % interval is 0.91 to 0.93 for
+    policies of varied quality, but 0.8 for six policies most of which fail.
 
     Args:
         twin: fᵢ, shape (n,).
@@ -305,7 +305,7 @@ class LinearCorrection:
         return LinearCorrection(slope, float(f.mean()), float(y.mean()), residual_std, squares, len(y))
 
     def predict(self, twin: ArrayLike, confidence: float = CONFIDENCE) -> tuple[Array, Array, Array]:
-        """Predicts real scores, in as many trials as the fitted policies had, from twin scores.
+        """Predicts the real scores that policies with these twin scores reach in as many trials as the fitted ones.
 
         Returns values and ends of their intervals, clipped to [0, 1], each of the shape of `twin`. The interval is the
         prediction interval of simple regression (Draper and Smith, Applied Regression Analysis, section 3.1). It is
@@ -324,8 +324,8 @@ def leave_one_group_out(
 ) -> tuple[Array, Array, Array]:
     """Predicts each real score by the line fitted to all other groups: values and ends of intervals, shapes (n,).
 
-    `groups` names the group of each score, such as its policy or lighting. Raises UndefinedStatistic: without one of
-    the groups, fewer than 5 scores remain.
+    `groups` contains the group of each score, such as its policy or lighting. Raises UndefinedStatistic: fewer than 5
+    scores remain without one of the groups.
     """
     f, y = np.asarray(twin, float), np.asarray(real, float)
     out = np.empty((3, len(y)))

@@ -1,4 +1,4 @@
-"""Success during training, from a run's `episodes.csv`: curves, and the rate before a policy was saved."""
+"""Success during training, from a run's `episodes.csv`: a curve, and the rate just before a policy was saved."""
 
 import csv
 import io
@@ -21,20 +21,20 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 CHOICE_FILE = "choice.json"
-"""File of a run with the selection of its policy; see `learn/selection.py`."""
+"""File of a run that records the selection of its policy; see `learn/selection.py`."""
 _MAX_BINS = 25  # points of a curve
 _MIN_EPISODES = 5  # per point
 
 
 def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Summarizes the trainings of policies in `runs/`, for those policies that are unchanged since their validation.
+    """Summarizes the trainings of those policies in `runs/` that are unchanged since their validation.
 
     Args:
         root: The scene folder.
         policies: Names as in tables, `run` or `run/checkpoint`.
 
     Returns:
-        By policy, JSON-able: its run; the step at which it was saved; task, observe and lighting of the training; and
+        By policy, JSON-able: its run; the step at which it was saved; task, observe and lighting of its training; and
         the `rate_summary` of the last `RECENT_EPISODES` episodes up to that step.
     """
     digests = validated_digests(root)

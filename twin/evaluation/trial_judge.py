@@ -1,8 +1,8 @@
 """Judges a trial on the road by the twin's rules of success and failure, and compares the trial with the twin.
 
-The recorded poses, sampled once per control step, are judged by the environment's `RewardAndTermination`. *Replay*: the
-recorded commands drive the twin's robot from the same start. *Views*: the field rendered from the poses at which the
-robot's pictures were taken. Outcomes that poses cannot show, such as a collision, are stated by the operator.
+`judge` applies the environment's `RewardAndTermination` to the recorded poses, sampled once per control step. The
+operator states outcomes that poses do not show, such as a collision. `replay` drives the twin's robot by the recorded
+commands, from the same start. `view` renders the field from the poses at which the robot took its pictures.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from twin.nerf.rendering import Rendering
 from twin.robot import PixelCamera
 from twin.types import Array, Image
 
-_PROBES = 8  # number of pictures by which a lighting is chosen
+_PROBES = 8  # number of pictures that decide the choice of a lighting
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,7 @@ class JudgedTrial:
     start_heading: float
     """Yaw relative to the route at the start [rad]."""
     rewards: Array
-    """Reward of the step that ended at each instant, by the environment's reward terms except that for steering; the
-    first is zero. Shape (k,)."""
+    """Reward of the step that ended at each instant, without the term for steering, shape (k,); the first is zero."""
 
 
 def judge(factory: EnvFactory, times: Array, poses: Array, uprightness: Array) -> JudgedTrial:
@@ -104,8 +103,8 @@ class TrialViews:
     psnr: Array
     """[dB], shape (n,)."""
     matched_psnr: Array
-    """PSNR after each color's mean and standard deviation were matched, so that shapes and shadows determine it [dB],
-    shape (n,)."""
+    """PSNR [dB], shape (n,), after matching each color's mean and standard deviation to the robot's picture; it depends
+    on shapes and shadows only."""
     trust: Array
     """See `twin.env.trust`, shape (n,)."""
 
@@ -113,7 +112,7 @@ class TrialViews:
 def view(
     factory: EnvFactory, poses: Array, pictures: list[Image], camera: PixelCamera, lighting: str | None
 ) -> TrialViews:
-    """Renders the field where pictures were taken.
+    """Renders the field from the poses at which pictures were taken, and compares the pictures.
 
     Args:
         factory: Scene, with its field.

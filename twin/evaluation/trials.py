@@ -1,14 +1,14 @@
-"""Tables of trials in the twin, which `twin.validate` writes, and on the road (`real.csv`).
+"""Tables of trials in the twin, which `twin.validate` writes, and of trials on the road.
 
 A *trial* is one drive of a policy, on a task, under a lighting; it succeeds or fails. A *cell* is all trials of one
-policy, task and lighting. In the twin every trial is a row of `validation/episodes.csv`; real trials are given as cells
-in `results.csv`:
+policy, task and lighting. `validation/episodes.csv` has a row for each trial in the twin. A *results table*, such as
+`real.csv` or `results.csv`, has a row for each cell of real trials:
 
     policy,lighting,trials,successes            optional columns: task, twin_lighting
 
-`task` is required only for a policy that was validated on several tasks. `twin_lighting` is required if the twin has no
-lighting named `lighting`: it names the twin's lighting to compare with, such as `held-out+randomised` for
-`dusk_on_monday`.
+`task` is required only for a policy that was validated on several tasks. `twin_lighting` names the twin's lighting to
+compare with, such as `held-out+randomised` for `dusk_on_monday`; it is required if the twin has no lighting named
+`lighting`.
 """
 
 import csv
@@ -29,12 +29,12 @@ EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "pr
 CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "low", "high")
 """Columns of `validation/cells.csv`: counts of episodes, with Wilson's interval."""
 RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
-"""Columns of `results.csv`."""
+"""Required columns of a results table."""
 SETUP_COLUMNS = ("place", "day", "robot", "camera", "outside_training")
-"""Columns that `twin.reality` writes: numbers of place, day, robot and camera, and the parameters of robot and camera
-that lie outside the ranges of the training."""
+"""Columns that `twin.reality` adds: numbers of place, day, robot and camera, and the parameters of robot and camera
+that lie outside the training's ranges."""
 OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting", *SETUP_COLUMNS)
-"""Further columns that `results.csv` may have."""
+"""Further columns that a results table may have."""
 RECENT_EPISODES = 20
 """Number of episodes over which a training's success rate is measured: the newest ones that started at the beginning of
 the task's route segment."""
@@ -58,7 +58,7 @@ class Trial:
     steps: int
     """Control steps."""
     trust: float | None = None
-    """Mean over the pictures in [0, 1]; None without pictures."""
+    """Mean over the pictures (see `twin.env.trust`), in [0, 1]; None without pictures."""
 
     @property
     def success(self) -> bool:
@@ -81,7 +81,7 @@ class Cell:
     trials: int
     successes: int
     twin_lighting: str = ""
-    """For a real cell, the twin's lighting to compare with."""
+    """For a real cell, the twin's lighting to compare with; empty: the one named `lighting`."""
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -131,10 +131,10 @@ def write_real_trials(
     twin_lighting: str,
     setup: Callable[[str], tuple[str, ...]] | None = None,
 ) -> None:
-    """Writes real trials, one row each, to `table`, and their counts to `out`, in the format of `read_results`.
+    """Writes real trials, one row each, to `table`, and their counts to the results table `out`.
 
-    Cells that are already in `out` keep their `twin_lighting` and `SETUP_COLUMNS`. For other cells, `setup` gives the
-    values of `SETUP_COLUMNS` by the lighting's name.
+    Cells that are already in `out` keep their `twin_lighting` and `SETUP_COLUMNS`. For other cells, `setup`, if given,
+    returns the values of `SETUP_COLUMNS` for a lighting's name.
     """
     known: dict[tuple[str, str, str], dict[str, str]] = {}
     if out.exists():
@@ -185,7 +185,7 @@ def read_trials(path: Path) -> list[Trial]:
 
 
 def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
-    """Reads `results.csv` and checks that for each real cell there is a cell of the twin to compare with.
+    """Reads a results table and checks that the twin has a cell to compare with each real cell.
 
     Raises InputError: no such file, a wrong header, or a line with an unknown name, an impossible count or a duplicate.
     """
@@ -213,7 +213,7 @@ def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
 
 
 def read_counts(path: Path) -> dict[tuple[str, str, str], tuple[int, int]]:
-    """Trials and successes by policy, task (empty if not given) and lighting in `results.csv`.
+    """Trials and successes by policy, task (empty if not given) and lighting in a results table.
 
     Raises InputError as `read_results` does; names are not compared with the twin's.
     """
