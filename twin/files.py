@@ -374,7 +374,7 @@ def is_file(path: Path) -> bool:
 
 def is_folder(path: Path, cure: str) -> bool:
     """True for a folder, False for a regular file. Raises InputError for anything else, with `cure` in the message."""
-    with contextlib.suppress(OSError, ValueError):  # `regular_file` raises
+    with contextlib.suppress(OSError, ValueError):  # `regular_file` reports these errors
         if stat.S_ISDIR(path.stat().st_mode):
             return True
     try:

@@ -304,7 +304,7 @@ def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], p
         digest = _digest(Path(source), source)
         if name in driven and recorded["policies"].get(name) != digest:
             raise InputError(
-                f"policy {name!r} was validated as another file than {source} is now; move {folder} away, or "
+                f"policy {name!r}: {source} is not the file that was validated under this name; move {folder} away, or "
                 "copy the policy to another name"
             )
         recorded["policies"][name] = digest
