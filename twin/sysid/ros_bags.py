@@ -1,8 +1,8 @@
-"""Drive logs from bags, as tables that have a row per joint state and the newest values of the other topics.
+"""Reads drive logs from bags: tables with a row per joint state, and the newest values of the other topics.
 
 If a bag has no joint states, the wheel speeds are computed from the wheels' odometry by the inverse of Clearpath's
-kinematics. Poses that come from the wheels are not used, since they hide the wheels' slip. If a bag has no others but a
-scene was built from its pictures, the poses are those of a robot at rest below the reconstructed cameras.
+kinematics. Poses that come from the wheels are not used, since they hide the wheels' slip. If a bag has no other poses,
+but a scene was built from its pictures, the poses are those of a robot at rest below the reconstructed cameras.
 """
 
 from dataclasses import dataclass
