@@ -60,8 +60,8 @@ PIPELINE = (
 _ON_DEVICE = ("field", "mesh")  # stages that take a device
 _WRITTEN = ("build", "runs", "validation", "forecast", "lightings")  # folders of a scene that are never inputs
 # Durations [s] for the demo with 2 cores. Only their ratios matter: they are scaled by the measured durations of
-# earlier stages. The remaining time is shown once more than `_LEAST_TIMED` of typical duration has run; the first stage
-# alone is too short for a scale.
+# earlier stages. The remaining time is shown once the typical durations of these stages exceed `_LEAST_TIMED`; the
+# first stage alone is too short for a scale.
 _TYPICAL = {"capture": 5.0, "cameras": 90.0, "metric": 1.0, "field": 280.0, "mesh": 70.0, "mjcf": 3.0, "review": 45.0}
 _LEAST_TIMED = 30.0
 

@@ -103,7 +103,7 @@ class SourceConfig:
     topic: str = ""
     """Topic of the pictures in a bag; by default the one with most pictures."""
     images: str = ""
-    """Image folder of a COLMAP model or transforms.json, if it is not beside that."""
+    """Image folder of a COLMAP model or transforms.json; needed unless it is beside that file."""
     mask: str = ""
     """One static mask image, or a folder of masks named like the frames; 0 = ignore."""
     camera: CalibrationConfig | None = None
@@ -287,7 +287,8 @@ class RouteConfig:
     """The choice of the route among the filmed passes; by default the longest line of one lighting."""
 
     passes: tuple[str, ...] = ()
-    """Passes in driving order, such as "noon:2", or "noon" for the longest one of that source; see the report."""
+    """Passes in driving order, such as "noon:2", or "noon" for the longest pass of that source; the report lists the
+    passes."""
     points: tuple[tuple[float, ...], ...] = ()
     """Way points [x, y] [m] instead of passes, in the frame of the report's map, at most 1 m from the filmed paths."""
     reverse: bool = False
@@ -350,7 +351,7 @@ class ObstacleConfig:
     speed: float = 1.2
     """Speed if it moves [m/s]."""
     delay: float = 0.0
-    """Time for which it has already been moving when the episode begins [s]."""
+    """Time for which the obstacle has already been moving when the episode begins [s]."""
     color: tuple[float, ...] = ()
     """Main color as red, green, blue, each from 0 to 1; by default the color of its kind."""
     size: tuple[float, ...] = ()

@@ -4,7 +4,7 @@
     python -m twin.pack scenes/demo --policy first --levels 8 -o scenes/demo.twin
 
 A pack contains what driving needs: the baked field, the MJCF scene with its assets, ground, parts and cameras, tasks,
-robot, and lightings of photos. It contains neither films, frames and reports nor the field as trained. Private data are
+robot, and lightings of photos. It contains no films, frames and reports, and not the field as trained. Private data are
 left out: comments and paths of `scene.toml`, photos, dependencies in stamps and, unless asked for, GPS positions.
 `twin.unpack` describes the format.
 

@@ -266,7 +266,7 @@ def _verified_stamp(scene: SceneDir, stage: str) -> Stamp:
 def require_stage(scene: SceneDir, stage: str) -> Path:
     """Returns the folder of a built stage, after comparing its files with its stamp (once per process).
 
-    Files larger than 256 MiB are compared by size only. A build hashes all files, and so finds every change.
+    Files larger than 256 MiB are compared by size only. A build hashes every file, and so finds all changes.
 
     Raises:
         InputError: the stage has not been built, or one of its files is damaged.

@@ -43,7 +43,7 @@ FORMAT, VERSION = "twin pack", 1
 MANIFEST, README = "manifest.json", "README.txt"
 PLAIN, DIFFERENCES = "plain", "differences"
 STAGES_PACKED = ("metric", "field", "mesh", "mjcf")
-"""Stages of a build of which a part is packed."""
+"""Build stages of which some files are packed."""
 
 _MAX_FILES = 20_000
 _MAX_FILE, _MAX_TOTAL = 2 << 30, 4 << 30  # [bytes] largest file, and largest total size, unpacked

@@ -178,7 +178,7 @@ def _write_results(twin: Twin) -> dict:
 
 
 def _worst_lightings(path: Path) -> list[dict]:
-    """Results of the final evaluations in the worst lighting, one cell per policy and task with a search."""
+    """Results in the worst lighting found, from the final episodes: one cell per policy and task with a search."""
     trials = _read_table(path)
     cells = summarize([t for t in trials if t.seed >= _FINAL_SEED])["cells"]
     return [

@@ -77,7 +77,7 @@ def estimate_extrinsics(
     way = float(np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1).sum())
     if len(poses) < _MIN_FRAMES or way < _MIN_WAY:
         raise InputError(
-            f"{len(poses)} frames of the film were found on the place, over {way:.1f} m; expected at least "
+            f"{len(poses)} frames of the film were localized in the place, over {way:.1f} m; expected at least "
             f"{_MIN_FRAMES} over {_MIN_WAY:g} m; drive further, slowly, on the filmed path and in light "
             "like that of one of the films"
         )
@@ -224,8 +224,8 @@ class CameraCalibration:
 
     @property
     def summary(self) -> str:
-        """One line: the number of frames found, and their reprojection error."""
-        found = f"{len(self.registration.frames)} of {self.frames} frames found on the place"
+        """One line: the number of localized frames, and their reprojection error."""
+        found = f"{len(self.registration.frames)} of {self.frames} frames localized in the place"
         return f"{found}, median reprojection error {self.registration.error:.2f} px"
 
     @property

@@ -119,7 +119,7 @@ def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tu
     if not any(count >= MIN_POSES and not is_from_wheels(name) for name, count in counts.items()):
         if filmed is None:
             raise InputError(
-                f"{path}: no topic with poses ({' or '.join(TYPES['poses'])}) that come from elsewhere than the wheels "
+                f"{path}: no topic with poses ({' or '.join(TYPES['poses'])}) other than wheel odometry "
                 f"among {topic_names(connections)}; record LiDAR, RTK or a total station, or build the scene from this "
                 "bag's pictures"
             )
