@@ -284,7 +284,7 @@ class MeshConfig:
 
 @dataclass(frozen=True)
 class RouteConfig:
-    """The choice of the route among the filmed passes; by default the longest line of one lighting."""
+    """The choice of the route among the filmed passes; by default the longest line of joined passes of one lighting."""
 
     passes: tuple[str, ...] = ()
     """Passes in driving order, such as "noon:2", or "noon" for the longest pass of that source; the report lists the

@@ -144,7 +144,7 @@ def copy_policy(source: Path, folder: Path) -> None:
 
 def _replace_policy(folder: Path, files: dict[str, bytes]) -> None:
     """Replaces files, policy.json last. If the disk is full, the old policy remains complete."""
-    with contextlib.ExitStack() as stack:  # at its end, the temporary files are renamed, the last created first
+    with contextlib.ExitStack() as stack:  # on exit, it renames the temporary files in reverse order
         temporary = {name: stack.enter_context(atomic_path(folder / name)) for name in reversed(files)}
         for name, content in files.items():
             temporary[name].write_bytes(content)

@@ -84,7 +84,7 @@ def run_episodes(
 ) -> list[EpisodeResult]:
     """Drives one episode per seed, in all environments at once; returns results in the order of the seeds.
 
-    `envs` must have pictures; their current episodes are abandoned. `watch` is called after every episode.
+    `envs` must render pictures; their current episodes are abandoned. `watch` is called after every episode.
     """
     assert envs.pixels is not None
     waiting = list(range(len(seeds)))

@@ -281,7 +281,7 @@ def prepare_folder(folder: Path) -> None:
 
 
 def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
-    """Settings that must be equal in all calls of a run: the configuration and the fingerprint of the road.
+    """Settings that `check_same` compares between calls of a run: the configuration, and the road's fingerprint.
 
     The values are JSON types, as read from `config.json`.
     """
@@ -290,7 +290,7 @@ def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
 
 
 def check_same(folder: Path, settings: dict[str, Any]) -> None:
-    """Raises InputError if an existing run has another configuration."""
+    """Raises InputError if a run has other settings, apart from `steps` and `success`."""
     with wrap_read_errors(folder / "config.json", "train anew under another name"):
         previous = dict(read_json(folder / "config.json"))
         previous["road"]

@@ -51,7 +51,7 @@ _FAR_OFF, _JUMP = 8.0, 3.0  # multiples of the median deviation (outliers) and o
 class CameraExtrinsics:
     """Values or standard errors of a camera's height [m] and angles [°].
 
-    An error of the principal point shifts the image as yaw and pitch do; it is meant to be absorbed by them.
+    An error of the principal point shifts the image as yaw and pitch do. They absorb it, as intended.
     """
 
     height: float

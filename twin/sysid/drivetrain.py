@@ -76,9 +76,9 @@ class Drivetrain:
 def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array, Array]:
     """Servo targets and the resulting wheel speeds, starting from each window's first wheel speeds.
 
-    A window that follows another one starts with that one's delayed commands, and where its acceleration ramp ended.
-    The wheel speeds do not show this point, since they lag behind the ramp. In other windows the wheels keep their
-    speed until the first command arrives.
+    A window that follows another one begins with the other's delayed commands and continues the other's acceleration
+    ramp. The wheel speeds do not show how far the ramp has come, since they lag behind it. In all other windows, the
+    wheels keep their speed until the first command arrives.
 
     Returns:
         Targets and lagged wheel speeds, left and right [rad/s], each of shape (n, (k + EXTRA_SAMPLES) · 5, 2),

@@ -96,7 +96,7 @@ def robust_jacobian(scaled: Array, jacobian: Array) -> Array:
 
 
 def apply_weights(scaled: Array, values: Array) -> Array:
-    """Values (n, ...) times the root of their window's weight in iteratively reweighted least squares, 1 / (1 + s)."""
+    """Values (n, ...) times √(weight / instants); weight is 1 / (1 + s), as in iteratively reweighted least squares."""
     return values * _per_window(1 / np.sqrt((1 + _squared_norm(scaled)) * scaled.shape[1]), values)
 
 
@@ -147,7 +147,7 @@ class Fit:
 
     values: dict[str, float]
     errors: dict[str, float]
-    """Standard errors of the identified parameters; the others have their defaults."""
+    """Standard errors of the identified parameters. The others have none; their values are the defaults."""
     refused: dict[str, str]
     """A line per parameter that is not identified: its default, its standard error and the cure."""
     negative_log_likelihood: float

@@ -25,7 +25,7 @@ _SILENT_AFTER = 1_000_000_000  # [ns] for which stops are published after the de
 
 
 class PolicyNode(Node):
-    """Drives by a policy; parameters are explained in config/twin_policy.yaml."""
+    """Drives a robot by a policy; `config/twin_policy.yaml` explains the parameters."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("twin_policy", **options)

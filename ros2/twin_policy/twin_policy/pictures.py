@@ -190,8 +190,8 @@ def _fisheye(x: np.ndarray, y: np.ndarray, d: tuple[float, ...]) -> tuple[np.nda
 class Rectifier:
     """Maps pictures of one camera to a pinhole camera at a policy's size.
 
-    The picture is sampled bilinearly on a grid as fine as its own pixels, and blocks of the grid are averaged, so that
-    nothing aliases. If both cameras are equal, pictures pass unchanged, bit for bit.
+    The picture is sampled bilinearly on a grid as fine as the camera's pixels, and blocks of the grid are averaged,
+    which avoids aliasing. If both cameras are equal, pictures pass unchanged, bit for bit.
     """
 
     def __init__(self, camera: Camera, pinhole: Camera, max_outside: float = 0.05) -> None:

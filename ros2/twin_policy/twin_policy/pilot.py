@@ -34,7 +34,7 @@ class Limits:
     inference: float = 0.1
     """Longest time from a picture's arrival to its command [s]."""
     ahead: float = 0.05
-    """Greatest lead of a stamp over the clock [s]."""
+    """Largest time by which a stamp may be ahead of the clock [s]."""
     clock_jump: float = 0.05
     """Largest sudden change of `clock` relative to `steady` [s]."""
     early: float = 0.25
@@ -89,7 +89,7 @@ class Pilot:
             limits: None: the defaults.
             pinhole: The camera that the policy was trained with; None: the policy's own; if it has none, the robot's,
                 without distortion, scaled by its width.
-            clock: Time of the stamps [ns].
+            clock: Clock of the pictures' stamps [ns].
             steady: A clock that never jumps [ns].
         """
         self.policy, self.limits = policy, limits or Limits()
@@ -195,7 +195,7 @@ class Pilot:
     # ---- state
 
     def _may_drive(self) -> bool:
-        """False while the robot has to stand; stops it if a clock jumped or the deadman switch is not held."""
+        """False while the robot has to stand. Also stops it if a clock jumped or the deadman switch is not held."""
         steady, offset = self._steady(), self._clock() - self._steady()
         jump = 0 if self._offset is None else offset - self._offset
         self._offset = offset
