@@ -203,9 +203,7 @@ def command(options: argparse.Namespace) -> None:
     if not options.quiet:
         print(lines)
         if overridden:
-            print(
-                f"scene.toml's [robot] overrides fitted values: {', '.join(overridden)}; remove them there to use these"
-            )
+            print(f"scene.toml's [robot] overrides fitted values: {', '.join(overridden)}; to use the fit, remove them")
         print(f"wrote {folder / ROBOT_TOML}; look at {folder / RESULT_FOLDER}")
 
 

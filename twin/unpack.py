@@ -198,7 +198,7 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         total += size
     bound = min(_MAX_TOTAL, max(_FREE, _MAX_RATIO * path.stat().st_size))
     if total > bound:
-        raise InputError(f"{path} unpacks to {total:,} bytes; expected at most {bound:,} of a file of its size")
+        raise InputError(f"{path} unpacks to {total:,} bytes; expected at most {bound:,} for a file of its size")
     if missing := {*head["files"], README, MANIFEST} ^ set(by_name):
         raise InputError(f"{path}: {short_repr(min(missing))} is in {MANIFEST} but missing, or the reverse; {_CURE}")
     for name, entry in by_name.items():

@@ -296,8 +296,8 @@ def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], p
         road, digest = _road(task, lighting), fingerprint(twin, task, Condition.parse(lighting))
         if road in driven and recorded["roads"].get(road) != digest:
             raise InputError(
-                f"{folder} has episodes of {task} under {lighting} from before its scene, task, obstacles or photo, "
-                "or twin's sampling of episodes changed; move it away to validate again"
+                f"{folder} has episodes of {task} under {lighting} that were driven before the scene, task, obstacles, "
+                "photo or twin's sampling of episodes changed; move it away to validate again"
             )
         recorded["roads"][road] = digest
     for name, source in policies.items():

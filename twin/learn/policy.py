@@ -286,7 +286,7 @@ def _from_callable(name: str) -> Policy:
         outputs = [output_of(stack) for stack in stacks]
         if any(one.shape != example.shape for one in outputs):
             raise InputError(
-                f"policy {name}: returned {short_repr(outputs)}; expected {example.shape[0]} number(s) as before"
+                f"policy {name}: returned {short_repr(outputs)}; expected {example.shape[0]} number(s) as at first"
             )
         return np.stack(outputs)
 

@@ -264,7 +264,7 @@ def read_choice(folder: Path) -> dict[str, Any] | None:
         known = choice["why"] in ENDS and 0 <= counts[1] <= counts[2] and counts[2] > 0
         texts = choice["failures"], choice["chosen"]["condition"]
         if not known or not all(isinstance(one, str) for one in texts) or not isinstance(choice["reached"], bool):
-            raise ValueError("no such choice")
+            raise ValueError("not a choice of twin train")
         float(choice["most"]), float(choice["success"])
         return choice
 

@@ -228,7 +228,7 @@ def _read_csv(path: Path) -> dict[str, Array]:
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path}: not a table of numbers under one line of names: {error}; export it anew") from None
     if values.ndim != 2 or values.shape[1] != len(head):
-        raise InputError(f"{path}: {len(head)} names over rows of another length; export it anew")
+        raise InputError(f"{path}: {len(head)} names in the first line, but rows of another length; export it anew")
     return {name.strip(): values[:, i] for i, name in enumerate(head)}
 
 
@@ -451,8 +451,8 @@ def check_log(windows: Windows, where: str) -> None:
     left, right = int((turned > _TURN).sum()), int((turned < -_TURN).sum())
     if left + right < _MIN_TURNS or min(left, right) < _MIN_TURNS / 4:
         raise InputError(
-            f"{where}: {left} windows turn left and {right} right by more than {_TURN} rad; expected {_MIN_TURNS}, a "
-            "quarter of them at least to either side; drive more turns"
+            f"{where}: {left} windows turn left and {right} right by more than {_TURN} rad; expected {_MIN_TURNS} or "
+            "more, and at least a quarter of that to each side; drive more turns"
         )
 
 

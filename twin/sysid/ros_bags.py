@@ -124,7 +124,7 @@ def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tu
                 "bag's pictures"
             )
         kinds.remove("poses")
-        runtime.log_line(f"{path}: poses are those of its pictures in the built scene, {len(filmed.times)} of them")
+        runtime.log_line(f"{path}: its pictures give the poses in the built scene, {len(filmed.times)} of them")
     if not messages_by_topic(connections, TYPES["wheels"]):
         from_wheels = messages_by_topic(connections, (ODOMETRY,))
         names = [name for name in from_wheels if is_from_wheels(name)]
@@ -132,7 +132,7 @@ def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tu
             topic = max(names, key=lambda name: from_wheels[name])
             values["wheels"] = next(one for one in connections if one.topic == topic and one.msgcount)
             runtime.log_line(
-                f"{path}: no joint states; wheel speeds are those of {topic}, by Clearpath's multiplier "
+                f"{path}: no joint states; wheel speeds are computed from {topic} with Clearpath's multiplier "
                 f"{HuskyParams.separation_multiplier:g}"
             )
     return kinds, values

@@ -111,7 +111,7 @@ def read_trial(path: Path, given: dict[str, str] | None = None) -> TrialRecordin
     stamps = {kind: message_times(np.array(times[kind], np.int64), topics[kind], path) for kind in times}
     arrival = np.array(times["pictures"], np.int64)[:, 1]
     if len(np.unique(arrival)) < len(arrival):
-        raise InputError(f"{path}: pictures on {topics['pictures']} were recorded at the same time; record one topic")
+        raise InputError(f"{path}: pictures on {topics['pictures']} have equal recording times; record the topic once")
     shutter, first = np.unique(stamps["pictures"], return_index=True)
     pose_times, poses, uprightness = _poses(stamps["poses"], values["poses"], f"{path}: {topics['poses']}")
     commands = np.array(values["commands"], float)
