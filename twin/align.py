@@ -159,7 +159,6 @@ def _scene_robot_table(folder: Path) -> dict[str, Any]:
 
 
 def summary(result: Identification) -> str:
-    """The printed summary."""
     scoring = ~result.windows.fitting
     rows = [f"{'errors after 2 s, held-out windows':36} {'median':>16} {'90th percentile':>18}  wheels"]
     for prediction in (result.nominal, result.baseline, result.level, result.fitted):

@@ -134,8 +134,7 @@ class CaptureConfig:
     """Segments of every film that are used, [[from, to], ...] in seconds from its first frame, ends included, ordered
     and disjoint; empty = all. Photos need timestamps."""
     min_motion: Annotated[float, Range(0)] = 1.0
-    """Least motion since the last kept frame; frames with less are dropped [px of median optical flow, at a width of
-    320 px]."""
+    """Least motion between kept frames; others are dropped [px of median optical flow, at a width of 320 px]."""
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,8 @@
 
 The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is a scripted
 route follower, or a policy that `twin.validate` accepts; then the environment has the policy's options. Task, lighting
-and seed determine the episode: with the values of a row of `validation/episodes.csv`, that row's episode is driven
-again. `--rerun` also writes the drive as a recording for Rerun. With `--lerobot`, drives are recorded as a dataset for
-learning instead of a film.
+and seed determine the episode, such as that of a row of `validation/episodes.csv`. `--rerun` also writes the drive as a
+recording for Rerun. With `--lerobot`, drives are recorded as a dataset for learning instead of a film.
 """
 
 import argparse
@@ -182,7 +181,6 @@ def _driver(
 
 
 def film_name(task: str, lighting: str, seed: int) -> str:
-    """File name of an episode's film."""
     return "".join(c if c.isalnum() or c in "-." else "_" for c in f"{task}_{lighting}_{seed}") + ".mp4"
 
 

@@ -199,7 +199,6 @@ class HuskyParams:
 
     @property
     def timing(self) -> ControllerTiming:
-        """Timing of the wheel controller."""
         return CONTROLLERS[self.controller]
 
     @property

@@ -182,7 +182,6 @@ class Stamp:
         write_bytes(folder / "stamp.json", self.content())
 
     def content(self) -> bytes:
-        """The contents of the file."""
         return json_bytes(asdict(replace(self, itself=self._digest())))
 
     @staticmethod

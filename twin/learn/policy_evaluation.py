@@ -39,12 +39,11 @@ _SAMPLED_LIGHTING = re.compile(r"drawn_(\d+)")
 
 @dataclass(frozen=True)
 class EpisodeChunk:
-    """Episodes of one policy under one lighting."""
+    """Episodes of one policy under one lighting; see `load_policy` for `source` and `trust`."""
 
     scene: str
     task: str
     source: str
-    """See `load_policy`."""
     trust: bool
     condition: Condition
     """The condition's lighting may be `drawn_<number>`, see `with_sampled_lighting`."""

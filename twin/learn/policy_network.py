@@ -39,7 +39,6 @@ class Architecture:
     features: int = 64
     """Size of the encoder's output."""
     hidden: tuple[int, ...] = (256, 256)
-    """Widths of the hidden layers."""
     actions: int = 1
 
     def __post_init__(self) -> None:

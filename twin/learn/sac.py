@@ -242,7 +242,6 @@ def save_state(folder: Path, model: PixelSAC, more: dict[str, Any]) -> None:
 
 
 def has_state(folder: Path) -> bool:
-    """True if the folder contains a saved state."""
     return (folder / _STATE).exists()
 
 

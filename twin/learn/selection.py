@@ -9,11 +9,11 @@ required success rate `config.success` allows. The training ends
 - at the largest number of steps.
 
 In the first two cases, `config.settle` more steps with a falling learning rate (`training.py`) and one more test
-follow. The policy that is kept is the one with most successes among those that drove a whole test; ties are broken by
-the mean reward. If no policy reached the required rate, the best `_FINALISTS` drive whole tests before the choice. The
-best of several results is biased upwards by luck. So the kept policy drives fresh episodes, which no decision used, in
-a *final test*. If the lighting varies, these episodes have held-out lightings and everything randomized, as in `twin
-validate` by default.
+follow. The kept policy is the one with most successes among those that drove a whole test; the mean reward breaks ties.
+If no policy reached the required rate, the best `_FINALISTS` drive whole tests before the choice. The best of several
+results is biased upwards by luck. So the kept policy drives fresh episodes, which no decision used, in a *final test*.
+If the lighting varies, these episodes have held-out lightings and everything randomized, as in `twin validate` by
+default.
 """
 
 from collections.abc import Callable, Sequence

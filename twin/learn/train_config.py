@@ -161,14 +161,12 @@ class TrainConfig:
 
     @property
     def lighting_varies(self) -> bool:
-        """True if the lighting varies between episodes."""
         return self.observe == NERF and self.lighting == TRAINING
 
     def options(self) -> dict[str, Any]:
-        """Options of the environment."""
-        # The goal's reward equals the discounted sum of step rewards for ever: if it were less, a policy would linger
-        # before the goal. The loss of reward beside the route keeps policies away from the kerb, where one disturbance
-        # ends an episode.
+        # The goal's reward equals the discounted sum of step rewards for ever; for less, a policy would linger before
+        # the goal. The loss of reward beside the route keeps policies off the kerb, where one disturbance ends an
+        # episode.
         goal = Rewards.step * self.gamma / (1.0 - self.gamma)
         rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
         ranges = Ranges() if self.lighting_varies else _ROBOT_ONLY

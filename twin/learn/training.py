@@ -403,7 +403,6 @@ class _RunRecorder(BaseCallback):
             writer.write(numbers, {}, named["step"])
 
     def _checkpoint(self) -> None:
-        """Saves a checkpoint if one is due."""
         every = self._config.steps / self._config.checkpoints
         number = int(self.model.num_timesteps / every)
         if number and self.model.num_timesteps - number * every < self._config.worlds:

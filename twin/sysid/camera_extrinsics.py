@@ -190,10 +190,7 @@ def _relative_to_base(
 def _base_pose(
     position: Array, heading: float, ground_at: Callable[[Array], Array], lens: Array
 ) -> tuple[Array, Array]:
-    """Origin [m] and axes (3, 3) of a base at rest on the ground, with its lens at x, y = `position` [m].
-
-    `lens` is the lens's position in the base [m], shape (3,).
-    """
+    """Origin [m] and axes (3, 3) of a base at rest with its lens, at `lens` [m] in the base, at x, y = `position`."""
     rotation = Rotation.from_euler("Z", heading).as_matrix()
     arm = lens + np.array([0.0, 0.0, BASE_HEIGHT])  # from the ground
     for _ in range(2):  # a tilted base moves its lens sideways

@@ -56,8 +56,7 @@ def slope_gravity(windows: Windows, model: IcrModel) -> Array:
     a window is noisy, but consecutive windows have similar slopes. So the readings are smoothed (`smooth_slopes`) with
     their most probable statistics (`fit_slope_model`); the noisier the IMU, the closer the result is to level ground.
     Subtracting the log's median removes errors that are constant in the robot's frame (mounting of the IMU, a pitched
-    chassis). Headings and accelerations of the motion come from wheel speeds, not from poses, since poses are to be
-    predicted.
+    chassis). Headings and accelerations of the motion come from wheel speeds: poses are to be predicted.
 
     Args:
         windows: All windows of a log; without accelerations the result is zero.
