@@ -153,7 +153,7 @@ def identify(
     """Fits baseline, drivetrain, tires and ground to the windows for fitting, then predicts every window.
 
     Args:
-        use_slope: Estimate the slope of the ground from accelerations; False: level ground.
+        use_slope: True: estimates the ground's slope from accelerations; False: assumes level ground.
     """
     if not use_slope:
         windows = replace(windows, acceleration=None)

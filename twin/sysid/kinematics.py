@@ -50,7 +50,7 @@ NOMINAL = IcrModel()
 
 
 def integrate(motion: Array) -> Array:
-    """Poses x, y [m], yaw [rad] from zero, shape (n, k + 1, 3), for velocities (n, k, 3) of `PERIOD` [s] each."""
+    """Poses x, y [m], yaw [rad] from zero, shape (n, k + 1, 3), for velocities (n, k, 3), each for `PERIOD` [s]."""
     turned = motion[..., 2] * PERIOD
     yaw = np.concatenate([np.zeros((len(motion), 1)), np.cumsum(turned, 1)], 1)
     middle = yaw[:, :-1] + turned / 2
