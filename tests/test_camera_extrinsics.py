@@ -328,7 +328,7 @@ def test_unusable_films_are_refused_in_one_line(place, film, registered, tmp_pat
     bent = replace(registered, error=0.9)
     with monkeypatch.context() as patch:
         patch.setattr("twin.sysid.camera_extrinsics.register_film", lambda *_: bent)
-        assert "0.9 px off where a pinhole camera would show them, expected at most 0.8; rectify" in refused(
+        assert "0.9 px (median) from where a pinhole camera would show them, expected at most 0.8; rectify" in refused(
             root, str(film)
         )
     (tmp_path / "text.mp4").write_text("no film")

@@ -397,7 +397,7 @@ def test_a_dataset_has_the_drives_that_are_filmed(scene, tmp_path, capsys):
         (["--seed", "-1"], "seed = -1: expected 0 or more"),
         (["--episodes", "2"], "--episodes 2: a film shows one drive"),
         (["--lerobot", "drives", "--episodes", "0"], "--episodes 0: expected 1 or more"),
-        (["--lerobot", "drives", "--out", "a.mp4"], "--out is of a film"),
+        (["--lerobot", "drives", "--out", "a.mp4"], "--out names a film"),
         (["--lerobot", "no/drives"], "there is no folder no"),
         (["--obstacles", "²"], "--obstacles '²': expected a number"),
         (["--obstacles", "-1"], "--obstacles '-1': expected a number"),

@@ -77,7 +77,7 @@ def test_a_recording_holds_the_drive(scene, tmp_path, capsys):
     ("options", "words"),
     [
         (["--rerun", "no/drive.rrd"], "there is no folder no"),
-        (["--rerun", "drive.rrd", "--lerobot", "drives"], "--rerun is of one drive"),
+        (["--rerun", "drive.rrd", "--lerobot", "drives"], "--rerun records one drive"),
     ],
 )
 def test_impossible_recordings_are_refused_in_one_line(scene, capsys, options, words):

@@ -39,7 +39,7 @@ def test_wheel_speeds_of_the_wheels_odometry_are_those_of_the_joints(table, tmp_
 
 def test_poses_of_the_wheels_are_refused_and_those_of_pictures_used(table, tmp_path: Path, capsys) -> None:
     bag = write_bag(tmp_path / "bag", table, without=("poses",))
-    with pytest.raises(InputError, match=r"no topic with poses .* elsewhere than the wheels among .*/platform/odom"):
+    with pytest.raises(InputError, match=r"no topic with poses .* other than wheel odometry among .*/platform/odom"):
         read_bag(bag)
     assert align_main(["husky", str(bag), "--out", str(tmp_path)]) == 2
     assert capsys.readouterr().err.count("error: ") == 1

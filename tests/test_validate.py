@@ -186,7 +186,7 @@ def test_policies_share_episodes_but_lightings_do_not(fresh):
 def test_another_policy_of_the_same_name_is_refused(fresh, tmp_path):
     run(fresh, "ahead", lightings=["day"], episodes=1)
     save_policy(tmp_path / "ahead", SMALL, Control(), some_weights(SMALL, 9), {})
-    with pytest.raises(InputError, match="validated as another file"):
+    with pytest.raises(InputError, match="not the file that was validated"):
         run(fresh, str(tmp_path / "ahead"))
     with pytest.raises(InputError, match="two policies"):
         run(fresh, "ahead", str(tmp_path / "ahead"))

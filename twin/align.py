@@ -1,4 +1,4 @@
-"""Verb: fits the Husky's parameters to a drive log, or its camera to a film that it recorded.
+"""Verb: fits the Husky's parameters to a drive log, or its front camera to a film by that camera.
 
     python -m twin.align scenes/demo drive.csv
     python -m twin.align scenes/demo robot.mp4
@@ -6,17 +6,17 @@
     python -m twin.align husky drive.npz --out aligned
 
 From a log, system identification fits the controller's limits and latency, the servo's lag, tires, ground, center of
-mass and effective wheel radii to half of the log. On the other half, the fit is scored and compared with a kinematic
-model that was also fitted to the first half. Each value has a standard error; parameters that the log does not
-determine keep their values and are listed. Results are `robot.toml`, which the scene's next build uses, and
-`alignment/` with `align.json` and four figures.
+mass and effective wheel radii to half of the log. The other half is held out; it scores this fit and a kinematic model
+that is fitted to the same data. Each value has a standard error; parameters that the log does not determine keep their
+values and are listed. Results are `robot.toml`, which the scene's next build uses, and `alignment/` with `align.json`
+and four figures.
 
-A robot's bag is used as a log, or with --camera, its pictures as a film. If the scene was built from the bag, and the
-bag's only poses are wheel odometry, the camera poses of its pictures are used instead.
+A robot's bag serves as a log; with --camera, its pictures serve as a film. If the bag's only poses are wheel odometry,
+but the scene was built from its pictures, the log's poses follow from the reconstructed cameras.
 
-From a film that the robot's front camera records in the built place, the camera's extrinsics (height, yaw, pitch, roll)
-are fitted, and also its focal length unless `[robot] camera_intrinsics` is given. The values are written to the same
-`robot.toml`; `alignment/camera.png` shows the film beside the twin's images.
+A film by the robot's front camera in the built place determines the camera's extrinsics (height, yaw, pitch, roll) and,
+unless `[robot] camera_intrinsics` is given, its focal length. The values are written to the same `robot.toml`;
+`alignment/camera.png` shows the film beside the twin's images.
 """
 
 import argparse
@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from twin.sysid.camera_extrinsics import CameraCalibration
 
 RESULT_FOLDER = "alignment"
-"""Folder beside `robot.toml` for figures."""
+"""Folder beside `robot.toml` for figures and numbers of the fit."""
 PUBLISHED_ROBOT = "husky"
-"""Name that is given instead of a scene for the published robot."""
+"""Given instead of a scene: the robot with Clearpath's published parameters."""
 _FILM_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
 _INTRINSICS_FIELDS = ("camera_intrinsics", "camera_size")
 
@@ -58,7 +58,7 @@ def align_to_log(
         target: Folder of a scene, a `robot.toml`, or `PUBLISHED_ROBOT`.
         log: See `twin.sysid.logs`.
         out: Folder for the results; by default the scene's.
-        use_slope: Account for the ground's slope, estimated from the log's accelerations, if it has any.
+        use_slope: Accounts for the ground's slope, which is estimated from the log's accelerations (if it has any).
 
     Raises:
         InputError: the robot is unknown, the folder is not writable, or the log is unusable.
@@ -85,7 +85,7 @@ def align_to_log(
 
 
 def _windows(target: str, log: Path) -> Windows:
-    """The windows of a log. For a bag from which the scene was built, they may use the camera poses of its pictures."""
+    """The windows of a log. If the scene was built from this bag, reconstructed poses can replace wheel odometry."""
     root = Path(target).parent if Path(target).name == "scene.toml" else Path(target)
     if not (is_bag(log) and exists(log) and SceneDir(root).config_file.exists()):
         return read_log(log)
@@ -159,7 +159,6 @@ def _scene_robot_table(folder: Path) -> dict[str, Any]:
 
 
 def summary(result: Identification) -> str:
-    """The printed summary."""
     scoring = ~result.windows.fitting
     rows = [f"{'errors after 2 s, held-out windows':36} {'median':>16} {'90th percentile':>18}  wheels"]
     for prediction in (result.nominal, result.baseline, result.level, result.fitted):
@@ -188,9 +187,9 @@ def _fitted(identified: dict[str, tuple[Any, Any]]) -> list[str]:
 def command(options: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
     if options.camera and not is_bag(options.log):
-        raise InputError(f"{options.log} is no bag; --camera is for bags, a film is taken for the camera anyway")
+        raise InputError(f"{options.log} is no bag; leave out --camera: a film is always fitted to the camera")
     if options.topic and not options.camera:
-        raise InputError(f"--topic {options.topic}: is for --camera")
+        raise InputError(f"--topic {options.topic}: expected --camera, too; for a log, leave it out")
     if options.camera or options.log.suffix.lower() in _FILM_SUFFIXES:
         if options.out or options.level:
             raise InputError(f"{options.log} is taken as a film; --out and --level are for logs")
@@ -203,9 +202,7 @@ def command(options: argparse.Namespace) -> None:
     if not options.quiet:
         print(lines)
         if overridden:
-            print(
-                f"scene.toml's [robot] overrides fitted values: {', '.join(overridden)}; remove them there to use these"
-            )
+            print(f"scene.toml's [robot] overrides fitted values: {', '.join(overridden)}; to use the fit, remove them")
         print(f"wrote {folder / ROBOT_TOML}; look at {folder / RESULT_FOLDER}")
 
 

@@ -2,7 +2,7 @@
 
     python -m twin.build SCENE [--until STAGE] [--force STAGE] [--set nerf.steps=4000] [--device cpu|cuda] [--quiet]
 
-A stage writes `build/<folder>.partial`, which is renamed when it is complete. `twin.scene` defines when it runs again.
+A stage writes `build/<folder>.partial`, which is renamed at the end. `twin.scene` defines when a stage is up to date.
 """
 
 import argparse
@@ -59,9 +59,9 @@ PIPELINE = (
 
 _ON_DEVICE = ("field", "mesh")  # stages that take a device
 _WRITTEN = ("build", "runs", "validation", "forecast", "lightings")  # folders of a scene that are never inputs
-# Durations [s] for the demo with 2 cores. Only their ratios matter, since the speed of a build is measured. The
-# remaining time is shown once stages with a typical duration of 30 s have run; the first stage is too short to estimate
-# the speed.
+# Durations [s] for the demo with 2 cores. Only their ratios matter: they are scaled by the measured durations of
+# earlier stages. The remaining time is shown once the typical durations of these stages exceed `_LEAST_TIMED`; the
+# first stage alone is too short for a scale.
 _TYPICAL = {"capture": 5.0, "cameras": 90.0, "metric": 1.0, "field": 280.0, "mesh": 70.0, "mjcf": 3.0, "review": 45.0}
 _LEAST_TIMED = 30.0
 
@@ -83,7 +83,7 @@ def build(
         device: cpu or cuda, for the stages field and mesh; None: cuda if it is usable.
 
     Raises:
-        InputError: bad input; earlier results stay as they are.
+        InputError: invalid input; earlier results are kept.
     """
     scene = SceneDir(root)
     config = load_config(scene.config_file, overrides)
@@ -153,7 +153,7 @@ def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
         files.update(source_files(path, source.kind, images))
         posed = path.suffix == ".json" or (path.is_dir() and any(path.glob("cameras.*")))
         if posed and not Path(source.path).is_absolute():
-            # The other files of a posed image set lie beside it, below the same top-level folder of the scene.
+            # A posed image set refers to files beside it, so its whole top-level folder in the scene is hashed.
             path = scene.root.joinpath(*Path(os.path.normpath(source.path)).parts[:1])
         files.update(_files_below(path, scene))
         if images:
@@ -186,7 +186,7 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
     for name in stage.config:
         section, _, key = name.partition(".")
         settings[name] = table[section][key] if key else table[section]
-    # Settings that older versions did not have are left out where they have no effect, so that older results stay
+    # Settings that were added later are omitted where they have no effect, so that results of older versions stay
     # valid.
     for one in (settings.get("capture", {}), *settings.get("source", ())):
         for key in ("keep", "topic"):

@@ -157,7 +157,7 @@ def _new(parser: argparse.ArgumentParser) -> None:
         "films", type=Path, nargs="+", metavar="VIDEO", help="films, bags or image folders, one per lighting"
     )
     parser.add_argument("--camera-height", type=float, metavar="METRES", help="lens above the ground while filming")
-    parser.add_argument("--topic", help="of the pictures in a bag; default: the one with most of them")
+    parser.add_argument("--topic", help="topic of a bag's pictures; default: the topic with most pictures")
 
 
 def _build(parser: argparse.ArgumentParser) -> None:
@@ -213,7 +213,7 @@ def _align(parser: argparse.ArgumentParser) -> None:
         "A log is a .csv or .npz with the columns time [s]; cmd_v [m/s] and cmd_yaw_rate [rad/s], or cmd_left "
         "and cmd_right [rad/s]; left_wheel_vel, right_wheel_vel [rad/s]; x, y [m], yaw [rad]; optionally "
         "acceleration_x, acceleration_y [m/s²] and group. Or a ROS bag with cmd_vel, joint states (or the wheels' "
-        "odometry), poses that are not the wheels' (or pictures that the scene was built from) and an IMU "
+        "odometry), poses other than wheel odometry (or pictures from which the scene was built) and an IMU "
         "(pip install 'twin[ros]'). A film (.mp4, ...) is one by the robot's front camera, rectified: the robot drives "
         "ten metres or more in the built scene's place, mostly straight ahead, in light like that of one of the "
         "scene's films."
@@ -221,7 +221,7 @@ def _align(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("robot", help="folder of a scene, a robot.toml, or `husky` for the published one")
     parser.add_argument("log", type=Path, help="a .csv, an .npz, a bag, or a film")
     parser.add_argument("--camera", action="store_true", help="fit the camera's pose to the bag's pictures")
-    parser.add_argument("--topic", help="of these pictures; default: the one with most of them")
+    parser.add_argument("--topic", help="topic of these pictures; default: the topic with most pictures")
     parser.add_argument("--out", type=Path, help="folder for robot.toml and alignment/; default: the scene's")
     parser.add_argument("--level", action="store_true", help="assume level ground and ignore the log's IMU")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
@@ -240,9 +240,9 @@ def _film(parser: argparse.ArgumentParser) -> None:
         help="a name, a mixture a:b:0.3, training, held-out or any; any of them with +randomised (default: training)",
     )
     parser.add_argument("--drift", action="store_true", help="the light changes during the drive")
-    parser.add_argument("--obstacles", default="scene", help="number of random ones; scene: those of scene.toml")
+    parser.add_argument("--obstacles", default="scene", help="number of random obstacles; scene: those of scene.toml")
     parser.add_argument("--randomise", action="store_true", help="randomize robot, weather and distractor objects")
-    parser.add_argument("--seed", type=int, default=0, help="of the episode")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the episode")
     parser.add_argument("--out", type=Path, help="the mp4; default: a file in SCENE/films")
     parser.add_argument(
         "--rerun",
@@ -267,17 +267,17 @@ def _film(parser: argparse.ArgumentParser) -> None:
 
 def _drive(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Show the Husky driving: the policy of a pack, or the only run of a scene, on its task; without one, the "
-        "scripted driver. A film is written, or the page of twin view opened."
+        "Show the Husky driving, in a film or on the page of twin view. By default, the policy of a pack or of a "
+        "scene's only run drives the task of its training; without such a policy, the scripted driver drives."
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene, a pack, or the name of one: demo")
-    parser.add_argument("--view", action="store_true", help="in the browser; there press Drive")
+    parser.add_argument("--view", action="store_true", help="show it in the browser; press Drive there")
     parser.add_argument("--policy", help="a run, a checkpoint, an ONNX file or module:function")
     parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
     parser.add_argument("--task", help="straight, right_turn, route, or one of scene.toml")
     parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5 (default: drawn by the seed)")
-    parser.add_argument("--seed", type=int, default=0, help="of the episode")
-    parser.add_argument("--port", type=int, default=8080, help="of the page, or the next free one; 0: any")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the episode")
+    parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; 0: any")
     parser.add_argument("--out", type=Path, help="the mp4; default: in SCENE/films, of a pack in the working folder")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
@@ -290,18 +290,18 @@ def _pack(parser: argparse.ArgumentParser) -> None:
         "--policy",
         action="append",
         default=[],
-        help="a run, a checkpoint or an ONNX file to take along; may be repeated",
+        help="a run, a checkpoint or an ONNX file to include; may be repeated",
     )
     parser.add_argument("--licence", default="", metavar="TEXT", help="terms for its receivers, such as 'CC BY 4.0'")
-    parser.add_argument("--with-positions", action="store_true", help="take the films' GPS positions along")
+    parser.add_argument("--with-positions", action="store_true", help="include the films' GPS positions")
     parser.add_argument(
         "--levels",
         type=int,
         default=256,
-        help="values to which the field's features are rounded: fewer make the pack smaller, and another field; 256: "
-        "as built, bit for bit",
+        help="number of values to which the field's features are rounded: fewer make the pack smaller and change the "
+        "field; 256 keeps it bit for bit",
     )
-    parser.add_argument("--trust", action="store_true", help="take a policy along that may run code")
+    parser.add_argument("--trust", action="store_true", help="include policies that may run code when they are loaded")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
 
@@ -323,10 +323,10 @@ def _view(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5; default: the first filmed one")
-    parser.add_argument("--task", help="of a policy or the scripted driver: straight, right_turn, ... (default: route)")
+    parser.add_argument("--task", help="task of the driver: straight, right_turn, ... (default: route)")
     parser.add_argument("--policy", help="a run, a checkpoint, an ONNX file or module:function that may drive")
     parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
-    parser.add_argument("--seed", type=int, default=0, help="of the task's episodes")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the task's episodes")
     parser.add_argument(
         "--host",
         default="127.0.0.1",
@@ -335,15 +335,15 @@ def _view(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=8080, help="port, or the next free one; 0: any")
     parser.add_argument("--path", type=Path, help="render this camera path instead of showing the page")
     parser.add_argument("--out", type=Path, help="the mp4 of --path")
-    parser.add_argument("--size", default="1280x720", help="of the film [px]")
-    parser.add_argument("--fps", type=int, default=30, help="of the film")
+    parser.add_argument("--size", default="1280x720", help="size of the film [px]")
+    parser.add_argument("--fps", type=int, default=30, help="frames per second of the film")
     parser.add_argument("--quiet", action="store_true", help="no progress, no address, no summary")
 
 
 def _export(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Write a built place for other programs: all of it as USD, its mesh as glTF, its field as Gaussian splats, its "
-        "frames and cameras for other trainers, a task's rules for other judges."
+        "frames and cameras for other trainers, a task's rules for evaluation elsewhere."
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument(
@@ -360,13 +360,13 @@ def _export(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--colmap", type=Path, metavar="DIR", help="write a COLMAP model with its frames and masks")
     parser.add_argument(
-        "--task-file", type=Path, metavar="FILE", help="write the rules of --task as JSON, for another judge"
+        "--task-file", type=Path, metavar="FILE", help="write the rules of --task as JSON, for evaluation elsewhere"
     )
     parser.add_argument("--task", metavar="NAME", help="a task of the scene, such as straight")
     parser.add_argument(
         "--lighting",
-        help="of --glb and --ply, and shown first by --usd: a name, or a mixture sun:night:0.5; default: first filmed "
-        "one",
+        help="lighting of --glb and --ply, and the first one in --usd: a name, or a mixture sun:night:0.5; default: "
+        "first filmed one",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
@@ -384,7 +384,7 @@ def _train(parser: argparse.ArgumentParser) -> None:
         "--success", type=float, help="success rate in tests at which the training ends (default: 0.95)"
     )
     parser.add_argument(
-        "--steps", type=int, help="most control steps, of all worlds together (default: 24000; gpu: 240000)"
+        "--steps", type=int, help="largest number of control steps, over all worlds (default: 24000; gpu: 240000)"
     )
     parser.add_argument("--worlds", type=int, help="number of worlds driven at once (default: 8; gpu: 32)")
     parser.add_argument(
@@ -400,7 +400,7 @@ def _train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--colours", type=float, help="strength of color augmentation where the lighting varies (default: 1.0)"
     )
-    parser.add_argument("--seed", type=int, help="of every random draw (default: 0)")
+    parser.add_argument("--seed", type=int, help="seed of every random draw (default: 0)")
     parser.add_argument(
         "--randomise",
         action=argparse.BooleanOptionalAction,
@@ -437,15 +437,15 @@ def _validate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worst", action="store_true", help="search for each policy's worst lighting")
     parser.add_argument("--films", action="store_true", help="film each policy's typical and worst episode")
     parser.add_argument("--trust", action="store_true", help="load policy files that may run code")
-    parser.add_argument("--processes", type=int, default=1, help="on this machine; one uses two cores")
+    parser.add_argument("--processes", type=int, default=1, help="processes on this machine; each uses two cores")
     parser.add_argument("--ray", metavar="ADDRESS", help="drive on a Ray cluster; auto: the one on this machine")
     parser.add_argument("--quiet", action="store_true", help="no progress, no table")
 
 
 def _trial(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Judge a trial on the road from the robot's ROS 2 bag by the twin's rules: a row of real.csv, a film beside "
-        "the twin's, and how far path and pictures are from the twin's."
+        "Evaluate a trial on the road, from the robot's ROS 2 bag, by the twin's rules. The results are a row of "
+        "real.csv, a film beside the twin's, and the differences of path and pictures from the twin's."
     )
     parser.epilog = (
         "The bag (a folder, .mcap or .db3; pip install 'twin[ros]') has the front camera's pictures and camera_info, "
@@ -463,7 +463,7 @@ def _trial(parser: argparse.ArgumentParser) -> None:
         choices=("collision", "out_of_bounds", "timeout", "rollover", "stuck"),
         help="what ended the trial, where poses do not show it",
     )
-    parser.add_argument("--out", type=Path, metavar="CSV", help="default: SCENE/real.csv; rows of trials go beside it")
+    parser.add_argument("--out", type=Path, metavar="CSV", help="default: SCENE/real.csv; trials are listed beside it")
     parser.add_argument(
         "--frame",
         choices=("pictures", "scene"),
@@ -501,7 +501,7 @@ held-out+randomised.
 """
     parser.add_argument("scene", type=Path, help="folder of a scene with validated policies")
     parser.add_argument("--real", type=Path, metavar="CSV", help="trials on the road; see below")
-    parser.add_argument("--seed", type=int, default=0, help="of the resampling")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the resampling")
     parser.add_argument("--quiet", action="store_true", help="no summary")
 
 
@@ -525,9 +525,9 @@ def _reality(parser: argparse.ArgumentParser) -> None:
 
     def robot(command: argparse.ArgumentParser, camera: bool = True) -> None:
         place(command)
-        command.add_argument("--robot", type=int, default=0, metavar="NUMBER", help="robot of the real test")
+        command.add_argument("--robot", type=int, default=0, metavar="NUMBER", help="which robot of the real test")
         if camera:
-            command.add_argument("--camera", type=int, default=0, metavar="NUMBER", help="its camera")
+            command.add_argument("--camera", type=int, default=0, metavar="NUMBER", help="which camera of that robot")
 
     def one_weather(command: argparse.ArgumentParser) -> None:
         either = command.add_mutually_exclusive_group(required=True)
@@ -538,7 +538,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument("--out", type=Path, required=True, help="scene folder to write")
     place(command)
     command.add_argument(
-        "--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; those of a drawn place"
+        "--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; for a drawn place, its own"
     )
     command.add_argument("--tiny", action="store_true", help="12 m in 320x180 under two lightings, for tests")
     command.add_argument(
@@ -555,7 +555,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
         required=True,
         help="{straight,right_turn}; a drawn place names its own; or a .json of twin export --task-file",
     )
-    command.add_argument("--scene", type=Path, help="the built scene that such a file was exported from")
+    command.add_argument("--scene", type=Path, help="the built scene from which the .json was exported")
     robot(command)
     command.add_argument("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
     command.add_argument("--lightings", nargs="+", metavar="NAME", help="weathers of the test (default: all)")
@@ -582,7 +582,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument("--policy", type=Path, help="policy folder; default: the robot follows the route")
     command.add_argument("--task", default="straight", help="{straight,right_turn}; a drawn place names its own")
     one_weather(command)
-    command.add_argument("--seed", type=int, default=0, help="of start, camera and noise")
+    command.add_argument("--seed", type=int, default=0, help="seed of start, camera and noise")
     robot(command)
     command = add("photo", "a photo by that camera in the weather of a trial, for twin relight")
     one_weather(command)

@@ -1,8 +1,8 @@
 """Settings of `scene.toml`: one frozen dataclass per stage, with units, ranges and defaults; read by `config_file.py`.
 
 A *source* is one film (or bag, photo folder, or posed image set) under one *lighting*. Several sources may share a
-lighting. Ranges are checked before a build, since with values outside them a stage may run out of memory, fail in its
-arithmetic or never end.
+lighting. Ranges are checked before a build: beyond them, a stage may run out of memory, fail in its arithmetic or never
+end.
 """
 
 from dataclasses import dataclass, field
@@ -19,8 +19,8 @@ RANDOMIZED = "+randomised"
 """Suffix of randomized conditions in tables, see `Condition`; the name of a lighting must not end with it."""
 
 CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
-"""Causes for which an episode or trial ends, in the order of tables. If several apply, the code that judges the episode
-decides which one counts."""
+"""Causes that end an episode or trial, in the order of tables. If several apply at once, the code that ends it picks
+one."""
 TWIST, STEERING = "twist", "steering"
 """Kinds of actions of a policy: `twist` is speed and yaw rate, `steering` is the yaw rate at a fixed speed."""
 
@@ -103,7 +103,7 @@ class SourceConfig:
     topic: str = ""
     """Topic of the pictures in a bag; by default the one with most pictures."""
     images: str = ""
-    """Image folder of a COLMAP model or transforms.json, if it is not beside that."""
+    """Image folder of a COLMAP model or transforms.json; needed unless it is beside that file."""
     mask: str = ""
     """One static mask image, or a folder of masks named like the frames; 0 = ignore."""
     camera: CalibrationConfig | None = None
@@ -134,8 +134,7 @@ class CaptureConfig:
     """Segments of every film that are used, [[from, to], ...] in seconds from its first frame, ends included, ordered
     and disjoint; empty = all. Photos need timestamps."""
     min_motion: Annotated[float, Range(0)] = 1.0
-    """Frames that moved less than this since the last kept frame are dropped [px of median optical flow, at a width of
-    320 px]."""
+    """Least motion between kept frames; others are dropped [px of median optical flow, at a width of 320 px]."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +150,7 @@ class CamerasConfig:
     min_registered: Annotated[float, Range(0, 1)] = 0.6
     """Fraction of frames that must be registered; otherwise the stage fails."""
     max_outlier: Annotated[float, Range(0.001)] = 0.3
-    """Distance from the path through its neighbors beyond which a frame is an outlier [median steps of the film]."""
+    """Distance from the path through its neighbors beyond which a frame is an outlier [median steps]."""
     free_focal: bool = False
     """Ignore given calibrations, and self-calibrate. This is for comparisons; a calibrated camera is better."""
 
@@ -231,9 +230,9 @@ class NerfConfig:
     """How often each training pixel on a near surface is used to fit details that are too fine for bricks; 0 = no
     detail."""
     max_bricks: Annotated[int, Range(100)] = 9000
-    """Largest number of bricks (blocks of 8 × 8 × 8 cells with 8-bit samples) of the baked field. It determines the
-    cell size; 9,000 bricks take about 105 MB. It is raised by a factor of 1.39 (146 MB) if cells would exceed 15 cm.
-    Fewer than 100 bricks do not cover even the coarsest far grid."""
+    """Largest number of bricks (blocks of 8 × 8 × 8 cells with 8-bit samples) of the baked field. This number
+    determines the cell size; 9,000 bricks take about 105 MB. If cells would exceed 15 cm, it is raised by a factor of
+    1.39 (146 MB). Fewer than 100 bricks do not cover even the coarsest far grid."""
     max_width: Annotated[int, Range(32)] = 480
     """Longer side of training images [px]."""
     refine_cameras: bool = False
@@ -286,16 +285,17 @@ class MeshConfig:
 
 @dataclass(frozen=True)
 class RouteConfig:
-    """The choice of the route among the filmed passes; by default the longest line of one lighting."""
+    """The choice of the route among the filmed passes; by default the longest line of joined passes of one lighting."""
 
     passes: tuple[str, ...] = ()
-    """Passes in driving order, such as "noon:2", or "noon" for the longest one of that source; see the report."""
+    """Passes in driving order, such as "noon:2", or "noon" for the longest pass of that source; the report lists the
+    passes."""
     points: tuple[tuple[float, ...], ...] = ()
     """Way points [x, y] [m] instead of passes, in the frame of the report's map, at most 1 m from the filmed paths."""
     reverse: bool = False
     """Drive against the filmed direction. The robot's camera then shows views that were not filmed."""
     max_gap: Annotated[float, Range(0, 50)] = 5.0
-    """Longest distance that was not filmed between two passes that are joined [m]."""
+    """Longest unfilmed gap between two joined passes [m]."""
 
 
 @dataclass(frozen=True)
@@ -307,9 +307,9 @@ class MjcfConfig:
     half_width: Annotated[float, Range(0.1, 100)] = 1.0
     """Half width of the drivable corridor around the route [m]."""
     hfield_cell: Annotated[float, Range(0.01, 10)] = 0.3
-    """Cell size of the collision height field [m], a multiple of `mesh.ground_cell`. A wheel on an edge between cells
-    touches several facets, so smaller cells cause more vibration, and they take more time. They would not show more
-    detail, since the ground is smoothed to about this scale (`mesh.ground_smoothing`)."""
+    """Cell size of the collision height field [m], a multiple of `mesh.ground_cell`. Smaller cells take more time and
+    cause more vibration, since a wheel on an edge between cells touches several facets. They add no detail: the ground
+    is smoothed to about this scale (`mesh.ground_smoothing`)."""
     corridor_margin: Annotated[float, Range(0, 100)] = 0.0
     """Extra clearance between the corridor and convex parts [m]."""
 
@@ -338,7 +338,7 @@ class ObstacleConfig:
     """An obstacle on the route, static or moving to and fro."""
 
     name: str = ""
-    """Its body in the model is `obstacle_<name>`; by default its kind and list index."""
+    """Name of the obstacle, by default its kind and list index; its body in the model is `obstacle_<name>`."""
     kind: str = ""
     """cone, box, bollard, car, pedestrian, cyclist or husky."""
     station: float = 0.0
@@ -346,13 +346,13 @@ class ObstacleConfig:
     lateral: float = 0.0
     """Distance from the route, left positive [m]."""
     yaw: float = 0.0
-    """Yaw relative to the route's heading, or to its direction of motion if it moves [°]."""
+    """Yaw relative to the route's heading or, for a moving obstacle, to its direction of motion [°]."""
     to: tuple[float, ...] = ()
     """(station, lateral) [m] of the turning point; the obstacle moves between it and its start. Empty: static."""
     speed: float = 1.2
     """Speed if it moves [m/s]."""
     delay: float = 0.0
-    """Time for which it has already been moving when the episode begins [s]."""
+    """Time for which the obstacle has already been moving when the episode begins [s]."""
     color: tuple[float, ...] = ()
     """Main color as red, green, blue, each from 0 to 1; by default the color of its kind."""
     size: tuple[float, ...] = ()
@@ -365,7 +365,7 @@ class TaskConfig:
 
     name: str = ""
     start: float = 0.0
-    """Arc length on the route where it starts [m]."""
+    """Arc length on the route at which the segment starts [m]."""
     length: float = 0.0
     """Length of the segment [m]."""
 

@@ -47,7 +47,7 @@ def command(given: argparse.Namespace) -> None:
         try:
             twin = load_scene(given.scene)
         except InputError:
-            more = "; it is scenes/demo.twin of twin's repository: download it" if named == f"demo{SUFFIX}" else ""
+            more = "; download scenes/demo.twin from twin's repository" if named == f"demo{SUFFIX}" else ""
             raise InputError(f"{given.scene}: {cure}{more}") from None
     else:
         twin = load_scene(given.scene)

@@ -28,7 +28,7 @@ class InputError(ValueError):
 
 def shortened(message: str) -> str:
     """A message as one line of printable characters, in which long quoted values, numbers and words are cut."""
-    if len(message) > 2 * _MAX_MESSAGE:  # first, since the patterns would be slow on values of megabytes
+    if len(message) > 2 * _MAX_MESSAGE:  # before the patterns, which would be slow on values of megabytes
         message = f"{message[:_MAX_MESSAGE]}...{message[-_MAX_MESSAGE:]}"
     message = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
     for pattern in _LONG_VALUES:

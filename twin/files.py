@@ -177,7 +177,7 @@ def _check_header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
         version = npy.read_magic(file)
         shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(file)
     if not dtype.hasobject and math.prod(shape) * dtype.itemsize > entry.file_size:
-        raise ValueError(f"{entry.filename} promises {shape} of {dtype} and holds {entry.file_size} bytes")
+        raise ValueError(f"{entry.filename} declares shape {shape} of {dtype}, but has {entry.file_size} bytes")
 
 
 @contextlib.contextmanager
@@ -305,7 +305,8 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
 
 
 def allocate(path: Path, size: int) -> None:
-    """Allocates disk space for a file up to `size` [bytes]; keeps its contents, or creates it.
+    """Allocates disk space for a file up to `size` [bytes]. A missing file is created; an existing one keeps its
+    contents.
 
     Without this, a process that writes to the memory-mapped file while the disk is full ends with SIGBUS. On
     copy-on-write file systems that may still happen. Raises OSError if the disk is full; a newly created file is
@@ -374,7 +375,7 @@ def is_file(path: Path) -> bool:
 
 def is_folder(path: Path, cure: str) -> bool:
     """True for a folder, False for a regular file. Raises InputError for anything else, with `cure` in the message."""
-    with contextlib.suppress(OSError, ValueError):  # `regular_file` raises
+    with contextlib.suppress(OSError, ValueError):  # `regular_file` reports these errors
         if stat.S_ISDIR(path.stat().st_mode):
             return True
     try:

@@ -5,9 +5,9 @@
     python -m twin.film scenes/demo --policy first --task straight --rerun drive.rrd
     python -m twin.film scenes/demo --lerobot drives --episodes 20
 
-The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is scripted,
-or a policy that `twin.validate` accepts, in an environment with the policy's options. Task, lighting and seed determine
-the episode, so those of a row of `validation/episodes.csv` reproduce its episode. `--rerun` also writes the drive as a
+The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is a scripted
+route follower, or a policy that `twin.validate` accepts; then the environment has the policy's options. Task, lighting
+and seed determine the episode, such as that of a row of `validation/episodes.csv`. `--rerun` also writes the drive as a
 recording for Rerun. With `--lerobot`, drives are recorded as a dataset for learning instead of a film.
 """
 
@@ -181,7 +181,6 @@ def _driver(
 
 
 def film_name(task: str, lighting: str, seed: int) -> str:
-    """File name of an episode's film."""
     return "".join(c if c.isalnum() or c in "-." else "_" for c in f"{task}_{lighting}_{seed}") + ".mp4"
 
 
@@ -197,9 +196,9 @@ def command(given: argparse.Namespace) -> None:
     driven = (given.task, given.policy, given.seed)
     if given.lerobot:
         if given.out:
-            raise InputError("--out is of a film; --lerobot names the dataset's folder")
+            raise InputError("--out names a film, and --lerobot DIR records none; leave out --out")
         if given.rerun:
-            raise InputError("--rerun is of one drive; --lerobot records several: give one of them")
+            raise InputError("--rerun records one drive, and --lerobot DIR several; leave out one of them")
         drives = record_dataset(given.scene, given.lerobot, given.episodes, *driven, given.trust, **options)
         if not given.quiet:
             from twin.report.drive_dataset import drives_summary

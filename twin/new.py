@@ -176,7 +176,7 @@ def _write_seat(path: Path, seat: CameraSeat, bag: BagContents) -> bool:
     except InputError:
         return False
     if not exists(path):
-        comment = f"The camera's seat is that of {bag.topics['transforms']} in {bag.path.name}."
+        comment = f"The camera's pose on the robot is that of {bag.topics['transforms']} in {bag.path.name}."
         write_text(path, toml_text(comment, {}, {name: (value, None) for name, value in fields.items()}))
     return True
 

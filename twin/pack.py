@@ -4,9 +4,9 @@
     python -m twin.pack scenes/demo --policy first --levels 8 -o scenes/demo.twin
 
 A pack contains what driving needs: the baked field, the MJCF scene with its assets, ground, parts and cameras, tasks,
-robot, and lightings of photos. It does not contain films, frames, the field as trained and reports, nor private data
-that driving does not need: comments and paths of `scene.toml`, photos, dependencies in stamps, GPS positions. The
-format is described in `twin.unpack`.
+robot, and lightings of photos. It contains no films, frames and reports, and not the field as trained. Private data are
+left out: comments and paths of `scene.toml`, photos, dependencies in stamps and, unless asked for, GPS positions.
+`twin.unpack` describes the format.
 
 Driving in a pack gives the same results as in the scene, bit for bit: in the field, only samples that no ray reads are
 replaced (`samples_read`). With `--levels` below 256, the features are rounded to that number of values. The pack is
@@ -39,7 +39,7 @@ from twin.nerf.baked import BrickLayout, samples_read
 from twin.scene import STAGES, SceneDir, Stamp, package_versions, require_stage, stage_result
 
 LEVELS = 256
-"""Number of values of a byte; with so many levels, the field is not rounded."""
+"""Default of `--levels`, the number of values of a byte: the field is not rounded."""
 _ZERO = 128  # features are rounded to multiples of the step from this byte, which stands for 0 in the detail
 _FINER = 4  # step of features / step of the density, which is rounded less because it determines surfaces
 _VERTEX_STEP = 2  # step of the hash grid's vertices / step of features
@@ -145,9 +145,7 @@ def _add_policy(files: dict[str, bytes], root: Path, source: str, trust: bool) -
                 files[f"runs/{kept}/{name}"] = read_bytes(path / name)
         return kept.replace("/checkpoints/", "/")
     if not path.is_file():
-        raise InputError(
-            f"--policy {source}: runs a function of yours, which has no place in a pack; export it to ONNX"
-        )
+        raise InputError(f"--policy {source}: a pack cannot contain a Python function; export the policy to ONNX")
     files[f"policies/{path.name}"] = read_bytes(path)
     return f"policies/{path.name}"
 
@@ -205,8 +203,8 @@ def _tuples(table: dict[str, Any]) -> dict[str, Any]:
 def packed_field(layout: BrickLayout, arrays: dict[str, NDArray], levels: int = LEVELS) -> dict[str, NDArray]:
     """The arrays of a baked field (see `BakedField`) for a pack.
 
-    Samples that no ray reads become copies of the sample before, which compress to almost nothing. With `levels` below
-    256, densities and features are rounded.
+    Samples that no ray reads become copies of the preceding sample, which compress to almost nothing. With `levels`
+    below 256, densities and features are rounded.
     """
     step = LEVELS / levels
     features = arrays["features"]

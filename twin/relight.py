@@ -188,7 +188,6 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
 
 
 def summary(lighting: AddedLighting) -> str:
-    """The printed summary of an added lighting."""
     f, fog = lighting.figures, lighting.air
     clear = f"without fog those halves have {f['psnr_clear_other_half']:.1f} dB"
     x, y, z = np.array(f["camera_to_world"])[:3, 3]

@@ -132,8 +132,8 @@ class HuskyParams:
     motor_inertia: Annotated[float, Range(0, 5)] = 0.15
     """Inertia of rotor and gears at one wheel [kg m²]: about 5e-5 kg m² per motor (estimated), times the square of the
     gear ratio 79, shared by two wheels. It also prevents stick-slip flutter of stiffly driven wheels: without it, the
-    robot hops in a point turn at 1.8 rad/s with a friction of 1.0 (9 m/s² rms at the camera). A value of 0.1 suffices
-    for that."""
+    robot hops in a point turn at 1.8 rad/s with a friction of 1.0 (9 m/s² rms at the camera). 0.1 kg m² would suffice
+    against that."""
     motor_torque: Annotated[float, Range(1, 500)] = 70.0
     """Torque limit of a side at its wheels [N m]; not published."""
     motor_constant: Annotated[float, Range(0.0001, 10)] = 0.035
@@ -199,7 +199,6 @@ class HuskyParams:
 
     @property
     def timing(self) -> ControllerTiming:
-        """Timing of the wheel controller."""
         return CONTROLLERS[self.controller]
 
     @property

@@ -59,7 +59,7 @@ def set_stage(stage: BuildStage | None) -> None:
     _stage = stage
 
 
-# tqdm's own lock has a semaphore of the system, of which Python warns when a child process with a bar is killed.
+# tqdm's default lock is a system semaphore. When a child process with a bar is killed, Python warns of a leaked one.
 tqdm.set_lock(threading.RLock())
 
 
@@ -123,8 +123,8 @@ class Stopped(KeyboardInterrupt):
 def stoppable() -> Iterator[None]:
     """Within the block, the first SIGINT, SIGTERM or SIGHUP raises `Stopped`.
 
-    Later ones have no effect, so that cleanup can finish, but a later SIGINT ends the process at once. Signals that
-    were ignored when the process started, for example because of nohup, stay ignored.
+    Later ones are ignored, so that cleanup can finish, except SIGINT, which ends the process at once. Signals that were
+    ignored when the process started, for example because of nohup, stay ignored.
     """
     stopping = False
 
@@ -189,7 +189,7 @@ def signals_kept() -> Iterator[None]:
 def signals_held() -> Iterator[None]:
     """Delays SIGINT, SIGTERM and SIGHUP to the end of the block.
 
-    Processes that are started in the block have these signals blocked until they unblock them.
+    Processes that are started in the block inherit the blocked signals, and must unblock them.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPING)
     try:

@@ -182,7 +182,6 @@ class Stamp:
         write_bytes(folder / "stamp.json", self.content())
 
     def content(self) -> bytes:
-        """The contents of the file."""
         return json_bytes(asdict(replace(self, itself=self._digest())))
 
     @staticmethod
@@ -266,8 +265,7 @@ def _verified_stamp(scene: SceneDir, stage: str) -> Stamp:
 def require_stage(scene: SceneDir, stage: str) -> Path:
     """Returns the folder of a built stage, after comparing its files with its stamp (once per process).
 
-    Files larger than 256 MiB are compared by size only. A build reads all files completely, and so also finds other
-    changes in these.
+    Files larger than 256 MiB are compared by size only. A build hashes every file, and so finds all changes.
 
     Raises:
         InputError: the stage has not been built, or one of its files is damaged.

@@ -56,7 +56,7 @@ def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
     chosen = choice["chosen"]
     won, trials = chosen["successes"], chosen["trials"]
     low, high = wilson(won, trials)
-    asked = f"{choice['success']:.0%} success that was asked"
+    asked = f"required success rate of {choice['success']:.0%}"
     ends = {
         "reached": f"a test reached the {asked}",
         "no better": f"tests got no better, and stayed below the {asked}",
@@ -75,7 +75,7 @@ def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
 def _train(
     twin: Twin, folder: Path, config: "TrainConfig", processes: int | None, project: str | None
 ) -> dict[str, Any]:
-    """Trains with progress bars; returns the contents of `choice.json`. `project`: in Weights & Biases; None: none."""
+    """Trains with progress bars; returns the contents of `choice.json`. `project`: in Weights & Biases, or None."""
     try:
         from twin.learn.selection import earlier_choice, train_until_learnt
         from twin.learn.training import prepare_folder

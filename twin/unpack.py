@@ -43,7 +43,7 @@ FORMAT, VERSION = "twin pack", 1
 MANIFEST, README = "manifest.json", "README.txt"
 PLAIN, DIFFERENCES = "plain", "differences"
 STAGES_PACKED = ("metric", "field", "mesh", "mjcf")
-"""Stages of a build of which a part is packed."""
+"""Build stages of which some files are packed."""
 
 _MAX_FILES = 20_000
 _MAX_FILE, _MAX_TOTAL = 2 << 30, 4 << 30  # [bytes] largest file, and largest total size, unpacked
@@ -190,7 +190,7 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
     total = 0
     for name, facts in head["files"].items():
         if not _PLACES.fullmatch(name):
-            raise InputError(f"{path}: {short_repr(name)} has no place in a scene; {_CURE}")
+            raise InputError(f"{path}: {short_repr(name)} is not a file of a scene; {_CURE}")
         size = facts["bytes"]
         if not isinstance(size, int) or not 0 <= size <= _MAX_FILE or facts["coding"] not in (PLAIN, DIFFERENCES):
             raise InputError(f"{path}: {name} of {short_repr(size)} bytes; expected at most {_MAX_FILE:,}")
@@ -198,9 +198,9 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         total += size
     bound = min(_MAX_TOTAL, max(_FREE, _MAX_RATIO * path.stat().st_size))
     if total > bound:
-        raise InputError(f"{path} unpacks to {total:,} bytes; expected at most {bound:,} of a file of its size")
+        raise InputError(f"{path} unpacks to {total:,} bytes; expected at most {bound:,} for a file of its size")
     if missing := {*head["files"], README, MANIFEST} ^ set(by_name):
-        raise InputError(f"{path}: {short_repr(min(missing))} is in its list and not in it, or the reverse; {_CURE}")
+        raise InputError(f"{path}: {short_repr(min(missing))} is in {MANIFEST} but missing, or the reverse; {_CURE}")
     for name, entry in by_name.items():
         kind = stat.S_IFMT(entry.external_attr >> 16)
         if kind not in (0, stat.S_IFREG) or entry.is_dir():
@@ -208,7 +208,7 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise InputError(f"{path}: {name} is encrypted or compressed in another way; {_CURE}")
         if name in head["files"] and entry.file_size != head["files"][name]["bytes"]:
-            raise InputError(f"{path}: {name} has {entry.file_size:,} bytes; its list says otherwise; {_CURE}")
+            raise InputError(f"{path}: {name} has {entry.file_size:,} bytes; {MANIFEST} says otherwise; {_CURE}")
     head["name"] = require_text(head["name"])
     head["policies"] = list(map(require_text, head["policies"]))
     return head

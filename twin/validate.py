@@ -178,7 +178,7 @@ def _write_results(twin: Twin) -> dict:
 
 
 def _worst_lightings(path: Path) -> list[dict]:
-    """Results of the final evaluations in the worst lighting, one cell per policy and task with a search."""
+    """Results in the worst lighting found, from the final episodes: one cell per policy and task with a search."""
     trials = _read_table(path)
     cells = summarize([t for t in trials if t.seed >= _FINAL_SEED])["cells"]
     return [
@@ -296,15 +296,15 @@ def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], p
         road, digest = _road(task, lighting), fingerprint(twin, task, Condition.parse(lighting))
         if road in driven and recorded["roads"].get(road) != digest:
             raise InputError(
-                f"{folder} has episodes of {task} under {lighting} from before its scene, task, obstacles or photo, "
-                "or twin's sampling of episodes changed; move it away to validate again"
+                f"{folder} has episodes of {task} under {lighting} that were driven before the scene, task, obstacles, "
+                "photo or twin's sampling of episodes changed; move it away to validate again"
             )
         recorded["roads"][road] = digest
     for name, source in policies.items():
         digest = _digest(Path(source), source)
         if name in driven and recorded["policies"].get(name) != digest:
             raise InputError(
-                f"policy {name!r} was validated as another file than {source} is now; move {folder} away, or "
+                f"policy {name!r}: {source} is not the file that was validated under this name; move {folder} away, or "
                 "copy the policy to another name"
             )
         recorded["policies"][name] = digest

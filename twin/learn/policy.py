@@ -75,7 +75,7 @@ class Policy:
 
     name: str
     act: ActFunction
-    """Runs the network without checking its output; `actions` checks it."""
+    """Runs the network; `actions` also checks input and output."""
     control: Control
     size: tuple[int, int] = (160, 90)
     """Width, height of the pictures [px]."""
@@ -144,11 +144,11 @@ def copy_policy(source: Path, folder: Path) -> None:
 
 def _replace_policy(folder: Path, files: dict[str, bytes]) -> None:
     """Replaces files, policy.json last. If the disk is full, the old policy remains complete."""
-    with contextlib.ExitStack() as stack:  # at its end, the temporary files are renamed, the last created first
+    with contextlib.ExitStack() as stack:  # on exit, it renames the temporary files in reverse order
         temporary = {name: stack.enter_context(atomic_path(folder / name)) for name in reversed(files)}
         for name, content in files.items():
             temporary[name].write_bytes(content)
-        (folder / JSON).unlink(missing_ok=True)  # the old one must not describe the new weights, even for a moment
+        (folder / JSON).unlink(missing_ok=True)  # the old one must never lie beside the new weights
 
 
 def find_policy(root: Path, source: str) -> str:
@@ -286,7 +286,7 @@ def _from_callable(name: str) -> Policy:
         outputs = [output_of(stack) for stack in stacks]
         if any(one.shape != example.shape for one in outputs):
             raise InputError(
-                f"policy {name}: returned {short_repr(outputs)}; expected {example.shape[0]} number(s) as before"
+                f"policy {name}: returned {short_repr(outputs)}; expected {example.shape[0]} number(s) as at first"
             )
         return np.stack(outputs)
 
@@ -309,7 +309,9 @@ def _from_zip(path: Path) -> Policy:
         raise InputError(f"{path}: not a SAC of stable-baselines3: {type(error).__name__}: {error}") from None
     shape, actions = model.observation_space.shape, model.action_space.shape
     if shape is None or len(shape) != 3 or shape[0] % 3 or actions not in ((1,), (2,)):
-        raise InputError(f"{path}: takes {shape}, gives {actions}; expected (3 · stack, height, width), 1 or 2 numbers")
+        raise InputError(
+            f"{path}: input {shape}, output {actions}; expected (3 · stack, height, width), and 1 or 2 numbers"
+        )
     control = Control(STEERING if actions == (1,) else TWIST)
 
     def act(stacks: Image) -> Array32:
@@ -322,12 +324,12 @@ def _session(model: bytes, path: Path) -> ActFunction:
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
-    # One thread, since environments already run in parallel, and since it fixes the order of sums.
+    # One thread: environments already run in parallel, and the order of sums must not vary.
     settings.intra_op_num_threads = settings.inter_op_num_threads = 1
     settings.log_severity_level = 4
     try:
         session = onnxruntime.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime's exceptions have no other common base
+    except Exception as error:  # the only common base of ONNX Runtime's exceptions
         raise InputError(f"{path}: ONNX Runtime cannot load it: {error}") from None
     (source,) = session.get_inputs()
     dtypes = {"tensor(uint8)": np.uint8, "tensor(float)": np.float32}

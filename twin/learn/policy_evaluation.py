@@ -1,7 +1,8 @@
 """Evaluation of policies on numbered episodes of a task, on this machine or a Ray cluster.
 
-An *episode* is determined by its seed and lighting: start, robot and light do not depend on the policy, the machine or
-other episodes. So all policies drive the same episodes, and the *chunks* of a campaign can run in any order.
+Seed and lighting determine an *episode*: its start, robot and light do not depend on the policy, the machine or other
+episodes. So all policies drive the same episodes, and the *chunks* of a campaign, groups of episodes that one process
+drives, can run in any order.
 """
 
 import dataclasses
@@ -30,7 +31,7 @@ from twin.loading import load_scene
 from twin.runtime import die_with_parent, ignore_terminal_signals, signals_held, signals_kept
 
 CHUNK = 16
-"""Largest number of episodes in a chunk; one process drives a chunk."""
+"""Largest number of episodes in a chunk."""
 
 _ENVS = 8  # number of episodes driven at once
 _SAMPLED_LIGHTING = re.compile(r"drawn_(\d+)")
@@ -38,12 +39,11 @@ _SAMPLED_LIGHTING = re.compile(r"drawn_(\d+)")
 
 @dataclass(frozen=True)
 class EpisodeChunk:
-    """Episodes of one policy under one lighting."""
+    """Episodes of one policy under one lighting; see `load_policy` for `source` and `trust`."""
 
     scene: str
     task: str
     source: str
-    """See `load_policy`."""
     trust: bool
     condition: Condition
     """The condition's lighting may be `drawn_<number>`, see `with_sampled_lighting`."""
@@ -52,7 +52,7 @@ class EpisodeChunk:
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """Result of an episode: among others, progress [m], mean trust of its pictures, and sum of its rewards.
+    """Result of an episode, with progress [m], mean trust of its pictures (`env/trust.py`), and sum of its rewards.
 
     `lighting` is the sampled lighting.
     """
@@ -83,7 +83,7 @@ def run_episodes(
 ) -> list[EpisodeResult]:
     """Drives one episode per seed, in all environments at once; returns results in the order of the seeds.
 
-    `envs` must have pictures; their current episodes are abandoned. `watch` is called after every episode.
+    `envs` must render pictures; their current episodes are abandoned. `watch` is called after every episode.
     """
     assert envs.pixels is not None
     waiting = list(range(len(seeds)))
@@ -101,8 +101,8 @@ def run_episodes(
         for i in which:
             trusts[driving[i]].append(float(envs.pixels.trust[i]))
         pictures = envs.observation()
-        # Stacks are passed one by one, since sums in a batch have another order, and the last bit of an action can
-        # decide whether a robot hits the kerb.
+        # Stacks are passed one by one: in a batch, sums have another order, and the last bit of an action can decide
+        # whether a robot hits the kerb.
         out = envs.step(np.stack([policy(pictures[i]) for i in which]), which)
         rewards[[driving[i] for i in which]] += out.reward
         for i in [i for i, ended in zip(which, out.over, strict=True) if ended]:
@@ -117,8 +117,8 @@ def run_episodes(
 def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[list[EpisodeResult]]:
     """Drives chunks in worker processes on this machine; yields the chunks' results in order.
 
-    The workers end with this process. Raises InputError: as in `run_chunk`, or because a worker ended, most likely
-    since memory ran out.
+    The workers end with this process. Raises InputError: an error of `run_chunk`, or a worker ended, most likely
+    because memory ran out.
     """
     if processes == 1:
         yield from map(run_chunk, chunks)
@@ -186,8 +186,8 @@ _CONNECT_TIMEOUT = 5.0  # [s]
 def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[list[EpisodeResult]]:
     """Does the same as `campaign` on a Ray cluster; the address `auto` stands for the cluster on this machine.
 
-    Every node needs `twin`, and needs scene and policies under the same paths as here. Raises InputError: Ray is not
-    installed, or there is no such cluster; also as in `run_chunk`.
+    Every node needs `twin`, and scene and policies under the same paths as here. Raises InputError: Ray is not
+    installed, there is no such cluster, or an error of `run_chunk`.
     """
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # silences a warning of Ray on GPUs
     try:
@@ -207,7 +207,7 @@ def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[li
         # A task that asks for more cores than the largest node has would wait for ever.
         cores = max((node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0)
         if cores < 1:
-            raise InputError(f"--ray {address}: no node of the cluster has a core to give; start one with `ray start`")
+            raise InputError(f"--ray {address}: no node of the cluster offers a CPU core; start one with `ray start`")
         # By default Ray fills one node before it uses the next.
         remote = ray.remote(num_cpus=int(min(_CORES, cores)), scheduling_strategy="SPREAD")(run_chunk)
         for driven in [remote.remote(chunk) for chunk in chunks]:

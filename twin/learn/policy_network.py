@@ -21,7 +21,7 @@ NORM_EPSILON = 1e-5
 GROUND_MEAN, GROUND_STD = 128.0, 48.0
 """Mean and standard deviation of a normalized color in the lower half of a picture."""
 NOISE_STD = 4.0
-"""Added to the measured standard deviation of a color, so that normalization amplifies no noise in plain pictures."""
+"""Added to the measured standard deviation of a color, so that noise in uniform pictures is not amplified."""
 _OPSET, _IR = 17, 8  # old enough for the ONNX Runtime on a robot
 
 
@@ -35,11 +35,10 @@ class Architecture:
     pool: int = 2
     """Side of the averaged blocks [px]: 1, 2 or 4, since these averages are exact in floating point."""
     convolutions: tuple[tuple[int, int, int], ...] = ((32, 4, 4), (64, 3, 2))
-    """Number of channels, side of the kernel and stride of each convolution."""
+    """Each convolution's number of channels, side of the kernel and stride."""
     features: int = 64
     """Size of the encoder's output."""
     hidden: tuple[int, ...] = (256, 256)
-    """Widths of the hidden layers."""
     actions: int = 1
 
     def __post_init__(self) -> None:
@@ -105,7 +104,7 @@ def average_pool(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
 def normalize_colors(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Scales channels (..., height, width) so that the lower half of each has the mean `GROUND_MEAN`.
 
-    Its standard deviation becomes `GROUND_STD`, or less because of `NOISE_STD`.
+    The lower half's standard deviation becomes `GROUND_STD`, or a little less because of `NOISE_STD`.
     """
     ground = pictures[..., pictures.shape[-2] // 2 :, :].astype(np.float32)
     mean, std = ground.mean((-2, -1), keepdims=True), ground.std((-2, -1), keepdims=True)

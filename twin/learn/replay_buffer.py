@@ -1,10 +1,10 @@
 """A replay buffer that stores single pictures instead of stacks, and color augmentation of its samples.
 
-Each environment has a *ring* in a file, to which its pictures are written once, in order; the first picture of an
-episode follows the last one of the episode before. A *transition* stores its *age*, the number of steps since its
-episode began, and the index of the newest picture before it. The stack before the transition ends with this picture,
-the stack after it with the next picture of the ring. If the episode has too few pictures for a stack, its first one is
-repeated. A buffer that stores both stacks, of four pictures each, would take eight times the memory.
+Each environment has a *ring* (buffer) in a file, to which its pictures are written once, in order, across episodes. A
+*transition* stores its *age*, the number of steps since its episode began, and the index of the newest picture before
+it. The stack before the transition ends with this picture, the stack after it with the next picture of the ring. If the
+episode has too few pictures for a stack, its first one is repeated. A buffer that stores both stacks, of four pictures
+each, would take eight times the memory.
 """
 
 from pathlib import Path
@@ -25,7 +25,7 @@ from twin.files import allocate
 
 _GAMMA, _CONTRAST, _TINT = 0.25, 0.25, 0.08  # standard deviations of their logarithms
 _KNOTS, _SHADING = (3, 5), 0.4  # brightness pattern: knots down and across; standard deviation of the logarithm
-_MAX_COVERS, _COVER_SIDES = 4, (0.1, 0.5)  # there are fewer rectangles than this; their sides over the picture's
+_MAX_COVERS, _COVER_SIDES = 4, (0.1, 0.5)  # bound of the number of rectangles, exclusive; their sides / the picture's
 _LEVELS = np.arange(256) / 255.0
 
 
@@ -78,7 +78,7 @@ _ROWS = ("actions", "rewards", "ends", "newest", "age", "states", "states_after"
 
 
 class ReplaySamples(NamedTuple):
-    """Samples as in stable-baselines3, with privileged states besides."""
+    """Samples as in stable-baselines3, and privileged states."""
 
     observations: torch.Tensor
     actions: torch.Tensor
@@ -92,8 +92,8 @@ class ReplaySamples(NamedTuple):
 class FrameReplayBuffer(ReplayBuffer):
     """Transitions of n environments; observations are stacks (3 · stack, height, width), the newest picture last.
 
-    The rings are longer than the transitions need. So pictures written after a save do not overwrite those of the saved
-    transitions, and a killed training resumes with all saved transitions. `slack` sets the additional length.
+    The rings are longer than the transitions need, by a length that `slack` sets. So pictures written after a save do
+    not overwrite those of saved transitions, and a killed training resumes with all of them.
     """
 
     def __init__(
@@ -150,7 +150,9 @@ class FrameReplayBuffer(ReplayBuffer):
         else:
             bytes_needed = int(np.prod(shape))
             if file.exists() and file.stat().st_size != bytes_needed:
-                raise InputError(f"{file} has {file.stat().st_size} bytes; expected {bytes_needed}: damaged")
+                raise InputError(
+                    f"{file} has {file.stat().st_size} bytes; expected {bytes_needed}; train anew under another name"
+                )
             allocate(file, bytes_needed)  # a full disk causes an error now, not a SIGBUS hours later
             self.frames = np.memmap(file, np.uint8, "r+", shape=shape)
         self.written = np.zeros(n_envs, np.int64)

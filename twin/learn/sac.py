@@ -96,8 +96,8 @@ class PixelSAC(SAC):
     """SAC with a shared encoder and privileged states."""
 
     averaged_actor: Actor
-    """Running mean of the actor and its encoder; it is saved as the policy. The actor itself fluctuates from update to
-    update: if it were saved at a bad moment, the policy would leave the road."""
+    """Running mean of the actor and its encoder, which is saved as the policy. The actor itself fluctuates between
+    updates: saved at a bad moment, it would leave the road."""
 
     def __init__(self, *arguments: Any, state_scales: tuple[float, ...] = (), **rest: Any) -> None:
         """`state_scales`: typical magnitude of each component of the privileged state; empty: no state is used.
@@ -170,7 +170,7 @@ class PixelSAC(SAC):
             self.logger.record(f"train/{name}", value)
 
     def break_off_episodes(self) -> None:
-        """Makes all environments begin new episodes at the next step; meanwhile they may be used for anything."""
+        """Makes all environments begin new episodes at the next step; until then they may drive other episodes."""
         assert isinstance(self.replay_buffer, FrameReplayBuffer)
         self.replay_buffer.break_off()
         self._last_obs = None
@@ -242,7 +242,6 @@ def save_state(folder: Path, model: PixelSAC, more: dict[str, Any]) -> None:
 
 
 def has_state(folder: Path) -> bool:
-    """True if the folder contains a saved state."""
     return (folder / _STATE).exists()
 
 

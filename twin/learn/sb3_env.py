@@ -14,7 +14,8 @@ from twin.loading import Twin
 
 
 class DriveVecEnv(VecEnv):
-    """n environments. The last step of an episode also resets its environment; `info` has the last observation.
+    """n environments. The last step of an episode also resets its environment; `info` then has the episode's last
+    observation.
 
     Every `info` has the privileged `state`; at the end of an episode, it also has `first_state`, the state at the start
     of the next episode. `lighting` is the name of the lighting in tables; `sampled_lighting` is the entry that

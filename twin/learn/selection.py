@@ -8,12 +8,12 @@ required success rate `config.success` allows. The training ends
 - when `PATIENCE` tests in a row have improved neither the success rate nor the mean distance along the route;
 - at the largest number of steps.
 
-In the first two cases the training first continues for `config.settle` steps with a falling learning rate
-(`training.py`), followed by one more test. The policy that is kept is the one with most successes among those that
-drove a whole test; ties are broken by the mean reward. If no policy reached the required rate, the best `_FINALISTS`
-drive whole tests before the choice. The best of several results is biased upwards by luck. So the kept policy drives
-fresh episodes, which no decision used, in a *final test*. If the lighting varies, these episodes have held-out
-lightings and everything randomized, as in `twin validate` by default.
+In the first two cases, `config.settle` more steps with a falling learning rate (`training.py`) and one more test
+follow. The kept policy is the one with most successes among those that drove a whole test; the mean reward breaks ties.
+If no policy reached the required rate, the best `_FINALISTS` drive whole tests before the choice. The best of several
+results is biased upwards by luck. So the kept policy drives fresh episodes, which no decision used, in a *final test*.
+If the lighting varies, these episodes have held-out lightings and everything randomized, as in `twin validate` by
+default.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,7 +48,7 @@ REACHED, NO_BETTER, ALL_STEPS = ENDS = ("reached", "no better", "steps")
 
 _BATCHES = (8, 12, 20)  # numbers of episodes; a test may be broken off after each batch
 _TEST_EPISODES = sum(_BATCHES)
-_BETTER = 0.02  # least improvement: of the success rate, absolute; of the mean distance along the route, relative
+_BETTER = 0.02  # least improvement of the success rate (absolute) and of the mean distance along the route (relative)
 _FINALISTS = 3
 _STREAM = 7  # see `training._TRAINING_STREAM`
 _PLACE = 5.0  # [m] length of the route sections in which failures are counted
@@ -60,9 +60,9 @@ class Failure:
 
     cause: str
     progress: float
-    """[m]"""
+    """Distance along the route [m]."""
     lighting: str
-    """As sampled; see `LocalVectorEnv.info`."""
+    """The sampled lighting; see `LocalVectorEnv.info`."""
 
 
 @dataclass(frozen=True)
@@ -264,7 +264,7 @@ def read_choice(folder: Path) -> dict[str, Any] | None:
         known = choice["why"] in ENDS and 0 <= counts[1] <= counts[2] and counts[2] > 0
         texts = choice["failures"], choice["chosen"]["condition"]
         if not known or not all(isinstance(one, str) for one in texts) or not isinstance(choice["reached"], bool):
-            raise ValueError("no such choice")
+            raise ValueError("not a choice of twin train")
         float(choice["most"]), float(choice["success"])
         return choice
 

@@ -88,8 +88,8 @@ class TrainConfig:
     """Target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 corresponds to a
     standard deviation of 0.15, and -1 to 0.09."""
     start_along: float = 0.9
-    """Half of the episodes start at a random point of this first fraction of the segment, not only at its beginning.
-    Starts are beside the route and at an angle to it, so that a policy practices returning to the middle."""
+    """Half of the episodes start at a random point of this first fraction of the segment, the others at its beginning.
+    All start beside the route and at an angle to it, so that a policy practices returning to the middle."""
     randomise: bool = True
     """Randomizes the robot in every episode; if the lighting varies, also the weather and distractor objects."""
     privileged: bool = True
@@ -123,7 +123,7 @@ class TrainConfig:
     test_every: int = 3_000
     """Number of steps between two tests of the policy (`selection.py`)."""
     settle: int = 2_000
-    """Number of steps, with a falling learning rate, that follow when tests end a training (`selection.py`)."""
+    """Number of steps, with a falling learning rate, after tests have ended a training (`selection.py`)."""
     save_every: int = 4_000
     """Number of steps between two saved states."""
     device: str = "cpu"
@@ -161,13 +161,12 @@ class TrainConfig:
 
     @property
     def lighting_varies(self) -> bool:
-        """True if the lighting varies between episodes."""
         return self.observe == NERF and self.lighting == TRAINING
 
     def options(self) -> dict[str, Any]:
-        """Options of the environment."""
-        # The goal's reward equals that of surviving for ever: if it were less, a policy would linger before the goal.
-        # The loss of reward beside the route keeps policies away from the kerb, where one disturbance ends an episode.
+        # The goal's reward equals the discounted sum of step rewards for ever; for less, a policy would linger before
+        # the goal. The loss of reward beside the route keeps policies off the kerb, where one disturbance ends an
+        # episode.
         goal = Rewards.step * self.gamma / (1.0 - self.gamma)
         rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
         ranges = Ranges() if self.lighting_varies else _ROBOT_ONLY
@@ -184,7 +183,7 @@ class TrainConfig:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "cpu": {},
-    # Pictures have the full resolution, as in the paper. This preset was not measured on a GPU yet.
+    # Pictures have the full resolution, as in arXiv 2403.15791. This preset was not measured on a GPU yet.
     "gpu": {
         "pool": 1,
         "convolutions": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),

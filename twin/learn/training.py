@@ -88,20 +88,20 @@ training."""
 
 _NO_CURVES = ("step", "seed", "lighting", "cause")  # columns that are not sent to the writers as curves
 _FINAL_RATE = 0.1  # lowest learning rate / `config.learning_rate`
-# Seeds derive from the run's seed, the number of resumptions and this number, which differs from `selection._STREAM`.
-# So no random stream is used twice.
+# Seeds derive from the run's seed, the number of resumptions and this number. It differs from `selection._STREAM`, so
+# that no random stream is used twice.
 _TRAINING_STREAM = 6
 
 
 class PreprocessedVecEnv(VecEnvWrapper):
-    """Environments with the policy's preprocessing; a function such as the networks' updates can run during a step."""
+    """Environments with the policy's preprocessing; during their steps, the networks can be updated (`meanwhile`)."""
 
     def __init__(self, envs: DriveVecEnv, pool: int) -> None:
         channels, height, width = envs.observation_space.shape  # type: ignore[misc]
         super().__init__(envs, spaces.Box(0, 255, (channels, height // pool, width // pool), np.uint8))
         self._pool, self._thread = pool, ThreadPoolExecutor(1)
         self.meanwhile: Callable[[], None] = lambda: None
-        """Called while the environments step, for the updates of the networks; the step must not depend on it."""
+        """Called while the environments step; the step must not depend on it."""
 
     def reset(self) -> NDArray:
         return preprocess(np.asarray(self.venv.reset()), self._pool)
@@ -267,7 +267,7 @@ def cycle_rate(config: TrainConfig, step: int) -> float:
 
 
 def prepare_folder(folder: Path) -> None:
-    """Creates a run's folder and in it the folder `state`, by which runs are recognized.
+    """Creates a run's folder and in it the folder `state`, which marks it as a run.
 
     Raises InputError if the folder exists and is neither empty nor a run, since a training deletes and replaces files.
     """
@@ -281,7 +281,7 @@ def prepare_folder(folder: Path) -> None:
 
 
 def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
-    """Settings that must be equal in all calls of a run: the configuration and the fingerprint of the road.
+    """Settings that `check_same` compares between calls of a run: the configuration, and the road's fingerprint.
 
     The values are JSON types, as read from `config.json`.
     """
@@ -290,7 +290,7 @@ def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
 
 
 def check_same(folder: Path, settings: dict[str, Any]) -> None:
-    """Raises InputError if an existing run has another configuration."""
+    """Raises InputError if a run has other settings, apart from `steps` and `success`."""
     with wrap_read_errors(folder / "config.json", "train anew under another name"):
         previous = dict(read_json(folder / "config.json"))
         previous["road"]
@@ -338,7 +338,7 @@ class _RunRecorder(BaseCallback):
         return self._wall + time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
-        # Written only now: if no environment starts with a configuration, it is invalid and must not be saved.
+        # Written only now: the environments have started, so the configuration is valid.
         write_json(self._folder / "config.json", self._settings)
         self._saved = self._first = self.model.num_timesteps
         self._first_updates = self.model._n_updates
@@ -403,7 +403,6 @@ class _RunRecorder(BaseCallback):
             writer.write(numbers, {}, named["step"])
 
     def _checkpoint(self) -> None:
-        """Saves a checkpoint if one is due."""
         every = self._config.steps / self._config.checkpoints
         number = int(self.model.num_timesteps / every)
         if number and self.model.num_timesteps - number * every < self._config.worlds:

@@ -1,10 +1,9 @@
 """Shows a training as a run of Weights & Biases (wandb.ai), if the package `wandb` is installed.
 
-The run gets the training's configuration, and these numbers as functions of the training's steps: those of
-`tensorboard/` under the same names, and those of `episodes.csv`, `log.csv` and `tests.json` as `episodes/...`,
-`log/...` and `tests/...`. At the end, it gets the curve of successes and a film of the kept policy. A resumed training
-continues its run. wandb's own environment variables apply: with `WANDB_MODE=offline`, the run is only written to
-`runs/<name>/wandb`.
+The run gets the training's configuration, and numbers over the training's steps: those of `tensorboard/` under the same
+names, and those of `episodes.csv`, `log.csv` and `tests.json` as `episodes/...`, `log/...` and `tests/...`. At the end,
+it gets the plot of the success rate and a film of the kept policy. A resumed training continues its run. wandb's own
+environment variables apply: with `WANDB_MODE=offline`, the run is only written to `runs/<name>/wandb`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     import wandb
 
 ID_FILE = "wandb.json"
-"""File in the training's folder with project and id of its run of Weights & Biases, so that it can be continued."""
+"""File in the training's folder with project and id of its run of Weights & Biases, by which the run is continued."""
 
 _STEP = "step"
 
@@ -51,7 +50,7 @@ class WandbRun(KVWriter):
         """Does nothing: `wandb_run` closes the run."""
 
     def show(self, step: int, curve: Path, film: Path, caption: str) -> None:
-        """Logs the curve of successes (.png) and a film (.mp4) with its caption."""
+        """Logs the plot of the success rate (.png), and a film (.mp4) with its caption."""
         import wandb
 
         video = wandb.Video(str(film), caption=caption, format="mp4")

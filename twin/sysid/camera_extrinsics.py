@@ -3,9 +3,9 @@
 `capture/localize.py` localizes the film's frames. The extrinsics are the camera's height above flat ground and its
 rotation from straight ahead: yaw to the left, pitch down, roll to the right. Height, pitch and roll follow from the
 frames' poses relative to a robot base at rest on the ground below. Yaw follows from the direction of travel: a base
-that does not slide sideways moves along its heading, so its sideways steps must not add up. A camera ahead of the point
-about which the robot turns swings outwards in turns. So the forward offset of this point from the base's origin is
-estimated together with yaw.
+that does not slide sideways moves along its heading, so its sideways steps must not add up. The robot turns about a
+point that need not be the base's origin, and a camera ahead of that point swings outwards. So the point's forward
+offset from the origin is estimated together with yaw.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ _FAR_OFF, _JUMP = 8.0, 3.0  # multiples of the median deviation (outliers) and o
 class CameraExtrinsics:
     """Values or standard errors of a camera's height [m] and angles [°].
 
-    Yaw and pitch absorb an error of the principal point, as intended: it shifts the image as they do.
+    An error of the principal point shifts the image as yaw and pitch do. They absorb it, as intended.
     """
 
     height: float
@@ -63,7 +63,7 @@ class CameraExtrinsics:
 def estimate_extrinsics(
     camera_to_world: Array, ground_at: Callable[[Array], Array], offset: tuple[float, float]
 ) -> tuple[CameraExtrinsics, CameraExtrinsics]:
-    """The extrinsics and their standard errors, by a jackknife over consecutive parts of the film.
+    """The extrinsics, and their standard errors from a jackknife over consecutive parts of the film.
 
     Args:
         camera_to_world: OpenCV axes, in the order of the film [m], shape (n, 4, 4).
@@ -77,7 +77,7 @@ def estimate_extrinsics(
     way = float(np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1).sum())
     if len(poses) < _MIN_FRAMES or way < _MIN_WAY:
         raise InputError(
-            f"{len(poses)} frames of the film were found on the place, over {way:.1f} m; expected at least "
+            f"{len(poses)} frames of the film were localized in the place, over {way:.1f} m; expected at least "
             f"{_MIN_FRAMES} over {_MIN_WAY:g} m; drive further, slowly, on the filmed path and in light "
             "like that of one of the films"
         )
@@ -157,7 +157,7 @@ def _yaw(bases: Array, headings: Array, use: NDArray[np.bool_]) -> float:
     def sideways(unknown: Array) -> Array:
         """Sideways drift [m] of the point about which the robot turns, `pivot` [m] ahead of the base's origin.
 
-        Per segment, the sum of sideways steps up to each frame, minus its mean over the segment; the last value is the
+        In each segment: the sum of sideways steps up to each frame, minus the mean of these sums. The last value is the
         residual of the prior of `pivot`.
         """
         yaw, pivot = unknown
@@ -190,7 +190,7 @@ def _relative_to_base(
 def _base_pose(
     position: Array, heading: float, ground_at: Callable[[Array], Array], lens: Array
 ) -> tuple[Array, Array]:
-    """Origin [m] and axes (3, 3) of a base at rest whose lens, at `lens` (3,) [m] in the base, is above `position`."""
+    """Origin [m] and axes (3, 3) of a base at rest with its lens, at `lens` [m] in the base, at x, y = `position`."""
     rotation = Rotation.from_euler("Z", heading).as_matrix()
     arm = lens + np.array([0.0, 0.0, BASE_HEIGHT])  # from the ground
     for _ in range(2):  # a tilted base moves its lens sideways
@@ -217,12 +217,12 @@ class CameraCalibration:
     extrinsics: CameraExtrinsics
     standard_errors: CameraExtrinsics
     focal_given: bool
-    """False: the focal length is estimated, or comes from a bag's calibration."""
+    """True: `[robot]` gives the intrinsics. False: the focal length is estimated, or comes from a bag's calibration."""
 
     @property
     def summary(self) -> str:
-        """A line on the film's registration."""
-        found = f"{len(self.registration.frames)} of {self.frames} frames found on the place"
+        """One line: the number of localized frames, and their reprojection error."""
+        found = f"{len(self.registration.frames)} of {self.frames} frames localized in the place"
         return f"{found}, median reprojection error {self.registration.error:.2f} px"
 
     @property
@@ -254,7 +254,7 @@ class CameraCalibration:
 def calibrate_camera(
     film: Path, scene: SceneDir, params: HuskyParams, topic: str = ""
 ) -> tuple[CameraCalibration, list[Image]]:
-    """Estimates the camera's extrinsics, and its focal length unless it is given; also returns the film's frames.
+    """Estimates the camera's extrinsics and, unless given, its focal length; also returns the film's frames.
 
     Args:
         film: Undistorted film of the front camera, while the robot drives through the scene, mostly straight ahead; or
@@ -282,8 +282,8 @@ def calibrate_camera(
     worst = _WORST_ERROR * max(size) / 1280
     if registration.error > worst:
         raise InputError(
-            f"{film}: features lie {registration.error:.1f} px off where a pinhole camera would show them, expected "
-            f"at most {worst:.1f}; rectify the film (take the distortion out of it)"
+            f"{film}: features lie {registration.error:.1f} px (median) from where a pinhole camera would show them, "
+            f"expected at most {worst:.1f}; rectify the film (remove its lens distortion)"
         )
     extrinsics, errors = estimate_extrinsics(registration.camera_to_world, ground.at, params.camera_offset)
     if max(errors.yaw, errors.pitch, errors.roll) > _WORST_TURN or errors.height > _WORST_HEIGHT:

@@ -1,12 +1,11 @@
 """Drivetrain model, fitted to a log: how the robot's controller and servos turn commands into wheel speeds.
 
-The model applies the limits of `twin.env.controller` to many windows at once, every 0.01 s instead of every 0.1 s, so
-that it is smooth in its parameters. (A real controller reacts up to one period late, but then changes the speed in one
-step by as much as the limit allows per period. On average the delay and the early step cancel.) *Mean* and *half*
-speed are the mean of the two sides and half their difference [rad/s at the wheels]. Wheel commands may be in units of
-another robot (DRIVE's log assumes a Husky with wheels of 0.3 m), so they have a gain for the mean and one for the half
-speed. For commands v and ω, the gain of the mean speed is 1, and that of the half speed is the controller's separation
-multiplier.
+The model applies the limits of `twin.env.controller` to many windows at once. Its step is 0.01 s instead of 0.1 s, so
+that it is smooth in its parameters. (A real controller reacts up to one period late, but then makes the whole change of
+a period in one step. On average, the two effects cancel.) *Mean speed* is the mean of the two sides' wheel speeds
+[rad/s], *half speed* is half of right minus left. Each of the two has a gain, since wheel commands may be in units of
+another robot (DRIVE's log assumes a Husky with wheels of 0.3 m). For commands v and ω, the gain of the mean speed is 1,
+and that of the half speed is the controller's separation multiplier.
 """
 
 from dataclasses import dataclass, replace
@@ -77,8 +76,8 @@ class Drivetrain:
 def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array, Array]:
     """Servo targets and the resulting wheel speeds, starting from each window's first wheel speeds.
 
-    A window that follows another one starts with that window's delayed commands and with the end state of its
-    acceleration ramp. That state cannot be read from the wheel speeds, which lag behind the ramp. In other windows the
+    A window that follows another one begins with the other's delayed commands and continues the other's acceleration
+    ramp. The wheel speeds do not show how far the ramp has come, since they lag behind it. In all other windows, the
     wheels keep their speed until the first command arrives.
 
     Returns:
@@ -108,8 +107,8 @@ def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array
             begin[follows] = ended[follows - 1]
         return _wheel_speeds(drivetrain, _ramped(drivetrain, arrived, begin), speed)
 
-    # If the delay is not a whole number of steps, the results for the two nearest whole numbers are interpolated, not
-    # the commands, because ramps are not linear in their input.
+    # If the delay is not a whole number of steps, the results for the two nearest whole numbers are interpolated.
+    # Delayed commands are not interpolated, because ramps are not linear in their input.
     one, other = delayed_by(whole), delayed_by(whole + 1)
     return (1 - share) * one[0] + share * other[0], (1 - share) * one[1] + share * other[1]
 

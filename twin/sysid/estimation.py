@@ -1,8 +1,9 @@
 """Robust maximum a posteriori estimation with standard errors; unidentified parameters keep their defaults.
 
 A *parameter* has a normal prior; the residuals of a window follow a multivariate Student's t distribution (below). A
-parameter is *identified* if, with all others free, its standard error is at most `_MAX_ERROR_SHARE` of its prior's
-standard deviation. While some are not, the least certain one is fixed at its default and the others are fitted again.
+parameter is *identified* if its standard error, with all free parameters fitted together, is at most `_MAX_ERROR_SHARE`
+of its prior's standard deviation. While some are not, the least certain one is fixed at its default and the others are
+fitted again.
 """
 
 from collections.abc import Callable
@@ -88,14 +89,14 @@ def robust_loss(scaled: Array) -> Array:
 def robust_jacobian(scaled: Array, jacobian: Array) -> Array:
     """Approximate Jacobian of `robust_loss(scaled)` for least squares, from that of `scaled` (n, instants, c, p).
 
-    The gradient of the loss that follows from it is exact; only the curvature is approximate.
+    It gives the exact gradient of the loss, and an approximate curvature.
     """
     norm = _squared_norm(scaled)
     return jacobian * _per_window(1 / (1 + norm) / _loss_factor(norm) / np.sqrt(scaled.shape[1]), jacobian)
 
 
 def apply_weights(scaled: Array, values: Array) -> Array:
-    """Values (n, ...) times the root of their window's weight in iteratively reweighted least squares, 1 / (1 + s)."""
+    """Values (n, ...) times √(weight / instants); weight is 1 / (1 + s), as in iteratively reweighted least squares."""
     return values * _per_window(1 / np.sqrt((1 + _squared_norm(scaled)) * scaled.shape[1]), values)
 
 
@@ -118,7 +119,7 @@ def _per_window(factor: Array, like: Array) -> Array:
 _MAX_ERROR_SHARE = 0.5  # largest standard error of an identified parameter, in prior standard deviations
 _MIN_CURVATURE = 0.1  # smallest curvature as a fraction of that of the squares, see `_inverse_curvature`
 _STEP = 0.05  # step of finite differences, in prior standard deviations
-_NATS = 0.02  # a search ends when a step gains less log-likelihood; 0.2 standard errors off the maximum cost as much
+_NATS = 0.02  # [nat] a search ends when a step gains less; it is the loss at 0.2 standard errors from the maximum
 _EVALUATIONS = 50  # most evaluations per round of the search, not counting those for Jacobians
 
 
@@ -146,7 +147,7 @@ class Fit:
 
     values: dict[str, float]
     errors: dict[str, float]
-    """Standard errors of the identified parameters; the others have their defaults."""
+    """Standard errors of the identified parameters. The others have none; their values are the defaults."""
     refused: dict[str, str]
     """A line per parameter that is not identified: its default, its standard error and the cure."""
     negative_log_likelihood: float
@@ -256,7 +257,7 @@ def _prior_weights(table: list[Parameter], kinds: Kinds) -> Array:
 
 
 def _cached(residuals: Callable[[dict[str, float]], Array]) -> Callable[[dict[str, float]], Array]:
-    """The same function with a cache of the newest 4 (p + 1) results: standard errors reuse the search's last ones."""
+    """Adds a cache of the newest 4 (p + 1) results, since standard errors reuse the last ones of the search."""
     seen: dict[tuple[float, ...], Array] = {}
 
     def at(values: dict[str, float]) -> Array:
@@ -285,7 +286,7 @@ def _standard_errors(jacobian: Array, scaled: Array, groups: NDArray[np.int64], 
     """Standard errors of the parameters, shape (p,); infinite where the data contain no information.
 
     They are cluster-robust (Liang and Zeger 1986): residuals within a group may be correlated in any way. With few
-    groups, errors that treat windows as independent can be larger; the larger ones are returned.
+    groups, errors that treat windows as independent can be larger; the larger of the two is returned.
 
     Args:
         jacobian: Jacobian of the scaled residuals, shape (n, instants, c, p).
@@ -324,9 +325,8 @@ def _standard_errors(jacobian: Array, scaled: Array, groups: NDArray[np.int64], 
 def _inverse_curvature(information: Array, score: Array) -> Array:
     """Inverse of the curvature of the objective, shape (p, p).
 
-    The curvature of log(1 + s) is that of the squares that replace it in a step, minus twice the squared score of a
-    window. Where noise would make the difference too small, `_MIN_CURVATURE` times the curvature of the squares is
-    used.
+    The curvature of log(1 + s) is the curvature of the squares that replace it in a least-squares step, minus twice the
+    squared score of a window. Where noise makes the difference too small, `_MIN_CURVATURE` times the former is used.
     """
     root = np.linalg.inv(np.linalg.cholesky(information))
     less, axes = np.linalg.eigh(2 * root @ score.T @ score @ root.T)

@@ -1,7 +1,7 @@
 """System identification of a robot from a log, and the text of `robot.toml`.
 
-`robot.toml` keeps its previous fields and gets a line with value and standard error for each identified field. All
-other fields have their published values or those of `scene.toml`. `align.json` has all numbers.
+`robot.toml` keeps its previous fields and gets a line with value and standard error for each identified field. Fields
+that it lacks have their published values or those of `scene.toml`. `align.json` has all numbers.
 """
 
 from collections.abc import Callable
@@ -63,8 +63,8 @@ class Identification:
     def identified(self) -> dict[str, tuple[float | tuple[float, ...], float | tuple[float | None, ...]]]:
         """Identified fields of HuskyParams: value and standard error, each a number or a tuple.
 
-        Errors of yaw rate and yaw acceleration are those at the fitted separation multiplier. The error of a component
-        that is not identified is None.
+        Errors of `max_yaw_rate` and `max_yaw_acceleration` take the fitted separation multiplier as exact. The error of
+        a component that is not identified is None.
         """
         out: dict[str, tuple[Any, Any]] = {}
         twist = self.windows.twist
@@ -136,7 +136,7 @@ class Identification:
 
 
 def _identified_drive_fields(fit: Fit, twist: bool) -> list[str]:
-    """Fields that the drivetrain's fit identifies; wheel commands bypass the separation multiplier."""
+    """Fields that the drivetrain's fit identifies: without `twist`, not the multiplier, which wheel commands bypass."""
     return [
         field
         for field, name in _DRIVE_FIELDS.items()
@@ -153,7 +153,7 @@ def identify(
     """Fits baseline, drivetrain, tires and ground to the windows for fitting, then predicts every window.
 
     Args:
-        use_slope: Estimate the slope of the ground from accelerations; False: level ground.
+        use_slope: True: estimates the ground's slope from accelerations; False: assumes level ground.
     """
     if not use_slope:
         windows = replace(windows, acceleration=None)

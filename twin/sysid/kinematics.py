@@ -1,4 +1,4 @@
-"""Kinematic models of skid steering, the baselines of the fitted model, and the scores of predictions.
+"""Kinematic models of skid steering, which are baselines for the fitted model, and the scores of predictions.
 
 *Nominal*: a differential drive whose wheels roll without slip. *ICR model* (Mandow et al. 2007): each side's tread has
 an instantaneous center of rotation at its own lateral offset. Its five parameters are these offsets, a slip factor per
@@ -50,7 +50,7 @@ NOMINAL = IcrModel()
 
 
 def integrate(motion: Array) -> Array:
-    """Poses x, y [m], yaw [rad] from zero, shape (n, k + 1, 3), for velocities (n, k, 3) of `PERIOD` [s] each."""
+    """Poses x, y [m], yaw [rad] from zero, shape (n, k + 1, 3), for velocities (n, k, 3), each for `PERIOD` [s]."""
     turned = motion[..., 2] * PERIOD
     yaw = np.concatenate([np.zeros((len(motion), 1)), np.cumsum(turned, 1)], 1)
     middle = yaw[:, :-1] + turned / 2
@@ -62,9 +62,9 @@ def integrate(motion: Array) -> Array:
 
 
 def predict(model: IcrModel, windows: Windows) -> Array:
-    """Predicted poses, from the time at which each window's first one was measured, (n, k + MAX_POSE_AGE + 1, 3).
+    """Poses integrated from the measured wheel speeds, shape (n, k + MAX_POSE_AGE + 1, 3).
 
-    They follow from the measured wheel speeds; after a window's end, its last wheel speeds continue.
+    They begin when the window's first pose was measured. After a window's end, its last wheel speeds continue.
     """
     before = windows.preceding_wheels[:, -1 - MAX_POSE_AGE : -1]
     after = np.repeat(windows.wheels[:, -1:], MAX_POSE_AGE, 1)
@@ -87,7 +87,7 @@ def fit_icr(windows: Windows) -> IcrModel:
 
 
 def interpolate_poses(poses: Array, time: Array) -> Array:
-    """Poses (n, m, 3), `PERIOD` [s] apart, at one time [s] per window (n,); shape (n, 3)."""
+    """Interpolates poses (n, m, 3), which are `PERIOD` [s] apart, at one time [s] per window (n,); returns (n, 3)."""
     position = np.clip(time / PERIOD, 0, poses.shape[1] - 1 - 1e-9)
     before = position.astype(int)
     share = (position - before)[:, None]
@@ -117,7 +117,7 @@ def track_ratios(windows: Windows, ends: Array) -> Array:
 
 
 def steady_windows(windows: Windows) -> NDArray[np.bool_]:
-    """Mask (n,) of windows in which the sides' wheels turn at constant, different speeds, as chi requires."""
+    """Mask (n,) of windows in which the sides' wheels turn at constant, different speeds; only these determine chi."""
     sides = windows.wheels * WHEEL_RADIUS
     thirds = np.stack([part.mean(1) for part in np.array_split(sides, 3, axis=1)])
     constant = np.ptp(thirds, axis=0).max(1) < 0.08
@@ -149,9 +149,9 @@ class Prediction:
     def __init__(self, name: str, windows: Windows, poses: Array, wheels: Array | None = None) -> None:
         """
         Args:
-            poses: `PERIOD` [s] apart, from the time at which each window's first one was measured,
+            poses: `PERIOD` [s] apart, beginning when the window's first pose was measured,
                 shape (n, k + MAX_POSE_AGE + 1, 3).
-            wheels: Shape (n, ≥ k, 2) [rad/s]; None: the model takes the measured ones.
+            wheels: Shape (n, ≥ k, 2) [rad/s]; None: the measured ones, which the model has as input.
         """
         self.name, self.windows, self.poses = name, windows, poses
         self.wheels = windows.wheels if wheels is None else wheels[:, : windows.wheels.shape[1]]

@@ -1,4 +1,4 @@
-"""Drive logs: commands, wheel speeds and poses of a robot, cut into windows of two seconds, and their plausibility.
+"""Drive logs: commands, wheel speeds and poses of a robot, cut into windows of two seconds, and plausibility checks.
 
 A *window* contains evenly spaced samples of commands, wheel speeds, poses relative to the first one and, with an IMU,
 accelerations. Windows of one *group* belong to one experiment; even groups are for fitting, odd ones for scoring. A
@@ -60,13 +60,13 @@ _CONTINUES = 1.0  # [rad/s] largest change of wheel speeds between consecutive w
 
 
 def measurement_times(fresh: NDArray[np.bool_]) -> Array:
-    """Estimates the time at which each pose of a log's windows was measured, from the samples at which poses changed.
+    """Estimates when each pose of a log's windows was measured, from the samples at which poses changed.
 
-    A pose sensor measures at a steady rate, but its poses reach the log with varying delay: a robot moves as far
-    between fresh poses that appear 0.05 s apart as between those that appear 0.15 s apart. (In turning windows of
-    DRIVE's log, yaw as a function of the number of the fresh pose is smooth to 0.3°, as a function of its time of
-    appearance to 0.7°.) So the n-th fresh pose counts as measured n periods after the first; if a pose and all later
-    ones are late by more than half a period, poses before it were lost and are counted, too.
+    A pose sensor measures at a steady rate, but its poses reach the log with varying delay: between fresh poses that
+    appear 0.05 s apart, a robot moves as far as between those that appear 0.15 s apart. (In turning windows of DRIVE's
+    log, yaw is smooth to 0.3° over the number of the fresh pose, but only to 0.7° over its time of appearance.) So the
+    n-th fresh pose counts as measured n periods after the first. Lost poses are counted, too: if a pose and all later
+    ones are late by more than half a period, poses before it were lost.
 
     Times of appearance are used instead for windows that contradict the period by more than `_JITTER`, and for the
     whole log if many windows do so or if the sensor is fast.
@@ -102,7 +102,7 @@ def _steady(appeared: Array, period: float) -> Array:
         return np.zeros(1)
     number = np.arange(1.0, len(appeared) + 1)
     lost = np.maximum(0.0, np.ceil((appeared - appeared[0]) / period - number + 0.5))
-    number += np.minimum.accumulate(lost[::-1])[::-1]  # if later poses are on time again, the pose was late, not lost
+    number += np.minimum.accumulate(lost[::-1])[::-1]  # if a later pose is on time again, none was lost
     start = float(np.median(appeared - period * number))
     if start > period / 2:  # the robot rested, or the first poses were lost
         first = start - period * np.ceil(start / period)
@@ -153,7 +153,7 @@ class Windows:
     def preceding_wheels(self) -> Array:
         """Wheel speeds in the `DURATION` before each window and at its start [rad/s], shape (n, k + 1, 2).
 
-        If a window follows the previous one, these are the previous one's; else the speed at the start is repeated.
+        If the window follows the previous one, they are that one's; otherwise the speed at the start is repeated.
         """
         out = np.repeat(self.wheels[:, :1], self.wheels.shape[1] + 1, 1)
         follows = np.flatnonzero(self.follows)
@@ -228,7 +228,7 @@ def _read_csv(path: Path) -> dict[str, Array]:
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path}: not a table of numbers under one line of names: {error}; export it anew") from None
     if values.ndim != 2 or values.shape[1] != len(head):
-        raise InputError(f"{path}: {len(head)} names over rows of another length; export it anew")
+        raise InputError(f"{path}: {len(head)} names in the first line, but rows of another length; export it anew")
     return {name.strip(): values[:, i] for i, name in enumerate(head)}
 
 
@@ -292,7 +292,7 @@ def cut_windows(columns: dict[str, Array], where: str) -> Windows:
 
 
 def _informative(windows: Windows, where: str) -> Windows:
-    """Leaves out windows that lose poses while the wheels turn, and those in which the robot stands still as commanded.
+    """Leaves out windows that lose poses while the wheels turn, and windows in which the robot stands as commanded.
 
     Raises InputError: poses are lost in more than half of the windows in which the wheels turn.
     """
@@ -375,7 +375,7 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
 
 
 def resample_poses(poses: Array, late: Array, before: int) -> Array:
-    """Poses from the measurement of the first one on, and relative to it, shape (n, k + MAX_POSE_AGE + 1, 3).
+    """Resamples poses from the measurement of the first one on, relative to it, to shape (n, k + MAX_POSE_AGE + 1, 3).
 
     Args:
         poses: `PERIOD` [s] apart, shape (n, m, 3); extrapolated linearly beyond the last one.
@@ -451,8 +451,8 @@ def check_log(windows: Windows, where: str) -> None:
     left, right = int((turned > _TURN).sum()), int((turned < -_TURN).sum())
     if left + right < _MIN_TURNS or min(left, right) < _MIN_TURNS / 4:
         raise InputError(
-            f"{where}: {left} windows turn left and {right} right by more than {_TURN} rad; expected {_MIN_TURNS}, a "
-            "quarter of them at least to either side; drive more turns"
+            f"{where}: {left} windows turn left and {right} right by more than {_TURN} rad; expected {_MIN_TURNS} or "
+            "more, and at least a quarter of that to each side; drive more turns"
         )
 
 

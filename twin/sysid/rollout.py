@@ -1,8 +1,8 @@
 """Simulates the windows of a log with the Husky's MJCF on a plane, in parallel threads of `mujoco.rollout`.
 
 Each simulation starts with the robot settled on the plane. Before time zero its wheels turn as in the log before the
-window (`Windows.preceding_wheels`), which gives body and tires their momentum. From then on the servos receive the
-targets of the drivetrain model. The only other input from the log is the slope of the ground, as tilted gravity.
+window (`Windows.preceding_wheels`), which gives body and tires their momentum. From time zero on, the servos receive
+the targets of the drivetrain model. The only other input from the log is the slope of the ground, as tilted gravity.
 """
 
 import copy
@@ -51,12 +51,12 @@ _RANGE = 1e-3, 1e3  # bounds of each statistic; they keep the fit finite if the 
 def slope_gravity(windows: Windows, model: IcrModel) -> Array:
     """Gravity along x and y [m/s²] in the robot's frame at the start of each window's `preceding_wheels`, shape (n, 2).
 
-    Tires that scrub sideways over soft ground slide downhill by more than a good model's error, so a log on real ground
-    is fitted with its slope. At rest an accelerometer reads minus gravity. A rattling robot's mean over a window is
-    noisy, but consecutive windows have similar slopes, so the readings are smoothed (`smooth_slopes`) with their most
-    probable statistics (`fit_slope_model`), which shrink a noisy IMU's slopes towards level ground. Subtracting the
-    log's median removes errors that are constant in the robot's frame (mounting of the IMU, a pitched chassis).
-    Headings and the motion's own acceleration come from wheel speeds alone, since poses are to be predicted.
+    Tires that scrub sideways over soft ground slide downhill by more than a good model's error, so the fit to a log on
+    real ground needs the slope. An accelerometer at rest reads minus gravity. On a rattling robot, the mean reading of
+    a window is noisy, but consecutive windows have similar slopes. So the readings are smoothed (`smooth_slopes`) with
+    their most probable statistics (`fit_slope_model`); the noisier the IMU, the closer the result is to level ground.
+    Subtracting the log's median removes errors that are constant in the robot's frame (mounting of the IMU, a pitched
+    chassis). Headings and accelerations of the motion come from wheel speeds: poses are to be predicted.
 
     Args:
         windows: All windows of a log; without accelerations the result is zero.
@@ -184,7 +184,7 @@ def simulate_windows(
     states, sensors = rollout.rollout(models, [mujoco.MjData(model) for _ in range(threads)], states, control)
     torque = [model.sensor(f"{side}_torque").adr[0] for side in ("left", "right")]
     torques = sensors[:, lead:, torque]
-    # A rollout's first state is that after the first step, so time zero is the last step of the lead.
+    # The first state of a rollout is the one after its first step, so time zero is the last step of the lead.
     seen = states[:, lead - 1 - LEAD_SAMPLES * per_sample :: per_sample]
     position, velocity = seen[..., 1 : 1 + model.nq], seen[..., 1 + model.nq : 1 + model.nq + model.nv]
     n, k = targets.shape[0], SAMPLES + EXTRA_SAMPLES
@@ -216,7 +216,7 @@ def _initial_states(model: mujoco.MjModel, params: HuskyParams, start: Array) ->
     for i, sides in enumerate(start):
         rolling = sides * params.wheel_radius
         data.qvel[0] = rolling.mean()
-        data.qvel[5] = (rolling[1] - rolling[0]) / 2  # TRACK / 2 = 0.29 times the yaw rate of a differential drive
+        data.qvel[5] = (rolling[1] - rolling[0]) / 2  # 0.29 (TRACK / 2) times the yaw rate of a differential drive
         data.qvel[joints] = np.tile(sides, 2)
         if model.na:
             data.act[:] = sides

@@ -1,8 +1,8 @@
-"""Drive logs from bags, as tables that have a row per joint state and the newest values of the other topics.
+"""Reads drive logs from bags: tables with a row per joint state, and the newest values of the other topics.
 
 If a bag has no joint states, the wheel speeds are computed from the wheels' odometry by the inverse of Clearpath's
-kinematics. Poses that come from the wheels are not used, since they hide the wheels' slip. If a bag has no others but a
-scene was built from its pictures, the poses are those of a robot at rest below the reconstructed cameras.
+kinematics. Poses that come from the wheels are not used, since they hide the wheels' slip. If a bag has no other poses,
+but a scene was built from its pictures, the poses are those of a robot at rest below the reconstructed cameras.
 """
 
 from dataclasses import dataclass
@@ -119,12 +119,12 @@ def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tu
     if not any(count >= MIN_POSES and not is_from_wheels(name) for name, count in counts.items()):
         if filmed is None:
             raise InputError(
-                f"{path}: no topic with poses ({' or '.join(TYPES['poses'])}) that come from elsewhere than the wheels "
+                f"{path}: no topic with poses ({' or '.join(TYPES['poses'])}) other than wheel odometry "
                 f"among {topic_names(connections)}; record LiDAR, RTK or a total station, or build the scene from this "
                 "bag's pictures"
             )
         kinds.remove("poses")
-        runtime.log_line(f"{path}: poses are those of its pictures in the built scene, {len(filmed.times)} of them")
+        runtime.log_line(f"{path}: its pictures give the poses in the built scene, {len(filmed.times)} of them")
     if not messages_by_topic(connections, TYPES["wheels"]):
         from_wheels = messages_by_topic(connections, (ODOMETRY,))
         names = [name for name in from_wheels if is_from_wheels(name)]
@@ -132,7 +132,7 @@ def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tu
             topic = max(names, key=lambda name: from_wheels[name])
             values["wheels"] = next(one for one in connections if one.topic == topic and one.msgcount)
             runtime.log_line(
-                f"{path}: no joint states; wheel speeds are those of {topic}, by Clearpath's multiplier "
+                f"{path}: no joint states; wheel speeds are computed from {topic} with Clearpath's multiplier "
                 f"{HuskyParams.separation_multiplier:g}"
             )
     return kinds, values

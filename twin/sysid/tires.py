@@ -1,9 +1,9 @@
 """Tires and ground, fitted to the poses of a log.
 
 All terms are parameters of the MJCF: contact coefficients, `impratio`, and the viscosity of a medium around the tires
-alone. By default all are off, except the rolling resistance of hard ground. Two more parameters belong to the log: the
-offset of the pose sensor from the base's origin, and the delay of poses against wheel speeds. The height of the center
-of mass is fitted only on slopes, as poses on level ground do not depend on it.
+alone. By default, the ground is hard: only sliding friction and a small rolling resistance matter. Two more parameters
+belong to the log: the offset of the pose sensor from the base's origin, and the delay of poses against wheel speeds.
+The height of the center of mass is fitted only on slopes, as poses on level ground do not depend on it.
 """
 
 from collections.abc import Callable
@@ -126,7 +126,7 @@ def simulate_log(
     slope: Array,
     timestep: float | None = None,
 ) -> Rollouts:
-    """Simulates the log's commands with these values; the poses are as its sensor measures them (`_measured_poses`)."""
+    """Simulates the log's commands with these values; poses are those of the log's sensor (`_measured_poses`)."""
     targets, _ = simulate_drivetrain(drivetrain, windows)
     fitted = robot_with_values(_with_drivetrain(params, drivetrain), values)
     out = simulate_windows(fitted, targets, windows.preceding_wheels, slope, timestep)
@@ -170,7 +170,7 @@ def fit_ground(
         height = defaults["center_of_mass_z"]
         refused["center_of_mass_z"] = f"center_of_mass_z = {height:.4g} m: on level ground, needs {_BRAKING}"
     fitting = np.flatnonzero(windows.fitting)
-    if len(fitting) < _MANY:  # if the true delay is near zero, fitting it would bias the others
+    if len(fitting) < _MANY:  # fitting a delay that is near zero would bias the other parameters
         refused["pose_late"] = f"pose_late = 0 s: from {len(fitting)} windows, needs {_MANY}"
     table = [
         Parameter(name, mean, std, low, high, defaults[name], unit, cure)
@@ -192,9 +192,9 @@ def fit_ground(
 
         return pose_residuals
 
-    # The coarse search uses a long time step and, if there are many windows, a third of them. It gets near the solution
-    # in a tenth of the time. The final fit uses the shipped time step, since values that are fitted at a longer one
-    # compensate for its errors.
+    # The coarse search uses a long time step and, if there are many windows, a third of them; it gets near the solution
+    # in a tenth of the time. The final fit uses the scene's time step, since values fitted at a longer step compensate
+    # for that step's errors.
     some = fitting
     if len(fitting) >= _MANY:
         some = np.sort(np.random.default_rng(0).choice(fitting, len(fitting) // 3, replace=False))

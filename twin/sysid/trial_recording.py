@@ -1,7 +1,7 @@
 """A trial on the road, read from the robot's bag: pictures, calibration, poses and commands.
 
 Times are nanoseconds (`twin.capture.bag.message_times`). Poses are planar, in the frame of their topic (odometry, RTK);
-`fit_frame` finds that frame in the scene from pictures that were located there. Pictures are read from the bag only
+`fit_frame` finds the pose of that frame in the scene, from pictures located there. Pictures are read from the bag only
 when they are needed.
 """
 
@@ -33,7 +33,7 @@ from twin.errors import InputError
 from twin.types import Array
 from twin_policy import Camera, PictureError
 
-_STEP = 0.3  # [m] before and after a fix, between which its heading is measured
+_STEP = 0.3  # [m] a fix's heading is the direction of motion from this far before it to this far after it
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def read_trial(path: Path, given: dict[str, str] | None = None) -> TrialRecordin
     stamps = {kind: message_times(np.array(times[kind], np.int64), topics[kind], path) for kind in times}
     arrival = np.array(times["pictures"], np.int64)[:, 1]
     if len(np.unique(arrival)) < len(arrival):
-        raise InputError(f"{path}: pictures on {topics['pictures']} were recorded at the same time; record one topic")
+        raise InputError(f"{path}: pictures on {topics['pictures']} have equal recording times; record the topic once")
     shutter, first = np.unique(stamps["pictures"], return_index=True)
     pose_times, poses, uprightness = _poses(stamps["poses"], values["poses"], f"{path}: {topics['poses']}")
     commands = np.array(values["commands"], float)
@@ -181,7 +181,7 @@ def _poses(times: NDArray[np.int64], rows: list[Any], where: str) -> tuple[NDArr
 
 
 def _headings(xy: Array) -> Array:
-    """Heading of motion [rad] at positions (n, 2), over `_STEP` before and after; constant while standing."""
+    """Heading of motion [rad] at positions (n, 2), from `_STEP` before to `_STEP` after; constant while standing."""
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1)))
     ahead, behind = (np.stack([np.interp(way + d, way, c) for c in xy.T], -1) for d in (_STEP, -_STEP))
     return np.unwrap(np.arctan2(*(ahead - behind).T[::-1]))

@@ -1,7 +1,7 @@
 """ROS 2 node: pictures and camera_info in, velocity commands and diagnostics out, with a deadman switch.
 
-A driving command is published once, when its picture has been seen. Stops are published at `watchdog_rate` for as long
-as the deadman switch is held, and for one second after it was released, so that another source may then drive.
+A driving command is published once, as soon as the policy has processed its picture. Stops are published at
+`watchdog_rate`. When the deadman switch is released, they end after one second, so that another source may drive.
 """
 
 import signal
@@ -21,11 +21,11 @@ from twin_policy.onnx_policy import OnnxPolicy
 from twin_policy.pictures import Camera, CompressedPicture, PictureError, RawPicture
 from twin_policy.pilot import DEADMAN, Command, Limits, Pilot
 
-_SILENT_AFTER = 1_000_000_000  # [ns] of stops after the deadman switch was released
+_SILENT_AFTER = 1_000_000_000  # [ns] for which stops are published after the deadman switch was released
 
 
 class PolicyNode(Node):
-    """Drives by a policy; parameters are explained in config/twin_policy.yaml."""
+    """Drives a robot by a policy; `config/twin_policy.yaml` explains the parameters."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("twin_policy", **options)

@@ -1,7 +1,8 @@
 """A policy of `twin` run by ONNX Runtime: `policy.onnx`, and `policy.json` beside it.
 
 A *stack* is the last pictures, uint8 (3 · stack, height, width), the newest last. The network's output becomes a
-command exactly as in `twin`: one number is the yaw rate at constant speed (steering), two are speed and yaw rate.
+command exactly as in `twin`: one number is the yaw rate at constant speed (steering), two numbers are speed and yaw
+rate (twist).
 """
 
 import json
@@ -26,7 +27,7 @@ class OnnxPolicy:
             source: A policy folder of `twin train`, or its `policy.onnx`.
 
         Raises:
-            ValueError: no such file, or not a policy of this version; one line.
+            ValueError: no such file, or not a policy of this version. The message is one line.
         """
         import onnxruntime
 
@@ -44,7 +45,7 @@ class OnnxPolicy:
             self._session = onnxruntime.InferenceSession(
                 path.read_bytes(), settings, providers=["CPUExecutionProvider"]
             )
-        except Exception as error:  # of ONNX Runtime, without a common base
+        except Exception as error:  # ONNX Runtime's exceptions have no other common base
             raise ValueError(f"{path}: ONNX Runtime cannot load it: {str(error).splitlines()[0]}") from None
         head = _parse(self._session.get_modelmeta().custom_metadata_map.get("twin", ""), f"{path}: its metadata")
         beside = path.with_name("policy.json")
@@ -71,7 +72,7 @@ class OnnxPolicy:
         self.name = path.parent.name if path.name == "policy.onnx" else path.stem
         self._actions = 1 if self.action == "steering" else 2
         (self._input,) = self._session.get_inputs()
-        self.run(np.zeros(self.stack_shape, np.uint8))  # the first run is slow, and tells whether shapes fit
+        self.run(np.zeros(self.stack_shape, np.uint8))  # the first run is slow; it also shows whether the shapes fit
 
     @property
     def stack_shape(self) -> tuple[int, int, int]:
@@ -107,6 +108,7 @@ def _parse(text: str, where: str) -> dict[str, Any]:
         raise ValueError(f"{where}: not a policy of twin; expected the files that twin train writes")
     if head.get("version") != VERSION:
         raise ValueError(
-            f"{where}: version {head.get('version')!r}; expected {VERSION}: install the twin_policy beside it"
+            f"{where}: version {head.get('version')!r}; expected {VERSION}: install the twin_policy of the twin that "
+            "wrote it"
         )
     return head

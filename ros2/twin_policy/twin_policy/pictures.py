@@ -34,16 +34,16 @@ _TO_RGB = {
     "8UC1": cv2.COLOR_GRAY2RGB,
 }
 ENCODINGS = (*_CHANNELS, *_BAYER, *_YUV)
-"""Encodings of raw pictures that are understood."""
+"""Supported encodings of raw pictures."""
 
 _COEFFICIENTS = {"": (0,), "none": (0,), "plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
-_MAX_SIDE = 16_384  # [px] of a picture
+_MAX_SIDE = 16_384  # [px] largest side of a picture
 _MAX_OVERSAMPLING = 16
-_EXACT = 1e-6  # [px] up to which two intrinsics are equal
+_EXACT = 1e-6  # [px] intrinsics that differ by less count as equal
 
 
 class PictureError(ValueError):
-    """A picture or a camera that cannot be used; one line."""
+    """A picture or a camera that cannot be used. The message is one line."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class CompressedPicture:
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera with its distortion. Raises PictureError: values that no camera has."""
+    """A camera with its distortion. Raises PictureError: invalid values."""
 
     size: tuple[int, int]
     """Width, height [px]."""
@@ -155,7 +155,7 @@ class Camera:
         return Camera(self.size, self.intrinsics)
 
     def reach(self) -> float:
-        """Largest distance of a ray (x, y, 1) from the axis up to which the distortion polynomial is one to one."""
+        """Largest √(x² + y²) of a ray (x, y, 1) up to which the distortion is one to one."""
         r = np.linspace(0.0, 10.0, 2001)
         turns = np.flatnonzero(np.diff(self.project(r, np.zeros_like(r))[0]) <= 0.0)
         return float(r[turns[0]]) if len(turns) else np.inf
@@ -190,8 +190,8 @@ def _fisheye(x: np.ndarray, y: np.ndarray, d: tuple[float, ...]) -> tuple[np.nda
 class Rectifier:
     """Maps pictures of one camera to a pinhole camera at a policy's size.
 
-    The picture is sampled bilinearly on a grid as fine as its own pixels, and blocks of the grid are averaged, so that
-    nothing aliases. A picture that is already the pinhole camera's passes unchanged, bit for bit.
+    The picture is sampled bilinearly on a grid as fine as the camera's pixels, and blocks of the grid are averaged,
+    which avoids aliasing. If both cameras are equal, pictures pass unchanged, bit for bit.
     """
 
     def __init__(self, camera: Camera, pinhole: Camera, max_outside: float = 0.05) -> None:
@@ -202,7 +202,7 @@ class Rectifier:
             max_outside: Fraction of the pinhole camera's picture that the camera may not see.
 
         Raises:
-            PictureError: the camera does not see what the policy's does.
+            PictureError: more than `max_outside` of the pinhole camera's picture is outside the camera's.
         """
         self.camera, self.pinhole = camera, pinhole
         (fx, fy, cx, cy), (width, height) = pinhole.intrinsics, pinhole.size

@@ -1,11 +1,11 @@
-"""The pilot: decides picture by picture what the robot does, and stops it when something is wrong.
+"""The pilot turns pictures into commands by a policy, and stops the robot when something is wrong.
 
-As in twin's environment, a policy sees the last few pictures, `timestep` apart, the newest last, and the first picture
-after standing fills the whole stack. Pictures that come faster are left out. A *stop* is a command of zeros with a
-*cause*; the stack is dropped then, and the robot rests before the next picture counts as the first one.
+As in twin's environment, a policy sees a stack of the last few pictures, `timestep` apart, the newest last; the first
+picture after standing fills the whole stack. Pictures that come faster are left out. A *stop* is a command of zeros
+with a *cause*. It empties the stack, and the robot rests before the next picture counts as the first one.
 
-Two clocks are given: `clock`, which also stamps the pictures, and `steady`, which never jumps. Both return nanoseconds.
-A pilot is not for several threads at once.
+A pilot has two clocks: `clock`, which also stamps the pictures, and `steady`, which never jumps. Both return
+nanoseconds. A pilot is not thread-safe.
 """
 
 import time
@@ -30,17 +30,17 @@ class Limits:
     """Limits beyond which the robot stops. Raises ValueError: a value out of range."""
 
     timeout: float = 0.3
-    """Age of the newest picture that a command may depend on [s]; 0.3 s bears one lost picture at 10 Hz."""
+    """Largest age of the newest picture behind a command [s]; 0.3 s tolerates one lost picture at 10 Hz."""
     inference: float = 0.1
     """Longest time from a picture's arrival to its command [s]."""
     ahead: float = 0.05
-    """Greatest lead of a stamp over the clock [s]."""
+    """Largest time by which a stamp may be ahead of the clock [s]."""
     clock_jump: float = 0.05
-    """Sudden change of the clock against the steady one [s]."""
+    """Largest sudden change of `clock` relative to `steady` [s]."""
     early: float = 0.25
-    """How much earlier than a control step after the last one a picture may be used [control steps]."""
+    """Largest time by which a picture may come before its control step [control steps]."""
     rest: float = 1.0
-    """Time for which a stop lasts at least [s]: the robot comes to rest, as at the start of an episode."""
+    """Shortest duration of a stop [s], in which the robot comes to rest, as at the start of an episode."""
     deadman: float = 0.0
     """Time for which one press of the deadman switch holds [s]; 0: there is no switch."""
 
@@ -85,23 +85,23 @@ class Pilot:
     ) -> None:
         """
         Args:
-            policy: Says sizes and control step.
+            policy: Determines the pictures' size, the stack and the control step.
             limits: None: the defaults.
             pinhole: The camera that the policy was trained with; None: the policy's own; if it has none, the robot's,
                 without distortion, scaled by its width.
-            clock: Time of the stamps [ns].
+            clock: Clock of the pictures' stamps [ns].
             steady: A clock that never jumps [ns].
         """
         self.policy, self.limits = policy, limits or Limits()
         self.counts: Counter[str] = Counter()
-        """Pictures by what became of them: used, between (two control steps), doubled, reordered, late, lost, waiting
-        (during a stop), refused; and stops."""
+        """Numbers of pictures that were used, between (two control steps), doubled, reordered, late, lost, waiting
+        (during a stop) or refused; and of stops."""
         self.duration = 0.0
-        """From the arrival of the last used picture to its command [s]."""
+        """Time from the arrival of the last used picture to its command [s]."""
         self._pinhole, self._clock, self._steady = pinhole or policy.camera, clock, steady
         self._rectifier: Rectifier | None = None
         self._no_camera = "no camera_info, so pictures cannot be rectified"
-        self._offset: int | None = None  # of the clocks
+        self._offset: int | None = None  # clock − steady [ns]
         self._pressed = 0
         self._is_held = False
         self._rest_until = steady()
@@ -115,9 +115,9 @@ class Pilot:
     # ---- inputs
 
     def set_camera(self, camera: Camera) -> None:
-        """Sets the camera that takes the pictures; nothing is done if it is the present one.
+        """Sets the camera that takes the pictures; does nothing if it is the present one.
 
-        Raises PictureError: it does not see what the policy's camera does.
+        Raises PictureError: see `Rectifier`.
         """
         if self._rectifier is not None and self._rectifier.camera == camera:
             return
@@ -132,7 +132,7 @@ class Pilot:
             raise
 
     def press(self, held: bool = True) -> None:
-        """A message of the deadman switch."""
+        """Handles a message of the deadman switch."""
         if held:
             self._pressed = self._steady()
         elif self._is_held:
@@ -140,9 +140,9 @@ class Pilot:
         self._is_held = held
 
     def picture(self, picture: Any, stamp: int) -> Command:
-        """Takes a picture: anything with `decode()`, such as RawPicture, or RGB uint8 (h, w, 3); its stamp [ns].
+        """Handles a picture with its stamp [ns]: an object with `decode()`, such as RawPicture, or RGB uint8 (h, w, 3).
 
-        Returns the command that holds now. It is new if the picture was used: then its `stamp` is the picture's.
+        Returns the command that holds now. If the picture was used, the command is new and has the picture's `stamp`.
         """
         begin = self._steady()
         if not self._may_drive():
@@ -195,7 +195,7 @@ class Pilot:
     # ---- state
 
     def _may_drive(self) -> bool:
-        """False while the robot has to stand; stops it if a clock jumped or the deadman switch is not held."""
+        """False while the robot has to stand. Also stops it if a clock jumped or the deadman switch is not held."""
         steady, offset = self._steady(), self._clock() - self._steady()
         jump = 0 if self._offset is None else offset - self._offset
         self._offset = offset
@@ -216,7 +216,7 @@ class Pilot:
         seconds = abs(age) * 1e-9
         if age > self._nanoseconds(self.limits.timeout):
             self.counts["late"] += 1
-            if not self._command.drives:  # else the driving command, which is older still, expires
+            if not self._command.drives:  # a driving command, whose picture is older still, expires by itself
                 self._command = Command(
                     cause=f"pictures are {seconds:.2f} s old; expected at most {self.limits.timeout:g}"
                 )
@@ -237,7 +237,8 @@ class Pilot:
         else:
             self.stack = np.repeat(newest[None], self.policy.stack, 0)
             self._due = stamp
-        # A grid of control steps, as a camera's rate need not be a multiple of theirs; begun anew where one was missed.
+        # Pictures are due on a grid of control steps, since the camera's rate need not be a multiple of theirs. After a
+        # missed step, the grid begins anew.
         self._due += step
         if self._due <= stamp:
             self._due = stamp + step
