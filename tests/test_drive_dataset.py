@@ -126,9 +126,9 @@ def test_info_describes_every_column(written):
 
 
 def test_what_a_film_cannot_hold_is_refused(tmp_path):
-    with pytest.raises(InputError, match="even sides"):
+    with pytest.raises(InputError, match="even width and height"):
         DriveDataset(tmp_path, (63, 36), 0.1, ACTIONS, "Drive.")
-    with pytest.raises(InputError, match="whole pictures a second"):
+    with pytest.raises(InputError, match="needs a whole number"):
         DriveDataset(tmp_path, SIZE, 0.15, ACTIONS, "Drive.")
 
 

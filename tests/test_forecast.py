@@ -281,7 +281,7 @@ def test_rates_that_are_all_the_same_have_no_correlation_but_a_bias() -> None:
     (group,) = made.groups
     assert group.spearman.value is None and "all rates on the road are 1" in group.spearman.missing
     assert group.bias.value is not None and group.winner_regret.value == 0.0
-    assert verdicts(made)[0].mood == "bad" and "does not tell these policies apart" in verdicts(made)[0].text
+    assert verdicts(made)[0].mood == "bad" and "do not differ on the road" in verdicts(made)[0].text
     assert verdicts(made)[1].mood == "bad" and "cannot be compared" in verdicts(made)[1].text
     assert "nan" not in forecast_page(made) + summary_text(made) + candidates_csv(made)
 

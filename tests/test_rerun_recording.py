@@ -90,4 +90,5 @@ def test_impossible_recordings_are_refused_in_one_line(scene, capsys, options, w
 def test_without_the_package_one_line_says_what_to_install(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main([str(scene), "--task", "ahead", "--quiet", "--rerun", str(tmp_path / "drive.rrd")]) == 2
-    assert capsys.readouterr().err == "error: a recording for Rerun needs more: pip install 'twin[rerun]'\n"
+    error = "error: a Rerun recording needs the missing package rerun-sdk: pip install 'twin[rerun]'\n"
+    assert capsys.readouterr().err == error

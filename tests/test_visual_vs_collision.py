@@ -187,7 +187,8 @@ def test_the_build_page_shows_the_comparison(place, tmp_path):
     large = geometry_section({"seen_touched": found | {"corridor_leak_m": 0.4, "unfilmed_ghost_m": 0.9}})
     assert large.cautions[0].what.startswith("Something in the corridor") and len(large.cautions) == 2
     just_over = geometry_section({"seen_touched": found | {"median_m": 0.0521}}).cautions
-    assert [it.what for it in just_over] == ["Visual and collision geometry differ: 0.052 m, more than 0.05 m."]
+    median = "Visual and collision geometry differ by 0.052 m in the median, more than 0.05 m."
+    assert [it.what for it in just_over] == [median]
     assert geometry_section({}).not_applicable
     assert gap_row(views, 0).shape[1] > 4 * 300
     assert isinstance(views, GeometryViews)

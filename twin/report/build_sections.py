@@ -52,7 +52,7 @@ def _facts(report: dict[str, Any], *rows: Row) -> list[Fact]:
 def _above(report: dict[str, Any], *limits: Limit) -> list[Caution]:
     """Cautions about the numbers whose magnitude exceeds their limit.
 
-    The text of a limit is a format string; the number's magnitude and the limit are inserted.
+    The caution in a `Limit` is a format string for the magnitude and the limit.
     """
     found = [(_numeric(pick(report, path)), limit, what, cure) for path, limit, what, cure in limits]
     return [
@@ -347,7 +347,7 @@ def mesh_section(report: dict[str, Any]) -> Section:
 
 
 def _route_choice(report: dict[str, Any]) -> str:
-    """Text that says where the route comes from: the passes that it follows, way points, or the filmed path."""
+    """Source of the route in words: the passes that it follows, way points, or the filmed path."""
     route = pick(report, "mesh.route")
     if not isinstance(route, dict) or not route.get("passes"):
         return "the filmed path"
@@ -486,7 +486,7 @@ def geometry_section(report: dict[str, Any]) -> Section:
         ),
         ("views", "views", "{}", "of the robot’s camera, along its drive"),
     )
-    beyond = ": {:.3f} m, more than {:g} m."
+    beyond = ". The largest difference is {:.3f} m, more than {:g} m."
     unfilmed = (
         "Collision geometry in the corridor is not visible where no film shows it from two directions; the field’s "
         "depth there is not determined and may differ from build to build" + beyond
@@ -494,7 +494,7 @@ def geometry_section(report: dict[str, Any]) -> Section:
     leak = "Something in the corridor is visible but has no collision geometry" + beyond
     ghost = "Collision geometry in the corridor is not visible" + beyond
     earlier = "start the drive a little further along, or start to film a little earlier."
-    apart = "Visual and collision geometry differ" + beyond
+    apart = "Visual and collision geometry differ by {:.3f} m in the median, more than {:g} m."
     cautions = _above(
         found,
         ("median_m", 0.05, apart, "raise nerf.steps, or lower mesh.voxel."),
@@ -514,7 +514,7 @@ def geometry_section(report: dict[str, Any]) -> Section:
 
 
 def truth_section(report: dict[str, Any]) -> Section:
-    """Errors of the twin against ground truth; not applicable for a real place."""
+    """Errors of the twin compared with ground truth; not applicable for a real place."""
     truth = pick(report, "truth")
     name, title = "truth", "Comparison with ground truth"
     if not isinstance(truth, dict):
@@ -555,10 +555,10 @@ def truth_section(report: dict[str, Any]) -> Section:
     )
     cautions = _above(
         truth,
-        ("ate_m", 0.08, "The camera path: {:.3f} m off, more than {:.3f} m.", "give the camera’s calibration."),
-        ("scale_error", 0.02, "The scale: {:.1%} off, more than {:.1%}.", "check the source of the scale."),
-        ("ground_median_m", 0.04, "The ground: {:.3f} m off, more than {:.3f} m.", "check the camera’s height."),
-        ("obstacle_median_m", 0.1, "Solid parts: {:.3f} m off, more than {:.3f} m.", "lower mesh.max_protrusion."),
+        ("ate_m", 0.08, "The camera path is {:.3f} m off, more than {:.3f} m.", "give the camera’s calibration."),
+        ("scale_error", 0.02, "The scale is {:.1%} off, more than {:.1%}.", "check the source of the scale."),
+        ("ground_median_m", 0.04, "The ground is {:.3f} m off, more than {:.3f} m.", "check the camera’s height."),
+        ("obstacle_median_m", 0.1, "Solid parts are {:.3f} m off, more than {:.3f} m.", "lower mesh.max_protrusion."),
         (
             "corridor_intrusions",
             0,

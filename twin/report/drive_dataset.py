@@ -41,7 +41,7 @@ class DriveDataset:
 
     Raises:
         InputError: Pyarrow is not installed, the frame rate [1/s] is not a whole number, or the width or height of the
-            pictures is odd (videos need even numbers).
+            pictures is odd (the video format needs even ones).
     """
 
     folder: Path
@@ -62,10 +62,14 @@ class DriveDataset:
         self.fps = round(1.0 / self.timestep)
         if abs(self.fps * self.timestep - 1.0) > 1e-6:
             raise InputError(
-                f"control_timestep = {self.timestep} s: a dataset needs whole pictures a second, as by 0.1 s"
+                f"control_timestep = {self.timestep:g} s is {1.0 / self.timestep:g} pictures a second: a LeRobot "
+                "dataset needs a whole number; set another control_timestep, for instance 0.1 s"
             )
         if self.size[0] % 2 or self.size[1] % 2:
-            raise InputError(f"size {self.size[0]}×{self.size[1]}: a dataset's films need even sides")
+            raise InputError(
+                f"pictures of {self.size[0]}×{self.size[1]} px: a LeRobot dataset needs an even width and height; set "
+                "another size, for instance 160×90"
+            )
 
     def add(self, episode: Episode, pictures: Sequence[NDArray[np.uint8]], motion: Array) -> None:
         """Adds a drive that was recorded at k instants.
@@ -226,7 +230,7 @@ def require_pyarrow() -> None:
     try:
         import pyarrow  # noqa: F401
     except ModuleNotFoundError:
-        raise InputError("a LeRobot dataset needs pyarrow: pip install 'twin[lerobot]'") from None
+        raise InputError("a LeRobot dataset needs the missing package pyarrow: pip install 'twin[lerobot]'") from None
 
 
 def _statistics(values: NDArray) -> dict[str, Array]:
@@ -262,7 +266,7 @@ def _merged(stats: list[dict[str, Array]]) -> dict[str, Array]:
 
 
 def _task_table(tasks: list[str]) -> "pyarrow.Table":
-    """Table of tasks. Its pandas metadata tell LeRobot to use the text of the task as the index."""
+    """Table of tasks. LeRobot reads it by pandas; the metadata make the text of the task the index."""
     import pyarrow as pa
 
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})

@@ -20,7 +20,7 @@ from twin.report.html import Caution, Verdict
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
 """Twin and road rank policies alike, or roughly alike, if the rank correlation is at least this."""
 SMALL_REGRET = 0.05
-_SMALL_GAP = 0.1  # an order is good news only if it is reliable from this difference of twin scores on, or less
+_SMALL_GAP = 0.1  # if the order is reliable only for larger differences of twin scores, the verdict is not good
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
@@ -48,10 +48,10 @@ PERCENT_STATISTICS = ("winner_regret", "bias", "coverage", "corrected_coverage",
 """Statistics shown in percent."""
 
 INTERVALS_NOTE = (
-    "Intervals (90%) are about repetitions with other trainings and other days, of which these are a sample: days and "
-    "trainings are left out in turn, not trials. More days and more trainings make them narrower; more checkpoints of "
-    "one training, or more trials on the same day, hardly do. No interval is given where there are too few of them for "
-    "a reliable one."
+    "Intervals (90%) hold for repetitions with other trainings and other days, of which these are a sample. They are "
+    "computed by leaving out days and trainings in turn, not trials. More days and more trainings make them narrower; "
+    "more checkpoints of one training, or more trials on the same day, hardly do. With too few days or trainings for a "
+    "reliable interval, none is given."
 )
 """Note on all intervals of the numbers in `Agreement`.
 
@@ -117,13 +117,13 @@ def verdicts(forecast: Forecast) -> list[Verdict]:
 
 
 def believable(group: Agreement) -> Verdict:
-    """Verdict: by how much must the twin's scores of two policies differ, so that the road confirms their order?"""
+    """Verdict on the smallest difference of two policies' twin scores from which the road confirms their order."""
     pairs = [(it.low, it.pairs, it.right) for it in group.ordered]
     many, days = _count(group.trainings, "training"), _count(group.days, "day")
     where = f"measured on {days} and {many}"
     if not pairs:
         return Verdict(
-            f"The road does not tell these policies apart, so no order of the twin was confirmed ({where}).", "bad"
+            f"These policies do not differ on the road, so no order in the twin could be confirmed ({where}).", "bad"
         )
     for start, _, _ in pairs:
         beyond = [(n, right) for low, n, right in pairs if low >= start]
@@ -140,7 +140,7 @@ def believable(group: Agreement) -> Verdict:
             enough = group.trainings >= MIN_TRAININGS and group.days >= MIN_DAYS
             return Verdict(text, "good" if enough and start <= _SMALL_GAP else "mixed")
     n, right = sum(n for _, n, _ in pairs), sum(right for _, _, right in pairs)
-    text = f"No order of two policies in the twin may be believed yet: the road had the same in {right:g} of {n} pairs"
+    text = f"No order of two policies in the twin may be believed yet: the road agrees in {right:g} of {n} pairs"
     return Verdict(f"{text} ({where}).", "bad")
 
 
@@ -189,10 +189,7 @@ def _bias(group: Agreement) -> Verdict:
 
 
 def _skill(group: Agreement) -> list[Verdict]:
-    """Verdict: does the twin predict single days better than the mean of the other policies does?
-
-    The list is empty if the scores are missing.
-    """
+    """Verdict on the twin's prediction of days, compared with the mean of the other policies; empty without scores."""
     gains = {it.predictor: it.gain for it in group.scores}
     gain = gains.get(OTHERS)
     if gain is None or gain.value is None:
@@ -207,7 +204,7 @@ def _skill(group: Agreement) -> list[Verdict]:
         text = "The twin predicts a policy’s days better than the mean of the other policies does"
         shuffled = gains.get(SHUFFLED)
         if shuffled is not None and shuffled.low is not None:
-            more = "and tells days apart" if shuffled.low > 0 else "but whether it tells days apart is open"
+            more = "and distinguishes days" if shuffled.low > 0 else "but may not distinguish days"
             text = f"{text}, {more}"
         return [Verdict(f"{text} (log scores).", "good")]
     worse = gain.high < 0
@@ -235,15 +232,15 @@ def limitations(forecast: Forecast) -> list[Caution]:
         for what in group.missing
     ]
     if not forecast.real_trials:
-        what = "Whether the road ranks these policies as the twin does, and how far its rates are off, is not known."
+        what = "Whether the road ranks these policies as the twin does is unknown, as is the error of the twin’s rates."
         out.append(Caution(what, _TRIALS_NEEDED))
     on_road = {p.policy for p in forecast.pairs}
     days = {p.lighting for p in forecast.pairs}
     runs = {training_of(name) for name in on_road}
     if on_road:
         what = (
-            f"What is known of the road rests on {_count(len(days), 'day')} and {_count(len(runs), 'training')}, "
-            f"not on {_count(forecast.real_trials, 'trial')}."
+            f"Trials of one day or of one training are alike: the sample of the road is {_count(len(days), 'day')} and "
+            f"{_count(len(runs), 'training')}, not {_count(forecast.real_trials, 'trial')}."
         )
         cure = "drive on further days, and train again with another --seed."
         out.append(Caution(what, cure))
@@ -294,16 +291,16 @@ def next_trials(forecast: Forecast) -> list[str]:
         best = [c for c in driven if c.real_ranks and c.real_ranks[0] >= _POSSIBLY_BEST]
         if len(best) > 1:
             odds = join_names([f"{c.policy} ({format_probability(c.real_ranks[0])})" for c in best], 6)
-            out.append(f"{task}: drive these again, each of which may be the best (probability): {odds}.")
+            out.append(f"{task}: drive these again; each may be the best (with this probability): {odds}.")
         elif best:
             out.append(f"{task}: drive {best[0].policy} on further days, in light that it has not met; it leads.")
         if unseen := [c.policy for c in mine if not c.driven]:
-            out.append(f"{task}: drive what has not been driven, best in the twin first: {join_names(unseen, 6)}.")
+            out.append(f"{task}: drive the policies never driven yet, best in the twin first: {join_names(unseen, 6)}.")
     return out
 
 
 def allocation_text(allocation: TrialAllocation) -> str:
-    """Text with two numbers of further real trials: to find the best policy, and to find the order of all."""
+    """Text with the numbers of further real trials that find the best policy, and the order of all policies."""
     if allocation.policies < 2:
         return f"{allocation.task}: one policy; there is nothing to rank."
 

@@ -109,7 +109,7 @@ def duration(seconds: Any) -> str:
 def flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:
     """Lists the numbers and words of a JSON value with their dotted paths.
 
-    Of a long or nested list, only the length is given.
+    A long or nested list is represented by its length.
     """
     if isinstance(value, dict):
         return [

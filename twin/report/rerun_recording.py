@@ -43,7 +43,7 @@ def require_rerun() -> None:
     try:
         import rerun  # noqa: F401
     except ImportError:
-        raise InputError("a recording for Rerun needs more: pip install 'twin[rerun]'") from None
+        raise InputError("a Rerun recording needs the missing package rerun-sdk: pip install 'twin[rerun]'") from None
 
 
 def write_rerun_recording(

@@ -1,6 +1,6 @@
 """Chapters of the review video: comparison of real and rendered frames, changing light, and the drive.
 
-A `Studio` does the work that all chapters share: it renders the field, counts renders, and saves pictures for the page.
+All chapters use a `Studio`. It renders the field, counts renders, and saves pictures for the build's page.
 """
 
 import math
@@ -58,13 +58,13 @@ from twin.types import Array, Image
 
 # ---- studio
 
-_PICTURE_WIDTH = 1000  # [px] greatest width of pictures for the page
+_PICTURE_WIDTH = 1000  # [px] greatest width of pictures for the build's page
 _PICTURE_QUALITY = 82  # of their JPEG files
 
 
 @dataclass
 class Studio:
-    """Renders views of the field, counts renders, and saves pictures for the page."""
+    """Renders views of the field, counts renders, and saves pictures for the build's page."""
 
     name: str
     """Name of the scene."""
@@ -200,7 +200,7 @@ def write_title_card(studio: Studio, title: str, lines: list[str], seconds: floa
 
 
 def comparison_frames(studio: Studio, budget: int) -> dict[str, list[int]]:
-    """Lighting → its frames in chapter 1. One of the `budget` renders per lighting is reserved for the page."""
+    """Lighting → its frames in chapter 1. Of its share of the `budget`, one render is reserved for the page."""
     share = max(1, budget // max(1, len(studio.field.lightings)) - 1)
     return {name: frames_to_compare(studio.cameras, name, share) for name in studio.field.lightings}
 
@@ -282,7 +282,7 @@ def comparison_row(studio: Studio, i: int) -> tuple[Image, float]:
     height, width = depth.shape[:2]
     film = resize(read_image(cameras.image_path(i)), width, height) / 255.0
     path = cameras.mask_path(i)
-    # A pixel of the smaller mask is valid only if it covers valid pixels only.
+    # A pixel of the shrunk mask is valid if it covers no masked pixel.
     mask = None if path is None else resize((read_image(path)[..., 0] > 0).astype(np.float32), width, height) > 0.999
     score = psnr(rgb, film, mask)
     error = error_colors(np.abs(rgb - film).mean(-1), mask)
@@ -322,7 +322,7 @@ def map_with_pose(map_view: MapView, pose: NDArray[np.float64], dots: NDArray[np
 
 
 def lighting_steps(lightings: int, budget: int) -> int:
-    """Number of views per transition between two lightings, at least 2. The budget also pays for the final view."""
+    """Number of views per transition between two lightings, at least 2. One view of `budget` is the final one."""
     return max(2, (budget - 1) // max(1, lightings - 1))
 
 
@@ -384,7 +384,7 @@ T = TypeVar("T")
 
 DRIVE_STRIP = (0.62, 0.38)  # shares of the strip: map, facts
 _MAX_DRIVE_SECONDS = 14.0  # [s] in the video; longer drives are sped up
-_CROSSFADE_SHARE = 0.25  # in this last share of a lighting's route segment, it blends into the next lighting
+_CROSSFADE_SHARE = 0.25  # over this last share of its route segment, a lighting blends into the next one
 _CONTROL_RATE = 10  # control steps per second of a RecordedDrive
 
 
@@ -398,7 +398,7 @@ def smoothed_speed(drive: RecordedDrive) -> Array:
 
 
 def lighting_at(lightings: tuple[str, ...], share: float) -> tuple[str, str]:
-    """Lighting at a share of the route: its name for the field, and its label. Lightings get equal segments."""
+    """Name (for the field) and label of the lighting at a share of the route. Lightings get equal segments."""
     index = min(int(share * len(lightings)), len(lightings) - 1)
     within = share * len(lightings) - index
     if index == len(lightings) - 1 or within <= 1.0 - _CROSSFADE_SHARE:
@@ -409,7 +409,7 @@ def lighting_at(lightings: tuple[str, ...], share: float) -> tuple[str, str]:
 
 
 def frame_timing(drive: RecordedDrive, fps: int) -> tuple[int, int]:
-    """Returns control steps and video frames per picture, so that the drive takes `_MAX_DRIVE_SECONDS` at most."""
+    """Returns control steps and video frames per picture, such that the video takes `_MAX_DRIVE_SECONDS` at most."""
     speedup = max(1.0, float(drive.times[-1]) / _MAX_DRIVE_SECONDS)
     every = max(1, math.ceil(speedup * _CONTROL_RATE / fps - 1e-9))
     return every, max(1, int(fps * every / (_CONTROL_RATE * speedup) + 1e-9))

@@ -96,7 +96,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
 
 def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: RenderableField) -> dict[str, Any]:
-    """Does the work of `run` with any field."""
+    """Does the work of `run` with any field, not only the baked one."""
     cameras = Cameras.load(scene.stage("metric"))
     world = World.load(scene.stage("mjcf")) if config.mjcf.route and scene.has_route else None
     drive = follow_route(world, HuskyPhysics(world.model(), world.robot), config.review.speed) if world else None
@@ -113,7 +113,7 @@ def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: R
         if world:
             along = trust_grid(field, cameras, world)
             metrics["trust"] = trust_metrics(*along)
-            caption = "trust in the robot's camera views: high close to filmed poses and where road is seen as road"
+            caption = "trust in views of the robot's camera: high near filmed poses, if the field is opaque on the road"
             studio.save_picture("trust", "review", caption, trust_picture(*along))
         verdict = follower_verdict(
             {"review": metrics, "mjcf": {"route_length_m": float(arc_lengths(world.route)[-1]) if world else None}}
@@ -150,7 +150,7 @@ def _write_chapters(
     strip, panel = studio.layout.strip, studio.layout.panel
     views, model = _scene_shots(studio, scene, world)
     behind = chase_shots(drive, frame_timing(drive, studio.fps)[0]) if drive else []
-    # Warp compiles kernels at first use: those of the field now, before the second thread compiles those of the scene.
+    # Warp compiles kernels at first use. The field's are compiled here, before the second thread compiles the scene's.
     field.render(cameras.select(np.array([0])), field.lightings[0], (16, 8))
     total = sum(map(len, chosen.values())) + len(rendered_instants(behind, drives))
     total += lighting_steps(len(field.lightings), turns) * (len(field.lightings) - 1) + 1 if turns else 0
@@ -198,7 +198,7 @@ def _scene_shots(studio: Studio, scene: SceneDir, world: World | None) -> tuple[
 
 
 def load_ground_and_parts(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
-    """For the map: the ground of the mesh stage (None if there is none), and the outlines of its low parts."""
+    """Returns the ground of the mesh stage (None if there is none) and the outlines of its low parts, for the map."""
     folder = scene.stage("mesh")
     ground = Ground.load(folder) if (folder / "ground.npz").exists() else None
     return ground, load_footprints(folder / "parts.npz", ground)
@@ -221,7 +221,7 @@ def _save_capture_pictures(studio: Studio) -> None:
 
 # ---- numbers of the drive
 
-_TRACE_SAMPLES = 200  # most samples of a drive
+_TRACE_SAMPLES = 200  # most samples in a drive's trace
 
 
 def drive_metrics(drive: RecordedDrive) -> dict[str, Any]:

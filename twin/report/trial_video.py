@@ -52,7 +52,7 @@ def write_trial_video(
     Args:
         path: The mp4.
         trial: The judged trial.
-        replayed: Poses (x, y, yaw), shape (k, 3), of the twin's robot at the trial's times; it got the same commands.
+        replayed: Poses (x, y, yaw) of the twin's robot under the trial's commands, at the trial's times, shape (k, 3).
         pictures: n pictures of the robot's camera as the policy saw them, each uint8, shape (h, w, 3).
         times: Times of the pictures since the trial's start [s], shape (n,).
         views: The twin's pictures from the same poses.

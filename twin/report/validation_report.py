@@ -176,7 +176,7 @@ def p_value_text(p: float) -> str:
 
 
 def verdicts(results: dict[str, Any]) -> list[Verdict]:
-    """The headlines: each task's best policy with its worst lighting, and the number of untrusted episodes."""
+    """The headlines: each task's best policy and its worst lighting, and the number of untrusted episodes."""
     out = [_task_verdict(task, [c for c in results["cells"] if c["task"] == task]) for task in tasks(results)]
     low, of = (sum(c[k]["trials"] for c in results["cells"]) for k in ("low_trust", "trusted"))
     if low:
@@ -233,7 +233,7 @@ def limitations(results: dict[str, Any]) -> list[Caution]:
         out.append(Caution(what, cure))
     searched = {(w["policy"], w["task"]) for w in results.get("worst", [])}
     if left := dict.fromkeys(c["policy"] for c in cells if (c["policy"], c["task"]) not in searched):
-        what = f"The worst light that {join_names(left)} might meet was not searched for."
+        what = f"The worst light for {join_names(left)} is not known: no search was made."
         out.append(Caution(what, "run the same command with --worst."))
     return out
 

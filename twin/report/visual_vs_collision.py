@@ -42,21 +42,21 @@ from twin.report.video_layout import (
 from twin.runtime import track
 from twin.types import Array, Image
 
-VIEW_SPACING = 2.0  # [m] way of the robot between two views
+VIEW_SPACING = 2.0  # [m] that the robot drives between two views
 MAX_DEPTH = 10.0  # [m] maximum compared depth
 LARGE_ERROR = 0.2  # [m] larger differences are counted or get a caution
 
 _MIN_OPACITY = 0.5  # pixels of lower opacity count as empty
 _THINNING_CELL = 0.05  # [m]; point clouds are thinned to one point per cell
 _MIN_OBSTACLE_HEIGHT = 0.2  # [m] above the ground
-_ROUTE_STEP = 0.05  # [m] between the places on the route to which points are assigned
-_BIN = 1.0  # [m] length on the route of a bin of the figure
+_ROUTE_STEP = 0.05  # [m] between stations; a point is assigned to the nearest one
+_BIN = 1.0  # [m] of the route per bin of `along`
 _MIN_PARALLAX = 1.0  # [°] two views determine a point's depth if their directions differ by at least this
 
 
 @dataclass(frozen=True)
 class GeometryViews:
-    """n views of both geometries. Depths (n, height, width) are z-depths [m]; they are FAR where nothing is hit."""
+    """n views of both geometries. Depths (n, height, width) are z-depths [m], or FAR where a ray hits nothing."""
 
     camera_to_world: Array
     """Shape (n, 4, 4)."""
@@ -123,8 +123,8 @@ def compare_geometry(
     Returns:
         Lengths are in [m]. A median, quantile or share is None if there are no points for it.
 
-        - `views`, `pixels`: numbers of views and of compared pixels. Their visible geometry is closer than `MAX_DEPTH`
-          and not higher above the ground than the highest part.
+        - `views`, `pixels`: numbers of views and of compared pixels. A pixel is compared if its visible geometry is
+          closer than `MAX_DEPTH` and not higher above the ground than the highest part.
         - `median_m`, `p90_m`: |gap| of these pixels.
         - `ground_median_m`, `ground_p95_m`: height difference of visible ground and collision ground in the corridor.
         - `standing_median_m`: median distance of visible obstacles from the nearest collision geometry.
@@ -196,7 +196,7 @@ def _in_corridor(world: World, points: Array, among: NDArray[np.bool_]) -> tuple
 
 
 def _depth_determined(cameras: Cameras, points: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask of points (..., 3): in `among`, and shown by one film from directions at least `_MIN_PARALLAX` apart.
+    """Mask of the points (..., 3) in `among` that one film shows from directions at least `_MIN_PARALLAX` apart.
 
     Only training frames count. Each is compared with the film's first frame that shows the point. Occlusions and image
     masks are ignored.
@@ -252,7 +252,7 @@ _PANEL_WIDTH = 320  # [px] width of a panel
 
 
 def gap_row(views: GeometryViews, k: int) -> Image:
-    """Panels of view k: field, visual depth, collision depth, and the gap in colors."""
+    """Panels of view k in a row: field, visual depth, collision depth, and gap."""
     visual, collision = views.visual_depth[k], views.collision_depth[k]
     size = (_PANEL_WIDTH, round(_PANEL_WIDTH * visual.shape[0] / visual.shape[1]))
     near = (visual < MAX_DEPTH) & (collision < MAX_DEPTH)
