@@ -105,7 +105,7 @@ def software_gl(scene: Path) -> tuple[Any, str]:
 
 
 def batch(scene: Path, count: int, runs: int) -> dict[str, Any]:
-    """Speed of a vector env on two cores, alternately in two processes and in one, in steps of all environments."""
+    """Speed of a vector env on two cores, alternately in two processes and in one: steps of all environments per s."""
     spread, alone = _vector_env(scene, count), _vector_env(scene, count, 1)
     both = [(_vector_env_pace(spread), _vector_env_pace(alone)) for _ in range(runs)]
     rates, costs = zip(*(pair[0] for pair in both), strict=True)

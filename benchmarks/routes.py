@@ -1,11 +1,11 @@
-"""Benchmark of routes from random simulated filmings: passes, laps, there and back, stops, reversals, cuts.
+"""Benchmark of the routes that twin finds in random simulated filmings: laps, there and back, stops, reversals, cuts.
 
     python benchmarks/routes.py [--first 1] [--count 40]
 
 The number of a filming seeds it. Numbers 1 to 999 are for development; those from 1,000 on are for reports, each used
 once. A filming is a set of camera poses along a random line, with errors like those of structure from motion, so no
 pictures are needed. Prints a row per filming: the kind, the route's largest distance from the filmed line, its largest
-step, its sharpest turn over 2 m, and its length divided by that of the longest way filmed without interruption. The
+step, its sharpest turn over 2 m, and its length divided by that of the longest path filmed without interruption. The
 exit status is 1 if a route is more than 0.3 m off the filmed line, has a step above 0.3 m, or turns by more than 120°.
 """
 
@@ -51,7 +51,7 @@ class Filming:
     lines: tuple[Array, ...]
     """True lines (m, 2) [m]; those across a permitted gap are included."""
     longest: float
-    """Longest way filmed without interruption [m], without turning maneuvers."""
+    """Length of the longest path filmed without interruption [m], less turning maneuvers."""
 
 
 def drawn_line(rng: np.random.Generator, length: float) -> Array:

@@ -7,7 +7,7 @@ it with replacement. On some of these days the policies drive on the road, five 
 only a photo: there, the policies drive only in the twin. A policy's rate is then estimated in four ways:
 
 - alone: from the real trials, by the model of `twin.evaluation.rate_model`.
-- twin: the same model with the policy's rate in the twin as covariate, which shrinks the estimate towards this rate.
+- twin: the same model with the policy's rate in the twin as covariate; the estimate shrinks towards its prediction.
 - mean: the mean real rate over the driven days; its interval is Student's t over days.
 - powered: prediction-powered inference (PPI++, `prediction_powered_mean`): the same mean plus λ times the
   difference between the twin's rates on the further days and on the driven days. It is unbiased even if the twin is

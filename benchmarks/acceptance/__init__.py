@@ -1,4 +1,4 @@
-"""Acceptance table of the Husky model: measured values with limits, and wrong models that must exceed them.
+"""Acceptance table of the Husky model: measured values with limits, and wrong models that must exceed these limits.
 
 *Subject*: the robot that is measured, correct or deliberately wrong. *Edit*: a change to the `MjSpec` before it is
 compiled, which makes a wrong model. *Chi*: track ratio, the effective track divided by the geometric one. Letters of

@@ -56,8 +56,8 @@ def reconstructed(
 def roughness(ground: Ground, line: Array) -> tuple[float, float]:
     """Rms [m] and correlation length [m] of the heights along a polyline (m, ≥2).
 
-    A straight line is fitted to every 8 m, much more than the robot's length, and subtracted. The correlation length is
-    the lag at which the autocorrelation falls to 1/e.
+    A straight line is fitted to each 8 m of the heights and subtracted; the robot is much shorter than 8 m. The
+    correlation length is the lag at which the autocorrelation falls to 1/e.
     """
     step = ground.cell / 2
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1))])

@@ -51,7 +51,7 @@ class PlaceRecord:
 def freeze(folder: Path, runs: dict[str, Path]) -> None:
     """Records the digests of trained policies; `runs` names their folders.
 
-    Raises InputError: the record has other digests; trials would then be driven by policies it does not contain.
+    Raises InputError: the record has other digests, so trials would be driven by policies that it does not contain.
     """
     digests = {name: digest_file(path / "policy.json") for name, path in runs.items()}
     record = folder / POLICIES

@@ -4,10 +4,10 @@ The forecast of a policy on a day is its success rate in the twin under the ligh
 under held-out lightings if the photo could not be placed. The baselines are success on the road at *other places* only,
 which does not use the twin, and the twin's own rates with the days shuffled.
 
-- within: mean over places of Spearman, MMRV and regret of the place's policies; over all: the statistic of
+- *within*: mean over places of Spearman, MMRV and regret of the place's policies. *over all*: the statistic of
   the policies of all places together.
-- single days: mean over places of the log and Brier scores of all cells; *gain* is a baseline's log score minus the
-  twin's, above 0 if the twin is better.
+- single days: mean over places of the log and Brier scores of all cells. *gain* is a baseline's log score minus the
+  twin's; it is above 0 if the twin is better.
 
 Intervals (90 %) have the place as their unit (`twin.evaluation.jackknife`), so they hold for experiments at other
 places. There are none for fewer than five places.
@@ -96,7 +96,7 @@ def _held_out(one: PlaceRecord) -> Array:
 def _elsewhere(places: list[PlaceRecord], one: PlaceRecord, by_setup: bool) -> Array:
     """Success on the road at other places, shape (n,).
 
-    The mean of all setups, or if `by_setup`, the mean of each setup, shrunk by one more place with the mean of all.
+    The mean of all setups; if `by_setup`, each setup's mean, shrunk by one added place with the mean of all setups.
     """
     others = [_real(other).mean(1) for other in places if other is not one]
     if not others:

@@ -1,7 +1,7 @@
-"""The known-truth world: a generated campus road that is filmed like a real place and serves as the real test.
+"""The known-truth world: generated places that are filmed like real ones and in which the real test drives.
 
-The rest of `twin` imports nothing from this package. The truth beside a scene is read only by `comparison.py`, by the
-verb `drive` for a task in the scene's frame, by benchmarks and by tests.
+Place 0 is the campus road. The rest of `twin` imports nothing from this package. Only `comparison.py`, the verb `drive`
+for a task in the scene's frame, benchmarks and tests read the truth beside a scene.
 """
 
 SEED = 20  # seed of everything random in this world: places, textures, skies, films, robots, cameras

@@ -64,13 +64,13 @@ def measure(scene: SceneDir) -> dict[str, Any]:
     """Measures a build against its truth.
 
     Returns:
-        `figures`, and `camera_errors_m`: position errors after a similarity, as a list per source [m].
+        `figures`, and `camera_errors_m`: position errors after a similarity alignment [m], as a list per source.
 
-        `figures`, lengths [m], angles [°]: `frames` (their number), `ate_m`, `ate_max_m` (camera positions after a
-        similarity: rms and maximum), `scale_error` (a length in the twin over the true length, minus 1), `ate_rigid_m`,
-        `ate_rigid_max_m` (camera positions after the rigid alignment), `rotation_median_deg`, `tilt_deg` (angle between
-        the twin's vertical and the true one), `ground_median_m`, `ground_p95_m`, `ground_bias_m` (height of the ground
-        inside the corridor: median and 95 % quantile of the absolute error, median of the signed error),
+        `figures`, lengths [m], angles [°]: `frames` (their number), `ate_m`, `ate_max_m` (absolute trajectory error
+        after a similarity alignment: rms and maximum), `scale_error` (a length in the twin over the true length, minus
+        1), `ate_rigid_m`, `ate_rigid_max_m` (the same after the rigid alignment), `rotation_median_deg`, `tilt_deg`
+        (angle between the twin's vertical and the true one), `ground_median_m`, `ground_p95_m`, `ground_bias_m` (height
+        of the ground inside the corridor: median and 95 % quantile of the absolute error, median of the signed error),
         `obstacle_accuracy_m` (visible surface of the convex parts to the true surface), `obstacle_completeness_m`
         (true surface to parts), `obstacle_median_m` (the larger of the two), `corridor_intrusions` (number of convex
         parts in the corridor), `route_median_m` (twin's route to the true center line), `depth_median_m`,

@@ -1,9 +1,9 @@
 """The road of a drawn place (sampled at random, see `place_sampling.py`): its driven line in plan, and the height of
 the ground on and around it.
 
-Along the line, the height follows the drawn grades and a slight unevenness; across the line, it follows the drawn cross
-section. The section ends with the verge, where the ground blends into open land, a smooth surface through the heights
-of the whole line.
+Along the line, the height follows the sampled grades and a slight unevenness; across the line, it follows the sampled
+cross section. The section ends with the verge. There, the ground blends into open land: a smooth surface through the
+heights of the whole line, plus swells.
 """
 
 from functools import cached_property
@@ -26,7 +26,7 @@ _CHUNK = 40_000  # points whose land height is evaluated together
 
 
 class DrawnRoad:
-    """The driven line and the ground of a drawn place; `centerline.RoadLine` has the same methods."""
+    """The driven line and the ground of a drawn place. Like `centerline.RoadLine`, it is a `DrivenLine`."""
 
     def __init__(self, spec: PlaceSpec) -> None:
         self.spec, self.section, self.line = spec, spec.section, spec.line
@@ -142,7 +142,7 @@ class DrawnRoad:
         return out
 
     def grade(self, station: ArrayLike) -> Array:
-        """Drawn slope along the line, without its unevenness."""
+        """Sampled slope along the line, without its unevenness."""
         knots = np.arange(len(self.line.grades)) * GRADE_STEP
         return np.interp(np.asarray(station, float), knots, self.line.grades)
 

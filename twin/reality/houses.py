@@ -122,7 +122,7 @@ class House:
 
 
 def add_house(place: KnownPlace, name: str, house: House, lit_windows: float) -> None:
-    """Adds a house with doors and windows; its textures are `name` (walls) and `name`_roof.
+    """Adds a house with doors and windows; its textures are `<name>` (walls) and `<name>_roof`.
 
     `lit_windows` is the fraction of windows that are lit after dark.
     """

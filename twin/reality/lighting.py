@@ -176,7 +176,7 @@ def sky_cube_map(
 
 _HAZE_HEIGHT = 25.0  # [m] height over which the density of haze falls to 1/e
 _FORWARD_SCATTER = 0.35  # relative excess of the haze's brightness in the direction of the sun
-_SKY = 400.0  # [m] length of the ray through haze in pixels of the sky
+_SKY = 400.0  # [m] assumed length of the ray through haze for a pixel of the sky
 
 
 def apply_haze(

@@ -1,7 +1,7 @@
 """Data of a place: its objects with their collision shapes, its textures and its lightings.
 
-The kind of an object is `ground` (driven or walked on), `obstacle` (solid), `foliage` (not solid) or `detail` (too
-small to matter). Stations and laterals are defined in `centerline.py`.
+The kind of an object is `ground` (driven or walked on), `obstacle` (solid), `foliage` (not solid) or `detail` (grass
+and wires, which comparisons with the truth ignore). Stations and laterals are defined in `centerline.py`.
 """
 
 from collections.abc import Callable, Mapping
@@ -79,7 +79,7 @@ class GroundLayout:
     land: tuple[float, float, float, float]
     """x and y range of the texture `land` [m]."""
     field: tuple[tuple[float, float], tuple[float, float]]
-    """Lowest and highest x, y [m] of the area around the driven line, in which drawn places have cast shadows."""
+    """Lowest and highest x, y [m] of the area around the driven line; a drawn place has cast shadows only there."""
     wet: tuple[str, ...]
     """Textures that rain darkens."""
 

@@ -2,8 +2,8 @@
 
 `draw(number)` returns the description of a place from number 1 on; place 0 is the campus road, designed in `place.py`.
 Every aspect of a place (its line, its surface, its trees, ...) has its own random stream,
-`np.random.default_rng([SEED, 100, number, index of the aspect])`, so a change of one aspect leaves the others as they
-are. Aspects share only the *setting*, such as `village`, which sets their probabilities and ranges.
+`np.random.default_rng([SEED, 100, number, index of the aspect])`, so a further random value in one aspect leaves the
+random values of the others as they are. The *setting*, such as `village`, sets probabilities and ranges of all aspects.
 """
 
 import colorsys
@@ -54,7 +54,7 @@ def stream(number: int, aspect: str, *more: int) -> np.random.Generator:
 
 
 def draw(number: int) -> PlaceSpec:
-    """The description of a place, always the same for a number.
+    """The description of the place with a number, always the same.
 
     Raises:
         InputError: `number` < 1; place 0 has no description of this kind.

@@ -171,7 +171,7 @@ class BoundarySpec:
     covered: float
     """Fraction of the length that it covers."""
     distance: float
-    """Distance from the road's edge [m]."""
+    """Distance from the outer edge of the kerb, or from the road's edge without one [m]."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,7 @@ class LightSpec:
     elevation: float
     """Elevation of the sun, or of the moon at night [°]."""
     azimuth: float
-    """Its azimuth, counterclockwise from the direction of the driven line's start [°]."""
+    """Azimuth of the sun or moon, counterclockwise from the direction of the driven line at its start [°]."""
     clouds: float
     """Cloud cover, 0 to 1."""
     haze: float

@@ -1,8 +1,8 @@
 """A CPU rasterizer for the images of the robot's camera in the known-truth world: small images in a few milliseconds.
 
 The static world is flattened once into triangles, mip-mapped textures, lights and a shadow map. An image takes two
-passes over 2 × 2 samples per pixel: the first finds the nearest triangle, the second computes its color. Shading is
-that of `filming.Renderer`, but textures are averaged over the footprint of a sample.
+passes over 2 × 2 samples per pixel: the first finds each sample's nearest triangle, the second computes its color.
+Shading is that of `filming.Renderer`, but textures are averaged over the footprint of a sample.
 
 A ray through a sample has direction d with z = 1 in the camera frame. The ray hits a triangle with corners a, b, c in
 that frame if d · (b × c), d · (c × a) and d · (a × b) have the sign of det = a · (b × c). These three products are
@@ -248,7 +248,7 @@ def render_shadow_map(corners: wp.array, flat: FlatScene, reach: ShadowRange = S
 
 
 SAMPLES = 2
-"""Samples per pixel and axis."""
+"""Samples per pixel along each axis of the image."""
 
 _NEAR = 0.02  # [m]
 _UNBOUNDED = 1.0e30  # [samples]

@@ -314,8 +314,9 @@ class RealCamera:
         """Rolling shutter and motion blur: every row shows what the camera saw while the row was exposed.
 
         A point has the camera coordinates X in the middle of the readout, and X − f (ω × X + t) after the camera has
-        moved by the fraction f of its motion (ω, t). For a pixel in a row that is read at that time, X is taken as the
-        point on its ray at its depth. The pixel gets the middle picture's color at the projection of X + f (ω × X + t).
+        moved by the fraction f of its motion (ω, t). For a pixel in a row that is read at that time, X is the point on
+        the pixel's ray at the pixel's depth. The pixel gets the color of the middle picture at the projection of
+        X + f (ω × X + t).
         """
         if not np.any(motion):
             return light

@@ -1,4 +1,4 @@
-"""The judge of a trial on the road: decides when it ends, and its cause, such as goal, collision or timeout.
+"""The judge of a trial on the road: decides when the trial ends, and the cause, such as goal, collision or timeout.
 
 It uses the task's numbers and the robot's position, tilt and contact, and shares no code with the twin's
 `RewardAndTermination`. A test compares both on a thousand paths.
@@ -9,7 +9,7 @@ from math import hypot
 
 from twin.reality.road_task import RoadTask
 
-_BEHIND, _AHEAD = 1.5, 4.0  # [m] of the line around the last nearest point, in which the next one is searched
+_BEHIND, _AHEAD = 1.5, 4.0  # [m] range of the search for the nearest point: behind and ahead of the previous one
 
 
 class RealJudge:
@@ -64,7 +64,7 @@ class RealJudge:
         return self.station - self._task.start
 
     def _locate(self, x: float, y: float) -> None:
-        """Moves on to the nearest point of the line around the last one."""
+        """Finds the nearest point of the line within the search range around the previous one."""
         low, high = self.station - _BEHIND, self.station + _AHEAD
         best = (float("inf"), self.station, 0.0)
         first = max(bisect_left(self._knots, low) - 1, 0)

@@ -195,13 +195,13 @@ def run(
 
     Args:
         policies: Policy files.
-        task: A task, or the name of one of the place's.
+        task: A task, or the name of one of the place's tasks.
         lightings: See `twin.reality.lighting.weather`.
         trials: Trials per policy and lighting.
         out: Results file as read by `twin.forecast`. `<name>_trials.csv` beside it has a row per trial,
             `<name>_policies.json` the digests of the policy files, `<name>_setup.json` place, robot and camera.
         twin_lighting: Value of the column of this name in new rows.
-        films: Folder for a film of every trial, by the robot's camera.
+        films: Folder for a film of every trial, from the robot's camera.
         setup: Place, robot and camera, the same in all rows of a table.
 
     Returns:

@@ -48,7 +48,7 @@ class RoadTask:
     start_offset: float
     """Bound of the start's distance from the line [m]."""
     start_heading: float
-    """Bound of the start's angle against the line [rad]."""
+    """Bound of the angle between the robot and the line at the start [rad]."""
     goal: float
     """Station that the base must reach [m]."""
     time_limit: float

@@ -13,7 +13,7 @@ from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.rasterizer import SHADOW_RANGE
 from twin.types import Array
 
-_LENGTH_TOLERANCE = 0.98  # the first film at least this fraction of the longest path long gives the route
+_LENGTH_TOLERANCE = 0.98  # least length of the path that becomes the route, as a fraction of the longest path
 
 
 def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) -> Array:
