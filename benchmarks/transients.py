@@ -4,8 +4,8 @@
     python -m twin.reality film --place N --traffic --out TRAFFIC && twin build TRAFFIC
     python benchmarks/transients.py CLEAN TRAFFIC [WITHOUT] [--json FILE]
 
-Both films have the same camera poses, exposure and noise. Every build is scored on its held-out frames as the clean film
-shows them: the static place alone. WITHOUT is an optional build of the traffic's films with `nerf.transients = false`.
+Both films have the same camera poses, exposure and noise. Every build is scored on its held-out frames as the clean
+film shows them: the static place alone. WITHOUT is an optional build of the same films with `nerf.transients = false`.
 A *ghost* is visual geometry above the true ground of the corridor, on a grid of 0.25 m.
 """
 
