@@ -93,14 +93,15 @@ def test_a_scene_without_a_route_needs_another_field():
     assert drive != object_filmed and drive == wider
 
 
-def test_pose_refinement_changes_the_key_and_older_fields_stay_valid():
+@pytest.mark.parametrize("setting", ["refine_cameras", "transients"])
+def test_later_settings_change_the_key_and_older_fields_stay_valid(setting):
     (stage,) = (one for one in verb.PIPELINE if one.name == "field")
     stamps = {name: types.SimpleNamespace(result="same") for name in stage.upstream}
-    plain, refined = (
-        verb._depends(stage, SceneConfig(nerf=NerfConfig(refine_cameras=on)), {}, stamps) for on in (False, True)
+    off, on = (
+        verb._depends(stage, SceneConfig(nerf=NerfConfig(**{setting: value})), {}, stamps) for value in (False, True)
     )
-    assert "refine_cameras" not in plain["config"]["nerf"]  # as keys were before there was such a setting
-    assert digest_json(plain) != digest_json(refined)
+    assert setting not in off["config"]["nerf"]  # as keys were before there was such a setting
+    assert digest_json(off) != digest_json(on)
 
 
 def test_an_upstream_rerun_with_the_same_result_stops_there(pipeline):

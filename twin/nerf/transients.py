@@ -261,6 +261,7 @@ _BEHIND = (0.5, 0.08)  # surface this far behind a voxel shows that it is empty:
 _AT = (0.3, 0.04)  # surface this far from a voxel shows that it is occupied: the same units
 _MIN_FRAMES = 3  # least number of frames that show a voxel empty, and occupied
 _MIN_VOXELS = 24  # smaller objects are left alone: noise of stereo looks like them
+_HIDDEN = 0.7  # [m] an object is hidden by surfaces that are nearer than its nearest voxel by more than this
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 _MIN_EXTENT = 0.6  # [m] least extent along the second longest axis
 
@@ -341,11 +342,6 @@ def left_objects(pixels: TrainingPixels) -> list[LeftObject]:
         if present and absent:
             found.append(LeftObject(voxels[own], present, absent))
     return found
-
-
-_HIDDEN = (
-    0.7  # an object whose nearest voxel is farther than the surface of a cell by more than this [m] is hidden there
-)
 
 
 def object_mask(pixels: TrainingPixels, cells: Cells, i: int, one: LeftObject) -> NDArray[np.bool_]:
