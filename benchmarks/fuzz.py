@@ -251,9 +251,7 @@ def table(rows: dict[str, Row]) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Fuzzes every reader and every verb with hostile input.")
-    parser.add_argument(
-        "--cases", type=int, default=50_000, help="number for all targets together (default %(default)s)"
-    )
+    parser.add_argument("--cases", type=int, default=50_000, help="total of all targets (default %(default)s)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", metavar="TARGET", help="one target")
     parser.add_argument("--case", type=int, metavar="K", help="one case of that target")

@@ -232,9 +232,7 @@ def main() -> int:
     parser.add_argument("--protocol", type=Path, default=PROTOCOL, help="default: protocol.toml beside this file")
     parser.add_argument("--results", type=Path, default=RESULTS, help="default: results beside this file")
     parser.add_argument("--places", type=int, nargs="+", metavar="NUMBER", help="of the protocol's (default: all)")
-    parser.add_argument(
-        "--minutes", type=float, default=float("inf"), help="stop after this time; the same command continues"
-    )
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop; the same command continues")
     parser.add_argument("--jobs", type=int, default=2, help="processes at once, one core each")
     parser.add_argument("--ray", metavar="ADDRESS", help="a Ray cluster that validates")
     parser.add_argument("--tables", action="store_true", help="drive nothing")

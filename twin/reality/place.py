@@ -50,10 +50,7 @@ _CARS = ((31.2, -5.2, "white"), (12.6, -4.9, "blue"), (66.0, 5.4, "red"))
 
 
 def _add_street_furniture(place: KnownPlace, rng: np.random.Generator | None = None) -> None:
-    """Adds street furniture, cars and the barriers at the road's end.
-
-    With a generator, cones, bins, crates and cars are displaced, as on another day.
-    """
+    """Adds street furniture, cars and barriers; with a generator, cones, bins, crates and cars are displaced."""
     for k, lamp in enumerate(_LAMPS):
         add_lamp_post(place, k, *lamp)
     for k, (station, lateral, turn) in enumerate(_SIGNS):
