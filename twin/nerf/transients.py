@@ -33,6 +33,7 @@ _DEPTH_TOLERANCE = 0.1  # a surface is visible in a frame whose own depth there 
 _MIN_DIFFERENCE = 0.015  # least difference of a mover's color from the surface's, on black
 _MIN_CONTRAST = 0.12  # the same, as a share of the brightness
 _MIN_CELLS = 8  # least size of a mover in cells
+_WEAK = 0.75  # a mover's cells have at least this difference, as a share of that of its strongest cells
 _SPREADS = 4.0  # least difference, as a multiple of the frames' median deviation from their median
 
 
@@ -211,17 +212,25 @@ def mover_cells(pixels: TrainingPixels, cells: list[Cells]) -> list[NDArray[np.b
     """True in the cells of every training frame that show a mover, or a shadow that moves, shapes (rows, columns)."""
     static = [replace(one, depth=depth) for one, depth in zip(cells, static_depths(pixels, cells), strict=True)]
     # Depths of the field miss what is behind a mover, medians miss thin things: a mover differs from both.
-    return parallel(lambda i: cleaned(differs(pixels, cells, i) & differs(pixels, static, i)), range(len(cells)), "cpu")
+
+    def find(i: int) -> NDArray[np.bool_]:
+        excess = np.fmin(difference(pixels, cells, i), difference(pixels, static, i))
+        return cleaned(excess > 1.0, excess > _WEAK)
+
+    return parallel(find, range(len(cells)), "cpu")
 
 
-def differs(pixels: TrainingPixels, cells: list[Cells], i: int) -> NDArray[np.bool_]:
-    """True in the cells of frame i whose color is not that which other frames show there, shape (rows, columns)."""
+def difference(pixels: TrainingPixels, cells: list[Cells], i: int) -> Array32:
+    """Difference of frame i's cells from what other frames show there, shape (rows, columns).
+
+    Above 1, depths and poses that are not exact cannot explain it. It is 0 where too few frames see the surface.
+    """
     median, spread, count = consensus(pixels, cells, i)
     color = cells[i].color
     coarse = np.abs(_mean_around(color) - _mean_around(median)).mean(-1)
     brightness = np.fmax(color.mean(-1), median.mean(-1))
     least = np.maximum(_MIN_DIFFERENCE + _MIN_CONTRAST * brightness, _SPREADS * spread)
-    return (count >= _MIN_SEEN) & (np.fmin(_least_difference(color, median), coarse) > least)
+    return np.where(count >= _MIN_SEEN, np.fmin(_least_difference(color, median), coarse) / least, np.float32(0.0))
 
 
 def _least_difference(color: Array32, median: Array32) -> Array32:
@@ -243,14 +252,14 @@ def _mean_around(color: Array32) -> Array32:
     return total / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), np.float32(1e-6))
 
 
-def cleaned(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Closes gaps, drops groups of fewer than eight cells and thin ones, and adds a margin of one cell."""
-    closed = cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+def cleaned(strong: NDArray[np.bool_], weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Weakly marked regions, with gaps closed and a margin of one cell, that contain eight strongly marked cells."""
+    closed = cv2.morphologyEx((strong | weak).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
-    large = stats[:, cv2.CC_STAT_AREA] >= _MIN_CELLS
-    large[0] = False  # the background
-    return cv2.dilate(large[labels].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    count, labels = cv2.connectedComponents(opened, connectivity=4)
+    kept = np.bincount(labels[strong], minlength=count) >= _MIN_CELLS
+    kept[0] = False  # the background
+    return cv2.dilate(kept[labels].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 # ---- objects that stand in some films only
