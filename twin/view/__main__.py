@@ -90,11 +90,11 @@ def serve(twin: Twin, given: argparse.Namespace) -> None:
 
     page = open_page(twin, given.host, given.port, given.lighting, announce)
     try:
-        page.loop.has_shown.wait(_HEAD_START)  # rendering the first picture needs all cores
+        page.viewer.loop.has_shown.wait(_HEAD_START)  # rendering the first picture needs all cores
         load_driving(page, given.task, policy, given.seed)
         threading.Event().wait()
     finally:
-        page.close()
+        page.viewer.close()
 
 
 def open_page(
@@ -160,14 +160,14 @@ def load_driving(page: "Page", task: str | None = None, policy: "Policy | None" 
     try:
         from twin.view.driving import Driving
 
-        held, lighting = page.guarded.keys.held, page.lighting
-        driving = Driving(page.twin, page.field, task or "route", policy, lighting, held, page.drove, seed)
+        shown = page.viewer
+        held = shown.guarded.keys.held
+        driving = Driving(shown.twin, shown.field, task or "route", policy, shown.lighting, held, page.drove, seed)
     except InputError as error:
         if task is not None or policy is not None:
             raise
         page.no_driving(str(error))
         return
-    page.picture.add_objects(driving.world, driving.obstacles.pool)
     page.add_driving(driving)
 
 
