@@ -149,7 +149,7 @@ class DrivePanel:
         )
 
         def dragged(event: viser.TransformControlsEvent) -> None:
-            with self._viewer.guard():
+            with self._viewer.locked():
                 if name not in driving.obstacles.standing:
                     return
                 (x, y, _), (w, _, _, z) = event.target.position, event.target.wxyz

@@ -112,7 +112,7 @@ class FilmPanel:
         index = clicked_frame(self._cameras, np.array(event.ray_origin), np.array(event.ray_direction))
         if index is None:
             return
-        with self._viewer.guard():
+        with self._viewer.locked():
             source = self._cameras.sources[index]
             if self._source.value != source:
                 self._source.value = source

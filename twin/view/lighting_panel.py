@@ -76,7 +76,7 @@ class LightingPanel:
         self._viewer.set_lighting(EpisodeLighting(f"sampled lighting {self._sampled}", embedding))
 
     def _photo_given(self, name: str, content: bytes) -> None:
-        with self._viewer.guard():
+        with self._viewer.locked():
             if len(content) > _MAX_PHOTO:
                 raise InputError(f"{name}: {len(content) >> 20} MB; expected a photo of at most {_MAX_PHOTO >> 20} MB")
             lighting = self._name.value.strip() or "".join(c if c.isalnum() else "_" for c in Path(name).stem)
@@ -99,7 +99,7 @@ class LightingPanel:
                     text=True,
                     env=child_environment(),
                 )
-            with self._viewer.guard():
+            with self._viewer.locked():
                 if done.returncode:
                     last = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
                     raise InputError(last.removeprefix("error: ").replace(str(photo), "the photo"))

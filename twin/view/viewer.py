@@ -121,7 +121,7 @@ class Viewer:
     # ---- controls, notices and jobs
 
     @contextmanager
-    def guard(self) -> Iterator[None]:
+    def locked(self) -> Iterator[None]:
         """Holds the lock; an InputError within the block becomes a notice on all pages."""
         with self._lock:
             try:
@@ -131,14 +131,14 @@ class Viewer:
 
     def on_click(self, button: Any, work: Callable[[viser.GuiEvent], None]) -> None:
         def clicked(event: viser.GuiEvent) -> None:
-            with self.guard():
+            with self.locked():
                 work(event)
 
         button.on_click(clicked)
 
     def on_update(self, handle: Any, work: Callable[[], None]) -> None:
         def updated(_: viser.GuiEvent) -> None:
-            with self.guard():
+            with self.locked():
                 work()
 
         handle.on_update(updated)
