@@ -57,7 +57,7 @@ def record_trial(
     frame: str = FIT,
     topics: dict[str, str] | None = None,
 ) -> tuple[Trial, dict[str, Any], Path]:
-    """Judges a trial, and writes its results. Returns its table row, its figures and its folder.
+    """Judges a trial and writes its results. Returns its row of `real_trials.csv`, its figures and its folder.
 
     Args:
         root: A built scene.
@@ -66,7 +66,8 @@ def record_trial(
         task: See `twin.load`.
         lighting: Name of the day or light in `real.csv`.
         out: `real.csv`; by default the scene's.
-        twin_lighting: The twin's lighting to compare with; by default the one named `lighting`.
+        twin_lighting: The lighting of the twin that the trial is counted under, by default `lighting`. Pictures are
+            compared with it or, if the field has none of that name, with the lighting that matches them best.
         cause: The cause of the recording's end, as stated by the operator.
         frame: See `twin.sysid.frame_fit.scene_frame`.
         topics: Topics of the bag; see `read_trial`.
@@ -168,14 +169,14 @@ def _pictures(
     """Feeds the pictures between start and end to the pilot that runs policies on the robot.
 
     Returns:
-        Stamps [ns] (n,) of the pictures that the policy used; these pictures (h, w, 3); and for each that is soon
-        followed by a recorded command, the policy's command minus the recorded one, v [m/s] and ω [rad/s], shape
-        (m, 2), m ≤ n.
+        Stamps [ns] (n,) of the pictures that the policy used; these pictures (h, w, 3); and the policy's commands minus
+        the recorded ones, v [m/s] and ω [rad/s], shape (m, 2), for the m ≤ n pictures that a recorded command follows
+        within `_ANSWER`.
     """
     first = max(0, int(np.searchsorted(recording.shutter, begin, side="right")) - 1)
     which = slice(first, int(np.searchsorted(recording.shutter, end, side="right")))
     arrival = dict(zip(recording.shutter[which].tolist(), recording.arrival[which].tolist(), strict=True))
-    now = 0  # the pilot's clocks show when each picture was recorded
+    now = 0  # [ns] time of the pilot's clocks, at which the present picture was recorded
 
     def clock() -> int:
         return now
@@ -203,14 +204,9 @@ def _pictures(
 
 
 def _figures(
-    recording: TrialRecording,
-    trial: JudgedTrial,
-    replayed: Array,
-    fit: FrameFit,
-    views: TrialViews,
-    apart: Array,
+    recording: TrialRecording, trial: JudgedTrial, replayed: Array, fit: FrameFit, views: TrialViews, apart: Array
 ) -> dict[str, Any]:
-    """All numbers of a trial, for JSON."""
+    """The contents of `trial.json`, except for its head."""
     off = np.linalg.norm(trial.poses[:, :2] - replayed[:, :2], axis=1)
 
     def at(seconds: float) -> float | None:
@@ -256,7 +252,7 @@ def _figures(
 
 
 def summary(row: Trial, figures: dict[str, Any]) -> str:
-    """The printed summary."""
+    """The printed summary of a trial; `figures` are those of `record_trial`."""
     frame, replayed, seen, policy = (figures[name] for name in ("frame", "replay", "pictures", "policy"))
     lines = [
         f"{row.policy}, {row.task}, {row.lighting}: {row.cause} after {row.progress:.1f} m and "
@@ -292,23 +288,18 @@ def summary(row: Trial, figures: dict[str, Any]) -> str:
 
 def command(options: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
-    names = {
-        "pictures": options.image,
-        "camera": options.camera_info,
-        "poses": options.poses,
-        "commands": options.commands,
-    }
+    names = {"pictures": options.image, "camera": options.camera_info}
+    names |= {"poses": options.poses, "commands": options.commands}
     topics = {kind: topic for kind, topic in names.items() if topic}
     if options.lerobot:
         from twin.report.bag_dataset import write_bag_dataset
+        from twin.report.drive_dataset import drives_summary
 
         drives = write_bag_dataset(
             *(options.scene, options.bag, options.lerobot, options.task, options.policy, options.lighting or ""),
             *(options.cause, options.frame, topics),
         )
         if not options.quiet:
-            from twin.report.drive_dataset import drives_summary
-
             print(drives_summary(drives, options.lerobot))
         return
     if len(options.bag) > 1:
@@ -318,8 +309,7 @@ def command(options: argparse.Namespace) -> None:
             raise InputError(f"a trial needs --{name}; without a policy, --lerobot DIR records drives to learn from")
     row, figures, folder = record_trial(
         *(options.scene, options.bag[0], options.policy, options.task, options.lighting, options.out),
-        *(options.twin_lighting, options.cause, options.frame),
-        topics,
+        *(options.twin_lighting, options.cause, options.frame, topics),
     )
     if not options.quiet:
         print(summary(row, figures))

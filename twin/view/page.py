@@ -1,4 +1,4 @@
-"""The page of `twin view`: its tabs Look, Drive, Film and Path, and what it shows under their settings."""
+"""The page of `twin view`: its tabs Look, Drive, Film and Path, and the picture under their settings."""
 
 from typing import Any
 
