@@ -71,7 +71,7 @@ class CameraPath:
         knots = np.array([view.time for view in self.views]) - self.views[0].time
         poses = np.array([view.camera_to_world for view in self.views])
         t = np.clip(times, 0.0, knots[-1])
-        # A cubic spline overshoots where the camera stands still. Such a path, or one of two views, gets a monotone one.
+        # A cubic spline overshoots where the camera stands still; then, or with two views only, it is a monotone one.
         still = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).min() < 1e-6
         curve = PchipInterpolator if still or len(knots) == 2 else CubicSpline
         out = np.tile(np.eye(4), (len(t), 1, 1))
