@@ -138,6 +138,7 @@ def test_training_is_the_last_episodes_before_the_policy_was_saved(tmp_path):
     write_json(run / "choice.json", {"chosen": final | {"successes": 41, "condition": ""}})
     with pytest.raises(InputError, match=r"choice\.json is damaged .*41 successes in 40 trials"):
         training_summaries(tmp_path, heads)
+    (run / "choice.json").unlink()
     # The run was trained on, or is another one: its curve is not that of the policy that was validated.
     write_json(heads["r"], {"trained": {"step": 4000}})
     assert set(training_summaries(tmp_path, ["r", "r/5"])) == {"r/5"}
