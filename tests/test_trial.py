@@ -21,8 +21,10 @@ from twin.errors import InputError
 from twin.evaluation.trials import Cell, read_results, read_trials
 from twin.learn.policy import Control, load_policy, save_policy
 from twin.learn.policy_network import Architecture
+from twin.report.bag_dataset import write_bag_dataset
 from twin.report.video_writer import read_frames, video_info
-from twin.sysid.trial_recording import fit_frame, read_trial
+from twin.sysid.frame_fit import fit_frame
+from twin.sysid.trial_recording import read_trial
 
 STEP = 100_000_000  # [ns]
 SMALL = Architecture((64, 36), 2, 1, ((4, 8, 8),), 8, (8,), 1)
@@ -139,7 +141,7 @@ def test_a_drive_by_hand_needs_no_policy_and_no_outcome(place, tmp_path):
     few = [one for one in fast if one.stamp < START + 10 * STEP]  # then the operator lets go
     given = [one for one in cut if one.topic != "/cmd_vel"]
     bag = write(tmp_path / "by_hand", [*given, *few, *[command(0.3, -0.1, one.stamp + 7) for one in few]])
-    (drive,) = trial.record_dataset(scene, [bag], tmp_path / "drives", "ahead", frame="scene")
+    (drive,) = write_bag_dataset(scene, [bag], tmp_path / "drives", "ahead", frame="scene")
     assert drive.cause == "" and not drive.success
     np.testing.assert_allclose(drive.actions[:9], np.tile([0.4, 0.0], (9, 1)))
     np.testing.assert_allclose(drive.actions[10:14], np.tile([0.3, -0.1], (4, 1)))
@@ -147,13 +149,13 @@ def test_a_drive_by_hand_needs_no_policy_and_no_outcome(place, tmp_path):
     info = json.loads((tmp_path / "drives/meta/info.json").read_text())
     assert info["features"]["observation.images.front"]["shape"] == [90, 160, 3]
     assert info["twin"]["action_range"] == {"linear_velocity": [0.0, 1.0], "angular_velocity": [-1.0, 1.0]}
-    (drive,) = trial.record_dataset(scene, [bag], tmp_path / "hit", "ahead", cause="collision", frame="scene")
+    (drive,) = write_bag_dataset(scene, [bag], tmp_path / "hit", "ahead", cause="collision", frame="scene")
     assert drive.cause == "collision" and drive.rewards[-1] == -4.0
     gap = [one for one in cut if "image" not in one.topic or not START + STEP < one.stamp < START + 9 * STEP]
     with pytest.raises(
         InputError, match=r"/camera/image has no picture within 0\.7 s of 0\.8 s after the first command"
     ):
-        trial.record_dataset(scene, [write(tmp_path / "gap", gap)], tmp_path / "none", "ahead", frame="scene")
+        write_bag_dataset(scene, [write(tmp_path / "gap", gap)], tmp_path / "none", "ahead", frame="scene")
     assert not (tmp_path / "none").exists()
 
 

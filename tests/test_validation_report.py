@@ -127,7 +127,18 @@ def test_training_is_the_last_episodes_before_the_policy_was_saved(tmp_path):
             "successes": sum(won),
             "trials": RECENT_EPISODES,
         }
+        assert (found[name]["first_step"], found[name]["test"]) == (step - 10 * (RECENT_EPISODES - 1), None)
     assert found["r"]["low"] < found["r"]["rate"] < found["r"]["high"] and found["r/5"]["run"] == "r"
+    # A final test counts for the policy that drove it.
+    final = {"step": 3000, "successes": 39, "trials": 40}
+    write_json(run / "choice.json", {"chosen": final | {"condition": "held-out+randomised"}})
+    tested = training_summaries(tmp_path, heads)
+    assert tested["r"]["test"] == {"step": 3000, "condition": "held-out+randomised", **rate_summary(39, 40)}
+    assert tested["r"] | {"test": None} == found["r"] and tested["r/5"] == found["r/5"]
+    write_json(run / "choice.json", {"chosen": final | {"successes": 41, "condition": ""}})
+    with pytest.raises(InputError, match=r"choice\.json is damaged .*41 successes in 40 trials"):
+        training_summaries(tmp_path, heads)
+    (run / "choice.json").unlink()
     # The run was trained on, or is another one: its curve is not that of the policy that was validated.
     write_json(heads["r"], {"trained": {"step": 4000}})
     assert set(training_summaries(tmp_path, ["r", "r/5"])) == {"r/5"}
@@ -191,14 +202,19 @@ def test_the_page_shows_the_numbers_of_the_tables(tmp_path):
     trials = [trial("a", k, "goal" if k < 31 else "collision", trust=0.9 if k % 2 else 0.5) for k in range(40)]
     trials += [trial("b", k, "goal" if k < 12 else "timeout", light=light) for k in range(40) for light in ("day", "n")]
     trials += [trial("a", 7, "stuck", task="bend", light="any")]
-    trained = {"a": TRAINED | {"run": "a"} | rate_summary(96, 100)}
+    trained = {"a": TRAINED | {"run": "a", "first_step": 20, "test": None} | rate_summary(96, 100)}
     worst = [summarize([trial("a", k, "rollover", light="drawn_3") for k in range(5)])["cells"][0] | {"of": 16}]
     curve = TrainingCurve("a", np.arange(10, 400, 10), np.arange(39) % 2)
     said = told(trials, training=trained, worst=worst)
     text = page(tmp_path, said, curve).text
     for cell in [*said["cells"], *worst]:
         assert rate_text(cell) in text and failure_text(cell) in text
-    assert rate_text(trained["a"]) in text and "after 300 steps" in text and "in varying light" in text
+    assert rate_text(trained["a"]) in text and "from the task’s start, n = 100, ending from step 20 on" in text
+    assert "trained on ahead, in varying light, for 300 steps" in text
+    tested = {"a": trained["a"] | {"test": {"step": 300, "condition": "held-out"} | rate_summary(37, 40)}}
+    shown = page(tmp_path, told(trials, training=tested)).text
+    assert rate_text(tested["a"]["test"]) in shown and "final test, n = 40, light held-out" in shown
+    assert rate_text(trained["a"]) not in shown
     assert "19" in text and "only A arrived" in text and "“a” is better" in text  # 31 - 12 episodes
     assert rate_text(said["cells"][0]["low_trust"]) in text
     assert "drawn_3" in text and "5 rolled over" in text
@@ -366,12 +382,12 @@ def test_many_lightings_are_a_heatmap_with_the_mean_of_the_shared_ones():
     ]
     drawn = tiles(rate_heatmap(summarize(trials)["cells"], {"a": 0.5, "b": None}))
     assert {light: text for (policy, light), (text, _) in drawn.items() if policy == "a"} == {
-        "in training": "50", "mean": "100",
+        "training’s result": "50", "mean": "100",
         "day_0": "0", "day_1": "25", "day_2": "100", "day_3": "100", "day_4": "100", "day_5": "100",
     }  # fmt: skip
     assert drawn["b", "mean"][0] == "81"  # (100 + 3 * 75) / 4; of the episodes 91 %
-    assert ("b", "day_1") not in drawn and ("b", "in training") not in drawn
-    shades = [drawn["a", name][1][3] for name in ("day_0", "day_1", "in training", "day_2")]
+    assert ("b", "day_1") not in drawn and ("b", "training’s result") not in drawn
+    shades = [drawn["a", name][1][3] for name in ("day_0", "day_1", "training’s result", "day_2")]
     assert shades == sorted(set(shades))
 
 

@@ -36,7 +36,7 @@ from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_ti
 from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, station_and_lateral
 from twin.view.guarded_server import Gate, HeldKeys, open_server
 from twin.view.layers import clicked_frame
-from twin.view.page import slider_lighting
+from twin.view.lighting_panel import slider_lighting
 from twin.view.picture_loop import COARSE_AREA, FilmedFrame, add_film, film_camera, picture_size
 from twin.view.scene_picture import FreeCamera, ScenePicture
 
@@ -483,48 +483,49 @@ def _picture(browser: Chromium, size: tuple[int, int]) -> np.ndarray:
 def test_the_page_in_a_browser(scene):
     size = (960, 540)
     page = open_page(scene, port=0)
+    viewer = page.viewer
     loading = threading.Thread(target=load_driving, args=(page, "ahead"))
     try:
         with Chromium(size) as browser:
             browser.call("Page.addScriptToEvaluateOnNewDocument", source=_COUNT_PICTURES)
-            browser.open(page.guarded.url)
+            browser.open(viewer.guarded.url)
             browser.wait("window.pictures > 0")
             loading.start()
             loading.join()
             # What the page shows is what the field renders; it fades in.
-            client = next(iter(page.server.get_clients().values()))
-            shot = page._shot(client)
+            client = next(iter(viewer.server.get_clients().values()))
+            shot = page.shot(client)
             seen = client.camera.image_width, client.camera.image_height
             camera = FreeCamera.of_fov(shot.camera_to_world, shot.fov, seen)
-            own = to_uint8(page.picture.render(camera, shot.lighting, shot.objects).rgb[0])
+            own = to_uint8(viewer.picture.render(camera, shot.lighting, shot.objects).rgb[0])
             own = own[: size[1], size[0] // 3 : size[0] // 2].astype(float)
             assert own.std() > 5.0
             _wait(lambda: np.abs(_picture(browser, size) - own).mean() < 4.0)
             day = _picture(browser, size)
 
-            before = page.loop.fine
+            before = viewer.loop.fine
             browser.slide("lighting", 0.98)
-            _wait(lambda: page.lighting.name.startswith(("night", "day:night")) and page.loop.fine > before)
+            _wait(lambda: viewer.lighting.name.startswith(("night", "day:night")) and viewer.loop.fine > before)
             _wait(lambda: np.abs(_picture(browser, size) - day).mean() > 5.0)
 
             browser.click_on("[role=tab]", "Drive")
             browser.click_on("button", "Start driving")
             browser.wait("document.documentElement.dataset.driving === 'true'")
-            start = page.driving.objects().qpos[:2].copy()
+            start = viewer.driving.objects().qpos[:2].copy()
             eye = client.camera.position.copy()
             browser.key("w", True)
-            _wait(lambda: np.linalg.norm(page.driving.objects().qpos[:2] - start) > 0.3)
+            _wait(lambda: np.linalg.norm(viewer.driving.objects().qpos[:2] - start) > 0.3)
             browser.key("w", False)
-            _wait(lambda: not page.guarded.keys.held())
+            _wait(lambda: not viewer.guarded.keys.held())
             browser.click_on("button", "Stop")
             browser.wait("document.documentElement.dataset.driving === 'false'")
             assert np.linalg.norm(client.camera.position - eye) > 0.1  # it followed the robot
 
             browser.click_on("[role=tab]", "Film")
             browser.click_on("input[type=checkbox]", "compare")
-            _wait(lambda: page._film_index == 0)
-            assert page.lighting.name == "day"  # that of the frame
+            _wait(lambda: page.film.index == 0)
+            assert viewer.lighting.name == "day"  # that of the frame
             time.sleep(0.5)
             assert browser.errors == []
     finally:
-        page.close()
+        viewer.close()

@@ -1,4 +1,4 @@
-"""Verb: evaluates a robot's recording of a trial on the road: counts it in `real.csv`, and compares it with the twin.
+"""Verb: judges a robot's recording of a trial on the road, counts it in `real.csv`, and compares it with the twin.
 
     python -m twin.trial scenes/my_road monday_1.mcap --policy first --task straight --lighting monday
 
@@ -6,58 +6,42 @@ The bag has the front camera's pictures and camera_info, commands, and poses (RT
 are localized in the scene, and the poses are fitted to their positions. Then the trial is judged by the twin's rules of
 success and failure. Poses do not show collisions; `--cause collision` states that the recording ends with one.
 
-Two files are written to `<scene>/trials/<bag>/`: `trial.mp4` shows the robot's pictures beside the twin's. `trial.json`
-has the outcome, the distance between the final positions of the twin's robot and the real one under the same commands,
-the similarity of the pictures, and the fraction of the recorded commands that the policy gives again for the recorded
-pictures. The trial is counted in `real.csv`, and listed with its cause in `real_trials.csv` beside it.
+Two files are written to `<scene>/trials/<bag>/`. `trial.mp4` shows the robot's pictures beside the twin's. `trial.json`
+has the outcome; the distance between the final positions of the real robot and of the twin's robot under the same
+commands; the similarity of the pictures; and the fraction of recorded commands that the policy gives again for the
+recorded pictures. The trial is counted in `real.csv`, and listed with its cause in `real_trials.csv` beside it.
 
     python -m twin.trial scenes/my_road monday_1.mcap monday_2.mcap --task straight --lerobot drives
 
-With `--lerobot`, recordings are instead written as a dataset for learning; they may also be of drives by hand. See
-`record_dataset`.
+With `--lerobot`, recordings are written as a dataset for learning instead; see `report/bag_dataset.py`.
 """
 
 import argparse
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from twin import commands, runtime
-from twin.assets.ground import Ground
-from twin.capture.camera_models import Lens
-from twin.capture.localize import register_film
-from twin.config import TWIST, Condition
-from twin.env.episode import Episode
+from twin.config import Condition
 from twin.env.suite import EnvFactory
 from twin.errors import InputError
 from twin.evaluation.trial_judge import JudgedTrial, TrialViews, judge, replay, view
 from twin.evaluation.trials import Trial, read_counts, read_trials, tally, write_real_trials
-from twin.files import new_folder, require_absent, write_json
+from twin.files import write_json
 from twin.learn.policy import Policy, find_policy, load_policy
-from twin.loading import Twin, load_scene
+from twin.loading import load_scene
 from twin.robot import PixelCamera
-from twin.scene import require_stage
-from twin.sysid.camera_extrinsics import base_below_camera
-from twin.sysid.trial_recording import FrameFit, TrialRecording, fit_frame, read_trial
+from twin.sysid.frame_fit import FIT, FrameFit, scene_frame
+from twin.sysid.trial_recording import TrialRecording, read_trial
 from twin.types import Array, Image
-from twin_policy import Camera, Limits, PictureError, Pilot, Rectifier
+from twin_policy import Limits, Pilot, Rectifier
 
-SCENE_FRAME, FIT = "scene", "pictures"
-_LOCATED = 24  # number of pictures that are localized in the scene
-_MOVING = 0.02  # [m/s], [rad/s]; the trial starts with the first command that exceeds this
 _ANSWER = 300_000_000  # [ns] longest time from a picture to the command that follows from it
 _SAME = 1e-3  # [m/s], [rad/s]; commands that differ by less count as equal
-_SPEED_SPAN = (
-    0.2  # [s] before an instant over which speed is measured from poses; later poses would show later commands
-)
-_MAX_GAP = 0.5  # [s] longest time without a picture in a dataset, and time for which a command is in force (ROS 2)
 _START_OFFSET, _START_HEADING = 0.3, 10.0  # [m], [°] largest deviations from the route at a trial's start in the twin
 
 
@@ -73,7 +57,7 @@ def record_trial(
     frame: str = FIT,
     topics: dict[str, str] | None = None,
 ) -> tuple[Trial, dict[str, Any], Path]:
-    """Judges a trial, and writes its results. Returns its table row, its figures and its folder.
+    """Judges a trial and writes its results. Returns its row of `real_trials.csv`, its figures and its folder.
 
     Args:
         root: A built scene.
@@ -82,10 +66,10 @@ def record_trial(
         task: See `twin.load`.
         lighting: Name of the day or light in `real.csv`.
         out: `real.csv`; by default the scene's.
-        twin_lighting: The twin's lighting to compare with; by default the one named `lighting`.
+        twin_lighting: The lighting of the twin that the trial is counted under, by default `lighting`. Pictures are
+            compared with it or, if the field has none of that name, with the lighting that matches them best.
         cause: The cause of the recording's end, as stated by the operator.
-        frame: `SCENE_FRAME` if the poses are in the scene's frame; `FIT` if their frame is to be fitted to localized
-            pictures.
+        frame: See `twin.sysid.frame_fit.scene_frame`.
         topics: Topics of the bag; see `read_trial`.
 
     Raises:
@@ -103,10 +87,12 @@ def record_trial(
         raise InputError(f"{root}: has no field to compare pictures with; build it")
     name = Condition.parse(compared).lighting
     chosen = name if name in factory.field.lightings else None
-    rectify = _rectifier(recording, policy, factory)
-    begin = _begin(recording)
-    fit = _frame(recording, scene, factory, begin) if frame == FIT else FrameFit(0.0, np.zeros(2))
-    trial = _with_cause(_judge(recording, factory, fit, begin), cause, bag)
+    own = policy.trained.get("camera") or factory.world.camera.resized(factory.options.size).intrinsics
+    rectify = recording.rectifier(factory.options.size, own)
+    begin = recording.start()
+    fit = scene_frame(recording, frame, begin, scene.scene, factory.world.robot)
+    times, poses, upright = recording.motion_at_steps(begin, factory.options.control_timestep)
+    trial = judge(factory, times, fit(poses), upright).with_cause(cause, bag)
     end = begin + round(float(trial.times[-1]) * 1e9)
 
     since = np.asarray((recording.command_times - begin) * 1e-9, np.float64)
@@ -146,147 +132,6 @@ def record_trial(
     return row, figures, folder
 
 
-def record_dataset(
-    root: Path,
-    bags: Sequence[Path],
-    out: Path,
-    task: str,
-    policy_name: str | None = None,
-    lighting: str = "",
-    cause: str | None = None,
-    frame: str = FIT,
-    topics: dict[str, str] | None = None,
-) -> list[Episode]:
-    """Writes drives on the road as a LeRobot dataset, see `twin.report.drive_dataset`; returns them as episodes.
-
-    A frame has the newest picture, as a policy would see it; speed and yaw rate from the poses before it; and the mean
-    of the commands until the next frame. The other data come from the poses and the twin's rules.
-
-    Args:
-        root, task, frame, topics: See `record_trial`.
-        bags: One drive each, by a policy or by hand.
-        out: The dataset's folder; must not exist.
-        policy_name: The policy that determines the frames' camera and period; None: those of the scene's environments.
-        lighting: Name of the day or light in the dataset's table of drives.
-        cause: The cause of the recording's end, as stated by the operator; only allowed with a single bag.
-
-    Raises:
-        InputError: an error of `record_trial`, except that a drive needs no outcome; `out` exists, or pyarrow is not
-            installed.
-    """
-    from twin.report.drive_dataset import DriveDataset, drive_instruction, require_pyarrow
-
-    if cause and len(bags) > 1:
-        raise InputError(f"--cause {cause} is of one bag; there are {len(bags)}")
-    require_pyarrow()
-    require_absent(out)
-    scene = load_scene(root)
-    policy = load_policy(find_policy(root, policy_name)) if policy_name else None
-    seen = policy.options() if policy else {}
-    factory = EnvFactory.open(scene, task, {**seen, "action": TWIST, "pixels": False})
-    options = factory.options
-    physics, driving = factory.make_env(0)
-    limits, ground = driving.action_spec(physics), Ground.load(require_stage(scene.scene, "mesh"))
-    names = ("linear_velocity", "angular_velocity")
-    ranges = {n: (float(a), float(b)) for n, a, b in zip(names, limits.minimum, limits.maximum, strict=True)}
-    words = drive_instruction(scene.scene.root, task)
-    drives = []
-    with new_folder(out) as folder:
-        dataset = DriveDataset(folder, options.size, options.control_timestep, ranges, words)
-        for bag in bags:
-            recording = read_trial(bag, topics)
-            rectify, begin = _rectifier(recording, policy, factory), _begin(recording)
-            fit = _frame(recording, scene, factory, begin) if frame == FIT else FrameFit(0.0, np.zeros(2))
-            trial = _judge(recording, factory, fit, begin)
-            rewards = trial.rewards.copy()
-            if cause:
-                trial = _with_cause(trial, cause, bag)
-                rewards[-1] = getattr(options.rewards, cause)
-            stamps = begin + np.round(trial.times * 1e9).astype(np.int64)
-            motion = _motion(recording, stamps)
-            base_to_world = np.tile(np.eye(4), (len(stamps), 1, 1))
-            base_to_world[:, :3, :3] = Rotation.from_euler("z", trial.poses[:, 2:]).as_matrix()
-            base_to_world[:, :2, 3] = trial.poses[:, :2]
-            base_to_world[:, 2, 3] = ground.at(trial.poses[:, :2])
-            drives.append(
-                Episode(
-                    times=trial.times,
-                    base_to_world=base_to_world,
-                    qpos=np.zeros((len(stamps), 0)),  # the simulator's state, which a recording does not have
-                    actions=_actions(recording, stamps, options.control_timestep),
-                    rewards=rewards,
-                    speed=motion[:, 0],
-                    cross_track=trial.cross_track,
-                    progress=trial.progress,
-                    trust=np.full(len(stamps), np.nan),
-                    cause=trial.cause,
-                    touched=(),
-                    task=factory.segment.name,
-                    lighting=lighting,
-                    seed=begin // 10**6,  # as in `real_trials.csv`
-                    randomisation={},
-                    obstacles=(),
-                )
-            )
-            dataset.add(drives[-1], _pictures_at(recording, rectify, stamps), motion)
-        dataset.finish()
-    return drives
-
-
-def _begin(recording: TrialRecording) -> int:
-    """Start of the trial [ns]: the time of the first command that moves the robot."""
-    moving = np.flatnonzero(np.abs(recording.commands).max(1, initial=0.0) > _MOVING)
-    if not len(moving):
-        topic = recording.topics["commands"]
-        raise InputError(f"{recording.path}: no command on {topic} moves the robot; record the whole trial")
-    return int(recording.command_times[moving[0]])
-
-
-def _motion(recording: TrialRecording, stamps: NDArray[np.int64]) -> Array:
-    """Speed along the heading [m/s] and yaw rate [rad/s] over the last `_SPEED_SPAN`, shape (k, 2)."""
-    now, before = (recording.poses_at(one) for one in (stamps, stamps - round(_SPEED_SPAN * 1e9)))
-    (x, y, turn), yaw = ((now - before) / _SPEED_SPAN).T, (now[:, 2] + before[:, 2]) / 2.0
-    return np.column_stack([x * np.cos(yaw) + y * np.sin(yaw), turn])
-
-
-def _actions(recording: TrialRecording, stamps: NDArray[np.int64], period: float) -> Array:
-    """Action in the step after each instant, v [m/s] and ω [rad/s], shape (k, 2); the last one is zero.
-
-    It is the mean of the commands in the step. If there are none, it is the last command before, or zero if that is too
-    old, since the robot has then stopped.
-    """
-    actions = np.zeros((len(stamps), 2))
-    ends = np.searchsorted(recording.command_times, stamps + round(period * 1e9))
-    for k, (start, end) in enumerate(zip(np.searchsorted(recording.command_times, stamps), ends, strict=True)):
-        if end > start:
-            actions[k] = recording.commands[start:end].mean(0)
-        elif start and stamps[k] - recording.command_times[start - 1] < _MAX_GAP * 1e9:
-            actions[k] = recording.commands[start - 1]
-    actions[-1] = 0.0
-    return actions
-
-
-def _pictures_at(recording: TrialRecording, rectify: Rectifier, stamps: NDArray[np.int64]) -> list[Image]:
-    """The newest picture (h, w, 3) at each instant. Raises InputError: at an instant there is no recent picture."""
-    newest = np.maximum(0, np.searchsorted(recording.shutter, stamps, side="right") - 1)
-    ages = np.abs(stamps - recording.shutter[newest]) * 1e-9
-    if ages.max() > _MAX_GAP:
-        at = float((stamps[ages.argmax()] - stamps[0]) * 1e-9)
-        raise InputError(
-            f"{recording.path}: {recording.topics['pictures']} has no picture within {ages.max():.1f} s of {at:.1f} s "
-            f"after the first command; expected one every {_MAX_GAP:g} s at least"
-        )
-    pictures: dict[int, Image] = {}
-    with runtime.bar("pictures", len(np.unique(newest)), "picture") as progress:
-        for stamp, picture in recording.pictures(recording.shutter[np.unique(newest)]):
-            try:
-                pictures[stamp] = rectify(picture.decode())
-            except PictureError as error:
-                raise InputError(f"{recording.path}: {recording.topics['pictures']}: {error}") from None
-            progress.update()
-    return [pictures[int(stamp)] for stamp in recording.shutter[newest]]
-
-
 def _key(trial: Trial) -> tuple[str, str, str, int]:
     return trial.policy, trial.task, trial.lighting, trial.seed
 
@@ -303,73 +148,6 @@ def _known_trials(table: Path, out: Path) -> list[Trial]:
                 "--out, and join the two by hand"
             )
     return known
-
-
-def _rectifier(recording: TrialRecording, policy: Policy | None, factory: EnvFactory) -> Rectifier:
-    """Rectifier from the robot's camera to the policy's camera, or else to that of the scene's environments."""
-    size = factory.options.size
-    own = (policy and policy.trained.get("camera")) or factory.world.camera.resized(size).intrinsics
-    try:
-        fx, fy, cx, cy = map(float, own)
-        return Rectifier(recording.camera, Camera(size, (fx, fy, cx, cy)))
-    except (PictureError, TypeError, ValueError) as error:
-        raise InputError(f"{recording.path}: {error}") from None
-
-
-def _frame(recording: TrialRecording, scene: Twin, factory: EnvFactory, begin: int) -> FrameFit:
-    """Localizes pictures, evenly spaced along the drive, in the scene, and fits the frame of the poses to them."""
-    ground = Ground.load(require_stage(scene.scene, "mesh"))
-    stamps = recording.shutter[recording.shutter >= begin]
-    xy = recording.poses_at(stamps)[:, :2]
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))) if len(xy) else np.zeros(0)
-    some = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], _LOCATED))) if len(way) else np.zeros(0, int)
-    native = recording.camera.without_distortion()
-    rectify = Rectifier(recording.camera, native, max_outside=1.0)
-    frames, shown = [], []
-    for stamp, picture in recording.pictures(stamps[some]):
-        try:
-            frames.append(rectify(picture.decode()))
-        except PictureError as error:
-            raise InputError(f"{recording.path}: {recording.topics['pictures']}: {error}") from None
-        shown.append(stamp)
-    if not frames:
-        raise InputError(f"{recording.path}: no picture after the first command; record pictures throughout")
-    found = register_film(frames, Lens("PINHOLE", native.intrinsics, *native.size), scene.scene)
-    located = [base_below_camera(factory.world.robot, pose, ground.at) for pose in found.camera_to_world]
-    times = np.array(shown, np.int64)[found.frames]
-    return fit_frame(recording.poses_at(times), np.array(located).reshape(-1, 3), str(recording.path))
-
-
-def _judge(recording: TrialRecording, factory: EnvFactory, fit: FrameFit, begin: int) -> JudgedTrial:
-    """The trial from its first command to its outcome or the recording's end."""
-    period = factory.options.control_timestep
-    left = (int(recording.pose_times[-1]) - begin) * 1e-9
-    steps = int(left / period + 1e-6)
-    if begin < recording.pose_times[0] or steps < 1:
-        raise InputError(
-            f"{recording.path}: {recording.topics['poses']} has poses from "
-            f"{(int(recording.pose_times[0]) - begin) * 1e-9:.1f} to {left:.1f} s after the first "
-            "command; expected the whole trial"
-        )
-    times = np.arange(steps + 1) * np.float64(period)
-    stamps = begin + np.round(times * 1e9).astype(np.int64)
-    upright = np.interp(stamps - begin, recording.pose_times - begin, recording.uprightness)
-    return judge(factory, times, fit(recording.poses_at(stamps)), upright)
-
-
-def _with_cause(trial: JudgedTrial, cause: str | None, bag: Path) -> JudgedTrial:
-    """The trial with the cause stated by the operator, if one is given."""
-    if cause == "goal" and trial.cause != "goal":
-        raise InputError(
-            f"{bag}: the recording ends {trial.progress[-1]:.1f} m along the task ({trial.cause or 'no outcome'}); "
-            "expected a cause of failure, as the goal was not reached"
-        )
-    if not (cause or trial.cause):
-        raise InputError(
-            f"{bag}: the recording ends after {trial.times[-1]:.1f} s and {trial.progress[-1]:.1f} m without an "
-            "outcome; record to the end, or say what ended it, such as --cause collision"
-        )
-    return replace(trial, cause=cause or trial.cause)
 
 
 class _PolicyOfPictures:
@@ -391,14 +169,14 @@ def _pictures(
     """Feeds the pictures between start and end to the pilot that runs policies on the robot.
 
     Returns:
-        Stamps [ns] (n,) of the pictures that the policy used; these pictures (h, w, 3); and for each that is soon
-        followed by a recorded command, the policy's command minus the recorded one, v [m/s] and ω [rad/s], shape
-        (m, 2), m ≤ n.
+        Stamps [ns] (n,) of the pictures that the policy used; these pictures (h, w, 3); and the policy's commands minus
+        the recorded ones, v [m/s] and ω [rad/s], shape (m, 2), for the m ≤ n pictures that a recorded command follows
+        within `_ANSWER`.
     """
     first = max(0, int(np.searchsorted(recording.shutter, begin, side="right")) - 1)
     which = slice(first, int(np.searchsorted(recording.shutter, end, side="right")))
     arrival = dict(zip(recording.shutter[which].tolist(), recording.arrival[which].tolist(), strict=True))
-    now = 0  # the pilot's clocks show when each picture was recorded
+    now = 0  # [ns] time of the pilot's clocks, at which the present picture was recorded
 
     def clock() -> int:
         return now
@@ -426,14 +204,9 @@ def _pictures(
 
 
 def _figures(
-    recording: TrialRecording,
-    trial: JudgedTrial,
-    replayed: Array,
-    fit: FrameFit,
-    views: TrialViews,
-    apart: Array,
+    recording: TrialRecording, trial: JudgedTrial, replayed: Array, fit: FrameFit, views: TrialViews, apart: Array
 ) -> dict[str, Any]:
-    """All numbers of a trial, for JSON."""
+    """The contents of `trial.json`, except for its head."""
     off = np.linalg.norm(trial.poses[:, :2] - replayed[:, :2], axis=1)
 
     def at(seconds: float) -> float | None:
@@ -479,7 +252,7 @@ def _figures(
 
 
 def summary(row: Trial, figures: dict[str, Any]) -> str:
-    """The printed summary."""
+    """The printed summary of a trial; `figures` are those of `record_trial`."""
     frame, replayed, seen, policy = (figures[name] for name in ("frame", "replay", "pictures", "policy"))
     lines = [
         f"{row.policy}, {row.task}, {row.lighting}: {row.cause} after {row.progress:.1f} m and "
@@ -515,21 +288,18 @@ def summary(row: Trial, figures: dict[str, Any]) -> str:
 
 def command(options: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
-    names = {
-        "pictures": options.image,
-        "camera": options.camera_info,
-        "poses": options.poses,
-        "commands": options.commands,
-    }
+    names = {"pictures": options.image, "camera": options.camera_info}
+    names |= {"poses": options.poses, "commands": options.commands}
     topics = {kind: topic for kind, topic in names.items() if topic}
     if options.lerobot:
-        drives = record_dataset(
+        from twin.report.bag_dataset import write_bag_dataset
+        from twin.report.drive_dataset import drives_summary
+
+        drives = write_bag_dataset(
             *(options.scene, options.bag, options.lerobot, options.task, options.policy, options.lighting or ""),
             *(options.cause, options.frame, topics),
         )
         if not options.quiet:
-            from twin.report.drive_dataset import drives_summary
-
             print(drives_summary(drives, options.lerobot))
         return
     if len(options.bag) > 1:
@@ -539,8 +309,7 @@ def command(options: argparse.Namespace) -> None:
             raise InputError(f"a trial needs --{name}; without a policy, --lerobot DIR records drives to learn from")
     row, figures, folder = record_trial(
         *(options.scene, options.bag[0], options.policy, options.task, options.lighting, options.out),
-        *(options.twin_lighting, options.cause, options.frame),
-        topics,
+        *(options.twin_lighting, options.cause, options.frame, topics),
     )
     if not options.quiet:
         print(summary(row, figures))

@@ -34,8 +34,9 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
         policies: Names as in tables, `run` or `run/checkpoint`.
 
     Returns:
-        By policy, JSON-able: its run; the step at which it was saved; task, observe and lighting of its training; and
-        the `rate_summary` of the last `RECENT_EPISODES` episodes up to that step.
+        By policy, JSON-able: its run; the step at which it was saved; task, observe and lighting of the training; the
+        `rate_summary` of the last `RECENT_EPISODES` episodes of `read_episodes` up to that step; `first_step`, at which
+        the first of them ended; and `test`, the run's final test if it drove this policy, else None.
     """
     digests = validated_digests(root)
     out = {}
@@ -49,12 +50,33 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
             trained = dict(read_json(head).get("trained", {}))
             if "step" not in trained:
                 continue
-            at = float(trained["step"])
+            at = int(trained["step"])
         steps, success = read_episodes(folder)
-        won = success[steps <= at][-RECENT_EPISODES:]
-        recorded = {key: trained.get(key, "") for key in ("step", "task", "observe", "lighting")}
-        out[policy] = {"run": run, **recorded, **rate_summary(int(won.sum()), len(won))}
+        recent = np.flatnonzero(steps <= at)[-RECENT_EPISODES:]
+        test = _final_test(folder)
+        out[policy] = {
+            "run": run,
+            "step": at,
+            **{key: trained.get(key, "") for key in ("task", "observe", "lighting")},
+            **rate_summary(int(success[recent].sum()), len(recent)),
+            "first_step": int(steps[recent[0]]) if len(recent) else None,
+            "test": test if test and test["step"] == at else None,
+        }
     return out
+
+
+def _final_test(folder: Path) -> dict[str, Any] | None:
+    """A run's final test: step of the tested policy, condition of the episodes, and `rate_summary`; None without it."""
+    path = folder / CHOICE_FILE
+    if not _is_there(path):
+        return None
+    with wrap_read_errors(path, "delete it, and the best policy is selected again"):
+        chosen = dict(read_json(path)["chosen"])
+        step, won, trials = (int(chosen[name]) for name in ("step", "successes", "trials"))
+        if not 0 <= won <= trials or not trials:
+            raise ValueError(f"{won} successes in {trials} trials")
+        condition = str(chosen.get("condition", ""))  # older runs store none
+        return {"step": step, "condition": condition, **rate_summary(won, trials)}
 
 
 def validated_digests(root: Path) -> dict[str, Any]:

@@ -5,12 +5,14 @@ operator states outcomes that poses do not show, such as a collision. `replay` d
 commands, from the same start. `view` renders the field from the poses at which the robot took its pictures.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from twin.env.suite import EnvFactory
 from twin.env.task import Motion, RewardAndTermination
+from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints
 from twin.geometry.images import psnr
 from twin.mjcf.world import heading_at, heading_error
@@ -39,6 +41,23 @@ class JudgedTrial:
     """Yaw relative to the route at the start [rad]."""
     rewards: Array
     """Reward of the step that ended at each instant, without the term for steering, shape (k,); the first is zero."""
+
+    def with_cause(self, cause: str | None, where: Path) -> "JudgedTrial":
+        """The trial with the cause stated by the operator, if one is given; `where` is the recording's name in errors.
+
+        Raises InputError: there is neither a cause nor an outcome, or the cause is the goal, which was not reached.
+        """
+        if cause == "goal" and self.cause != "goal":
+            raise InputError(
+                f"{where}: the recording ends {self.progress[-1]:.1f} m along the task ({self.cause or 'no outcome'}); "
+                "expected a cause of failure, as the goal was not reached"
+            )
+        if not (cause or self.cause):
+            raise InputError(
+                f"{where}: the recording ends after {self.times[-1]:.1f} s and {self.progress[-1]:.1f} m without an "
+                "outcome; record to the end, or say what ended it, such as --cause collision"
+            )
+        return replace(self, cause=cause or self.cause)
 
 
 def judge(factory: EnvFactory, times: Array, poses: Array, uprightness: Array) -> JudgedTrial:

@@ -156,11 +156,16 @@ def lighting_text(lighting: str) -> str:
 
 
 def training_text(trained: dict[str, Any]) -> str:
-    """Describes a training, for instance "on straight, in varying light"."""
-    if trained["observe"] == "simulator":
-        return f"on {trained['task']}, from MuJoCo’s picture of the mesh"
+    """Describes the episodes of a training's result, and the training; see `training_summaries`."""
+    test = trained["test"]
+    if test:
+        episodes = f"final test, n = {test['trials']}" + (f", light {test['condition']}" if test["condition"] else "")
+    else:
+        since = f"ending from step {trained['first_step']:,} on"
+        episodes = f"last training episodes from the task’s start, n = {trained['trials']}, {since}"
     light = "in varying light" if trained["lighting"] in (TRAINING, ANY) else f"in the light {trained['lighting']}"
-    return f"on {trained['task']}, {light}"
+    light = "from MuJoCo’s picture of the mesh" if trained["observe"] == "simulator" else light
+    return f"{episodes}; trained on {trained['task']}, {light}, for {trained['step']:,} steps"
 
 
 def pair_text(pair: dict[str, Any]) -> str:
@@ -296,8 +301,8 @@ def rate_figure(cells: Sequence[dict[str, Any]]) -> Figure:
 def rate_heatmap(cells: Sequence[dict[str, Any]], trained: Mapping[str, float | None]) -> Figure:
     """Success rates on a task [%]: one row per policy, one column per lighting.
 
-    The first column is the rate in training, unless none is known. The next is the mean over the lightings in which
-    all policies drove.
+    The first column is the training's result (`trained`), unless none is known. The next is the mean over the lightings
+    in which all policies drove.
     """
     policies, lightings = (list(dict.fromkeys(c[key] for c in cells)) for key in ("policy", "lighting"))
     rate = matrix({(c["policy"], c["lighting"]): c["rate"] for c in cells}, policies, lightings)
@@ -307,7 +312,7 @@ def rate_heatmap(cells: Sequence[dict[str, Any]], trained: Mapping[str, float | 
     names, label = lighting_labels(lightings)
     shown, columns = np.column_stack([means, rate]), ["mean", *names]
     if np.isfinite(training).any():
-        shown, columns = np.column_stack([training, shown]), ["in training", *columns]
+        shown, columns = np.column_stack([training, shown]), ["training’s result", *columns]
     return heatmap(shown, list(map(shorten_name, policies)), columns, percent_texts(shown), label, FULL_WIDTH)
 
 
@@ -465,7 +470,7 @@ def _task(results: dict[str, Any], task: str) -> dict[str, Any]:
     if len({c["lighting"] for c in mine}) <= MAX_PLOTTED_LIGHTINGS:
         title, figure = f"Share of episodes that reached the goal, with 90% intervals ({each})", rate_figure(mine)
     else:
-        trained = {policy: rate["rate"] for policy, rate in results["training"].items()}
+        trained = {policy: (row["test"] or row)["rate"] for policy, row in results["training"].items()}
         title = f"Episodes that reached the goal [%] ({each}); the mean is over the lights that all policies drove in"
         figure = rate_heatmap(mine, trained)
     pair_title = (

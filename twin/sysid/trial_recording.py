@@ -1,7 +1,7 @@
 """A trial on the road, read from the robot's bag: pictures, calibration, poses and commands.
 
 Times are nanoseconds (`twin.capture.bag.message_times`). Poses are planar, in the frame of their topic (odometry, RTK);
-`fit_frame` finds the pose of that frame in the scene, from pictures located there. Pictures are read from the bag only
+`frame_fit.py` finds the pose of that frame in the scene, from pictures located there. Pictures are read from the bag only
 when they are needed.
 """
 
@@ -30,10 +30,11 @@ from twin.capture.bag import (
 )
 from twin.capture.scale import local_east_north_up
 from twin.errors import InputError
-from twin.types import Array
-from twin_policy import Camera, PictureError
+from twin.types import Array, Image
+from twin_policy import Camera, PictureError, Rectifier
 
 _STEP = 0.3  # [m] a fix's heading is the direction of motion from this far before it to this far after it
+_MOVING = 0.02  # [m/s], [rad/s]; a drive starts with the first command that exceeds this
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,57 @@ class TrialRecording:
                 if stamp is not None and stamp in wanted:
                     wanted.discard(stamp)
                     yield stamp, picture_of(message)
+
+    def rectified(self, stamps: NDArray[np.int64], rectify: Rectifier) -> Iterator[tuple[int, Image]]:
+        """Yields stamp and rectified picture (h, w, 3) of the pictures with these stamps, in order.
+
+        Raises InputError: a picture cannot be decoded or rectified.
+        """
+        for stamp, picture in self.pictures(stamps):
+            try:
+                yield stamp, rectify(picture.decode())
+            except PictureError as error:
+                raise InputError(f"{self.path}: {self.topics['pictures']}: {error}") from None
+
+    def rectifier(self, size: tuple[int, int], intrinsics: Any) -> Rectifier:
+        """Rectifier to a pinhole camera of width, height [px] and fx, fy, cx, cy [px].
+
+        Raises InputError: the intrinsics are not four numbers, or the camera sees too little of the pinhole camera.
+        """
+        try:
+            fx, fy, cx, cy = map(float, intrinsics)
+            return Rectifier(self.camera, Camera(size, (fx, fy, cx, cy)))
+        except (PictureError, TypeError, ValueError) as error:
+            raise InputError(f"{self.path}: {error}") from None
+
+    def start(self) -> int:
+        """Time of the first command that moves the robot [ns]. Raises InputError: there is none."""
+        moving = np.flatnonzero(np.abs(self.commands).max(1, initial=0.0) > _MOVING)
+        if not len(moving):
+            topic = self.topics["commands"]
+            raise InputError(f"{self.path}: no command on {topic} moves the robot; record the whole trial")
+        return int(self.command_times[moving[0]])
+
+    def motion_at_steps(self, start: int, period: float) -> tuple[Array, Array, Array]:
+        """Samples the poses once per control step of `period` [s], from `start` [ns] to the last recorded pose.
+
+        Returns:
+            Times since the start [s] (n,), poses (n, 3) in the frame of their topic, and uprightness (n,).
+
+        Raises:
+            InputError: the poses begin after the start, or end within the first step.
+        """
+        left = (int(self.pose_times[-1]) - start) * 1e-9
+        steps = int(left / period + 1e-6)
+        if start < self.pose_times[0] or steps < 1:
+            raise InputError(
+                f"{self.path}: {self.topics['poses']} has poses from {(int(self.pose_times[0]) - start) * 1e-9:.1f} to "
+                f"{left:.1f} s after the first command; expected the whole trial"
+            )
+        times = np.arange(steps + 1) * np.float64(period)
+        stamps = start + np.round(times * 1e9).astype(np.int64)
+        upright = np.interp(stamps - start, self.pose_times - start, self.uprightness)
+        return times, self.poses_at(stamps), upright
 
 
 def read_trial(path: Path, given: dict[str, str] | None = None) -> TrialRecording:
@@ -185,70 +237,3 @@ def _headings(xy: Array) -> Array:
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1)))
     ahead, behind = (np.stack([np.interp(way + d, way, c) for c in xy.T], -1) for d in (_STEP, -_STEP))
     return np.unwrap(np.arctan2(*(ahead - behind).T[::-1]))
-
-
-# ---- the frame of the poses
-
-_MIN_LOCATED, _MIN_WAY = 5, 2.0  # least number of pictures; [m] least distance of the farthest pose from the first
-_MAX_RESIDUAL = 0.25  # [m] rms
-_OUTLIER = 3.0  # pictures whose residual is above this multiple of the median are left out
-_ROUNDS = 5
-
-
-@dataclass(frozen=True)
-class FrameFit:
-    """Rotation and shift from a recording's frame to the scene's, and how well they fit."""
-
-    yaw: float
-    """[rad]"""
-    shift: Array
-    """[m], shape (2,)."""
-    residual: float = 0.0
-    """Root mean square distance between the poses and the located pictures [m]."""
-    scale: float = 1.0
-    """Metres of the scene per metre of the poses, from the same pictures; reported only, not applied to poses."""
-    located: int = 0
-    """Pictures used."""
-
-    def __call__(self, poses: Array) -> Array:
-        """Poses (n, 3) in the scene."""
-        cos, sin = np.cos(self.yaw), np.sin(self.yaw)
-        xy = poses[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + self.shift
-        return np.column_stack([xy, poses[:, 2] + self.yaw])
-
-
-def fit_frame(poses: Array, located: Array, where: str) -> FrameFit:
-    """Fits the frame to positions, without a scale; wrongly located pictures are left out.
-
-    Args:
-        poses: Recorded poses at the pictures' stamps, shape (n, 3).
-        located: Poses of the base in the scene, located from the same pictures, shape (n, 3).
-        where: The recording's name in errors.
-
-    Raises:
-        InputError: too few pictures, too short a way, or poses that do not fit.
-    """
-    source, target = (one[:, 0] + 1j * one[:, 1] for one in (poses, located))
-    way = float(np.abs(source - source[:1]).max(initial=0.0))
-    if len(poses) < _MIN_LOCATED or way < _MIN_WAY:
-        raise InputError(
-            f"{where}: {len(poses)} pictures were located in the scene, over {way:.1f} m; expected {_MIN_LOCATED} over "
-            f"{_MIN_WAY:g} m: is it the same place, in light like that of a film? If the poses are already in the "
-            "scene's frame, --frame scene"
-        )
-    use = np.ones(len(poses), bool)
-    for _ in range(_ROUNDS):
-        a, b = source[use] - source[use].mean(), target[use] - target[use].mean()
-        turn = (a.conj() * b).sum()
-        yaw = float(np.angle(turn))
-        shift = target[use].mean() - np.exp(1j * yaw) * source[use].mean()
-        off = np.abs(np.exp(1j * yaw) * source + shift - target)
-        use = off <= max(_OUTLIER * float(np.median(off)), 0.05)
-    residual, scale = float(np.sqrt((off[use] ** 2).mean())), float(abs(turn) / (np.abs(a) ** 2).sum())
-    if residual > _MAX_RESIDUAL:
-        raise InputError(
-            f"{where}: poses and located pictures differ by {residual:.2f} m (rms); expected at most "
-            f"{_MAX_RESIDUAL:g}: wheel odometry drifts in turns; record RTK or LiDAR odometry, or name its topic with "
-            "--poses"
-        )
-    return FrameFit(yaw, np.array([shift.real, shift.imag]), residual, scale, int(use.sum()))

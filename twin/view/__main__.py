@@ -4,8 +4,8 @@
     python -m twin.view scenes/demo --policy first --task straight
     python -m twin.view scenes/demo --path scenes/demo/paths/path.json --out film.mp4
 
-The page needs no GPU and no network. It is served to this machine alone unless `--host` names another address; then its
-address has a token.
+The page needs no GPU and no network. It is served to this machine alone unless `--host` names another address; then the
+printed address has a token that the browser needs.
 """
 
 import argparse
@@ -90,11 +90,11 @@ def serve(twin: Twin, given: argparse.Namespace) -> None:
 
     page = open_page(twin, given.host, given.port, given.lighting, announce)
     try:
-        page.loop.has_shown.wait(_HEAD_START)  # rendering the first picture needs all cores
+        page.viewer.loop.has_shown.wait(_HEAD_START)  # rendering the first picture needs all cores
         load_driving(page, given.task, policy, given.seed)
         threading.Event().wait()
     finally:
-        page.close()
+        page.viewer.close()
 
 
 def open_page(
@@ -106,7 +106,7 @@ def open_page(
 ) -> "Page":
     """Opens the page of a built scene, without the robot.
 
-    `announce` is called with its address as soon as the page can be opened, before the field is loaded.
+    `announce` is called with the page's address as soon as a browser can open it, before the field is loaded.
 
     Raises:
         InputError: viser is missing, the scene has no field, or an unknown lighting or unusable address.
@@ -123,7 +123,7 @@ def open_page(
     server = open_server(host, port, "twin view")
     try:
         announce(server.url)
-        # A browser loads the page while this goes on.
+        # The browser loads the page during the rest.
         from twin.view.camera_path import named_lighting
         from twin.view.page import Page
 
@@ -136,7 +136,7 @@ def open_page(
 
 
 def _check_driver(twin: Twin, given: argparse.Namespace) -> "Policy | None":
-    """The policy that may drive. Raises InputError: an unknown policy or task, or a negative seed."""
+    """The policy given by `--policy`, if any. Raises InputError: an unknown policy or task, or a negative seed."""
     if given.seed < 0:
         raise InputError(f"--seed {given.seed}: expected 0 or more")
     if given.task is not None:
@@ -160,14 +160,14 @@ def load_driving(page: "Page", task: str | None = None, policy: "Policy | None" 
     try:
         from twin.view.driving import Driving
 
-        held, lighting = page.guarded.keys.held, page.lighting
-        driving = Driving(page.twin, page.field, task or "route", policy, lighting, held, page.drove, seed)
+        shown = page.viewer
+        held = shown.guarded.keys.held
+        driving = Driving(shown.twin, shown.field, task or "route", policy, shown.lighting, held, page.drove, seed)
     except InputError as error:
         if task is not None or policy is not None:
             raise
         page.no_driving(str(error))
         return
-    page.picture.add_objects(driving.world, driving.obstacles.pool)
     page.add_driving(driving)
 
 

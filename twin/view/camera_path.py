@@ -4,7 +4,7 @@
 
 `time` [s] increases, `camera_to_world` is 4×4 with OpenCV axes in the scene's frame, `fov` [°] is the vertical angle of
 view, and `lighting` is a name or mixture as for `twin film`, or an embedding as a list of numbers; by default it is the
-first filmed lighting. Positions follow a cubic spline, rotations a spline of their own; angle of view, lighting and fog
+first filmed lighting. Positions follow a cubic spline, and rotations a rotation spline; angle of view, lighting and fog
 are interpolated linearly.
 """
 
@@ -71,7 +71,7 @@ class CameraPath:
         knots = np.array([view.time for view in self.views]) - self.views[0].time
         poses = np.array([view.camera_to_world for view in self.views])
         t = np.clip(times, 0.0, knots[-1])
-        # A cubic spline would overshoot at a standstill. With one, or with only two views, a monotone one is used.
+        # A cubic spline overshoots where the camera stands still; then, or with two views only, it is a monotone one.
         still = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).min() < 1e-6
         curve = PchipInterpolator if still or len(knots) == 2 else CubicSpline
         out = np.tile(np.eye(4), (len(t), 1, 1))

@@ -52,7 +52,7 @@ class LoadedTwin(Twin):
 
 @dataclass(frozen=True)
 class DriveFacts:
-    """State of the drive after a control step."""
+    """State of the drive after a control step: speed [m/s], yaw rate [rad/s], cross-track and progress [m]."""
 
     time: float
     """[s]"""

@@ -120,7 +120,7 @@ class GuardedServer:
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def set_driving(self, driving: bool) -> None:
-        """Tells the pages whether the keys W A S D drive the robot (True) or move the camera (False)."""
+        """Makes the keys W A S D drive the robot (True) or move the camera (False), on all pages."""
         self._driving = driving
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the server has stopped
@@ -138,7 +138,7 @@ class GuardedServer:
                 await page.send(json.dumps({"driving": self._driving}))
 
     async def hear_keys(self, page: ServerConnection) -> None:
-        """Serves the socket of one page."""
+        """Receives the held keys of one page until its socket closes."""
         self._loop = asyncio.get_running_loop()
         self._pages.add(page)
         try:
@@ -253,7 +253,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def _index_page() -> Callable[[Request], Response]:
-    """viser's page with our script in it."""
+    """Answers requests with viser's page, in which `page.js` is embedded."""
     page = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text(encoding="utf-8")
     script = resources.files("twin.view").joinpath("page.js").read_text(encoding="utf-8")
     head = page.index("</head>")

@@ -175,7 +175,7 @@ def picture_size(page: tuple[int, int], area: int) -> tuple[int, int] | None:
 
 
 def film_camera(film: FilmedFrame, size: tuple[int, int]) -> FreeCamera:
-    """The frame's camera, with the frame in the middle of a picture, as large as fits."""
+    """The frame's camera for a picture of a size, in whose middle the frame is as large as fits."""
     height, width = film.image.shape[:2]
     scale = min(size[0] / width, size[1] / height)
     offset = (np.array(size) - scale * np.array([width, height])) / 2.0
