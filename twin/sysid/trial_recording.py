@@ -1,8 +1,8 @@
 """A trial on the road, read from the robot's bag: pictures, calibration, poses and commands.
 
 Times are nanoseconds (`twin.capture.bag.message_times`). Poses are planar, in the frame of their topic (odometry, RTK);
-`frame_fit.py` finds the pose of that frame in the scene, from pictures located there. Pictures are read from the bag only
-when they are needed.
+`frame_fit.py` finds the pose of that frame in the scene, from pictures located there. Pictures are read from the bag
+only when they are needed.
 """
 
 from collections.abc import Iterator
