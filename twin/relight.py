@@ -128,7 +128,8 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     with single_threaded_torch():
         halves = [[fit(np.flatnonzero(h), start, with_fog) for h in masks] for with_fog in (False, True)]
         clear, foggy = (
-            float(np.mean([psnr(render(*one), photo, ~h) for one, h in zip(fits, masks, strict=True)])) for fits in halves
+            float(np.mean([psnr(render(*one), photo, ~h) for one, h in zip(fits, masks, strict=True)]))
+            for fits in halves
         )
         is_foggy = foggy > clear + _FOG_GAIN
         embedding, fog = fit(np.arange(height * width), start, is_foggy)
@@ -356,7 +357,9 @@ def relight(
         figures |= {"sun_azimuth_deg": round(azimuth, 2), "sun_elevation_deg": round(elevation, 2)}
         figures["psnr_no_sun_other_half"] = round(relit.psnr_no_sun_other_half, 3)
     write_image(scene.lightings / f"{name}.png", comparison(name, relit))
-    lighting = AddedLighting(name, [float(x) for x in relit.embedding], relit.fog, result, str(photo), figures, relit.sun)
+    lighting = AddedLighting(
+        name, [float(x) for x in relit.embedding], relit.fog, result, str(photo), figures, relit.sun
+    )
     lighting.save(scene)
     return lighting
 

@@ -208,7 +208,7 @@ class IrradianceEstimator:
 
 
 def _gains(sunlight: Sunlight, points: Array, normals: Array) -> tuple[Array, Array]:
-    """Gain of sunlight at points (n, 3) [m] with normals (n, 3), shape (n, 3), and the suns' share of it, shape (n,)."""
+    """Gain of sunlight at points (n, 3) [m] with normals (n, 3), shape (n, 3), and the suns' share of it, (n,)."""
     gain = np.full((len(points), 3), 1.0 - sum(weight for _, weight in sunlight))
     direct = np.zeros(len(points))
     for sun, weight in sunlight:

@@ -57,8 +57,8 @@ def sun_direction(moment: datetime, latitude: float, longitude: float, heading: 
     compass, elevation = sun_angles(moment, latitude, longitude)
     if not elevation > 0.0:
         raise InputError(
-            f"--time {moment.isoformat()}: the sun is {-elevation:.0f}° below the horizon at {latitude:g},{longitude:g}; "
-            "correct --time or --location, or give --sun none"
+            f"--time {moment.isoformat()}: the sun is {-elevation:.0f}° below the horizon at {latitude:g},{longitude:g}"
+            "; correct --time or --location, or give --sun none"
         )
     return direction(heading - compass, elevation)
 

@@ -24,18 +24,18 @@ from twin.types import Array, Array32
 if TYPE_CHECKING:
     from twin.nerf.field import RadianceField
 
-SEARCH_TEXEL = 0.4
+SEARCH_TEXEL = 0.5
 """[m] texels of the shadow maps of a search."""
-_ELEVATIONS = (8.0, 16.0, 26.0, 38.0, 52.0)  # [°] elevations of the first directions
-_AZIMUTH_STEP = 20.0  # [°] step of their azimuths
+_ELEVATIONS = (8.0, 18.0, 32.0, 50.0)  # [°] elevations of the first directions
+_AZIMUTH_STEP = 22.5  # [°] step of their azimuths
 _ELEVATION_RANGE = (3.0, 80.0)  # [°] of a search
 _REFINEMENTS = (9.0, 5.0, 2.5)  # [°] steps of the further searches around the best directions
 _STARTS = 2  # number of first directions around which the search goes on
 _BASES = 2  # number of bases for which it goes on, besides the fitted embedding
-_RIDGE = 3e-3  # weight of the squared differences of coefficients from those without a sun
+_RIDGE = 2e-4  # weight of the squared differences of coefficients from those without a sun
 _PLAIN = np.array([1.0, 0.0, 1.0, 0.0, 0.0])  # coefficients of the terms without a sun
-_STEPS = 150
-_RAYS, _SEARCH_RAYS = 10_000, 4_000  # pixels of the joint fits and of the searches, evenly spaced over the photo
+_STEPS = 100
+_RAYS, _SEARCH_RAYS = 6_000, 2_500  # pixels of the joint fits and of the searches, evenly spaced over the photo
 _EMBEDDING_RATE, _COEFFICIENT_RATE = 0.03, 0.03  # learning rates
 _EXTINCTION_RATE, _AIRLIGHT_RATE = 0.1, 0.03  # of the logarithm of extinction, and of the airlight
 _PRIOR = 1e-2  # weight of the squared distance from the initial embedding
