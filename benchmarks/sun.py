@@ -2,16 +2,15 @@
 
     python benchmarks/sun.py SCENE [--place N] [--camera N] [--days N ...] [--json FILE] [--pictures FOLDER]
 
-The scene was built from the film of a generated place (`twin reality film`). For each day, by number, a photo from the
-start of the road is relit as `twin relight` does, in three ways: without a sun, with the sun searched in the photo, and
-with the day's true sun. Printed are the nearest filmed lighting's PSNR of the photo, the PSNR of each half of the photo
-under the fit to the other half, and the mean PSNR of pictures of the day from other stations of the road [dB]. *Sunny*
-days are those on which the sun casts shadows. The added lightings, `benchmark_...`, are removed afterwards.
+The scene was built from the film of a generated place (`twin reality film`). For each day, by number, a lighting is
+fitted to a photo from the start of the road as `twin relight` does, but at the photo's true pose, in three ways: with no
+sun (`embedding`), with the sun searched in the photo, and with the day's true sun. Printed are the nearest filmed
+lighting's PSNR of the photo, the PSNR of each half of the photo under the fit to the other half, and the mean PSNR of
+pictures of the day from other stations of the road [dB]. *Sunny* days are those on which the sun casts shadows.
 """
 
 import argparse
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +19,11 @@ from record import add_record_options, save
 
 from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
-from twin.geometry.shadow_map import angles
+from twin.geometry.shadow_map import ShadowCasters, angles
 from twin.loading import load_scene
 from twin.nerf.baked import BakedField
-from twin.nerf.sun import relit
+from twin.nerf.fog import Fog
+from twin.nerf.sun import Sunlight, relit
 from twin.reality import recordings
 from twin.reality.comparison import align_rigid, matched_poses
 from twin.reality.lighting import Lighting, weather
@@ -31,7 +31,7 @@ from twin.reality.real_camera import draw_camera, intrinsics_of
 from twin.reality.real_test import Setup
 from twin.reality.trial_place import place_on_test_day
 from twin.reality.truth import Truth
-from twin.relight import relight
+from twin.relight import PhotoFit, SunSource, fit_photo, shadow_casters, with_sun
 
 SIZE = (240, 135)  # [px]
 STATIONS = 7  # the photo is taken at the first one
@@ -39,31 +39,70 @@ FIRST, MARGIN = 4.0, 6.0  # [m] the first station; distance of the last one from
 VARIANTS = ("embedding", "searched", "true")
 
 
-def day_pictures(setup: Setup, light: Lighting) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray]:
-    """Photo at full size, pictures at all stations (stations, h, w, 3), and true camera_to_world poses."""
+def day_pictures(setup: Setup, light: Lighting) -> tuple[NDArray[np.float32], NDArray]:
+    """Pictures at all stations (stations, h, w, 3), the first of which is the photo, and true camera_to_world poses."""
     line = place_on_test_day(setup.place).route
     robot, camera = recordings.robot_and_camera(setup, light)
-    rows, poses, photo = [], [], None
+    rows, poses = [], []
     for station in np.linspace(FIRST, line.length - MARGIN, STATIONS):
         recordings.set_on_line(robot, line, float(station))
         poses.append(camera.pose(robot, robot.time))
-        full = camera.capture(robot)
-        photo = full if photo is None else photo
-        rows.append(np.asarray(resize(full, *SIZE), np.float32) / 255.0)
-    assert photo is not None
-    return photo, np.array(rows), np.array(poses)
+        rows.append(np.asarray(resize(camera.capture(robot), *SIZE), np.float32) / 255.0)
+    return np.array(rows), np.array(poses)
 
 
-def shown(field: BakedField, views: Viewpoints, rays: NDArray, poses: NDArray, lighting: str) -> NDArray[np.float32]:
-    """Pictures of the field in a lighting with its sun and fog, from poses, shape (n, h, w, 3)."""
-    out = field.render(views, lighting)
-    lengths = np.linalg.norm(rays, axis=-1).astype(np.float32)
-    fog, suns = field.fog(lighting), field.sunlight(lighting)
-    many = []
-    for rgb, depth, pose in zip(out.rgb, out.depth, poses, strict=True):
-        lit = relit(rgb, depth, rays, pose, suns)
-        many.append(np.clip(fog.apply(lit, depth * lengths) if fog else lit, 0.0, 1.0))
-    return np.array(many)
+class Views:
+    """Pictures of a field from the stations."""
+
+    def __init__(self, field: BakedField, poses: NDArray, intrinsics: NDArray) -> None:
+        self._field, self._poses = field, poses
+        self._cameras = Viewpoints.of(poses, intrinsics, SIZE)
+        self._rays = unproject(pixel_grid(*SIZE), intrinsics)
+
+    def shown(self, lighting: str | NDArray, fog: Fog | None = None, suns: Sunlight = ()) -> NDArray[np.float32]:
+        """Pictures in a lighting, shape (stations, h, w, 3)."""
+        out = self._field.render(self._cameras, lighting)
+        lengths = np.linalg.norm(self._rays, axis=-1).astype(np.float32)
+        many = []
+        for rgb, depth, pose in zip(out.rgb, out.depth, self._poses, strict=True):
+            lit = relit(rgb, depth, self._rays, pose, suns)
+            many.append(np.clip(fog.apply(lit, depth * lengths) if fog else lit, 0.0, 1.0))
+        return np.array(many)
+
+
+def fitted(relit_photo: PhotoFit, views: Views) -> NDArray[np.float32]:
+    """Pictures in the light of a fit, shape (stations, h, w, 3)."""
+    suns = ((relit_photo.sun, 1.0),) if relit_photo.sun else ()
+    return views.shown(relit_photo.embedding, relit_photo.fog, suns)
+
+
+def day_row(
+    truth: NDArray[np.float32],
+    toward: NDArray | None,
+    field,
+    views: Views,
+    pose: NDArray,
+    casters: ShadowCasters,
+    k: NDArray,
+) -> tuple[dict[str, object], list[NDArray[np.float32]]]:
+    """The figures of one day, and its pictures: true, under the embedding, with the searched and with the true sun.
+
+    `toward` is the direction to the day's sun in the scene, None if it casts no shadows.
+    """
+    plain = fit_photo(field, truth[0], pose, k)
+    fits = {"embedding": plain, "searched": with_sun(field, plain, casters, SunSource(None, "searched"))}
+    if toward is not None:
+        fits["true"] = with_sun(field, plain, casters, SunSource(toward, "true"))
+    pictures = {"filmed": views.shown(plain.nearest)} | {name: fitted(one, views) for name, one in fits.items()}
+    row: dict[str, object] = {"half.filmed": plain.psnr_nearest}
+    row |= {f"half.{name}": one.psnr_other_half for name, one in fits.items()}
+    for name, many in pictures.items():
+        row[f"elsewhere.{name}"] = float(np.mean([psnr(a, b) for a, b in zip(many[1:], truth[1:], strict=True)]))
+    sun = fits["searched"].sun
+    row["found"] = sun is not None
+    if sun is not None and toward is not None:
+        row["direction_error_deg"] = float(np.rad2deg(np.arccos(np.clip(sun.toward @ toward, -1.0, 1.0))))
+    return row, [truth, *(pictures[name] for name in fits)]
 
 
 def main() -> int:
@@ -78,48 +117,22 @@ def main() -> int:
     twin, setup = load_scene(given.scene), Setup(given.place, 0, given.camera)
     cameras = Cameras.load(twin.scene.stage("metric"))
     from_truth = align_rigid(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras)).inverse()
-    intrinsics = intrinsics_of(draw_camera(setup.camera), SIZE)
-    rays = unproject(pixel_grid(*SIZE), intrinsics)
-    days = {}
+    intrinsics, casters = intrinsics_of(draw_camera(setup.camera), SIZE), shadow_casters(twin.scene)
+    assert casters is not None
+    field, baked, days = twin.radiance_field("cpu"), twin.field(), {}
     for number in given.days:
         light = weather(f"day_{number}")
-        photo, truth, poses = day_pictures(setup, light)
+        truth, poses = day_pictures(setup, light)
         poses = from_truth.poses(poses)
         ray, _, is_sunny = light.suns[0]
         toward = -from_truth.rotation @ np.array(ray) / np.linalg.norm(ray)
+        views = Views(baked, poses, intrinsics)
+        row, pictures = day_row(truth, toward if is_sunny else None, field, views, poses[0], casters, intrinsics)
         azimuth, elevation = angles(toward)
-        row: dict[str, object] = {"sunny": bool(is_sunny), "azimuth_deg": azimuth, "elevation_deg": elevation}
-        views, pictures = Viewpoints.of(poses, intrinsics, SIZE), [truth]
-        for variant in VARIANTS if is_sunny else VARIANTS[:2]:
-            name = f"benchmark_{variant}_{number}"
-            sun = {"embedding": "none", "searched": None, "true": f"{azimuth:.2f},{elevation:.2f}"}[variant]
-            try:
-                with tempfile.TemporaryDirectory() as folder:
-                    write_image(Path(folder) / "photo.png", photo)
-                    added = relight(given.scene, Path(folder) / "photo.png", name, sun)
-                field = twin.field()
-                mine = shown(field, views, rays, poses, name)
-            finally:
-                for suffix in ("json", "png"):
-                    (twin.scene.lightings / f"{name}.{suffix}").unlink(missing_ok=True)
-            pictures.append(mine)
-            if variant == "embedding":
-                nearest = str(added.figures["nearest"])
-                filmed = shown(field, views, rays, poses, nearest)
-                row["half.filmed"] = added.figures["psnr_nearest"]
-                row["elsewhere.filmed"] = float(
-                    np.mean([psnr(a, b) for a, b in zip(filmed[1:], truth[1:], strict=True)])
-                )
-            row[f"half.{variant}"] = added.figures["psnr_other_half"]
-            elsewhere = [psnr(a, b) for a, b in zip(mine[1:], truth[1:], strict=True)]
-            row[f"elsewhere.{variant}"] = float(np.mean(elsewhere))
-            if variant == "searched":
-                row["found"] = added.sun is not None
-                if added.sun is not None and is_sunny:
-                    cosine = float(np.clip(added.sun.toward @ toward, -1.0, 1.0))
-                    row["direction_error_deg"] = float(np.rad2deg(np.arccos(cosine)))
-        days[f"day_{number}"] = row
-        text = " ".join(f"{k} {v:.2f}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items())
+        days[f"day_{number}"] = row | {"sunny": is_sunny, "azimuth_deg": azimuth, "elevation_deg": elevation}
+        text = " ".join(
+            f"{k} {v:.2f}" if isinstance(v, float) else f"{k} {v}" for k, v in days[f"day_{number}"].items()
+        )
         print(f"day_{number}: {text}", flush=True)
         if given.pictures:
             given.pictures.mkdir(parents=True, exist_ok=True)

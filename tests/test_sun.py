@@ -109,7 +109,7 @@ def test_gain_is_that_of_its_definition():
     some = points[tuple(rows.T)]
     around = some[:, None] + 0.4 * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
     rays = np.broadcast_to(toward, (around.size // 3, 3))
-    lit = (surface.cast(around.reshape(-1, 3) + [0, 0, 1e-3], rays) < 0.0).reshape(around.shape[:2])
+    lit = (surface.cast(around.reshape(-1, 3) + np.array([0.0, 0.0, 1e-3]), rays) < 0.0).reshape(around.shape[:2])
     sure = (lit == lit[:, :1]).all(1)
     expected = sun.coefficients[0] + sun.coefficients[1] * (lit[sure, :1] * toward[2])
     assert lit[sure, 0].any() and not lit[sure, 0].all()
@@ -159,7 +159,7 @@ def test_a_photo_made_by_the_model_is_recovered(fog):
     np.testing.assert_allclose(exact.coefficients[:2], sun.coefficients[:2], atol=0.1)
     found = search_directions(problem, ShadowCasters(*_mesh()), fog)[1]
     assert np.rad2deg(np.arccos(found.toward @ toward)) < 6.0
-    assert found.error < 1.5 * exact.error
+    assert found.error < 2.0 * exact.error
 
 
 def test_sun_survives_its_file_and_damaged_ones_are_refused():

@@ -12,6 +12,7 @@ edges of shadows are soft.
 
 import base64
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -85,6 +86,11 @@ class ShadowMap:
     height: Array32
     """Largest coordinate along `toward` in each texel [m], −inf where nothing is; shape (rows, columns)."""
 
+    @cached_property
+    def _height(self) -> Any:
+        """`height` for the kernel, without infinities."""
+        return wp.array(np.maximum(self.height, np.float32(-1e9)), dtype=float, device="cpu")
+
     @staticmethod
     def of_mesh(vertices: Array, faces: NDArray, toward: Array, texel: float = TEXEL) -> "ShadowMap":
         """Casts a ray from the sun through each texel of the map of a mesh, vertices (n, 3) [m] and faces (m, 3)."""
@@ -95,10 +101,9 @@ class ShadowMap:
         right, upward = plane_axes(self.toward)
         # Single precision suffices, as scenes are some hundred meters wide.
         at = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device="cpu")
-        height: Any = wp.array(np.maximum(self.height, np.float32(-1e9)), dtype=float, device="cpu")
         out = wp.empty(len(points), dtype=float, device="cpu")
         axes = (wp.vec3(*axis.tolist()) for axis in (right, upward, self.toward))
-        inputs = [height, at, *axes, wp.vec2(*self.origin.tolist()), self.texel, bias, _RAMP]
+        inputs = [self._height, at, *axes, wp.vec2(*self.origin.tolist()), self.texel, bias, _RAMP]
         wp.launch(_look_up, len(points), inputs=inputs, outputs=[out], device="cpu")
         return out.numpy()
 

@@ -241,6 +241,8 @@ class SunFit:
     """The field in this light, from the photo's pose, shape (h, w, 3)."""
     psnr_other_half: float
     """Mean PSNR of each half of the photo under the fit to the other half [dB]."""
+    disagreement: float
+    """Angle between the directions found in the two halves [°]; 0 if the direction was given."""
 
 
 def fit_sun(
@@ -313,4 +315,6 @@ def fit_sun(
     base = max(scores, key=lambda k: scores[k])
     found = refine(whole, *solve(whole)[base])
     embedding, sun, fog = found
-    return SunFit(sun, embedding, fog, names[base], picture(*found), scores[base])
+    one, other = (fits[base][0].toward for fits in solved)
+    disagreement = float(np.rad2deg(np.arccos(np.clip(one @ other, -1.0, 1.0))))
+    return SunFit(sun, embedding, fog, names[base], picture(*found), scores[base], disagreement)
