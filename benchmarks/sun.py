@@ -3,10 +3,10 @@
     python benchmarks/sun.py SCENE [--place N] [--camera N] [--days N ...] [--json FILE] [--pictures FOLDER]
 
 The scene was built from the film of a generated place (`twin reality film`). For each day, by number, a lighting is
-fitted to a photo from the start of the road as `twin relight` does, but at the photo's true pose, in three ways: with no
-sun (`embedding`), with the sun searched in the photo, and with the day's true sun. Printed are the nearest filmed
-lighting's PSNR of the photo, the PSNR of each half of the photo under the fit to the other half, and the mean PSNR of
-pictures of the day from other stations of the road [dB]. *Sunny* days are those on which the sun casts shadows.
+fitted to a photo from the start of the road as `twin relight` does, but at the true pose of the photo: without a sun
+(`embedding`), with the sun searched in the photo, and with the true sun. Printed are the nearest filmed lighting's PSNR
+of the photo, the PSNR of each half of the photo under the fit to the other half, and the mean PSNR of pictures of the
+day from other stations of the road [dB]. *Sunny* days are those on which the sun casts shadows.
 """
 
 import argparse
@@ -99,7 +99,7 @@ def day_row(
     for name, many in pictures.items():
         row[f"elsewhere.{name}"] = float(np.mean([psnr(a, b) for a, b in zip(many[1:], truth[1:], strict=True)]))
     sun = fits["searched"].sun
-    row["found"] = sun is not None
+    row |= {"found": sun is not None, "disagreement_deg": fits["searched"].sun_disagreement}
     if sun is not None and toward is not None:
         row["direction_error_deg"] = float(np.rad2deg(np.arccos(np.clip(sun.toward @ toward, -1.0, 1.0))))
     return row, [truth, *(pictures[name] for name in fits)]

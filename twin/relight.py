@@ -77,7 +77,9 @@ class PhotoFit:
     sun_from: str = ""
     """Origin of the sun's direction, or the reason why there is no sun."""
     psnr_no_sun_other_half: float | None = None
-    """`psnr_other_half` for fits without a sun [dB]; None if no sun was tried."""
+    """`psnr_other_half` for fits without a sun [dB]; None if there is no sun."""
+    sun_disagreement: float = 0.0
+    """Angle between the suns found in the two halves of the photo [°]."""
 
 
 def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArray) -> PhotoFit:
@@ -170,7 +172,8 @@ def with_sun(field, relit: PhotoFit, casters: ShadowCasters, source: SunSource) 
     needed = relit.psnr_other_half + (_SUN_GAIN if source.toward is None else 0.0)
     if not lit.psnr_other_half > needed:
         seen = f"with a sun {lit.psnr_other_half:.1f} dB" + ("" if source.toward is None else f" ({source.origin})")
-        return replace(relit, sun_from=f"the photo is not explained better by one: {seen}")
+        because = f"the photo is not explained better by one: {seen}"
+        return replace(relit, sun_from=because, sun_disagreement=lit.disagreement)
     photo, _, nearest = relit.images
     return replace(
         relit,
@@ -182,6 +185,7 @@ def with_sun(field, relit: PhotoFit, casters: ShadowCasters, source: SunSource) 
         sun=lit.sun,
         sun_from=source.origin,
         psnr_no_sun_other_half=relit.psnr_other_half,
+        sun_disagreement=lit.disagreement,
     )
 
 
