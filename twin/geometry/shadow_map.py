@@ -100,7 +100,7 @@ class ShadowMap:
         """Fraction of the sunlight that reaches points (n, 3) [m], shape (n,); 1 outside the map."""
         right, upward = plane_axes(self.toward)
         # Single precision suffices, as scenes are some hundred meters wide.
-        at = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device="cpu")
+        at: Any = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device="cpu")
         out = wp.empty(len(points), dtype=float, device="cpu")
         axes = (wp.vec3(*axis.tolist()) for axis in (right, upward, self.toward))
         inputs = [self._height, at, *axes, wp.vec2(*self.origin.tolist()), self.texel, bias, _RAMP]
