@@ -195,6 +195,9 @@ def test_unusable_input_ends_with_one_line_and_status_2(scene, tmp_path, capsys)
         ([str(scene.root), photo, "--name", "a:b"], "expected a name of letters"),
         ([str(scene.root), photo, "--name", "../x"], "expected a name of letters"),
         ([str(tmp_path), photo, "--name", "x"], "no scene.toml"),
+        ([str(scene.root), photo, "--name", "x", "--sun", "high"], "--sun high: expected azimuth and elevation"),
+        ([str(scene.root), photo, "--name", "x", "--time", "noon"], "--time 'noon': expected date, time and offset"),
+        ([str(scene.root), photo, "--name", "x", "--sun", "120,35"], "a sun needs the stage mesh"),
     ):
         assert main([*arguments, "--quiet"]) == 2
         error = capsys.readouterr().err.strip()
@@ -214,7 +217,8 @@ def test_error_names_a_damaged_file(scene):
             (without_air, r"is damaged \(KeyError: 'air'"),
             (bad_air, r"is damaged \(ValueError: air -0\.1"),
             (whole | {"air": {"extinction": 0.1, "airlight": [1, 2, 1]}}, r"is damaged \(ValueError: air 0\.1"),
-            (whole | {"format": 3}, "format 3, expected 2; fit it again"),
+            (whole | {"format": 4}, "format 4, expected 3; fit it again"),
+            (whole | {"format": 3, "sun": {"coefficients": {}}}, r"is damaged \(KeyError: 'ambient'"),
         ):
             path.write_text(json.dumps(head))
             with pytest.raises(InputError, match=rf"broken\.json:? {words}") as error:
@@ -228,8 +232,8 @@ def test_lighting_of_format_1_is_stale(scene):
     path = scene.lightings / "early.json"
     path.write_text('{"format": 1, "name": "early", "embedding": [0, 0, 0, 0, 0, 0, 0, 0], "field": "first"}')
     try:
-        fresh, stale, airs = added_lightings(scene, 8)
-        assert stale == ("early",) and "early" not in {**fresh, **airs}
+        fresh, stale, airs, suns = added_lightings(scene, 8)
+        assert stale == ("early",) and "early" not in {**fresh, **airs, **suns}
         with pytest.raises(
             InputError, match=r"'early': .* by an older twin; fit its photo again: python -m twin\.relight"
         ):

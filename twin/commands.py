@@ -195,12 +195,26 @@ twin new SCENE VIDEO... writes such a folder.
 
 def _relight(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Add a lighting to a built scene from one photo: the photo is located, then the field's appearance embedding "
-        "and the fog are fitted to it. The twin can then be rendered in that light from everywhere."
+        "Add a lighting to a built scene from one photo: the photo is located, then the field's appearance embedding, "
+        "the fog and the sun are fitted to it. The twin can then be rendered in that light from everywhere."
+    )
+    parser.epilog = (
+        "Without --sun and --time the sun's direction is searched in the photo; a sun is kept only if it explains the "
+        "half of the photo that was not fitted better."
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("photo", type=Path, help="an image file that shows the place, from near the filmed path")
     parser.add_argument("--name", required=True, help="name of the lighting; an added one of that name is replaced")
+    parser.add_argument(
+        "--sun",
+        metavar="AZIMUTH,ELEVATION",
+        help="direction of the sun [°], the azimuth counterclockwise from the scene's x axis; none: no sun",
+    )
+    parser.add_argument("--time", help="when the photo was taken, such as 2026-06-01T17:30+02:00; gives the sun")
+    parser.add_argument("--location", metavar="LAT,LON", help="where [°]; default: the GPS positions of the frames")
+    parser.add_argument(
+        "--heading", type=float, metavar="DEG", help="compass angle of the scene's x axis [°]; default: by GPS"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
 

@@ -52,7 +52,7 @@ class Twin:
         from twin.nerf.lightings import added_lightings
 
         field = RadianceField.load(require_stage(self.scene, "field"), device)
-        fresh, stale, _ = added_lightings(self.scene, field.appearance.vectors.shape[1])
+        fresh, stale, *_ = added_lightings(self.scene, field.appearance.vectors.shape[1])
         field.add_lightings(fresh, stale)
         return field
 

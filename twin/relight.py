@@ -1,30 +1,41 @@
 """Verb: adds a lighting to a built scene from a single photo.
 
     python -m twin.relight scenes/demo photo.jpg --name afternoon
+    python -m twin.relight scenes/demo photo.jpg --name afternoon --time 2026-06-01T17:30+02:00 --location 48.14,11.58
 
 This localizes the photo, then fits an appearance embedding and fog so that renderings of the frozen field match the
 photo. The lighting is saved as `<scene>/lightings/afternoon.json`, with an image beside it that shows the photo, the
-field under the fitted lighting, and the field under the most similar filmed lighting. Afterwards,
+field under the fitted lighting, and the field under the most similar filmed lighting. A lighting may have a sun, whose
+direction is given, computed from time and place, or searched in the photo (`nerf/sun_fit.py`). Afterwards,
 `twin.load_scene(scene).field()` has the lighting as `lighting="afternoon"` or in mixtures such as
-`"sun:afternoon:0.5"`; environments apply its fog to their images.
+`"sun:afternoon:0.5"`; environments apply its sun and fog to their images.
 """
 
 import argparse
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin import commands
 from twin.errors import InputError
+from twin.files import load_arrays, wrap_read_errors
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
+from twin.geometry.shadow_map import ShadowCasters, angles, direction
+from twin.geometry.solar import heading_from_gps, parse_time, sun_direction
 from twin.nerf.fog import Fog
 from twin.nerf.lightings import AddedLighting, check_name
+from twin.nerf.sun import Sun
 from twin.scene import SceneDir, require_stage, stage_result
+from twin.types import Array
+
+if TYPE_CHECKING:
+    from twin.nerf.sun_fit import AirFit, TracedPhoto
 
 _CLEAR = Fog()
 _MAX_WIDTH = 480  # [px] longer side of the fitted image, as for training frames
@@ -32,6 +43,7 @@ _STEPS = 300
 _RAYS = 10_000  # the fit uses about this many rays, evenly spaced over the image
 _START_RAYS = 1000  # number of rays by which the most similar filmed frame is chosen
 _FOG_GAIN = 0.2  # [dB] by which fog must improve the half of the image that is not fitted
+_SUN_GAIN = 0.3  # [dB] by which a sun found in the photo must improve the half of the image that is not fitted
 _GAP = 4  # [px] between the images
 _LABEL_SIZE = 13  # [px] text size in the images; usual labels fit into an upright photo 270 px wide
 
@@ -56,6 +68,18 @@ class PhotoFit:
     """Mean PSNR of the left and right half of the image, each under the lighting fitted to the other half [dB]."""
     psnr_clear_other_half: float
     """The same mean for fits without fog [dB]."""
+    traced: "TracedPhoto | None" = None
+    """The photo with what the field has in its pixels."""
+    fits: tuple["AirFit", ...] = ()
+    """The fits to the left half, to the right half and to the whole photo."""
+    sun: Sun | None = None
+    """The fitted sun, or none if it does not improve the fit."""
+    sun_from: str = ""
+    """Origin of the sun's direction, or the reason why there is no sun."""
+    psnr_no_sun_other_half: float | None = None
+    """`psnr_other_half` for fits without a sun [dB]; None if there is no sun."""
+    sun_disagreement: float = 0.0
+    """Angle between the suns found in the two halves of the photo [°]."""
 
 
 def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArray) -> PhotoFit:
@@ -73,6 +97,7 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
 
     from twin.nerf.appearance import fit_appearance
     from twin.nerf.buffers import CameraArrays, single_threaded_torch
+    from twin.nerf.sun_fit import AirFit, TracedPhoto
 
     height, width = photo.shape[:2]
     v, u = np.mgrid[:height, :width] + 0.5
@@ -101,18 +126,142 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     renders = [field.color(features[some], harmonics[some], one) for one in starts]
     start = starts[int(np.argmin([((one - photo.reshape(-1, 3)[some]) ** 2).mean() for one in renders]))]
     left = np.broadcast_to(np.arange(width) < width // 2, (height, width))
+    masks = (left, ~left)
     with single_threaded_torch():
+        halves = [[fit(np.flatnonzero(h), start, with_fog) for h in masks] for with_fog in (False, True)]
         clear, foggy = (
-            float(np.mean([psnr(render(*fit(np.flatnonzero(h), start, with_fog)), photo, ~h) for h in (left, ~left)]))
-            for with_fog in (False, True)
+            float(np.mean([psnr(render(*one), photo, ~h) for one, h in zip(fits, masks, strict=True)]))
+            for fits in halves
         )
         is_foggy = foggy > clear + _FOG_GAIN
         embedding, fog = fit(np.arange(height * width), start, is_foggy)
     fitted = render(embedding, fog)
+    every = np.ones((height, width), bool)
+    whole = zip((*masks, every), (*halves[is_foggy], (embedding, fog)), strict=True)
+    depths = depth.cpu().numpy().reshape(height, width)
     return PhotoFit(
         *(nearest, embedding, fog, (photo, fitted, filmed[nearest])),
         *(psnr(filmed[nearest], photo), psnr(fitted, photo), foggy if is_foggy else clear, clear),
+        TracedPhoto(photo.astype(np.float32), depths, rays, np.asarray(camera_to_world), features, harmonics),
+        tuple(AirFit(np.flatnonzero(h), *one) for h, one in whole),
     )
+
+
+@dataclass(frozen=True)
+class SunSource:
+    """Direction of a photo's sun."""
+
+    toward: Array | None
+    """Unit vector towards the sun in the scene, shape (3,); None: it is searched in the photo."""
+    origin: str
+    """Where the direction comes from."""
+
+
+def with_sun(field, relit: PhotoFit, casters: ShadowCasters, source: SunSource) -> PhotoFit:
+    """The fit with a sun if that improves the half of the photo that is not fitted, or else the same fit.
+
+    A sun that is found in the photo must improve it by `_SUN_GAIN`.
+    """
+    from twin.nerf.buffers import single_threaded_torch
+    from twin.nerf.sun_fit import fit_sun
+
+    assert relit.traced is not None
+    left, right, whole = relit.fits
+    with single_threaded_torch():
+        lit = fit_sun(field, relit.traced, (left, right), whole, casters, source.toward)
+    needed = relit.psnr_other_half + (_SUN_GAIN if source.toward is None else 0.0)
+    if not lit.psnr_other_half > needed:
+        seen = f"with a sun {lit.psnr_other_half:.1f} dB" + ("" if source.toward is None else f" ({source.origin})")
+        because = f"the photo is not explained better by one: {seen}"
+        return replace(relit, sun_from=because, sun_disagreement=lit.disagreement)
+    photo, _, nearest = relit.images
+    return replace(
+        relit,
+        embedding=lit.embedding,
+        fog=lit.fog,
+        images=(photo, lit.picture, nearest),
+        psnr_fitted=psnr(lit.picture, photo),
+        psnr_other_half=lit.psnr_other_half,
+        sun=lit.sun,
+        sun_from=source.origin,
+        psnr_no_sun_other_half=relit.psnr_other_half,
+        sun_disagreement=lit.disagreement,
+    )
+
+
+def find_sun(
+    scene: SceneDir, sun: str | None, time: str | None, location: str | None, heading: float | None
+) -> SunSource | None:
+    """Direction of the sun from the options of the verb; None: no sun is wanted.
+
+    Raises:
+        InputError: an option is malformed, options contradict each other, or location or heading are missing and the
+            scene has no GPS positions.
+    """
+    if sun is not None and time is not None:
+        raise InputError(f"--sun {sun} with --time {time}: expected one of them")
+    if time is None and (location is not None or heading is not None):
+        raise InputError("--location and --heading need a time, such as --time 2026-06-01T17:30+02:00")
+    if sun == "none":
+        return None
+    if sun is not None:
+        azimuth, elevation = _two_numbers("--sun", sun, "azimuth and elevation in degrees, such as 120,35, or none")
+        if not 0.0 < elevation <= 90.0 or abs(azimuth) > 360.0:
+            raise InputError(f"--sun {sun}: expected an azimuth within ±360 and an elevation from 0 to 90 degrees")
+        return SunSource(direction(azimuth, elevation), "given")
+    if time is None:
+        return SunSource(None, "found in the photo")
+    moment = parse_time(time)
+    if heading is not None and not np.isfinite(heading):
+        raise InputError(f"--heading {heading}: expected the compass angle of the scene's x axis in degrees")
+    from twin.capture.capture_data import Capture
+    from twin.capture.scale import local_east_north_up
+    from twin.geometry.cameras import Cameras
+
+    capture = Capture.load(require_stage(scene, "capture"))
+    known = np.isfinite(capture.gps[:, :2]).all(1)
+    if location is not None:
+        place = _two_numbers("--location", location, "latitude and longitude in degrees, such as 48.14,11.58")
+    elif known.any():
+        latitude, longitude = np.median(capture.gps[known, :2], axis=0).tolist()
+        place = latitude, longitude
+    else:
+        raise InputError("--time needs --location LAT,LON, since no frame of the scene has a GPS position")
+    if heading is None:
+        cameras = Cameras.load(require_stage(scene, "metric"))
+        row = {name: i for i, name in enumerate(capture.names)}
+        gps = capture.gps[[row[name] for name in cameras.names]]
+        east_north = np.full((len(gps), 2), np.nan)
+        rows = np.flatnonzero(np.isfinite(gps[:, :2]).all(1))
+        if len(rows):
+            east_north[rows] = local_east_north_up(np.where(np.isfinite(gps[rows]), gps[rows], 0.0))[:, :2]
+        heading = heading_from_gps(cameras.positions[:, :2], east_north)
+        if heading is None:
+            raise InputError(
+                "--time needs --heading DEG, the compass angle of the scene's x axis: the scene's GPS positions do not "
+                "give it"
+            )
+    return SunSource(sun_direction(moment, *place, heading), f"time and place, x axis at {heading % 360.0:.0f}°")
+
+
+def _two_numbers(option: str, text: str, expected: str) -> tuple[float, float]:
+    try:
+        first, second = map(float, text.split(","))
+        if not np.isfinite([first, second]).all():
+            raise ValueError
+    except ValueError:
+        raise InputError(f"{option} {text}: expected {expected}") from None
+    return first, second
+
+
+def shadow_casters(scene: SceneDir) -> ShadowCasters | None:
+    """The surfaces of the mesh stage, which throw shadows; None if the stage is not built."""
+    path = scene.stage("mesh") / "visual.npz"
+    if not path.exists():
+        return None
+    with wrap_read_errors(path, "build the scene again"):
+        data = load_arrays(path)
+        return ShadowCasters(data["vertices"].astype(np.float64), data["faces"].astype(np.int64))
 
 
 def comparison(name: str, relit: PhotoFit) -> NDArray[np.uint8]:
@@ -126,7 +275,7 @@ def comparison(name: str, relit: PhotoFit) -> NDArray[np.uint8]:
     out = (np.clip(row, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     labels = (
         "photo",
-        f"fitted: {name}, {relit.psnr_fitted:.1f} dB",
+        f"fitted{' with sun' if relit.sun else ''}: {name}, {relit.psnr_fitted:.1f} dB",
         f"nearest filmed: {relit.nearest}, {relit.psnr_nearest:.1f} dB",
     )
     for k, label in enumerate(labels):
@@ -134,11 +283,30 @@ def comparison(name: str, relit: PhotoFit) -> NDArray[np.uint8]:
     return out
 
 
-def relight(root: Path, photo: Path, name: str) -> AddedLighting:
+def relight(
+    root: Path,
+    photo: Path,
+    name: str,
+    sun: str | None = None,
+    time: str | None = None,
+    location: str | None = None,
+    heading: float | None = None,
+) -> AddedLighting:
     """Adds the lighting of a photo to a scene under a name, and returns it.
 
+    Args:
+        root: The scene.
+        photo: The image file.
+        name: Name of the lighting.
+        sun: Azimuth, counterclockwise from the scene's x axis, and elevation of the sun [°], as `120,35`; `none`: no
+            sun. By default, the sun is searched in the photo.
+        time: When the photo was taken, with the offset from UTC, as `2026-06-01T17:30+02:00`.
+        location: Latitude and longitude [°], as `48.14,11.58`; by default from the GPS positions of the frames.
+        heading: Compass angle of the scene's x axis [°]; by default from the GPS positions of the frames.
+
     Raises:
-        InputError: the scene is not built, the photo is unusable or cannot be localized, or the name is invalid.
+        InputError: the scene is not built, the photo is unusable or cannot be localized, or the name or an option is
+            invalid.
     """
     scene = SceneDir(root)
     if not scene.config_file.exists():
@@ -155,6 +323,10 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
         require_stage(scene, stage)
     field = RadianceField.load(scene.stage("field"))
     check_name(name, field.lightings)
+    source = find_sun(scene, sun, time, location, heading)
+    casters = shadow_casters(scene) if source else None
+    if source and source.toward is not None and casters is None:
+        raise InputError("a sun needs the stage mesh, whose surfaces throw the shadows; run python -m twin.build SCENE")
     image, facts = load_photo(photo, None)
     try:
         found = register_photo(image, facts, scene)
@@ -166,6 +338,8 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
     lens = lens.scaled(round(lens.width * scale), round(lens.height * scale))
     small = np.asarray(resize(flat, lens.width, lens.height), np.float32) / 255.0
     relit = fit_photo(field, small, found.camera_to_world, lens.intrinsics)
+    if source and casters:
+        relit = with_sun(field, relit, casters, source)
     away = float(np.linalg.norm(Cameras.load(scene.stage("metric")).positions - position, axis=1).min())
     figures = {
         "inliers": found.inliers,
@@ -180,9 +354,16 @@ def relight(root: Path, photo: Path, name: str) -> AddedLighting:
         "psnr_fitted": round(relit.psnr_fitted, 3),
         "psnr_other_half": round(relit.psnr_other_half, 3),
         "psnr_clear_other_half": round(relit.psnr_clear_other_half, 3),
+        **({"sun_from": relit.sun_from} if relit.sun_from else {}),
     }
+    if relit.sun and relit.psnr_no_sun_other_half is not None:
+        azimuth, elevation = angles(relit.sun.toward)
+        figures |= {"sun_azimuth_deg": round(azimuth, 2), "sun_elevation_deg": round(elevation, 2)}
+        figures["psnr_no_sun_other_half"] = round(relit.psnr_no_sun_other_half, 3)
     write_image(scene.lightings / f"{name}.png", comparison(name, relit))
-    lighting = AddedLighting(name, [float(x) for x in relit.embedding], relit.fog, result, str(photo), figures)
+    lighting = AddedLighting(
+        name, [float(x) for x in relit.embedding], relit.fog, result, str(photo), figures, relit.sun
+    )
     lighting.save(scene)
     return lighting
 
@@ -198,12 +379,25 @@ def summary(lighting: AddedLighting) -> str:
         f"{lighting.name}: {f['psnr_nearest']:.1f} dB under the nearest filmed lighting ({f['nearest']}), "
         f"{f['psnr_fitted']:.1f} dB fitted; each half of the image by the other's fit {f['psnr_other_half']:.1f} dB\n"
         + (f"visibility {3.0 / fog.extinction:.0f} m; {clear}" if fog.extinction else "no fog")
+        + _sun_line(f)
     )
+
+
+def _sun_line(figures: dict) -> str:
+    """The line of the summary about the sun."""
+    if "sun_azimuth_deg" in figures:
+        return (
+            f"\nsun at azimuth {figures['sun_azimuth_deg']:.0f}° (counterclockwise from the x axis), elevation "
+            f"{figures['sun_elevation_deg']:.0f}°, {figures['sun_from']}; without it those halves have "
+            f"{figures['psnr_no_sun_other_half']:.1f} dB"
+        )
+    return f"\nno sun: {figures['sun_from']}" if "sun_from" in figures else ""
 
 
 def command(options: argparse.Namespace) -> None:
     """Runs the verb with the options parsed by `twin.commands`."""
-    lighting = relight(options.scene, options.photo, options.name)
+    given = (options.sun, options.time, options.location, options.heading)
+    lighting = relight(options.scene, options.photo, options.name, *given)
     if not options.quiet:
         print(summary(lighting))
         print(f"look at {SceneDir(options.scene).lightings / f'{options.name}.png'}")

@@ -9,7 +9,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -26,6 +26,7 @@ from twin.geometry.cameras import Viewpoints, opencv_to_mujoco, pixel_grid, unpr
 from twin.mjcf.husky import ROBOT_VISUAL_GROUP, camera_mount_geoms
 from twin.nerf.baked import BakedField
 from twin.nerf.rendering import Rendering
+from twin.nerf.sun import Sunlight, relit
 from twin.runtime import available_cores
 from twin.types import Array, Array32
 from twin.warp_runtime import wp
@@ -330,6 +331,7 @@ class Compositor:
         lighting: Lighting | Sequence[Lighting],
         noise: Sequence[CameraNoise] | None = None,
         weather: Sequence[Weather | None] = (),
+        sunlight: Sequence[Sunlight] = (),
     ) -> Rendering:
         """Renders the camera of every env.
 
@@ -338,6 +340,7 @@ class Compositor:
             lighting: One lighting, or one per env, as in `BakedField.render`.
             noise: Camera imperfections of each env; None: perfect cameras.
             weather: Weather of each env; None: that of the film.
+            sunlight: Suns of each env's lighting; empty: the light of the film.
 
         Raises:
             InputError: an unknown lighting, or more envs than `max_envs`.
@@ -353,7 +356,9 @@ class Compositor:
 
         def composite_all(worker: _CompositorWorker) -> None:
             for k in todo:
-                self._add_objects(worker, datas[k], poses[k], lightings[k], out, k)
+                suns = sunlight[k] if sunlight else ()
+                out.rgb[k] = relit(out.rgb[k], out.depth[k], self._rays, poses[k], suns)
+                self._add_objects(worker, datas[k], poses[k], lightings[k], out, k, suns)
                 if weather and (sky := weather[k]):
                     out.rgb[k] = sky.apply(out.rgb[k], out.depth[k], self._rays, poses[k])
                 if noise:
@@ -367,28 +372,40 @@ class Compositor:
         return out
 
     def _add_objects(
-        self, worker: "_CompositorWorker", data: mujoco.MjData, pose: Array, lighting: Lighting, out: Rendering, k: int
+        self,
+        worker: "_CompositorWorker",
+        data: mujoco.MjData,
+        pose: Array,
+        lighting: Lighting,
+        out: Rendering,
+        k: int,
+        sunlight: Sunlight,
     ) -> None:
         """Draws the objects in view of a camera, and their shadows, into picture k of a rendering."""
         mask = worker.renderer.visible_mask(data, pose)
         if mask is None:
             return
-        irradiance = self._irradiance(lighting)
+        irradiance = self._irradiance(lighting, sunlight)
         if irradiance is not None:
             self._shadows.darken(out.rgb[k], out.depth[k], self._rays, pose, data, irradiance)
         drawn = worker.renderer.render(data, pose, mask, irradiance)
         if drawn is not None:
             left, top, width, height = drawn.window
             inner = np.s_[k, top : top + height, left : left + width]
-            composite(out, inner, drawn, worker.foreground(pose, drawn, lighting))
+            front = worker.foreground(pose, drawn, lighting)
+            if sunlight:
+                depth = np.minimum(front.depth, drawn.depth)
+                rays = self._rays[top : top + height, left : left + width]
+                front = replace(front, rgb=relit(front.rgb, depth, rays, pose, sunlight))
+            composite(out, inner, drawn, front)
 
-    def _irradiance(self, lighting: Lighting) -> Irradiance | None:
+    def _irradiance(self, lighting: Lighting, sunlight: Sunlight) -> Irradiance | None:
         if not self._shaded:
             return None
         with self._lock:
             if self._estimator is None:  # there are no obstacles, but the robot's own body is in view
                 self._estimator = IrradianceEstimator(self._field, self._route)
-        return self._estimator.estimate(lighting)
+        return self._estimator.estimate(lighting, sunlight)
 
 
 class _CompositorWorker:

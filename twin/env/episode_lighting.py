@@ -23,6 +23,7 @@ from twin.config import ANY, HELD_OUT, RESERVED_LIGHTINGS, TRAINING
 from twin.errors import InputError
 from twin.nerf.baked import BakedField
 from twin.nerf.fog import Fog, mixed
+from twin.nerf.sun import Sunlight, mixed_sunlight
 from twin.types import Array32
 
 VERSION = 2
@@ -51,6 +52,10 @@ class EpisodeLighting:
     """Fog at the beginning, if fitted to a photo; None: the film's."""
     end_fog: Fog | None = None
     """Fog after `duration`, if fitted to a photo; None: the film's."""
+    sunlight: Sunlight = ()
+    """Suns at the beginning; empty: the light of the film."""
+    end_sunlight: Sunlight = ()
+    """Suns after `duration`."""
 
     def at(self, time: float) -> Array32:
         """The embedding after `time` [s], shape (dim,)."""
@@ -62,6 +67,12 @@ class EpisodeLighting:
     def fog_at(self, time: float) -> Fog | None:
         """The fog after `time` [s]; None: the film's."""
         return self.fog if self.end is None else mixed(self.fog, self.end_fog, self._share(time))
+
+    def sunlight_at(self, time: float) -> Sunlight:
+        """The suns after `time` [s]."""
+        if self.end is None or not (self.sunlight or self.end_sunlight):
+            return self.sunlight
+        return mixed_sunlight(self.sunlight, self.end_sunlight, self._share(time))
 
     def _share(self, time: float) -> float:
         return float(np.clip(time / self.duration, 0.0, 1.0))
@@ -165,28 +176,28 @@ def sample_lighting(
     Raises:
         InputError: a lighting is unknown, or none is found.
     """
-    name, start, fog = _sample_one(lighting, sets, rng)
+    name, start, fog, suns = _sample_one(lighting, sets, rng)
     if not drift:
-        return EpisodeLighting(name, start, fog=fog)
-    other, end, end_fog = _sample_one(lighting, sets, rng)
+        return EpisodeLighting(name, start, fog=fog, sunlight=suns)
+    other, end, end_fog, end_suns = _sample_one(lighting, sets, rng)
     if isinstance(lighting, str) and lighting not in RESERVED_LIGHTINGS:
         names = [n for n in sets.field.lightings_by_name.filmed().names if n != lighting]
         if not names:
             raise InputError(f"lighting {lighting!r} cannot drift: the field has no other; give lighting_drift=False")
-        other, end, end_fog = _sample_one(tuple(names), sets, rng)
-    return EpisodeLighting(f"{name} → {other}", start, end, duration, fog, end_fog)
+        other, end, end_fog, end_suns = _sample_one(tuple(names), sets, rng)
+    return EpisodeLighting(f"{name} → {other}", start, end, duration, fog, end_fog, suns, end_suns)
 
 
 def _sample_one(
     lighting: str | Sequence[str], sets: LightingSets, rng: np.random.Generator
-) -> tuple[str, Array32, Fog | None]:
-    """Name, embedding and fog of one lighting."""
+) -> tuple[str, Array32, Fog | None, Sunlight]:
+    """Name, embedding, fog and suns of one lighting."""
     if not isinstance(lighting, str):
         if not lighting:
             raise InputError("lighting = (): expected at least one name")
         lighting = lighting[int(rng.integers(len(lighting)))]
     if lighting == ANY:
-        return ANY, sets.field.sample_lighting(rng), None
+        return ANY, sets.field.sample_lighting(rng), None, ()
     if lighting in (TRAINING, HELD_OUT):
-        return lighting, sets.sample(lighting, rng), None
-    return lighting, sets.field.embedding(lighting), sets.field.fog(lighting)
+        return lighting, sets.sample(lighting, rng), None, ()
+    return lighting, sets.field.embedding(lighting), sets.field.fog(lighting), sets.field.sunlight(lighting)

@@ -30,6 +30,7 @@ from twin.mjcf.world import arc_lengths, heading_at, point_at
 from twin.nerf.appearance_prior import Probes
 from twin.nerf.baked import BakedField
 from twin.nerf.kernels.color_head import harmonics_of
+from twin.nerf.sun import Sunlight, main_sun
 from twin.types import Array
 
 GROUND_ALBEDO = 0.37
@@ -70,6 +71,10 @@ class Irradiance:
     """Constant light on surfaces that do not face up, shape (5, 3): undirected, then from each of `SIDE_DIRECTIONS`."""
     proportional: Array
     """Ratio of the proportional light to the ground irradiance, shape (5, 3); rows as in `constant`."""
+    known_sun: Array | None = None
+    """Direction to the sun, shape (3,), if the lighting has one; None: `sun` estimates it."""
+    sun_share: Array | None = None
+    """That sun's share of the light at `xy`, shape (k,)."""
     _cache: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
     """Ground irradiance by position: most objects stand still, so positions recur."""
 
@@ -103,6 +108,9 @@ class Irradiance:
         times that of a sun at elevation e. Only the sun lights one side more than the opposite side: by cot e times its
         contribution to the ground. So the light on upright surfaces gives both the sun's share and e.
         """
+        if self.known_sun is not None and self.sun_share is not None:
+            nearest = int(((self.xy - xy) ** 2).sum(1).argmin())
+            return float(np.clip(self.sun_share[nearest], 0.0, _MAX_SUN_SHARE)), self.known_sun
         ground = self.ground(np.asarray(xy)[None])[0]
         parts = (self.constant + self.proportional * ground).mean(1) / max(float(ground.mean()), 1e-6)
         difference = np.array([parts[1] - parts[2], parts[3] - parts[4]])
@@ -132,7 +140,7 @@ class IrradianceEstimator:
         """
         self._field = baked
         self._lock = threading.Lock()
-        self._cache: OrderedDict[bytes, Irradiance] = OrderedDict()
+        self._cache: OrderedDict[tuple[bytes, Sunlight], Irradiance] = OrderedDict()
         points = _surface_points(baked, route)
         height, lateral = _height_above(points.positions, route)
         flat = points.normals[:, 2] > 0.9
@@ -159,28 +167,36 @@ class IrradianceEstimator:
         self._reference = sky * mean_ground[self._neighbors].mean(1) / GROUND_ALBEDO
         self._rows = _basis(self._upright.normals)
 
-    def estimate(self, lighting: str | NDArray) -> Irradiance:
-        """The irradiance of a lighting, by name or embedding (dim,). Recent estimates are cached."""
+    def estimate(self, lighting: str | NDArray, sunlight: Sunlight = ()) -> Irradiance:
+        """The irradiance of a lighting, by name or embedding (dim,), in sunlight. Recent estimates are cached."""
         embedding = self._field.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
-        key = embedding.tobytes()
+        key = embedding.tobytes(), sunlight
         with self._lock:
             if key not in self._cache:
-                self._cache[key] = self._estimate(embedding)
+                self._cache[key] = self._estimate(embedding, sunlight)
                 if len(self._cache) > _LIGHTINGS_CACHED:
                     self._cache.popitem(last=False)
             return self._cache[key]
 
-    def _estimate(self, embedding: NDArray) -> Irradiance:
+    def _estimate(self, embedding: NDArray, sunlight: Sunlight) -> Irradiance:
         from scipy.optimize import nnls
 
         up = self._ground.probes.picture(embedding).astype(np.float64) / GROUND_ALBEDO
-        ground = up[self._neighbors].mean(1)
         colors = self._upright.probes.picture(embedding).astype(np.float64)
+        known: tuple[Array, Array] | tuple[()] = ()
+        if sunlight:
+            level = np.tile([0.0, 0.0, 1.0], (len(up), 1))
+            up_gain, share = _gains(sunlight, self._ground.positions, level)
+            up, sun = up * up_gain, main_sun(sunlight)
+            colors = colors * _gains(sunlight, self._upright.positions, self._upright.normals)[0]
+            known = (sun.toward, share) if sun else ()
+        ground = up[self._neighbors].mean(1)
         seen = colors / np.maximum(self._mean, _MIN_COLOR) * self._reference
         sides = seen - np.maximum(self._upright.normals[:, 2:], 0.0) * ground
         if len(self._rows) < _MIN_PROBES:  # assume a uniform sky
             return Irradiance(
-                self._xy, up, np.zeros((5, 3)), np.array([_UPRIGHT_SKY, 0.0, 0.0, 0.0, 0.0])[:, None] * np.ones(3)
+                *(self._xy, up, np.zeros((5, 3)), np.array([_UPRIGHT_SKY, 0.0, 0.0, 0.0, 0.0])[:, None] * np.ones(3)),
+                *known,
             )
         found = np.empty((10, 3))
         for c in range(3):
@@ -189,7 +205,18 @@ class IrradianceEstimator:
             # The Cholesky factor of the normal equations replaces the many rows; the minimum stays the same.
             square = np.linalg.cholesky(rows.T @ rows + 1e-6 * len(rows) * np.eye(10))
             found[:, c], _ = nnls(square.T, np.linalg.solve(square, rows.T @ sides[usable, c]))
-        return Irradiance(self._xy, up, found[:5], found[5:])
+        return Irradiance(self._xy, up, found[:5], found[5:], *known)
+
+
+def _gains(sunlight: Sunlight, points: Array, normals: Array) -> tuple[Array, Array]:
+    """Gain of sunlight at points (n, 3) [m] with normals (n, 3), shape (n, 3), and the suns' share of it, (n,)."""
+    gain = np.full((len(points), 3), 1.0 - sum(weight for _, weight in sunlight))
+    direct = np.zeros(len(points))
+    for sun, weight in sunlight:
+        one, share = sun.gain(points, normals)
+        gain += weight * one
+        direct += weight * one.mean(1) * share
+    return gain, direct / gain.mean(1)
 
 
 @dataclass(frozen=True)

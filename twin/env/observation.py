@@ -22,6 +22,7 @@ from twin.env.trust import SKY_OPACITY, Trust
 from twin.env.weather import Weather
 from twin.geometry.cameras import Viewpoints
 from twin.nerf.baked import BakedField
+from twin.nerf.sun import main_sun
 from twin.types import Array, Image
 from twin.warp_runtime import wp
 
@@ -90,7 +91,9 @@ class PixelObserver:
         if fog is not None and o.randomise and o.randomise.hold_known:
             task.set_weather(task.sample.for_known_weather())
         has_weather = fog is not None or o.randomise
-        self._weather[i] = Weather(task.sample, task.rng(WEATHER), fog) if has_weather else None
+        sun = main_sun(self.lightings[i].sunlight_at(0.0))  # type: ignore[union-attr]
+        known_sun = sun.toward if sun else None
+        self._weather[i] = Weather(task.sample, task.rng(WEATHER), fog, known_sun) if has_weather else None
 
     def observe(self, which: Sequence[int]) -> None:
         """Adds a new frame to the stacks of some envs."""
@@ -120,7 +123,9 @@ class PixelObserver:
         for i, one, data in zip(which, weather, datas, strict=True):
             if one:
                 one.fog = self.lightings[i].fog_at(data.time)  # type: ignore[union-attr]
-        out = self._renderer.render(datas, embeddings, noise, weather)
+        suns = [self.lightings[i].sunlight_at(data.time) for i, data in zip(which, datas, strict=True)]  # type: ignore[union-attr]
+        sunlight: dict[str, Any] = {"sunlight": suns} if any(suns) else {}
+        out = self._renderer.render(datas, embeddings, noise, weather, **sunlight)
         self.trust[list(which)] = self._trust.of(poses, out)
         return (np.clip(out.rgb.transpose(0, 3, 1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 

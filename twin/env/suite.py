@@ -99,7 +99,8 @@ class EnvFactory:
         names = (lighting,) if isinstance(lighting, str) else tuple(lighting)
         fogs = [self.field.fog(name) for name in names] if self.field else []
         has_fog = any(one and one.extinction for one in fogs)
-        if self.options.randomise or self.options.camera or self.obstacles.pool or has_fog:
+        has_sun = any(self.field.sunlight(name) for name in names) if self.field else False
+        if self.options.randomise or self.options.camera or self.obstacles.pool or has_fog or has_sun:
             return False
         data, camera = mujoco.MjData(self.model), self.model.camera("front").id
         mujoco.mj_resetDataKeyframe(self.model, data, self.model.key("spawn").id)

@@ -189,17 +189,34 @@ def _patches(rng: np.random.Generator, radius: float, cover: float) -> Array32:
 # ---- weather of an episode
 
 _SUN_ELEVATION = (10.0, 55.0)  # [°]
+_KNOWN_ELEVATION = (5.0, 85.0)  # [°] a pattern of shadows has a direction and a finite length
+
+
+def _within_elevations(sun: Array) -> Array:
+    """The direction (3,) with its elevation limited to `_KNOWN_ELEVATION`."""
+    azimuth = np.arctan2(sun[1], sun[0])
+    elevation = np.clip(np.arcsin(np.clip(sun[2], -1.0, 1.0)), *np.deg2rad(_KNOWN_ELEVATION))
+    return np.array([*(np.cos(elevation) * np.array([np.cos(azimuth), np.sin(azimuth)])), np.sin(elevation)])
 
 
 class Weather:
     """Weather of one episode: relighting, shadows and fog, applied in this order."""
 
-    def __init__(self, sample: RandomizationSample, rng: np.random.Generator, fog: Fog | None = None) -> None:
+    def __init__(
+        self,
+        sample: RandomizationSample,
+        rng: np.random.Generator,
+        fog: Fog | None = None,
+        known_sun: Array | None = None,
+    ) -> None:
+        """`known_sun` is the direction (3,) to the sun of the episode's lighting, which is then not sampled."""
         self.fog = fog
         """Current fog of the episode's lighting, if fitted to a photo; None: the film's."""
         elevation, azimuth = np.deg2rad(rng.uniform(*_SUN_ELEVATION)), rng.uniform(0.0, 2.0 * np.pi)
         level = np.cos(elevation)
         sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+        if known_sun is not None:
+            sun = _within_elevations(known_sun)
         # Two random streams, so that relighting is the same with and without shadows, and vice versa.
         relighting_rng, shadow_rng = rng.spawn(2)
         self._relighting = DirectionalRelighting(sample.sunlight, sun, relighting_rng) if sample.sunlight else None

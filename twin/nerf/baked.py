@@ -31,6 +31,7 @@ from twin.nerf.kernels.color_head import LANES as HEAD_LANES
 from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import Rendering
+from twin.nerf.sun import Sun, Sunlight
 from twin.runtime import available_cores, bar
 from twin.types import Array32
 from twin.warp_runtime import wp
@@ -385,15 +386,23 @@ class BakedField:
         """See `Lightings.fog`. `render` leaves the fog out; environments apply it to their images."""
         return self.lightings_by_name.fog(lighting)
 
+    def sunlight(self, lighting: str) -> Sunlight:
+        """See `Lightings.sunlight`. `render` leaves the sun out; environments apply it to their images."""
+        return self.lightings_by_name.sunlight(lighting)
+
     def sample_lighting(self, rng: np.random.Generator) -> Array32:
         """Embedding (dim,) of a random plausible lighting, see `Lightings.sample`."""
         return self.lightings_by_name.sample(rng)
 
     def add_lightings(
-        self, more: Mapping[str, Array32], stale: tuple[str, ...] = (), fogs: Mapping[str, Fog] | None = None
+        self,
+        more: Mapping[str, Array32],
+        stale: tuple[str, ...] = (),
+        fogs: Mapping[str, Fog] | None = None,
+        suns: Mapping[str, Sun] | None = None,
     ) -> None:
         """See `Lightings.added`."""
-        self.lightings_by_name = self.lightings_by_name.added(more, stale, fogs)
+        self.lightings_by_name = self.lightings_by_name.added(more, stale, fogs, suns)
 
     def render(
         self,

@@ -19,6 +19,7 @@ from twin.errors import InputError
 from twin.files import read_json, wrap_read_errors, write_json
 from twin.nerf import appearance_prior
 from twin.nerf.fog import Fog, mixed
+from twin.nerf.sun import Sun, Sunlight, mixed_sunlight
 from twin.scene import SceneDir, stage_result
 from twin.scene import check_name as check_scene_name
 from twin.types import Array32
@@ -42,6 +43,8 @@ class Lightings:
     """Number of added lightings, the last ones of `names`."""
     fogs: Mapping[str, Fog] = field(default_factory=dict)
     """Fog in the photos of the added lightings, by name."""
+    suns: Mapping[str, Sun] = field(default_factory=dict)
+    """Suns of those added lightings that have one, by name."""
 
     def embedding(self, lighting: str) -> Array32:
         """The embedding of a lighting, a frame or a mixture, shape (dim,).
@@ -73,6 +76,16 @@ class Lightings:
         mixture = None if lighting in self.names else _mixture(lighting)
         return mixed(self.fog(mixture[0]), self.fog(mixture[1]), mixture[2]) if mixture else None
 
+    def sunlight(self, lighting: str) -> Sunlight:
+        """Suns of an added lighting or of a mixture with one; empty: the light of the film alone.
+
+        Raises InputError for a mixture that is not `a:b:share` with a share from 0 to 1.
+        """
+        if lighting in self.suns:
+            return ((self.suns[lighting], 1.0),)
+        mixture = None if lighting in self.names else _mixture(lighting)
+        return mixed_sunlight(self.sunlight(mixture[0]), self.sunlight(mixture[1]), mixture[2]) if mixture else ()
+
     def sample(self, rng: np.random.Generator) -> Array32:
         """Samples the embedding (dim,) of a plausible lighting. Raises InputError without probes or success."""
         return self.prior.sample(rng)
@@ -87,9 +100,13 @@ class Lightings:
         return appearance_prior.AppearancePrior(self.probes, self.vectors, self.frame_vectors)
 
     def added(
-        self, more: Mapping[str, Array32], stale: tuple[str, ...] = (), fogs: Mapping[str, Fog] | None = None
+        self,
+        more: Mapping[str, Array32],
+        stale: tuple[str, ...] = (),
+        fogs: Mapping[str, Fog] | None = None,
+        suns: Mapping[str, Sun] | None = None,
     ) -> "Lightings":
-        """A copy with more lightings: embeddings (dim,) by name, stale names (see `stale`), and fog by name."""
+        """A copy with more lightings: embeddings (dim,) by name, stale names (see `stale`), fog and suns by name."""
         return replace(
             self,
             names=(*self.names, *more),
@@ -97,12 +114,13 @@ class Lightings:
             stale=(*self.stale, *stale),
             count_added=self.count_added + len(more),
             fogs={**self.fogs, **(fogs or {})},
+            suns={**self.suns, **(suns or {})},
         )
 
     def filmed(self) -> "Lightings":
         """A copy without the added lightings."""
         count = len(self.names) - self.count_added
-        return replace(self, names=self.names[:count], vectors=self.vectors[:count], count_added=0, fogs={})
+        return replace(self, names=self.names[:count], vectors=self.vectors[:count], count_added=0, fogs={}, suns={})
 
 
 def _mixture(lighting: str) -> tuple[str, str, float] | None:
@@ -124,7 +142,7 @@ def _mixture(lighting: str) -> tuple[str, str, float] | None:
 
 # ---- lightings added to a scene
 
-_FORMAT = 2  # format 1 has no fog
+_FORMAT = 3  # format 1 has no fog; a lighting without a sun has format 2
 
 
 @dataclass(frozen=True)
@@ -142,11 +160,17 @@ class AddedLighting:
     """Path of the photo, as given."""
     figures: dict[str, Any]
     """Numbers of the fit, JSON-able."""
+    sun: Sun | None = None
+    """Sun in the photo; None: the light of the film."""
 
     def save(self, scene: SceneDir) -> None:
         """Writes `lightings/<name>.json`, replacing an existing file."""
         scene.lightings.mkdir(exist_ok=True)
-        write_json(scene.lightings / f"{self.name}.json", {"format": _FORMAT, **asdict(self)})
+        head = {"format": _FORMAT if self.sun else 2, **asdict(replace(self, sun=None))}
+        del head["sun"]
+        if self.sun:
+            head["sun"] = self.sun.to_json()
+        write_json(scene.lightings / f"{self.name}.json", head)
 
 
 def check_name(name: str, filmed: tuple[str, ...]) -> None:
@@ -158,14 +182,17 @@ def check_name(name: str, filmed: tuple[str, ...]) -> None:
         raise InputError(f"--name {name!r}: the place was filmed under a lighting of this name; choose another")
 
 
-def added_lightings(scene: SceneDir, dim: int) -> tuple[dict[str, Array32], tuple[str, ...], dict[str, Fog]]:
-    """Loads the lightings added to a scene's field: embeddings (dim,) by name, stale names, and fog by name.
+def added_lightings(
+    scene: SceneDir, dim: int
+) -> tuple[dict[str, Array32], tuple[str, ...], dict[str, Fog], dict[str, Sun]]:
+    """Loads the lightings added to a scene's field: embeddings (dim,) by name, stale names, fog and suns by name.
 
     Raises InputError if the field is not built, or if a file is damaged or has another format.
     """
     result = stage_result(scene, "field")
     fresh: dict[str, Array32] = {}
     fogs: dict[str, Fog] = {}
+    suns: dict[str, Sun] = {}
     stale = []
     for path in sorted(scene.lightings.glob("*.json")):
         with wrap_read_errors(path, "fit it again or delete it"):
@@ -173,7 +200,7 @@ def added_lightings(scene: SceneDir, dim: int) -> tuple[dict[str, Array32], tupl
             if head["format"] == 1:  # has no fog
                 stale.append(path.stem)
                 continue
-            if head["format"] != _FORMAT:
+            if head["format"] not in (2, _FORMAT):
                 raise InputError(f"{path}: format {head['format']}, expected {_FORMAT}; fit it again or delete it")
             made_by, vector = head["field"], np.array(head["embedding"], np.float32)
             red, green, blue = map(float, head["air"]["airlight"])
@@ -182,8 +209,11 @@ def added_lightings(scene: SceneDir, dim: int) -> tuple[dict[str, Array32], tupl
                 raise ValueError(f"air {fog.extinction}, {fog.airlight}")
             if vector.ndim != 1 or not np.isfinite(vector).all() or (made_by == result and vector.shape != (dim,)):
                 raise ValueError(f"embedding of shape {vector.shape}, or not finite")
+            sun = Sun.from_json(head["sun"]) if head["format"] == _FORMAT else None
         if made_by == result:
             fresh[path.stem], fogs[path.stem] = vector, fog
+            if sun:
+                suns[path.stem] = sun
         else:
             stale.append(path.stem)
-    return fresh, tuple(stale), fogs
+    return fresh, tuple(stale), fogs, suns

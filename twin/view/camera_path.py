@@ -22,6 +22,7 @@ from twin.errors import short_repr
 from twin.files import json_bytes, read_json, wrap_read_errors, write_bytes
 from twin.nerf.baked import BakedField
 from twin.nerf.fog import mixed
+from twin.nerf.sun import mixed_sunlight
 from twin.report.video_layout import to_uint8
 from twin.report.video_writer import VideoWriter
 from twin.types import Array, Image
@@ -112,12 +113,13 @@ def mixed_lighting(one: EpisodeLighting, other: EpisodeLighting, share: float) -
     if share >= 1.0:
         return other
     start = ((1.0 - share) * one.start + share * other.start).astype(np.float32)
-    return EpisodeLighting(f"{one.name} → {other.name}", start, fog=mixed(one.fog, other.fog, share))
+    suns = mixed_sunlight(one.sunlight, other.sunlight, share)
+    return EpisodeLighting(f"{one.name} → {other.name}", start, fog=mixed(one.fog, other.fog, share), sunlight=suns)
 
 
 def named_lighting(field: BakedField, name: str) -> EpisodeLighting:
     """A lighting of the field by its name or mixture. Raises InputError: it is unknown."""
-    return EpisodeLighting(name, field.embedding(name), fog=field.fog(name))
+    return EpisodeLighting(name, field.embedding(name), fog=field.fog(name), sunlight=field.sunlight(name))
 
 
 def _view_row(view: KeyView) -> dict[str, Any]:

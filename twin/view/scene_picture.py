@@ -21,6 +21,7 @@ from twin.geometry.cameras import Viewpoints, opencv_to_mujoco, pixel_grid, unpr
 from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
 from twin.nerf.rendering import Rendering
+from twin.nerf.sun import relit
 from twin.types import Array, Array32
 
 _CAMERA = "view"  # name of the free camera in the model
@@ -93,6 +94,10 @@ class ScenePicture:
             if objects is None or self._model is None:
                 view = Viewpoints.of(camera.camera_to_world, camera.intrinsics, camera.size)
                 out = self.field.render(view, lighting.start)
+                if lighting.sunlight:
+                    rays = unproject(pixel_grid(*camera.size), camera.intrinsics)
+                    pose = camera.camera_to_world
+                    out.rgb[0] = relit(out.rgb[0], out.depth[0], rays, pose, lighting.sunlight)
             else:
                 out = self._render_objects(camera, lighting, objects)
             if lighting.fog is not None and lighting.fog.extinction:
@@ -106,7 +111,7 @@ class ScenePicture:
         mujoco.mj_kinematics(data.model, data)
         pose, number = opencv_to_mujoco(camera.camera_to_world), data.model.camera(_CAMERA).id
         data.cam_xpos[number], data.cam_xmat[number] = pose[:3, 3], pose[:3, :3].ravel()
-        return compositor.render([data], lighting.start)
+        return compositor.render([data], lighting.start, sunlight=[lighting.sunlight])
 
     def _compositor(self, camera: FreeCamera) -> Compositor:
         key = (*camera.size, round(camera.fov, 4))

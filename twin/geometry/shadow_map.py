@@ -1,0 +1,180 @@
+"""Shadow map: the parts of a place that the sun reaches, as an orthographic height map seen from the sun.
+
+The sun's plane is perpendicular to the direction towards the sun. Its axes are `right`, which is horizontal, and
+`upward`. A texel stores the largest *height*, the coordinate along the direction towards the sun, of all surfaces in
+it. A point is in shadow if the map is higher than the point by more than a bias, which absorbs the errors of surfaces.
+Several texels around a point are compared and averaged (percentage-closer filtering, Reeves et al. 1987), so that the
+edges of shadows are soft.
+"""
+
+# mypy: disable-error-code="index, attr-defined, valid-type, arg-type, call-overload, operator"
+# (mypy does not know the types that Warp uses inside kernels)
+
+import base64
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.geometry.mesh_rays import Surface
+from twin.types import Array, Array32
+from twin.warp_runtime import wp
+
+TEXEL = 0.15
+"""[m] side of a texel."""
+BIAS = 0.3
+"""[m] height by which the map must exceed a point for a shadow; surfaces of a field have errors of this size."""
+_RAMP = 0.2  # [m] further height over which the shadow becomes full
+_MAX_SIDE = 4096  # [texels] larger maps get larger texels
+_FULL = 65535  # largest value of a stored texel; 0 means that nothing is there
+_START = 1.0  # [m] distance from the highest vertex to the plane from which rays are cast
+
+
+@wp.kernel
+def _look_up(
+    height: wp.array2d(dtype=float),
+    points: wp.array(dtype=wp.vec3),
+    right: wp.vec3,
+    upward: wp.vec3,
+    toward: wp.vec3,
+    origin: wp.vec2,
+    texel: float,
+    bias: float,
+    ramp: float,
+    out: wp.array(dtype=float),
+):
+    """Fraction of the sunlight at a point: the mean over a square of three texels' side around it."""
+    i = wp.tid()
+    p = points[i]
+    column, row = (wp.dot(p, right) - origin[0]) / texel, (wp.dot(p, upward) - origin[1]) / texel
+    level = wp.dot(p, toward) + bias
+    first_column, first_row = int(wp.floor(column)) - 1, int(wp.floor(row)) - 1
+    across, along = column - wp.floor(column), row - wp.floor(row)
+    dark = float(0.0)
+    for a in range(4):
+        y = first_row + a
+        wide = float(1.0)
+        if a == 0:
+            wide = 1.0 - along
+        if a == 3:
+            wide = along
+        for b in range(4):
+            x = first_column + b
+            weight = wide
+            if b == 0:
+                weight = wide * (1.0 - across)
+            if b == 3:
+                weight = wide * across
+            if x >= 0 and y >= 0 and x < height.shape[1] and y < height.shape[0]:
+                dark += weight * wp.clamp((height[y, x] - level) / ramp, 0.0, 1.0)
+    out[i] = 1.0 - dark / 9.0
+
+
+@dataclass(frozen=True)
+class ShadowMap:
+    """Height map of a place seen from the sun."""
+
+    toward: Array
+    """Unit vector towards the sun, shape (3,)."""
+    origin: Array
+    """Coordinates of the center of the first texel along `right` and `upward` [m], shape (2,)."""
+    texel: float
+    """Side of a texel [m]."""
+    height: Array32
+    """Largest coordinate along `toward` in each texel [m], −inf where nothing is; shape (rows, columns)."""
+
+    @cached_property
+    def _height(self) -> Any:
+        """`height` for the kernel, without infinities."""
+        return wp.array(np.maximum(self.height, np.float32(-1e9)), dtype=float, device="cpu")
+
+    @staticmethod
+    def of_mesh(vertices: Array, faces: NDArray, toward: Array, texel: float = TEXEL) -> "ShadowMap":
+        """Casts a ray from the sun through each texel of the map of a mesh, vertices (n, 3) [m] and faces (m, 3)."""
+        return ShadowCasters(vertices, faces).seen_from(toward, texel)
+
+    def visibility(self, points: Array, bias: float = BIAS) -> Array32:
+        """Fraction of the sunlight that reaches points (n, 3) [m], shape (n,); 1 outside the map."""
+        right, upward = plane_axes(self.toward)
+        # Single precision suffices, as scenes are some hundred meters wide.
+        at: Any = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device="cpu")
+        out = wp.empty(len(points), dtype=float, device="cpu")
+        axes = (wp.vec3(*axis.tolist()) for axis in (right, upward, self.toward))
+        inputs = [self._height, at, *axes, wp.vec2(*self.origin.tolist()), self.texel, bias, _RAMP]
+        wp.launch(_look_up, len(points), inputs=inputs, outputs=[out], device="cpu")
+        return out.numpy()
+
+    def to_json(self) -> dict[str, Any]:
+        """The map for a JSON file; heights are rounded to 1/65534 of their range and stored as a PNG."""
+        seen = np.isfinite(self.height)
+        low, high = (float(f(self.height[seen], initial=0.0)) for f in (np.min, np.max))
+        step = max(high - low, 1e-6) / (_FULL - 1)
+        image = np.where(seen, np.rint((np.where(seen, self.height, low) - low) / step) + 1, 0).astype(np.uint16)
+        content = base64.b64encode(cv2.imencode(".png", image)[1].tobytes()).decode("ascii")
+        place = {"toward": self.toward.tolist(), "origin_m": self.origin.tolist(), "texel_m": self.texel}
+        return {**place, "low_m": low, "step_m": step, "png": content}
+
+    @staticmethod
+    def from_json(table: dict[str, Any]) -> "ShadowMap":
+        """Reads the result of `to_json`. Raises ValueError, KeyError or TypeError if it is damaged."""
+        toward, origin = (np.array(table[name], np.float64) for name in ("toward", "origin_m"))
+        texel, low, step = (float(table[name]) for name in ("texel_m", "low_m", "step_m"))
+        if toward.shape != (3,) or abs(np.linalg.norm(toward) - 1.0) > 1e-6 or not toward[2] > 0.0:
+            raise ValueError(f"sun {toward.tolist()}; expected a unit vector above the horizon")
+        if origin.shape != (2,) or not np.isfinite([*origin, texel, low, step]).all() or min(texel, step) <= 0.0:
+            raise ValueError(f"shadow map at {origin.tolist()} with texels of {texel} m")
+        data = np.frombuffer(base64.b64decode(table["png"], validate=True), np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        if image is None or image.dtype != np.uint16 or image.ndim != 2 or max(image.shape) > _MAX_SIDE + 1:
+            raise ValueError("the shadow map is no 16-bit picture")
+        height = np.where(image > 0, low + step * (image.astype(np.float64) - 1.0), -np.inf).astype(np.float32)
+        return ShadowMap(toward, origin, texel, height)
+
+
+class ShadowCasters:
+    """Surfaces of a place that throw shadows; `seen_from` makes the map for any sun."""
+
+    def __init__(self, vertices: Array, faces: NDArray) -> None:
+        """`vertices` have shape (n, 3) [m], `faces` (m, 3)."""
+        self._vertices = np.asarray(vertices, np.float64)[np.unique(faces)] if len(faces) else np.zeros((0, 3))
+        self._surface = Surface(np.asarray(vertices), faces) if len(faces) else None
+
+    def seen_from(self, toward: Array, texel: float = TEXEL) -> ShadowMap:
+        """The map for a sun in the direction of a unit vector (3,); `texel` [m] grows if the place is very wide."""
+        toward = np.asarray(toward, np.float64) / np.linalg.norm(toward)
+        if self._surface is None:
+            return ShadowMap(toward, np.zeros(2), texel, np.full((1, 1), -np.inf, np.float32))
+        right, upward = plane_axes(toward)
+        at = self._vertices @ np.stack([right, upward, toward], 1)
+        low, high = at[:, :2].min(0), at[:, :2].max(0)
+        texel = max(texel, float((high - low).max()) / (_MAX_SIDE - 1))
+        columns, rows = np.ceil((high - low) / texel).astype(int) + 1
+        start = float(at[:, 2].max()) + _START
+        u, v = low[0] + texel * np.arange(columns), low[1] + texel * np.arange(rows)
+        origins = u[None, :, None] * right + v[:, None, None] * upward + start * toward
+        rays = np.broadcast_to(-toward, (rows * columns, 3))
+        hit = self._surface.cast(origins.reshape(-1, 3), rays).reshape(rows, columns)
+        return ShadowMap(toward, low, texel, np.where(hit < 0.0, -np.inf, start - hit).astype(np.float32))
+
+
+def plane_axes(toward: Array) -> tuple[Array, Array]:
+    """Unit axes `right` (horizontal) and `upward` of the plane perpendicular to a unit vector (3,)."""
+    right = np.cross([0.0, 0.0, 1.0], toward)
+    size = float(np.linalg.norm(right))
+    right = right / size if size > 1e-6 else np.array([1.0, 0.0, 0.0])
+    return right, np.cross(toward, right)
+
+
+def direction(azimuth: float, elevation: float) -> Array:
+    """Unit vector (3,) at an azimuth, counterclockwise from the x axis, and an elevation [°]."""
+    a, e = np.deg2rad([azimuth, elevation])
+    return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+
+
+def angles(toward: Array) -> tuple[float, float]:
+    """Azimuth in [0, 360) and elevation [°] of a unit vector (3,)."""
+    azimuth = float(np.rad2deg(np.arctan2(toward[1], toward[0]))) % 360.0
+    return azimuth, float(np.rad2deg(np.arcsin(np.clip(toward[2], -1.0, 1.0))))

@@ -1,0 +1,179 @@
+"""Sun of an added lighting: a gain on pictures of the field, by which another sun lights the place.
+
+A field stores the colors of its films, with their light and shadows in them. The picture under another sun is the
+picture under the lighting's embedding times a gain. The gain of each color channel is a sum of five terms:
+
+    near surfaces:   ambient + direct · visibility · max(0, n · s)
+    far view, sky:   base + toward · ((1 + d · s) / 2)⁴ + up · max(0, d_z)
+
+Here n is the normal of the surface, s the direction towards the sun, d the direction of view. The visibility comes from
+a shadow map (`geometry/shadow_map.py`). Between `_NEAR` and `_FAR` the two sums are blended. The coefficients are
+fitted to a photo (`sun_fit.py`). They are ratios to the light of the film, in the film's tone curve.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.geometry.shadow_map import ShadowMap
+from twin.types import Array, Array32
+
+TERMS = ("ambient", "direct", "base", "toward", "up")
+"""Names of the terms of the gain."""
+MIN_GAIN, MAX_GAIN = 0.1, 4.0
+"""Limits of the gain."""
+_NEAR, _FAR = 30.0, 60.0  # [m] z-depth below which surfaces are lit by their normals alone, and above which not at all
+_GLOW = 4  # exponent of the brightening towards the sun
+_SMOOTHING = 3 / 160  # [widths of the picture] window over which points are averaged before normals are computed
+_LEVEL = (0.75, 0.92)  # upward components of normals between which they are replaced more and more by the vertical
+_MAX_ENTRY = 100.0  # largest absolute coefficient in a file
+
+
+@dataclass(frozen=True, eq=False)
+class Sun:
+    """A sun with the gain by which it changes pictures of a field under one embedding."""
+
+    shadows: ShadowMap
+    """The parts of the place that it reaches; contains its direction."""
+    coefficients: Array32
+    """RGB of each of `TERMS`, shape (5, 3)."""
+
+    @property
+    def toward(self) -> Array:
+        """Unit vector towards the sun, shape (3,)."""
+        return self.shadows.toward
+
+    def gain(self, points: Array, normals: Array) -> tuple[Array32, Array32]:
+        """Gain of near surfaces at points (n, 3) [m] with unit normals (n, 3), shape (n, 3).
+
+        Also returns the fraction of it that is the direct light's, averaged over the channels, shape (n,).
+        """
+        direct = lit_cosine(self.shadows, points, normals)[:, None] * self.coefficients[1]
+        gain = np.clip(self.coefficients[0] + direct, MIN_GAIN, MAX_GAIN)
+        return gain, (direct / gain).mean(1)
+
+    def to_json(self) -> dict[str, Any]:
+        """The sun for a JSON file."""
+        values = self.coefficients.astype(np.float64).round(6)
+        return {
+            "coefficients": dict(zip(TERMS, values.tolist(), strict=True)),
+            "shadow_map": self.shadows.to_json(),
+        }
+
+    @staticmethod
+    def from_json(table: dict[str, Any]) -> "Sun":
+        """Reads the result of `to_json`. Raises ValueError, KeyError or TypeError if it is damaged."""
+        rows = np.array([table["coefficients"][name] for name in TERMS], np.float32)
+        if rows.shape != (len(TERMS), 3) or not (np.abs(rows) <= _MAX_ENTRY).all():
+            raise ValueError(f"coefficients of the sun of shape {rows.shape}, or beyond ±{_MAX_ENTRY:g}")
+        return Sun(ShadowMap.from_json(table["shadow_map"]), rows)
+
+
+Sunlight = tuple[tuple[Sun, float], ...]
+"""Suns with their weights, which sum to 1 at most; the rest is the light of the film. Empty: the film's light alone."""
+
+
+def mixed_sunlight(one: Sunlight, other: Sunlight, share: float) -> Sunlight:
+    """Interpolated sunlight, `share` of the way from `one` to `other`."""
+    weights: dict[Sun, float] = {}
+    for part, factor in ((one, 1.0 - share), (other, share)):
+        for sun, weight in part:
+            weights[sun] = weights.get(sun, 0.0) + factor * weight
+    return tuple((sun, weight) for sun, weight in weights.items() if weight > 0.0)
+
+
+def main_sun(sunlight: Sunlight) -> Sun | None:
+    """The sun that has at least half of the weight; None if there is none."""
+    return next((sun for sun, weight in sunlight if weight >= 0.5), None)
+
+
+def relit(rgb: Array32, depth: Array32, rays: Array, pose: Array, sunlight: Sunlight) -> Array32:
+    """Returns a picture of the field in sunlight.
+
+    Args:
+        rgb: Shape (height, width, 3).
+        depth: z-depth [m], shape (height, width).
+        rays: Rays of the pixels in the camera frame, with z = 1, shape (height, width, 3).
+        pose: camera_to_world, OpenCV axes, shape (4, 4).
+        sunlight: The suns; without one, the picture is returned as it is.
+    """
+    if not sunlight:
+        return rgb
+    seen = SeenSurfaces.of(depth, rays, pose)
+    gain = np.float32(1.0 - sum(weight for _, weight in sunlight))
+    for sun, weight in sunlight:
+        terms = seen.terms(sun.shadows)
+        gain = gain + np.float32(weight) * np.clip(terms @ sun.coefficients, MIN_GAIN, MAX_GAIN)
+    return rgb * gain.reshape(rgb.shape)
+
+
+@dataclass(frozen=True)
+class SeenSurfaces:
+    """Surfaces that the n pixels of a picture show."""
+
+    points: Array32
+    """[m], shape (n, 3); no deeper than `_FAR`."""
+    normals: Array32
+    """Unit normals towards the camera, shape (n, 3)."""
+    directions: Array32
+    """Unit vectors along the rays, shape (n, 3)."""
+    far: Array32
+    """Weight of the far view, shape (n,)."""
+
+    @staticmethod
+    def of(depth: Array32, rays: Array, pose: Array) -> "SeenSurfaces":
+        """Arguments as of `relit`."""
+        turned = (rays @ pose[:3, :3].T).astype(np.float32)
+        around = turned * np.minimum(depth, np.float32(_FAR))[..., None]
+        directions = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+        far = np.clip((depth - _NEAR) / (_FAR - _NEAR), 0.0, 1.0).astype(np.float32)
+        points = around + pose[:3, 3].astype(np.float32)
+        return SeenSurfaces(
+            *(points.reshape(-1, 3), _normals(around).reshape(-1, 3), directions.reshape(-1, 3), far.ravel())
+        )
+
+    def subset(self, rows: NDArray) -> "SeenSurfaces":
+        """Surfaces in some of the pixels."""
+        return SeenSurfaces(self.points[rows], self.normals[rows], self.directions[rows], self.far[rows])
+
+    def terms(self, shadows: ShadowMap) -> Array32:
+        """The terms of the gain at each pixel under a sun, shape (n, 5)."""
+        near, toward = np.float32(1.0) - self.far, shadows.toward.astype(np.float32)
+        out = np.zeros((len(near), len(TERMS)), np.float32)
+        out[:, 0] = near
+        close = np.flatnonzero(near)
+        out[close, 1] = near[close] * lit_cosine(shadows, self.points[close], self.normals[close])
+        away = np.flatnonzero(self.far)
+        far, directions = self.far[away], self.directions[away]
+        out[away, 2] = far
+        out[away, 3] = far * (0.5 + 0.5 * (directions @ toward)) ** _GLOW
+        out[away, 4] = far * np.maximum(directions[:, 2], 0.0)
+        return out
+
+
+def lit_cosine(shadows: ShadowMap, points: Array, normals: Array) -> Array32:
+    """Visibility of the sun times the cosine of its incidence, at points (n, 3) [m] with unit normals (n, 3); (n,)."""
+    cosine = np.maximum(normals.astype(np.float32) @ shadows.toward.astype(np.float32), 0.0)
+    facing = np.flatnonzero(cosine > 0.0)
+    cosine[facing] *= shadows.visibility(points[facing])
+    return cosine
+
+
+def _normals(points: Array32) -> Array32:
+    """Unit normals of the surface through points relative to the camera (height, width, 3), towards the camera.
+
+    Nearly level surfaces get the vertical, since the ground of a field is rough.
+    """
+    window = max(3, 2 * round(_SMOOTHING * points.shape[1] / 2) + 1)
+    smooth = cv2.blur(points, (window, window), borderType=cv2.BORDER_REPLICATE)
+    down, across = np.gradient(smooth, axis=(0, 1))
+    normal = np.cross(down, across)
+    squares, towards = (np.einsum("...i,...i", normal, other) for other in (normal, smooth))
+    normal *= (-np.sign(towards) / np.sqrt(np.maximum(squares, 1e-18)))[..., None]
+    low, high = _LEVEL
+    level = np.clip((normal[..., 2:] - low) / (high - low), 0.0, 1.0)
+    normal += level * (np.array([0.0, 0.0, 1.0], np.float32) - normal)
+    return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)).astype(np.float32)

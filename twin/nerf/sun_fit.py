@@ -1,0 +1,320 @@
+"""Fit of a sun to a photo: a search over directions, then a joint fit with the appearance embedding and the fog.
+
+The photo is compared with pictures of the field, its *bases*, whose colors are multiplied by the sun's gain
+(`sun.py`). For one base and one direction, the gain's coefficients are a linear least squares problem, so hundreds of
+directions can be tried. The best base and direction start a gradient descent on coefficients, embedding and fog.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from twin.geometry.images import psnr
+from twin.geometry.shadow_map import ShadowCasters, ShadowMap, angles, direction
+from twin.nerf import network
+from twin.nerf.fog import REACH, Fog
+from twin.nerf.sun import MAX_GAIN, MIN_GAIN, TERMS, SeenSurfaces, Sun
+from twin.types import Array, Array32
+
+if TYPE_CHECKING:
+    from twin.nerf.field import RadianceField
+
+SEARCH_TEXEL = 0.5
+"""[m] texels of the shadow maps of a search."""
+_ELEVATIONS = (8.0, 18.0, 32.0, 50.0)  # [°] elevations of the first directions
+_AZIMUTH_STEP = 22.5  # [°] step of their azimuths
+_ELEVATION_RANGE = (3.0, 80.0)  # [°] of a search
+_REFINEMENTS = (9.0, 5.0, 2.5)  # [°] steps of the further searches around the best directions
+_STARTS = 2  # number of first directions around which the search goes on
+_BASES = 2  # number of bases for which it goes on, besides the fitted embedding
+_RIDGE = 2e-4  # weight of the squared differences of coefficients from those without a sun
+_PLAIN = np.array([1.0, 0.0, 1.0, 0.0, 0.0])  # coefficients of the terms without a sun
+_STEPS = 100
+_RAYS, _SEARCH_RAYS = 6_000, 2_500  # pixels of the joint fits and of the searches, evenly spaced over the photo
+_EMBEDDING_RATE, _COEFFICIENT_RATE = 0.03, 0.03  # learning rates
+_EXTINCTION_RATE, _AIRLIGHT_RATE = 0.1, 0.03  # of the logarithm of extinction, and of the airlight
+_PRIOR = 1e-2  # weight of the squared distance from the initial embedding
+_MAX_EXTINCTION = 0.1  # [1/m]
+
+
+@dataclass(frozen=True)
+class SunProblem:
+    """n pixels of a photo, with what the field shows in them."""
+
+    colors: Array32
+    """Colors of the photo, shape (n, 3)."""
+    seen: SeenSurfaces
+    distances: Array32
+    """Distances along the rays [m], shape (n,)."""
+    bases: Array32
+    """Colors of the field under each base, shape (bases, n, 3)."""
+
+    def subset(self, rows: NDArray) -> "SunProblem":
+        """The problem of some pixels."""
+        return SunProblem(self.colors[rows], self.seen.subset(rows), self.distances[rows], self.bases[:, rows])
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """A sun fitted to a base by least squares."""
+
+    base: int
+    toward: Array
+    """Unit vector towards the sun, shape (3,)."""
+    coefficients: Array32
+    """Shape (5, 3), see `Sun`."""
+    error: float
+    """Mean squared difference of the colors."""
+
+
+def search_directions(problem: SunProblem, casters: ShadowCasters, fog: Fog) -> list[LinearFit]:
+    """For each base its best fit, over the directions of a grid and of refinements around the best of them."""
+    known: dict[tuple[float, float], list[LinearFit]] = {}
+
+    def fits(azimuth: float, elevation: float) -> list[LinearFit]:
+        key = round(azimuth % 360.0, 1), round(min(max(elevation, _ELEVATION_RANGE[0]), _ELEVATION_RANGE[1]), 1)
+        if key not in known:
+            known[key] = fit_direction(problem, casters.seen_from(direction(*key), SEARCH_TEXEL), fog)
+        return known[key]
+
+    grid = [fits(a, e) for e in _ELEVATIONS for a in np.arange(0.0, 360.0, _AZIMUTH_STEP)]
+    best = [min((one[k] for one in grid), key=_error) for k in range(len(problem.bases))]
+    promising = set(np.argsort([one.error for one in best])[:_BASES].tolist()) | {len(best) - 1}
+    for k in promising:
+        starts = sorted((one[k] for one in grid), key=_error)[:_STARTS]
+        for found in starts:
+            for step in _REFINEMENTS:
+                azimuth, elevation = angles(found.toward)
+                wide = step / math.cos(math.radians(elevation))
+                around = ((wide, 0.0), (-wide, 0.0), (0.0, step), (0.0, -step))
+                found = min([found, *(fits(azimuth + a, elevation + e)[k] for a, e in around)], key=_error)
+            best[k] = min(best[k], found, key=_error)
+    return best
+
+
+def _error(fit: LinearFit) -> float:
+    return fit.error
+
+
+def fit_direction(problem: SunProblem, shadows: ShadowMap, fog: Fog) -> list[LinearFit]:
+    """Fits each base under a sun with a shadow map, in given fog."""
+    terms = problem.seen.terms(shadows).astype(np.float64)
+    kept = _kept(fog, problem.distances)[:, None]
+    target = problem.colors - (1.0 - kept) * np.asarray(fog.airlight)
+    out = []
+    for number, base in enumerate(problem.bases):
+        coefficients = np.empty((len(TERMS), 3))
+        for c in range(3):
+            coefficients[:, c] = _solve(kept * base[:, c : c + 1] * terms, target[:, c])
+        gain = np.clip(terms @ coefficients, MIN_GAIN, MAX_GAIN)
+        shown = np.clip(kept * base * gain + (1.0 - kept) * np.asarray(fog.airlight), 0.0, 1.0)
+        error = float(((shown - problem.colors) ** 2).mean())
+        out.append(LinearFit(number, shadows.toward, coefficients.astype(np.float32), error))
+    return out
+
+
+def _kept(fog: Fog, distances: NDArray) -> NDArray:
+    """Fraction of light that the fog keeps."""
+    return np.exp(-fog.extinction * np.minimum(distances, REACH))
+
+
+def _solve(columns: NDArray, target: NDArray) -> NDArray:
+    """Least squares with a weak pull to `_PLAIN`; ambient and direct light are not negative."""
+    scale = _RIDGE * float((columns**2).mean(0).sum()) * len(columns)
+    square = columns.T @ columns + scale * np.eye(len(_PLAIN))
+    right = columns.T @ target + scale * _PLAIN
+    free = np.ones(len(_PLAIN), bool)
+    while True:
+        out = np.zeros(len(_PLAIN))
+        out[free] = np.linalg.solve(square[np.ix_(free, free)], right[free])
+        negative = free & (out < 0.0) & np.array([True, True, False, False, False])
+        if not negative.any():
+            return out
+        free &= ~negative
+
+
+def fit_jointly(
+    parameters: dict[str, torch.Tensor],
+    features: torch.Tensor,
+    harmonics: torch.Tensor,
+    problem: SunProblem,
+    start: Array32,
+    sun: Sun,
+    fog: Fog,
+    steps: int = _STEPS,
+) -> tuple[Array32, Sun, Fog]:
+    """Fits embedding (dim,), coefficients and, if there is fog, the fog, by gradient descent from a linear fit.
+
+    `parameters` are the weights of the field's networks; features (n, CHANNELS − 1) and harmonics (n, 16) of the
+    problem's pixels come from `RadianceField.trace`. `start` is the mean of the embedding's prior.
+    """
+    device = features.device
+    terms = torch.as_tensor(problem.seen.terms(sun.shadows), device=device)
+    colors = torch.as_tensor(problem.colors, device=device)
+    distances = torch.as_tensor(problem.distances, device=device).clamp(max=REACH)
+    origin = torch.as_tensor(start, device=device)
+    embedding = origin.clone().requires_grad_(True)
+    coefficients = torch.tensor(sun.coefficients, device=device, requires_grad=True)
+    fitted, rates = [embedding, coefficients], [_EMBEDDING_RATE, _COEFFICIENT_RATE]
+    if fog.extinction:
+        log_extinction = torch.tensor(math.log(fog.extinction), device=device, requires_grad=True)
+        airlight = torch.tensor(fog.airlight, device=device, requires_grad=True)
+        fitted += [log_extinction, airlight]
+        rates += [_EXTINCTION_RATE, _AIRLIGHT_RATE]
+    optimizer = torch.optim.Adam([{"params": [p], "lr": rate} for p, rate in zip(fitted, rates, strict=True)])
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1.0 - step / steps)
+    for _ in range(steps):
+        rgb = network.head(parameters, features, harmonics, embedding)
+        rgb = rgb * (terms @ coefficients).clamp(MIN_GAIN, MAX_GAIN)
+        if fog.extinction:
+            kept = torch.exp(-torch.exp(log_extinction) * distances)[:, None]
+            rgb = kept * rgb + (1.0 - kept) * airlight
+        loss = ((rgb.clamp(max=1.0) - colors) ** 2).mean() + _PRIOR * ((embedding - origin) ** 2).mean()
+        for parameter, gradient in zip(fitted, torch.autograd.grad(loss, fitted), strict=True):
+            parameter.grad = gradient
+        optimizer.step()
+        schedule.step()
+        with torch.no_grad():
+            coefficients[:2].clamp_(min=0.0)
+            if fog.extinction:
+                log_extinction.clamp_(max=math.log(_MAX_EXTINCTION))
+                airlight.clamp_(0.0, 1.0)
+    if fog.extinction:
+        red, green, blue = airlight.tolist()
+        fog = Fog(float(log_extinction.detach().exp()), (red, green, blue))
+    return embedding.detach().cpu().numpy(), Sun(sun.shadows, coefficients.detach().cpu().numpy()), fog
+
+
+# ---- fit to a photo
+
+
+@dataclass(frozen=True)
+class TracedPhoto:
+    """A photo with what the field has in its pixels."""
+
+    photo: Array32
+    """RGB in [0, 1], shape (h, w, 3)."""
+    depth: Array32
+    """z-depth [m], shape (h, w)."""
+    rays: Array
+    """Rays of the pixels in the camera frame, with z = 1, shape (h, w, 3)."""
+    camera_to_world: Array
+    """OpenCV axes, shape (4, 4)."""
+    features: torch.Tensor
+    """Shape (h · w, CHANNELS − 1), see `RadianceField.trace`."""
+    harmonics: torch.Tensor
+    """Shape (h · w, 16)."""
+
+    @property
+    def distance(self) -> Array32:
+        """Distances along the rays [m], shape (h, w)."""
+        return self.depth * np.linalg.norm(self.rays, axis=-1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class AirFit:
+    """Embedding and fog fitted to some pixels of a photo, without a sun."""
+
+    pixels: NDArray[np.int64]
+    """Indices of the pixels, shape (k,)."""
+    embedding: Array32
+    """Shape (dim,)."""
+    fog: Fog
+
+
+@dataclass(frozen=True)
+class SunFit:
+    """A sun fitted to a photo."""
+
+    sun: Sun
+    embedding: Array32
+    """Appearance embedding under which the sun's gain applies, shape (dim,)."""
+    fog: Fog
+    base: str
+    """Lighting from which the embedding started; empty for the embedding fitted without a sun."""
+    picture: Array32
+    """The field in this light, from the photo's pose, shape (h, w, 3)."""
+    psnr_other_half: float
+    """Mean PSNR of each half of the photo under the fit to the other half [dB]."""
+    disagreement: float
+    """Angle between the directions found in the two halves [°]; 0 if the direction was given."""
+
+
+def fit_sun(
+    field: "RadianceField",
+    traced: TracedPhoto,
+    halves: Sequence[AirFit],
+    whole: AirFit,
+    casters: ShadowCasters,
+    toward: Array | None = None,
+) -> SunFit:
+    """Fits a sun to a photo.
+
+    The base is the filmed lighting, or the embedding fitted without a sun, whose fits to each half of the photo explain
+    the other half best.
+
+    Args:
+        field: The field; it stays fixed.
+        traced: The photo.
+        halves: Fits to both halves without a sun.
+        whole: The fit to the whole photo without a sun.
+        casters: What throws shadows.
+        toward: Direction to the sun, shape (3,); None: it is searched.
+    """
+    shape, seen = traced.photo.shape, SeenSurfaces.of(traced.depth, traced.rays, traced.camera_to_world)
+    colors, distances = traced.photo.reshape(-1, 3).astype(np.float32), traced.distance.ravel()
+    names = [*field.lightings, ""]
+    filmed = [field.embedding(name) for name in field.lightings]
+
+    def color(rows: NDArray, embedding: Array32) -> Array32:
+        index = torch.as_tensor(rows, device=field.device)
+        return field.color(traced.features[index], traced.harmonics[index], embedding)
+
+    def problem(rows: NDArray, count: int, embeddings: Sequence[Array32]) -> tuple[NDArray, SunProblem]:
+        some = rows[:: max(1, len(rows) // count)]
+        bases = np.stack([color(some, one) for one in embeddings])
+        return some, SunProblem(colors[some], seen.subset(some), distances[some], bases)
+
+    def solve(given: AirFit) -> list[tuple[LinearFit, Array32]]:
+        """The best linear fits of the bases to some pixels, and the bases' embeddings."""
+        embeddings = [*filmed, given.embedding]
+        small = problem(given.pixels, _SEARCH_RAYS, embeddings)[1]
+        if toward is None:
+            found = search_directions(small, casters, given.fog)
+        else:
+            found = fit_direction(small, casters.seen_from(toward, SEARCH_TEXEL), given.fog)
+        return list(zip(found, embeddings, strict=True))
+
+    def refine(given: AirFit, start: LinearFit, embedding: Array32) -> tuple[Array32, Sun, Fog]:
+        some, mine = problem(given.pixels, _RAYS, [embedding])
+        sun = Sun(casters.seen_from(start.toward), start.coefficients)
+        index = torch.as_tensor(some, device=field.device)
+        traces = traced.features[index], traced.harmonics[index]
+        return fit_jointly(field.parameters, *traces, mine, embedding, sun, given.fog)
+
+    def picture(embedding: Array32, sun: Sun, fog: Fog) -> Array32:
+        rgb = field.color(traced.features, traced.harmonics, embedding)
+        gain = np.clip(seen.terms(sun.shadows) @ sun.coefficients, MIN_GAIN, MAX_GAIN)
+        return np.clip(fog.apply((rgb * gain).reshape(shape), traced.distance), 0.0, 1.0)
+
+    solved = [solve(half) for half in halves]
+    order = np.argsort(np.mean([[fit.error for fit, _ in one] for one in solved], 0))
+    scores = {}
+    for k in {*order[:_BASES].tolist(), len(filmed)}:
+        each = []
+        for half, fits in zip(halves, solved, strict=True):
+            rest = np.ones(len(colors), bool)
+            rest[half.pixels] = False
+            each.append(psnr(picture(*refine(half, *fits[k])), traced.photo, rest.reshape(shape[:2])))
+        scores[k] = float(np.mean(each))
+    base = max(scores, key=lambda k: scores[k])
+    found = refine(whole, *solve(whole)[base])
+    embedding, sun, fog = found
+    one, other = (fits[base][0].toward for fits in solved)
+    disagreement = float(np.rad2deg(np.arccos(np.clip(one @ other, -1.0, 1.0))))
+    return SunFit(sun, embedding, fog, names[base], picture(*found), scores[base], disagreement)
