@@ -84,25 +84,22 @@ def joined(one: Cameras, other: Cameras) -> Cameras:
 def test_a_mover_is_found_in_every_frame_and_little_else(tmp_path):
     cameras, depth = film(tmp_path, "day", PLACE, mover=True)
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
-    found = transients.find_transients(pixels, cell_depths(pixels, depth))
+    masks = np.array(transients.mover_masks(pixels, cell_depths(pixels, depth)))
     mover, around = (np.zeros((len(depth), HEIGHT, WIDTH), bool) for _ in range(2))
     for i in range(len(depth)):
         mover[i, MOVING, columns(i)] = True
         around[i, 22:74, max(0, columns(i).start - 8) : columns(i).stop + 8] = True
-    masks = np.array(found.masks)
     # At the ends of the film, surfaces near the border of a frame are seen in too few others.
     assert (masks & mover)[1:-1].sum() > 0.9 * mover[1:-1].sum()
     assert (masks & ~around).mean() < 0.005
-    assert found.moving == pytest.approx(masks.mean())
-    assert not found.objects
 
 
 def test_nothing_is_left_out_of_a_static_film(tmp_path):
     cameras, depth = film(tmp_path, "day", PLACE)
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     pixels.stereo = supervision(pixels, depth)
-    found = transients.find_transients(pixels, cell_depths(pixels, depth))
-    assert np.array(found.masks).mean() < 0.003 and not found.objects
+    assert np.array(transients.mover_masks(pixels, cell_depths(pixels, depth))).mean() < 0.003
+    assert not transients.left_objects(pixels)
 
 
 def test_a_car_that_left_is_found_and_excluded_where_it_stands(tmp_path):
@@ -112,18 +109,17 @@ def test_a_car_that_left_is_found_and_excluded_where_it_stands(tmp_path):
     cameras, depth = joined(day, night), np.concatenate([day_depth, night_depth])
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     pixels.stereo = supervision(pixels, depth)
-    found = transients.find_transients(pixels, cell_depths(pixels, depth))
-    (car,) = found.objects
+    (car,) = transients.left_objects(pixels)
     assert car.present == ("day",) and car.absent == ("night",)
     half = 0.5 * np.array([CAR.length, CAR.width, CAR.top])
     assert (np.abs(car.voxels - [CAR.x, CAR.y, half[2]]) < half + 0.4).all()
     assert car.size[0] > 0.8 * CAR.length and car.size[2] > 0.7 * CAR.top  # its far side is not seen
     shows = day_depth < night_depth - 0.01
-    masks = np.array(found.masks)
+    masks = np.array(transients.object_masks(pixels, [car]))
     assert (masks[: len(day)] & shows).sum() > 0.97 * shows.sum()
-    assert masks[len(day) :].mean() < 0.02
-    assert masks[: len(day)].sum() < 2.0 * shows.sum()
-    assert found.summary()["objects"][0]["present"] == ["day"]
+    assert not masks[len(day) :].any()
+    assert masks[: len(day)].sum() < 2.5 * shows.sum()
+    assert car.to_json()["present"] == ["day"]
 
 
 def test_excluded_pixels_are_neither_sampled_nor_supervised(tmp_path):
@@ -146,19 +142,19 @@ def test_training_leaves_out_what_was_found_and_can_be_told_not_to(tmp_path):
     config = NerfConfig(steps=10, rays=256, samples=8, levels=3, log2_table=10, max_width=WIDTH, stereo=False)
     trainer = Trainer(cameras, points_of(cameras), config, 0, "cpu")
     while not trainer.done:
-        assert (trainer.transients is None) == (trainer.steps_done < 4)
+        assert bool(trainer.excluded) == (trainer.steps_done > 3)
         trainer.step()
-    excluded = np.concatenate([mask.ravel() for mask in trainer.transients.masks])
-    assert (trainer.pixels.unmasked == ~excluded).all()
+    excluded = np.concatenate([mask.ravel() for mask in trainer.excluded])
+    assert (trainer.pixels.unmasked == ~excluded).all() and trainer.moving == pytest.approx(excluded.mean())
     trainer = Trainer(cameras, points_of(cameras), replace(config, transients=False), 0, "cpu")
     while not trainer.done:
         trainer.step()
-    assert trainer.transients is None and trainer.pixels.unmasked.all()
+    assert not trainer.excluded and trainer.pixels.unmasked.all()
 
 
 def test_photos_of_many_lightings_have_no_transients(tmp_path):
     cameras, depth = film(tmp_path, "day", PLACE, n=3)
     cameras = replace(cameras, lightings=("a", "b", "c"))
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
-    found = transients.find_transients(pixels, cell_depths(pixels, depth))
-    assert not np.array(found.masks).any() and found.moving == 0.0
+    assert not np.array(transients.mover_masks(pixels, cell_depths(pixels, depth))).any()
+    assert not transients.left_objects(pixels)

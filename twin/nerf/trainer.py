@@ -42,7 +42,7 @@ from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler
 from twin.nerf.pose_refinement import PoseRefinement
 from twin.nerf.stereo import stereo_depths
-from twin.nerf.transients import Transients, cell_centers, cell_size, find_transients
+from twin.nerf.transients import LeftObject, cell_centers, cell_size, left_objects, mover_masks, object_masks
 from twin.runtime import bar
 from twin.scene import SceneDir
 from twin.warp_runtime import wp
@@ -97,7 +97,7 @@ _FINAL_RATE = 0.03  # final learning rates, as a share of the initial ones
 _RISE, _FALL = 0.3, 0.1  # step of an opacity grid cell toward a more or a less opaque sample [share of the difference]
 _LOG_OFFSET = 0.05  # added to distances in the distortion loss's logarithm [share of the near box's longest half side]
 _WARM_UP = 20  # steps of rising learning rate
-_TRANSIENTS_SHARE = 0.3  # share of the steps after which the field is good enough to find transients
+_MOVERS_SHARE = 0.3  # share of the steps after which the field is good enough to find movers
 _EXPLORATION_SHARE = 0.15  # share of the steps in which sampling narrows down to surfaces; cameras are refined after it
 
 
@@ -119,6 +119,14 @@ class Trainer:
         """Summary of the stereo depths; None without `nerf.stereo`."""
         if config.stereo:
             self.pixels.stereo, self.stereo = stereo_depths(self.pixels, seed, device)
+        self.excluded: list[NDArray[np.bool_]] = []
+        """True where a training frame shows transients, a frame's size each; empty without any."""
+        self.moving = 0.0
+        """Fraction of the training pixels that show movers."""
+        self.left: list[LeftObject] = left_objects(self.pixels) if config.transients else []
+        # Their colors must never be learned: where they stood, some lightings have no other pixels to correct them.
+        if self.left:
+            self._exclude(object_masks(self.pixels, self.left))
         train = self.pixels.cameras
         lightings = tuple(dict.fromkeys(train.lightings))
         frame_lighting = np.array([lightings.index(name) for name in train.lightings])
@@ -158,8 +166,6 @@ class Trainer:
         # The hash table's gradient, and Adam's first and second moment of it.
         self.moments = [warp_view(torch.zeros_like(f.table), hashgrid.Feature) for _ in range(3)]
         self.steps_done = 0
-        self.transients: Transients | None = None
-        """What is not trained on; None without `nerf.transients`, and before it was looked for."""
 
     def _growth(self, near_box: NearBox) -> float:
         """Factor between the cells per axis of consecutive hash levels: makes the finest cell `_CELL_PIXELS` wide."""
@@ -183,9 +189,10 @@ class Trainer:
 
     def step(self) -> float:
         """Runs one training step and returns the mean squared error of its colors."""
-        if self.config.transients and self.steps_done == int(_TRANSIENTS_SHARE * self.config.steps):
-            self.transients = find_transients(self.pixels, self._cell_depths())
-            self.pixels.exclude(self.transients.masks)
+        if self.config.transients and self.steps_done == int(_MOVERS_SHARE * self.config.steps):
+            movers = mover_masks(self.pixels, self._cell_depths())
+            self.moving = sum(float(mask.sum()) for mask in movers) / len(self.pixels.colors)
+            self._exclude(movers)
         ws, device = self.ws, self.device
         per_shard = self.rays // _SHARDS
         supervised = int(per_shard * self.config.sightings)
@@ -265,6 +272,12 @@ class Trainer:
                 device=self.device,
             )
             return float((error**2).mean()), [first, second, *gradients[2:]]
+
+    def _exclude(self, masks: list[NDArray[np.bool_]]) -> None:
+        """Excludes marked pixels from training, in addition to earlier ones."""
+        self.pixels.exclude(masks)
+        before = self.excluded or [np.zeros_like(mask) for mask in masks]
+        self.excluded = [one | other for one, other in zip(before, masks, strict=True)]
 
     def _cell_depths(self) -> list[NDArray[np.float32]]:
         """The field's z-depths [m] at the centers of every training frame's cells, shapes (rows, columns)."""
@@ -381,8 +394,9 @@ def train_field(
     seed: int = 0,
     camera_height: float = 0.0,
     device: str | None = None,
-) -> tuple[RadianceField, dict[str, Any], Cameras, Transients | None]:
-    """Trains a field; returns it, the training metrics, the cameras, refined if so configured, and what was left out.
+) -> tuple[RadianceField, dict[str, Any], Cameras, list[NDArray[np.bool_]]]:
+    """Trains a field; returns it, the training metrics, the cameras, refined if so configured, and
+    the excluded pixels of every training frame (`Trainer.excluded`).
 
     `camera_height` [m] is the constant height of the camera above the ground, 0 if it is not constant; for `device` see
     `buffers.resolve_device`. Raises InputError if training diverges.
@@ -418,11 +432,13 @@ def train_field(
             "sightings_path": len(trainer.pixels.path.frame),
             "stereo": trainer.stereo,
             "cameras_moved": moved,
-            "transients": None if trainer.transients is None else trainer.transients.summary(),
+            "transients": {"moving_share": round(trainer.moving, 4), "objects": [one.to_json() for one in trainer.left]}
+            if config.transients
+            else None,
             "curve": curve,
         },
         cameras,
-        trainer.transients,
+        trainer.excluded,
     )
 
 
@@ -458,10 +474,10 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))
     height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
-    field, metrics, cameras, transients = train_field(cameras, points, config.nerf, config.seed, height, device)
+    field, metrics, cameras, excluded = train_field(cameras, points, config.nerf, config.seed, height, device)
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
-    if transients is not None:
-        pixels.exclude(transients.masks)
+    if excluded:
+        pixels.exclude(excluded)
     baked, metrics["bake"] = bake(field, pixels, config.seed, config.nerf.bake_steps, config.nerf.max_bricks)
     if config.nerf.detail_passes > 0.0:
         metrics["detail"] = fit_detail(baked, field.appearance, pixels, config.seed, config.nerf.detail_passes)

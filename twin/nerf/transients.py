@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from twin.geometry.cameras import project, unproject
 from twin.nerf.buffers import parallel
@@ -35,61 +35,6 @@ _MIN_CONTRAST = 0.12  # the same, as a share of the brightness
 _MIN_CELLS = 8  # least size of a mover in cells
 _WEAK = 0.75  # a mover's cells have at least this difference, as a share of that of its strongest cells
 _SPREADS = 4.0  # least difference, as a multiple of the frames' median deviation from their median
-
-
-@dataclass(frozen=True)
-class Transients:
-    """The transients of a capture."""
-
-    masks: list[NDArray[np.bool_]]
-    """True where a training frame shows a transient, shape (height, width) each."""
-    moving: float
-    """Fraction of the training pixels that show movers or their shadows."""
-    objects: list["LeftObject"]
-
-    def summary(self) -> dict[str, Any]:
-        """Entries of `report.json`."""
-        objects = [
-            {
-                "center": [round(float(x), 2) for x in one.center],
-                "size": [round(float(x), 2) for x in one.size],
-                "present": list(one.present),
-                "absent": list(one.absent),
-            }
-            for one in self.objects
-        ]
-        return {
-            "moving_share": round(self.moving, 4),
-            "frames": sum(bool(m.any()) for m in self.masks),
-            "objects": objects,
-        }
-
-
-def find_transients(pixels: TrainingPixels, depths: list[Array32]) -> Transients:
-    """Finds what moved, and what stands in some films only.
-
-    Args:
-        pixels: The training frames, with their stereo depths.
-        depths: z-depths [m] of the surfaces in every training frame's cells (`cell_centers`), shapes (rows, columns).
-    """
-    side = cell_size(pixels)
-    cells = [frame_cells(pixels, i, side, depth) for i, depth in enumerate(depths)]
-    movers = mover_cells(pixels, cells)
-    objects = left_objects(pixels)
-    masks = [_enlarged(mark, side, pixels, i) for i, mark in enumerate(movers)]
-    moving = sum(float(mask.sum()) for mask in masks) / len(pixels.colors)
-    for mask, i in zip(masks, range(len(cells)), strict=True):
-        for one in objects:
-            if pixels.cameras.lightings[i] in one.present:
-                mask |= object_mask(pixels, cells[i], i, one)
-    return Transients(masks, moving, objects)
-
-
-def _enlarged(cells: NDArray[np.bool_], side: int, pixels: TrainingPixels, i: int) -> NDArray[np.bool_]:
-    """A frame's marked cells as pixels."""
-    width, height = int(pixels.width[i]), int(pixels.height[i])
-    mask = np.repeat(np.repeat(cells, side, 0), side, 1)
-    return np.pad(mask, ((0, height - mask.shape[0]), (0, width - mask.shape[1])), mode="edge")
 
 
 @dataclass(frozen=True)
@@ -112,9 +57,9 @@ class Cells:
         return (rays / rays[:, 2:] * self.depth.reshape(-1, 1)) @ pose[:3, :3].T + pose[:3, 3]
 
 
-def cell_size(pixels: TrainingPixels) -> int:
-    """Side of a cell [px]."""
-    return max(1, round(float(max(pixels.width.max(), pixels.height.max())) / _GRID_CELLS))
+def cell_size(pixels: TrainingPixels, count: int = _GRID_CELLS) -> int:
+    """Side of a cell [px], such that `count` cells are about as long as a frame's longer side."""
+    return max(1, round(float(max(pixels.width.max(), pixels.height.max())) / count))
 
 
 def cell_centers(width: int, height: int, side: int) -> Array:
@@ -208,16 +153,27 @@ def _median(stack: Array32, count: NDArray) -> Array32:
     return 0.5 * (ordered[np.maximum(count - 1, 0) // 2, index] + ordered[count // 2, index])
 
 
-def mover_cells(pixels: TrainingPixels, cells: list[Cells]) -> list[NDArray[np.bool_]]:
-    """True in the cells of every training frame that show a mover, or a shadow that moves, shapes (rows, columns)."""
-    static = [replace(one, depth=depth) for one, depth in zip(cells, static_depths(pixels, cells), strict=True)]
-    # Depths of the field miss what is behind a mover, medians miss thin things: a mover differs from both.
+def mover_masks(pixels: TrainingPixels, depths: list[Array32]) -> list[NDArray[np.bool_]]:
+    """True where a training frame shows a mover, or a shadow that moves; a frame's size each.
 
+    `depths` are the z-depths [m] of the surfaces in every frame's cells (`cell_centers`), shapes (rows, columns).
+    """
+    side = cell_size(pixels)
+    cells = [frame_cells(pixels, i, side, depth) for i, depth in enumerate(depths)]
+    static = [replace(one, depth=depth) for one, depth in zip(cells, static_depths(pixels, cells), strict=True)]
+
+    # Depths of the field miss what is behind a mover, medians miss thin things: a mover differs from both.
     def find(i: int) -> NDArray[np.bool_]:
         excess = np.fmin(difference(pixels, cells, i), difference(pixels, static, i))
-        return cleaned(excess > 1.0, excess > _WEAK)
+        return _enlarged(cleaned(excess > 1.0, excess > _WEAK), side, int(pixels.width[i]), int(pixels.height[i]))
 
     return parallel(find, range(len(cells)), "cpu")
+
+
+def _enlarged(cells: NDArray[np.bool_], side: int, width: int, height: int) -> NDArray[np.bool_]:
+    """A frame's marked cells as pixels, shape (height, width)."""
+    mask = np.repeat(np.repeat(cells, side, 0), side, 1)
+    return np.pad(mask, ((0, height - mask.shape[0]), (0, width - mask.shape[1])), mode="edge")
 
 
 def difference(pixels: TrainingPixels, cells: list[Cells], i: int) -> Array32:
@@ -271,6 +227,11 @@ _AT = (0.3, 0.04)  # surface this far from a voxel shows that it is occupied: th
 _MIN_FRAMES = 3  # least number of frames that show a voxel empty, and occupied
 _MIN_VOXELS = 24  # smaller objects are left alone: noise of stereo looks like them
 _HIDDEN = 0.7  # [m] an object is hidden by surfaces that are nearer than its nearest voxel by more than this
+_NEAR_PLANE = 0.3  # [m] z-depth from which an object's outline is drawn
+_SHADOW_REACH = 2.5  # [m] from an object, within which ground is taken to be in its shadow if it is dark
+_SHADOW_DARKNESS = 0.8  # brightness of such ground, as a share of that of the ground farther away, at most
+_MIN_AROUND = 20  # least number of cells with ground farther away
+_STEREO_CELLS = 160  # cells along a frame's longer side in which stereo depths are looked up
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 _MIN_EXTENT = 0.6  # [m] least extent along the second longest axis
 
@@ -296,19 +257,10 @@ class LeftObject:
         """Size of its bounding box [m], shape (3,)."""
         return np.ptp(self.voxels, axis=0) + _VOXEL
 
-
-def depth_maps(pixels: TrainingPixels, side: int) -> list[Array32]:
-    """Known z-depths [m] of every training frame on its grid of cells, nan where unknown, shapes (rows, columns)."""
-    maps = []
-    for i in range(len(pixels.cameras)):
-        known = np.full((int(pixels.height[i]) // side, int(pixels.width[i]) // side), np.nan, np.float32)
-        own = pixels.stereo.frame == i
-        pixel = pixels.stereo.pixel[own]
-        z = pixels.stereo.distance[own] / np.linalg.norm(unproject(pixel, pixels.intrinsics[i]), axis=1)
-        column, row = np.minimum((pixel // side).astype(int), [known.shape[1] - 1, known.shape[0] - 1]).T
-        known[row, column] = z
-        maps.append(known)
-    return maps
+    def to_json(self) -> dict[str, Any]:
+        """Its place, size [m] and lightings, for the report."""
+        center, size = ([round(float(x), 2) for x in values] for values in (self.center, self.size))
+        return {"center": center, "size": size, "present": list(self.present), "absent": list(self.absent)}
 
 
 def left_objects(pixels: TrainingPixels) -> list[LeftObject]:
@@ -317,11 +269,11 @@ def left_objects(pixels: TrainingPixels) -> list[LeftObject]:
     if len(lightings) < 2 or not len(pixels.stereo.frame):
         return []
     voxels = _voxels(pixels)
-    side = max(1, round(float(max(pixels.width.max(), pixels.height.max())) / 160))
-    maps = depth_maps(pixels, side)
+    side = cell_size(pixels, _STEREO_CELLS)
     index = np.array([lightings.index(name) for name in pixels.cameras.lightings])
     occupied, empty = (np.zeros((len(voxels), len(lightings)), np.int32) for _ in range(2))
-    for i, known in enumerate(maps):
+    for i in range(len(pixels.cameras)):
+        known = stereo_map(pixels, i, side)
         near = np.flatnonzero(((voxels - pixels.cameras.positions[i]) ** 2).sum(1) < _REACH**2)
         pixel, z = project(voxels[near], pixels.cameras.camera_to_world[i], pixels.intrinsics[i])
         column, row = np.floor(pixel / side).astype(int).T
@@ -353,20 +305,74 @@ def left_objects(pixels: TrainingPixels) -> list[LeftObject]:
     return found
 
 
-def object_mask(pixels: TrainingPixels, cells: Cells, i: int, one: LeftObject) -> NDArray[np.bool_]:
+def object_masks(pixels: TrainingPixels, objects: list[LeftObject]) -> list[NDArray[np.bool_]]:
+    """True where a training frame shows one of the objects, or its shadow on the ground; a frame's size each."""
+    side = cell_size(pixels)
+
+    def find(i: int) -> NDArray[np.bool_]:
+        width, height = int(pixels.width[i]), int(pixels.height[i])
+        mask = np.zeros((height, width), bool)
+        present = [one for one in objects if pixels.cameras.lightings[i] in one.present]
+        if present:
+            known = stereo_map(pixels, i, side)
+            cells = frame_cells(pixels, i, side, np.where(np.isnan(known), np.float32(_FAR), known))
+            for one in present:
+                mask |= _outline(pixels, cells, i, one)
+                mask |= _enlarged(_shadow(pixels, cells, i, one), side, width, height)
+        return mask
+
+    return parallel(find, range(len(pixels.cameras)), "cpu")
+
+
+def _outline(pixels: TrainingPixels, cells: Cells, i: int, one: LeftObject) -> NDArray[np.bool_]:
     """True where frame i shows an object, with a margin of a voxel, shape (height, width)."""
     height, width = int(pixels.height[i]), int(pixels.width[i])
     mask = np.zeros((height, width), np.uint8)
-    corners = one.voxels[:, None] + _VOXEL * _CORNERS
-    pixel, z = project(corners.reshape(-1, 3), pixels.cameras.camera_to_world[i], pixels.intrinsics[i])
-    ahead = z > 0.3
-    if not ahead.any():
+    corners = (one.voxels[:, None] + _VOXEL * _CORNERS).reshape(-1, 3)
+    corners = corners[ConvexHull(corners).vertices]
+    local = (corners - pixels.cameras.positions[i]) @ pixels.cameras.camera_to_world[i, :3, :3]
+    ahead, behind = local[local[:, 2] >= _NEAR_PLANE], local[local[:, 2] < _NEAR_PLANE]
+    if not len(ahead):
         return mask > 0
-    hull = cv2.convexHull(np.clip(pixel[ahead], -4.0 * width, 5.0 * width).astype(np.float32))
-    cv2.fillConvexPoly(mask, np.rint(hull).astype(np.int32), 1)
-    hidden = (cells.depth < z[ahead].min() - _HIDDEN).astype(np.uint8)
+    # Where edges of the hull cross the near plane.
+    share = (_NEAR_PLANE - behind[:, None, 2]) / (ahead[:, 2] - behind[:, None, 2])
+    crossing = behind[:, None] + share[..., None] * (ahead - behind[:, None])
+    corner = np.concatenate([ahead, crossing.reshape(-1, 3)])
+    fx, fy, cx, cy = pixels.intrinsics[i]
+    u, v = fx * corner[:, 0] / corner[:, 2] + cx, fy * corner[:, 1] / corner[:, 2] + cy
+    cv2.fillConvexPoly(mask, np.rint(cv2.convexHull(np.stack([u, v], 1).astype(np.float32))).astype(np.int32), 1)
+    hidden = (cells.depth < corner[:, 2].min() - _HIDDEN).astype(np.uint8)
     hidden = cv2.resize(hidden, (width, height), interpolation=cv2.INTER_NEAREST)
     return (mask > 0) & (hidden == 0)
+
+
+def _shadow(pixels: TrainingPixels, cells: Cells, i: int, one: LeftObject) -> NDArray[np.bool_]:
+    """True in the cells of frame i with ground near an object that is darker than the ground around it."""
+    base = one.voxels[:, 2].min() - 0.5 * _VOXEL
+    rays = unproject(cells.pixel.reshape(-1, 2), pixels.intrinsics[i]) @ pixels.cameras.camera_to_world[i, :3, :3].T
+    position = pixels.cameras.positions[i]
+    down = rays[:, 2] < -1e-3
+    reach = np.where(down, (base - position[2]) / np.where(down, rays[:, 2], -1.0), 0.0)
+    ground = position[:2] + reach[:, None] * rays[:, :2]
+    distance = np.where(down & (reach > 0.0), cKDTree(one.voxels[:, :2]).query(ground)[0], np.inf)
+    brightness = cells.color.mean(-1).ravel()
+    around = (distance > _SHADOW_REACH) & (distance < 2.0 * _SHADOW_REACH)
+    if around.sum() < _MIN_AROUND:
+        return np.zeros(cells.depth.shape, bool)
+    dark = (distance < _SHADOW_REACH) & (brightness < _SHADOW_DARKNESS * np.median(brightness[around]))
+    dark = cv2.morphologyEx(dark.reshape(cells.depth.shape).astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    return cv2.dilate(dark, np.ones((3, 3), np.uint8)) > 0
+
+
+def stereo_map(pixels: TrainingPixels, i: int, side: int) -> Array32:
+    """Stereo's z-depths [m] in training frame i by cells of some pixels' side, nan where unknown, (rows, columns)."""
+    known = np.full((int(pixels.height[i]) // side, int(pixels.width[i]) // side), np.nan, np.float32)
+    own = pixels.stereo.frame == i
+    pixel = pixels.stereo.pixel[own]
+    z = pixels.stereo.distance[own] / np.linalg.norm(unproject(pixel, pixels.intrinsics[i]), axis=1)
+    column, row = np.minimum((pixel // side).astype(int), [known.shape[1] - 1, known.shape[0] - 1]).T
+    known[row, column] = z
+    return known
 
 
 def _voxels(pixels: TrainingPixels) -> Array:
