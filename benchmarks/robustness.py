@@ -428,10 +428,10 @@ def _fault_or_ok(mounted: Path, leave: int, command: list[str], root: Path) -> s
 _VERB_TRAIN = _TRAIN.replace(
     "train(twin.load_scene(sys.argv[1]), Path(sys.argv[2]), small)",
     """
-from twin import commands
+from twin import command_line
 def work(options):
     train(twin.load_scene(sys.argv[1]), Path(sys.argv[1]) / "runs" / sys.argv[2], small)
-sys.exit(commands.run(commands.Parser(), work, []))
+sys.exit(command_line.run(command_line.Parser(), work, []))
 """,
 )
 

@@ -10,7 +10,8 @@ from twin import runtime
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
-from twin.nerf.baked import BakedField, BrickLayout, brick_indices, skip_distances
+from twin.nerf.baked import BakedField
+from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
 from twin.nerf.kernels import bricks
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import FAR

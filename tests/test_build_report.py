@@ -24,9 +24,10 @@ from twin.errors import join_names
 from twin.files import write_json
 from twin.geometry.images import write_image
 from twin.report import build_report as report_page
-from twin.report import build_sections
+from twin.report import build_sections, build_topics, section_facts
 from twin.report.build_report import page, write_page
-from twin.report.build_sections import SECTIONS, cautions, headline_sections, sections, truth_section
+from twin.report.build_sections import SECTIONS, cautions, headline_sections, sections
+from twin.report.build_topics import truth_section
 from twin.report.html import (
     NOT_MEASURED,
     Caution,
@@ -328,27 +329,31 @@ def test_every_defect_gives_a_caution_with_a_cure_in_section_and_summary(
 
 def test_the_defects_tried_cover_every_kind_of_caution(monkeypatch: pytest.MonkeyPatch) -> None:
     """A caution that the code can give and the list above lacks would not be tested."""
-    given: set[int] = set()
+    makers = (build_sections, build_topics, section_facts)
+    given: set[tuple[str, int]] = set()
     limits: set[str] = set()
     exceeded: set[str] = set()
-    above = build_sections._above
+    above = section_facts.cautions_above
 
     def recording(*args: str) -> Caution:
-        given.add(sys._getframe(1).f_lineno)
+        frame = sys._getframe(1)
+        given.add((frame.f_globals["__name__"], frame.f_lineno))
         return Caution(*args)
 
-    def recording_limits(report: dict[str, Any], *rows: build_sections.Limit) -> list[Caution]:
+    def recording_limits(report: dict[str, Any], *rows: section_facts.Limit) -> list[Caution]:
         limits.update(path for path, *_ in rows)
         exceeded.update(row[0] for row in rows if above(report, row))
         return above(report, *rows)
 
-    monkeypatch.setattr(build_sections, "Caution", recording)
-    monkeypatch.setattr(build_sections, "_above", recording_limits)
+    for maker in makers:
+        monkeypatch.setattr(maker, "Caution", recording)
+        monkeypatch.setattr(maker, "cautions_above", recording_limits)
     for _, path, value, _ in CAUTIONS:
         sections(changed(path, value))
     written = {
-        node.lineno
-        for node in ast.walk(ast.parse(inspect.getsource(build_sections)))
+        (maker.__name__, node.lineno)
+        for maker in makers
+        for node in ast.walk(ast.parse(inspect.getsource(maker)))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Caution"
     }
     assert len(written) > 15 and given == written
@@ -359,7 +364,7 @@ def test_the_defects_tried_cover_every_kind_of_caution(monkeypatch: pytest.Monke
         if "Caution(" in path.read_text(encoding="utf-8").replace("class Caution", "")
     }
     # The pages of a validation and of a forecast have their own.
-    assert elsewhere == {"build_sections", "validation_report", "forecast_text"}
+    assert elsewhere == {"build_sections", "build_topics", "section_facts", "validation_report", "forecast_text"}
 
 
 @pytest.mark.usefixtures("no_charts")

@@ -20,7 +20,7 @@ from textured import filmed_corridor, picture, pose_at
 from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
 
-from twin import commands
+from twin import command_line
 from twin.errors import InputError, print_error, shortened
 from twin.geometry.images import write_image
 from twin.nerf.appearance import initial_appearance
@@ -164,7 +164,7 @@ convex._run_coacd([piece(k) for k in range(40)], 0.01, Path({str(tmp_path)!r}), 
 
 
 def _runs(work, *arguments: str) -> int:
-    return commands.run(commands.Parser(prog="python -m twin.some"), lambda options: work(), list(arguments))
+    return command_line.run(command_line.Parser(prog="python -m twin.some"), lambda options: work(), list(arguments))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
@@ -203,7 +203,7 @@ def test_a_killed_child_with_a_bar_leaks_nothing(tmp_path):
 def test_colmap_keeps_our_signal_handlers(tmp_path):
     script = (
         "import os, signal, twin.capture.formats, twin.capture.matching;"
-        "from twin.commands import *;"
+        "from twin.command_line import *;"
         "raise SystemExit(run(Parser(), lambda o: os.kill(os.getpid(), signal.SIGTERM), []))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
@@ -211,7 +211,7 @@ def test_colmap_keeps_our_signal_handlers(tmp_path):
 
 
 def test_a_broken_pipe_ends_a_verb_quietly(tmp_path):
-    script = "import sys; from twin.commands import *; sys.exit(run(Parser(), lambda o: print('x' * 10**6), []))"
+    script = "import sys; from twin.command_line import *; sys.exit(run(Parser(), lambda o: print('x' * 10**6), []))"
     process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout and process.stderr
     process.stdout.close()

@@ -14,7 +14,7 @@ from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import point_at
 from twin.nerf.rendering import FAR, Rendering
 from twin.report.build_report import page
-from twin.report.build_sections import geometry_section
+from twin.report.build_topics import geometry_section
 from twin.report.visual_vs_collision import (
     GeometryViews,
     compare_geometry,

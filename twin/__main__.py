@@ -7,7 +7,7 @@ from twin.errors import print_error, short_repr
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs a verb; returns its exit status, see `twin.commands`."""
+    """Runs a verb; returns its exit status, see `twin.command_line`."""
     given = sys.argv[1:] if arguments is None else arguments
     if not given or given[0] in ("-h", "--help", "help"):
         print("usage: twin VERB ...\n\nA filmed place as a MuJoCo digital twin. The verbs, in the order of use:\n")

@@ -9,8 +9,8 @@ left out: comments and paths of `scene.toml`, photos, dependencies in stamps and
 `twin.unpack` describes the format.
 
 Driving in a pack gives the same results as in the scene, bit for bit: in the field, only samples that no ray reads are
-replaced (`samples_read`). With `--levels` below 256, the features are rounded to that number of values. The pack is
-then smaller, but contains a different field.
+replaced (`brick_layout.samples_read`). With `--levels` below 256, the features are rounded to that number of values.
+The pack is then smaller, but contains a different field.
 """
 
 import argparse
@@ -35,7 +35,7 @@ from twin.errors import InputError
 from twin.files import atomic_path, digest_json, json_bytes, load_tensors, read_bytes, read_json, read_toml, toml_value
 from twin.learn.policy import JSON, ONNX, WEIGHTS, find_policy, load_policy
 from twin.loading import Twin, load_scene
-from twin.nerf.baked import BrickLayout, samples_read
+from twin.nerf.brick_layout import BrickLayout, samples_read
 from twin.scene import STAGES, SceneDir, Stamp, package_versions, require_stage, stage_result
 
 LEVELS = 256

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from twin.errors import InputError
 from twin.nerf import network
-from twin.nerf.baked import BakedField, BrickLayout, brick_indices, skip_distances
+from twin.nerf.baked import BakedField
+from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
 from twin.nerf.buffers import CameraArrays, Workspace, in_batches, parallel, single_threaded_torch, warp_view
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.field import QUERY_POINTS, RadianceField

@@ -1,7 +1,8 @@
 """Baked field: density and features of a trained radiance field in sparse 8-bit bricks. Renders without torch.
 
-`kernels/bricks.py` defines the bricks. The two per-ray networks, head and background (`network.py`), are stored beside
-them. A lighting is one vector, so one baked field renders the place under every lighting.
+`kernels/bricks.py` defines the bricks, `brick_layout.py` their layout. The two per-ray networks, head and background
+(`network.py`), are stored beside them. A lighting is one vector, so one baked field renders the place under every
+lighting.
 """
 
 import copy
@@ -9,7 +10,7 @@ import itertools
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,255 +23,21 @@ from twin.errors import InputError, short_repr
 from twin.files import check_shapes, load_tensors, read_json, require_text, wrap_read_errors, write_json
 from twin.geometry.cameras import PosedCameras, intrinsics_for_size
 from twin.nerf.appearance_prior import Probes
+from twin.nerf.brick_layout import BrickLayout, brick_indices, check_arrays, density_codes, stored_skips
 from twin.nerf.fog import Fog
 from twin.nerf.kernels import march as kernels
 from twin.nerf.kernels import surface_detail as detail_kernels
-from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, HALF_CORNERS, Bricks, Bytes
+from twin.nerf.kernels.bricks import BLOCKS, Bricks, Bytes
 from twin.nerf.kernels.color_head import HARMONICS, Vec8, color_head_kernel
 from twin.nerf.kernels.color_head import LANES as HEAD_LANES
 from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import Rendering
 from twin.nerf.sun import Sun, Sunlight
+from twin.nerf.surface_features import Detail, detail_grid
 from twin.runtime import available_cores, bar
 from twin.types import Array32
 from twin.warp_runtime import wp
-
-# ---- layout of the bricks
-
-_MAX_EMPTY_OPACITY = 0.03  # a cell that blocks at most this share of light counts as empty
-
-
-@dataclass(frozen=True)
-class BrickLayout:
-    """Sizes and bounds of a baked field. `baked.json` stores these names as keys."""
-
-    centre: tuple[float, float, float]
-    """Center of the near box [m]."""
-    half: tuple[float, float, float]
-    """Half sides of the near box [m]."""
-    near_plane: float
-    """Distance at which rays start [m]."""
-    density_unit: float
-    """Density at raw value 0 [1/contracted m]."""
-    near_shape: tuple[int, int, int]
-    """Bricks over the near box."""
-    far_shape: tuple[int, int, int]
-    """Bricks over the contracted cube."""
-
-    @property
-    def near_side(self) -> NDArray[np.float64]:
-        """Sides of a brick in the near box [m]."""
-        return 2.0 * np.array(self.half) / np.array(self.near_shape)
-
-    @property
-    def near_cell(self) -> float:
-        """Smallest side of a near cell [m]."""
-        return float(self.near_side.min()) / CELLS
-
-    @property
-    def far_cell(self) -> float:
-        """Smallest side of a far cell [contracted m]."""
-        return float((4.0 * np.array(self.half) / np.array(self.far_shape)).min()) / CELLS
-
-
-def brick_indices(layout: BrickLayout, near: NDArray, far: NDArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Near and far index (see `kernels/bricks.py`) of near and far bricks, each (s, 3); near slots come first."""
-    out = []
-    for shape, slots, first in ((layout.near_shape, near, 0), (layout.far_shape, far, len(near))):
-        index = np.full(shape, -1, np.int32)
-        index[tuple(slots.T)] = np.arange(first, first + len(slots))
-        out.append(index)
-    return out[0], out[1]
-
-
-def _density_codes(samples: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Density bytes of bricks (s, 729) in the order that is described at `bricks.DENSITIES`, shape (s · 810 + 8,)."""
-    cube = samples.reshape(-1, *[CORNERS] * 3)
-    halves = np.stack([cube[..., :HALF_CORNERS], cube[..., HALF_CORNERS - 1 :]], 2)
-    return np.concatenate([halves.ravel(), np.zeros(8, np.uint8)])  # padding, as the march reads eight bytes at a time
-
-
-def _stored_skips(index: NDArray[np.int32], distance: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
-    """Compresses a grid's skip distances to the arrays that the march reads.
-
-    `distance` has one value per block; each of its axes is 4 times as long as that of the brick `index`. Returns the
-    index with −d for bricks without a slot (d: least distance in the brick), and the distances in the stored bricks,
-    shape (slots, 64).
-    """
-    n0, n1, n2 = index.shape
-    blocks = distance.reshape(n0, BLOCKS, n1, BLOCKS, n2, BLOCKS).transpose(0, 2, 4, 1, 3, 5).reshape(*index.shape, -1)
-    stored = index >= 0
-    by_slot = blocks[stored][np.argsort(index[stored])]
-    return np.where(stored, index, -blocks.min(-1).astype(np.int32)), by_slot
-
-
-def skip_distances(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str, NDArray[np.uint8]]:
-    """Skip distances (see `kernels/march.py`) of all blocks of both grids, as arrays `near_leap` and `far_leap`.
-
-    A block is occupied if one of its samples has a density at which a cell blocks more than `_MAX_EMPTY_OPACITY`.
-    """
-    from scipy.ndimage import distance_transform_cdt
-
-    split = len(arrays["near"])
-    codes = arrays["features"][..., 0].reshape(-1, *[CORNERS] * 3)
-    cell = np.where(np.arange(len(codes)) < split, layout.near_cell, layout.far_cell)
-    threshold = (np.log(_MAX_EMPTY_OPACITY / (cell * layout.density_unit)) - arrays["low"][0]) / arrays["step"][0]
-    occupied = codes > threshold[:, None, None, None]
-    for axis in (1, 2, 3):
-        first, second, third = (np.take(occupied, np.arange(k, k + CELLS - 1, 2), axis) for k in (0, 1, 2))
-        occupied = first | second | third
-    out = {}
-    for name, shape, slots, mine in (
-        ("near_leap", layout.near_shape, arrays["near"], occupied[:split]),
-        ("far_leap", layout.far_shape, arrays["far"], occupied[split:]),
-    ):
-        bricks = np.zeros((*shape, BLOCKS, BLOCKS, BLOCKS), bool)
-        bricks[tuple(slots.T)] = mine
-        blocks = bricks.transpose(0, 3, 1, 4, 2, 5).reshape(np.multiply(shape, BLOCKS))
-        distance = distance_transform_cdt(~blocks, "chessboard") if blocks.any() else np.full(blocks.shape, 255)
-        out[name] = np.minimum(distance, 255).astype(np.uint8)
-    return out
-
-
-def samples_read(layout: BrickLayout, arrays: dict[str, NDArray]) -> NDArray[np.bool_]:
-    """Mask of the samples (s, 729) of occupied blocks (see `skip_distances`); the march reads no other samples."""
-    near, far = brick_indices(layout, arrays["near"], arrays["far"])
-    skips = [_stored_skips(near, arrays["near_leap"])[1], _stored_skips(far, arrays["far_leap"])[1]]
-    occupied = np.concatenate(skips).reshape(-1, *[BLOCKS] * 3) == 0
-    read = np.zeros((len(occupied), *[CORNERS] * 3), bool)
-    for corner in itertools.product(range(CELLS // BLOCKS + 1), repeat=3):
-        read[:, *(slice(c, c + CELLS - 1, CELLS // BLOCKS) for c in corner)] |= occupied
-    return read.reshape(len(read), -1)
-
-
-def _check_arrays(layout: BrickLayout, arrays: dict[str, NDArray], dim: int) -> None:
-    """Raises ValueError if the arrays would make a kernel read outside of them."""
-    near, far = arrays["near"], arrays["far"]
-    slots, hidden = len(near) + len(far), arrays["network.head.1"].shape[0]
-    background, inputs = arrays["network.backdrop.0"].shape[1], CHANNELS - 1 + HARMONICS + dim
-    shapes: dict[str, tuple[tuple[int, ...], str]] = {
-        "near": ((len(near), 3), "i"),
-        "far": ((len(far), 3), "i"),
-        "features": ((slots, CORNERS**3, CHANNELS), "u"),
-        "low": ((CHANNELS,), "f"),
-        "step": ((CHANNELS,), "f"),
-        "near_leap": (tuple(BLOCKS * n for n in layout.near_shape), "u"),
-        "far_leap": (tuple(BLOCKS * n for n in layout.far_shape), "u"),
-        "network.head.0": ((inputs, hidden), "f"),
-        "network.head.0.bias": ((hidden,), "f"),
-        "network.head.1": ((hidden, hidden), "f"),
-        "network.head.1.bias": ((hidden,), "f"),
-        "network.head.2": ((hidden, 3), "f"),
-        "network.head.2.bias": ((3,), "f"),
-        "network.backdrop.0": ((HARMONICS, background), "f"),
-        "network.backdrop.0.bias": ((background,), "f"),
-        "network.backdrop.1": ((background, CHANNELS - 1), "f"),
-    }
-    check_shapes({name: (arrays[name], *expected) for name, expected in shapes.items()})
-    if hidden % 8 or not hidden:
-        raise ValueError(f"head of {hidden} units; expected a multiple of 8")
-    for name, index, shape in (("near", near, layout.near_shape), ("far", far, layout.far_shape)):
-        inside = not len(index) or (index.min() >= 0 and (index < np.array(shape)).all())
-        if not inside or len(np.unique(np.ravel_multi_index(tuple(index.T), shape))) < len(index):
-            raise ValueError(f"{name}: a brick is outside the grid of {shape} bricks or occurs twice")
-
-
-# ---- detail
-
-
-@dataclass(frozen=True)
-class Detail:
-    """Features at surfaces, finer than those of bricks; `kernels/surface_detail.py` defines the terms."""
-
-    heights: Array32
-    """Height map [m], shape (along x, along y)."""
-    origin: NDArray[np.float64]
-    """Lowest corner of the height map and of the tiles [m], shape (2,)."""
-    height_cell: float
-    """Spacing of the height map [m]."""
-    tiles: NDArray[np.int32]
-    """Positions of the stored tiles in their grid, shape (t, 2)."""
-    texel: float
-    """Side of the finest texels [m]."""
-    texels: NDArray[np.uint8]
-    """Bytes of the texels, shape (t · TEXELS, CHANNELS), see `DetailBytes`."""
-    texel_step: Array32
-    cell: float
-    """Side of the hash grid's cells [m]."""
-    vertices: NDArray[np.uint8]
-    """Bytes of the hash grid's table, shape (rows, CHANNELS)."""
-    vertex_step: Array32
-
-    @staticmethod
-    def without_features(heights: Array32, origin: NDArray[np.float64], height_cell: float) -> "Detail":
-        """Detail with a height map only."""
-        none, step = np.zeros((0, CHANNELS), np.uint8), np.zeros(CHANNELS, np.float32)
-        return Detail(heights, origin, height_cell, np.zeros((0, 2), np.int32), 1.0, none, step, 1.0, none, step)
-
-    @property
-    def tile_index(self) -> NDArray[np.int32]:
-        """Slots of the tiles in the grid that covers them, −1 where no tile is stored."""
-        index = np.full(self.tiles.max(0, initial=0) + 1, -1, np.int32)
-        index[tuple(self.tiles.T)] = np.arange(len(self.tiles))
-        return index
-
-    def arrays(self) -> dict[str, NDArray]:
-        """The arrays of a `BakedField` that hold the detail."""
-        sides = np.array([self.height_cell, self.texel, self.cell])
-        return {f"detail.{name}": getattr(self, name) for name in _DETAIL_ARRAYS} | {"detail.sides": sides}
-
-    @staticmethod
-    def of_arrays(arrays: dict[str, NDArray]) -> "Detail":
-        """The detail in the arrays of a `BakedField`; fields of earlier versions have none.
-
-        Raises ValueError for arrays that a kernel could not read.
-        """
-        if "detail.sides" not in arrays:
-            return Detail.without_features(np.zeros((0, 0), np.float32), np.zeros(2), 1.0)
-        sides = arrays["detail.sides"]
-        named = {name: arrays[f"detail.{name}"] for name in _DETAIL_ARRAYS}
-        tiles, rows = len(named["tiles"]), len(named["vertices"])
-        check_shapes(
-            {
-                "detail.sides": (sides, (3,), "f"),
-                "detail.heights": (named["heights"], named["heights"].shape[:2], "f"),
-                "detail.origin": (named["origin"], (2,), "f"),
-                "detail.tiles": (named["tiles"], (tiles, 2), "i"),
-                "detail.texels": (named["texels"], (tiles * detail_kernels.TEXELS, CHANNELS), "u"),
-                "detail.texel_step": (named["texel_step"], (CHANNELS,), "f"),
-                "detail.vertices": (named["vertices"], (rows, CHANNELS), "u"),
-                "detail.vertex_step": (named["vertex_step"], (CHANNELS,), "f"),
-            }
-        )
-        if rows < 8 or rows & (rows - 1):
-            raise ValueError(f"detail.vertices has {rows} rows; expected a power of 2 from 8 on")
-        if not (sides > 0.0).all() or named["tiles"].min(initial=0) < 0 or named["tiles"].max(initial=0) >= _MAX_INDEX:
-            raise ValueError("detail.sides or detail.tiles out of range")
-        height_cell, texel, cell = map(float, sides)
-        return Detail(height_cell=height_cell, texel=texel, cell=cell, **named)
-
-
-_MAX_INDEX = 10_000  # greatest number of tiles along an axis
-_DETAIL_ARRAYS = ("heights", "origin", "tiles", "texels", "texel_step", "vertices", "vertex_step")
-
-
-def detail_grid(detail: Detail, device: str) -> Any:
-    """Height map, tile index and sizes on a device, see `detail_kernels.DetailGrid`."""
-    grid: Any = detail_kernels.DetailGrid()
-    grid.origin = wp.vec2f(*detail.origin.tolist())
-    grid.texel, grid.cell, grid.per_height_cell = detail.texel, detail.cell, 1.0 / detail.height_cell
-    grid.coarsest = max(detail.texel * 2 ** (detail_kernels.LEVELS - 1), detail.cell)
-    grid.mask = wp.uint32(max(1, len(detail.vertices)) - 1)
-    index = detail.tile_index
-    grid.heights_x, grid.heights_y = detail.heights.shape
-    grid.tiles_x, grid.tiles_y = index.shape
-    grid.heights = wp.array(detail.heights.ravel(), dtype=wp.float32, device=device)
-    grid.tiles = wp.array(index.ravel(), dtype=wp.int32, device=device)
-    return grid
-
-
-# ---- field
 
 _FORMAT = 2
 _MAX_TARGETS = 4  # render targets kept at most; a vector env uses one for all its envs and one for those that reset
@@ -293,7 +60,8 @@ class BakedField:
             lightings: Appearance embeddings by name.
             arrays: `near` and `far` (grid positions of the stored bricks, (s, 3)), `features` (s, 729, CHANNELS) bytes,
                 near bricks first, `low` and `step` (CHANNELS,) of the quantization, `near_leap` and `far_leap` (see
-                `skip_distances`), `network.*`, and for random lightings `probes.*` (see `appearance_prior.Probes`).
+                `brick_layout.skip_distances`), `network.*`, and for random lightings `probes.*` (see
+                `appearance_prior.Probes`).
             device: `cpu` or `cuda`.
             about: JSON-able metadata stored with the field.
         """
@@ -313,13 +81,13 @@ class BakedField:
 
         b: Any = Bricks()
         near_index, far_index = brick_indices(layout, arrays["near"], arrays["far"])
-        near_index, near_skips = _stored_skips(near_index, arrays["near_leap"])
-        far_index, far_skips = _stored_skips(far_index, arrays["far_leap"])
+        near_index, near_skips = stored_skips(near_index, arrays["near_leap"])
+        far_index, far_skips = stored_skips(far_index, arrays["far_leap"])
         b.near_index, b.far_index = on_device(near_index.ravel(), wp.int32), on_device(far_index.ravel(), wp.int32)
         b.skips = on_device(np.concatenate([near_skips, far_skips]).ravel(), wp.uint8)
         b.near_blocks = wp.vec3i(*(BLOCKS * n for n in layout.near_shape))
         b.far_blocks = wp.vec3i(*(BLOCKS * n for n in layout.far_shape))
-        b.densities = on_device(_density_codes(arrays["features"][..., 0]), wp.uint8)
+        b.densities = on_device(density_codes(arrays["features"][..., 0]), wp.uint8)
         b.features = on_device(arrays["features"].reshape(-1, CHANNELS), Bytes)
         b.low, b.step = Channels(*arrays["low"].tolist()), Channels(*arrays["step"].tolist())
         b.center = wp.vec3f(*layout.centre)
@@ -556,7 +324,7 @@ class BakedField:
             dim = vectors.shape[1]
             shapes = {"lightings.vectors": (vectors, (len(names), dim), "f")}
             check_shapes(shapes | {"lightings.frames": (frame_vectors, (len(frames), dim), "f")})
-            _check_arrays(bricks, arrays, dim)
+            check_arrays(bricks, arrays, dim)
             return BakedField(bricks, Lightings(names, vectors, frames, frame_vectors), arrays, device, about)
 
 

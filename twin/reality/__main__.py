@@ -121,7 +121,7 @@ def scene_toml(plan: FilmingPlan, name: str, spec: PlaceSpec | None = None) -> s
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.commands`."""
+    """Runs the verb; returns the exit status, see `twin.command_line`."""
     return commands.main("reality", arguments)
 
 

@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twin.reality.place_sampling import stream
 from twin.reality.place_spec import GRADE_STEP, RUN_IN, RUN_OUT, Mouth, PlaceSpec
+from twin.reality.place_streams import stream
 from twin.types import Array
 
 _CROWN_ROUNDING = 0.3  # [m] half width of the rounding of a crown

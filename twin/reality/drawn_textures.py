@@ -11,8 +11,8 @@ from twin.reality.atlas_painting import AtlasColors, paint_atlas, to_uint8
 from twin.reality.drawn_road import MOUTH_REACH
 from twin.reality.houses import House
 from twin.reality.place_objects import CELLS, GroundLayout
-from twin.reality.place_sampling import stream
 from twin.reality.place_spec import BoundarySpec, PlaceSpec, Rgb
+from twin.reality.place_streams import stream
 from twin.reality.textures import slabs
 
 DRAWN_CELLS = (

@@ -1,7 +1,7 @@
 """Writes `report.html`: what a build did, how good the result is, and how to improve it.
 
 The page is self-contained except for the review video, a file beside it. Pictures come from the stage folders. Figures
-show data from these folders and from the report. The text comes from `twin.report.build_sections`.
+show data from these folders and from the report. The text comes from `build_sections.py`.
 """
 
 import shlex
@@ -16,7 +16,8 @@ from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.passes import find_passes
 from twin.mjcf.world import SCENE_XML, World
 from twin.report import figures
-from twin.report.build_sections import SECTIONS, costs_section, headline_sections, sections
+from twin.report.build_sections import SECTIONS, headline_sections, sections
+from twin.report.build_topics import costs_section
 from twin.report.html import Chart, Picture, command, data_url, duration, flatten, number, numbers, pick, render
 from twin.report.video_layout import load_footprints
 from twin.scene import SceneDir, stage_result

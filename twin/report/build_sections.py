@@ -1,12 +1,14 @@
 """Sections of the build report: a description of each stage, its numbers, and cautions with their cures.
 
 `sections` is the only source of headlines and cautions for the page, `report.json` and the printed summary.
+`build_topics.py` makes the sections that describe no stage.
 """
 
 from collections.abc import Callable
 from typing import Any
 
 from twin.errors import join_names
+from twin.report.build_topics import costs_section, geometry_section, truth_section
 from twin.report.html import (
     NOT_MEASURED,
     Caution,
@@ -20,14 +22,13 @@ from twin.report.html import (
     numbers,
     pick,
 )
-from twin.report.visual_vs_collision import LARGE_ERROR, MAX_DEPTH
+from twin.report.section_facts import as_number, cautions_above, facts_of
 
 _MIN_REGISTERED = 0.9  # a caution is given if a smaller share of frames was placed
 _LARGE_SCALE_UNCERTAINTY = 0.03  # [relative] a caution is given if it is larger
 _LOW_PSNR = 18.0  # [dB]
 _FEW_HELD_OUT = 3  # a caution is given if a lighting has fewer held-out frames
 _LOW_LIGHTING_AGREEMENT = 0.7  # [share of places] 0.5 is chance
-_LARGE_MEMORY = 4.0  # [GiB]
 
 _SCALE_SOURCES = {
     "camera_height": "the camera’s height above the ground",
@@ -39,39 +40,12 @@ _SCALE_SOURCES = {
     "poses_are_metric": "the given metric poses",
 }
 
-Row = tuple[str, str, str, str]
-"""Path of a number in the report, its name, its format, and its meaning."""
-Limit = tuple[str, float, str, str]
-"""Path of a number in the report, its limit, and the caution and its cure if the magnitude exceeds the limit."""
-
-
-def _facts(report: dict[str, Any], *rows: Row) -> list[Fact]:
-    return [Fact(name, number(pick(report, path), form), meaning) for path, name, form, meaning in rows]
-
-
-def _above(report: dict[str, Any], *limits: Limit) -> list[Caution]:
-    """Cautions about the numbers whose magnitude exceeds their limit.
-
-    The caution in a `Limit` is a format string for the magnitude and the limit.
-    """
-    found = [(_numeric(pick(report, path)), limit, what, cure) for path, limit, what, cure in limits]
-    return [
-        Caution(what.format(abs(x), limit), cure) for x, limit, what, cure in found if x is not None and abs(x) > limit
-    ]
-
-
-def _numeric(value: Any) -> float | None:
-    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
-# ---- stages
-
 
 def capture_section(report: dict[str, Any]) -> Section:
     sources = pick(report, "capture.sources")
     count = len(sources) if isinstance(sources, list | dict) else sources
     facts = [
-        *_facts(
+        *facts_of(
             report,
             ("capture.frames", "frames kept", "{}", "the sharpest of each time slot"),
             ("capture.train", "training frames", "{}", "the field is trained on them"),
@@ -80,7 +54,7 @@ def capture_section(report: dict[str, Any]) -> Section:
         Fact("sources", number(count, "{}"), "films or photo folders, each under one lighting"),
     ]
     cautions = []
-    frames = _numeric(pick(report, "capture.frames"))
+    frames = as_number(pick(report, "capture.frames"))
     if frames is not None and frames < 20:
         cautions.append(Caution(f"Only {frames} frames were kept.", "film slower or longer, or raise capture.fps."))
     for name, source in sources.items() if isinstance(sources, dict) else ():
@@ -89,7 +63,7 @@ def capture_section(report: dict[str, Any]) -> Section:
             length = duration(seconds) if isinstance(seconds, int | float) and seconds > 0 else None
             about = (pick(source, "kind"), length, light and f"lighting “{light}”")
             facts.append(Fact(str(name), f"{kept} frames", ", ".join(str(part) for part in about if part)))
-        if damaged := _numeric(pick(source, "damaged")):
+        if damaged := as_number(pick(source, "damaged")):
             cure = "copy the film from the camera again if possible."
             cautions.append(Caution(f"{damaged} frame(s) of “{name}” are damaged.", cure))
     done = (
@@ -116,7 +90,7 @@ def cameras_section(report: dict[str, Any]) -> Section:
             )
             cautions.append(Caution(f"{total - registered} of {total} frames could not be placed.", cure))
     calibrate = "give the camera’s calibration (camera = … under [[source]]); a wrong lens model distorts the path."
-    cautions += _above(
+    cautions += cautions_above(
         report, ("cameras.reprojection_error_px", 1.5, "The reprojection error is {:.2f} px.", calibrate)
     )
     outliers = cameras.get("outliers")
@@ -131,7 +105,7 @@ def cameras_section(report: dict[str, Any]) -> Section:
     focal = _focal_text(_first_present(cameras, "focal_px", "focal"))
     facts = [
         Fact("frames placed", placed, "frames that the reconstruction could use"),
-        *_facts(
+        *facts_of(
             report,
             (
                 "cameras.reprojection_error_px",
@@ -169,7 +143,7 @@ def _scale_facts(scales: Any) -> list[Fact]:
     """Facts that compare the scale from each source with the combined scale."""
     facts = []
     for name, one in scales.items() if isinstance(scales, dict) else ():
-        relative, sigma = (_numeric(pick(one, key)) for key in ("relative", "uncertainty"))
+        relative, sigma = (as_number(pick(one, key)) for key in ("relative", "uncertainty"))
         offset = number(None if relative is None else relative - 1.0, "{:+.2%}")
         text = f"{offset} ± {number(sigma, '{:.1%}')}"
         facts.append(Fact(f"by {_SCALE_SOURCES.get(name, name)}", text, "compared with the combined scale"))
@@ -178,7 +152,7 @@ def _scale_facts(scales: Any) -> list[Fact]:
 
 def metric_section(report: dict[str, Any]) -> Section:
     metric = pick(report, "metric") or {}
-    uncertainty = _numeric(metric.get("scale_uncertainty"))
+    uncertainty = as_number(metric.get("scale_uncertainty"))
     cautions = []
     if uncertainty is not None and uncertainty > _LARGE_SCALE_UNCERTAINTY:
         what = f"The scale is uncertain by {uncertainty:.1%}: 10 m may be {10 * uncertainty:.1f} m longer or shorter."
@@ -189,13 +163,13 @@ def metric_section(report: dict[str, Any]) -> Section:
         cautions.append(Caution(what, cure))
     cure = "film with the road in view and the horizon level; give the camera’s calibration."
     what = "The direction of gravity is uncertain by {:.1f}°."
-    cautions += _above(report, ("metric.gravity_uncertainty_deg", 1.5, what, cure))
+    cautions += cautions_above(report, ("metric.gravity_uncertainty_deg", 1.5, what, cure))
     if metric.get("road_reliable") is False:
         cure = "film closer to the ground or at a higher resolution, or put textured objects on the road."
         cautions.append(Caution("Too few points lie on the road to estimate its plane.", cure))
     cure = "measure again what was given under [metric], and remove the source that is wrong."
     what = "The sources of scale contradict each other: they differ by {:.1f} standard deviations."
-    cautions += _above(report, ("metric.scale_disagreement", 3.0, what, cure))
+    cautions += cautions_above(report, ("metric.scale_disagreement", 3.0, what, cure))
     source = metric.get("scale_source")
     source_text, verdict = NOT_MEASURED, None
     if source:
@@ -208,7 +182,7 @@ def metric_section(report: dict[str, Any]) -> Section:
         Fact("scale uncertainty", number(uncertainty, "{:.1%}"), "one standard deviation, relative"),
         *_scale_facts(metric.get("scales")),
         Fact("gravity from", str(gravity or NOT_MEASURED), "source of the vertical direction"),
-        *_facts(
+        *facts_of(
             report,
             ("metric.gravity_uncertainty_deg", "tilt uncertainty", "{:.2f}°", "one standard deviation"),
             ("metric.path_length_m", "filmed path", "{:.1f} m", "of the longest film"),
@@ -249,7 +223,7 @@ def field_section(report: dict[str, Any]) -> Section:
             cure = "keep more frames (capture.fps) or hold out more of them (capture.held_out_every)."
             cautions.append(Caution(what, cure))
     facts = facts or [Fact("held-out PSNR", NOT_MEASURED)]
-    facts += _facts(report, ("field.steps", "training steps", "{:,}", "more steps are sharper but slower"))
+    facts += facts_of(report, ("field.steps", "training steps", "{:,}", "more steps are sharper but slower"))
     if (found := pick(field, "stereo.sightings")) is not None:
         form = "used for depth supervision; {:.0%} of the attempted stereo estimates succeeded"
         facts.append(Fact("stereo depths", number(found, "{:,}"), number(pick(field, "stereo.share"), form)))
@@ -294,8 +268,8 @@ def cross_lighting_facts(report: dict[str, Any]) -> tuple[list[Fact], list[Cauti
             cautions.append(Caution(what, cure))
     moves = ("field.cross_lighting.depth_moves_m", "depth, light swapped", "{:.3f} m", "largest change; zero by design")
     what = "Depth moves by up to {:.3f} m with the light."
-    cautions += _above(report, (moves[0], 1e-3, what, "this is a bug; please report it."))
-    return facts + (_facts(report, moves) if follows else []), cautions
+    cautions += cautions_above(report, (moves[0], 1e-3, what, "this is a bug; please report it."))
+    return facts + (facts_of(report, moves) if follows else []), cautions
 
 
 def mesh_section(report: dict[str, Any]) -> Section:
@@ -303,7 +277,7 @@ def mesh_section(report: dict[str, Any]) -> Section:
     if pick(report, "mesh.parts") == 0:
         cure = "if there are obstacles, film them from closer, raise nerf.steps or lower mesh.obstacle_height."
         cautions.append(Caution("Nothing solid was found apart from the ground.", cure))
-    cautions += _above(
+    cautions += cautions_above(
         report,
         (
             "mesh.parts_left_out",
@@ -324,12 +298,12 @@ def mesh_section(report: dict[str, Any]) -> Section:
             "check them in the picture of the MuJoCo scene; a smaller mesh.voxel usually helps.",
         ),
     )
-    covered = _numeric(pick(report, "mesh.ground.corridor_coverage"))
+    covered = as_number(pick(report, "mesh.ground.corridor_coverage"))
     if covered is not None and covered < 0.5:
         what = f"Only {covered:.0%} of the ground along the route was measured; the rest is interpolated."
         cure = "film with more of the road in view, or carry the camera at constant height."
         cautions.append(Caution(what, cure))
-    facts = _facts(
+    facts = facts_of(
         report,
         ("mesh.parts", "solid parts", "{}", "convex collision geometry"),
         ("mesh.faces", "surface", "{:,} triangles", "visual mesh, without collisions"),
@@ -364,17 +338,17 @@ def mjcf_section(report: dict[str, Any]) -> Section:
     if routeless:
         done = "Ground, parts and lights as a folder that MuJoCo loads, without a robot because there is no route: "
     else:
-        route = _facts(
+        route = facts_of(
             report,
             ("mjcf.route_length_m", "route", "{:.1f} m", _route_choice(report)),
             ("mjcf.turn_deg", "turn", "{:+.0f}°", "from the first heading to the last; right is negative"),
             ("mjcf.half_width_m", "corridor", "± {:.2f} m", "kept free of solid parts"),
             ("mjcf.spawn_clearance_m", "free at the start", "{:.2f} m", "robot to the nearest part"),
         )
-    size = _numeric(pick(report, "mjcf.assets_bytes"))
+    size = as_number(pick(report, "mjcf.assets_bytes"))
     facts = [
         *route,
-        *_facts(report, ("mjcf.geoms", "geoms", "{:,}", "shapes in the scene")),
+        *facts_of(report, ("mjcf.geoms", "geoms", "{:,}", "shapes in the scene")),
         Fact("folder", number(size and size / 1e6, "{:.1f} MB"), "may be moved or zipped"),
     ]
     touched = pick(report, "mjcf.spawn_touched")
@@ -408,7 +382,7 @@ def review_section(report: dict[str, Any]) -> Section:
         facts = [
             Fact("goal reached", format_value(follower.get("reached_goal")), "by a scripted driver without camera"),
             Fact("touched", parts, "besides ground"),
-            *_facts(
+            *facts_of(
                 report,
                 ("review.follower.max_cross_track_m", "farthest off the route", "{:.2f} m", "cross-track"),
                 ("review.follower.distance_m", "driven", "{:.1f} m", duration(follower.get("seconds"))),
@@ -418,7 +392,9 @@ def review_section(report: dict[str, Any]) -> Section:
         ]
     frames = number(pick(report, "review.frames"), "{} frames")
     facts.append(Fact("video", duration(pick(report, "review.duration_s")), frames))
-    facts += _facts(report, ("review.render_seconds_per_frame", "rendering", "{:.2f} s", "per NeRF view in the video"))
+    facts += facts_of(
+        report, ("review.render_seconds_per_frame", "rendering", "{:.2f} s", "per NeRF view in the video")
+    )
     done = "The video above: the field beside the real frames, the changing light, and the Husky on the route."
     reason = str(pick(report, "review.not_applicable") or "")
     return Section("review", "Review", done, facts, cautions, reason, follower_verdict(report))
@@ -434,154 +410,6 @@ SECTIONS: dict[str, Callable[[dict[str, Any]], Section]] = {
     "review": review_section,
 }
 """Stage name → function that makes its section, in page order."""
-
-# ---- topics beside the stages
-
-
-def geometry_section(report: dict[str, Any]) -> Section:
-    """The review stage's comparison of visual with collision geometry (`twin.report.visual_vs_collision`)."""
-    name, title = "seen_touched", "Visual and collision geometry"
-    found = pick(report, name)
-    if not isinstance(found, dict):
-        return Section(name, title, "", not_applicable="nothing was driven here, so there are no views to compare")
-    visible = "visible above the ground, without collision geometry"
-    twice = "where no film shows the corridor from two directions; not part of the previous number"
-    within = f"median within {MAX_DEPTH:g} m, ground and parts"
-    facts = _facts(
-        found,
-        ("median_m", "visual to collision geometry, along the ray", "{:.3f} m", within),
-        (
-            "p90_m",
-            "the same, 90th percentile",
-            "{:.3f} m",
-            "large where the ground is seen at a low angle",
-        ),
-        (
-            "ground_median_m",
-            "visual to collision ground",
-            "{:.3f} m",
-            "median height difference in the corridor",
-        ),
-        ("ground_p95_m", "the same, 95th percentile", "{:.3f} m", "height difference in the corridor"),
-        ("corridor_leak_m", "largest visual-only in the corridor", "{:.3f} m", visible),
-        (
-            "corridor_ghost_m",
-            "largest collision-only in the corridor",
-            "{:.3f} m",
-            "collision geometry that is not visible",
-        ),
-        ("unfilmed_ghost_m", "the same, filmed from one direction", "{:.3f} m", twice),
-        (
-            "standing_median_m",
-            "visible obstacles to collision geometry",
-            "{:.3f} m",
-            "median distance to the nearest surface",
-        ),
-        ("leak_share", "visual-only", "{:.1%}", f"of visible obstacles, by more than {LARGE_ERROR:g} m"),
-        (
-            "ghost_share",
-            "collision-only",
-            "{:.1%}",
-            f"of the parts in view, by more than {LARGE_ERROR:g} m",
-        ),
-        ("views", "views", "{}", "of the robot’s camera, along its drive"),
-    )
-    beyond = ". The largest difference is {:.3f} m, more than {:g} m."
-    unfilmed = (
-        "Collision geometry in the corridor is not visible where no film shows it from two directions; the field’s "
-        "depth there is not determined and may differ from build to build" + beyond
-    )
-    leak = "Something in the corridor is visible but has no collision geometry" + beyond
-    ghost = "Collision geometry in the corridor is not visible" + beyond
-    earlier = "start the drive a little further along, or start to film a little earlier."
-    apart = "Visual and collision geometry differ by {:.3f} m in the median, more than {:g} m."
-    cautions = _above(
-        found,
-        ("median_m", 0.05, apart, "raise nerf.steps, or lower mesh.voxel."),
-        ("corridor_leak_m", LARGE_ERROR, leak, "mask what moved while filming."),
-        ("corridor_ghost_m", LARGE_ERROR, ghost, "raise nerf.steps."),
-        ("unfilmed_ghost_m", LARGE_ERROR, unfilmed, earlier),
-    )
-    done = (
-        "A policy sees the radiance field but collides with MuJoCo’s ground and convex parts. Both were rendered from "
-        "the robot’s camera along the drive and compared pixel by pixel."
-    )
-    median = _numeric(found.get("median_m"))
-    verdict = None
-    if median is not None:
-        verdict = Verdict(f"Visual and collision geometry differ by {100 * median:.1f} cm in the median.", "good")
-    return Section(name, title, done, facts, cautions, verdict=verdict)
-
-
-def truth_section(report: dict[str, Any]) -> Section:
-    """Errors of the twin compared with ground truth; not applicable for a real place."""
-    truth = pick(report, "truth")
-    name, title = "truth", "Comparison with ground truth"
-    if not isinstance(truth, dict):
-        reason = (
-            "there is no ground truth to compare with; it exists for generated places only (python -m twin.reality "
-            "compare SCENE)"
-        )
-        return Section(name, title, "", not_applicable=reason)
-    kinds = {"ground": "ground", "obstacle": "obstacles up to full height", "foliage": "leaves"}
-    shares = {kind: truth.get(f"mesh_completeness_10cm_{kind}") for kind in kinds}
-    complete = [f"{number(share, '{:.0%}')} of {kinds[kind]}" for kind, share in shares.items() if share is not None]
-    by_kind = join_names(complete) if complete else "completeness of the mesh"
-    facts = _facts(
-        truth,
-        ("ate_m", "camera positions", "{:.3f} m", "root mean square, after a similarity fit of the paths"),
-        ("ate_max_m", "worst camera", "{:.3f} m", "the frame with the largest error"),
-        (
-            "ate_rigid_m",
-            "camera positions, in the twin’s meters",
-            "{:.3f} m",
-            "after a rigid fit, without a change of scale",
-        ),
-        ("rotation_median_deg", "camera directions", "{:.2f}°", "median"),
-        ("scale_error", "scale", "{:+.2%}", "the twin’s meter compared with the true one"),
-        ("tilt_deg", "gravity", "{:.2f}°", "between the twin’s vertical and the true one"),
-        ("ground_median_m", "ground height", "{:.3f} m", "median error inside the corridor"),
-        ("ground_p95_m", "ground height, worst places", "{:.3f} m", "95 of 100 places are better"),
-        ("obstacle_accuracy_m", "solid parts to true surface", "{:.3f} m", "median: accuracy of the parts"),
-        ("obstacle_completeness_m", "true surface to solid parts", "{:.3f} m", "median: completeness of the parts"),
-        ("mesh_accuracy_median_m", "visual mesh to true surface", "{:.3f} m", "median: accuracy of the mesh"),
-        ("mesh_accuracy_mean_m", "the same, mean", "{:.3f} m", "errors above 1 m count as 1 m"),
-        ("mesh_completeness_5cm", "true surface within 5 cm of the mesh", "{:.0%}", "of what the cameras saw nearby"),
-        ("mesh_completeness_10cm", "true surface within 10 cm of the mesh", "{:.0%}", by_kind),
-        ("mesh_chamfer_m", "visual mesh, Chamfer distance", "{:.3f} m", "mean of both directions, each up to 1 m"),
-        ("corridor_intrusions", "parts inside the true corridor", "{}", "the corridor must be free"),
-        ("route_median_m", "route", "{:.3f} m", "median distance to the true center line"),
-        ("depth_median_m", "depth of the field", "{:.3f} m", "median error, up to 20 m"),
-    )
-    cautions = _above(
-        truth,
-        ("ate_m", 0.08, "The camera path is {:.3f} m off, more than {:.3f} m.", "give the camera’s calibration."),
-        ("scale_error", 0.02, "The scale is {:.1%} off, more than {:.1%}.", "check the source of the scale."),
-        ("ground_median_m", 0.04, "The ground is {:.3f} m off, more than {:.3f} m.", "check the camera’s height."),
-        ("obstacle_median_m", 0.1, "Solid parts are {:.3f} m off, more than {:.3f} m.", "lower mesh.max_protrusion."),
-        (
-            "corridor_intrusions",
-            0,
-            "{} solid part(s) reach into the true corridor.",
-            "raise nerf.steps, or mjcf.corridor_margin.",
-        ),
-    )
-    off, ground = _numeric(truth.get("ate_m")), _numeric(truth.get("ground_median_m"))
-    verdict = None
-    if off is not None:
-        also = "" if ground is None else f" and its ground by {100 * ground:.1f} cm"
-        verdict = Verdict(f"Compared with ground truth, its cameras are off by {100 * off:.1f} cm{also}.", "good")
-    done = "This place was generated, so its ground truth is known. Only this comparison uses it; the build does not."
-    return Section(name, title, done, facts, cautions, verdict=verdict)
-
-
-def costs_section(report: dict[str, Any]) -> Section:
-    peak, cautions = _numeric(pick(report, "peak_memory_bytes")), []
-    if peak is not None and peak / 2**30 > _LARGE_MEMORY:
-        cure = "for a smaller machine lower capture.max_size or nerf.rays, or raise mesh.voxel."
-        cautions.append(Caution(f"The build needed {peak / 2**30:.1f} GiB of memory.", cure))
-    done = "Time and memory per stage, and everything needed to reproduce this build."
-    return Section("costs", "Costs and provenance", done, cautions=cautions)
 
 
 def sections(report: dict[str, Any]) -> list[Section]:
