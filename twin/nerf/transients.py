@@ -186,7 +186,8 @@ def difference(pixels: TrainingPixels, cells: list[Cells], i: int) -> Array32:
     coarse = np.abs(_mean_around(color) - _mean_around(median)).mean(-1)
     brightness = np.fmax(color.mean(-1), median.mean(-1))
     least = np.maximum(_MIN_DIFFERENCE + _MIN_CONTRAST * brightness, _SPREADS * spread)
-    return np.where(count >= _MIN_SEEN, np.fmin(_least_difference(color, median), coarse) / least, np.float32(0.0))
+    excess = np.fmin(_least_difference(color, median), coarse) / least
+    return np.where(count >= _MIN_SEEN, excess, 0.0).astype(np.float32)
 
 
 def _least_difference(color: Array32, median: Array32) -> Array32:
