@@ -200,7 +200,9 @@ def test_nothing_is_fetched_from_elsewhere(scene: SceneDir) -> None:
         {"file": f"pictures/{name}.jpg", "section": s, "caption": s} for name, s in (("a", "poster"), ("b", "field"))
     ]
     write_json(scene.stage("review") / "review.json", {"pictures": told})
+    write_image(scene.stage("field") / "excluded.jpg", np.zeros((4, 4, 3), np.uint8))
     html = page(scene, REPORT)
+    assert "were not used" in html
     parser = read(html)
     assert {link for link in parser.links if not link.startswith(("#", "data:"))} == {"review.mp4", "report.json"}
     assert "http" not in html and "url(" not in html.replace("url(#", "")

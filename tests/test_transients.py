@@ -92,6 +92,8 @@ def test_a_mover_is_found_in_every_frame_and_little_else(tmp_path):
     # At the ends of the film, surfaces near the border of a frame are seen in too few others.
     assert (masks & mover)[1:-1].sum() > 0.9 * mover[1:-1].sum()
     assert (masks & ~around).mean() < 0.005
+    shown = transients.picture(pixels, list(masks)).astype(int)
+    assert shown.shape == (180, 2 * 320, 3) and (shown[..., 0] - shown[..., 1] > 60).any()
 
 
 def test_nothing_is_left_out_of_a_static_film(tmp_path):

@@ -19,6 +19,7 @@ from twin.config import NerfConfig, SceneConfig
 from twin.errors import InputError
 from twin.files import read_json
 from twin.geometry.cameras import Cameras, SparsePoints
+from twin.geometry.images import write_image
 from twin.nerf import network
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.bake import bake
@@ -43,6 +44,7 @@ from twin.nerf.kernels import hashgrid, sampler
 from twin.nerf.pose_refinement import PoseRefinement
 from twin.nerf.stereo import stereo_depths
 from twin.nerf.transients import LeftObject, cell_centers, cell_size, left_objects, mover_masks, object_masks
+from twin.nerf.transients import picture as excluded_picture
 from twin.runtime import bar
 from twin.scene import SceneDir
 from twin.warp_runtime import wp
@@ -468,16 +470,17 @@ def without_timings(metrics: dict[str, Any]) -> dict[str, Any]:
 def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = None) -> dict[str, Any]:
     """Runs stage `field`: trains and bakes a field, adds detail, evaluates it on held-out frames, and saves it.
 
-    Saves both the trained and the baked field; returns the metrics. Raises InputError without a training frame, on an
-    unreadable frame, on an unavailable device, or if training diverges.
+    Saves both the trained and the baked field, and a picture of what was left out; returns the metrics. Raises
+    InputError without a training frame, on an unreadable frame, on an unavailable device, or if training diverges.
     """
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))
     height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
     field, metrics, cameras, excluded = train_field(cameras, points, config.nerf, config.seed, height, device)
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
-    if excluded:
+    if any(mask.any() for mask in excluded):
         pixels.exclude(excluded)
+        write_image(out / "excluded.jpg", excluded_picture(pixels, excluded))
     baked, metrics["bake"] = bake(field, pixels, config.seed, config.nerf.bake_steps, config.nerf.max_bricks)
     if config.nerf.detail_passes > 0.0:
         metrics["detail"] = fit_detail(baked, field.appearance, pixels, config.seed, config.nerf.detail_passes)

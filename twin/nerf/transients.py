@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
 
 from twin.geometry.cameras import project, unproject
+from twin.geometry.images import resize
 from twin.nerf.buffers import parallel
 from twin.nerf.dataset import TrainingPixels
 from twin.types import Array, Array32
@@ -407,3 +408,33 @@ def _components(points: Array) -> list[NDArray[np.int64]]:
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points), len(points)))
     labels = connected_components(graph, directed=False)[1]
     return [np.flatnonzero(labels == k) for k in range(labels.max() + 1)]
+
+
+# ---- picture for the report
+
+_SHOWN = 2  # frames per lighting, and columns of the picture
+_TILE = (320, 180)  # size of a frame in the picture [px]
+_RED = np.array([230, 20, 20], np.float32)
+
+
+def picture(pixels: TrainingPixels, excluded: list[NDArray[np.bool_]]) -> NDArray[np.uint8]:
+    """Two frames of every lighting with many excluded pixels, which are red; RGB, shape (height, width, 3).
+
+    At least one pixel must be excluded.
+    """
+    lightings = np.array(pixels.cameras.lightings)
+    share = np.array([mask.mean() for mask in excluded])
+    tiles = []
+    for name in dict.fromkeys(pixels.cameras.lightings):
+        own = np.flatnonzero((lightings == name) & (share > 0.0))
+        for i in own[np.argsort(-share[own], kind="stable")][: 8 * _SHOWN : 8]:  # neighbors look alike
+            mask = excluded[i]
+            image = pixels.colors[pixels.start[i] : pixels.start[i + 1]].reshape(*mask.shape, 3).astype(np.float32)
+            image[mask] = 0.5 * (image[mask] + _RED)
+            scale = min(_TILE[0] / mask.shape[1], _TILE[1] / mask.shape[0])
+            small = resize(image.astype(np.uint8), round(scale * mask.shape[1]), round(scale * mask.shape[0]))
+            tile = np.zeros((_TILE[1], _TILE[0], 3), np.uint8)
+            tile[: small.shape[0], : small.shape[1]] = small
+            tiles.append(tile)
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % _SHOWN)
+    return np.concatenate([np.concatenate(tiles[k : k + _SHOWN], 1) for k in range(0, len(tiles), _SHOWN)])

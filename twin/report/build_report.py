@@ -24,6 +24,7 @@ from twin.scene import SceneDir, stage_result
 
 _MAX_REPROJECTION = 4.0  # [px] right end of the histogram of reprojection errors
 _MAX_TRACK_LENGTH = 30.0  # [frames] right end of the histogram of track lengths
+_EXCLUDED = "Frames of each film: red pixels show what moved or left, and were not used."
 
 
 def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
@@ -212,12 +213,12 @@ def _kicker(report: dict[str, Any]) -> str:
 
 
 def _pictures(scene: SceneDir) -> list[Picture]:
-    """The pictures that the review stage saved for the page."""
-    folder = scene.stage("review")
-    if not (folder / "review.json").exists():
-        return []
-    stored = read_json(folder / "review.json").get("pictures", [])
-    pictures = [Picture(folder / str(row["file"]), str(row["caption"]), str(row["section"])) for row in stored]
+    """The pictures that the review stage saved for the page, and that of the pixels that training left out."""
+    folder, pictures = scene.stage("review"), []
+    if (folder / "review.json").exists():
+        stored = read_json(folder / "review.json").get("pictures", [])
+        pictures = [Picture(folder / str(row["file"]), str(row["caption"]), str(row["section"])) for row in stored]
+    pictures.append(Picture(scene.stage("field") / "excluded.jpg", _EXCLUDED, "field"))
     return [picture for picture in pictures if picture.path.is_file()]
 
 
