@@ -1,4 +1,4 @@
-"""Verbs of the known-truth world.
+"""`twin reality`: commands of the known-truth world.
 
     python -m twin.reality film [--place NUMBER] --out DIR
     python -m twin.reality compare DIR
