@@ -1,4 +1,4 @@
-"""The command line of every verb: `twin VERB`, also `python -m twin.VERB`.
+"""The command line of every subcommand (verb): `twin VERB`, also `python -m twin.VERB`.
 
 Only options are defined here, so that `--help` is fast; a verb's module is imported when the verb runs.
 
@@ -47,13 +47,13 @@ _CURES = {
 
 @dataclass(frozen=True)
 class Verb:
-    """A verb of the command `twin`."""
+    """A subcommand of `twin`."""
 
     summary: str
     define: Callable[[argparse.ArgumentParser], None]
-    """Adds the verb's description and options to a parser."""
+    """Adds the description and options to a parser."""
     module: str
-    """Module whose function `command` runs the verb with the parsed options."""
+    """Module whose function `command` runs with the parsed options."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -307,8 +307,8 @@ def _pack(parser: argparse.ArgumentParser) -> None:
 
 def _unpack(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Unpack a pack into a scene folder, in which all verbs work that need no films. Its paths, sizes and digests "
-        "are checked, and nothing in it runs."
+        "Unpack a pack into a scene folder, in which all commands work that need no films. Its paths, sizes and "
+        "digests are checked, and nothing in it runs."
     )
     parser.add_argument("pack", type=Path, help="the file")
     parser.add_argument("folder", type=Path, help="folder to make")

@@ -50,7 +50,7 @@ A pack of {name}, made by twin {version}: a place to drive in, on MuJoCo, as `tw
 
   pip install twin                       the program, see its README
   twin drive {file}     the Husky drives in it{driver}
-  twin unpack {file} FOLDER              a scene folder, in which all verbs work that need no films
+  twin unpack {file} FOLDER              a scene folder, in which all commands work that need no films
 
 LICENCE
   {licence}

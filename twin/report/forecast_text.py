@@ -18,17 +18,17 @@ from twin.evaluation.trials import csv_text
 from twin.report.html import Caution, Verdict
 
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
-"""Twin and road rank policies alike, or roughly alike, if the rank correlation is at least this."""
+"""Rank correlations from which the verdict is that the twin ranks, or roughly ranks, policies as the road does."""
 SMALL_REGRET = 0.05
 _SMALL_GAP = 0.1  # if the order is reliable only for larger differences of twin scores, the verdict is not good
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
-    ("pearson", "Pearson", "linear correlation of the rates: 1 on a straight line"),
-    ("mmrv", "MMRV", "mean maximum rank violation, in real success: 0 is best"),
+    ("pearson", "Pearson", "linear correlation of the rates: 1 if they lie on a rising straight line"),
+    ("mmrv", "MMRV", "mean maximum rank violation: the real success lost by each policy’s worst swap; 0 is best"),
     ("winner_agreement", "winner agrees", "1 if the twin’s best policy is also the best on the road, else 0"),
     ("winner_regret", "regret", "real success lost by choosing the twin’s best policy"),
-    ("bias", "road minus twin", "mean over the cells; below 0 the twin is too optimistic"),
+    ("bias", "road minus twin", "mean over the policies; below 0 the twin is too optimistic"),
     (
         "coverage",
         "cells agree",
@@ -57,10 +57,7 @@ INTERVALS_NOTE = (
     "more checkpoints of one training, or more trials on the same day, hardly do. With too few days or trainings for a "
     "reliable interval, there is none."
 )
-"""Note on all intervals of the numbers in `Agreement`.
-
-`benchmarks/intervals.py` measures the coverage of these intervals.
-"""
+"""Note on all intervals in `Agreement`; `benchmarks/intervals.py` measures their coverage."""
 
 CSV_COLUMNS = (
     *("task", "policy", "twin", "twin_low", "twin_high", "twin_trials", "rank", "rank_low", "rank_high"),
