@@ -179,7 +179,7 @@ def _bias(group: Agreement) -> Verdict:
     bias, off = group.bias, group.twin_error
     if bias.value is None or off.value is None:
         return Verdict("The bias of the twin’s rates is not known.", "bad")
-    single = f"a single policy’s rate is off by {percentage_points(off.value)} on average"
+    single = f"for a single policy, the twin’s rate is off by {percentage_points(off.value)} on average"
     much = "high" if bias.value < 0 else "low"
     if bias.low is None or bias.high is None:
         mean = f"The twin’s rates are {percentage_points(bias.value)} too {much} on average"
@@ -258,7 +258,7 @@ def limitations(forecast: Forecast) -> list[Caution]:
         "validate under further lightings (any, mixtures, +randomised), film the place in that light, or add a photo "
         "with twin.relight."
     )
-    out.append(Caution(f"Success was not measured in light unlike {lightings}.", cure))
+    out.append(Caution(f"Success is unknown in light that differs from {lightings}.", cure))
     for task in forecast.tasks:
         mine = forecast.candidates_of(task)
         sets = [frozenset(c.lightings) for c in mine]
