@@ -33,7 +33,11 @@ def one_obstacle(scene: Path) -> dict[str, Any]:
 
 
 def single(scene: Path, runs: int) -> dict[str, Any]:
-    """Speed of one environment on one core, alternating with MuJoCo's renderer if software OpenGL is available."""
+    """Speed of one environment on one core.
+
+    If software OpenGL is available, its runs alternate with runs of the same environment whose images come from
+    MuJoCo's renderer.
+    """
     import twin
     from twin.env.drivers import RouteDriver
 
@@ -237,7 +241,7 @@ def host(scene: Path, count: int) -> dict[str, Any]:
 
     GpuSimulation._advance, BakedField.render_on_device = lambda self: None, show  # type: ignore[method-assign]
     factory = EnvFactory.open(scene, standard_tasks(scene)[-1], {"obstacles": (), "size": (8, 8)})
-    # With "cuda" the images stay on the device, as on a GPU; the field itself is on the CPU.
+    # This option selects the observer that keeps images on the device. Here the device is the CPU, as for the field.
     options = dataclasses.replace(factory.options, device="cuda")
     envs = GpuVectorEnv(dataclasses.replace(factory, options=options), list(range(count)), "cpu")
     begin = time.perf_counter()

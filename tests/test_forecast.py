@@ -138,7 +138,7 @@ def test_rates_are_those_of_the_tables() -> None:
     for name, _, _ in STATISTICS[:-1]:
         estimate = getattr(group, name)
         if name == "corrected_coverage":
-            assert "7 policies of a task, of other trainings" in estimate.missing
+            assert "7 policies of other trainings on its task" in estimate.missing
             continue
         assert estimate.value is not None and estimate.n > 0
         assert estimate.low is estimate.high is None  # seven trainings on two days

@@ -137,7 +137,7 @@ def test_prediction_intervals_cover(n: int, real_trials: int, noise: float) -> N
 
 
 def test_too_few_are_refused() -> None:
-    with pytest.raises(UndefinedStatistic, match="4 policies driven in both worlds; 5 are needed"):
+    with pytest.raises(UndefinedStatistic, match="4 policies driven both in the twin and on the road; 5 are needed"):
         LinearCorrection.fit(twin=F[:4], real=Y[:4])
     with pytest.raises(UndefinedStatistic, match="4 policies"):
         prediction_powered_mean(twin=F[:4], real=Y[:4], twin_only=FURTHER)

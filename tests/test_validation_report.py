@@ -181,11 +181,11 @@ def test_a_weak_light_and_untrusted_pictures_are_headlines():
     assert "1 of 4 episodes" in second.text
 
 
-def test_differences_are_named_by_chance():
+def test_differences_are_named_by_significance():
     pair = {"a": "x", "b": "y", "only_a": 9, "only_b": 1, "p": 0.02}
     assert pair_text(pair) == "“x” is better"
     assert pair_text(pair | {"only_a": 1, "only_b": 9}) == "“y” is better"
-    assert pair_text(pair | {"p": 0.3}) == "within chance" and pair_text(pair | {"only_b": 9}) == "no difference"
+    assert pair_text(pair | {"p": 0.3}) == "not significant" and pair_text(pair | {"only_b": 9}) == "no difference"
     assert [p_value_text(p) for p in (1e-5, 0.0213, 0.62, 1.0)] == ["<0.1%", "2.1%", "62%", "100%"]
 
 

@@ -1,4 +1,4 @@
-"""Verb: fits the Husky's parameters to a drive log, or its front camera to a film by that camera.
+"""`twin align`: fits the Husky's parameters to a drive log, or its front camera to a film by that camera.
 
     python -m twin.align scenes/demo drive.csv
     python -m twin.align scenes/demo robot.mp4

@@ -1,4 +1,4 @@
-"""Verb: builds a drivable twin of a filmed place, stage by stage; stages that are up to date are skipped.
+"""`twin build`: builds a drivable twin of a filmed place, stage by stage; stages that are up to date are skipped.
 
     python -m twin.build SCENE [--until STAGE] [--force STAGE] [--set nerf.steps=4000] [--device cpu|cuda] [--quiet]
 

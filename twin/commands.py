@@ -1,4 +1,4 @@
-"""The verbs of the command `twin` and their options: `twin VERB`, also `python -m twin.VERB`.
+"""The subcommands (verbs) of `twin` and their options: `twin VERB`, also `python -m twin.VERB`.
 
 Only options are defined here, so that `--help` is fast; a verb's module is imported when the verb runs.
 `command_line.py` runs a command line.
@@ -17,13 +17,13 @@ from twin.scene import STAGES
 
 @dataclass(frozen=True)
 class Verb:
-    """A verb of the command `twin`."""
+    """A subcommand of `twin`."""
 
     summary: str
     define: Callable[[argparse.ArgumentParser], None]
-    """Adds the verb's description and options to a parser."""
+    """Adds the description and options to a parser."""
     module: str
-    """Module whose function `command` runs the verb with the parsed options."""
+    """Module whose function `command` runs with the parsed options."""
 
 
 def main(verb: str, arguments: list[str] | None = None) -> int:
@@ -222,8 +222,8 @@ def _pack(parser: argparse.ArgumentParser) -> None:
 
 def _unpack(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Unpack a pack into a scene folder, in which all verbs work that need no films. Its paths, sizes and digests "
-        "are checked, and nothing in it runs."
+        "Unpack a pack into a scene folder, in which all commands work that need no films. Its paths, sizes and "
+        "digests are checked, and nothing in it runs."
     )
     parser.add_argument("pack", type=Path, help="the file")
     parser.add_argument("folder", type=Path, help="folder to make")

@@ -1,4 +1,4 @@
-"""Verb: shows the Husky driving in a scene or a pack, as a film or in the browser.
+"""`twin drive`: shows the Husky driving in a scene or a pack, as a film or in the browser.
 
     python -m twin.drive demo
     python -m twin.drive scenes/demo --policy first --lighting night --view
@@ -40,7 +40,7 @@ def chosen_task(twin: Twin, name: str | None, policy: str | None, trust: bool) -
 
 
 def command(given: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin drive` with the options parsed by `twin.commands`."""
     if not given.scene.exists() and len(given.scene.parts) == 1:
         named = f"{given.scene.name.removesuffix(SUFFIX)}{SUFFIX}"
         cure = f"no folder, and no {named} here or in scenes/"

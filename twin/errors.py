@@ -19,8 +19,8 @@ _LONG_WORD = re.compile(rf"(\S{{{_MAX_WORD - 63}}})\S{{4,}}(\S{{60}})")
 
 
 class InputError(ValueError):
-    """Wrong input. The message is one line with the value, what was expected, and the cure. Verbs print it and exit
-    with status 2."""
+    """Wrong input. The message is one line with the value, what was expected, and the cure. The command prints it and
+    exits with status 2."""
 
     def __init__(self, message: object = "") -> None:
         super().__init__(shortened(str(message)))

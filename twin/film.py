@@ -1,4 +1,4 @@
-"""Verb: films a drive in a built scene, for visual review.
+"""`twin film`: films a drive in a built scene, for visual review.
 
     python -m twin.film scenes/demo --task right_turn --lighting night --obstacles 4
     python -m twin.film scenes/demo --policy first --task straight --lighting held-out --seed 7 --out drive.mp4
@@ -185,7 +185,7 @@ def film_name(task: str, lighting: str, seed: int) -> str:
 
 
 def command(given: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin film` with the options parsed by `twin.commands`."""
     obstacles = given.obstacles
     if obstacles != "scene":
         if not obstacles.isdecimal() or len(obstacles) > _MAX_DIGITS:  # isdigit accepts "²"

@@ -1,4 +1,4 @@
-"""Verb: forecasts success on the real road from success in the twin.
+"""`twin forecast`: forecasts success on the real road from success in the twin.
 
     python -m twin.forecast SCENE [--real results.csv]
 

@@ -1,4 +1,4 @@
-"""Verb: creates a scene folder from films or a robot's bags.
+"""`twin new`: creates a scene folder from films or a robot's bags.
 
     python -m twin.new scenes/my_road day.mp4 dusk.mp4 --camera-height 1.2
 

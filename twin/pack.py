@@ -1,4 +1,4 @@
-"""Verb: packs a built scene, with chosen policies, into one file for another machine.
+"""`twin pack`: packs a built scene, with chosen policies, into one file for another machine.
 
     python -m twin.pack scenes/demo --policy first -o demo.twin
     python -m twin.pack scenes/demo --policy first --levels 8 -o scenes/demo.twin
@@ -50,7 +50,7 @@ A pack of {name}, made by twin {version}: a place to drive in, on MuJoCo, as `tw
 
   pip install twin                       the program, see its README
   twin drive {file}     the Husky drives in it{driver}
-  twin unpack {file} FOLDER              a scene folder, in which all verbs work that need no films
+  twin unpack {file} FOLDER              a scene folder, in which all commands work that need no films
 
 LICENCE
   {licence}
@@ -270,7 +270,7 @@ def _entry(name: str) -> zipfile.ZipInfo:
 
 
 def command(given: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin pack` with the options parsed by `twin.commands`."""
     out, manifest = pack(
         given.scene, given.out, given.policy, given.levels, given.licence, given.with_positions, given.trust
     )

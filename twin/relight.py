@@ -1,4 +1,4 @@
-"""Verb: adds a lighting to a built scene from a single photo.
+"""`twin relight`: adds a lighting to a built scene from a single photo.
 
     python -m twin.relight scenes/demo photo.jpg --name afternoon
     python -m twin.relight scenes/demo photo.jpg --name afternoon --time 2026-06-01T17:30+02:00 --location 48.14,11.58

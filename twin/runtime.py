@@ -1,4 +1,4 @@
-"""Runtime services of the verbs: progress bars, signals, child processes, CPU cores, memory and file locks."""
+"""Runtime services of the commands: progress bars, signals, child processes, CPU cores, memory and file locks."""
 
 import contextlib
 import ctypes

@@ -1,4 +1,4 @@
-"""Verb: trains a policy from pixels on a task of a built scene.
+"""`twin train`: trains a policy from pixels on a task of a built scene.
 
     python -m twin.train scenes/demo --task straight --run first
     python -m twin.train scenes/demo --task straight --run plain --observe simulator
@@ -65,7 +65,7 @@ def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
     lines = [
         f"{folder}: trained for {choice['steps']:,} steps: {ends[choice['why']]}",
         f"The policy of step {chosen['step']:,} is kept. In {trials} fresh episodes ({chosen['condition']}) it arrives "
-        f"{won} times ({low:.2f} to {high:.2f}).",
+        f"{won} times (rate {won / trials:.2f}, 90 % interval {low:.2f} to {high:.2f}).",
     ]
     if choice["failures"]:
         lines.append(f"Where the kept policy fails: {choice['failures']}.")
@@ -89,7 +89,7 @@ def _train(
         prepare_folder(folder)
     settings = {"scene": twin.scene.root.resolve().name, **dataclasses.asdict(config)}
     logging = wandb_run(project, folder, settings) if project else nullcontext()
-    with logging as log, runtime.bar("train, at most", config.steps, "step") as bar:
+    with logging as log, runtime.bar("train (may end earlier)", config.steps, "step") as bar:
 
         def watch(steps: int, recent: Sequence[bool]) -> None:
             if not bar.n:  # the bar's speed must not include the steps of earlier calls

@@ -1,4 +1,4 @@
-"""Verb: judges a robot's recording of a trial on the road, counts it in `real.csv`, and compares it with the twin.
+"""`twin trial`: evaluates a robot's recording of a trial: counts it in `real.csv`, and compares it with the twin.
 
     python -m twin.trial scenes/my_road monday_1.mcap --policy first --task straight --lighting monday
 

@@ -1,4 +1,4 @@
-"""Verb: unpacks a *pack*, a file with everything that driving in a built scene needs. `twin.pack` writes packs.
+"""`twin unpack`: unpacks a *pack*, a file with all that driving in a built scene needs. `twin.pack` writes packs.
 
     python -m twin.unpack demo.twin scenes/demo_copy
 
@@ -47,7 +47,8 @@ STAGES_PACKED = ("metric", "field", "mesh", "mjcf")
 
 _MAX_FILES = 20_000
 _MAX_FILE, _MAX_TOTAL = 2 << 30, 4 << 30  # [bytes] largest file, and largest total size, unpacked
-_MAX_RATIO, _FREE = 30, 16 << 20  # largest total size / the pack's size; [bytes] totals up to this are always allowed
+_MAX_RATIO = 30  # largest total size / the pack's size
+_FREE = 16 << 20  # [bytes] a total up to this is allowed at any ratio
 _MAX_MANIFEST = 16 << 20  # [bytes]
 _CHUNK = 4 << 20  # [bytes]
 _N = r"\w[\w.+-]{0,99}"  # a name in a path; it cannot begin with a dot, so ".." is excluded
@@ -96,7 +97,7 @@ def decode_differences(content: bytes) -> bytes:
 def _recode(content: bytes, change: Any) -> bytes:
     (length,) = struct.unpack_from("<Q", content)
     if length > len(content) - _HEADER:
-        raise ValueError(f"a header of {length:,} bytes in {len(content):,}")
+        raise ValueError(f"its header has {length:,} bytes, but the file only {len(content):,}")
     out, start = bytearray(content), _HEADER + length
     for name, tensor in json.loads(content[_HEADER:start]).items():
         if name == "__metadata__" or tensor["dtype"] != "U8" or len(tensor["shape"]) < 2:
@@ -105,7 +106,8 @@ def _recode(content: bytes, change: Any) -> bytes:
         shape = [int(n) for n in tensor["shape"]]
         if not 0 <= first <= last <= len(content) - start or min(shape) < 0 or math.prod(shape) != last - first:
             raise ValueError(
-                f"{short_repr(name)} of shape {shape} in bytes {first} to {last} of {len(content) - start}"
+                f"{short_repr(name)}: shape {shape} does not match bytes {first} to {last}, or these are not within "
+                f"the {len(content) - start} data bytes"
             )
         if last > first:
             flat = np.frombuffer(content, np.uint8, last - first, start + first)
@@ -192,15 +194,21 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         if not _PLACES.fullmatch(name):
             raise InputError(f"{path}: {short_repr(name)} is not a file of a scene; {_CURE}")
         size = facts["bytes"]
-        if not isinstance(size, int) or not 0 <= size <= _MAX_FILE or facts["coding"] not in (PLAIN, DIFFERENCES):
-            raise InputError(f"{path}: {name} of {short_repr(size)} bytes; expected at most {_MAX_FILE:,}")
+        if not isinstance(size, int) or not 0 <= size <= _MAX_FILE:
+            raise InputError(f"{path}: {name} has {short_repr(size)} bytes; expected at most {_MAX_FILE:,}")
+        if facts["coding"] not in (PLAIN, DIFFERENCES):
+            coding = short_repr(facts["coding"])
+            raise InputError(f"{path}: {name} has coding {coding}; expected {PLAIN} or {DIFFERENCES}; {_CURE}")
         require_text(facts["sha256"])
         total += size
     bound = min(_MAX_TOTAL, max(_FREE, _MAX_RATIO * path.stat().st_size))
     if total > bound:
         raise InputError(f"{path} unpacks to {total:,} bytes; expected at most {bound:,} for a file of its size")
     if missing := {*head["files"], README, MANIFEST} ^ set(by_name):
-        raise InputError(f"{path}: {short_repr(min(missing))} is in {MANIFEST} but missing, or the reverse; {_CURE}")
+        name = short_repr(min(missing))
+        raise InputError(
+            f"{path}: {name} is listed in {MANIFEST} but not in the pack, or in the pack but not listed; {_CURE}"
+        )
     for name, entry in by_name.items():
         kind = stat.S_IFMT(entry.external_attr >> 16)
         if kind not in (0, stat.S_IFREG) or entry.is_dir():
@@ -255,7 +263,7 @@ def _check_contents(root: Path, path: Path) -> None:
 
 
 def open_scene(path: Path) -> Path:
-    """The folder of a scene: `path` itself, or for a pack or the name of a pack, the folder of its contents in a cache.
+    """Returns the folder of a scene: `path` itself; for a pack or its name, the cache folder into which it is unpacked.
 
     A pack is unpacked once, into a folder in `$XDG_CACHE_HOME/twin/packs` that is named after its digest. Several
     processes may do so at once.
@@ -304,7 +312,7 @@ def packed_policies(root: Path) -> list[str]:
 
 
 def command(given: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin unpack` with the options parsed by `twin.commands`."""
     manifest = unpack(find_pack(given.pack) or given.pack, given.folder, given.trust)
     if not given.quiet:
         policies = f", with the policies {', '.join(manifest['policies'])}" if manifest["policies"] else ""

@@ -1,4 +1,4 @@
-"""Verb: measures the success rates of policies in a built scene, per lighting.
+"""`twin validate`: measures the success rates of policies in a built scene, per lighting.
 
     python -m twin.validate scenes/demo --task straight --policy scenes/demo/runs/first --episodes 100
     python -m twin.validate scenes/demo --policy first plain my_module:act --lightings held-out night --worst --films

@@ -1,4 +1,4 @@
-"""Test grounds: level, random relief, reconstructed from noisy data; and the roughness of a ground."""
+"""Grounds for tests (level, random relief, or fitted by the pipeline to noisy data), and a measure of roughness."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,11 @@ def level(height: float = 0.0, half: float = 8.0, cell: float = 0.1) -> Ground:
 
 
 def random_relief(rms: float, length: float, rng: np.random.Generator, half: float = 9.0) -> Callable[[Array], Array]:
-    """Isotropic Gaussian bumps around the origin: maps points (k, 2) to heights [m]; `length` [m] is the kernel's σ."""
+    """Returns a random relief as a function from points (k, 2) to heights (k,) [m], up to `half` [m] from the origin.
+
+    The relief is white noise, smoothed by a Gaussian kernel of standard deviation `length` [m] and scaled to the root
+    mean square `rms` [m].
+    """
     cell = length / 4
     n = round(2 * half / cell) + 1
     height = gaussian_filter(rng.normal(size=(n, n)), length / cell)
@@ -56,8 +60,9 @@ def reconstructed(
 def roughness(ground: Ground, line: Array) -> tuple[float, float]:
     """Rms [m] and correlation length [m] of the heights along a polyline (m, ≥2).
 
-    A straight line is fitted to each 8 m of the heights and subtracted; the robot is much shorter than 8 m. The
-    correlation length is the lag at which the autocorrelation falls to 1/e.
+    The heights are cut into windows of 8 m, and the straight line fitted to each window is subtracted. A window is much
+    longer than the robot, so unevenness on the robot's scale remains.
+    The correlation length is the lag at which the autocorrelation falls to 1/e.
     """
     step = ground.cell / 2
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1))])

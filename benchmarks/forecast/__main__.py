@@ -1,22 +1,22 @@
-"""The forecast experiment: how well the twin forecasts success on the road, at random places not examined before.
+"""Forecast experiment: measures how well the twin predicts success on the road at places not used in development.
 
     python benchmarks/forecast WORK [--minutes 150] [--jobs 2] [--places 100 101] [--ray ADDRESS]
-    python benchmarks/forecast --tables                     only the scores of the kept results, in seconds
+    python benchmarks/forecast --tables                     only scores the recorded results, in seconds
 
 `protocol.toml` fixes every number in advance; `place_record.py` keeps every episode and trial in `results/`; the scores
 are defined in `place_scores.py`. Steps at a place, each a command of `twin` that resumes where it was interrupted:
 
 - film: generates the place from its number, and films it under its lightings.
 - build: builds the twin; aligns the robot to a drive log and a film of its own camera; builds again with this robot.
-- photos: adds each day's lighting to the twin, from one photo by the robot's camera. If the photo cannot be placed (its
-  pose is not found), held-out lightings replace that day's lighting.
+- photos: adds each day's lighting to the twin, from one photo by the robot's camera. If the photo's pose is not found,
+  held-out lightings replace that day's lighting.
 - train: trains one policy per setup, and records the policies' digests before any of them drives.
 - validate: drives every policy in the twin, under the lighting of each day and under held-out lightings.
 - drive: drives every policy in the reality, on each day, on the task that the twin exported.
 
 WORK holds the scenes (1 GB a place). After a kill, or when `--minutes` are over, the same command continues. A place of
-60 m takes about two hours on two cores. Results never lose a row. If a command fails, its place is left unfinished, and
-the next one begins.
+60 m takes about two hours on two cores. No recorded row is removed. If a command fails, its place stays unfinished, and
+the next place begins.
 """
 
 import argparse
@@ -97,7 +97,7 @@ class Commands:
         """Runs a command. Raises InputError: the command failed."""
         status = self(*arguments, cores=cores)
         if status:
-            raise InputError(f"{' '.join(map(str, arguments))}: exit status {status}; its own message is above")
+            raise InputError(f"{' '.join(map(str, arguments))}: exit status {status}; see its message above")
 
 
 class PlaceRun:
@@ -127,7 +127,7 @@ class PlaceRun:
         self.run.must("twin.reality", "compare", self.scene, cores=self.jobs)
 
     def photos(self) -> None:
-        """Adds the days' lightings; `photos.json` in the scene records for each day if its photo could be placed."""
+        """Adds the days' lightings; `photos.json` in the scene records for each day if the photo's pose was found."""
         done = dict(read_json(self._photos)) if self._photos.exists() else {}
         for day in (day for day in self.days if day not in done):
             photo = self.scene / "photos" / f"{day}.png"
@@ -231,11 +231,15 @@ def main() -> int:
     parser.add_argument("work", type=Path, nargs="?", help="folder of the scenes")
     parser.add_argument("--protocol", type=Path, default=PROTOCOL, help="default: protocol.toml beside this file")
     parser.add_argument("--results", type=Path, default=RESULTS, help="default: results beside this file")
-    parser.add_argument("--places", type=int, nargs="+", metavar="NUMBER", help="of the protocol's (default: all)")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="then stop; the same command continues")
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once, one core each")
-    parser.add_argument("--ray", metavar="ADDRESS", help="a Ray cluster that validates")
-    parser.add_argument("--tables", action="store_true", help="drive nothing")
+    parser.add_argument(
+        "--places", type=int, nargs="+", metavar="NUMBER", help="places of the protocol to run (default: all)"
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=float("inf"), help="stop after this time; the same command continues"
+    )
+    parser.add_argument("--jobs", type=int, default=2, help="number of processes in parallel, each on one core")
+    parser.add_argument("--ray", metavar="ADDRESS", help="Ray cluster that runs the validations")
+    parser.add_argument("--tables", action="store_true", help="run nothing; score what is recorded")
     given = parser.parse_args()
     try:
         protocol = read_protocol(given.protocol)

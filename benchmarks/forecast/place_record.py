@@ -1,7 +1,7 @@
-"""Record of a place, in files under version control: every episode and trial, and the digests of the policies.
+"""Record of a place in files under version control: every episode and trial, and the policies' digests.
 
     results/version_N/place_P/
-      place.json            figures of build and trainings; robot and camera, and their values outside training's ranges
+      place.json            figures of build and trainings; robot and camera, with values outside training's ranges
       policies.json         digest of every policy, written before the first trial
       episodes.csv.gz       a row per episode in the twin
       trials.csv.gz         a row per trial in the reality
@@ -27,7 +27,7 @@ HELD_OUT_CONDITION = str(Condition(HELD_OUT, True))
 
 
 def by_photo(day: str) -> str:
-    """The twin's condition for a day: lit as in its photo, the rest randomized."""
+    """The twin's condition for a day: lighting from the day's photo, everything else randomized."""
     return str(Condition(day, True))
 
 
@@ -41,7 +41,7 @@ class PlaceRecord:
     days: tuple[str, ...]
     twin: Array
     """Successes and episodes in the twin under the lighting of each day's photo, or under held-out lightings if the
-    photo could not be placed; shape (n, k, 2)."""
+    photo's pose was not found; shape (n, k, 2)."""
     held_out: Array
     """Successes and episodes under held-out lightings, shape (n, 2)."""
     real: Array
@@ -51,7 +51,7 @@ class PlaceRecord:
 def freeze(folder: Path, runs: dict[str, Path]) -> None:
     """Records the digests of trained policies; `runs` names their folders.
 
-    Raises InputError: the record has other digests, so trials would be driven by policies that it does not contain.
+    Raises InputError: the record has other digests, so the policies to be driven would not be those recorded.
     """
     digests = {name: digest_file(path / "policy.json") for name, path in runs.items()}
     record = folder / POLICIES

@@ -1,10 +1,10 @@
-"""Scores of a forecast experiment over places, from the kept tables alone.
+"""Scores of a forecast experiment over places, from the recorded tables alone.
 
-The forecast of a policy on a day is its success rate in the twin under the lighting of that day's photo, or
-under held-out lightings if the photo could not be placed. The baselines are success on the road at *other places* only,
-which does not use the twin, and the twin's own rates with the days shuffled.
+The forecast of a policy on a day is its success rate in the twin under the lighting of that day's photo, or under
+held-out lightings if the photo's pose was not found. One kind of baseline is the success on the road at *other places*,
+which does not use the twin. The other is the twin's rates with the days shuffled.
 
-- *within*: mean over places of Spearman, MMRV and regret of the place's policies. *over all*: the statistic of
+- *within places*: mean over places of Spearman, MMRV and regret of the place's policies. *over all*: the statistic of
   the policies of all places together.
 - single days: mean over places of the log and Brier scores of all cells. *gain* is a baseline's log score minus the
   twin's; it is above 0 if the twin is better.
@@ -217,7 +217,7 @@ def _gain(log: list[float], twin: list[float]) -> dict[str, float | None]:
 
 
 def _met(protocol: Protocol, out: dict[str, Any]) -> dict[str, bool | None]:
-    """Wanted figure → True if it is reached; None if it is undefined."""
+    """Acceptance criterion → True if it is reached; None if its figure is undefined."""
     ranking = out["ranking"][TWIN]
     varied = [row["real"] for row in out["road"] if row["setup"] == next(iter(protocol.setups))]
     figures = {
@@ -248,31 +248,39 @@ def tables(protocol: Protocol, found: dict[str, Any]) -> str:
         return "\n".join(lines)
     lines += [
         "",
-        "| ranking of policies by | within places: Spearman | MMRV | regret | over all: Spearman | road minus it |",
+        "| ranking by | within places: Spearman | MMRV | regret | over all: Spearman | road minus predicted |",
     ]
     lines += ["|---|---|---|---|---|---|"]
     for name, row in found["ranking"].items():
         keys = ("spearman_within", "mmrv", "regret", "spearman_over_all", "bias")
         lines.append(f"| {name} | {' | '.join(_text(row.get(key)) for key in keys)} |")
-    lines += ["", "| single days | Brier | log score | the twin's is better by |", "|---|---|---|---|"]
+    lines += [
+        "",
+        "| predictor of single days | Brier | log score | the twin's log score is better by |",
+        "|---|---|---|---|",
+    ]
     for name, row in found["days"].items():
         lines.append(f"| {name} | {_number(row['brier'])} | {_number(row['log'])} | {_text(row['gain'], '+.3f')} |")
     lines += [
         "",
-        "| place | policy | road | 90 % over days | twin, by photos | twin, held out |",
+        "| place | policy | road | 90 % interval over days | twin, by photos | twin, held-out lightings |",
         "|---|---|---|---|---|---|",
     ]
     for row in found["road"]:
         ends = f"{row['low']:.2f} to {row['high']:.2f}"
         rates = f"{row['twin']:.2f} | {row['held_out']:.2f}"
         lines.append(f"| {row['place']} | {row['setup']} | {row['real']:.2f} of {row['trials']} | {ends} | {rates} |")
-    lines += ["", "| the twin's probability | mean | success on the road | cells | trials |", "|---|---|---|---|---|"]
+    lines += [
+        "",
+        "| probability predicted by the twin | mean | success on the road | cells | trials |",
+        "|---|---|---|---|---|",
+    ]
     for row in found["calibration"]:
         ends = f"{row['low']:g} to {row['high']:g}"
         lines.append(f"| {ends} | {row['predicted']:.2f} | {row['observed']:.2f} | {row['cells']} | {row['trials']} |")
     lines += ["", "| day | cells | missed failures | false alarms |", "|---|---|---|---|"]
     lines += [f"| {row['day']} | {row['cells']} | {row['misses']} | {row['false_alarms']} |" for row in found["errors"]]
-    lines += ["", "Wanted, and whether it is reached:", ""]
+    lines += ["", "Acceptance criteria:", ""]
     words = {True: "reached", False: "missed", None: "undefined"}
     lines += [f"- {name} ({protocol.wanted.get(name, 0.0):g}): {words[met]}" for name, met in found["met"].items()]
     return "\n".join(lines)

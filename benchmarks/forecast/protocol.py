@@ -1,4 +1,4 @@
-"""Protocol of the forecast experiment: places, days, trials, setups, and the wanted scores (`protocol.toml`)."""
+"""Protocol of the forecast experiment: places, days, trials, setups, and acceptance criteria (`protocol.toml`)."""
 
 import tomllib
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class Protocol:
         return f"version_{self.version}"
 
     def days_of(self, place: int) -> list[str]:
-        """Names of the days on which a place's trials are driven."""
+        """Names of the days of a place's trials."""
         return [f"day_{10 * place + k + 1}" for k in range(self.days)]
 
     def options_of(self, setup: str, lightings: list[str]) -> list[str]:
@@ -63,7 +63,10 @@ def read_protocol(path: Path = PROTOCOL) -> Protocol:
         (not 1 <= protocol.days <= 10, f"days = {protocol.days}; expected 1 to 10, the days of a place"),
         (len(setups) < MIN_POLICIES, f"{len(setups)} setups; expected {MIN_POLICIES} or more"),
         (protocol.trials < MIN_TRIALS, f"trials = {protocol.trials}; expected {MIN_TRIALS} or more"),
-        (protocol.episodes < 1 or protocol.held_out_episodes < 1, "episodes below 1"),
+        (
+            protocol.episodes < 1 or protocol.held_out_episodes < 1,
+            f"episodes = {protocol.episodes}, held_out_episodes = {protocol.held_out_episodes}; expected 1 or more",
+        ),
     ]
     for wrong, text in faults:
         if wrong:

@@ -10,7 +10,7 @@ from random import Random
 from typing import Any
 
 DEEP_NESTING = 100_000  # levels
-OUTSIDE_PATH = "../kept/notes.txt"  # relative to a case's folder; must not change
+OUTSIDE_PATH = "../kept/notes.txt"  # a file outside the case's folder, relative to it; a case that changes it fails
 
 
 class RawLiteral(str):
@@ -174,7 +174,11 @@ def mutated_json(rng: Random, tree: Any) -> bytes:
 
 
 def mutated_text(rng: Random, text: str) -> bytes:
-    """A text as bytes: unchanged (60 %), in another encoding, with a character inserted, or corrupted."""
+    """A text as bytes.
+
+    It is unchanged (60 %), has a byte order mark, another encoding, an inserted character, or a very long or deeply
+    nested prefix, or is corrupted.
+    """
     what = rng.random()
     if what < 0.6:
         return text.encode("utf-8", "surrogatepass")

@@ -1,4 +1,4 @@
-"""Replication of the paper's table 1 on a road with known truth.
+"""Replication of table 1 of DriveEnv-NeRF (arXiv 2403.15791) in the known-truth world, a simulated road.
 
     python benchmarks/table1 SCENE [--seeds 0 1] [--jobs 2] [--steps train validate photos real forecast]
 
@@ -13,9 +13,10 @@ Steps, each a command of `twin` that resumes where it was interrupted:
 - forecast: forecasts real success, once from held-out lightings, once from the photos.
 
 The defaults are the published plan; the same call with more seeds adds runs. `results.json` beside this file records
-every run. It is never overwritten by a record with fewer runs, policies, days or trials: the command then ends with
-status 2, the new record is in `results.json.partial`, and `--results` names another file for it. `plan.py` defines
-setups, sizes and checkpoints. The command first prints the tables of `scores.py`, which needs only `results.json`.
+every run. If the new record has fewer runs, policies, days or trials, the file is kept, the new record is written to
+`results.json.partial`, and the command ends with status 2. `--results` gives another file for the record. `plan.py`
+defines setups, sizes and checkpoints. After all steps the command prints the tables of `scores.py`, the paper's table
+and the forecasts. `scores.py` itself needs only `results.json`.
 """
 
 import argparse
@@ -95,9 +96,10 @@ def real(scene: Path, run: Run) -> None:
 
 
 def forecast(scene: Path) -> None:
-    """Forecasts from held-out lightings, then from photos, for the policies that were validated under their lightings.
+    """Forecasts from held-out lightings for all policies, then from photos.
 
-    The second forecast replaces the first, of which `HELD_OUT_FORECAST` keeps a copy.
+    The second forecast has the policies that were validated under the photos' lightings. It replaces the first one, of
+    which `HELD_OUT_FORECAST` keeps a copy.
     """
     tables = sorted(path for path in (scene / "real").glob("*_*.csv") if path.stem.split("_")[0] in TASKS)
     rows = [row for path in tables if not path.stem.endswith("_trials") for row in _rows(path)]
@@ -135,7 +137,7 @@ def main() -> int:
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--setups", nargs="+", choices=SETUPS, default=list(SETUPS))
     parser.add_argument("--steps", nargs="*", choices=STAGES, default=list(STAGES), help="no names: the tables only")
-    parser.add_argument("--jobs", type=int, default=2, help="runs at once, one core each")
+    parser.add_argument("--jobs", type=int, default=2, help="number of runs in parallel, each on one core")
     parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: the one beside this file)")
     given = parser.parse_args()
     asked = runs(given.seeds, given.tasks, given.setups)

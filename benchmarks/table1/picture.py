@@ -1,4 +1,4 @@
-"""The README's picture of the experiment.
+"""Draws the README's picture of the table 1 experiment.
 
     python benchmarks/table1/picture.py SCENE docs/forecast.jpg
 
@@ -31,7 +31,7 @@ from twin.types import Image
 
 _WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] total width, gap between images, height of a caption
 _PER_ROW = 5  # images
-_SEEDS = range(1, 1 + _PER_ROW)  # of the episodes that the twin's images show
+_SEEDS = range(1, 1 + _PER_ROW)  # seeds of the episodes in the twin's images
 _SHOWN = list(WEATHER)[: 2 * _PER_ROW]
 _PAPER = {
     INK: "#16202a",
@@ -60,7 +60,7 @@ def main() -> None:
         _caption("The twin in training: randomised lighting, sun, shadows and haze"),
         *_rows([_first(given.scene, seed, randomise=True) for seed in _SEEDS]),
         _caption(
-            f"The test road in {len(_SHOWN)} of its {len(WEATHER)} weathers, none of them filmed; objects were moved"
+            f"The test road in {len(_SHOWN)} of its {len(WEATHER)} weathers, which were not filmed; objects were moved"
         ),
         *_rows(road, _SHOWN),
         _caption("The twin under the appearance and the haze of one photo of each of these days"),
@@ -79,7 +79,7 @@ def _first(scene: Path, seed: int, **options: Any) -> Image:
 
 
 def _in_paper_colors(figure: Figure) -> Image:
-    """A report figure as an image, with the page's theme colors replaced by those of `_PAPER`."""
+    """A report figure as an image, with the theme's colors replaced by those for white paper (`_PAPER`)."""
     for artist in figure.findobj():
         if isinstance(artist, Text) and artist.get_bbox_patch():
             artist.set_bbox({"facecolor": _PAPER[CARD], "edgecolor": "none", "alpha": 0.7, "pad": 1.0})

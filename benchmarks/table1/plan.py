@@ -1,8 +1,8 @@
 """Design of the experiment: setups, tasks, runs, and the policies that are driven on the road.
 
 A *setup* is a set of training options. A *run* trains a setup on a task with a seed. Each run contributes its finished
-policy and its checkpoints at a quarter and at half of the steps, which gives the forecast policies of varied quality.
-The selection is fixed here, before any result is known.
+policy and its checkpoints at a quarter and at half of the steps, so that the policies vary in quality. This selection
+was fixed before any result was known.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ LIGHTINGS = {"final": (HELD_OUT, str(Condition(HELD_OUT, True))), "checkpoint": 
 Forecasts use the randomized condition. The paper's table, which has only finished policies, uses the other one.
 """
 PHOTOS = tuple(str(Condition(name, True)) for name in WEATHER)
-"""Lightings of the twin from a photo of each test day, for forecasts per weather."""
+"""Lightings of the twin fitted to a photo of each test day, for forecasts per weather."""
 PHOTO_EPISODES = 5
 """Episodes in the twin per policy and weather."""
 TRIALS = MIN_TRIALS
@@ -47,7 +47,7 @@ PAPER: dict[tuple[str, str], tuple[float, float, float]] = {
     ("one_light", "right"): (1.00, 0.95, 0.67),
     ("varied", "right"): (1.00, 1.00, 0.83),
 }
-"""Success in training, in validation and on the road, arXiv 2403.15791, table 1."""
+"""Success rates in training, in validation and on the road: arXiv 2403.15791, table 1."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Run:
         return scene / "runs" / self.name
 
     def checkpoints(self, scene: Path) -> list[Path]:
-        """Checkpoints for the forecast: for each of `SHARES`, the last one saved up to 100 steps after it."""
+        """Checkpoints for the forecast: for each of `SHARES`, the last one saved no more than 100 steps after it."""
         saved = sorted((self.folder(scene) / "checkpoints").glob("*"), key=lambda path: int(path.name))
         before = [[path for path in saved if int(path.name) <= share * STEPS[self.task] + 100] for share in SHARES]
         return [some[-1] for some in before if some]

@@ -1,4 +1,4 @@
-"""Collects `results.json`, the record of every run, and formats the paper's table from it."""
+"""Collects `results.json`, the record of every run, and formats it like table 1 of the paper (see `plan.py`)."""
 
 import csv
 from pathlib import Path
@@ -16,7 +16,7 @@ from twin.files import read_json
 _EVALUATIONS = ("validate", "validate_randomised", "validate_by_photo", "real")
 _BY_DAY = ("validate_by_photo", "real")
 HELD_OUT_FORECAST = "forecast_held_out"
-"""Folder of the forecast from held-out lightings, if `forecast` contains the one from photos."""
+"""Folder of the forecast from held-out lightings, if the folder `forecast` has the one from photos."""
 FORECAST = (
     "pearson",
     "spearman",
@@ -48,11 +48,11 @@ def collect(scene: Path, every: list[Run]) -> dict[str, Any]:
 
 
 def table(results: dict[str, Any]) -> str:
-    """The paper's table beside ours, in Markdown, from the finished policies of all seeds.
+    """Table 1 of the paper beside its replication, in Markdown, from the finished policies of all seeds.
 
     Rates by photo and on the road are means over days, with intervals over days.
     """
-    columns = "train / validate / (ours: another day / a photo of each day of the test) / real"
+    columns = "train / validate / (ours: all randomized / by a photo of each day) / real"
     lines = [f"| | | straight: {columns} | right turn: {columns} |", "|---|---|---|---|"]
     for setup in SETUPS:
         lines.append(f"| paper | {setup} | " + " | ".join(_numbers(PAPER[setup, task]) for task in TASKS) + " |")
@@ -101,7 +101,7 @@ def _training(folder: Path) -> dict[str, Any]:
 
 
 def _own_kind(choice: dict[str, Any]) -> dict[str, Any]:
-    """Test of the chosen policy in the training's own lighting; `choice["chosen"]` is its test under held-out ones."""
+    """The chosen policy's test in the training's lighting; `choice["chosen"]` has its test under held-out lightings."""
     return next(one for one in choice["candidates"] if one["step"] == choice["chosen"]["step"])
 
 

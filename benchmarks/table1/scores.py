@@ -1,16 +1,18 @@
-"""Scores of the experiment, computed from `results.json`, first for the days that influenced no choice.
+"""Scores of the table 1 experiment from `results.json`, first for the days that influenced no decision.
 
     python benchmarks/table1/scores.py [--results FILE]
 
 Prints, by groups of days: success on the road; how well the twin's rates rank the policies; proper scores of the twin's
 predictions of single days, beside those of baselines that do not use the twin; and the twin's false alarms and missed
-failures. Rates on the road have intervals over days. Ranking and scores have a forecast's intervals, which hold for
-further trainings and days on this street (`twin/evaluation/jackknife.py`; coverage in this shape:
-`benchmarks/intervals.py`). The *rule* is a baseline of the ranking that does not use the twin; see `rule`.
+failures. Rates on the road have intervals over days. Ranking and scores have jackknife intervals, as in
+`twin forecast`, which hold for further trainings and days on this street (`twin/evaluation/jackknife.py`).
+`benchmarks/intervals.py` measures their coverage for these numbers of trainings and days. The *rule* is a baseline of
+the ranking that does not use the twin; see `rule`.
 
-A *choice* is a decision made while trials or images of a day were known. There were two. The training methods were
-developed in the five stated weathers. The fraction of the weather randomization that is kept if there is a photo was
-measured on images of these weathers and of days 1 to 5. Days 6 to 15 were driven after everything was fixed.
+Two decisions used trials or images of some days. The training methods were developed on the five designed weathers
+(dawn, afternoon, evening, haze, rain). `KNOWN_WEATHER_FRACTION`, the fraction of the weather randomization that is kept
+when a photo is available, was tuned on images of these weathers and of days 1 to 5. Days 6 to 15 were driven after
+everything was fixed.
 """
 
 import argparse
@@ -54,18 +56,20 @@ from twin.reality.lighting import WEATHER
 RESULTS = Path(__file__).with_name("results.json")
 _USED = 5  # number of sampled days that were examined before everything was fixed
 _DAYS = [name for name in WEATHER if name.startswith("day_")]
-_STATED = len(WEATHER) - len(_DAYS)
+_DESIGNED = len(WEATHER) - len(_DAYS)
 GROUPS: dict[str, tuple[str, ...]] = {
-    f"days {_USED + 1} to {len(_DAYS)}, which no choice had seen": tuple(_DAYS[_USED:]),
+    f"days {_USED + 1} to {len(_DAYS)}, not used during development": tuple(_DAYS[_USED:]),
     f"days 1 to {len(_DAYS)}, sampled at random": tuple(_DAYS),
-    "the stated weathers and days 1 to 5, seen during development": tuple(WEATHER)[: _STATED + _USED],
-    f"all {len(WEATHER)} weathers, half of them seen during development": tuple(WEATHER),
+    "the designed weathers and days 1 to 5, used during development": tuple(WEATHER)[: _DESIGNED + _USED],
+    f"all {len(WEATHER)} weathers, half of them used during development": tuple(WEATHER),
 }
 """Group of days → weathers."""
 
 RULE_TRIALS = 5
-"""Episodes per day assumed for the rule, as many as in the twin."""
-_HALF = max(SHARES) - 0.05  # of a training, with a tolerance: checkpoints are saved within 100 steps of it
+"""Number of trials per day by which the rule's rate is turned into counts, for `_cells_held`; the twin has as many."""
+# Fraction of its training from which a policy counts as half trained; less than 0.5, since the checkpoint may have been
+# saved slightly earlier.
+_HALF = max(SHARES) - 0.05
 
 Counts = dict[str, tuple[int, int]]
 """Successes and trials by weather."""
@@ -116,7 +120,7 @@ def counts(part: dict[str, Any]) -> Counts:
 def rule(policy: PolicyRecord) -> float:
     """A baseline without the twin: 1 if lightings varied in training and at least half the training is done, else 0.
 
-    The rule was formulated after all trials were known.
+    This rule was formulated after the results of all trials were known.
     """
     return float(policy.setup == "varied" and policy.trained >= _HALF)
 
@@ -152,10 +156,11 @@ class Scores:
     bias: float
     """Mean over policies of real minus predicted rate."""
     cells: float | None
-    """Fraction of the cells whose predicted and real counts are compatible; None if the predictor has no counts."""
+    """Fraction of the cells (a policy on a day) in which predicted and real rate agree, see `_cells_held`; None if the
+    predictor has no counts."""
     corrected: tuple[int, int]
-    """Number of policies whose real rate is in its interval predicted from the task's other trainings, and number of
-    such intervals."""
+    """A line fitted to the task's other trainings predicts an interval for each policy's real rate: number of intervals
+    that contain the rate, and number of intervals."""
 
 
 def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> Scores | None:
@@ -183,7 +188,7 @@ def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]
 
 
 def paired_cells(policies: Sequence[PolicyRecord], days: Sequence[str], twin: np.ndarray) -> PairedCells:
-    """Real rates of policies on days, and predictions `twin` (n, k) of them, as units of the jackknife."""
+    """Pairs the real rates of n policies on k days with their predictions `twin` (n, k), for the jackknife."""
     tasks, runs = [policy.task for policy in policies], [training_of(policy.name) for policy in policies]
     return PairedCells(
         twin=twin,
@@ -226,7 +231,7 @@ class DayScores:
 
 
 def probabilities(policies: Sequence[PolicyRecord], days: Sequence[str]) -> tuple[PairedCells, dict[str, np.ndarray]]:
-    """The cells, and the probability of success by predictor, shapes (n, k); baselines use only other trainings."""
+    """The cells, and each predictor's probability of success in them, (n, k); baselines use only other trainings."""
     counts_ = np.array([[policy.twin[day] for day in days] for policy in policies])
     twin = twin_probabilities(counts_[..., 0], counts_[..., 1])
     data = paired_cells(policies, days, twin)
@@ -268,13 +273,20 @@ def day_scores(policies: Sequence[PolicyRecord], days: Sequence[str]) -> dict[st
 
 def day_tables(policies: Sequence[PolicyRecord], days: Sequence[str]) -> str:
     """Scores of single days, calibration of the twin, and its errors by day, in Markdown."""
-    lines = ["| predictor of single days | Brier | log score | the twin's is better by | ", "|---|---|---|---|"]
+    lines = [
+        "| predictor of single days | Brier | log score | the twin's log score is better by | ",
+        "|---|---|---|---|",
+    ]
     for name, one in day_scores(policies, days).items():
         gain = "–" if name == TWIN else _bracketed(one.gain, one.interval, "+.3f")
         lines.append(f"| {name} | {one.brier:.3f} | {one.log:.3f} | {gain} |")
     data, each = probabilities(policies, days)
     trials = np.array([[policy.real[day][1] for day in days] for policy in policies])
-    lines += ["", "| the twin's probability | mean | success on the road | cells | trials |", "|---|---|---|---|---|"]
+    lines += [
+        "",
+        "| probability predicted by the twin | mean | success on the road | cells | trials |",
+        "|---|---|---|---|---|",
+    ]
     for part in calibration(each[TWIN].ravel(), data.real.ravel(), trials.ravel()):
         ends = f"{part.low:g} to {part.high:g}"
         lines.append(f"| {ends} | {part.predicted:.2f} | {part.observed:.2f} | {part.cells} | {part.trials} |")
@@ -315,7 +327,7 @@ def _defined(statistic: Callable[..., float], twin: np.ndarray, real: np.ndarray
 
 
 def _cells_held(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> float | None:
-    """Fraction of cells that agree as in a forecast: the interval of the difference of their rates contains 0."""
+    """Fraction of cells in which the interval of real minus predicted rate contains 0, as in a forecast."""
     if predictor not in ("twin, by a photo of each day", "rule without the twin"):
         return None
     predicted = [
@@ -371,7 +383,7 @@ def tables(results: dict[str, Any]) -> str:
         "regret",
         "road minus predicted",
         "cells that agree",
-        "corrected hold",
+        "real rate in predicted interval",
     )
     lines += ["", "Ranking of all policies, finished and checkpoints, by predictor, with 90 % intervals", ""]
     lines += [f"| days | task | predictor | {' | '.join(heads)} |", f"|---|---|---|{'---|' * len(heads)}"]

@@ -62,9 +62,10 @@ class DirectionalRelighting:
     A surface with normal n under a sun in direction s gets the gain exp(strength · (n · s − s_z)). The strength is
     higher in red than in blue, since the light of a low sun is warm. Horizontal ground keeps its brightness. Normals
     come from the picture's depth, and are inaccurate within three pixels of an outline. Surfaces more than 0.4 m below
-    the lens, including curbs, are not relit, since normals of a field's rough ground are noisy; surfaces above the lens
-    get the full gain. Far surfaces and the sky get another gain, which does not depend on normals: it has a random
-    brightness and color, and is higher towards the sun. At depths from 25 to 40 m, the two gains are blended.
+    the lens, including curbs, are not relit, since the ground that a radiance field renders is rough, with noisy
+    normals. From there up to the height of the lens, the gain's exponent increases linearly to its full value. Far
+    surfaces and the sky get another gain, which does not depend on normals: it has a random brightness and color, and
+    is higher towards the sun. At depths from 25 to 40 m, the two gains are blended.
     """
 
     def __init__(self, strength: float, sun: Array, rng: np.random.Generator) -> None:
@@ -182,7 +183,7 @@ def _patches(rng: np.random.Generator, radius: float, cover: float) -> Array32:
     smooth = np.exp(-2.0 * (np.pi * radius) ** 2 * frequency)
     noise = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(_SIDE, _SIDE))) * smooth, (_SIDE, _SIDE))
     noise /= noise.std()
-    edge = 0.15  # edges are about a third of a radius wide: as soft as the shadow of a tree some meters away
+    edge = 0.15  # [standard deviations of the noise] makes edges about a sixth of `radius` wide, like a penumbra
     return np.clip((noise - np.quantile(noise, 1.0 - cover)) / edge + 0.5, 0.0, 1.0).astype(np.float32)
 
 
@@ -211,7 +212,8 @@ class Weather:
     ) -> None:
         """`known_sun` is the direction (3,) to the sun of the episode's lighting, which is then not sampled."""
         self.fog = fog
-        """Current fog of the episode's lighting, if fitted to a photo; None: the film's."""
+        """Fog of the episode's lighting, if fitted to a photo; updated while the lighting drifts. None: no fog beyond
+        the haze that the film contains."""
         elevation, azimuth = np.deg2rad(rng.uniform(*_SUN_ELEVATION)), rng.uniform(0.0, 2.0 * np.pi)
         level = np.cos(elevation)
         sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])

@@ -2,10 +2,10 @@
 
 A *group* is the policies of one task, or of all tasks, that were driven on the road. A *cell* is the trials of one
 policy on one task under one lighting. A *day* is a lighting of the real trials; a *training* is a run, with all its
-checkpoints. Every number is an `Estimate`: a value with its count, or the reason why there is no value. The value has a
-90 % interval if `benchmarks/intervals.py` confirmed this coverage, or else the reason why there is none. Intervals are
-about the population from which the trainings and days are a sample, not about the measured cells (see `jackknife` and
-`rate_model`).
+checkpoints. Every number is an `Estimate`: a value with its count, or the reason why there is no value. A value has a
+90 % interval if `benchmarks/intervals.py` confirmed this coverage; otherwise it has the reason why there is no
+interval. Intervals hold for the population from which the trainings and days are a sample, not for the measured cells
+(see `jackknife` and `rate_model`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -82,7 +82,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class CellPair:
-    """A real cell and the twin cell it is compared with."""
+    """A real cell and the twin's cell with which it is compared."""
 
     policy: str
     task: str
@@ -155,7 +155,7 @@ class Agreement:
 
 
 def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
-    """Texts about the data that a statistic over these real cells needs, but that are missing."""
+    """Texts that list the data that a statistic of these real cells still needs."""
     policies = len({cell.policy for cell in real})
     out = []
     if policies < MIN_POLICIES:
@@ -185,7 +185,7 @@ def unit_counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, 
 
 
 def compare_cells(cell: Cell, mate: Cell) -> CellPair:
-    """Compares the rate of a real cell with that of the twin's cell `mate`."""
+    """Compares the rate of a real cell with that of the corresponding cell `mate` of the twin."""
     value, low, high = rate_difference(
         twin_successes=mate.successes,
         twin_trials=mate.trials,
@@ -281,7 +281,7 @@ def _corrected_coverage(data: PairedCells) -> Estimate:
             continue
         hits += list((low <= y) & (y <= high))
     if not hits:
-        return Estimate(missing=f"{MIN_PREDICTORS} policies of a task, of other trainings, are needed for each")
+        return Estimate(missing=f"each policy needs {MIN_PREDICTORS} policies of other trainings on its task")
     return share_estimate(int(sum(hits)), len(hits), DEPENDENT)
 
 
@@ -291,7 +291,7 @@ def _mean_real(data: PairedCells, further: Sequence[float]) -> Estimate:
         mean = prediction_powered_mean(twin=rates["twin"], real=rates["real"], twin_only=further)
     except UndefinedStatistic as refusal:
         return Estimate(missing=str(refusal))
-    alike = "none: it would treat the trials of a day as independent"
+    alike = "none: its formula treats the trials of a day as independent"
     return Estimate(mean.value, n=data.policies + len(further), no_interval=alike)
 
 
@@ -363,7 +363,7 @@ def _trials_and_days(real: Sequence[Cell]) -> tuple[Indices, NDArray[np.object_]
 
 
 def _twin_probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> tuple[Array, bool]:
-    """The twin's probability of success in each real cell; True if some policy has several twin cells."""
+    """The twin's probability of success in each real cell, and True if some policy has several twin cells."""
     rows = _real_rows(real)
     mine = [list(dict.fromkeys(cell.twin_key for cell in row)) for row in rows]
     several = max(map(len, mine)) > 1

@@ -56,14 +56,14 @@ class Candidate:
     lightings: tuple[str, ...]
     """The twin's lightings over which its score is averaged."""
     twin: Estimate
-    """Twin score. Its interval is over days if real days are compared with several of the twin's lightings, otherwise
-    over episodes under these lightings."""
+    """Twin score. Its interval holds for further days if real days are compared with several of the twin's lightings,
+    otherwise for further episodes under these lightings."""
     twin_rank: Estimate
     """Expected rank among the task's candidates (1 is best), and its interval."""
     twin_ranks: tuple[float, ...]
     """Probability of each rank in the twin."""
     real: Estimate
-    """Mean rate over its real cells; the interval is over days."""
+    """Mean rate of its real cells; the interval holds for further days."""
     real_ranks: tuple[float, ...]
     """Probability of each rank on the road among driven candidates; empty unless this one and another are driven."""
     corrected: Estimate
@@ -105,7 +105,8 @@ class TrialAllocation:
     order_now: float | None = None
     """See `RankingConfidence.order`."""
     more_for_winner: int | None = None
-    """Further trials per policy until `RankingConfidence.winner` reaches `sure`; None: over `ranking.MAX_TRIALS`."""
+    """Further trials per policy until `RankingConfidence.winner` reaches `Forecast.sure`; None: more than
+    `ranking.MAX_TRIALS`."""
     more_for_order: int | None = None
     """The same for `RankingConfidence.order`."""
 

@@ -18,12 +18,12 @@ statistic of many units, such as the bias, all of V_both is subtracted. For the 
 intervals too narrow where ranks jump, and subtracting nothing made them too wide (`benchmarks/intervals.py`).
 
 The interval is the estimate ± Student's t times √V, on a scale on which the statistic is less skewed. The degrees of
-freedom are Satterthwaite's, but at least half of those of the trainings, since few days made intervals too wide. There
-is no interval for fewer units than those for which its coverage was tested. There is also none if leaving units out
-changes nothing, since the variance cannot be estimated then.
+freedom are Satterthwaite's, clipped to between (trainings − 1) / 2, since few days made intervals too wide, and
+trainings + days − 2. There is no interval for fewer units than those for which its coverage was tested. There is also
+none if leaving units out changes nothing, since the variance cannot be estimated then.
 
-A bootstrap was worse (coverage 0.5 to 0.8). It samples some policies twice, which raises correlations. And its
-resampled trials give twin and real rates that agree less than the observed ones.
+A bootstrap was worse (coverage 0.5 to 0.8). It samples some policies twice, which raises correlations. Resampled trials
+make twin and real rates agree less than the observed ones do.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -49,7 +49,7 @@ MIN_PEARSON_TRAININGS = 12
 MIN_BIAS_TRAININGS, MIN_BIAS_DAYS = 5, 3
 """Number of units below which a mean difference has no interval."""
 
-_SHARE_OF_BOTH = 0.5  # fraction of V_both that is subtracted; see the module
+_SHARE_OF_BOTH = 0.5  # fraction of V_both that is subtracted; see the module's docstring
 _LARGEST = 0.999  # correlations are clipped to ± this before Fisher's transform
 
 

@@ -5,10 +5,10 @@ A predictor gives a probability p of success for each cell (policy, day) of the 
     Brier score: mean over trials of (p − outcome)²
     log score: mean over trials of −log of the outcome's predicted probability
 
-Both scores are 0 at best and *proper*: the expected score is best if p is the true probability (Gneiting and Raftery,
-J. Am. Stat. Assoc. 102, 2007). The twin's scores are compared with those of baselines: `other_trainings` does not use
-the twin, and `shuffled_days` does not use its differences between days. `other_trainings` and the twin's recalibration
-are fitted to real trials; they predict each training from trials of other trainings only.
+The best value of both scores is 0. They are *proper*: the expected score is best if p is the true probability (Gneiting
+and Raftery, J. Am. Stat. Assoc. 102, 2007). The twin's scores are compared with those of baselines: `other_trainings`
+does not use the twin, and `shuffled_days` does not use its differences between days. `other_trainings` and the twin's
+recalibration are fitted to real trials; they predict each training from trials of other trainings only.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,7 +49,7 @@ class CalibrationBin:
 
 @dataclass(frozen=True)
 class DayErrors:
-    """The twin's errors in predicting the more frequent outcome of the cells of one day."""
+    """Counts of one day's cells: all, and those whose more frequent outcome the twin predicts wrongly."""
 
     day: str
     cells: int

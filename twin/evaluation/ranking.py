@@ -3,7 +3,7 @@
 Samples of the policies' true rates come from the posterior of `twin.evaluation.rate_model`, which shrinks a rate
 towards those of the other policies and treats trials of one day as correlated. The probability of a policy's rank is
 the fraction of samples in which the policy has that rank. Results hold for the world, twin or road, in which the trials
-were driven: a ranking in the twin is no evidence of a ranking on the road.
+were driven: a ranking in the twin is no evidence for the same ranking on the road.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ SETTLED_PROBABILITY = 0.95  # a ranking is settled when the expected confidence 
 MARGIN = 0.05  # policies whose true rates differ by less count as equally good
 MAX_TRIALS = 1000  # largest number of further trials per policy that is considered
 
-SAMPLES = 4000  # of the posterior
-_STEP = 5  # trials
+SAMPLES = 4000  # samples of the posterior
+_STEP = 5  # [trials] resolution of `trials_needed`
 
 
 def rank_probabilities(rates: Array) -> Array:

@@ -14,8 +14,8 @@ the twin's rates (`road=False`), ρ has a uniform prior. For the road, its prior
 of a policy have the same outcome (706 of 720 cells in docs/benchmarks.md). Few days do not suffice to estimate such a
 ρ: with a uniform prior, 90 % intervals from four days had a coverage of 0.79. All parameters are integrated over a
 grid, so intervals need neither sampling nor a seed. A policy's rate is shrunk towards the rates of the other policies,
-more strongly if these are alike; it is not shrunk towards one half. Policies share ρ, so even two days suffice to
-estimate ρ if eight policies drove on them. The beta-binomial distribution is Skellam's (J. R. Stat. Soc. B 10, 1948);
+more strongly if these are alike; it is not shrunk towards one half. All policies share ρ, so even two days suffice to
+estimate it if eight policies drove on them. The beta-binomial distribution is Skellam's (J. R. Stat. Soc. B 10, 1948);
 for hierarchical models see Gelman et al., Bayesian Data Analysis, section 5.3.
 
 Policies of one experiment drive on the same days, and a bad day is bad for all of them. So their cells are not
@@ -53,7 +53,7 @@ _SLOPES = (0.0, 0.5, 1.0)  # grid of β, equally likely
 
 @dataclass(frozen=True)
 class RateModel:
-    """Posterior of the rates of n policies; see the module."""
+    """Posterior of the rates of n policies; see the module's docstring."""
 
     successes: Array
     """Successes in each cell, shape (n, k)."""
@@ -85,7 +85,7 @@ class RateModel:
             successes: Successes of each cell.
             trials: Trials of each cell.
             covariate: xᵢ [logit], shape (n,); `fit` subtracts its mean; None: no covariate.
-            shared_days: True if the policies drove on the same few days; see the module.
+            shared_days: True if the policies drove on the same few days; see the module's docstring.
             road: True: ρ has the road's prior; False: a uniform one.
 
         Raises:

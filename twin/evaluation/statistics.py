@@ -30,7 +30,7 @@ MIN_TRIALS = 5
 """Number of trials per cell below which neither agreement nor predictions are given."""
 
 _MIN_POINTS = 3  # smallest number of policies for a correlation
-_DECIMALS = 12  # scores equal to this many decimals are tied: the order of summation changes further decimals
+_DECIMALS = 12  # scores that are equal to so many decimals are tied; further decimals depend on the order of summation
 _MIN_VARIANCE = 1e-12  # scores with a smaller variance count as equal
 
 
@@ -59,8 +59,8 @@ def mean_rate(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFI
     """Unweighted mean of the rates of k cells, shape (k,), and the ends of its interval.
 
     The interval is Wilson's for k² / Σ 1/nᵢ trials: if all cells have the same true rate, a binomial rate of so many
-    trials has the same variance as the mean. Cells with unequal rates have less variance, for which the interval is too
-    wide rather than too narrow.
+    trials has the same variance as the mean. If the true rates differ, the variance is smaller, so the
+    interval is too wide rather than too narrow.
     """
     n = np.asarray(trials, float)
     mean = float(np.mean(np.asarray(successes, float) / n))
@@ -82,9 +82,9 @@ def rate_over_days(rates: ArrayLike, confidence: float = CONFIDENCE) -> tuple[fl
 
     Trials of one day share its lighting and weather. The interval assumes that all trials of a day have the same
     outcome: with an intra-class correlation ρ of 1, the design effect 1 + (m − 1) ρ equals the number m of trials of a
-    day (Kish, Survey Sampling, 1965, section 5.4), so k days count as k trials in Wilson's interval. Days with rates
-    between 0 and 1 have less variance, for which the interval is too wide rather than too narrow. It holds for further
-    days of the same policies, not for further policies. Raises ValueError: no rate, or one outside [0, 1].
+    day (Kish, Survey Sampling, 1965, section 5.4), so k days count as k trials in Wilson's interval. If the trials of
+    a day differ, the variance is smaller, so the interval is too wide rather than too narrow. It holds for further days
+    of the same policies, not for further policies. Raises ValueError: no rate, or one outside [0, 1].
     """
     days = np.asarray(rates, float)
     if days.ndim != 1 or not len(days) or not ((days >= 0.0) & (days <= 1.0)).all():
@@ -337,4 +337,4 @@ def leave_one_group_out(
 
 def _check_count(n: int) -> None:
     if n < MIN_POLICIES:
-        raise UndefinedStatistic(f"{n} policies driven in both worlds; {MIN_POLICIES} are needed")
+        raise UndefinedStatistic(f"{n} policies driven both in the twin and on the road; {MIN_POLICIES} are needed")

@@ -89,7 +89,7 @@ def validated_digests(root: Path) -> dict[str, Any]:
 
 
 def _is_there(path: Path) -> bool:
-    """True for an existing regular file; False also for an invalid file name, which a table may contain."""
+    """True for an existing regular file. A name that is invalid as a file name, as a table may contain, gives False."""
     try:
         return bool(regular_file(path))
     except InputError:
@@ -104,7 +104,7 @@ def read_episodes(folder: Path) -> tuple[Indices, Indices]:
     """
     path = folder / "episodes.csv"
     text = read_text(path)
-    with wrap_read_errors(path, "cut its last lines off, or train anew under another name"):
+    with wrap_read_errors(path, "delete its last lines, or train anew under another name"):
         # Tables of older runs have no column start_m; all their episodes started at the beginning.
         whole = [row for row in csv.DictReader(io.StringIO(text)) if float(row.get("start_m") or 0.0) == 0.0]
         rows = [(int(row["step"]), int(row["success"])) for row in whole]
@@ -132,14 +132,14 @@ def plot_success_curve(axes: Axes, steps: Indices, success: Indices, color: str)
     """Plots the success rate over steps, with its interval; see `binned_rates`. Needs at least one episode."""
     step, won, count, low, high = np.array(binned_rates(steps, success), float).T
     axes.fill_between(step, low, high, color=color, alpha=0.2, linewidth=0, label="90 % interval")
-    axes.plot(step, won / count, ".-", color=color, label=f"{len(steps)} episodes, {int(count[0])} a point")
+    axes.plot(step, won / count, ".-", color=color, label=f"{len(steps)} episodes, {int(count[0])} per point")
 
 
 def _plot_choice(axes: Axes, choice: dict[str, Any]) -> None:
     tried, chosen = choice["candidates"], choice["chosen"]
     shares = [one["successes"] / one["trials"] for one in tried]
     counts = sorted({one["trials"] for one in tried})
-    label = f"tests without exploring, {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} episodes"
+    label = f"tests without exploration, {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} episodes"
     axes.plot([one["step"] for one in tried], shares, "o", color="#d95f02", fillstyle="none", label=label)
     rate = chosen["successes"] / chosen["trials"]
     low, high = wilson(chosen["successes"], chosen["trials"])

@@ -1,7 +1,7 @@
-"""Judges a trial on the road by the twin's rules of success and failure, and compares the trial with the twin.
+"""Applies the twin's rules of success and failure to a recorded trial on the road; compares the trial with the twin.
 
 `judge` applies the environment's `RewardAndTermination` to the recorded poses, sampled once per control step. The
-operator states outcomes that poses do not show, such as a collision. `replay` drives the twin's robot by the recorded
+operator reports outcomes that poses do not show, such as a collision. `replay` drives the twin's robot by the recorded
 commands, from the same start. `view` renders the field from the poses at which the robot took its pictures.
 """
 
@@ -20,7 +20,7 @@ from twin.nerf.rendering import Rendering
 from twin.robot import PixelCamera
 from twin.types import Array, Image
 
-_PROBES = 8  # number of pictures that decide the choice of a lighting
+_PROBES = 8  # number of pictures by which a lighting is chosen
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,8 @@ class TrialViews:
     psnr: Array
     """[dB], shape (n,)."""
     matched_psnr: Array
-    """PSNR [dB], shape (n,), after matching each color's mean and standard deviation to the robot's picture; it depends
-    on shapes and shadows only."""
+    """PSNR [dB], shape (n,), after the mean and standard deviation of each color were matched to the robot's picture;
+    only shapes and shadows affect it."""
     trust: Array
     """See `twin.env.trust`, shape (n,)."""
 

@@ -7,8 +7,8 @@ policy, task and lighting. `validation/episodes.csv` has a row for each trial in
     policy,lighting,trials,successes            optional columns: task, twin_lighting
 
 `task` is required only for a policy that was validated on several tasks. `twin_lighting` names the twin's lighting to
-compare with, such as `held-out+randomised` for `dusk_on_monday`; it is required if the twin has no lighting named
-`lighting`.
+compare with, such as `held-out+randomised` for `dusk_on_monday`; it is required if `lighting` is not the name of one
+of the twin's lightings.
 """
 
 import csv
@@ -36,8 +36,8 @@ that lie outside the training's ranges."""
 OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting", *SETUP_COLUMNS)
 """Further columns that a results table may have."""
 RECENT_EPISODES = 20
-"""Number of episodes over which a training's success rate is measured: the newest ones that started at the beginning of
-the task's route segment."""
+"""Number of episodes over which a training's success rate is measured. They are the newest of those that started at the
+beginning of the task's route segment."""
 
 _MAX_COUNT, _MAX_SEED = 10**6, 2**63 - 1  # largest count in a table, and largest seed
 _VALIDATE_COMMAND = "python -m twin.validate"
@@ -160,7 +160,7 @@ def write_real_trials(
 def read_trials(path: Path) -> list[Trial]:
     """Reads a table such as `validation/episodes.csv`, which may be compressed (`.csv.gz`).
 
-    Raises InputError: no such file, or an invalid row (the message has its line).
+    Raises InputError: no such file, or an invalid row (the message gives its line).
     """
     if not path.exists():
         raise InputError(
@@ -206,7 +206,7 @@ def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
         if cell.key in cells:
             raise InputError(
                 f"{where}: policy {policy!r}, lighting {cell.lighting!r}, task {task!r} is there twice; "
-                "add the two lines up"
+                "replace the two lines by one with their sums"
             )
         cells[cell.key] = cell
     return list(cells.values())

@@ -1,4 +1,4 @@
-"""Verb: writes a built place for other programs.
+"""`twin export`: writes a built place for other programs.
 
     python -m twin.export scenes/demo --usd road.usdz
     python -m twin.export scenes/demo --glb road.glb --ply road.ply --lighting night
@@ -42,7 +42,7 @@ _MEGABYTE = 1e6
 
 
 def command(given: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin export` with the options parsed by `twin.commands`."""
     paths = given.usd, given.glb, given.ply, given.nerfstudio, given.colmap
     lines = export(given.scene, given.lighting, *paths, given.task_file, given.task)
     if not given.quiet:

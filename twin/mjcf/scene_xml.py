@@ -82,7 +82,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     spec.meshdir = spec.texturedir = "assets"
     spec.modelfiledir = str(out.resolve())
     husky.set_options(spec, config.robot)
-    # MuJoCo computes no poses of sleeping bodies, such as thousands of static geoms; bodies with motors never sleep.
+    # The sleep flag saves time: MuJoCo then does not recompute the poses of the static geoms, of which there may be
+    # thousands. The robot has motors, so it never sleeps.
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     _add_sky_and_lights(spec)
     picture = mesh / "ground.png"  # the stage `mesh` writes it; `build_assets` alone does not
@@ -217,7 +218,8 @@ def add_ground(
     write_image(assets / "ground.png", texels[::-1])
     low, high = float(coarse.height.min()), float(coarse.height.max())
     half = np.array([columns - 1, rows - 1]) * ground.cell / 2
-    # MuJoCo maps the lowest value of the file to 0 and the highest to size[2]; a level field is 0 for any size.
+    # MuJoCo maps the file's lowest value to 0 and its highest to size[2], which must be positive. On level ground all
+    # heights are mapped to 0, so the 1e-3 has no effect.
     spec.add_hfield(name="ground", file="ground.bin", size=(*half, max(high - low, 1e-3), _HFIELD_BASE))
     _add_textured_material(spec, "ground", emission=0.25)
     spec.worldbody.add_geom(

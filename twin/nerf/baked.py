@@ -40,7 +40,9 @@ from twin.types import Array32
 from twin.warp_runtime import wp
 
 _FORMAT = 2
-_MAX_TARGETS = 4  # render targets kept at most; a vector env uses one for all its envs and one for those that reset
+# Largest number of render targets that are kept, one per number of cameras and image size; the least recently used one
+# is dropped. A vector env renders either all its envs or those that reset, whose number varies.
+_MAX_TARGETS = 4
 
 
 class BakedField:

@@ -28,7 +28,7 @@ class BrickLayout:
     near_plane: float
     """Distance at which rays start [m]."""
     density_unit: float
-    """Density at raw value 0 [1/contracted m]."""
+    """Density at raw network output 0 [1/contracted m, see `kernels/space.py`]."""
     near_shape: tuple[int, int, int]
     """Bricks over the near box."""
     far_shape: tuple[int, int, int]
@@ -51,7 +51,10 @@ class BrickLayout:
 
 
 def brick_indices(layout: BrickLayout, near: NDArray, far: NDArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Near and far index (see `kernels/bricks.py`) of near and far bricks, each (s, 3); near slots come first."""
+    """Near and far index (see `kernels/bricks.py`); near bricks have the lower slots.
+
+    `near` and `far` are grid positions of the stored bricks, shape (s, 3).
+    """
     out = []
     for shape, slots, first in ((layout.near_shape, near, 0), (layout.far_shape, far, len(near))):
         index = np.full(shape, -1, np.int32)
@@ -84,7 +87,8 @@ def stored_skips(index: NDArray[np.int32], distance: NDArray[np.uint8]) -> tuple
 def skip_distances(layout: BrickLayout, arrays: dict[str, NDArray]) -> dict[str, NDArray[np.uint8]]:
     """Skip distances (see `kernels/march.py`) of all blocks of both grids, as arrays `near_leap` and `far_leap`.
 
-    A block is occupied if one of its samples has a density at which a cell blocks more than `_MAX_EMPTY_OPACITY`.
+    A block is occupied if one of its samples is so dense that a cell of this density has an opacity above
+    `_MAX_EMPTY_OPACITY`.
     """
     from scipy.ndimage import distance_transform_cdt
 

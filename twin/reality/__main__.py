@@ -1,4 +1,4 @@
-"""Verbs of the known-truth world.
+"""`twin reality`: commands of the known-truth world.
 
     python -m twin.reality film [--place NUMBER] --out DIR
     python -m twin.reality compare DIR
@@ -121,7 +121,7 @@ def scene_toml(plan: FilmingPlan, name: str, spec: PlaceSpec | None = None) -> s
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the verb; returns the exit status, see `twin.command_line`."""
+    """Runs `twin reality`; returns the exit status, see `twin.command_line`."""
     return commands.main("reality", arguments)
 
 
@@ -132,7 +132,7 @@ def _check_lightings(names: list[str], among: Iterable[str]) -> None:
 
 
 def command(options: argparse.Namespace) -> None:
-    """Runs the verb in the options parsed by `twin.commands`."""
+    """Runs the command in the options parsed by `twin.commands`."""
     if options.command == "film":
         plan = TINY if options.tiny else FilmingPlan()
         if options.place:
@@ -151,7 +151,7 @@ def command(options: argparse.Namespace) -> None:
 
 
 def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
-    """Runs a verb that needs a robot: log, onboard, bag, photo or drive."""
+    """Runs a command that needs a robot: log, onboard, bag, photo or drive."""
     days = [f"day_{number}" for number in getattr(options, "day", None) or []]
     if options.command == "log":
         recordings.write_log(options.out, recordings.record_log(options.duration, setup))

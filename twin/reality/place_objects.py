@@ -75,11 +75,13 @@ class GroundLayout:
     stations: tuple[float, float]
     """First and last station of the road mesh [m]."""
     bands: Mapping[str, tuple[float, float]]
-    """Texture → laterals of its first and last row [m]; its columns run along the road."""
+    """Texture → lateral of its first and of its last row [m]. Rows run along the road: the station increases with
+    the column index."""
     land: tuple[float, float, float, float]
     """x and y range of the texture `land` [m]."""
     field: tuple[tuple[float, float], tuple[float, float]]
-    """Lowest and highest x, y [m] of the area around the driven line; a drawn place has cast shadows only there."""
+    """Lowest and highest (x, y) [m] of the area around the driven line. In randomly sampled places (number ≥ 1), the
+    rasterizer casts shadows only in this area (`trial_place.shadow_range`)."""
     wet: tuple[str, ...]
     """Textures that rain darkens."""
 

@@ -47,17 +47,17 @@ from twin.report.html import MAX_TABLE_ROWS, Chart, command, render
 
 # ---- figures
 
-_MAX_LABELS = 3  # most named points in a figure
+_MAX_LABELS = 3  # maximum number of points with a name in a figure
 _LABEL_SIZE = (0.5, 0.06)  # assumed width and height of a name, in axis units
 _SQUARE_SIZE = 4.6  # [in]
 
 
 @styled
 def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "success in the twin") -> Figure:
-    """Success rates of the driven candidates, colored by task: on the road (vertical), and as in `field` (horizontal).
+    """Scatter plot of the candidates that have real trials (`twin.evaluation.forecasting`), colored by task.
 
-    `field` is an attribute: "twin" for rates in the twin, or "corrected" for rates predicted from the other candidates.
-    `label` is the label of its axis. On the diagonal both rates are equal.
+    Vertical: success rate on the road. Horizontal: the candidate's attribute `field`, with the axis label `label`:
+    "twin" for the rate in the twin, or "corrected" for the rate predicted from policies of other trainings.
     """
     figure, axes = new_figure(_SQUARE_SIZE)
     axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
@@ -107,14 +107,20 @@ def _label_outliers(axes: Axes, points: list[tuple[str, float, float]]) -> None:
 
 @styled
 def calibration_chart(group: Agreement) -> Figure:
-    """Chart of the success rate on the road over the success probability that the twin predicts.
+    """Calibration chart: success rate on the road against the success probability that the twin predicts.
 
-    There is one point per bin of this probability; its area shows the number of trials in the bin.
+    There is one point per bin of this probability; its area and label show the number of trials in the bin.
     """
     figure, axes = new_figure(_SQUARE_SIZE)
     axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
     limits, ticks = RATE_AXIS.values()
-    axes.set(xlabel="probability by the twin", ylabel="success on the road", ylim=limits, yticks=ticks, **RATE_AXIS)
+    axes.set(
+        xlabel="success probability predicted by the twin",
+        ylabel="success on the road",
+        ylim=limits,
+        yticks=ticks,
+        **RATE_AXIS,
+    )
     x, y, trials = (
         np.array([getattr(it, name) for it in group.calibration]) for name in ("predicted", "observed", "trials")
     )
@@ -152,7 +158,10 @@ def _rate_heatmap(candidates: Sequence[Candidate], rates: dict[tuple[str, str], 
 
 
 def difference_heatmap(candidates: Sequence[Candidate], pairs: Sequence[CellPair]) -> Figure:
-    """Success rate on the road minus that in the twin [percentage points]. Those within chance are pale and in ()."""
+    """Success rate on the road minus that in the twin [percentage points].
+
+    Differences whose Newcombe interval contains 0 get the color of 0, and parentheses.
+    """
     policies = [c.policy for c in candidates if c.driven]
     lightings = list(dict.fromkeys(pair.lighting for pair in pairs))
     bias = matrix({(pair.policy, pair.lighting): pair.bias.value for pair in pairs}, policies, lightings)
@@ -180,23 +189,31 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
     driven = sum(c.driven for c in forecast.candidates)
     agreement = []
     if forecast.groups:
-        title = f"Success on the road over success in the twin (n = {driven}); on the dashed line they are equal"
+        title = (
+            "Success on the road against success in the twin, one point per policy and task "
+            f"(n = {driven}); dashed: equal rates"
+        )
         agreement = [Chart(title, svg(rates_against_road(forecast)))]
     calibration = []
     if measured and measured[-1].calibration:
         group = measured[-1]
-        n = f"n = {group.cells} cells, {group.task}; numbers are trials"
-        title = f"Success on the road over the twin’s probability, cell by cell ({n})"
+        n = f"n = {group.cells} cells, {group.task}; labels: number of trials in each bin"
+        title = f"Calibration: success on the road against the success probability predicted by the twin ({n})"
         calibration = [Chart(title, svg(calibration_chart(group)))]
     predictions = []
     if tested := [c for c in known if c.driven]:
-        title = f"Success on the road over the rate predicted from the other policies (n = {len(tested)})"
-        drawn = rates_against_road(forecast, "corrected", "predicted from the other policies")
+        n = f"(n = {len(tested)}); dashed: equal rates"
+        title = f"Success on the road against the rate predicted from other trainings {n}"
+        drawn = rates_against_road(forecast, "corrected", "predicted from other trainings")
         predictions = [Chart(title, svg(drawn))]
     unpredicted = ""
     if not known:
         reasons = "; ".join(dict.fromkeys(c.corrected.missing for c in forecast.candidates))
-        unpredicted = f"Not given: {reasons}." if forecast.groups else "No real trials were given to estimate it from."
+        unpredicted = (
+            f"No prediction: {reasons}."
+            if forecast.groups
+            else "No prediction: it needs real trials, and none were given."
+        )
     return render(
         "forecast.html",
         title=f"{forecast.scene}: forecast",
@@ -208,7 +225,7 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
             "stages": "From training to the road",
             "policies": "Which policy is best?",
             "predictions": "What to expect on the road",
-            "cells": "Cell by cell",
+            "cells": "Twin and road under each lighting",
             "unknown": "Limitations",
             "next": "What to do next",
         },
@@ -262,7 +279,7 @@ def _task(forecast: Forecast, task: str) -> dict[str, Any]:
             cell_rates.append(Chart(f"{where} [%], n = {n} per cell", svg(figure(mine, pairs))))
         title = (
             "Road minus twin [percentage points]: red and below 0 where the twin was too optimistic, blue the "
-            "opposite, pale and in parentheses within chance"
+            "opposite, pale and in parentheses where the 90% interval of the difference contains 0"
         )
         differences = [Chart(title, svg(difference_heatmap(mine, pairs)))]
     return {"name": task, "candidates": mine, "charts": charts, "cell_rates": cell_rates, "differences": differences}

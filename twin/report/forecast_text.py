@@ -18,30 +18,34 @@ from twin.evaluation.trials import csv_text
 from twin.report.html import Caution, Verdict
 
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
-"""Twin and road rank policies alike, or roughly alike, if the rank correlation is at least this."""
+"""Rank correlations from which the verdict is that the twin ranks, or roughly ranks, policies as the road does."""
 SMALL_REGRET = 0.05
 _SMALL_GAP = 0.1  # if the order is reliable only for larger differences of twin scores, the verdict is not good
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
-    ("pearson", "Pearson", "linear correlation of the rates: 1 on a straight line"),
-    ("mmrv", "MMRV", "mean maximum rank violation, in real success: 0 is best"),
+    ("pearson", "Pearson", "linear correlation of the rates: 1 if they lie on a rising straight line"),
+    ("mmrv", "MMRV", "mean maximum rank violation: the real success lost by each policy’s worst swap; 0 is best"),
     ("winner_agreement", "winner agrees", "1 if the twin’s best policy is also the best on the road, else 0"),
     ("winner_regret", "regret", "real success lost by choosing the twin’s best policy"),
-    ("bias", "road minus twin", "mean over the cells; below 0 the twin is too optimistic"),
+    ("bias", "road minus twin", "mean over the policies; below 0 the twin is too optimistic"),
     (
         "coverage",
         "cells agree",
-        "share of the cells where twin and road differ by no more than chance; high for any guess if most cells are "
-        "all successes or all failures",
+        "share of the cells where the 90% interval of road minus twin contains 0; high for any guess if in most cells "
+        "all trials have the same outcome",
     ),
     (
         "corrected_coverage",
         "predictions hold",
-        "share of policies within the interval predicted from the other trainings; 90% are expected",
+        "share of policies whose real rate is in the interval predicted from other trainings; 90% are expected",
     ),
     ("twin_error", "twin is off by", "mean over the policies of the absolute difference of the rates"),
-    ("mean_real", "mean on the road", "of policies such as these, driven or not (prediction-powered estimate)"),
+    (
+        "mean_real",
+        "mean on the road",
+        "of policies such as these, with or without real trials (prediction-powered estimate)",
+    ),
 )
 """Name of a field of `Agreement`, its short name on the page, and its meaning."""
 PERCENT_STATISTICS = ("winner_regret", "bias", "coverage", "corrected_coverage", "twin_error", "mean_real")
@@ -51,12 +55,9 @@ INTERVALS_NOTE = (
     "Intervals (90%) hold for repetitions with other trainings and other days, of which these are a sample. They are "
     "computed by leaving out days and trainings in turn, not trials. More days and more trainings make them narrower; "
     "more checkpoints of one training, or more trials on the same day, hardly do. With too few days or trainings for a "
-    "reliable interval, none is given."
+    "reliable interval, there is none."
 )
-"""Note on all intervals of the numbers in `Agreement`.
-
-`benchmarks/intervals.py` measures the coverage of these intervals.
-"""
+"""Note on all intervals in `Agreement`; `benchmarks/intervals.py` measures their coverage."""
 
 CSV_COLUMNS = (
     *("task", "policy", "twin", "twin_low", "twin_high", "twin_trials", "rank", "rank_low", "rank_high"),
@@ -64,9 +65,9 @@ CSV_COLUMNS = (
     *("predicted", "predicted_low", "predicted_high", "trained", "trained_low", "trained_high"),
 )
 
-_RELIABLE = 0.95  # the twin's order may be believed if the road confirms it in at least this share of pairs
+_RELIABLE = 0.95  # the twin's order may be believed if the road confirms it in at least this fraction of pairs
 _ENOUGH_PAIRS = 10  # fewer pairs do not suffice to confirm an order
-_POSSIBLY_BEST = 0.05  # policies with at least this probability of being the best are worth further trials
+_POSSIBLY_BEST = 0.05  # policies with at least this probability of being the best should get further trials
 _TRIALS_NEEDED = (
     f"drive {MIN_POLICIES} policies or more of different quality, {MIN_TRIALS} times or more under each lighting; "
     "include good and bad ones, chosen before their real results are known."
@@ -178,39 +179,42 @@ def _bias(group: Agreement) -> Verdict:
     bias, off = group.bias, group.twin_error
     if bias.value is None or off.value is None:
         return Verdict("The bias of the twin’s rates is not known.", "bad")
-    single = f"a single policy’s rate is off by {percentage_points(off.value)} on average"
+    single = f"for a single policy, the twin’s rate is off by {percentage_points(off.value)} on average"
     much = "high" if bias.value < 0 else "low"
     if bias.low is None or bias.high is None:
         mean = f"The twin’s rates are {percentage_points(bias.value)} too {much} on average"
         return Verdict(f"{mean} ({bias.no_interval}); {single}.", "mixed")
     if bias.low <= 0.0 <= bias.high:
-        return Verdict(f"No bias of the twin is certain ({format_estimate(bias, True)}); {single}.", "good")
+        return Verdict(
+            f"The twin has no significant bias: road minus twin is {format_estimate(bias, True)}; {single}.", "good"
+        )
     return Verdict(f"The twin’s rates are {percentage_points(bias.value)} too {much} on average; {single}.", "mixed")
 
 
 def _skill(group: Agreement) -> list[Verdict]:
-    """Verdict on the twin's prediction of days, compared with the mean of the other policies; empty without scores."""
+    """Verdict on the twin's prediction of single days against the mean of other trainings; empty without scores."""
     gains = {it.predictor: it.gain for it in group.scores}
     gain = gains.get(OTHERS)
     if gain is None or gain.value is None:
         return []
     if gain.low is None or gain.high is None:
         better = "better" if gain.value > 0 else "worse"
-        text = (
-            f"In these trials the twin predicts days {better} than the mean of the other policies; {gain.no_interval}."
-        )
+        how = f"{better} than the mean of other trainings"
+        text = f"In these trials the twin predicts single days {how}; {gain.no_interval}."
         return [Verdict(text, "mixed")]
     if gain.low > 0:
-        text = "The twin predicts a policy’s days better than the mean of the other policies does"
+        text = "The twin predicts success on single days better than the mean of other trainings does"
         shuffled = gains.get(SHUFFLED)
         if shuffled is not None and shuffled.low is not None:
-            more = "and distinguishes days" if shuffled.low > 0 else "but may not distinguish days"
+            more = "and distinguishes days" if shuffled.low > 0 else "but it is not certain that it distinguishes days"
             text = f"{text}, {more}"
         return [Verdict(f"{text} (log scores).", "good")]
     worse = gain.high < 0
-    text = "worse than" if worse else "not certainly better than"
+    text = "worse than" if worse else "not significantly better than"
     return [
-        Verdict(f"The twin predicts a policy’s days {text} the mean of the other policies does (log scores).", "bad")
+        Verdict(
+            f"The twin predicts success on single days {text} the mean of other trainings does (log scores).", "bad"
+        )
     ]
 
 
@@ -239,8 +243,9 @@ def limitations(forecast: Forecast) -> list[Caution]:
     runs = {training_of(name) for name in on_road}
     if on_road:
         what = (
-            f"Trials of one day or of one training are alike: the sample of the road is {_count(len(days), 'day')} and "
-            f"{_count(len(runs), 'training')}, not {_count(forecast.real_trials, 'trial')}."
+            f"Trials of one day or of one training tend to have the same outcome: the real sample is "
+            f"{_count(len(days), 'day')} and {_count(len(runs), 'training')}, "
+            f"not {_count(forecast.real_trials, 'trial')}."
         )
         cure = "drive on further days, and train again with another --seed."
         out.append(Caution(what, cure))
@@ -253,7 +258,7 @@ def limitations(forecast: Forecast) -> list[Caution]:
         "validate under further lightings (any, mixtures, +randomised), film the place in that light, or add a photo "
         "with twin.relight."
     )
-    out.append(Caution(f"Success was not measured in light unlike {lightings}.", cure))
+    out.append(Caution(f"Success is unknown in light that differs from {lightings}.", cure))
     for task in forecast.tasks:
         mine = forecast.candidates_of(task)
         sets = [frozenset(c.lightings) for c in mine]
@@ -270,8 +275,8 @@ def limitations(forecast: Forecast) -> list[Caution]:
             cure = "drive all of them under the same ones; otherwise the rates mix policy and light."
             out.append(Caution(what, cure))
     what = (
-        "The twin lacks other traffic, wet ground, weather except for haze, sun and shadows, and all other changes "
-        "since the films."
+        "The twin has no other traffic and no wet ground. Of the weather it has only haze, sun and shadows. It has no "
+        "change since the films."
     )
     return [*out, Caution(what, "only real trials measure it; spread them over several days.")]
 
@@ -286,16 +291,20 @@ def next_trials(forecast: Forecast) -> list[str]:
         if len(driven) < enough:
             some = [mine[round(k)] for k in np.linspace(0, len(mine) - 1, enough)]
             names = join_names([c.policy for c in some if not c.driven], MIN_POLICIES)
-            out.append(f"{task}: drive {names}, {MIN_TRIALS} times or more in each light: good and bad ones.")
+            out.append(f"{task}: drive {names}, {MIN_TRIALS} times or more in each light.")
             continue
         best = [c for c in driven if c.real_ranks and c.real_ranks[0] >= _POSSIBLY_BEST]
         if len(best) > 1:
             odds = join_names([f"{c.policy} ({format_probability(c.real_ranks[0])})" for c in best], 6)
-            out.append(f"{task}: drive these again; each may be the best (with this probability): {odds}.")
+            out.append(
+                f"{task}: drive these again; each may be the best policy, with the probability in parentheses: {odds}."
+            )
         elif best:
-            out.append(f"{task}: drive {best[0].policy} on further days, in light that it has not met; it leads.")
+            out.append(f"{task}: drive {best[0].policy} on further days, in new light, since it is probably the best.")
         if unseen := [c.policy for c in mine if not c.driven]:
-            out.append(f"{task}: drive the policies never driven yet, best in the twin first: {join_names(unseen, 6)}.")
+            out.append(
+                f"{task}: drive the policies without real trials, best in the twin first: {join_names(unseen, 6)}."
+            )
     return out
 
 
@@ -304,16 +313,16 @@ def allocation_text(allocation: TrialAllocation) -> str:
     if allocation.policies < 2:
         return f"{allocation.task}: one policy; there is nothing to rank."
 
-    def needed(trials: int | None, purpose: str, now: float | None) -> str:
+    def needed(trials: int | None, purpose: str, now: float | None, of: str) -> str:
         many = f"more than {MAX_TRIALS}" if trials is None else f"{trials} more" if trials else "no more"
         each = "" if trials == 0 else " each"
         known = allocation.basis != "twin" and now is not None
-        sure = f", now {format_probability(now)} sure" if known and now is not None else ""
+        sure = f" (now {format_probability(now)} {of})" if known and now is not None else ""
         return f"{many} real trials{each} to {purpose}{sure}"
 
-    so_far = "" if allocation.basis == "road" else "no real trials yet; if the road were like the twin: "
-    winner = needed(allocation.more_for_winner, "find the best one", allocation.winner_now)
-    order = needed(allocation.more_for_order, "order all of them", allocation.order_now)
+    so_far = "" if allocation.basis == "road" else "too few real trials yet; if the road had the twin’s rates: "
+    winner = needed(allocation.more_for_winner, "find the best one", allocation.winner_now, "probability")
+    order = needed(allocation.more_for_order, "order all of them", allocation.order_now, "of pairs in the right order")
     return f"{allocation.task}, {allocation.policies} policies: {so_far}{winner}; {order}."
 
 

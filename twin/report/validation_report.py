@@ -49,7 +49,7 @@ from twin.report.html import MAX_TABLE_ROWS, Caution, Chart, Picture, Verdict, c
 from twin.scene import SceneDir
 
 MAX_P_VALUE = 0.1
-"""A paired difference with a larger p-value is reported as within chance."""
+"""A paired difference with a larger p-value is reported as not significant."""
 FEW_EPISODES = 30
 """A cell (one policy on one task in one lighting) with fewer episodes gets a caution that its interval is wide."""
 TRUSTED = 0.8
@@ -172,7 +172,7 @@ def pair_text(pair: dict[str, Any]) -> str:
     if pair["only_a"] == pair["only_b"]:
         return "no difference"
     if pair["p"] > MAX_P_VALUE:
-        return "within chance"
+        return "not significant"
     return f"“{pair['a'] if pair['only_a'] > pair['only_b'] else pair['b']}” is better"
 
 
@@ -317,10 +317,10 @@ def rate_heatmap(cells: Sequence[dict[str, Any]], trained: Mapping[str, float | 
 
 
 def pair_heatmap(pairs: Sequence[dict[str, Any]]) -> Figure:
-    """Paired comparisons of a task's policies: the row's policy is better (blue), worse (red), or within chance (pale).
+    """Paired comparisons of a task's policies: the row's policy is better (blue), worse (red), or neither (pale).
 
     A cell's number is the number of shared episodes in which only the row's policy succeeded, minus the number in which
-    only the column's policy did. It is in parentheses if the difference is within chance. Rows and columns are
+    only the column's policy did. It is in parentheses if the difference is not significant. Rows and columns are
     sorted by the number of significant wins minus that of significant losses.
     """
     policies = list(dict.fromkeys(p[key] for p in pairs for key in ("a", "b")))
@@ -475,7 +475,7 @@ def _task(results: dict[str, Any], task: str) -> dict[str, Any]:
         figure = rate_heatmap(mine, trained)
     pair_title = (
         "Number of episodes in which only the row’s policy reached the goal, minus the number in which only the "
-        "column’s did. Blue, +: the row’s policy is better; red, −: worse; pale, in parentheses: within chance"
+        "column’s did. Blue, +: the row’s policy is better; red, −: worse; pale, in parentheses: not significant"
     )
     return {
         "name": task,

@@ -20,7 +20,10 @@ _SHOWN = 3  # windows in the plot of wheel speeds
 
 
 def write_plots(folder: Path, windows: Windows, fitted: Prediction, baseline: Prediction) -> list[Path]:
-    """Writes four PNGs of the windows for scoring and returns their paths."""
+    """Writes four PNGs and returns their paths.
+
+    They show the held-out windows; the plot of track ratios shows all windows of steady speed.
+    """
     figures = {
         folder / "ends.png": _plot_ends(windows, fitted, baseline),
         folder / "turning.png": _plot_turning(windows, fitted),
@@ -63,9 +66,11 @@ def _plot_turning(windows: Windows, fitted: Prediction) -> plt.Figure:
         point = coulomb_track_ratio(np.zeros(2))
         axis.axhline(point, color=_OTHER, linewidth=0.8, label=f"Coulomb friction, centered mass: {point:.2f}")
         axis.set(xlabel=name, ylim=(1.0, 4.0))
-    axes[0].set_ylabel("track ratio chi")
+    axes[0].set_ylabel("track ratio χ")
     axes[1].legend(frameon=False)
-    figure.suptitle("Wheel speed difference relative to a differential drive; windows of steady speed")
+    figure.suptitle(
+        "Track ratio χ: speed difference of the sides / that without slip for the same yaw rate; steady windows"
+    )
     return figure
 
 

@@ -1,4 +1,4 @@
-"""Verb: shows a built scene in the browser, and drives the Husky in it; or renders a camera path to a film.
+"""`twin view`: shows a built scene in the browser, and drives the Husky in it; or renders a camera path to a film.
 
     python -m twin.view scenes/demo
     python -m twin.view scenes/demo --policy first --task straight

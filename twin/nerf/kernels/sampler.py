@@ -6,7 +6,8 @@ coarse one covers the contracted cube. *Bin*: one weighted step of the march thr
 K intervals of a ray that contain equal weight; it is sampled once, and the sample represents the whole stratum.
 """
 
-# Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
+# Warp evaluates annotations, so they contain calls, which mypy does not accept. In a kernel, float() and int() declare
+# a variable that a loop changes.
 # mypy: ignore-errors
 # ruff: noqa: RUF046
 from twin.nerf.kernels.composite import Strata
@@ -28,7 +29,7 @@ _WIDENING = 0.02  # least bin length as a share of the distance
 
 @wp.struct
 class OpacityGrids:
-    """Opacity grids over the near box and the contracted cube, and the sides of their cells inside the near box [m]."""
+    """Opacity grids over the near box and the contracted cube, and the side of a cell in each [contracted m]."""
 
     near: wp.array3d(dtype=wp.float32)
     far: wp.array3d(dtype=wp.float32)
@@ -70,7 +71,7 @@ def sample_rays(
     strata: Strata,
     positions: wp.array2d(dtype=wp.vec3f),
 ):
-    """Samples K strata per ray, and their grid positions (n, K).
+    """Divides each ray into K strata and takes one sample in each. Writes `strata` and the samples' `positions` (n, K).
 
     Args:
         targets: Known distance of a surface [m], 0 = unknown; its bin gets `target_mass` of extra weight.
