@@ -10,6 +10,7 @@ from tiny_world import BOX_FACES, box
 
 import twin
 from twin import runtime
+from twin.assets.shadow_casters import shadow_casters
 from twin.env.domain_randomization import RandomizationSample, Ranges
 from twin.env.irradiance import IrradianceEstimator
 from twin.env.suite import EnvFactory
@@ -25,7 +26,7 @@ from twin.nerf.lightings import AddedLighting
 from twin.nerf.sun import TERMS, SeenSurfaces, Sun, main_sun, mixed_sunlight, relit
 from twin.nerf.sun_fit import SunProblem, fit_direction, search_directions
 from twin.pack import pack
-from twin.relight import find_sun, shadow_casters
+from twin.relight import find_sun
 from twin.scene import SceneDir, stage_result, write_stamp
 from twin.view.camera_path import mixed_lighting, named_lighting
 from twin.view.scene_picture import FreeCamera, ScenePicture
@@ -230,7 +231,7 @@ def built(tmp_path_factory):
     """A built scene with a sunny lighting, and one with the same embedding and no sun."""
     runtime.set_quiet(True)
     scene = SceneDir(tiny_twin(tmp_path_factory.mktemp("sunny")))
-    casters = shadow_casters(scene)
+    casters = shadow_casters(scene, twin.load_scene(scene.root).field())
     assert casters is not None
     day = [float(x) for x in twin.load_scene(scene.root).field().embedding("day")]
     rows = np.array([[0.4] * 3, [0.8, 0.7, 0.5], [0.9] * 3, [0.2] * 3, [0.1] * 3], np.float32)

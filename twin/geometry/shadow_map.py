@@ -27,6 +27,8 @@ TEXEL = 0.15
 """[m] side of a texel."""
 BIAS = 0.3
 """[m] height by which the map must exceed a point for a shadow; surfaces of a field have errors of this size."""
+ROUGH_BIAS = 0.5
+"""[m] further bias of rough surfaces."""
 _RAMP = 0.2  # [m] further height over which the shadow becomes full
 _MAX_SIDE = 4096  # [texels] larger maps get larger texels
 _FULL = 65535  # largest value of a stored texel; 0 means that nothing is there
@@ -96,7 +98,7 @@ class ShadowMap:
         """Casts a ray from the sun through each texel of the map of a mesh, vertices (n, 3) [m] and faces (m, 3)."""
         return ShadowCasters(vertices, faces).seen_from(toward, texel)
 
-    def visibility(self, points: Array, bias: float = BIAS) -> Array32:
+    def visibility(self, points: NDArray, bias: float = BIAS) -> Array32:
         """Fraction of the sunlight that reaches points (n, 3) [m], shape (n,); 1 outside the map."""
         right, upward = plane_axes(self.toward)
         # Single precision suffices, as scenes are some hundred meters wide.
@@ -135,29 +137,45 @@ class ShadowMap:
 
 
 class ShadowCasters:
-    """Surfaces of a place that throw shadows; `seen_from` makes the map for any sun."""
+    """Surfaces of a place that throw shadows; `seen_from` makes the map for any sun.
 
-    def __init__(self, vertices: Array, faces: NDArray) -> None:
-        """`vertices` have shape (n, 3) [m], `faces` (m, 3)."""
-        self._vertices = np.asarray(vertices, np.float64)[np.unique(faces)] if len(faces) else np.zeros((0, 3))
-        self._surface = Surface(np.asarray(vertices), faces) if len(faces) else None
+    *Rough* surfaces throw shadows only on what is `ROUGH_BIAS` farther from the sun than the bias of other surfaces
+    demands, so that they do not darken the true surfaces beside them.
+    """
+
+    def __init__(
+        self, vertices: Array, faces: NDArray, rough_vertices: Array | None = None, rough_faces: NDArray | None = None
+    ) -> None:
+        """Vertices have shape (n, 3) [m], faces (m, 3)."""
+        parts = [(vertices, faces, 0.0)]
+        if rough_vertices is not None and rough_faces is not None:
+            parts.append((rough_vertices, rough_faces, ROUGH_BIAS))
+        self._parts = [
+            (np.asarray(points, np.float64)[np.unique(index)], Surface(np.asarray(points), index), bias)
+            for points, index, bias in parts
+            if len(index)
+        ]
 
     def seen_from(self, toward: Array, texel: float = TEXEL) -> ShadowMap:
         """The map for a sun in the direction of a unit vector (3,); `texel` [m] grows if the place is very wide."""
         toward = np.asarray(toward, np.float64) / np.linalg.norm(toward)
-        if self._surface is None:
+        if not self._parts:
             return ShadowMap(toward, np.zeros(2), texel, np.full((1, 1), -np.inf, np.float32))
         right, upward = plane_axes(toward)
-        at = self._vertices @ np.stack([right, upward, toward], 1)
-        low, high = at[:, :2].min(0), at[:, :2].max(0)
+        axes = np.stack([right, upward, toward], 1)
+        corners = np.array([[f(points @ axes, axis=0) for f in (np.min, np.max)] for points, _, _ in self._parts])
+        low, high = corners[:, 0, :2].min(0), corners[:, 1, :2].max(0)
         texel = max(texel, float((high - low).max()) / (_MAX_SIDE - 1))
         columns, rows = np.ceil((high - low) / texel).astype(int) + 1
-        start = float(at[:, 2].max()) + _START
+        start = float(corners[:, 1, 2].max()) + _START
         u, v = low[0] + texel * np.arange(columns), low[1] + texel * np.arange(rows)
-        origins = u[None, :, None] * right + v[:, None, None] * upward + start * toward
+        origins = (u[None, :, None] * right + v[:, None, None] * upward + start * toward).reshape(-1, 3)
         rays = np.broadcast_to(-toward, (rows * columns, 3))
-        hit = self._surface.cast(origins.reshape(-1, 3), rays).reshape(rows, columns)
-        return ShadowMap(toward, low, texel, np.where(hit < 0.0, -np.inf, start - hit).astype(np.float32))
+        height = np.full(rows * columns, -np.inf)
+        for _, surface, bias in self._parts:
+            hit = surface.cast(origins, rays)
+            height = np.maximum(height, np.where(hit < 0.0, -np.inf, start - hit - bias))
+        return ShadowMap(toward, low, texel, height.reshape(rows, columns).astype(np.float32))
 
 
 def plane_axes(toward: Array) -> tuple[Array, Array]:

@@ -154,7 +154,7 @@ class SeenSurfaces:
         return out
 
 
-def lit_cosine(shadows: ShadowMap, points: Array, normals: Array) -> Array32:
+def lit_cosine(shadows: ShadowMap, points: NDArray, normals: NDArray) -> Array32:
     """Visibility of the sun times the cosine of its incidence, at points (n, 3) [m] with unit normals (n, 3); (n,)."""
     cosine = np.maximum(normals.astype(np.float32) @ shadows.toward.astype(np.float32), 0.0)
     facing = np.flatnonzero(cosine > 0.0)
