@@ -35,7 +35,7 @@ from twin.reality.truth import Truth
 from twin.relight import PhotoFit, SunSource, fit_photo, with_sun
 
 SIZE = (240, 135)  # [px]
-STATIONS = 7  # the photo is taken at the first one
+STATIONS = 6  # the photo is taken at the first one
 FIRST, MARGIN = 4.0, 6.0  # [m] the first station; distance of the last one from the end of the road
 VARIANTS = ("embedding", "searched", "true")
 

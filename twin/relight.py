@@ -315,7 +315,8 @@ def relight(
     field = RadianceField.load(scene.stage("field"))
     check_name(name, field.lightings)
     source = find_sun(scene, sun, time, location, heading)
-    casters = shadow_casters(scene, BakedField.load(scene.stage("field"))) if source else None
+    has_mesh = (scene.stage("mesh") / "visual.npz").exists()
+    casters = shadow_casters(scene, BakedField.load(scene.stage("field"))) if source and has_mesh else None
     if source and source.toward is not None and casters is None:
         raise InputError("a sun needs the stage mesh, whose surfaces throw the shadows; run python -m twin.build SCENE")
     image, facts = load_photo(photo, None)

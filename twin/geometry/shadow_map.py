@@ -30,6 +30,7 @@ BIAS = 0.3
 ROUGH_BIAS = 0.5
 """[m] further bias of rough surfaces."""
 _RAMP = 0.2  # [m] further height over which the shadow becomes full
+_LEAST_COSINE = wp.constant(0.1)  # least cosine of incidence for which the slope of a surface is used
 _MAX_SIDE = 4096  # [texels] larger maps get larger texels
 _FULL = 65535  # largest value of a stored texel; 0 means that nothing is there
 _START = 1.0  # [m] distance from the highest vertex to the plane from which rays are cast
@@ -39,6 +40,7 @@ _START = 1.0  # [m] distance from the highest vertex to the plane from which ray
 def _look_up(
     height: wp.array2d(dtype=float),
     points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
     right: wp.vec3,
     upward: wp.vec3,
     toward: wp.vec3,
@@ -48,9 +50,19 @@ def _look_up(
     ramp: float,
     out: wp.array(dtype=float),
 ):
-    """Fraction of the sunlight at a point: the mean over a square of three texels' side around it."""
+    """Fraction of the sunlight at a point: the mean over a square of three texels' side around it.
+
+    A texel is compared with the height at its center of the plane through the point, so that slopes do not darken
+    themselves. A point without a normal (0, 0, 0) has a plane that is perpendicular to the light.
+    """
     i = wp.tid()
-    p = points[i]
+    p, n = points[i], normals[i]
+    facing = wp.dot(n, toward)
+    slope_right, slope_upward = float(0.0), float(0.0)
+    if facing > 0.0:
+        facing = wp.max(facing, _LEAST_COSINE)
+        slope_right = -wp.dot(n, right) / facing * texel
+        slope_upward = -wp.dot(n, upward) / facing * texel
     column, row = (wp.dot(p, right) - origin[0]) / texel, (wp.dot(p, upward) - origin[1]) / texel
     level = wp.dot(p, toward) + bias
     first_column, first_row = int(wp.floor(column)) - 1, int(wp.floor(row)) - 1
@@ -71,7 +83,8 @@ def _look_up(
             if b == 3:
                 weight = wide * across
             if x >= 0 and y >= 0 and x < height.shape[1] and y < height.shape[0]:
-                dark += weight * wp.clamp((height[y, x] - level) / ramp, 0.0, 1.0)
+                plane = level + slope_right * (float(x) - column) + slope_upward * (float(y) - row)
+                dark += weight * wp.clamp((height[y, x] - plane) / ramp, 0.0, 1.0)
     out[i] = 1.0 - dark / 9.0
 
 
@@ -98,14 +111,21 @@ class ShadowMap:
         """Casts a ray from the sun through each texel of the map of a mesh, vertices (n, 3) [m] and faces (m, 3)."""
         return ShadowCasters(vertices, faces).seen_from(toward, texel)
 
-    def visibility(self, points: NDArray, bias: float = BIAS) -> Array32:
-        """Fraction of the sunlight that reaches points (n, 3) [m], shape (n,); 1 outside the map."""
+    def visibility(self, points: NDArray, normals: NDArray | None = None, bias: float = BIAS) -> Array32:
+        """Fraction of the sunlight that reaches points (n, 3) [m], shape (n,); 1 outside the map.
+
+        With the unit normals (n, 3) of the surfaces there, slopes do not throw shadows on themselves.
+        """
         right, upward = plane_axes(self.toward)
         # Single precision suffices, as scenes are some hundred meters wide.
-        at: Any = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device="cpu")
+        if normals is None:
+            normals = np.zeros(points.shape)
+        at, facing = (
+            wp.array(np.ascontiguousarray(a, np.float32), dtype=wp.vec3, device="cpu") for a in (points, normals)
+        )
         out = wp.empty(len(points), dtype=float, device="cpu")
         axes = (wp.vec3(*axis.tolist()) for axis in (right, upward, self.toward))
-        inputs = [self._height, at, *axes, wp.vec2(*self.origin.tolist()), self.texel, bias, _RAMP]
+        inputs = [self._height, at, facing, *axes, wp.vec2(*self.origin.tolist()), self.texel, bias, _RAMP]
         wp.launch(_look_up, len(points), inputs=inputs, outputs=[out], device="cpu")
         return out.numpy()
 
