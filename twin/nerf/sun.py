@@ -8,9 +8,10 @@ picture under the lighting's embedding times a gain. The gain of each color chan
     far view, sky:   base + toward · ((1 + d · s) / 2)⁴ + up · max(0, d_z)
 
 The two coefficients of direct light differ if the ground lies in shadows of what was not filmed, or if its color
-saturates. Here n is the normal of the surface, s the direction towards the sun, d the direction of view. The visibility comes from
-a shadow map (`geometry/shadow_map.py`). Between `_NEAR` and `_FAR` near and far sums are blended. The coefficients are
-fitted to a photo (`sun_fit.py`). They are ratios to the light of the film, in the film's tone curve.
+saturates. Here n is the normal of the surface, s the direction towards the sun, d the direction of view. The
+visibility comes from a shadow map (`geometry/shadow_map.py`). Between `_NEAR` and `_FAR` near and far sums are
+blended. The coefficients are fitted to a photo (`sun_fit.py`). They are ratios to the light of the film, in the film's
+tone curve.
 """
 
 from dataclasses import dataclass
