@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from record import add_record_options, save
 
+from twin.assets.shadow_casters import shadow_casters
 from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
 from twin.geometry.shadow_map import ShadowCasters, angles
@@ -31,10 +32,10 @@ from twin.reality.real_camera import draw_camera, intrinsics_of
 from twin.reality.real_test import Setup
 from twin.reality.trial_place import place_on_test_day
 from twin.reality.truth import Truth
-from twin.relight import PhotoFit, SunSource, fit_photo, shadow_casters, with_sun
+from twin.relight import PhotoFit, SunSource, fit_photo, with_sun
 
 SIZE = (240, 135)  # [px]
-STATIONS = 7  # the photo is taken at the first one
+STATIONS = 6  # the photo is taken at the first one
 FIRST, MARGIN = 4.0, 6.0  # [m] the first station; distance of the last one from the end of the road
 VARIANTS = ("embedding", "searched", "true")
 
@@ -117,9 +118,9 @@ def main() -> int:
     twin, setup = load_scene(given.scene), Setup(given.place, 0, given.camera)
     cameras = Cameras.load(twin.scene.stage("metric"))
     from_truth = align_rigid(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras)).inverse()
-    intrinsics, casters = intrinsics_of(draw_camera(setup.camera), SIZE), shadow_casters(twin.scene)
-    assert casters is not None
     field, baked, days = twin.radiance_field("cpu"), twin.field(), {}
+    intrinsics, casters = intrinsics_of(draw_camera(setup.camera), SIZE), shadow_casters(twin.scene, baked)
+    assert casters is not None
     for number in given.days:
         light = weather(f"day_{number}")
         truth, poses = day_pictures(setup, light)

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from twin import commands
 from twin.errors import InputError
-from twin.files import load_arrays, wrap_read_errors
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
 from twin.geometry.shadow_map import ShadowCasters, angles, direction
@@ -254,16 +253,6 @@ def _two_numbers(option: str, text: str, expected: str) -> tuple[float, float]:
     return first, second
 
 
-def shadow_casters(scene: SceneDir) -> ShadowCasters | None:
-    """The surfaces of the mesh stage, which throw shadows; None if the stage is not built."""
-    path = scene.stage("mesh") / "visual.npz"
-    if not path.exists():
-        return None
-    with wrap_read_errors(path, "build the scene again"):
-        data = load_arrays(path)
-        return ShadowCasters(data["vertices"].astype(np.float64), data["faces"].astype(np.int64))
-
-
 def comparison(name: str, relit: PhotoFit) -> NDArray[np.uint8]:
     """Labelled image of a fit: photo, fitted lighting and nearest filmed lighting side by side."""
     from twin.report.video_layout import draw_label
@@ -313,10 +302,12 @@ def relight(
         raise InputError(f"no scene.toml in {root}; give the scene's folder, such as scenes/demo")
     result = stage_result(scene, "field")
 
+    from twin.assets.shadow_casters import shadow_casters
     from twin.capture.camera_models import undistorted
     from twin.capture.localize import register_photo
     from twin.capture.photos import load_photo
     from twin.geometry.cameras import Cameras
+    from twin.nerf.baked import BakedField
     from twin.nerf.field import RadianceField
 
     for stage in ("capture", "cameras", "metric"):
@@ -324,7 +315,8 @@ def relight(
     field = RadianceField.load(scene.stage("field"))
     check_name(name, field.lightings)
     source = find_sun(scene, sun, time, location, heading)
-    casters = shadow_casters(scene) if source else None
+    has_mesh = (scene.stage("mesh") / "visual.npz").exists()
+    casters = shadow_casters(scene, BakedField.load(scene.stage("field"))) if source and has_mesh else None
     if source and source.toward is not None and casters is None:
         raise InputError("a sun needs the stage mesh, whose surfaces throw the shadows; run python -m twin.build SCENE")
     image, facts = load_photo(photo, None)

@@ -27,7 +27,10 @@ TEXEL = 0.15
 """[m] side of a texel."""
 BIAS = 0.3
 """[m] height by which the map must exceed a point for a shadow; surfaces of a field have errors of this size."""
+ROUGH_BIAS = 0.5
+"""[m] further bias of rough surfaces."""
 _RAMP = 0.2  # [m] further height over which the shadow becomes full
+_LEAST_COSINE = wp.constant(0.1)  # least cosine of incidence for which the slope of a surface is used
 _MAX_SIDE = 4096  # [texels] larger maps get larger texels
 _FULL = 65535  # largest value of a stored texel; 0 means that nothing is there
 _START = 1.0  # [m] distance from the highest vertex to the plane from which rays are cast
@@ -37,6 +40,7 @@ _START = 1.0  # [m] distance from the highest vertex to the plane from which ray
 def _look_up(
     height: wp.array2d(dtype=float),
     points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
     right: wp.vec3,
     upward: wp.vec3,
     toward: wp.vec3,
@@ -46,9 +50,19 @@ def _look_up(
     ramp: float,
     out: wp.array(dtype=float),
 ):
-    """Fraction of the sunlight at a point: the mean over a square of three texels' side around it."""
+    """Fraction of the sunlight at a point: the mean over a square of three texels' side around it.
+
+    A texel is compared with the height at its center of the plane through the point, so that slopes do not darken
+    themselves. A point without a normal (0, 0, 0) has a plane that is perpendicular to the light.
+    """
     i = wp.tid()
-    p = points[i]
+    p, n = points[i], normals[i]
+    facing = wp.dot(n, toward)
+    slope_right, slope_upward = float(0.0), float(0.0)
+    if facing > 0.0:
+        facing = wp.max(facing, _LEAST_COSINE)
+        slope_right = -wp.dot(n, right) / facing * texel
+        slope_upward = -wp.dot(n, upward) / facing * texel
     column, row = (wp.dot(p, right) - origin[0]) / texel, (wp.dot(p, upward) - origin[1]) / texel
     level = wp.dot(p, toward) + bias
     first_column, first_row = int(wp.floor(column)) - 1, int(wp.floor(row)) - 1
@@ -69,7 +83,8 @@ def _look_up(
             if b == 3:
                 weight = wide * across
             if x >= 0 and y >= 0 and x < height.shape[1] and y < height.shape[0]:
-                dark += weight * wp.clamp((height[y, x] - level) / ramp, 0.0, 1.0)
+                plane = level + slope_right * (float(x) - column) + slope_upward * (float(y) - row)
+                dark += weight * wp.clamp((height[y, x] - plane) / ramp, 0.0, 1.0)
     out[i] = 1.0 - dark / 9.0
 
 
@@ -96,14 +111,21 @@ class ShadowMap:
         """Casts a ray from the sun through each texel of the map of a mesh, vertices (n, 3) [m] and faces (m, 3)."""
         return ShadowCasters(vertices, faces).seen_from(toward, texel)
 
-    def visibility(self, points: Array, bias: float = BIAS) -> Array32:
-        """Fraction of the sunlight that reaches points (n, 3) [m], shape (n,); 1 outside the map."""
+    def visibility(self, points: NDArray, normals: NDArray | None = None, bias: float = BIAS) -> Array32:
+        """Fraction of the sunlight that reaches points (n, 3) [m], shape (n,); 1 outside the map.
+
+        With the unit normals (n, 3) of the surfaces there, slopes do not throw shadows on themselves.
+        """
         right, upward = plane_axes(self.toward)
         # Single precision suffices, as scenes are some hundred meters wide.
-        at: Any = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device="cpu")
+        if normals is None:
+            normals = np.zeros(points.shape)
+        at, facing = (
+            wp.array(np.ascontiguousarray(a, np.float32), dtype=wp.vec3, device="cpu") for a in (points, normals)
+        )
         out = wp.empty(len(points), dtype=float, device="cpu")
         axes = (wp.vec3(*axis.tolist()) for axis in (right, upward, self.toward))
-        inputs = [self._height, at, *axes, wp.vec2(*self.origin.tolist()), self.texel, bias, _RAMP]
+        inputs = [self._height, at, facing, *axes, wp.vec2(*self.origin.tolist()), self.texel, bias, _RAMP]
         wp.launch(_look_up, len(points), inputs=inputs, outputs=[out], device="cpu")
         return out.numpy()
 
@@ -135,29 +157,45 @@ class ShadowMap:
 
 
 class ShadowCasters:
-    """Surfaces of a place that throw shadows; `seen_from` makes the map for any sun."""
+    """Surfaces of a place that throw shadows; `seen_from` makes the map for any sun.
 
-    def __init__(self, vertices: Array, faces: NDArray) -> None:
-        """`vertices` have shape (n, 3) [m], `faces` (m, 3)."""
-        self._vertices = np.asarray(vertices, np.float64)[np.unique(faces)] if len(faces) else np.zeros((0, 3))
-        self._surface = Surface(np.asarray(vertices), faces) if len(faces) else None
+    *Rough* surfaces throw shadows only on what is `ROUGH_BIAS` farther from the sun than the bias of other surfaces
+    demands, so that they do not darken the true surfaces beside them.
+    """
+
+    def __init__(
+        self, vertices: Array, faces: NDArray, rough_vertices: Array | None = None, rough_faces: NDArray | None = None
+    ) -> None:
+        """Vertices have shape (n, 3) [m], faces (m, 3)."""
+        parts = [(vertices, faces, 0.0)]
+        if rough_vertices is not None and rough_faces is not None:
+            parts.append((rough_vertices, rough_faces, ROUGH_BIAS))
+        self._parts = [
+            (np.asarray(points, np.float64)[np.unique(index)], Surface(np.asarray(points), index), bias)
+            for points, index, bias in parts
+            if len(index)
+        ]
 
     def seen_from(self, toward: Array, texel: float = TEXEL) -> ShadowMap:
         """The map for a sun in the direction of a unit vector (3,); `texel` [m] grows if the place is very wide."""
         toward = np.asarray(toward, np.float64) / np.linalg.norm(toward)
-        if self._surface is None:
+        if not self._parts:
             return ShadowMap(toward, np.zeros(2), texel, np.full((1, 1), -np.inf, np.float32))
         right, upward = plane_axes(toward)
-        at = self._vertices @ np.stack([right, upward, toward], 1)
-        low, high = at[:, :2].min(0), at[:, :2].max(0)
+        axes = np.stack([right, upward, toward], 1)
+        corners = np.array([[f(points @ axes, axis=0) for f in (np.min, np.max)] for points, _, _ in self._parts])
+        low, high = corners[:, 0, :2].min(0), corners[:, 1, :2].max(0)
         texel = max(texel, float((high - low).max()) / (_MAX_SIDE - 1))
         columns, rows = np.ceil((high - low) / texel).astype(int) + 1
-        start = float(at[:, 2].max()) + _START
+        start = float(corners[:, 1, 2].max()) + _START
         u, v = low[0] + texel * np.arange(columns), low[1] + texel * np.arange(rows)
-        origins = u[None, :, None] * right + v[:, None, None] * upward + start * toward
+        origins = (u[None, :, None] * right + v[:, None, None] * upward + start * toward).reshape(-1, 3)
         rays = np.broadcast_to(-toward, (rows * columns, 3))
-        hit = self._surface.cast(origins.reshape(-1, 3), rays).reshape(rows, columns)
-        return ShadowMap(toward, low, texel, np.where(hit < 0.0, -np.inf, start - hit).astype(np.float32))
+        height = np.full(rows * columns, -np.inf)
+        for _, surface, bias in self._parts:
+            hit = surface.cast(origins, rays)
+            height = np.maximum(height, np.where(hit < 0.0, -np.inf, start - hit - bias))
+        return ShadowMap(toward, low, texel, height.reshape(rows, columns).astype(np.float32))
 
 
 def plane_axes(toward: Array) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ def parse_time(text: str) -> datetime:
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
-        moment = None  # type: ignore[assignment]
+        moment = None
     if moment is None or moment.tzinfo is None:
         raise InputError(
             f"--time {text!r}: expected date, time and offset from UTC, such as 2026-06-01T17:30+02:00 (Z for UTC)"

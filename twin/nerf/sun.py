@@ -1,14 +1,17 @@
 """Sun of an added lighting: a gain on pictures of the field, by which another sun lights the place.
 
 A field stores the colors of its films, with their light and shadows in them. The picture under another sun is the
-picture under the lighting's embedding times a gain. The gain of each color channel is a sum of five terms:
+picture under the lighting's embedding times a gain. The gain of each color channel is a sum of terms:
 
-    near surfaces:   ambient + direct · visibility · max(0, n · s)
+    level surfaces:  ambient + level · visibility · max(0, n · s)
+    other surfaces:  ambient + direct · visibility · max(0, n · s)
     far view, sky:   base + toward · ((1 + d · s) / 2)⁴ + up · max(0, d_z)
 
-Here n is the normal of the surface, s the direction towards the sun, d the direction of view. The visibility comes from
-a shadow map (`geometry/shadow_map.py`). Between `_NEAR` and `_FAR` the two sums are blended. The coefficients are
-fitted to a photo (`sun_fit.py`). They are ratios to the light of the film, in the film's tone curve.
+The two coefficients of direct light differ if the ground lies in shadows of what was not filmed, or if its color
+saturates. Here n is the normal of the surface, s the direction towards the sun, d the direction of view. The
+visibility comes from a shadow map (`geometry/shadow_map.py`). Between `_NEAR` and `_FAR` near and far sums are
+blended. The coefficients are fitted to a photo (`sun_fit.py`). They are ratios to the light of the film, in the film's
+tone curve.
 """
 
 from dataclasses import dataclass
@@ -21,13 +24,13 @@ from numpy.typing import NDArray
 from twin.geometry.shadow_map import ShadowMap
 from twin.types import Array, Array32
 
-TERMS = ("ambient", "direct", "base", "toward", "up")
+TERMS = ("ambient", "direct", "base", "toward", "up", "level")
 """Names of the terms of the gain."""
 MIN_GAIN, MAX_GAIN = 0.1, 4.0
 """Limits of the gain."""
 _NEAR, _FAR = 30.0, 60.0  # [m] z-depth below which surfaces are lit by their normals alone, and above which not at all
 _GLOW = 4  # exponent of the brightening towards the sun
-_SMOOTHING = 3 / 160  # [widths of the picture] window over which points are averaged before normals are computed
+_SMOOTHING = 9 / 160  # [widths of the picture] window over which points are averaged before normals are computed
 _LEVEL = (0.75, 0.92)  # upward components of normals between which they are replaced more and more by the vertical
 _MAX_ENTRY = 100.0  # largest absolute coefficient in a file
 
@@ -39,7 +42,7 @@ class Sun:
     shadows: ShadowMap
     """The parts of the place that it reaches; contains its direction."""
     coefficients: Array32
-    """RGB of each of `TERMS`, shape (5, 3)."""
+    """RGB of each of `TERMS`, shape (6, 3)."""
 
     @property
     def toward(self) -> Array:
@@ -51,7 +54,9 @@ class Sun:
 
         Also returns the fraction of it that is the direct light's, averaged over the channels, shape (n,).
         """
-        direct = lit_cosine(self.shadows, points, normals)[:, None] * self.coefficients[1]
+        level = _levelness(normals)[:, None]
+        color = level * self.coefficients[5] + (1.0 - level) * self.coefficients[1]
+        direct = lit_cosine(self.shadows, points, normals)[:, None] * color
         gain = np.clip(self.coefficients[0] + direct, MIN_GAIN, MAX_GAIN)
         return gain, (direct / gain).mean(1)
 
@@ -140,12 +145,14 @@ class SeenSurfaces:
         return SeenSurfaces(self.points[rows], self.normals[rows], self.directions[rows], self.far[rows])
 
     def terms(self, shadows: ShadowMap) -> Array32:
-        """The terms of the gain at each pixel under a sun, shape (n, 5)."""
+        """The terms of the gain at each pixel under a sun, shape (n, 6)."""
         near, toward = np.float32(1.0) - self.far, shadows.toward.astype(np.float32)
         out = np.zeros((len(near), len(TERMS)), np.float32)
         out[:, 0] = near
         close = np.flatnonzero(near)
-        out[close, 1] = near[close] * lit_cosine(shadows, self.points[close], self.normals[close])
+        lit = near[close] * lit_cosine(shadows, self.points[close], self.normals[close])
+        level = _levelness(self.normals[close])
+        out[close, 1], out[close, 5] = (1.0 - level) * lit, level * lit
         away = np.flatnonzero(self.far)
         far, directions = self.far[away], self.directions[away]
         out[away, 2] = far
@@ -154,12 +161,18 @@ class SeenSurfaces:
         return out
 
 
-def lit_cosine(shadows: ShadowMap, points: Array, normals: Array) -> Array32:
+def lit_cosine(shadows: ShadowMap, points: NDArray, normals: NDArray) -> Array32:
     """Visibility of the sun times the cosine of its incidence, at points (n, 3) [m] with unit normals (n, 3); (n,)."""
     cosine = np.maximum(normals.astype(np.float32) @ shadows.toward.astype(np.float32), 0.0)
     facing = np.flatnonzero(cosine > 0.0)
-    cosine[facing] *= shadows.visibility(points[facing])
+    cosine[facing] *= shadows.visibility(points[facing], normals[facing])
     return cosine
+
+
+def _levelness(normals: NDArray) -> NDArray:
+    """1 for level surfaces, 0 for steep ones; normals (n, 3) → (n,)."""
+    low, high = _LEVEL
+    return np.clip((normals[:, 2] - low) / (high - low), 0.0, 1.0)
 
 
 def _normals(points: Array32) -> Array32:

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from twin.geometry.images import psnr
-from twin.geometry.shadow_map import ShadowCasters, ShadowMap, angles, direction
+from twin.geometry.shadow_map import TEXEL, ShadowCasters, ShadowMap, angles, direction
 from twin.nerf import network
 from twin.nerf.fog import REACH, Fog
 from twin.nerf.sun import MAX_GAIN, MIN_GAIN, TERMS, SeenSurfaces, Sun
@@ -33,7 +33,8 @@ _REFINEMENTS = (9.0, 5.0, 2.5)  # [°] steps of the further searches around the 
 _STARTS = 2  # number of first directions around which the search goes on
 _BASES = 2  # number of bases for which it goes on, besides the fitted embedding
 _RIDGE = 2e-4  # weight of the squared differences of coefficients from those without a sun
-_PLAIN = np.array([1.0, 0.0, 1.0, 0.0, 0.0])  # coefficients of the terms without a sun
+_PLAIN = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # coefficients of the terms without a sun
+_LIGHT = np.array([True, True, False, False, False, True])  # terms that are not negative, as light is not
 _STEPS = 100
 _RAYS, _SEARCH_RAYS = 6_000, 2_500  # pixels of the joint fits and of the searches, evenly spaced over the photo
 _EMBEDDING_RATE, _COEFFICIENT_RATE = 0.03, 0.03  # learning rates
@@ -67,7 +68,7 @@ class LinearFit:
     toward: Array
     """Unit vector towards the sun, shape (3,)."""
     coefficients: Array32
-    """Shape (5, 3), see `Sun`."""
+    """Shape (6, 3), see `Sun`."""
     error: float
     """Mean squared difference of the colors."""
 
@@ -124,7 +125,7 @@ def _kept(fog: Fog, distances: NDArray) -> NDArray:
 
 
 def _solve(columns: NDArray, target: NDArray) -> NDArray:
-    """Least squares with a weak pull to `_PLAIN`; ambient and direct light are not negative."""
+    """Least squares with a weak pull to `_PLAIN`; light is not negative."""
     scale = _RIDGE * float((columns**2).mean(0).sum()) * len(columns)
     square = columns.T @ columns + scale * np.eye(len(_PLAIN))
     right = columns.T @ target + scale * _PLAIN
@@ -132,7 +133,7 @@ def _solve(columns: NDArray, target: NDArray) -> NDArray:
     while True:
         out = np.zeros(len(_PLAIN))
         out[free] = np.linalg.solve(square[np.ix_(free, free)], right[free])
-        negative = free & (out < 0.0) & np.array([True, True, False, False, False])
+        negative = free & (out < 0.0) & _LIGHT
         if not negative.any():
             return out
         free &= ~negative
@@ -180,7 +181,7 @@ def fit_jointly(
         optimizer.step()
         schedule.step()
         with torch.no_grad():
-            coefficients[:2].clamp_(min=0.0)
+            coefficients[_LIGHT] = coefficients[_LIGHT].clamp(min=0.0)
             if fog.extinction:
                 log_extinction.clamp_(max=math.log(_MAX_EXTINCTION))
                 airlight.clamp_(0.0, 1.0)
@@ -292,7 +293,8 @@ def fit_sun(
 
     def refine(given: AirFit, start: LinearFit, embedding: Array32) -> tuple[Array32, Sun, Fog]:
         some, mine = problem(given.pixels, _RAYS, [embedding])
-        sun = Sun(casters.seen_from(start.toward), start.coefficients)
+        fine = TEXEL if given is whole else SEARCH_TEXEL
+        sun = Sun(casters.seen_from(start.toward, fine), start.coefficients)
         index = torch.as_tensor(some, device=field.device)
         traces = traced.features[index], traced.harmonics[index]
         return fit_jointly(field.parameters, *traces, mine, embedding, sun, given.fog)
