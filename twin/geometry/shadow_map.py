@@ -120,9 +120,8 @@ class ShadowMap:
         # Single precision suffices, as scenes are some hundred meters wide.
         if normals is None:
             normals = np.zeros(points.shape)
-        at, facing = (
-            wp.array(np.ascontiguousarray(a, np.float32), dtype=wp.vec3, device="cpu") for a in (points, normals)
-        )
+        at: Any = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device="cpu")
+        facing: Any = wp.array(np.ascontiguousarray(normals, np.float32), dtype=wp.vec3, device="cpu")
         out = wp.empty(len(points), dtype=float, device="cpu")
         axes = (wp.vec3(*axis.tolist()) for axis in (right, upward, self.toward))
         inputs = [self._height, at, facing, *axes, wp.vec2(*self.origin.tolist()), self.texel, bias, _RAMP]
