@@ -207,7 +207,7 @@ def _mean_around(color: Array32) -> Array32:
     """Means over 3 × 3 cells, without those that are nan."""
     known = np.isfinite(color)
     total = cv2.blur(np.where(known, color, np.float32(0.0)), (3, 3))
-    return total / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), np.float32(1e-6))
+    return (total / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), 1e-6)).astype(np.float32)
 
 
 def cleaned(strong: NDArray[np.bool_], weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
