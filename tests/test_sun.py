@@ -10,7 +10,9 @@ from tiny_world import BOX_FACES, box
 
 import twin
 from twin import runtime
-from twin.assets.shadow_casters import shadow_casters
+from twin.assets.ground import Ground
+from twin.assets.shadow_casters import rough_triangles, shadow_casters
+from twin.assets.views import Views
 from twin.env.domain_randomization import RandomizationSample, Ranges
 from twin.env.irradiance import IrradianceEstimator
 from twin.env.suite import EnvFactory
@@ -19,7 +21,7 @@ from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import look_at
-from twin.geometry.shadow_map import ShadowCasters, ShadowMap, angles, direction
+from twin.geometry.shadow_map import OrthographicShadowMap, ShadowCasters, angles, direction
 from twin.geometry.solar import heading_from_gps, parse_time, sun_angles, sun_direction
 from twin.nerf.fog import Fog
 from twin.nerf.lightings import AddedLighting
@@ -57,7 +59,7 @@ def test_shadow_map_equals_ray_casting(azimuth, elevation):
     toward = direction(azimuth, elevation)
     assert angles(toward)[1] == pytest.approx(elevation)
     vertices, faces = _mesh()
-    shadows = ShadowMap.of_mesh(vertices, faces, toward, texel=0.05)
+    shadows = OrthographicShadowMap.of_mesh(vertices, faces, toward, texel=0.05)
     rng = np.random.default_rng(0)
     points = rng.uniform([2.0, -6.0, 0.0], [13.0, 8.0, 2.5], (4000, 3))
     surface = Surface(vertices, faces)
@@ -71,14 +73,40 @@ def test_shadow_map_equals_ray_casting(azimuth, elevation):
     np.testing.assert_allclose(shadows.visibility(points[same]), lit[same, 0], atol=1e-5)
 
 
+@pytest.mark.parametrize("elevation", [6.0, 40.0])
+def test_slopes_throw_no_shadows_on_themselves(elevation):
+    vertices = np.array([[-20, -20, -2], [20, -20, 2], [20, 20, 2], [-20, 20, -2]], float)  # rises by a tenth along x
+    shadows = OrthographicShadowMap.of_mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), direction(200.0, elevation))
+    x, y = np.random.default_rng(0).uniform(-15.0, 15.0, (2, 500))
+    points, normals = np.column_stack([x, y, 0.1 * x]), np.tile([-0.1, 0.0, 1.0] / np.sqrt(1.01), (500, 1))
+    np.testing.assert_allclose(shadows.visibility(points, normals), 1.0, atol=1e-5)
+
+
+def test_rough_triangles_are_surfaces_above_the_mesh():
+    """A wall 10 m away, half of which stands in front of another at 20 m; the mesh ends 3 m above the ground."""
+    flat = Ground(
+        np.zeros((80, 80)), np.array([-20.0, -20.0]), 0.5, np.ones((80, 80), bool), np.zeros((80, 80, 3), np.uint8)
+    )
+    pose = look_at(np.array([0.0, 0.0, 1.5]), np.array([1.0, 0.0, 1.5]))
+    depth = np.where(np.arange(SIZE[0]) < 48, 10.0, 20.0) * np.ones((1, SIZE[1], 1))
+    one = np.ones(depth.shape, np.float32)
+    views = Views(pose[None], K[None], np.zeros((*depth.shape, 3), np.uint8), depth.astype(np.float32), one, one)
+    mesh = np.array([[-15.0, -15.0, 0.0], [15.0, 15.0, 3.0]])
+    vertices, faces = rough_triangles(views, flat, mesh)
+    corners = vertices[faces]
+    near, far = (np.abs(corners[..., 0] - x).max(1) < 1e-3 for x in (10.0, 20.0))
+    assert near.any() and far.any() and (near | far).all()  # nothing spans the gap
+    assert corners[near].mean(1)[:, 2].min() > 2.5 and corners[far].mean(1)[:, 2].min() > 1.0
+
+
 def test_shadow_map_survives_its_file():
-    shadows = ShadowMap.of_mesh(*_mesh(), direction(30.0, 40.0))
-    back = ShadowMap.from_json(json.loads(json.dumps(shadows.to_json())))
+    shadows = OrthographicShadowMap.of_mesh(*_mesh(), direction(30.0, 40.0))
+    back = OrthographicShadowMap.from_json(json.loads(json.dumps(shadows.to_json())))
     points = np.random.default_rng(0).uniform(0.0, 10.0, (500, 3))
     np.testing.assert_allclose(back.visibility(points), shadows.visibility(points), atol=1e-3)
     nothing = ShadowCasters(np.zeros((0, 3)), np.zeros((0, 3), int)).seen_from(direction(0.0, 10.0))
     assert (nothing.visibility(points) == 1.0).all()
-    assert (ShadowMap.from_json(nothing.to_json()).visibility(points) == 1.0).all()
+    assert (OrthographicShadowMap.from_json(nothing.to_json()).visibility(points) == 1.0).all()
 
 
 @pytest.mark.parametrize(
@@ -86,14 +114,14 @@ def test_shadow_map_survives_its_file():
     [{"toward": [0.0, 0.0, 2.0]}, {"toward": [1.0, 0.0, 0.0]}, {"texel_m": 0.0}, {"png": "AAAA"}, {"png": "?"}],
 )
 def test_damaged_shadow_maps_are_refused(change):
-    table = ShadowMap.of_mesh(*_mesh(), direction(30.0, 40.0)).to_json()
+    table = OrthographicShadowMap.of_mesh(*_mesh(), direction(30.0, 40.0)).to_json()
     with pytest.raises(ValueError):
-        ShadowMap.from_json(table | change)
+        OrthographicShadowMap.from_json(table | change)
 
 
 def _sun(toward: np.ndarray) -> Sun:
     rows = [[0.5, 0.55, 0.7], [1.3, 1.2, 0.9], [0.9, 1.0, 1.2], [0.4, 0.3, 0.1], [0.0, 0.1, 0.3], [1.0, 0.8, 0.5]]
-    return Sun(ShadowMap.of_mesh(*_mesh(), toward), np.array(rows, np.float32))
+    return Sun(OrthographicShadowMap.of_mesh(*_mesh(), toward), np.array(rows, np.float32))
 
 
 def test_gain_is_that_of_its_definition():

@@ -89,7 +89,7 @@ def _look_up(
 
 
 @dataclass(frozen=True)
-class ShadowMap:
+class OrthographicShadowMap:
     """Height map of a place seen from the sun."""
 
     toward: Array
@@ -107,7 +107,7 @@ class ShadowMap:
         return wp.array(np.maximum(self.height, np.float32(-1e9)), dtype=float, device="cpu")
 
     @staticmethod
-    def of_mesh(vertices: Array, faces: NDArray, toward: Array, texel: float = TEXEL) -> "ShadowMap":
+    def of_mesh(vertices: Array, faces: NDArray, toward: Array, texel: float = TEXEL) -> "OrthographicShadowMap":
         """Casts a ray from the sun through each texel of the map of a mesh, vertices (n, 3) [m] and faces (m, 3)."""
         return ShadowCasters(vertices, faces).seen_from(toward, texel)
 
@@ -139,7 +139,7 @@ class ShadowMap:
         return {**place, "low_m": low, "step_m": step, "png": content}
 
     @staticmethod
-    def from_json(table: dict[str, Any]) -> "ShadowMap":
+    def from_json(table: dict[str, Any]) -> "OrthographicShadowMap":
         """Reads the result of `to_json`. Raises ValueError, KeyError or TypeError if it is damaged."""
         toward, origin = (np.array(table[name], np.float64) for name in ("toward", "origin_m"))
         texel, low, step = (float(table[name]) for name in ("texel_m", "low_m", "step_m"))
@@ -152,7 +152,7 @@ class ShadowMap:
         if image is None or image.dtype != np.uint16 or image.ndim != 2 or max(image.shape) > _MAX_SIDE + 1:
             raise ValueError("the shadow map is no 16-bit picture")
         height = np.where(image > 0, low + step * (image.astype(np.float64) - 1.0), -np.inf).astype(np.float32)
-        return ShadowMap(toward, origin, texel, height)
+        return OrthographicShadowMap(toward, origin, texel, height)
 
 
 class ShadowCasters:
@@ -175,11 +175,11 @@ class ShadowCasters:
             if len(index)
         ]
 
-    def seen_from(self, toward: Array, texel: float = TEXEL) -> ShadowMap:
+    def seen_from(self, toward: Array, texel: float = TEXEL) -> OrthographicShadowMap:
         """The map for a sun in the direction of a unit vector (3,); `texel` [m] grows if the place is very wide."""
         toward = np.asarray(toward, np.float64) / np.linalg.norm(toward)
         if not self._parts:
-            return ShadowMap(toward, np.zeros(2), texel, np.full((1, 1), -np.inf, np.float32))
+            return OrthographicShadowMap(toward, np.zeros(2), texel, np.full((1, 1), -np.inf, np.float32))
         right, upward = plane_axes(toward)
         axes = np.stack([right, upward, toward], 1)
         corners = np.array([[f(points @ axes, axis=0) for f in (np.min, np.max)] for points, _, _ in self._parts])
@@ -194,7 +194,7 @@ class ShadowCasters:
         for _, surface, bias in self._parts:
             hit = surface.cast(origins, rays)
             height = np.maximum(height, np.where(hit < 0.0, -np.inf, start - hit - bias))
-        return ShadowMap(toward, low, texel, height.reshape(rows, columns).astype(np.float32))
+        return OrthographicShadowMap(toward, low, texel, height.reshape(rows, columns).astype(np.float32))
 
 
 def plane_axes(toward: Array) -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.geometry.shadow_map import ShadowMap
+from twin.geometry.shadow_map import OrthographicShadowMap
 from twin.types import Array, Array32
 
 TERMS = ("ambient", "direct", "base", "toward", "up", "level")
@@ -39,7 +39,7 @@ _MAX_ENTRY = 100.0  # largest absolute coefficient in a file
 class Sun:
     """A sun with the gain by which it changes pictures of a field under one embedding."""
 
-    shadows: ShadowMap
+    shadows: OrthographicShadowMap
     """The parts of the place that it reaches; contains its direction."""
     coefficients: Array32
     """RGB of each of `TERMS`, shape (6, 3)."""
@@ -74,7 +74,7 @@ class Sun:
         rows = np.array([table["coefficients"][name] for name in TERMS], np.float32)
         if rows.shape != (len(TERMS), 3) or not (np.abs(rows) <= _MAX_ENTRY).all():
             raise ValueError(f"coefficients of the sun of shape {rows.shape}, or beyond ±{_MAX_ENTRY:g}")
-        return Sun(ShadowMap.from_json(table["shadow_map"]), rows)
+        return Sun(OrthographicShadowMap.from_json(table["shadow_map"]), rows)
 
 
 Sunlight = tuple[tuple[Sun, float], ...]
@@ -144,7 +144,7 @@ class SeenSurfaces:
         """Surfaces in some of the pixels."""
         return SeenSurfaces(self.points[rows], self.normals[rows], self.directions[rows], self.far[rows])
 
-    def terms(self, shadows: ShadowMap) -> Array32:
+    def terms(self, shadows: OrthographicShadowMap) -> Array32:
         """The terms of the gain at each pixel under a sun, shape (n, 6)."""
         near, toward = np.float32(1.0) - self.far, shadows.toward.astype(np.float32)
         out = np.zeros((len(near), len(TERMS)), np.float32)
@@ -161,7 +161,7 @@ class SeenSurfaces:
         return out
 
 
-def lit_cosine(shadows: ShadowMap, points: NDArray, normals: NDArray) -> Array32:
+def lit_cosine(shadows: OrthographicShadowMap, points: NDArray, normals: NDArray) -> Array32:
     """Visibility of the sun times the cosine of its incidence, at points (n, 3) [m] with unit normals (n, 3); (n,)."""
     cosine = np.maximum(normals.astype(np.float32) @ shadows.toward.astype(np.float32), 0.0)
     facing = np.flatnonzero(cosine > 0.0)

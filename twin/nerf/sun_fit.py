@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from twin.geometry.images import psnr
-from twin.geometry.shadow_map import TEXEL, ShadowCasters, ShadowMap, angles, direction
+from twin.geometry.shadow_map import TEXEL, OrthographicShadowMap, ShadowCasters, angles, direction
 from twin.nerf import network
 from twin.nerf.fog import REACH, Fog
 from twin.nerf.sun import MAX_GAIN, MIN_GAIN, TERMS, SeenSurfaces, Sun
@@ -102,7 +102,7 @@ def _error(fit: LinearFit) -> float:
     return fit.error
 
 
-def fit_direction(problem: SunProblem, shadows: ShadowMap, fog: Fog) -> list[LinearFit]:
+def fit_direction(problem: SunProblem, shadows: OrthographicShadowMap, fog: Fog) -> list[LinearFit]:
     """Fits each base under a sun with a shadow map, in given fog."""
     terms = problem.seen.terms(shadows).astype(np.float64)
     kept = _kept(fog, problem.distances)[:, None]
