@@ -213,7 +213,7 @@ def test_lengths_of_odometry_give_metres_although_its_heading_drifts(tmp_path: P
     assert set(both["scales"]) == {"camera_height", "odometry"} and both["scale_disagreement"] < 2.0
     with pytest.raises(InputError, match=r"over 0 stretches of 2 m \(need 5\)"):
         scale_from_odometry(cameras, np.full((80, 3), np.nan), 0.03)
-    with pytest.raises(InputError, match=r"vary by \d+%"):
+    with pytest.raises(InputError, match=r"varies by \d+%"):
         scale_from_odometry(cameras, rng.normal(0, 3, (80, 3)).cumsum(0), 0.03)
 
 

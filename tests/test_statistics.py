@@ -169,7 +169,7 @@ def test_constant_scores_have_a_winner_and_violations() -> None:
 def test_shapes_and_numbers_are_checked() -> None:
     with pytest.raises(ValueError, match="shapes"):
         pearson(twin=[0.1, 0.2, 0.3], real=[0.1, 0.2])
-    with pytest.raises(ValueError, match="not a number"):
+    with pytest.raises(ValueError, match="nan or infinite"):
         mmrv(twin=[0.1, float("nan")], real=[0.1, 0.2])
 
 

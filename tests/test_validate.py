@@ -210,12 +210,12 @@ def test_a_changed_scene_is_refused(fresh):
     text = toml.read_text()
     try:
         toml.write_text(text + '\n[[obstacle]]\nkind = "cone"\nstation = 2.0\n')
-        with pytest.raises(InputError, match="obstacles or photo, or"):
+        with pytest.raises(InputError, match="obstacles, photo or"):
             run(fresh, "left", lightings=["day"], episodes=1)
         run(fresh, "left", lightings=["night"], episodes=1)  # of which nothing was driven yet
     finally:
         toml.write_text(text)
-    with pytest.raises(InputError, match="under night from before"):
+    with pytest.raises(InputError, match="under night that were driven before"):
         run(fresh, "left", lightings=["night"], episodes=2)
 
 
@@ -224,7 +224,7 @@ def test_a_table_without_a_record_is_refused(fresh):
     run(fresh, "ahead", lightings=["day"], episodes=1)
     path = fresh / "validation" / "validated.json"
     path.write_text(json.dumps({"field": "made up", "policies": json.loads(path.read_text())["policies"]}))
-    with pytest.raises(InputError, match="under day from before"):
+    with pytest.raises(InputError, match="under day that were driven before"):
         run(fresh, "ahead", lightings=["day"], episodes=2)
 
 

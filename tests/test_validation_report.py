@@ -194,8 +194,8 @@ def test_numbers_have_intervals_and_what_is_missing_is_not_made_up(tmp_path):
     text = page(tmp_path, told([trial("my_module:act")])).text
     assert "not known" in text and "nan" not in text and "None" not in text
     assert "There is no such episode here" in text and "No videos" in text
-    for absent in ("Which policy is better", "The worst light that", "How the policies were trained"):
-        assert (absent in text) == (absent == "The worst light that")
+    for absent in ("Which policy is better", "The worst light for", "How the policies were trained"):
+        assert (absent in text) == (absent == "The worst light for")
 
 
 def test_the_page_shows_the_numbers_of_the_tables(tmp_path):
