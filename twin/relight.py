@@ -5,7 +5,7 @@
 
 This localizes the photo, then fits an appearance embedding and fog so that renderings of the frozen field match the
 photo. The lighting is saved as `<scene>/lightings/afternoon.json`, with an image beside it that shows the photo, the
-field under the fitted lighting, and the field under the most similar filmed lighting. A lighting may have a sun, whose
+field under the fitted lighting, and the field under the most similar filmed lighting. A lighting may have a sun. Its
 direction is given, computed from time and place, or, on demand, searched in the photo (`nerf/sun_fit.py`). Afterwards,
 `twin.load_scene(scene).field()` has the lighting as `lighting="afternoon"` or in mixtures such as
 `"sun:afternoon:0.5"`; environments apply its sun and fog to their images.
