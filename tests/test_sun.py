@@ -245,7 +245,7 @@ def test_unusable_times_are_refused(text):
 
 
 def test_below_the_horizon_there_is_no_sun():
-    with pytest.raises(InputError, match=r"below the horizon.*--sun none"):
+    with pytest.raises(InputError, match=r"below the horizon.*leave --time out"):
         sun_direction(parse_time("2026-06-01T01:00+02:00"), 48.14, 11.58, 0.0)
     with pytest.raises(InputError, match="--location"):
         sun_direction(parse_time("2026-06-01T01:00+02:00"), 99.0, 11.58, 0.0)
@@ -375,8 +375,8 @@ def test_options_give_the_sun(tmp_path):
     scene = filmed_corridor(tmp_path / "corridor")
     for stage in ("capture", "metric"):
         write_stamp(scene.stage(stage), stage)
-    assert find_sun(scene, "none", None, None, None) is None
-    searched = find_sun(scene, None, None, None, None)
+    assert find_sun(scene, None, None, None, None) is None
+    searched = find_sun(scene, "search", None, None, None)
     assert searched is not None and searched.toward is None
     given = find_sun(scene, "120,35", None, None, None)
     assert given is not None and given.toward is not None and angles(given.toward) == pytest.approx((120.0, 35.0))

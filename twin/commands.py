@@ -97,11 +97,11 @@ twin new SCENE VIDEO... writes such a folder.
 def _relight(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Add a lighting to a built scene from one photo: the photo is located, then the field's appearance embedding, "
-        "the fog and the sun are fitted to it. The twin can then be rendered in that light from everywhere."
+        "the fog and, on demand, the sun are fitted to it. The twin can then be rendered in that light from everywhere."
     )
     parser.epilog = (
-        "Without --sun and --time the sun's direction is searched in the photo; a sun is kept only if it explains the "
-        "half of the photo that was not fitted better."
+        "Without --sun and --time the lighting has no sun. A sun is kept only if a fit to half of the photo explains the "
+        "other half better with it."
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("photo", type=Path, help="an image file that shows the place, from near the filmed path")
@@ -109,7 +109,7 @@ def _relight(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sun",
         metavar="AZIMUTH,ELEVATION",
-        help="direction of the sun [°], the azimuth counterclockwise from the scene's x axis; none: no sun",
+        help="direction of the sun [°], the azimuth counterclockwise from the scene's x axis; or search",
     )
     parser.add_argument("--time", help="when the photo was taken, such as 2026-06-01T17:30+02:00; gives the sun")
     parser.add_argument("--location", metavar="LAT,LON", help="where [°]; default: the GPS positions of the frames")

@@ -5,8 +5,8 @@
 
 This localizes the photo, then fits an appearance embedding and fog so that renderings of the frozen field match the
 photo. The lighting is saved as `<scene>/lightings/afternoon.json`, with an image beside it that shows the photo, the
-field under the fitted lighting, and the field under the most similar filmed lighting. A lighting may have a sun, whose
-direction is given, computed from time and place, or searched in the photo (`nerf/sun_fit.py`). Afterwards,
+field under the fitted lighting, and the field under the most similar filmed lighting. A lighting may have a sun. Its
+direction is given, computed from time and place, or, on demand, searched in the photo (`nerf/sun_fit.py`). Afterwards,
 `twin.load_scene(scene).field()` has the lighting as `lighting="afternoon"` or in mixtures such as
 `"sun:afternoon:0.5"`; environments apply its sun and fog to their images.
 """
@@ -43,6 +43,8 @@ _RAYS = 10_000  # the fit uses about this many rays, evenly spaced over the imag
 _START_RAYS = 1000  # number of rays by which the most similar filmed frame is chosen
 _FOG_GAIN = 0.2  # [dB] by which fog must improve the half of the image that is not fitted
 _SUN_GAIN = 0.3  # [dB] by which a sun found in the photo must improve the half of the image that is not fitted
+SEARCH = "search"
+"""Value of the option `--sun` with which the direction of the sun is searched in the photo."""
 _GAP = 4  # [px] between the images
 _LABEL_SIZE = 13  # [px] text size in the images; usual labels fit into an upright photo 270 px wide
 
@@ -201,15 +203,17 @@ def find_sun(
         raise InputError(f"--sun {sun} with --time {time}: expected one of them")
     if time is None and (location is not None or heading is not None):
         raise InputError("--location and --heading need a time, such as --time 2026-06-01T17:30+02:00")
-    if sun == "none":
-        return None
+    if sun == SEARCH:
+        return SunSource(None, "found in the photo")
     if sun is not None:
-        azimuth, elevation = _two_numbers("--sun", sun, "azimuth and elevation in degrees, such as 120,35, or none")
+        azimuth, elevation = _two_numbers(
+            "--sun", sun, f"azimuth and elevation in degrees, such as 120,35, or {SEARCH}"
+        )
         if not 0.0 < elevation <= 90.0 or abs(azimuth) > 360.0:
             raise InputError(f"--sun {sun}: expected an azimuth within ±360 and an elevation from 0 to 90 degrees")
         return SunSource(direction(azimuth, elevation), "given")
     if time is None:
-        return SunSource(None, "found in the photo")
+        return None
     moment = parse_time(time)
     if heading is not None and not np.isfinite(heading):
         raise InputError(f"--heading {heading}: expected the compass angle of the scene's x axis in degrees")
@@ -287,8 +291,8 @@ def relight(
         root: The scene.
         photo: The image file.
         name: Name of the lighting.
-        sun: Azimuth, counterclockwise from the scene's x axis, and elevation of the sun [°], as `120,35`; `none`: no
-            sun. By default, the sun is searched in the photo.
+        sun: Azimuth, counterclockwise from the scene's x axis, and elevation of the sun [°], as `120,35`; `search`:
+            the sun is searched in the photo. By default, there is no sun unless `time` is given.
         time: When the photo was taken, with the offset from UTC, as `2026-06-01T17:30+02:00`.
         location: Latitude and longitude [°], as `48.14,11.58`; by default from the GPS positions of the frames.
         heading: Compass angle of the scene's x axis [°]; by default from the GPS positions of the frames.
@@ -317,7 +321,7 @@ def relight(
     source = find_sun(scene, sun, time, location, heading)
     has_mesh = (scene.stage("mesh") / "visual.npz").exists()
     casters = shadow_casters(scene, BakedField.load(scene.stage("field"))) if source and has_mesh else None
-    if source and source.toward is not None and casters is None:
+    if source and casters is None:
         raise InputError("a sun needs the stage mesh, whose surfaces throw the shadows; run python -m twin.build SCENE")
     image, facts = load_photo(photo, None)
     try:

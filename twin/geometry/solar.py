@@ -58,7 +58,7 @@ def sun_direction(moment: datetime, latitude: float, longitude: float, heading: 
     if not elevation > 0.0:
         raise InputError(
             f"--time {moment.isoformat()}: the sun is {-elevation:.0f}° below the horizon at {latitude:g},{longitude:g}"
-            "; correct --time or --location, or give --sun none"
+            "; correct --time or --location, or leave --time out"
         )
     return direction(heading - compass, elevation)
 
