@@ -199,8 +199,8 @@ def _relight(parser: argparse.ArgumentParser) -> None:
         "the fog and, on demand, the sun are fitted to it. The twin can then be rendered in that light from everywhere."
     )
     parser.epilog = (
-        "Without --sun and --time the lighting has no sun. A sun is kept only if a fit to half of the photo explains the "
-        "other half better with it."
+        "Without --sun and --time the lighting has no sun. A sun is kept only if a fit to half of the photo explains "
+        "the other half better with it."
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("photo", type=Path, help="an image file that shows the place, from near the filmed path")
