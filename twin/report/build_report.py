@@ -24,7 +24,7 @@ from twin.scene import SceneDir, stage_result
 
 _MAX_REPROJECTION = 4.0  # [px] right end of the histogram of reprojection errors
 _MAX_TRACK_LENGTH = 30.0  # [frames] right end of the histogram of track lengths
-_EXCLUDED = "Frames of each film: red pixels show what moved or left, and were not used."
+_EXCLUDED = "Frames of each lighting: red pixels seem to show what moved or left, and were not used."
 
 
 def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
