@@ -35,6 +35,7 @@ _MIN_DIFFERENCE = 0.015  # least difference of a mover's color from the surface'
 _MIN_CONTRAST = 0.12  # the same, as a share of the brightness
 _MIN_CELLS = 8  # least size of a mover in cells
 _WEAK = 0.75  # a mover's cells have at least this difference, as a share of that of its strongest cells
+_FIXED = 0.25  # a cell that is marked in more than this share of a film's frames shows no mover
 _SPREADS = 4.0  # least difference, as a multiple of the frames' median deviation from their median
 
 
@@ -166,9 +167,23 @@ def mover_masks(pixels: TrainingPixels, depths: list[Array32]) -> list[NDArray[n
     # Depths of the field miss what is behind a mover, medians miss thin things: a mover differs from both.
     def find(i: int) -> NDArray[np.bool_]:
         excess = np.fmin(difference(pixels, cells, i), difference(pixels, static, i))
-        return _enlarged(cleaned(excess > 1.0, excess > _WEAK), side, int(pixels.width[i]), int(pixels.height[i]))
+        return cleaned(excess > 1.0, excess > _WEAK)
 
-    return parallel(find, range(len(cells)), "cpu")
+    marked = _without_fixed(parallel(find, range(len(cells)), "cpu"), pixels.cameras.sources)
+    sizes = zip(pixels.width, pixels.height, strict=True)
+    return [_enlarged(mark, side, int(w), int(h)) for mark, (w, h) in zip(marked, sizes, strict=True)]
+
+
+def _without_fixed(marked: list[NDArray[np.bool_]], sources: tuple[str, ...]) -> list[NDArray[np.bool_]]:
+    """Unmarks cells that are marked in many frames of a source: vignetting, and shadows that move with the camera."""
+    out = list(marked)
+    for source in dict.fromkeys(sources):
+        own = [i for i, name in enumerate(sources) if name == source]
+        if len({marked[i].shape for i in own}) == 1:
+            fixed = np.mean([marked[i] for i in own], 0) > _FIXED
+            for i in own:
+                out[i] = marked[i] & ~fixed
+    return out
 
 
 def _enlarged(cells: NDArray[np.bool_], side: int, width: int, height: int) -> NDArray[np.bool_]:
