@@ -105,7 +105,7 @@ def test_the_demo_has_no_mask(name: str) -> None:
 
 @pytest.mark.realdata
 def test_real_films_without_dirt_have_no_mask(real_data: Path) -> None:
-    """The robot in sim2real_day sways before the camera, so it is not fixed to it: nothing is found, and not the road."""
+    """The robot in sim2real_day sways before the camera, so nothing is found."""
     assert all(no_mask(path) for path in sorted((real_data / "driveenv_paper_road").glob("*.mp4")))
     for place in ("kitti_straight", "lund_street"):
         files = sorted(f for f in (real_data / place).rglob("*") if f.suffix.lower() in (".png", ".jpg"))

@@ -1,8 +1,8 @@
 """Finds what is fixed to the camera in a film: dirt and drops on the lens, logos, time stamps, parts of the robot.
 
 There are two kinds of evidence. At a *persistent edge*, the gradient of the brightness has one direction in nearly all
-frames: camera motion averages a scene's gradients out, those of a fixed pattern remain (Weiss, "Deriving intrinsic images
-from image sequences", ICCV 2001). Under forward motion, edges that point to the vanishing point persist, too, such as
+frames. Camera motion averages a scene's gradients out; those of a fixed pattern remain (Weiss, "Deriving intrinsic
+images from image sequences", ICCV 2001). Under forward motion, edges that point to the vanishing point persist, too, such as
 lanes and kerbs; they are rejected by their directions. An *island* hardly varies, while all around it varies much.
 Smooth regions such as the sky have no edges and are no islands.
 
@@ -127,7 +127,7 @@ def _solid_edges(surely: Mask, likely: Mask, direction: NDArray[np.float32]) -> 
         y, x = np.nonzero(edges & surely)
         solid = len(x) >= max(_MIN_EDGE, _SOLID * edges.sum())
         if solid and _crosses_motion(x, y, direction[:, y, x], kept.shape):
-            kept |= edges
+            kept |= edges & _grown(surely & component, 2)
     return kept
 
 
