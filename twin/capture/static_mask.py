@@ -2,8 +2,8 @@
 
 There are two kinds of evidence. At a *persistent edge*, the gradient of the brightness has one direction in nearly all
 frames. Camera motion averages a scene's gradients out; those of a fixed pattern remain (Weiss, "Deriving intrinsic
-images from image sequences", ICCV 2001). Under forward motion, edges that point to the vanishing point persist, too, such as
-lanes and kerbs; they are rejected by their directions. An *island* hardly varies, while all around it varies much.
+images from image sequences", ICCV 2001). Under forward motion, edges that point to the vanishing point persist, too,
+such as lanes and kerbs; they are rejected by their directions. An *island* hardly varies, amid much variation.
 Smooth regions such as the sky have no edges and are no islands.
 
 A missed spot costs a floater, a false mask costs a part of the place. In case of doubt, nothing is found.
