@@ -58,7 +58,7 @@ def static_parts(frames: list[Image]) -> StaticParts:
     if len(frames) < MIN_FRAMES or len({frame.shape for frame in frames}) > 1:
         return StaticParts()
     frames = frames[:: -(-len(frames) // _MAX_FRAMES)]
-    stack = np.stack([cv2.GaussianBlur(frame, (0, 0), 1.0) for frame in frames])
+    stack = np.asarray([cv2.GaussianBlur(frame, (0, 0), 1.0) for frame in frames], np.uint8)
     surely, likely = np.zeros((2, *stack.shape[1:3]), bool)
     direction = np.zeros((2, *surely.shape), np.float32)
     coherent, size = np.zeros((2, *surely.shape), np.float32)
