@@ -120,7 +120,7 @@ def test_without_the_package_one_line_says_what_to_install(tmp_path, monkeypatch
 
 def check(path: Path, pictures, **more) -> str:
     write_film(path, pictures, g="1", **more)
-    return "; ".join(check_film(path))
+    return "; ".join(check_film(path).notes)
 
 
 def test_a_good_film_is_passed_without_a_word(tmp_path):
@@ -144,11 +144,11 @@ def test_what_is_wrong_with_a_film_is_named_with_a_cure(tmp_path):
     times = [100 * k + 60 * (k // 2 * 2) for k in range(20)]
     assert "varying frame rate" in check(tmp_path / "h.mp4", good, times=times)
     write_hdr_film(tmp_path / "i.mp4", street(10, (640, 384)), HLG)
-    assert check_film(tmp_path / "i.mp4") == [
+    assert check_film(tmp_path / "i.mp4").notes == [
         "HDR (HLG): converted to SDR by a fixed curve; turn HDR off for the next film"
     ]
     write_film(tmp_path / "j.mpg", good, codec="mpeg2video", flags="+ildct+ilme")
-    assert any(note.startswith("interlaced: ") for note in check_film(tmp_path / "j.mpg"))
+    assert any(note.startswith("interlaced: ") for note in check_film(tmp_path / "j.mpg").notes)
 
 
 def test_new_says_it_and_makes_the_scene_all_the_same(tmp_path, capsys):

@@ -22,7 +22,7 @@ import numpy as np
 
 from twin import commands, runtime
 from twin.capture.bag_film import BagContents, CameraSeat, read_contents
-from twin.capture.film_check import check_film
+from twin.capture.film_check import FilmCheck, check_film
 from twin.capture.formats import ImageSet, find_model, listed_files, read_colmap, read_transforms
 from twin.capture.frames import detect_kind
 from twin.capture.scale import local_east_north_up
@@ -31,6 +31,7 @@ from twin.config import RANDOMIZED, RESERVED_LIGHTINGS
 from twin.config_file import MAX_NAME, ROBOT_TOML, parse_table
 from twin.errors import InputError, join_names
 from twin.files import digest_file, exists, is_file, read_toml, toml_string, write_text
+from twin.geometry.images import write_image
 from twin.robot import BASE_HEIGHT, HuskyParams
 from twin.scene import SceneDir
 from twin.sysid.identification import toml_text
@@ -51,10 +52,15 @@ _SOURCE = """
 path = {path}
 {topic}lighting = {lighting}  # sources filmed under the same light may share a name
 # Mask image or folder of masks: pixels of value 0 are ignored, such as the robot's hood or a person ahead.
-# mask = "input/mask.png"
+{mask}
 # Calibrate the camera if possible: forward motion biases self-calibration. Lengths in pixels of the upright image.
 # camera = {{ model = "PINHOLE", params = [fx, fy, cx, cy], width = 1920, height = 1080 }}
 """
+
+_NO_MASK = '# mask = "input/mask.png"'
+_MASK = """\
+# Found by twin new: the black pixels of this mask are the same in all frames. If that is wrong, delete the next line.
+mask = {path}"""
 
 _REST = """
 [capture]
@@ -111,23 +117,46 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
     inputs = root / "input"
     inputs.mkdir(parents=True, exist_ok=True)
     text = _HEAD.format(name=toml_string(root.resolve().name))
+    notes: list[str] = []
     for film in films:
         path = _import_film(film, inputs)
         lighting = _lighting(path, detect_kind(film))
         chosen = f"topic = {toml_string(bags[film].topics['pictures'])}\n" if film in bags else ""
         path_text = toml_string(("input" / path).as_posix())
-        text += _SOURCE.format(path=path_text, topic=chosen, lighting=toml_string(lighting))
+        mask = _NO_MASK
+        if detect_kind(film) == "video":
+            check = check_film(film)
+            found, mask = _mask_lines(check, inputs, path)
+            notes += [f"{film.name}: {note}" for note in check.notes + found]
+        text += _SOURCE.format(path=path_text, topic=chosen, lighting=toml_string(lighting), mask=mask)
     seat = next((bag.seat for bag in bags.values() if bag.seat), None)
     seat_used = seat is not None and _write_seat(root / ROBOT_TOML, seat, next(b for b in bags.values() if b.seat))
     scales = _scale_lines(list(bags.values()), camera_height, seat if seat_used else None)
     write_text(scene.config_file, text + _REST.format(**scales))
     for bag in bags.values():
         runtime.log_line(_taken(bag))
-    for film in films:
-        if detect_kind(film) == "video":
-            for note in check_film(film):
-                runtime.log_line(f"{film.name}: {note}")
+    for note in notes:
+        runtime.log_line(note)
     return scene.config_file
+
+
+def _mask_lines(check: FilmCheck, inputs: Path, path: Path) -> tuple[list[str], str]:
+    """Writes the mask of what is fixed to the camera, unless a file of that name exists.
+
+    Args:
+        path: The film, relative to the folder `inputs`.
+
+    Returns:
+        Sentences for the user, and the line about the mask for `scene.toml`.
+    """
+    if check.mask is None:
+        return [check.static_note] if check.static_note else [], _NO_MASK
+    file = path.with_name(f"{path.stem}_mask.png")
+    name = ("input" / file).as_posix()
+    if exists(inputs / file):
+        return [f"{check.static_note}; {name} exists and is kept; to use it, set mask in scene.toml"], _NO_MASK
+    write_image(inputs / file, check.mask)
+    return [f"{check.static_note}; masked by {name}: look at it"], _MASK.format(path=toml_string(name))
 
 
 def _scale_lines(bags: list[BagContents], camera_height: float | None, seat: CameraSeat | None) -> dict[str, str]:

@@ -1,10 +1,11 @@
-"""Checks a film before the build: finds defects that reduce the twin's quality, and says how to film better.
+"""Checks a film before the build: finds defects that reduce the twin's quality and parts that are fixed to the camera.
 
 Key frames spread over the film are decoded; if these are too few, other frames are decoded, too. The timing comes from
 all packets. Stabilization and rolling shutter are not checked, because they leave no trace in the file.
 """
 
 import contextlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -14,9 +15,10 @@ import cv2
 import numpy as np
 
 from twin.capture.hdr import NAMES, hdr_transfer
+from twin.capture.static_mask import MIN_FRAMES, static_parts
 from twin.capture.video import FilmTiming, fitted_size, probe, sharpness, upright
 from twin.geometry.images import resize
-from twin.types import Array
+from twin.types import Array, Image
 
 _SAMPLES = 60
 _WIDTH = 320  # [px] width of the scaled-down frames that are checked
@@ -34,18 +36,24 @@ _UNEVEN = 1.5  # largest good ratio of the 95 % quantile to the median of the ti
 _MIN_TRUSTED = 8  # fewest samples from which shares and quantiles are computed
 
 
-def check_film(path: Path) -> list[str]:
-    """One sentence per defect of a film, each with its cure; empty without defects.
+@dataclass(frozen=True)
+class FilmCheck:
+    """The result of a check."""
 
-    Raises InputError: see `probe`.
-    """
+    notes: list[str]  # one sentence per defect of the film, each with its cure; empty without defects
+    static_note: str = ""  # a sentence about parts of the picture that are fixed to the camera; empty if none are found
+    mask: Image | None = None  # 0 = fixed to the camera, 255 elsewhere, shape (h, w), at the film's upright size
+
+
+def check_film(path: Path) -> FilmCheck:
+    """Checks a film. Raises InputError: see `probe`."""
     timing = probe(path)
     notes = _timing_notes(timing)
     frames = _samples(path, "NONKEY")
-    if len(frames) < _MIN_TRUSTED:
+    if len(frames) < MIN_FRAMES:
         frames = _samples(path, "DEFAULT")
     if not frames:
-        return [*notes, "no frame can be decoded; copy the film again from the camera"]
+        return FilmCheck([*notes, "no frame can be decoded; copy the film again from the camera"])
     first = frames[0]
     if transfer := hdr_transfer(first):
         notes.append(f"HDR ({NAMES[transfer]}): converted to SDR by a fixed curve; turn HDR off for the next film")
@@ -55,7 +63,17 @@ def check_film(path: Path) -> list[str]:
         )
     if max(first.width, first.height) < _MIN_SIDE:
         notes.append(f"{first.width}x{first.height}: small pictures make a soft twin; film in 1920x1080")
-    return notes + _picture_notes(frames)
+    small = []
+    for frame in frames:
+        image = upright(frame)
+        size = (image.shape[1], image.shape[0])
+        small.append(np.asarray(resize(image, *fitted_size(*size, _WIDTH)), np.uint8))
+    static = static_parts(small)
+    mask = None
+    if static.mask is not None:
+        used = np.where(static.mask, 0, 255).astype(np.uint8)
+        mask = np.asarray(cv2.resize(used, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+    return FilmCheck(notes + _picture_notes(small), static.note, mask)
 
 
 def _timing_notes(timing: FilmTiming) -> list[str]:
@@ -93,12 +111,7 @@ def _samples(path: Path, skip: Literal["NONKEY", "DEFAULT"]) -> list[av.VideoFra
     return found
 
 
-def _picture_notes(frames: list[av.VideoFrame]) -> list[str]:
-    small = []
-    for frame in frames:
-        image = upright(frame)
-        width, height = fitted_size(image.shape[1], image.shape[0], _WIDTH)
-        small.append(np.asarray(resize(image, width, height), np.uint8))
+def _picture_notes(small: list[Image]) -> list[str]:
     gray = [np.asarray(cv2.cvtColor(one, cv2.COLOR_RGB2GRAY), np.uint8) for one in small]
     brightness = np.array([float(one.mean()) for one in gray])
     notes = []
@@ -108,7 +121,7 @@ def _picture_notes(frames: list[av.VideoFrame]) -> list[str]:
         notes.append(
             "overexposed: much of the picture is white; lock a shorter exposure, measured on the road, not the sky"
         )
-    if len(frames) < _MIN_TRUSTED:
+    if len(small) < _MIN_TRUSTED:
         return notes
     detail = np.array([sharpness(one) for one in gray])
     soft = float((detail < _BLURRED * np.quantile(detail, 0.9)).mean())
