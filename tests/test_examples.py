@@ -40,6 +40,7 @@ def test_sac_learns(scene, tmp_path, capsys):
     assert " after " in capsys.readouterr().out and out.exists()
 
 
+@pytest.mark.slow
 def test_imitation_drives_as_it_was_shown(scene, tmp_path, monkeypatch, capsys):
     pytest.importorskip("pyarrow", reason="needs pyarrow")
     root, drives = str(scene), tmp_path / "drives"

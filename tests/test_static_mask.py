@@ -104,6 +104,7 @@ def test_the_demo_has_no_mask(name: str) -> None:
     assert no_mask(Path(__file__).parents[1] / f"scenes/demo/input/{name}.mp4")
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_real_films_without_dirt_have_no_mask(real_data: Path) -> None:
     """The robot in sim2real_day sways before the camera, so nothing is found."""

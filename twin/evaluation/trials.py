@@ -15,6 +15,7 @@ import csv
 import difflib
 import gzip
 import io
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -271,7 +272,7 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
             raise InputError(f"{path} is empty; its first line must be {wanted}")
         missing = [name for name in needed if name not in header]
         unknown = [name for name in header if name not in (*needed, *optional)]
-        twice = [name for name in header if header.count(name) > 1]
+        twice = [name for name, times in Counter(header).items() if times > 1]
         faults = [
             *(f"no column {name}" for name in missing),
             *(f"unknown column {name!r}" for name in unknown),
