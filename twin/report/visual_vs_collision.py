@@ -130,7 +130,8 @@ def compare_geometry(
         - `standing_median_m`: median distance of visible obstacles from the nearest collision geometry.
         - `leak_share`: share of the points on visible obstacles further than `LARGE_ERROR` from collision geometry.
         - `ghost_share`: share of the points on parts in view further than `LARGE_ERROR` from visible geometry.
-        - `corridor_leak_m`, `corridor_ghost_m`: largest visual-only and collision-only difference in the corridor.
+        - `corridor_leak_m`, `corridor_ghost_m`: largest visual-only and collision-only difference in the corridor; the
+          latter is at most `MAX_DEPTH`.
         - `unfilmed_ghost_m`: largest collision-only difference where no film shows the corridor from two directions.
           These points do not count for `corridor_ghost_m`.
         - `along`: per meter of the route, the maxima `leak_m` and `ghost_m`, and the median `ground_m`.
@@ -154,6 +155,7 @@ def compare_geometry(
     # Size of collision-only geometry: the height difference on the ground, the gap on a part.
     depth_below = np.where(np.isfinite(height), -np.minimum(height, 0.0), FAR)
     behind = np.where(views.visual_depth > views.collision_depth, np.where(views.is_ground, depth_below, gap), 0.0)
+    behind = np.minimum(behind, MAX_DEPTH)  # where nothing at all is visible, the gap has no meaning
     filmed = _depth_determined(cameras, collision, hit)
     visual_only, collision_only = np.where(inside, height, 0.0), np.where(hit & filmed, behind, 0.0)
     out["corridor_leak_m"], out["corridor_ghost_m"] = float(max(visual_only.max(), 0.0)), float(collision_only.max())
