@@ -280,7 +280,7 @@ def by_hand(place, text: str) -> None:
 
 
 def test_the_verb_keeps_other_fields_and_prints_the_fit(place, film, found_once, capsys):
-    """What robot.toml had stays, an earlier film's focal length is found anew; the pictures are of the same spots."""
+    """Values in robot.toml stay, an earlier film's focal length is found anew; the pictures show the same spots."""
     robot = place.root / "robot.toml"
     robot.write_text("friction = 0.6\ncamera_intrinsics = [400.0, 400.0, 160.0, 120.0]\ncamera_size = [320, 240]\n")
     by_hand(place, "camera_offset = [0.3, 0.05]\nmax_speed = 0.8\n")

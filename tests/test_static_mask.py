@@ -1,4 +1,4 @@
-"""What is fixed to the camera is found in films, and nothing else is."""
+"""The search in films for parts that are fixed to the camera: it finds these and nothing else."""
 
 from pathlib import Path
 

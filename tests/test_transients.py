@@ -9,12 +9,15 @@ from analytic import AnalyticField, Box
 from test_stereo import HEIGHT, PLACE, WIDTH, K, pattern, points_of, poses
 
 from twin import runtime
-from twin.config import NerfConfig
+from twin.config import NerfConfig, SceneConfig, SourceConfig
+from twin.files import write_json
 from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, unproject
 from twin.geometry.images import write_image
+from twin.nerf import trainer as training
 from twin.nerf import transients
 from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths
 from twin.nerf.trainer import Trainer
+from twin.scene import SceneDir
 
 CAR = Box(7.0, -2.0, 3.6, 1.7, 1.4)
 MOVING = slice(30, 66)  # rows of a mover
@@ -169,3 +172,40 @@ def test_photos_of_many_lightings_have_no_transients(tmp_path):
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     assert not np.array(transients.mover_masks(pixels, cell_depths(pixels, depth))).any()
     assert not transients.left_objects(pixels)
+
+
+def test_an_object_that_left_is_excluded_before_training_begins(tmp_path, monkeypatch):
+    day, day_depth = film(tmp_path, "day", AnalyticField(boxes=(*PLACE.boxes, CAR), amplitude=0.0))
+    night, night_depth = film(tmp_path, "night", PLACE, gain=0.3)
+    depth = np.concatenate([day_depth, night_depth])
+    monkeypatch.setattr(training, "stereo_depths", lambda pixels, *_: (supervision(pixels, depth), {}))
+    config = NerfConfig(steps=10, rays=256, samples=8, levels=3, log2_table=10, max_width=WIDTH)
+    trainer = Trainer(joined(day, night), SparsePoints.empty(), config, 0, "cpu")
+    assert len(trainer.left) == 1 and not trainer.steps_done
+    shows = np.concatenate([(day_depth < night_depth - 0.01).ravel(), np.zeros(night_depth.size, bool)])
+    assert trainer.pixels.unmasked[shows].mean() < 0.03 and trainer.pixels.unmasked.mean() > 0.6
+
+
+def test_baking_uses_the_pixels_that_training_used(tmp_path, monkeypatch):
+    scene, out = SceneDir(tmp_path / "scene"), tmp_path / "out"
+    cameras, _ = film(tmp_path, "day", PLACE)
+    for folder in (scene.stage("metric"), out):
+        folder.mkdir(parents=True)
+    cameras.save(scene.stage("metric"))
+    points_of(cameras).save(scene.stage("metric"))
+    write_json(scene.stage("metric") / "metric.json", {})
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[:, :40] = True
+    monkeypatch.setattr(training, "mover_masks", lambda pixels, _: [mask] * len(pixels.cameras))
+    baked_from = []
+
+    def stop(_, pixels: TrainingPixels, *__) -> None:
+        baked_from.append(pixels)
+        raise InterruptedError
+
+    monkeypatch.setattr(training, "bake", stop)
+    nerf = NerfConfig(steps=4, rays=256, samples=8, levels=3, log2_table=10, max_width=WIDTH, stereo=False)
+    with pytest.raises(InterruptedError):
+        training.run(scene, SceneConfig(name="x", source=(SourceConfig(path="a"),), nerf=nerf), out)
+    assert (baked_from[0].unmasked == np.tile(~mask.ravel(), len(cameras))).all()
+    assert (out / "excluded.jpg").is_file()

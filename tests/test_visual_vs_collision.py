@@ -28,7 +28,7 @@ STATIONS = (0.0, 1.0, 2.0)
 
 
 class SolidField:
-    """What MuJoCo's own rays find, one by one."""
+    """Hits of MuJoCo's own rays, one by one."""
 
     lightings = ("day",)
 

@@ -74,7 +74,7 @@ class Irradiance:
     known_sun: Array | None = None
     """Direction to the sun, shape (3,), if the lighting has one; None: `sun` estimates it."""
     sun_share: Array | None = None
-    """That sun's share of the light at `xy`, shape (k,)."""
+    """Share of the light at `xy` that comes from the known sun, shape (k,)."""
     _cache: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
     """Ground irradiance by position: most objects stand still, so positions recur."""
 

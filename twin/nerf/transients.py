@@ -241,6 +241,7 @@ _VOXEL = 0.25  # [m] side
 _REACH = 18.0  # [m] from the camera, within which stereo is accurate enough
 _BEHIND = (0.5, 0.08)  # surface this far behind a voxel shows that it is empty: [m], and as a fraction of the depth
 _AT = (0.3, 0.04)  # surface this far from a voxel shows that it is occupied: the same units
+_MIN_KNOWN = 3  # least number of known depths among a voxel's cell and its eight neighbors, to find the voxel empty
 _MIN_FRAMES = 3  # least number of frames that show a voxel empty, and occupied
 _MIN_VOXELS = 24  # smaller objects are left alone: noise of stereo looks like them
 _HIDDEN = 0.7  # [m] an object is hidden by surfaces that are nearer than its nearest voxel by more than this
@@ -297,10 +298,10 @@ def left_objects(pixels: TrainingPixels) -> list[LeftObject]:
         inside = (z > 0.5) & (row >= 1) & (column >= 1) & (row < known.shape[0] - 1) & (column < known.shape[1] - 1)
         near, z, row, column = near[inside], z[inside], row[inside], column[inside]
         window = np.stack([known[row + a, column + b] for a in (-1, 0, 1) for b in (-1, 0, 1)])
-        at = np.nanmin(np.where(np.isnan(window), np.inf, np.abs(window - z)), 0) < np.maximum(_AT[0], _AT[1] * z)
-        some = (~np.isnan(window)).sum(0) >= 3
-        nearest = np.where(np.isnan(window), np.inf, window).min(0)
-        behind = some & (nearest > z + np.maximum(_BEHIND[0], _BEHIND[1] * z))
+        enough = np.isfinite(window).sum(0) >= _MIN_KNOWN
+        window = np.where(np.isnan(window), np.inf, window)
+        at = np.abs(window - z).min(0) < np.maximum(_AT[0], _AT[1] * z)
+        behind = enough & (window.min(0) > z + np.maximum(_BEHIND[0], _BEHIND[1] * z))
         occupied[near, index[i]] += at
         empty[near, index[i]] += behind
     is_there = (occupied >= _MIN_FRAMES) & (occupied > 2 * empty)
