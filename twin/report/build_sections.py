@@ -198,7 +198,13 @@ def _transient_facts(field: dict[str, Any]) -> list[Fact]:
     share, objects = pick(field, "transients.moving_share"), pick(field, "transients.objects") or []
     if share is None:
         return []
-    facts = [Fact("moving things", number(share, "{:.1%}"), "of the training pixels; left out, with moving shadows")]
+    facts = [
+        Fact(
+            "moving things",
+            number(share, "{:.1%}"),
+            "of the training pixels look like it and were left out; 1% is common where nothing moved",
+        )
+    ]
     for k, one in enumerate(objects, 1):
         size, (x, y, _) = sorted(one["size"], reverse=True), one["center"]
         text = f"{size[0]:.1f} m long, at x = {x:.1f}, y = {y:.1f} m"
