@@ -17,7 +17,7 @@ the weather of a trial, for `twin.relight`. All seeds are fixed in the code, so 
 
 import argparse
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,8 +36,10 @@ from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass
 from twin.reality.lighting import LIGHTINGS, WEATHER
+from twin.reality.place_objects import KnownPlace
 from twin.reality.place_sampling import draw
 from twin.reality.place_spec import PlaceSpec, tasks
+from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_test import Setup
 from twin.reality.road_task import RoadTask, read_task
 from twin.reality.traffic import parked_cars
@@ -55,11 +57,18 @@ def _tiny(plan: FilmingPlan) -> FilmingPlan:
     return replace(plan, lightings=plan.lightings[:2], length=12.0, width=320, height=180)
 
 
-def film(plan: FilmingPlan, out: Path, number: int = 0, traffic: bool = False) -> Truth:
+def film(
+    plan: FilmingPlan,
+    out: Path,
+    number: int = 0,
+    traffic: bool = False,
+    renderer_of: Callable[[str, KnownPlace], PlaceRenderer] | None = None,
+) -> Truth:
     """Films every pass of a plan under every lighting into the scene folder `out`, and saves the truth there.
 
     With `traffic`, walkers and cars move through every film, and cars are parked in all lightings but the last. The
-    truth does not contain them.
+    truth does not contain them. `renderer_of` returns the renderer for a lighting and a place; by default that is
+    `filming.Renderer`, the only one that shows moving traffic.
 
     Raises:
         InputError: `out` is not empty and has no folder `truth`.
@@ -74,9 +83,10 @@ def film(plan: FilmingPlan, out: Path, number: int = 0, traffic: bool = False) -
     films, lightings = {}, {}
     for lighting in plan.lightings:
         there = replace(place, objects=[*place.objects, *(parked if lighting != plan.lightings[-1] else [])])
+        renderer = renderer_of(lighting, there) if renderer_of else None
         for one in plan.passes:
             name = film_name(lighting, one)
-            times, poses = film_pass(lighting, there, plan, out / "input" / f"{name}.mp4", one, traffic)
+            times, poses = film_pass(lighting, there, plan, out / "input" / f"{name}.mp4", one, traffic, renderer)
             films[name] = TrueFilm(times, poses, *depth_maps(lighting, place, plan, poses))
             lightings[name] = lighting
     size = plan.width, plan.height
@@ -171,7 +181,7 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
             options.lightings = list(WEATHER)
         trials = real_test.run(
             options.policy,
-            _task(options.task, options.scene, setup.place),
+            scene_task(options.task, options.scene, setup.place),
             [*(options.lightings or []), *days],
             options.trials,
             options.out,
@@ -183,8 +193,12 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
         print(setup)
 
 
-def _task(given: str, scene: Path | None, place: int) -> str | RoadTask:
-    """The task in a JSON file, transformed from its scene's frame to the true frame; a task's name stays as it is."""
+def scene_task(given: str, scene: Path | None, place: int) -> str | RoadTask:
+    """The task in a JSON file, transformed from its scene's frame to the true frame; a task's name stays as it is.
+
+    Raises:
+        InputError: no scene, a scene without truth, or one of another place.
+    """
     if not given.endswith(".json"):
         return given
     if scene is None:

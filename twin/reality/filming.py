@@ -20,6 +20,7 @@ from twin.reality import SEED, true_world
 from twin.reality.lighting import Lighting, apply_haze
 from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.place_spec import PassSpec, PlaceSpec
+from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.traffic import Mover, movers
 from twin.runtime import track
 from twin.types import Array
@@ -226,23 +227,29 @@ def exposures(lighting: Lighting, times: Array) -> Array:
 
 
 def film_pass(
-    lighting: str, place: KnownPlace, plan: FilmingPlan, path: Path, one: PassSpec = OUT, traffic: bool = False
+    lighting: str,
+    place: KnownPlace,
+    plan: FilmingPlan,
+    path: Path,
+    one: PassSpec = OUT,
+    traffic: bool = False,
+    renderer: PlaceRenderer | None = None,
 ) -> tuple[Array, Array]:
     """Writes the film of one pass under one lighting; returns its times (n,) [s] and poses (n, 4, 4).
 
-    With `traffic`, walkers and cars move through the film.
+    With `traffic`, walkers and cars move through the film; no other `renderer` than the default one shows them.
     """
     name = film_name(lighting, one)
     times, poses = trajectory(plan, place.route, name, one)
     light = place.lightings[lighting]
     gains = exposures(light, times)
     rng = np.random.default_rng([SEED, 13, sum(map(ord, name))])
-    render = Renderer(lighting, place, plan, movers(place, name, times, poses) if traffic else ())
+    render = renderer or Renderer(lighting, place, plan, movers(place, name, times, poses) if traffic else ())
     steps = track(list(zip(times, poses, gains, strict=True)), f"film {name}", unit="frame")
     rays = unproject(pixel_grid(plan.width, plan.height), plan.intrinsics)
 
     def frame(time: float, pose: Array, gain: float) -> NDArray[np.uint8]:
-        if traffic:
+        if isinstance(render, Renderer) and traffic:
             render.move_to(time)
         ground = float(place.route.ground_height(pose[:2, 3]))
         return sensor_image(rng, apply_haze(*render(pose), rays, pose, light, ground), light, gain)

@@ -14,6 +14,7 @@ coordinates, 1997). Their sum is d · ((b − a) × (c − a)), and z = det / su
 # mypy: disable-error-code="call-overload, var-annotated"
 # (kernels use Warp's own types, which mypy does not know)
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,13 @@ from numpy.typing import NDArray
 
 from twin.types import Array, Array32
 from twin.warp_runtime import wp
+
+PlaceRenderer = Callable[[Array], tuple[Array32, Array32]]
+"""Renders a place under one lighting.
+
+It takes camera_to_world (4, 4) with OpenCV axes, and returns linear RGB (h, w, 3) and z-depth (h, w) [m]; the sky has
+depth 0.
+"""
 
 # ---- model to arrays
 

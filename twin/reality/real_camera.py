@@ -20,7 +20,7 @@ from twin.geometry.cameras import pixel_grid, unproject
 from twin.reality import SEED
 from twin.reality.filming import FilmingPlan, smooth_noise
 from twin.reality.lighting import Lighting, apply_haze
-from twin.reality.rasterizer import Rasterizer
+from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_robot import RealRobot
 from twin.types import Array, Array32, Image
 
@@ -231,7 +231,7 @@ class RealCamera:
 
     def __init__(
         self,
-        rasterizer: Rasterizer,
+        renderer: PlaceRenderer,
         lighting: Lighting,
         camera: HiddenCamera,
         size: tuple[int, int],
@@ -239,13 +239,13 @@ class RealCamera:
     ) -> None:
         """
         Args:
-            rasterizer: Renders the place under the lighting, with `intrinsics_of(camera, size)`.
+            renderer: Renders the place under the lighting, with `intrinsics_of(camera, size)`.
             lighting: Gives exposure, white balance, noise and haze.
             camera: The camera.
             size: Width, height [px].
             rng: Random generator of the trial.
         """
-        self.camera, self._lighting, self._rasterizer, self._rng = camera, lighting, rasterizer, rng
+        self.camera, self._lighting, self._renderer, self._rng = camera, lighting, renderer, rng
         self._size, self._intrinsics = size, intrinsics_of(camera, size)
         self._rays = unproject(pixel_grid(*size), self._intrinsics).astype(np.float32)
         self._seat = camera_to_base(camera)
@@ -271,7 +271,7 @@ class RealCamera:
         pose = self.pose(robot, middle)
         motion = motion_between(self.pose(robot, middle - half), self.pose(robot, middle + half), pose)
         ground = float(robot.base_to_world(middle)[2, 3])
-        return self.develop(*self._rasterizer(pose), pose, motion, ground, robot.time)
+        return self.develop(*self._renderer(pose), pose, motion, ground, robot.time)
 
     def develop(self, light: Array32, depth: Array32, pose: Array, motion: Array, ground: float, time: float) -> Image:
         """A picture (h, w, 3) of the light (h, w, 3) and z-depth (h, w) [m] at a pose (4, 4).

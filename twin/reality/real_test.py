@@ -29,7 +29,7 @@ from twin.learn.policy import JSON, Policy, load_policy
 from twin.reality import REALITY_VERSION, true_world
 from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import day_number, weather, weather_index
-from twin.reality.rasterizer import Rasterizer
+from twin.reality.rasterizer import PlaceRenderer, Rasterizer
 from twin.reality.real_camera import TRAINED as camera_ranges
 from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of
 from twin.reality.real_judge import RealJudge
@@ -107,17 +107,25 @@ class RealTest:
 
     __test__ = False  # not a pytest class
 
-    def __init__(self, task: RoadTask, setup: Setup | None = None, size: tuple[int, int] = (160, 90)) -> None:
+    def __init__(
+        self,
+        task: RoadTask,
+        setup: Setup | None = None,
+        size: tuple[int, int] = (160, 90),
+        renderer_of: Callable[[str, tuple[float, ...], tuple[int, int], int], PlaceRenderer] = rasterizer,
+    ) -> None:
         """
         Args:
             task: The task.
             setup: Place, robot and camera.
             size: Width, height of pictures [px].
+            renderer_of: Returns the renderer for a weather, intrinsics fx, fy, cx, cy [px], a size (width, height) [px]
+                and a place's number.
 
         Raises:
             InputError: no such place, robot or camera.
         """
-        self.task, self.setup, self.size = task, setup or Setup(), size
+        self.task, self.setup, self.size, self._renderer_of = task, setup or Setup(), size, renderer_of
         self.robot = RealRobot(draw_robot(self.setup.robot), place_on_test_day(self.setup.place))
         self.camera = draw_camera(self.setup.camera)
         self.judge = RealJudge(task)
@@ -127,10 +135,9 @@ class RealTest:
         start = self.task.sample_start(np.random.default_rng([seed, _START]))
         self.robot.set_pose(*start, np.random.default_rng([seed, _ROBOT]))
         self.judge.begin(*start[:2])
-        raster = rasterizer(
-            lighting, tuple(intrinsics_of(self.camera, self.size).tolist()), self.size, self.setup.place
-        )
-        return RealCamera(raster, weather(lighting), self.camera, self.size, np.random.default_rng([seed, _CAMERA]))
+        intrinsics = tuple(intrinsics_of(self.camera, self.size).tolist())
+        renderer = self._renderer_of(lighting, intrinsics, self.size, self.setup.place)
+        return RealCamera(renderer, weather(lighting), self.camera, self.size, np.random.default_rng([seed, _CAMERA]))
 
     def step(self, v: float, yaw_rate: float) -> None:
         """Drives one control step under a command [m/s], [rad/s], clipped to the task's limits, and asks the judge."""
