@@ -1,4 +1,4 @@
-"""Runs a command line: parses its options, calls its work, and prints errors as one line with a cure.
+"""Runs a command line: parses its options, calls the command's function, and prints errors as one line with a cure.
 
 | exit status | meaning |
 |---|---|

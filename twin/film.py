@@ -6,9 +6,9 @@
     python -m twin.film scenes/demo --lerobot drives --episodes 20
 
 The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is a scripted
-route follower, or a policy that `twin.validate` accepts; then the environment has the policy's options. Task, lighting
-and seed determine the episode, such as that of a row of `validation/episodes.csv`. `--rerun` also writes the drive as a
-recording for Rerun. With `--lerobot`, drives are recorded as a dataset for learning instead of a film.
+route follower, or a policy that `twin.validate` accepts; a policy also gives the environment's options. Task, lighting
+and seed determine the episode, so any row of `validation/episodes.csv` can be filmed. `--rerun` also writes the drive
+as a recording for Rerun. With `--lerobot`, drives are recorded as a dataset for learning instead of a film.
 """
 
 import argparse

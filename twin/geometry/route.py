@@ -22,7 +22,7 @@ _AS_LONG = 0.98  # lines longer than this share of the longest count as equally 
 _ASIDE = 0.6  # [m] largest lateral offset between a pass and its continuation; the joined line runs midway
 _BEYOND = 3.0  # [m] least length that a continuation adds
 _AGREE = np.cos(np.deg2rad(40.0))  # least cosine between the headings of joined passes
-_BLEND = 3.0  # [m] before and after a join over which the line goes from one pass to the other
+_BLEND = 3.0  # [m] length before and after a join over which the line passes from one pass to the other
 _MAX_FOLD = np.cos(np.deg2rad(120.0))  # cosine of the greatest change of heading over `_FOLD_CHORD`
 _FOLD_CHORD = 2.0  # [m] length along the line between the headings that are compared
 _OFF_FILM = 1.0  # [m] largest distance of a line through way points from the filmed paths
@@ -35,13 +35,13 @@ class Route:
     line: Array
     """Points about 0.25 m apart in driving order, shape (m, 2) [m]."""
     chosen: tuple[str, ...]
-    """Names of its passes in driving order; empty if way points were given."""
+    """Names of these passes in driving order; empty if way points were given."""
     passes: tuple[FilmedPass, ...]
-    """All passes."""
+    """All filmed passes, chosen or not."""
 
 
 def filmed_route(cameras: Cameras, config: RouteConfig | None = None) -> Route:
-    """The route of a place.
+    """Chooses the route among the filmed passes.
 
     Raises:
         InputError: the route is shorter than 2 m or folds back on itself, passes that are to be joined lie apart, a
@@ -150,7 +150,7 @@ def _joined(line: Array, one: FilmedPass, max_gap: float) -> Array:
 
 
 def _blended(line: Array, rest: Array) -> Array:
-    """A line joined to its continuation: gradually if they run side by side, by a straight piece across a gap."""
+    """A line joined to its continuation: gradually if they run side by side, by a straight line across a gap."""
     offset = rest[0] - line[-1]
     if np.linalg.norm(offset) > _ASIDE:
         return resample(np.concatenate([line, rest]), curved=False)
