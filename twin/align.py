@@ -6,7 +6,7 @@
     python -m twin.align husky drive.npz --out aligned
 
 System identification fits the controller's limits and latency, the servo's lag, tires, ground, center of mass and
-effective wheel radii to half of the log. The other half is held out; it scores this fit and a kinematic model
+effective wheel radii to half of the log. The other half is held out to score this fit, and a kinematic model
 that is fitted to the same data. Each value has a standard error; parameters that the log does not determine keep their
 values and are listed. Results are `robot.toml`, which the scene's next build uses, and `alignment/` with `align.json`
 and four figures.
@@ -113,7 +113,7 @@ def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalib
     params = load_config(scene.config_file).robot
     given = {name: by_hand[name] for name in _INTRINSICS_FIELDS if name in by_hand}
     lens = parse_table(HuskyParams, given, str(scene.config_file))
-    # Intrinsics in robot.toml may come from an earlier film, which this one replaces.
+    # Intrinsics in robot.toml may come from an earlier film, which this film replaces.
     params = replace(params, camera_intrinsics=lens.camera_intrinsics, camera_size=lens.camera_size)
     result, frames = calibrate_camera(film, scene, params, topic)
     kept = {name: value for name, value in read_robot(root / ROBOT_TOML).items() if name not in _INTRINSICS_FIELDS}

@@ -51,7 +51,7 @@ def film(
     Args:
         root: A built scene, or a pack.
         task: See `twin.load`.
-        policy: A run's name, or see `twin.learn.policy.load_policy`; None: the scripted driver.
+        policy: A run's name, or a source as in `twin.learn.policy.load_policy`; None: the scripted driver.
         seed: Seed of the episode.
         out: The mp4 file; by default `films/<task>_<lighting>_<seed>.mp4` in the scene's folder, or for a pack
             `<pack>_<task>_<lighting>_<seed>.mp4` in the working folder.
@@ -206,7 +206,7 @@ def command(given: argparse.Namespace) -> None:
             print(drives_summary(drives, given.lerobot))
         return
     if given.episodes != 1:
-        raise InputError(f"--episodes {given.episodes}: a film shows one drive; several are for --lerobot DIR")
+        raise InputError(f"--episodes {given.episodes}: a film shows one drive; for several, use --lerobot DIR")
     path, episode = film(given.scene, *driven, given.out, given.trust, given.rerun, **options)
     if not given.quiet:
         print(summary(path, episode))

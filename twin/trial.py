@@ -304,7 +304,7 @@ def command(options: argparse.Namespace) -> None:
             print(drives_summary(drives, options.lerobot))
         return
     if len(options.bag) > 1:
-        raise InputError(f"{len(options.bag)} bags: a bag is a trial; several are for --lerobot DIR")
+        raise InputError(f"{len(options.bag)} bags: expected the bag of one trial; for several, use --lerobot DIR")
     for name in ("policy", "lighting"):
         if not getattr(options, name):
             raise InputError(f"a trial needs --{name}; without a policy, --lerobot DIR records drives to learn from")

@@ -56,7 +56,7 @@ MIN_POSES = 10
 many."""
 # A topic with one of these words in its name is used for pictures only if it is given explicitly.
 _OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")
-# [ns] If header and recording times differ by more than this in the median, the headers are of another clock.
+# [ns] If header and recording times differ by more than this in the median, the header times are of another clock.
 _CLOCK = 1_000_000_000
 _MAX_METADATA = 16 << 20  # [bytes] largest accepted metadata.yaml
 _MAX_CHUNK = 1 << 30  # [bytes] largest accepted MCAP chunk, uncompressed

@@ -1,4 +1,4 @@
-"""Sources and kept frames of a capture, while they are read and as build stage `capture` stores them.
+"""Sources and kept (selected) frames of a capture, while they are read and as build stage `capture` stores them.
 
 A *mask* marks the pixels of a frame that all later stages ignore: 0 = ignore, any other value = use.
 """
@@ -41,7 +41,7 @@ _ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "intrinsics": ((4,), "f"),
     "odometry": ((3,), "f"),
 }
-"""Stored arrays of `Capture`: shape per frame and `dtype.kind`."""
+"""Arrays of `Capture` that are stored: name → (shape per frame, `dtype.kind`)."""
 
 
 # ---- the stored capture
@@ -200,7 +200,7 @@ class KeptFrames:
 
 
 class FrameWriter:
-    """Encodes and writes a source's frames and masks in threads; errors are raised at a later frame or at the end."""
+    """Encodes and writes a source's frames and masks in threads; errors are raised by a later `put` or at the end."""
 
     def __init__(self, out: Path, name: str) -> None:
         self._images, self._masks = out / "images" / name, out / "masks" / name

@@ -334,7 +334,7 @@ def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
 
 
 def is_image(path: Path) -> bool:
-    """True if the file exists and its name is that of an image."""
+    """True if the file exists and its name has an image suffix."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and is_file(path)
 
 

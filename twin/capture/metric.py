@@ -1,4 +1,4 @@
-"""Stage `metric`: transforms cameras and points to the metric *level frame*.
+"""Stage `metric`: transforms cameras and points to metric, level coordinates, the *level frame*.
 
 z points up along the ground's normal; z = 0 is the ground. The origin is on the ground below the first camera. x is the
 initial driving direction, or east if the scale comes from GPS. With metric.up = "poses", the level frame keeps the axes

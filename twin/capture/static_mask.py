@@ -26,16 +26,16 @@ _MAX_FRAMES = 40  # of more frames, every second or fewer are used, which saves 
 _MAX_SHARE = 0.4  # largest fraction of the picture that is masked
 _MIN_GRADIENT = 2.0  # [gray levels per px] smallest gradient of an edge
 # A persistent edge exceeds the smallest gradient in 90 % of the frames, a likely one in 70 %. Edges of the scene that
-# persist by chance are surrounded by likely edges. Of a fixed object's edges, at least this fraction is persistent.
+# persist by chance are surrounded by likely edges. Of a fixed object's edges, at least half are persistent.
 _PERSISTENT, _LIKELY, _SOLID = 0.1, 0.3, 0.5
 _MIN_EDGE = 16  # [px] fewest persistent pixels of an object
 _MIN_ACROSS = 0.1  # smallest mean cos² between an object's gradients and the rays from any possible vanishing point
-_MIN_DISTANCE = 0.06  # smallest rms distance of that point from the edges' tangents, as a fraction of the width
+_MIN_DISTANCE = 0.06  # smallest rms distance of such a point from the edges' tangents, as a fraction of the width
 _MAX_COHERENCE = 0.5  # largest |median gradient| / mean |gradient| of the scene; larger if the camera hardly moves
 _CALMER = 0.6  # a region between persistent edges is fixed if it varies less than this fraction of its surroundings
 _JOIN, _MARGIN = 4, 2  # [px] edges closer than twice the first are joined; the mask is wider by the second
-# Islands: fewest pixels, largest variation [gray levels], smallest ratio of the variation around to the median and to
-# the 80 % quantile of the variation inside, and smallest brightness [gray levels], since black night hardly varies.
+# Islands: fewest pixels, largest variation [gray levels], smallest ratios of the variation around an island to the
+# median and to the 80 % quantile of that inside, and smallest brightness [gray levels], since black night hardly varies.
 _ISLAND_AREA, _ISLAND_VARIATION, _AROUND_MEDIAN, _AROUND_MOST, _NIGHT = 40, 15.0, 3.0, 2.5, 15.0
 _NOISE = 2.0  # [gray levels] added to the variation inside before the ratio is formed
 
@@ -114,7 +114,7 @@ def _closed(mask: Mask, radius: int) -> Mask:
 
 
 def _components(mask: Mask) -> list[Mask]:
-    """The connected components, 4-neighbors, the largest first."""
+    """The connected components (4-neighbors) of at least `_MIN_EDGE` pixels, the largest first."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     areas = stats[1:, cv2.CC_STAT_AREA]
     return [labels == 1 + label for label in np.argsort(-areas, kind="stable") if areas[label] >= _MIN_EDGE]

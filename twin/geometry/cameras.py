@@ -26,7 +26,7 @@ _CAMERA_ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "times": ((), "f"),
     "held_out": ((), "b"),
 }
-"""Stored arrays of `Cameras`: shape per frame and `dtype.kind`."""
+"""Arrays of `Cameras` that are stored: name → (shape per frame, `dtype.kind`)."""
 
 
 def opencv_to_mujoco(camera_to_world: Array) -> Array:
@@ -99,7 +99,7 @@ class Cameras:
                 len(texts["names"]),
             )
             if any(len(values) != n for values in texts.values()):
-                raise ValueError(", ".join(f"{len(values)} {name}" for name, values in texts.items()))
+                raise ValueError(", ".join(f"{len(values)} {name}" for name, values in texts.items()) + ": not as many")
         with wrap_read_errors(folder / "cameras.npz", "build the scene again"):
             arrays = {name: data[name] for name in _CAMERA_ARRAYS}
             check_shapes({name: (arrays[name], (n, *one), kind) for name, (one, kind) in _CAMERA_ARRAYS.items()})
@@ -117,7 +117,7 @@ def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:
 
 
 class PosedCameras(Protocol):
-    """Cameras as a renderer needs them; `Cameras` and `Viewpoints` match this protocol."""
+    """The attributes that a renderer reads; `Cameras` and `Viewpoints` have them."""
 
     @property
     def camera_to_world(self) -> Array: ...
@@ -146,7 +146,7 @@ class Viewpoints:
 def intrinsics_for_size(cameras: PosedCameras, size: tuple[int, int] | None) -> tuple[Array, tuple[int, int]]:
     """Returns intrinsics (n, 4) scaled to one image size, and that size.
 
-    The size is `size` if given, else the one that all cameras share.
+    The size is `size` if given, else the size that all cameras share.
 
     Raises InputError: no size is given and the cameras' sizes differ.
     """

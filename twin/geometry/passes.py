@@ -1,9 +1,9 @@
 """Passes: the segments of a filmed path that a robot can drive without interruption.
 
-A film may go down a road twice, come back in the other lane, drive laps, stop, back up, or be cut. Its path is divided
-at *jumps* (a cut, or frames that lie far apart), at *turns* (the camera comes back the way it came) and at *laps* (it
-goes the same way again). Each part between them is a *pass*, named `<source>:<number>`. `twin/geometry/route.py`
-chooses the route from the passes.
+A filming camera may go down a road twice, come back in the other lane, stop or back up; a film may be cut. The path is
+divided at *jumps* (a cut, or frames that lie far apart), at *turns* (the camera comes back the way it came) and at
+*laps* (it goes the same way again). Each part between them is a *pass*, named `<source>:<number>`.
+`twin/geometry/route.py` chooses the route from the passes.
 """
 
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ _MIN_PASS = 1.0  # [m] shorter passes are dropped
 _CHORD = 1.0  # [m] length over which headings are measured
 _MIN_PATH_FRAMES = 6
 _MAX_OUTLIER_FRACTION = 0.25  # if more frames of a path look wrong, the path is not smooth and no frame is removed
-_MAX_ROUGHNESS = 0.3  # a path with a larger median residual [median steps] is a set of unordered photos, not a film
+_MAX_ROUGHNESS = 0.3  # a path with a larger median residual [median steps] is that of unordered photos, not of a film
 _OUTLIER_SIGMAS = 8.0  # an outlier's residual exceeds this many robust standard deviations of all residuals
 _MAX_TURN = np.radians(5.0)  # [rad] smaller deviations from the predicted direction are always allowed
 

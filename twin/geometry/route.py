@@ -18,11 +18,11 @@ from twin.geometry.passes import SPACING, FilmedPass, find_passes, path_directio
 from twin.types import Array
 
 _MIN_LENGTH = 2.0  # [m] least length of a route
-_AS_LONG = 0.98  # lines longer than this share of the longest count as equally long, so that noise does not decide
+_AS_LONG = 0.98  # lines longer than this fraction of the longest count as equally long, so that noise does not decide
 _ASIDE = 0.6  # [m] largest lateral offset between a pass and its continuation; the joined line runs midway
 _BEYOND = 3.0  # [m] least length that a continuation adds
 _AGREE = np.cos(np.deg2rad(40.0))  # least cosine between the headings of joined passes
-_BLEND = 3.0  # [m] length before and after a join over which the line passes from one pass to the other
+_BLEND = 3.0  # [m] length before and after a join over which the joined line shifts from one to the other
 _MAX_FOLD = np.cos(np.deg2rad(120.0))  # cosine of the greatest change of heading over `_FOLD_CHORD`
 _FOLD_CHORD = 2.0  # [m] length along the line between the headings that are compared
 _OFF_FILM = 1.0  # [m] largest distance of a line through way points from the filmed paths
@@ -81,7 +81,7 @@ def route_metrics(route: Route) -> dict[str, object]:
 
 
 def _named(name: str, passes: list[FilmedPass]) -> FilmedPass:
-    """A pass by its name, or the longest one of a source."""
+    """The pass with this name, or the longest pass of the source with this name."""
     fitting = [one for one in passes if name in (one.name, one.source)]
     if not fitting:
         known = ", ".join(f"{one.name} ({one.length:.1f} m)" for one in passes) or "none"
@@ -90,7 +90,7 @@ def _named(name: str, passes: list[FilmedPass]) -> FilmedPass:
 
 
 def _longest_line(passes: list[FilmedPass], max_gap: float) -> tuple[Array, tuple[str, ...]]:
-    """The longest line of a pass continued by others of its lighting, and the names of its passes."""
+    """The longest line of a pass and others of its lighting that continue it, and the names of these passes."""
     lines = []
     for start in passes:
         line, names = start.path, [start.name]

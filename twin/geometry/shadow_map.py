@@ -30,9 +30,9 @@ BIAS = 0.3
 ROUGH_BIAS = 0.5
 """[m] additional bias of rough surfaces, see `ShadowCasters`."""
 _RAMP = 0.2  # [m] height above the bias over which the shadow becomes full
-_LEAST_COSINE = wp.constant(0.1)  # lower bound of the cosine of incidence by which a surface's slope is divided
+_LEAST_COSINE = wp.constant(0.1)  # lower bound of the cosine of incidence in the slope of a surface
 _MAX_SIDE = 4096  # [texels] longest side of a map; larger places get larger texels
-_FULL = 65535  # largest value of a stored texel; 0 means that nothing is there
+_FULL = 65535  # largest value of a stored texel; 0: no surface
 _START = 1.0  # [m] distance from the highest vertex to the plane from which rays are cast
 
 
@@ -150,7 +150,7 @@ class OrthographicShadowMap:
         data = np.frombuffer(base64.b64decode(table["png"], validate=True), np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
         if image is None or image.dtype != np.uint16 or image.ndim != 2 or max(image.shape) > _MAX_SIDE + 1:
-            raise ValueError(f"shadow map: expected a 16-bit gray picture of at most {_MAX_SIDE + 1} px")
+            raise ValueError(f"shadow map: expected a 16-bit gray picture, at most {_MAX_SIDE + 1} px a side")
         height = np.where(image > 0, low + step * (image.astype(np.float64) - 1.0), -np.inf).astype(np.float32)
         return OrthographicShadowMap(toward, origin, texel, height)
 

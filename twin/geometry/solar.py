@@ -14,7 +14,7 @@ from twin.types import Array
 
 _YEARS = (1901, 2099)  # years for which the equations of `astral` hold
 _MAX_LATITUDE, _MAX_LONGITUDE = 89.9, 180.0  # [°]
-_GPS_SPREAD = 5.0  # least ratio of the positions' spread to their error for a heading
+_GPS_SPREAD = 5.0  # least ratio of the GPS positions' spread to their error, for a heading
 _GPS_SCALE = (0.7, 1.4)  # accepted ratio of distances by GPS to distances in the scene
 
 
