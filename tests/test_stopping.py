@@ -207,7 +207,10 @@ def test_colmap_keeps_our_signal_handlers(tmp_path):
         "raise SystemExit(run(Parser(), lambda o: os.kill(os.getpid(), signal.SIGTERM), []))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (128 + signal.SIGTERM, "stopped; to continue, run the same command again\n")
+    assert (done.returncode, done.stderr) == (
+        128 + signal.SIGTERM,
+        "stopped; to continue, run the same command again\n",
+    )
 
 
 def test_a_broken_pipe_ends_a_verb_quietly(tmp_path):

@@ -74,10 +74,10 @@ a scene.toml of your own road:
 
   [metric]                        # the source of the scale, one of
   camera_height = 1.2             #   lens above the ground [m]
-  # gps = true                    #   EXIF positions
+  # gps = true                    #   positions in EXIF or a bag
   # distance = { metres = 5.0, frame_a = "morning/000010", a = [u, v], b = [u, v] }
   # marker = { family = "DICT_APRILTAG_36h11", id = 0, size = 0.2 }
-  # poses_are_metric = true       #   poses that came with the input
+  # poses_are_metric = true       #   poses of the input, in meters
 
 twin new SCENE VIDEO... writes such a folder.
 """
@@ -89,7 +89,9 @@ twin new SCENE VIDEO... writes such a folder.
     parser.add_argument(
         "--quality", choices=tuple(QUALITIES), help="of the radiance field; default: scene.toml's, or standard"
     )
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as nerf.steps=4000")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="override scene.toml, as in nerf.steps=4000"
+    )
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
@@ -100,8 +102,8 @@ def _relight(parser: argparse.ArgumentParser) -> None:
         "radiance field, fog and, on demand, a sun are fitted to it. Then the twin can be rendered in that light."
     )
     parser.epilog = (
-        "Without --sun and --time the lighting has no sun. A sun is kept only if a fit to half of the photo explains "
-        "the other half better."
+        "Without --sun and --time the lighting has no sun. A sun is kept only if, with it, a fit to half of the photo "
+        "explains the other half better."
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("photo", type=Path, help="an image file that shows the place, from near the filmed path")
@@ -109,7 +111,7 @@ def _relight(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sun",
         metavar="AZIMUTH,ELEVATION",
-        help="direction of the sun [°], the azimuth counterclockwise from the scene's x axis; search: find it",
+        help="direction [°], the azimuth counterclockwise from the scene's x axis; search: find it in the photo",
     )
     parser.add_argument("--time", help="when the photo was taken, such as 2026-06-01T17:30+02:00; gives the sun")
     parser.add_argument("--location", metavar="LAT,LON", help="where it was taken [°]; default: by the frames' GPS")
@@ -130,9 +132,9 @@ def _align(parser: argparse.ArgumentParser) -> None:
         "acceleration_x, acceleration_y [m/s²] and group. Or a ROS bag with cmd_vel, joint states (or the wheels' "
         "odometry), poses other than wheel odometry (or pictures from which the scene was built) and optionally an IMU "
         "(pip install 'twin[ros]'). A film (.mp4, ...) has rectified pictures of the robot's front camera. In it, the "
-        "robot drives 10 m or more at the scene's place, mostly straight ahead, in light like that of a scene's film."
+        "robot drives 10 m or more at the scene's place, mostly straight ahead, in light like that of one of its films."
     )
-    parser.add_argument("robot", help="folder of a scene, a robot.toml, or `husky`: published values")
+    parser.add_argument("robot", help="folder of a scene, a robot.toml, or `husky` (published values)")
     parser.add_argument("log", type=Path, help="a .csv, an .npz, a bag, or a film")
     parser.add_argument("--camera", action="store_true", help="fit the camera's pose to the bag's pictures")
     parser.add_argument("--topic", help="topic of these pictures; default: that with the most pictures")
@@ -207,7 +209,9 @@ def _pack(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="a run, a checkpoint or an ONNX file to include; may be repeated",
     )
-    parser.add_argument("--licence", default="", metavar="TEXT", help="terms of use for others, such as 'CC BY 4.0'")
+    parser.add_argument(
+        "--licence", default="", metavar="TEXT", help="terms of use, such as 'CC BY 4.0'; default: not stated"
+    )
     parser.add_argument("--with-positions", action="store_true", help="include the films' GPS positions")
     parser.add_argument(
         "--levels",
@@ -248,7 +252,7 @@ def _view(parser: argparse.ArgumentParser) -> None:
         help="address to serve on; unless it is this machine's loopback, the page's URL contains a secret token",
     )
     parser.add_argument("--port", type=int, default=8080, help="port; if taken, the next free one; 0: any")
-    parser.add_argument("--path", type=Path, help="render this camera path instead of showing the page")
+    parser.add_argument("--path", type=Path, help="render this saved camera path instead of showing the page")
     parser.add_argument("--out", type=Path, help="the mp4 of --path")
     parser.add_argument("--size", default="1280x720", help="size of the film [px]")
     parser.add_argument("--fps", type=int, default=30, help="frames per second of the film")
@@ -299,7 +303,9 @@ def _train(parser: argparse.ArgumentParser) -> None:
         "--success", type=float, help="success rate in tests at which the training ends (default: 0.95)"
     )
     parser.add_argument(
-        "--steps", type=int, help="most control steps, all environments together (default: 24000; gpu: 240000)"
+        "--steps",
+        type=int,
+        help="largest number of control steps, all environments together (default: 24000; gpu: 240000)",
     )
     parser.add_argument("--worlds", type=int, help="number of parallel environments (default: 8; gpu: 32)")
     parser.add_argument(
@@ -495,17 +501,17 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument("--out", type=Path, required=True, help="drive.csv")
     command.add_argument("--duration", type=float, default=300.0, help="of the drive [s]")
     robot(command, camera=False)
-    command = add("onboard", "a film by that Husky's own camera, for twin align")
+    command = add("onboard", "a film by the place's Husky, for twin align")
     command.add_argument("--out", type=Path, required=True, help="robot.mp4")
     robot(command)
-    command = add("bag", "a ROS 2 bag of one trial of that Husky, for twin trial")
+    command = add("bag", "a ROS 2 bag of one trial of the place's Husky, for twin trial")
     command.add_argument("--out", type=Path, required=True, help="folder of the bag")
     command.add_argument("--policy", type=Path, help="policy folder; default: the robot follows the route")
     command.add_argument("--task", default="straight", help="{straight,right_turn}; a random place names its own")
     one_weather(command)
     command.add_argument("--seed", type=int, default=0, help="seed of start, camera and noise")
     robot(command)
-    command = add("photo", "a photo by that camera in the weather of a trial, for twin relight")
+    command = add("photo", "a photo by the Husky's camera in the weather of a trial, for twin relight")
     one_weather(command)
     command.add_argument("--out", type=Path, required=True, help="photo.png")
     robot(command)

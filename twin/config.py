@@ -120,8 +120,8 @@ class CaptureConfig:
     """Selection of frames."""
 
     frames: Annotated[int, Range(0)] = 0
-    """Number of frames to keep per source: the film is divided into as many equal time slots, and the sharpest frame of
-    each is kept. 0: use `fps`."""
+    """Number of frames to keep per source: the film is divided into this number of equal time slots, and the sharpest
+    frame of each is kept. 0: use `fps`."""
     fps: Annotated[float, Range(0.001, 1000)] = 2.0
     """Number of frames to keep per second of video, if `frames` is 0."""
     max_frames: Annotated[int, Range(2)] = 300
@@ -134,7 +134,7 @@ class CaptureConfig:
     """Segments of every film that are used, [[from, to], ...] in seconds from its first frame, ends included, ordered
     and disjoint; empty = all. Photos need timestamps."""
     min_motion: Annotated[float, Range(0)] = 1.0
-    """Least median optical flow between a film's kept frames [px, at a width of 320 px]; others are duplicates."""
+    """Least median optical flow between a film's kept frames [px, at a width of 320 px]; others are dropped."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ class MetricConfig:
     odometry_tolerance: Annotated[float, Range(0.0001, 0.5)] = 0.03
     """Standard deviation of the relative error of these distances: a few percent for wheels, less for LiDAR or RTK."""
     poses_are_metric: bool = False
-    """The given poses (COLMAP model or transforms.json) are in metres."""
+    """The given poses (COLMAP model or transforms.json) are in meters."""
     up: str = "ground"
     """Source of the vertical: `ground` (road, path, cameras), `cameras` (mean camera up) or `poses` (given, z up)."""
 
@@ -232,7 +232,7 @@ class NerfConfig:
     max_bricks: Annotated[int, Range(100)] = 9000
     """Largest number of bricks (blocks of 8 × 8 × 8 cells with 8-bit samples) of the baked field. This number
     determines the cell size; 9,000 bricks take about 105 MB. If cells would exceed 15 cm, 1.39 times as many bricks
-    are allowed (146 MB). Fewer than 100 bricks do not cover even the coarsest far grid."""
+    are allowed (146 MB). Fewer than 100 bricks cannot cover the distant surroundings."""
     max_width: Annotated[int, Range(32)] = 480
     """Longer side of training images [px]."""
     refine_cameras: bool = False
@@ -291,7 +291,7 @@ class RouteConfig:
     """Passes in driving order, such as "noon:2", or "noon" for the longest pass of that source; the report lists the
     passes."""
     points: tuple[tuple[float, ...], ...] = ()
-    """Way points [x, y] [m] instead of passes, in the frame of the report's map, at most 1 m from the filmed paths."""
+    """Way points [x, y] [m], instead of passes, as in the report's map; at most 1 m from the filmed paths."""
     reverse: bool = False
     """Drive against the filmed direction. The robot's camera then shows views that were not filmed."""
     max_gap: Annotated[float, Range(0, 50)] = 5.0
@@ -348,7 +348,7 @@ class ObstacleConfig:
     yaw: float = 0.0
     """Yaw relative to the route's heading or, for a moving obstacle, to its direction of motion [°]."""
     to: tuple[float, ...] = ()
-    """(station, lateral) [m] of the turning point; the obstacle moves between it and its start. Empty: static."""
+    """(station, lateral) [m] of the turning point; the obstacle starts at `station` and `lateral`. Empty: static."""
     speed: float = 1.2
     """Speed if it moves [m/s]."""
     delay: float = 0.0

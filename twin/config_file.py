@@ -279,7 +279,7 @@ def _check_metric(metric: MetricConfig) -> None:
         _require(size > 0.0, f"metric.marker.size = {size:g}; expected the side of the black square [m]")
     if metric.distance is not None:
         metres, frame = metric.distance.metres, metric.distance.frame_a
-        _require(metres > 0.0, f"metric.distance.metres = {metres:g}; expected the metres between the points a and b")
+        _require(metres > 0.0, f"metric.distance.metres = {metres:g}; expected the meters between the points a and b")
         for key in ("a", "b", *(("a2", "b2") if metric.distance.frame_b else ())):
             pixel = getattr(metric.distance, key)
             _require(len(pixel) == 2, f"metric.distance.{key} = {list(pixel)}; expected [u, v] [px]")

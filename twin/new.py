@@ -72,7 +72,7 @@ fps = 2.0                      # frames kept per second of film, the sharpest of
 {camera_height}
 {gps}
 {odometry}
-# poses_are_metric = true      # the given poses are in metres
+# poses_are_metric = true      # the given poses are in meters
 # marker = {{ family = "DICT_APRILTAG_36h11", id = 0, size = 0.16 }}   # a printed marker; side of its square [m]
 # distance = {{ metres = 3.5, frame_a = "day/000012", a = [400, 500], b = [700, 500] }}   # two points on the road
 
@@ -100,7 +100,7 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
     if scene.config_file.exists():
         raise InputError(f"{scene.config_file}: a scene is here already; edit it, or choose another folder")
     if camera_height is not None and not 0.01 <= camera_height <= 100.0:
-        raise InputError(f"--camera-height {camera_height:g}: expected metres above the ground, such as 1.2")
+        raise InputError(f"--camera-height {camera_height:g}: expected meters above the ground, such as 1.2")
     bags: dict[Path, BagContents] = {}
     for film in films:
         if not film.exists():
@@ -166,7 +166,7 @@ def _scale_lines(bags: list[BagContents], camera_height: float | None, seat: Cam
     elif seat is not None:
         height = (
             f"camera_height = {seat.height:<14.4g} # lens above the ground [m], by /tf_static\n"
-            f"camera_height_tolerance = {_SEAT_TOLERANCE:<4g} # its standard deviation [m]; less if you measure it"
+            f"camera_height_tolerance = {_SEAT_TOLERANCE:<4g} # its standard deviation [m]; smaller if measured by hand"
         )
     else:
         height = "# camera_height = 1.2          # lens above the ground [m]: fill in, or choose another source below"

@@ -74,7 +74,7 @@ class PhotoFit:
     fits: tuple["AirFit", ...] = ()
     """The fits to the left half, to the right half and to the whole photo."""
     sun: Sun | None = None
-    """The fitted sun, or none if it does not improve the fit."""
+    """The fitted sun; None if no sun is wanted, or the sun does not improve the fit."""
     sun_from: str = ""
     """Origin of the sun's direction, or the reason why there is no sun."""
     psnr_no_sun_other_half: float | None = None
@@ -193,7 +193,7 @@ def with_sun(field, relit: PhotoFit, casters: ShadowCasters, source: SunSource) 
 def find_sun(
     scene: SceneDir, sun: str | None, time: str | None, location: str | None, heading: float | None
 ) -> SunSource | None:
-    """Direction of the sun from the options of the verb; None: no sun is wanted.
+    """Direction of the sun from the options of the command; None: no sun is wanted.
 
     Raises:
         InputError: an option is malformed, options contradict each other, or location or heading are missing and the
@@ -258,7 +258,7 @@ def _two_numbers(option: str, text: str, expected: str) -> tuple[float, float]:
 
 
 def comparison(name: str, relit: PhotoFit) -> NDArray[np.uint8]:
-    """Labelled image of a fit: photo, fitted lighting and nearest filmed lighting side by side."""
+    """Labeled image of a fit: photo, fitted lighting and nearest filmed lighting side by side."""
     from twin.report.video_layout import draw_label
 
     height, width = relit.images[0].shape[:2]

@@ -123,7 +123,7 @@ class Stopped(KeyboardInterrupt):
 def stoppable() -> Iterator[None]:
     """Within the block, the first SIGINT, SIGTERM or SIGHUP raises `Stopped`.
 
-    Later ones are ignored, so that cleanup can finish, except SIGINT, which ends the process at once. Signals that were
+    Later signals are ignored, so that cleanup can finish; only SIGINT ends the process at once. Signals that were
     ignored when the process started, for example because of nohup, stay ignored.
     """
     stopping = False

@@ -2,8 +2,8 @@
 
 A *source* is one input under one lighting; its *kind* is video, bag, images, colmap or transforms. A *kept* frame is
 upright and scaled to `capture.max_size`, and still has the lens's distortion. Its name is `<source>/<index>`, where the
-index is its position in the whole film, or among all images of the set in natural order.
-*Held-out* frames are never trained on.
+index is its position in the whole film, or among all images of the set in natural order. *Held-out* frames are never
+trained on.
 """
 
 from pathlib import Path

@@ -92,8 +92,8 @@ def candidate_lenses(size: tuple[int, int], exif: PhotoExif, scene: SceneDir) ->
     """Candidate lenses of a photo, most likely first.
 
     Each entry consists of the lens at `size`, whether it stays fixed, and its origin. The origin is the photo's EXIF
-    header, the calibration or the estimated camera of a source with the same aspect ratio, or a guess. Only calibrated lenses
-    stay fixed.
+    header, the calibration or the estimated camera of a source with the same aspect ratio, or a guess. Only calibrated
+    lenses stay fixed.
     """
 
     def simple(focal: float) -> Lens:

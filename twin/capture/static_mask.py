@@ -35,7 +35,7 @@ _MAX_COHERENCE = 0.5  # largest |median gradient| / mean |gradient| of the scene
 _CALMER = 0.6  # a region between persistent edges is fixed if it varies less than this fraction of its surroundings
 _JOIN, _MARGIN = 4, 2  # [px] edges closer than twice the first are joined; the mask is wider by the second
 # Islands: fewest pixels, largest variation [gray levels], smallest ratios of the variation around an island to the
-# median and to the 80 % quantile of that inside, and smallest brightness [gray levels], since black night hardly varies.
+# median and to the 80 % quantile inside, and smallest brightness [gray levels], since black night hardly varies.
 _ISLAND_AREA, _ISLAND_VARIATION, _AROUND_MEDIAN, _AROUND_MOST, _NIGHT = 40, 15.0, 3.0, 2.5, 15.0
 _NOISE = 2.0  # [gray levels] added to the variation inside before the ratio is formed
 
