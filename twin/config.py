@@ -291,7 +291,7 @@ class RouteConfig:
     """Passes in driving order, such as "noon:2", or "noon" for the longest pass of that source; the report lists the
     passes."""
     points: tuple[tuple[float, ...], ...] = ()
-    """Way points [x, y] [m], instead of passes, as in the report's map; at most 1 m from the filmed paths."""
+    """Way points [x, y] [m] instead of passes, in the report map's coordinates, at most 1 m from the filmed paths."""
     reverse: bool = False
     """Drive against the filmed direction. The robot's camera then shows views that were not filmed."""
     max_gap: Annotated[float, Range(0, 50)] = 5.0

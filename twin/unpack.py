@@ -214,7 +214,7 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         if kind not in (0, stat.S_IFREG) or entry.is_dir():
             raise InputError(f"{path}: {name} is not a regular file; {_CURE}")
         if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise InputError(f"{path}: {name} is encrypted, or not compressed by deflate; {_CURE}")
+            raise InputError(f"{path}: {name} is encrypted, or compressed by another method than deflate; {_CURE}")
         if name in head["files"] and entry.file_size != head["files"][name]["bytes"]:
             raise InputError(f"{path}: {name} has {entry.file_size:,} bytes; {MANIFEST} says otherwise; {_CURE}")
     head["name"] = require_text(head["name"])

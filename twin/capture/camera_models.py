@@ -27,8 +27,8 @@ from twin.geometry.poses import inverse_pose
 from twin.types import Array, Image
 
 PixelMap = NDArray[np.float32]
-"""Position in the raw image of each pinhole pixel, (height, width, 2) [px], for `cv2.remap`: (0, 0) is the center of
-the first pixel."""
+"""For each pixel of the pinhole image, its position in the raw image, (height, width, 2) [px]; as in `cv2.remap`,
+(0, 0) is the center of the first pixel."""
 
 _NEGLIGIBLE_DISTORTION = 0.1  # [px] smaller displacements are ignored
 _MAX_ZOOM = 4.0  # largest ratio of the pinhole's focal length to that of the lens

@@ -359,7 +359,7 @@ def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> 
     spread = 1.4826 * float(np.median(np.abs(logs - middle)))
     if spread > _MAX_STRETCH_SPREAD:
         raise InputError(
-            f"metric.odometry: its lengths / those of the reconstruction vary by {spread:.0%} (expected at most "
+            f"metric.odometry: length by odometry / reconstructed length varies by {spread:.0%} (expected at most "
             f"{_MAX_STRETCH_SPREAD:.0%}); check the stamps of pictures and odometry, or give the scale another way"
         )
     inliers = np.abs(logs - middle) <= max(3.0 * spread, 1e-3)

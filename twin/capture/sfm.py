@@ -48,7 +48,7 @@ _NEAR_PAIRS = 4  # largest number of near pairs per frame
 _POSED_PAIRS = 10  # the same, if poses are given
 # The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
 _REMAPPING_FRACTION = 0.05
-_TRACKS_PER_VIEW = 300  # number of point tracks in the first solution; saves 40 % of its time, others are added later
+_TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
 _MIN_ANGLE = 0.5  # [°] smallest angle between two rays to a point
 _LOSS_SCALE = 0.5  # [px] scale of the Cauchy loss in the last bundle adjustment

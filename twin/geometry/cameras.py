@@ -99,7 +99,9 @@ class Cameras:
                 len(texts["names"]),
             )
             if any(len(values) != n for values in texts.values()):
-                raise ValueError(", ".join(f"{len(values)} {name}" for name, values in texts.items()) + ": not as many")
+                raise ValueError(
+                    ", ".join(f"{len(values)} {name}" for name, values in texts.items()) + "; expected equal numbers"
+                )
         with wrap_read_errors(folder / "cameras.npz", "build the scene again"):
             arrays = {name: data[name] for name in _CAMERA_ARRAYS}
             check_shapes({name: (arrays[name], (n, *one), kind) for name, (one, kind) in _CAMERA_ARRAYS.items()})

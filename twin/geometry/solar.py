@@ -19,10 +19,7 @@ _GPS_SCALE = (0.7, 1.4)  # accepted ratio of distances by GPS to distances in th
 
 
 def parse_time(text: str) -> datetime:
-    """A moment from text such as 2026-06-01T17:30+02:00.
-
-    Raises InputError: another form, no time zone, or a year outside 1901 to 2099.
-    """
+    """A moment from text such as 2026-06-01T17:30+02:00. Raises InputError: another form, or a year out of range."""
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
@@ -69,7 +66,7 @@ def sun_direction(moment: datetime, latitude: float, longitude: float, heading: 
 def heading_from_gps(positions: Array, east_north: Array) -> float | None:
     """Heading [°] of a scene from positions of its cameras, in the scene and by GPS, each (n, 2) [m].
 
-    `east_north` is NaN where unknown. Returns None if it has fewer than three positions, or does not fit the scene.
+    `east_north` is NaN where unknown. None if fewer than three are known or they do not fit.
     """
     known = np.isfinite(east_north).all(1)
     if known.sum() < 3:
