@@ -3,10 +3,10 @@
     python -m twin.pack scenes/demo --policy first -o demo.twin
     python -m twin.pack scenes/demo --policy first --levels 8 -o scenes/demo.twin
 
-A pack contains what driving needs: the baked field, the MJCF scene with its assets, ground, parts and cameras, tasks,
-robot, and lightings fitted to photos. It contains no films, frames, reports, or torch model of the field. Private data
-are left out: comments and paths of `scene.toml`, photos, dependencies in stamps and, unless asked for, GPS positions.
-`twin.unpack` describes the format.
+A pack contains what driving needs: the baked radiance field, the MJCF scene with its assets, ground, collision parts
+and cameras, tasks, robot, and lightings fitted to photos. It contains no films, frames, reports, or torch model.
+Private data are left out: comments and paths of `scene.toml`, photos, dependencies in stamps and, unless asked for, GPS
+positions. `twin.unpack` describes the format.
 
 Driving in a pack gives the same results as in the scene, bit for bit: only those samples of the radiance field are
 replaced that no ray reads (`brick_layout.samples_read`). With `--levels` below 256, the field's features are rounded to

@@ -137,7 +137,7 @@ def _picture_notes(small: list[Image]) -> list[str]:
     tint = np.array([float(one[..., 0].mean() + 1.0) / float(one[..., 2].mean() + 1.0) for one in small])
     if (ratio := _range(tint)) > _TINT_RANGE:
         notes.append(
-            f"the color ratio red / blue varies {ratio:.1f}-fold along the film; unless lamps cause it, lock the white balance"
+            f"the ratio red / blue varies {ratio:.1f}-fold along the film; unless due to lamps, lock the white balance"
         )
     return notes
 

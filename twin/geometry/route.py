@@ -1,6 +1,6 @@
 """The route: the line that the robot drives, chosen from the filmed passes.
 
-By default it is the longest line made of a pass and of others of the same lighting that continue it; `[route]` in
+By default it is the longest line of a pass and the passes of the same lighting that continue it; `[route]` in
 scene.toml chooses passes, their direction, or way points. *Station* [m] is the arc length along the route. The
 *corridor* is the area within a half width of the route; it is free, since the camera passed through it.
 """

@@ -3,8 +3,8 @@
 The sun's plane is perpendicular to the direction towards the sun. Its axes are `right`, which is horizontal, and
 `upward`. A texel stores the largest *height*, the coordinate along the direction towards the sun, of all surfaces in
 it. A point is in shadow if the map is higher than the point by more than a bias, which absorbs the errors of surfaces.
-Several texels around a point are compared and averaged (percentage-closer filtering, Reeves et al. 1987), so that the
-edges of shadows are soft.
+A point is compared with several texels, and the results are averaged (percentage-closer filtering, Reeves et al. 1987),
+so that the edges of shadows are soft.
 """
 
 # mypy: disable-error-code="index, attr-defined, valid-type, arg-type, call-overload, operator"
@@ -30,7 +30,7 @@ BIAS = 0.3
 ROUGH_BIAS = 0.5
 """[m] additional bias of rough surfaces, see `ShadowCasters`."""
 _RAMP = 0.2  # [m] height above the bias over which the shadow becomes full
-_LEAST_COSINE = wp.constant(0.1)  # lower bound of the cosine of incidence in the slope of a surface
+_LEAST_COSINE = wp.constant(0.1)  # lower bound of the cosine of incidence when a slope is computed
 _MAX_SIDE = 4096  # [texels] longest side of a map; larger places get larger texels
 _FULL = 65535  # largest value of a stored texel; 0: no surface
 _START = 1.0  # [m] distance from the highest vertex to the plane from which rays are cast
