@@ -165,7 +165,7 @@ def test_another_cameras_info_is_not_used(tmp_path: Path) -> None:
     contents = read_contents(write(tmp_path / "drive", messages))
     assert (
         contents.lens is None
-        and "is of another camera (frame rear_optical, the pictures have camera_optical)" in contents.lens_note
+        and "is of another camera (frame rear_optical, pictures have camera_optical)" in contents.lens_note
     )
     zero = MESSAGES.camera_info((0.0, 0.0, 0.5, 0.5), (WIDTH, HEIGHT), START)
     messages[0] = Recorded(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", zero, START)
@@ -231,8 +231,8 @@ def test_new_takes_what_the_bag_has_and_says_so(tmp_path: Path, capsys: pytest.C
         "drive: 30 pictures of /camera/image, 160x120 rgb8, 10.0 a second over 2.9 s",
         "calibration: /camera/camera_info: plumb_bob",
         "other pictures: /rear/image; choose by --topic",
-        "GPS: /gps/fix, 30 fixes, 29.0 m",
-        "odometry: /odom, 29.0 m",
+        "GPS: /gps/fix, 30 fixes, up to 29.0 m from the first",
+        "odometry: /odom, a path of 29.0 m",
         "camera on the robot: 0.700 m above the ground, 0.300 m ahead, pitch 5.7°, by /tf_static",
     ):
         assert words in text, text

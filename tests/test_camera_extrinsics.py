@@ -319,7 +319,7 @@ def test_unusable_films_are_refused_in_one_line(place, film, registered, tmp_pat
     for other in ("husky", str(place.root / "robot.toml")):
         assert "give the scene's folder" in refused(other, str(film))
     for more in (("--level",), ("--out", str(tmp_path))):
-        assert "--out and --level are for logs" in refused(root, str(film), *more)
+        assert "leave out --out and --level" in refused(root, str(film), *more)
     bare = tmp_path / "bare"
     bare.mkdir()
     (bare / "scene.toml").write_text(place.config_file.read_text())

@@ -70,7 +70,7 @@ def test_nested_table_and_integer_for_float(tmp_path):
         ('metric.marker = {family = "DICT_4x4_5O", size = 1}\n' + _SOURCE, "did you mean 'DICT_4X4_50'"),
         ('metric.marker = {family = "DICT_4X4_50", id = 50, size = 1}\n' + _SOURCE, "id = 50; expected 0 to 49"),
         ('metric.marker = {family = "DICT_4X4_50", id = 1}\n' + _SOURCE, "size = 0; expected the side"),
-        ("metric.distance = {a = [1, 2], b = [3, 4]}\n" + _SOURCE, "metres = 0; expected the metres"),
+        ("metric.distance = {a = [1, 2], b = [3, 4]}\n" + _SOURCE, "metres = 0; expected the meters"),
         ("metric.distance = {metres = 1, a = [1], b = [3, 4]}\n" + _SOURCE, "a = [1.0]; expected [u, v]"),
         ("metric.distance = {metres = 1, a = [1, 2], b = [3, 4]}\n" + _SOURCE, "frame_a = ''; expected a frame"),
         ('name = "a\\nb"\n' + _MINIMAL, "without control characters"),

@@ -407,8 +407,8 @@ def test_invalid_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     cases: list[tuple[dict, str]] = [
         ({}, "no scale given; give one of: metric.camera_height .*distance.*gps.*marker.*poses_are_metric"),
         ({"camera_height": -1.0}, "metric.camera_height = -1.0; expected meters"),
-        ({"poses_are_metric": True}, "the input brought no poses"),
-        ({"camera_height": 1.0, "up": "poses"}, "the input brought no poses"),
+        ({"poses_are_metric": True}, "the input has no poses"),
+        ({"camera_height": 1.0, "up": "poses"}, "the input has no poses"),
         ({"camera_height": 1.0, "up": "north"}, "metric.up = 'north'; expected ground, cameras or poses"),
     ]
     for changes, text in cases:

@@ -299,7 +299,7 @@ HOSTILE = {
     "backslash": (add("build\\evil.obj"), "is not a file of a scene"),
     "code": (add("build/5_mjcf/evil.py"), "is not a file of a scene"),
     "hidden": (add("lightings/.bashrc"), "is not a file of a scene"),
-    "link": (add("build/5_mjcf/assets/a.obj", b"/etc/passwd", stat.S_IFLNK | 0o777), "is a link"),
+    "link": (add("build/5_mjcf/assets/a.obj", b"/etc/passwd", stat.S_IFLNK | 0o777), "is not a regular file"),
     "bomb": (add("build/5_mjcf/assets/a.obj", bytes(90 << 20)), "unpacks to"),
     "huge": (add("build/5_mjcf/assets/a.obj", bytes=10**13), "expected at most"),
     "negative": (add("build/5_mjcf/assets/a.obj", bytes=-1), "expected at most"),
@@ -317,7 +317,7 @@ HOSTILE = {
     "include": (edit(XML, lambda b: b.replace(b"<asset>", b'<include file="/a"/><asset>', 1)), "names a file"),
     "path": (edit(XML, lambda b: b.replace(b'meshdir="assets"', b'meshdir="/etc"', 1)), "names a file"),
     "config": (edit("scene.toml", lambda b: b + b"surprise = 1\n"), "surprise"),
-    "untrusted": (add("policies/a.zip"), "if you trust its sender, --trust"),
+    "untrusted": (add("policies/a.zip"), "if you trust its sender, add --trust"),
 }  # fmt: skip
 
 

@@ -133,7 +133,7 @@ def test_nothing_outlives_a_verb(cases, name, number):
     if number == signal.SIGKILL:
         return
     lines = [line for line in said.splitlines(keepends=True) if not line.startswith("Warp CUDA warning")]
-    assert (process.returncode, lines) == (128 + number, ["stopped; run it again to go on\n"])
+    assert (process.returncode, lines) == (128 + number, ["stopped; to continue, run the same command again\n"])
     scene = Path(cases[name].arguments[0])
     assert not [path for path in scene.rglob("*") if ".partial" in path.name or path.name.endswith(".lock")]
 
@@ -171,7 +171,7 @@ def _runs(work, *arguments: str) -> int:
 def test_a_signal_is_one_line_and_handlers_are_restored(capfd, number):
     before = signal.getsignal(number)
     assert _runs(lambda: signal.raise_signal(number)) == 128 + number
-    assert capfd.readouterr().err == "stopped; run it again to go on\n"
+    assert capfd.readouterr().err == "stopped; to continue, run the same command again\n"
     assert signal.getsignal(number) is before
 
 
@@ -207,7 +207,10 @@ def test_colmap_keeps_our_signal_handlers(tmp_path):
         "raise SystemExit(run(Parser(), lambda o: os.kill(os.getpid(), signal.SIGTERM), []))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (128 + signal.SIGTERM, "stopped; run it again to go on\n")
+    assert (done.returncode, done.stderr) == (
+        128 + signal.SIGTERM,
+        "stopped; to continue, run the same command again\n",
+    )
 
 
 def test_a_broken_pipe_ends_a_verb_quietly(tmp_path):

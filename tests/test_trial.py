@@ -164,7 +164,7 @@ def test_a_drive_by_hand_needs_no_policy_and_no_outcome(place, tmp_path):
     [
         (
             ["a", "b", "--policy", "ahead", "--lighting", "day"],
-            "2 bags: a bag is a trial; several are for --lerobot DIR",
+            "2 bags: expected the bag of one trial; for several, use --lerobot DIR",
         ),
         (["a", "--lighting", "day"], "a trial needs --policy; without a policy, --lerobot DIR records"),
         (["a", "--policy", "ahead"], "a trial needs --lighting"),

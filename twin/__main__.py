@@ -1,4 +1,4 @@
-"""The command `twin`, also `python -m twin`: lists the verbs, or runs one of them."""
+"""The command `twin`, also `python -m twin`: lists its subcommands (verbs), or runs one of them."""
 
 import sys
 

@@ -5,14 +5,14 @@
     python -m twin.align scenes/my_road drive.mcap [--camera]
     python -m twin.align husky drive.npz --out aligned
 
-From a log, system identification fits the controller's limits and latency, the servo's lag, tires, ground, center of
-mass and effective wheel radii to half of the log. The other half is held out; it scores this fit and a kinematic model
+System identification fits the controller's limits and latency, the servo's lag, tires, ground, center of mass and
+effective wheel radii to half of the log. The other half is held out to score this fit, and a kinematic model
 that is fitted to the same data. Each value has a standard error; parameters that the log does not determine keep their
 values and are listed. Results are `robot.toml`, which the scene's next build uses, and `alignment/` with `align.json`
 and four figures.
 
-A robot's bag serves as a log; with --camera, its pictures serve as a film. If the bag's only poses are wheel odometry,
-but the scene was built from its pictures, the log's poses follow from the reconstructed cameras.
+A ROS bag serves as a log; with --camera, its pictures serve as a film. If the bag's only poses are wheel odometry, but
+the scene was built from the bag's pictures, the log's poses are computed from the reconstructed cameras.
 
 A film by the robot's front camera in the built place determines the camera's extrinsics (height, yaw, pitch, roll) and,
 unless `[robot] camera_intrinsics` is given, its focal length. The values are written to the same `robot.toml`;
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 RESULT_FOLDER = "alignment"
 """Folder beside `robot.toml` for figures and numbers of the fit."""
 PUBLISHED_ROBOT = "husky"
-"""Given instead of a scene: the robot with Clearpath's published parameters."""
+"""Name that stands, in place of a scene, for the robot with Clearpath's published parameters."""
 _FILM_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
 _INTRINSICS_FIELDS = ("camera_intrinsics", "camera_size")
 
@@ -68,7 +68,7 @@ def align_to_log(
     if folder is None:
         raise InputError(f"{target}: the published robot has no folder for its robot.toml; give one with --out")
     windows = _windows(target, log)
-    runtime.log_line(f"{log}: {len(windows)} windows, {int(windows.fitting.sum())} for fitting, the others for scoring")
+    runtime.log_line(f"{log}: {len(windows)} time windows, {int(windows.fitting.sum())} to fit, the others held out")
     check_log(windows, str(log))
     pictures = folder / RESULT_FOLDER
     _check_writable(pictures)
@@ -85,7 +85,7 @@ def align_to_log(
 
 
 def _windows(target: str, log: Path) -> Windows:
-    """The windows of a log. If the scene was built from this bag, reconstructed poses can replace wheel odometry."""
+    """The time windows of a log. If it is a bag that the scene was built from, reconstructed poses can be used."""
     root = Path(target).parent if Path(target).name == "scene.toml" else Path(target)
     if not (is_bag(log) and exists(log) and SceneDir(root).config_file.exists()):
         return read_log(log)
@@ -113,7 +113,7 @@ def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalib
     params = load_config(scene.config_file).robot
     given = {name: by_hand[name] for name in _INTRINSICS_FIELDS if name in by_hand}
     lens = parse_table(HuskyParams, given, str(scene.config_file))
-    # Intrinsics in robot.toml may come from an earlier film, which this one replaces.
+    # Intrinsics in robot.toml may come from an earlier film, which this film replaces.
     params = replace(params, camera_intrinsics=lens.camera_intrinsics, camera_size=lens.camera_size)
     result, frames = calibrate_camera(film, scene, params, topic)
     kept = {name: value for name, value in read_robot(root / ROBOT_TOML).items() if name not in _INTRINSICS_FIELDS}
@@ -129,7 +129,7 @@ def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalib
 
 
 def _robot(target: str) -> tuple[HuskyParams, dict[str, Any], Path | None]:
-    """The initial robot parameters, the table of its robot.toml, and the folder of that file."""
+    """The robot's initial parameters, the table of its robot.toml, and that file's folder; {} and None for `husky`."""
     if target == PUBLISHED_ROBOT:
         return HuskyParams(), {}, None
     path = Path(target)
@@ -185,14 +185,14 @@ def _fitted(identified: dict[str, tuple[Any, Any]]) -> list[str]:
 
 
 def command(options: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin align` with the options parsed by `twin.commands`."""
     if options.camera and not is_bag(options.log):
-        raise InputError(f"{options.log} is no bag; leave out --camera: a film is always fitted to the camera")
+        raise InputError(f"{options.log} is no bag; leave out --camera, which is only for bags")
     if options.topic and not options.camera:
         raise InputError(f"--topic {options.topic}: expected --camera, too; for a log, leave it out")
     if options.camera or options.log.suffix.lower() in _FILM_SUFFIXES:
         if options.out or options.level:
-            raise InputError(f"{options.log} is taken as a film; --out and --level are for logs")
+            raise InputError(f"{options.log} is taken as a film; leave out --out and --level, which are for logs")
         camera, folder = align_camera(options.robot, options.log, options.topic or "")
         identified, lines = camera.identified, "\n".join([camera.summary, "fitted:", *_fitted(camera.identified)])
     else:
@@ -202,7 +202,7 @@ def command(options: argparse.Namespace) -> None:
     if not options.quiet:
         print(lines)
         if overridden:
-            print(f"scene.toml's [robot] overrides fitted values: {', '.join(overridden)}; to use the fit, remove them")
+            print(f"scene.toml overrides fitted values: {', '.join(overridden)}; to use the fit, remove them there")
         print(f"wrote {folder / ROBOT_TOML}; look at {folder / RESULT_FOLDER}")
 
 

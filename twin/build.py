@@ -57,11 +57,11 @@ PIPELINE = (
     ),
 )
 
-_ON_DEVICE = ("field", "mesh")  # stages that take a device
-_WRITTEN = ("build", "runs", "validation", "forecast", "lightings")  # folders of a scene that are never inputs
+_ON_DEVICE = ("field", "mesh")  # stages that run on the device of --device
+_WRITTEN = ("build", "runs", "validation", "forecast", "lightings")  # folders to which twin writes; never inputs
 # Durations [s] for the demo with 2 cores. Only their ratios matter: they are scaled by the measured durations of
-# earlier stages. The remaining time is shown once the typical durations of these stages exceed `_LEAST_TIMED`; the
-# first stage alone is too short for a scale.
+# earlier stages. The remaining time is shown once the typical durations of these stages exceed `_LEAST_TIMED` [s]; the
+# first stage alone is too short to determine the speed.
 _TYPICAL = {"capture": 5.0, "cameras": 90.0, "metric": 1.0, "field": 280.0, "mesh": 70.0, "mjcf": 3.0, "review": 45.0}
 _LEAST_TIMED = 30.0
 
@@ -134,8 +134,8 @@ def _announce(stage: Stage, done: dict[str, float], until: str | None) -> None:
 def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
     """SHA-256 of every file of the sources, by path relative to the scene.
 
-    All files of a source folder are hashed, except twin's own output. If the folder contains the scene itself, or is a
-    posed image set outside the scene, only the files that the build reads are hashed.
+    All files of a source folder are hashed, except twin's own output. Only the files that the build reads are hashed if
+    the folder contains the scene itself, or is a posed image set given by a relative path that leaves the scene.
 
     Raises:
         InputError: a source is missing, or neither a file nor a folder.
@@ -250,7 +250,7 @@ def _report(scene: SceneDir, config: SceneConfig, stamps: dict[str, Stamp], skip
         "inputs": stamps["capture"].depends["inputs"],
     }
     report |= {name: stamp.metrics for name, stamp in stamps.items()}
-    if "review" in report:  # stored at the top level, because it concerns all stages
+    if "review" in report:  # `seen_touched` is moved to the top level, because it concerns all stages
         report["review"] = {k: v for k, v in report["review"].items() if k != "seen_touched"}
         report["seen_touched"] = stamps["review"].metrics.get("seen_touched")
     return report
@@ -309,7 +309,7 @@ def summary(report: dict[str, Any]) -> str:
 
 
 def command(options: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin build` with the options parsed by `twin.commands`."""
     settings = [*options.set, *([f"nerf.quality={options.quality}"] if options.quality else [])]
     report = build(options.scene, options.until, tuple(options.force), tuple(settings), options.device)
     if not options.quiet:

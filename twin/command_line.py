@@ -1,4 +1,4 @@
-"""Runs a command line: parses its options, calls its work, and prints errors as one line with a cure.
+"""Runs a command line: parses its options, calls the command's function, and prints errors as one line with a cure.
 
 | exit status | meaning |
 |---|---|
@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 from twin import runtime
 from twin.errors import InputError, print_error, shortened
 
-_FULL = "free some space and run it again"
+_FULL = "free some space and run the command again"
 _DENIED = "make it readable and writable, or choose another place"
 _CURES = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _FULL),  # EFBIG: a file exceeds the size limit
@@ -34,7 +34,7 @@ _CURES = {
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.ELOOP: "the link points to itself; remove it",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
-    errno.ENOMEM: "close other programs, or ask for less at once",
+    errno.ENOMEM: "close other programs, or choose smaller settings",
 }
 
 
@@ -86,12 +86,12 @@ def run(
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that exiting raises no second error
         return 128 + int(signal.SIGPIPE)
     except MemoryError as error:
-        return print_error(f"out of memory ({error}); close other programs, or ask for less at once")
+        return print_error(f"out of memory ({error}); close other programs, or choose smaller settings")
     except OSError as error:
         return print_error(_describe(error))
     except KeyboardInterrupt as error:
         with contextlib.suppress(OSError):
-            print("stopped; run it again to go on", file=sys.stderr)
+            print("stopped; to continue, run the same command again", file=sys.stderr)
         return 128 + (error.number if isinstance(error, runtime.Stopped) else int(signal.SIGINT))
     return 0
 

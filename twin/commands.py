@@ -57,8 +57,8 @@ def _new(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "films", type=Path, nargs="+", metavar="VIDEO", help="films, bags or image folders, one per lighting"
     )
-    parser.add_argument("--camera-height", type=float, metavar="METRES", help="lens above the ground while filming")
-    parser.add_argument("--topic", help="topic of a bag's pictures; default: the topic with most pictures")
+    parser.add_argument("--camera-height", type=float, metavar="METRES", help="height of the lens above the ground")
+    parser.add_argument("--topic", help="topic of a bag's pictures; default: that with the most pictures")
 
 
 def _build(parser: argparse.ArgumentParser) -> None:
@@ -74,45 +74,47 @@ a scene.toml of your own road:
 
   [metric]                        # the source of the scale, one of
   camera_height = 1.2             #   lens above the ground [m]
-  # gps = true                    #   EXIF positions
+  # gps = true                    #   positions in EXIF or a bag
   # distance = { metres = 5.0, frame_a = "morning/000010", a = [u, v], b = [u, v] }
   # marker = { family = "DICT_APRILTAG_36h11", id = 0, size = 0.2 }
-  # poses_are_metric = true       #   poses that came with the input
+  # poses_are_metric = true       #   poses of the input, in meters
 
 twin new SCENE VIDEO... writes such a folder.
 """
     parser.add_argument("scene", type=Path, help="folder with scene.toml and input/")
-    parser.add_argument("--until", choices=STAGES, metavar="STAGE", help=f"stop after: {', '.join(STAGES)}")
+    parser.add_argument("--until", choices=STAGES, metavar="STAGE", help=f"last stage to run: {', '.join(STAGES)}")
     parser.add_argument(
         "--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="stage to run again"
     )
     parser.add_argument(
-        "--quality", choices=tuple(QUALITIES), help="picture quality of the field; default: scene.toml's, or standard"
+        "--quality", choices=tuple(QUALITIES), help="of the radiance field; default: scene.toml's, or standard"
     )
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as nerf.steps=4000")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="override scene.toml, as in nerf.steps=4000"
+    )
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
 
 def _relight(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Add a lighting to a built scene from one photo: the photo is located, then the field's appearance embedding, "
-        "the fog and, on demand, the sun are fitted to it. The twin can then be rendered in that light from everywhere."
+        "Add a lighting to a built scene from one photo: the photo is located, then an appearance embedding of the "
+        "radiance field, fog and, on demand, a sun are fitted to it. Then the twin can be rendered in that light."
     )
     parser.epilog = (
-        "Without --sun and --time the lighting has no sun. A sun is kept only if a fit to half of the photo explains "
-        "the other half better with it."
+        "Without --sun and --time the lighting has no sun. A sun is kept only if, with it, a fit to half of the photo "
+        "explains the other half better."
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument("photo", type=Path, help="an image file that shows the place, from near the filmed path")
-    parser.add_argument("--name", required=True, help="name of the lighting; an added one of that name is replaced")
+    parser.add_argument("--name", required=True, help="name of the lighting; replaces an added one of that name")
     parser.add_argument(
         "--sun",
         metavar="AZIMUTH,ELEVATION",
-        help="direction of the sun [°], the azimuth counterclockwise from the scene's x axis; or search",
+        help="direction [°], the azimuth counterclockwise from the scene's x axis; search: find it in the photo",
     )
     parser.add_argument("--time", help="when the photo was taken, such as 2026-06-01T17:30+02:00; gives the sun")
-    parser.add_argument("--location", metavar="LAT,LON", help="where [°]; default: the GPS positions of the frames")
+    parser.add_argument("--location", metavar="LAT,LON", help="where it was taken [°]; default: by the frames' GPS")
     parser.add_argument(
         "--heading", type=float, metavar="DEG", help="compass angle of the scene's x axis [°]; default: by GPS"
     )
@@ -128,15 +130,14 @@ def _align(parser: argparse.ArgumentParser) -> None:
         "A log is a .csv or .npz with the columns time [s]; cmd_v [m/s] and cmd_yaw_rate [rad/s], or cmd_left "
         "and cmd_right [rad/s]; left_wheel_vel, right_wheel_vel [rad/s]; x, y [m], yaw [rad]; optionally "
         "acceleration_x, acceleration_y [m/s²] and group. Or a ROS bag with cmd_vel, joint states (or the wheels' "
-        "odometry), poses other than wheel odometry (or pictures from which the scene was built) and an IMU "
-        "(pip install 'twin[ros]'). A film (.mp4, ...) is one by the robot's front camera, rectified: the robot drives "
-        "ten metres or more in the built scene's place, mostly straight ahead, in light like that of one of the "
-        "scene's films."
+        "odometry), poses other than wheel odometry (or pictures from which the scene was built) and optionally an IMU "
+        "(pip install 'twin[ros]'). A film (.mp4, ...) has rectified pictures of the robot's front camera. In it, the "
+        "robot drives 10 m or more at the scene's place, mostly straight ahead, in light like that of one of its films."
     )
-    parser.add_argument("robot", help="folder of a scene, a robot.toml, or `husky` for the published one")
+    parser.add_argument("robot", help="folder of a scene, a robot.toml, or `husky` (published values)")
     parser.add_argument("log", type=Path, help="a .csv, an .npz, a bag, or a film")
     parser.add_argument("--camera", action="store_true", help="fit the camera's pose to the bag's pictures")
-    parser.add_argument("--topic", help="topic of these pictures; default: the topic with most pictures")
+    parser.add_argument("--topic", help="topic of these pictures; default: that with the most pictures")
     parser.add_argument("--out", type=Path, help="folder for robot.toml and alignment/; default: the scene's")
     parser.add_argument("--level", action="store_true", help="assume level ground and ignore the log's IMU")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
@@ -152,7 +153,8 @@ def _film(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
     parser.add_argument(
         "--lighting",
-        help="a name, a mixture a:b:0.3, training, held-out or any; any of them with +randomised (default: training)",
+        help="a name, a mixture a:b:0.3 (30 %% of b), or a random one: training, held-out, any; each may end with "
+        "+randomised (default: training)",
     )
     parser.add_argument("--drift", action="store_true", help="the light changes during the drive")
     parser.add_argument("--obstacles", default="scene", help="number of random obstacles; scene: those of scene.toml")
@@ -163,7 +165,7 @@ def _film(parser: argparse.ArgumentParser) -> None:
         "--rerun",
         type=Path,
         metavar="FILE",
-        help="write the drive as a recording of Rerun, too: drive.rrd (pip install 'twin[rerun]')",
+        help="also write the drive as a Rerun recording, such as drive.rrd (pip install 'twin[rerun]')",
     )
     parser.add_argument(
         "--lerobot",
@@ -185,15 +187,15 @@ def _drive(parser: argparse.ArgumentParser) -> None:
         "Show the Husky driving, in a film or on the page of twin view. By default, the policy of a pack or of a "
         "scene's only run drives the task of its training; without such a policy, the scripted driver drives."
     )
-    parser.add_argument("scene", type=Path, help="folder of a built scene, a pack, or the name of one: demo")
-    parser.add_argument("--view", action="store_true", help="show it in the browser; press Drive there")
+    parser.add_argument("scene", type=Path, help="folder of a built scene, or a pack or its name: demo")
+    parser.add_argument("--view", action="store_true", help="show the drive in the browser; press Drive there")
     parser.add_argument("--policy", help="a run, a checkpoint, an ONNX file or module:function")
     parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
     parser.add_argument("--task", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5 (default: drawn by the seed)")
+    parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5 (default: random)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the episode")
-    parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; 0: any")
-    parser.add_argument("--out", type=Path, help="the mp4; default: in SCENE/films, of a pack in the working folder")
+    parser.add_argument("--port", type=int, default=8080, help="port of the page; if taken, the next free one; 0: any")
+    parser.add_argument("--out", type=Path, help="the mp4; default: in SCENE/films; for a pack, in this folder")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
 
@@ -207,14 +209,16 @@ def _pack(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="a run, a checkpoint or an ONNX file to include; may be repeated",
     )
-    parser.add_argument("--licence", default="", metavar="TEXT", help="terms for its receivers, such as 'CC BY 4.0'")
+    parser.add_argument(
+        "--licence", default="", metavar="TEXT", help="terms of use, such as 'CC BY 4.0'; default: not stated"
+    )
     parser.add_argument("--with-positions", action="store_true", help="include the films' GPS positions")
     parser.add_argument(
         "--levels",
         type=int,
         default=256,
-        help="number of values to which the field's features are rounded: fewer make the pack smaller and change the "
-        "field; 256 keeps it bit for bit",
+        help="number of values to which the radiance field's features are rounded; fewer values make the pack smaller "
+        "and change the field; 256 keeps every bit",
     )
     parser.add_argument("--trust", action="store_true", help="include policies that may run code when they are loaded")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
@@ -227,7 +231,7 @@ def _unpack(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("pack", type=Path, help="the file")
     parser.add_argument("folder", type=Path, help="folder to make")
-    parser.add_argument("--trust", action="store_true", help="take policies that may run code when they are loaded")
+    parser.add_argument("--trust", action="store_true", help="unpack policies that may run code when loaded, too")
     parser.add_argument("--quiet", action="store_true", help="no summary")
 
 
@@ -247,8 +251,8 @@ def _view(parser: argparse.ArgumentParser) -> None:
         default="127.0.0.1",
         help="address to serve on; unless it is this machine's loopback, the page's URL contains a secret token",
     )
-    parser.add_argument("--port", type=int, default=8080, help="port, or the next free one; 0: any")
-    parser.add_argument("--path", type=Path, help="render this camera path instead of showing the page")
+    parser.add_argument("--port", type=int, default=8080, help="port; if taken, the next free one; 0: any")
+    parser.add_argument("--path", type=Path, help="render this saved camera path instead of showing the page")
     parser.add_argument("--out", type=Path, help="the mp4 of --path")
     parser.add_argument("--size", default="1280x720", help="size of the film [px]")
     parser.add_argument("--fps", type=int, default=30, help="frames per second of the film")
@@ -257,8 +261,8 @@ def _view(parser: argparse.ArgumentParser) -> None:
 
 def _export(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Write a built place for other programs: all of it as USD, its mesh as glTF, its field as Gaussian splats, its "
-        "frames and cameras for other trainers, a task's rules for evaluation elsewhere."
+        "Write a built place for other programs: all of it as USD, its mesh as glTF, its radiance field as Gaussian "
+        "splats, its frames and cameras for other trainers, a task's rules for evaluation elsewhere."
     )
     parser.add_argument("scene", type=Path, help="folder of a built scene")
     parser.add_argument(
@@ -299,18 +303,20 @@ def _train(parser: argparse.ArgumentParser) -> None:
         "--success", type=float, help="success rate in tests at which the training ends (default: 0.95)"
     )
     parser.add_argument(
-        "--steps", type=int, help="largest number of control steps, over all worlds (default: 24000; gpu: 240000)"
+        "--steps",
+        type=int,
+        help="largest number of control steps, all environments together (default: 24000; gpu: 240000)",
     )
-    parser.add_argument("--worlds", type=int, help="number of worlds driven at once (default: 8; gpu: 32)")
+    parser.add_argument("--worlds", type=int, help="number of parallel environments (default: 8; gpu: 32)")
     parser.add_argument(
-        "--processes", type=int, help="processes that step the worlds (default: a core each, at most 8)"
+        "--processes", type=int, help="processes that step the environments (default: one per core, at most 8)"
     )
-    parser.add_argument("--updates", type=float, help="updates of the networks per step (default: 0.5)")
+    parser.add_argument("--updates", type=float, help="network updates per control step (default: 0.5)")
     parser.add_argument(
         "--steering", type=float, help="penalty of full steering, as a share of a step's reward (default: 0.5)"
     )
     parser.add_argument(
-        "--entropy", type=float, help="target entropy per action [nat]; more explores more (default: -0.5)"
+        "--entropy", type=float, help="target entropy per action component [nat]; higher explores more (default: -0.5)"
     )
     parser.add_argument(
         "--colours", type=float, help="strength of color augmentation where the lighting varies (default: 1.0)"
@@ -331,8 +337,8 @@ def _train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--wandb",
         metavar="PROJECT",
-        help="log to this project of Weights & Biases, or ENTITY/PROJECT: numbers, and at the end a film of the kept "
-        "policy (pip install 'twin[wandb]')",
+        help="project of Weights & Biases, or ENTITY/PROJECT, to which numbers are logged and at the end a film of the "
+        "kept policy (pip install 'twin[wandb]')",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 
@@ -346,21 +352,21 @@ def _validate(parser: argparse.ArgumentParser) -> None:
         "--lightings",
         nargs="+",
         default=[HELD_OUT, str(Condition(HELD_OUT, True))],
-        help="names, mixtures a:b:0.3, held-out, any; any of them with +randomised",
+        help="names, mixtures a:b:0.3, or random ones: held-out, any; each may end with +randomised",
     )
-    parser.add_argument("--episodes", type=int, default=100, help="per policy and lighting")
+    parser.add_argument("--episodes", type=int, default=100, help="number per policy and lighting")
     parser.add_argument("--worst", action="store_true", help="search for each policy's worst lighting")
     parser.add_argument("--films", action="store_true", help="film each policy's typical and worst episode")
     parser.add_argument("--trust", action="store_true", help="load policy files that may run code")
     parser.add_argument("--processes", type=int, default=1, help="processes on this machine; each uses two cores")
-    parser.add_argument("--ray", metavar="ADDRESS", help="drive on a Ray cluster; auto: the one on this machine")
+    parser.add_argument("--ray", metavar="ADDRESS", help="use a Ray cluster; auto: the one on this machine")
     parser.add_argument("--quiet", action="store_true", help="no progress, no table")
 
 
 def _trial(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Evaluate a trial on the road, from the robot's ROS 2 bag, by the twin's rules. The results are a row of "
-        "real.csv, a film beside the twin's, and the differences of path and pictures from the twin's."
+        "real.csv, a film of robot and twin side by side, and their differences in path and pictures."
     )
     parser.epilog = (
         "The bag (a folder, .mcap or .db3; pip install 'twin[ros]') has the front camera's pictures and camera_info, "
@@ -372,24 +378,28 @@ def _trial(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--policy", help="the policy that drove: a run, a checkpoint or an ONNX file")
     parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
     parser.add_argument("--lighting", metavar="NAME", help="name of the day or light for real.csv")
-    parser.add_argument("--twin-lighting", metavar="NAME", help="the twin's lighting to compare with; default: NAME")
+    parser.add_argument(
+        "--twin-lighting", metavar="NAME", help="the lighting of the twin that is compared; default: --lighting"
+    )
     parser.add_argument(
         "--cause",
         choices=("collision", "out_of_bounds", "timeout", "rollover", "stuck"),
-        help="what ended the trial, where poses do not show it",
+        help="what ended the trial, if the poses do not show it",
     )
-    parser.add_argument("--out", type=Path, metavar="CSV", help="default: SCENE/real.csv; trials are listed beside it")
+    parser.add_argument(
+        "--out", type=Path, metavar="CSV", help="default: SCENE/real.csv; a list of trials is beside it"
+    )
     parser.add_argument(
         "--frame",
         choices=("pictures", "scene"),
         default="pictures",
-        help="pictures: locate them to place the poses in the scene; scene: the poses are in its frame",
+        help="pictures: fit the poses to the localized pictures; scene: the poses are in the scene's coordinates",
     )
     parser.add_argument(
         "--lerobot",
         type=Path,
         metavar="DIR",
-        help="write the bags as a LeRobot dataset instead, by a policy or by hand (pip install 'twin[lerobot]')",
+        help="write the bags, of a policy or a human, as a LeRobot dataset instead (pip install 'twin[lerobot]')",
     )
     for name, what in (
         ("image", "pictures"),
@@ -410,13 +420,13 @@ results.csv, one line per policy and lighting:
   first,morning,10,8
   first,dusk,10,6
 
-Names are those of validation/episodes.csv. Where a policy was validated on several tasks, add a column task.
-If the twin has no lighting of that name, a column twin_lighting names the one to compare with, such as
+Names are those of validation/episodes.csv. If a policy was validated on several tasks, add a column task.
+If the twin has no lighting of a name, a column twin_lighting names the lighting to compare with, such as
 held-out+randomised.
 """
     parser.add_argument("scene", type=Path, help="folder of a scene with validated policies")
     parser.add_argument("--real", type=Path, metavar="CSV", help="trials on the road; see below")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the resampling")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the sampling from posteriors")
     parser.add_argument("--quiet", action="store_true", help="no summary")
 
 
@@ -435,27 +445,29 @@ def _reality(parser: argparse.ArgumentParser) -> None:
             type=int,
             default=0,
             metavar="NUMBER",
-            help="0: the demo's street; from 1: drawn places (1 to 49 are for development)",
+            help="0: the demo's street; from 1: random places (1 to 49 are for development)",
         )
 
     def robot(command: argparse.ArgumentParser, camera: bool = True) -> None:
         place(command)
-        command.add_argument("--robot", type=int, default=0, metavar="NUMBER", help="which robot of the real test")
+        command.add_argument("--robot", type=int, default=0, metavar="NUMBER", help="number of the simulated robot")
         if camera:
-            command.add_argument("--camera", type=int, default=0, metavar="NUMBER", help="which camera of that robot")
+            command.add_argument(
+                "--camera", type=int, default=0, metavar="NUMBER", help="number of that robot's camera"
+            )
 
     def one_weather(command: argparse.ArgumentParser) -> None:
         either = command.add_mutually_exclusive_group(required=True)
-        either.add_argument("--lighting", metavar="NAME", help="a weather of the test")
-        either.add_argument("--day", type=int, nargs=1, metavar="NUMBER", help="a drawn day of the test, from 1")
+        either.add_argument("--lighting", metavar="NAME", help="a designed weather")
+        either.add_argument("--day", type=int, nargs=1, metavar="NUMBER", help="number of a random day, from 1")
 
     command = add("film", "film the place into a scene folder")
     command.add_argument("--out", type=Path, required=True, help="scene folder to write")
     place(command)
     command.add_argument(
-        "--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; for a drawn place, its own"
+        "--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; for a random place, its own"
     )
-    command.add_argument("--tiny", action="store_true", help="12 m in 320x180 under two lightings, for tests")
+    command.add_argument("--tiny", action="store_true", help="only 12 m in 320x180 px under two lightings, for tests")
     command.add_argument(
         "--traffic",
         action="store_true",
@@ -468,18 +480,18 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--task",
         required=True,
-        help="{straight,right_turn}; a drawn place names its own; or a .json of twin export --task-file",
+        help="{straight,right_turn}; a random place names its own; or a .json of twin export --task-file",
     )
     command.add_argument("--scene", type=Path, help="the built scene from which the .json was exported")
     robot(command)
     command.add_argument("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
-    command.add_argument("--lightings", nargs="+", metavar="NAME", help="weathers of the test (default: all)")
-    command.add_argument("--day", type=int, nargs="+", metavar="NUMBER", help="drawn days of the test, from 1")
+    command.add_argument("--lightings", nargs="+", metavar="NAME", help="designed weathers (default: all)")
+    command.add_argument("--day", type=int, nargs="+", metavar="NUMBER", help="numbers of random days, from 1")
     command.add_argument(
         "--out",
         type=Path,
         required=True,
-        help="results.csv, with a table of trials beside it; two commands cannot share it",
+        help="results.csv, with a table of trials beside it; only one command at a time may write it",
     )
     command.add_argument(
         "--twin-lighting", default=str(Condition(HELD_OUT, True)), help="the twin's lighting to compare with"
@@ -487,19 +499,19 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument("--films", type=Path, help="folder for a film of every trial, as the robot saw it")
     command = add("log", "a drive log of the place's Husky, for twin align")
     command.add_argument("--out", type=Path, required=True, help="drive.csv")
-    command.add_argument("--duration", type=float, default=300.0, help="[s]")
+    command.add_argument("--duration", type=float, default=300.0, help="of the drive [s]")
     robot(command, camera=False)
-    command = add("onboard", "a film by that Husky's own camera, for twin align")
+    command = add("onboard", "a film by the place's Husky, for twin align")
     command.add_argument("--out", type=Path, required=True, help="robot.mp4")
     robot(command)
-    command = add("bag", "a ROS 2 bag of one trial of that Husky, for twin trial")
+    command = add("bag", "a ROS 2 bag of one trial of the place's Husky, for twin trial")
     command.add_argument("--out", type=Path, required=True, help="folder of the bag")
     command.add_argument("--policy", type=Path, help="policy folder; default: the robot follows the route")
-    command.add_argument("--task", default="straight", help="{straight,right_turn}; a drawn place names its own")
+    command.add_argument("--task", default="straight", help="{straight,right_turn}; a random place names its own")
     one_weather(command)
     command.add_argument("--seed", type=int, default=0, help="seed of start, camera and noise")
     robot(command)
-    command = add("photo", "a photo by that camera in the weather of a trial, for twin relight")
+    command = add("photo", "a photo by the Husky's camera in the weather of a trial, for twin relight")
     one_weather(command)
     command.add_argument("--out", type=Path, required=True, help="photo.png")
     robot(command)
@@ -518,7 +530,7 @@ VERBS = {
     "unpack": Verb("unpack such a file into a scene folder", _unpack, "twin.unpack"),
     "train": Verb("train a policy on a task of a built scene", _train, "twin.train"),
     "validate": Verb("measure how often policies succeed, lighting by lighting", _validate, "twin.validate"),
-    "trial": Verb("judge a trial on the road from the robot's recording", _trial, "twin.trial"),
+    "trial": Verb("evaluate a trial on the road from the robot's recording", _trial, "twin.trial"),
     "forecast": Verb("predict success on the real road from success in the twin", _forecast, "twin.forecast"),
     "reality": Verb("a generated place whose truth is known: film it, drive in it", _reality, "twin.reality.__main__"),
 }

@@ -1,4 +1,4 @@
-"""Settings of `scene.toml`: one frozen dataclass per stage, with units, ranges and defaults; read by `config_file.py`.
+"""Settings of `scene.toml`: a frozen dataclass per section, with units, ranges and defaults; read by `config_file.py`.
 
 A *source* is one film (or bag, photo folder, or posed image set) under one *lighting*. Several sources may share a
 lighting. Ranges are checked before a build: beyond them, a stage may run out of memory, fail in its arithmetic or never
@@ -19,8 +19,8 @@ RANDOMIZED = "+randomised"
 """Suffix of randomized conditions in tables, see `Condition`; the name of a lighting must not end with it."""
 
 CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
-"""Causes that end an episode or trial, in the order of tables. If several apply at once, the code that ends it picks
-one."""
+"""Causes that end an episode or trial, in the order of tables. If several apply at once, the code that ends the
+episode picks one."""
 TWIST, STEERING = "twist", "steering"
 """Kinds of actions of a policy: `twist` is speed and yaw rate, `steering` is the yaw rate at a fixed speed."""
 
@@ -61,8 +61,8 @@ MARKER_FAMILIES = {
 
 @dataclass(frozen=True)
 class Condition:
-    """Condition of an episode. In tables it is a text such as `night` or `night+randomised`; only this class parses and
-    writes that text."""
+    """Lighting and randomization of an episode. In tables, this is a text such as `night` or `night+randomised`; only
+    this class parses and writes it."""
 
     lighting: str
     """A name, a mixture, or one of `RESERVED_LIGHTINGS`; see `twin/env/episode_lighting.py`."""
@@ -120,8 +120,8 @@ class CaptureConfig:
     """Selection of frames."""
 
     frames: Annotated[int, Range(0)] = 0
-    """Number of frames to keep per source: the film is divided into as many equal time slots, and the sharpest frame of
-    each is kept. 0: use `fps`."""
+    """Number of frames to keep per source: the film is divided into this number of equal time slots, and the sharpest
+    frame of each is kept. 0: use `fps`."""
     fps: Annotated[float, Range(0.001, 1000)] = 2.0
     """Number of frames to keep per second of video, if `frames` is 0."""
     max_frames: Annotated[int, Range(2)] = 300
@@ -134,7 +134,7 @@ class CaptureConfig:
     """Segments of every film that are used, [[from, to], ...] in seconds from its first frame, ends included, ordered
     and disjoint; empty = all. Photos need timestamps."""
     min_motion: Annotated[float, Range(0)] = 1.0
-    """Least motion between kept frames; others are dropped [px of median optical flow, at a width of 320 px]."""
+    """Least median optical flow between a film's kept frames [px, at a width of 320 px]; others are dropped."""
 
 
 @dataclass(frozen=True)
@@ -146,28 +146,28 @@ class CamerasConfig:
     max_feature_size: Annotated[int, Range(64, 100_000)] = 1280
     """Longer side of the image for feature detection [px]."""
     mapper: str = "auto"
-    """auto (global, then incremental), global or incremental."""
+    """COLMAP's mapper: global, incremental or auto (global, then incremental if too few frames are registered)."""
     min_registered: Annotated[float, Range(0, 1)] = 0.6
     """Fraction of frames that must be registered; otherwise the stage fails."""
     max_outlier: Annotated[float, Range(0.001)] = 0.3
-    """Distance from the path through its neighbors beyond which a frame is an outlier [median steps]."""
+    """A frame farther than this from the path of its neighbors is an outlier [median distances between frames]."""
     free_focal: bool = False
-    """Ignore given calibrations, and self-calibrate. This is for comparisons; a calibrated camera is better."""
+    """Ignore given calibrations, and self-calibrate. Only for comparisons: a calibrated camera is more accurate."""
 
 
 @dataclass(frozen=True)
 class DistanceConfig:
-    """Two points and the metres between them, marked in pixels of `build/2_cameras/images/<frame>.png`."""
+    """Two points marked in pixels of `build/2_cameras/images/<frame>.png`, and the distance between them [m]."""
 
     metres: float = 0.0
     frame_a: str = ""
-    """Frame name such as `sunny/000012`. Points are triangulated from two frames, or lie on the ground."""
+    """Name of the frame in which the points are marked, such as `sunny/000012`."""
     a: tuple[float, ...] = ()
     """[u, v] of the first point in `frame_a`."""
     b: tuple[float, ...] = ()
     """[u, v] of the second point in `frame_a`."""
     frame_b: str = ""
-    """A second frame with both points; empty = both points lie on the ground."""
+    """A second frame with both points, to triangulate them; empty = both points lie on the ground."""
     a2: tuple[float, ...] = ()
     b2: tuple[float, ...] = ()
 
@@ -194,15 +194,15 @@ class MetricConfig:
     distance: DistanceConfig | None = None
     marker: MarkerConfig | None = None
     gps: bool = False
-    """GPS positions: EXIF of the images, or NavSatFix of bags."""
+    """Use GPS positions: EXIF of the images, or NavSatFix of bags."""
     odometry: bool = False
-    """Distances by the odometry of bags."""
+    """Use distances by the odometry of bags."""
     odometry_tolerance: Annotated[float, Range(0.0001, 0.5)] = 0.03
     """Standard deviation of the relative error of these distances: a few percent for wheels, less for LiDAR or RTK."""
     poses_are_metric: bool = False
-    """The given poses (COLMAP model or transforms.json) are in metres."""
+    """The given poses (COLMAP model or transforms.json) are in meters."""
     up: str = "ground"
-    """Source of the vertical: `ground` (plane of the road), `cameras` (mean camera up) or `poses` (given, z up)."""
+    """Source of the vertical: `ground` (road, path, cameras), `cameras` (mean camera up) or `poses` (given, z up)."""
 
 
 @dataclass(frozen=True)
@@ -223,16 +223,16 @@ class NerfConfig:
     stereo: bool = True
     """Supervise depth from stereo between frames in addition to the sparse points."""
     transients: bool = True
-    """Leave out what moved while a film was made, and what stands in the films of some lightings only."""
+    """Do not train on objects that moved during a film, or that are present under some lightings only."""
     bake_steps: Annotated[int, Range(1)] = 600
     """Number of fine-tuning steps of the baked field, which renders the images."""
     detail_passes: Annotated[float, Range(0, 100)] = 2.0
-    """How often each training pixel on a near surface is used to fit details that are too fine for bricks; 0 = no
-    detail."""
+    """How often each training pixel on a near surface is used to fit details that are too fine for bricks (see
+    `max_bricks`); 0 = no detail."""
     max_bricks: Annotated[int, Range(100)] = 9000
     """Largest number of bricks (blocks of 8 × 8 × 8 cells with 8-bit samples) of the baked field. This number
-    determines the cell size; 9,000 bricks take about 105 MB. If cells would exceed 15 cm, it is raised by a factor of
-    1.39 (146 MB). Fewer than 100 bricks do not cover even the coarsest far grid."""
+    determines the cell size; 9,000 bricks take about 105 MB. If cells would exceed 15 cm, 1.39 times as many bricks
+    are allowed (146 MB). Fewer than 100 bricks cannot cover the distant surroundings."""
     max_width: Annotated[int, Range(32)] = 480
     """Longer side of training images [px]."""
     refine_cameras: bool = False
@@ -244,9 +244,9 @@ class NerfConfig:
     levels: Annotated[int, Range(1, 32)] = 8
     log2_table: Annotated[int, Range(1, 24)] = 18
     near_half_extent: Annotated[float, Range(0, 100)] = 0.0
-    """Half side of the uncontracted near box [m]; 0 = from the cameras."""
+    """Half side of the near box, in which space is not contracted [m]; 0 = from the camera positions."""
     near_plane: Annotated[float, Range(0, 100)] = 0.3
-    """Distance from a camera up to which space is empty [m]."""
+    """Distance from a camera up to which space is assumed empty [m]."""
 
 
 QUALITIES: dict[str, dict[str, int | float]] = {
@@ -291,7 +291,7 @@ class RouteConfig:
     """Passes in driving order, such as "noon:2", or "noon" for the longest pass of that source; the report lists the
     passes."""
     points: tuple[tuple[float, ...], ...] = ()
-    """Way points [x, y] [m] instead of passes, in the frame of the report's map, at most 1 m from the filmed paths."""
+    """Way points [x, y] [m] instead of passes, in the report map's coordinates, at most 1 m from the filmed paths."""
     reverse: bool = False
     """Drive against the filmed direction. The robot's camera then shows views that were not filmed."""
     max_gap: Annotated[float, Range(0, 50)] = 5.0
@@ -348,7 +348,7 @@ class ObstacleConfig:
     yaw: float = 0.0
     """Yaw relative to the route's heading or, for a moving obstacle, to its direction of motion [°]."""
     to: tuple[float, ...] = ()
-    """(station, lateral) [m] of the turning point; the obstacle moves between it and its start. Empty: static."""
+    """(station, lateral) [m] of the turning point; the obstacle starts at `station` and `lateral`. Empty: static."""
     speed: float = 1.2
     """Speed if it moves [m/s]."""
     delay: float = 0.0

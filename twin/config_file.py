@@ -196,7 +196,7 @@ def _check(config: SceneConfig, folder: str) -> None:
         any(scales) or any(source.camera_height > 0.0 for source in config.source),
         "[metric] gives no scale; give one or more of "
         "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
-        "gps = true (EXIF or a bag's fixes), odometry = true (a bag's), "
+        "gps = true (EXIF or NavSatFix of a bag), odometry = true (of a bag), "
         "marker = {family, id, size} (printed ArUco or AprilTag), poses_are_metric = true",
     )
 
@@ -279,7 +279,7 @@ def _check_metric(metric: MetricConfig) -> None:
         _require(size > 0.0, f"metric.marker.size = {size:g}; expected the side of the black square [m]")
     if metric.distance is not None:
         metres, frame = metric.distance.metres, metric.distance.frame_a
-        _require(metres > 0.0, f"metric.distance.metres = {metres:g}; expected the metres between the points a and b")
+        _require(metres > 0.0, f"metric.distance.metres = {metres:g}; expected the meters between the points a and b")
         for key in ("a", "b", *(("a2", "b2") if metric.distance.frame_b else ())):
             pixel = getattr(metric.distance, key)
             _require(len(pixel) == 2, f"metric.distance.{key} = {list(pixel)}; expected [u, v] [px]")
@@ -337,5 +337,5 @@ def _check_obstacles(obstacles: tuple[ObstacleConfig, ...]) -> None:
         _require(sides, f"[[obstacle]] size = {size}; expected length, width, height > 0 [m]")
         _require(all(0.0 <= c <= 1.0 for c in color), f"[[obstacle]] color = {color}; expected values from 0 to 1")
         moves = one.speed > 0.0 or not one.to
-        _require(moves, f"[[obstacle]] speed = {one.speed}; expected more than 0 where it moves")
+        _require(moves, f"[[obstacle]] speed = {one.speed}; expected more than 0, since it moves")
     _check_unique([one.name or f"{one.kind}_{k}" for k, one in enumerate(obstacles)], "[[obstacle]]")

@@ -3,8 +3,8 @@
     python -m twin.drive demo
     python -m twin.drive scenes/demo --policy first --lighting night --view
 
-By default, the driver is the first policy in a pack, or the policy of a scene's only run, on the task of its training;
-if there is no such policy, it is the scripted driver. `twin.film` has more options.
+By default, the first policy in a pack, or the policy of a scene's only run, drives the task of its training; without
+such a policy, the scripted driver drives. `twin.film` has more options.
 """
 
 import argparse

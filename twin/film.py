@@ -6,9 +6,9 @@
     python -m twin.film scenes/demo --lerobot drives --episodes 20
 
 The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is a scripted
-route follower, or a policy that `twin.validate` accepts; then the environment has the policy's options. Task, lighting
-and seed determine the episode, such as that of a row of `validation/episodes.csv`. `--rerun` also writes the drive as a
-recording for Rerun. With `--lerobot`, drives are recorded as a dataset for learning instead of a film.
+route follower, or a policy that `twin.validate` accepts; a policy also gives the environment's options. Task, lighting
+and seed determine the episode, so any row of `validation/episodes.csv` can be filmed. `--rerun` also writes the drive
+as a recording for Rerun. With `--lerobot`, drives are recorded as a dataset for learning instead of a film.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def film(
     Args:
         root: A built scene, or a pack.
         task: See `twin.load`.
-        policy: A run's name, or see `twin.learn.policy.load_policy`; None: the scripted driver.
+        policy: A run's name, or a source as in `twin.learn.policy.load_policy`; None: the scripted driver.
         seed: Seed of the episode.
         out: The mp4 file; by default `films/<task>_<lighting>_<seed>.mp4` in the scene's folder, or for a pack
             `<pack>_<task>_<lighting>_<seed>.mp4` in the working folder.
@@ -206,7 +206,7 @@ def command(given: argparse.Namespace) -> None:
             print(drives_summary(drives, given.lerobot))
         return
     if given.episodes != 1:
-        raise InputError(f"--episodes {given.episodes}: a film shows one drive; several are for --lerobot DIR")
+        raise InputError(f"--episodes {given.episodes}: a film shows one drive; for several, use --lerobot DIR")
     path, episode = film(given.scene, *driven, given.out, given.trust, given.rerun, **options)
     if not given.quiet:
         print(summary(path, episode))

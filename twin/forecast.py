@@ -57,7 +57,7 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
 
 
 def command(options: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin forecast` with the options parsed by `twin.commands`."""
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
     result = forecast(options.scene, options.real, options.seed)

@@ -4,8 +4,8 @@
 
 This writes `scenes/my_road/scene.toml` with the common settings and copies the films into `input/`;
 `python -m twin.build scenes/my_road` then builds the scene. A bag (`twin.capture.bag_film`) provides pictures and their
-calibration. Its GPS and odometry become sources of scale. Its `/tf_static` gives the camera's height, and the camera's
-position and angles on the robot (its *seat*), which are written to `robot.toml`.
+calibration. Its GPS and odometry become sources of scale. Its `/tf_static` gives the camera's extrinsics (height,
+position and angles on the robot), which are written to `robot.toml`.
 
 A *posed image set* is a `transforms.json` or a COLMAP model, which refers to image files. Its *root* is the deepest
 folder that contains all of its files; they are copied with their paths relative to the root.
@@ -37,7 +37,7 @@ from twin.scene import SceneDir
 from twin.sysid.identification import toml_text
 
 _POSED = ("colmap", "transforms")
-_MIN_FIX_WAY = 20.0  # [m] from the first GPS fix to the farthest one; with less, GPS does not determine the scale
+_MIN_FIX_WAY = 20.0  # [m] from the first GPS fix to the farthest fix; with less, GPS does not determine the scale
 _MIN_ODOMETRY_WAY = 15.0  # [m] length of the path; with less, odometry does not determine the scale
 _SEAT_TOLERANCE = 0.02  # [m] standard deviation of a camera's height that comes from /tf_static
 _SEAT_FIELDS = ("height", "offset", "yaw", "pitch", "roll")
@@ -59,20 +59,20 @@ path = {path}
 
 _NO_MASK = '# mask = "input/mask.png"'
 _MASK = """\
-# Found by twin new: the black pixels of this mask are the same in all frames. If that is wrong, delete the next line.
+# Found by twin new: where this mask is black, all frames look the same. If that is wrong, delete the next line.
 mask = {path}"""
 
 _REST = """
 [capture]
 fps = 2.0                      # frames kept per second of film, the sharpest of each time slot
-# frames = 80                  # or: so many per film
-# keep = [[0, 62.5]]           # use only these time ranges [s], such as one pass; under a [[source]]: for it only
+# frames = 80                  # or: this number of frames per film
+# keep = [[0, 62.5]]           # use only these time ranges [s]; under a [[source]]: for that source only
 
-[metric]                       # sources of the metric scale; several are compared
+[metric]                       # sources of the metric scale; several are compared and combined
 {camera_height}
 {gps}
 {odometry}
-# poses_are_metric = true      # the given poses are in metres
+# poses_are_metric = true      # the given poses are in meters
 # marker = {{ family = "DICT_APRILTAG_36h11", id = 0, size = 0.16 }}   # a printed marker; side of its square [m]
 # distance = {{ metres = 3.5, frame_a = "day/000012", a = [400, 500], b = [700, 500] }}   # two points on the road
 
@@ -83,8 +83,8 @@ half_width = 1.0               # half the width of the drivable corridor around 
 
 
 def new_scene(root: Path, films: list[Path], camera_height: float | None = None, topic: str = "") -> Path:
-    """Writes a scene folder: copies of the films in `input/`, `robot.toml` if a bag has the camera's seat, and
-    `scene.toml`. Returns the path of `scene.toml`. Logs the data found in bags, and problems with films.
+    """Writes a scene folder: copies of the films in `input/`, `robot.toml` if a bag has the camera's extrinsics,
+    and `scene.toml`. Returns the path of `scene.toml`. Logs the data found in bags, and problems with films.
 
     Args:
         root: The scene folder; created if it does not exist.
@@ -100,7 +100,7 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
     if scene.config_file.exists():
         raise InputError(f"{scene.config_file}: a scene is here already; edit it, or choose another folder")
     if camera_height is not None and not 0.01 <= camera_height <= 100.0:
-        raise InputError(f"--camera-height {camera_height:g}: expected metres above the ground, such as 1.2")
+        raise InputError(f"--camera-height {camera_height:g}: expected meters above the ground, such as 1.2")
     bags: dict[Path, BagContents] = {}
     for film in films:
         if not film.exists():
@@ -141,7 +141,7 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
 
 
 def _mask_lines(check: FilmCheck, inputs: Path, path: Path) -> tuple[list[str], str]:
-    """Writes the mask of what is fixed to the camera, unless a file of that name exists.
+    """Writes the mask of what is fixed to the camera, unless the mask's file exists.
 
     Args:
         path: The film, relative to the folder `inputs`.
@@ -166,7 +166,7 @@ def _scale_lines(bags: list[BagContents], camera_height: float | None, seat: Cam
     elif seat is not None:
         height = (
             f"camera_height = {seat.height:<14.4g} # lens above the ground [m], by /tf_static\n"
-            f"camera_height_tolerance = {_SEAT_TOLERANCE:<4g} # its standard deviation [m]; measure it for less"
+            f"camera_height_tolerance = {_SEAT_TOLERANCE:<4g} # its standard deviation [m]; smaller if measured by hand"
         )
     else:
         height = "# camera_height = 1.2          # lens above the ground [m]: fill in, or choose another source below"
@@ -174,8 +174,8 @@ def _scale_lines(bags: list[BagContents], camera_height: float | None, seat: Cam
     odometry = "" if any(_odometry_way(bag) >= _MIN_ODOMETRY_WAY for bag in bags) else "# "
     return {
         "camera_height": height,
-        "gps": f"{gps + 'gps = true':<30} # positions: EXIF of photos, or a bag's fixes",
-        "odometry": f"{odometry + 'odometry = true':<30} # distances by a bag's odometry, good to 3 %"
+        "gps": f"{gps + 'gps = true':<30} # positions: EXIF of photos, or a bag's NavSatFix",
+        "odometry": f"{odometry + 'odometry = true':<30} # distances by a bag's odometry, accurate to 3 %"
         " (odometry_tolerance)",
     }
 
@@ -197,7 +197,7 @@ def _odometry_way(bag: BagContents) -> float:
 
 
 def _write_seat(path: Path, seat: CameraSeat, bag: BagContents) -> bool:
-    """Writes `robot.toml` with the camera's seat, unless the file exists. Returns False if the seat is out of the
+    """Writes `robot.toml` with the camera's extrinsics, unless the file exists. Returns False if they are out of the
     ranges for a Husky."""
     fields = {f"camera_{name}": getattr(seat, name) for name in _SEAT_FIELDS}
     try:
@@ -223,12 +223,13 @@ def _taken(bag: BagContents) -> str:
         lines.append(f"  other pictures: {others}; choose by --topic, or topic = in scene.toml")
     if "fixes" in bag.topics:
         lines.append(
-            f"  GPS: {bag.topics['fixes']}, {np.isfinite(bag.fixes[:, :2]).all(1).sum()} fixes, {_fix_way(bag):.1f} m"
+            f"  GPS: {bag.topics['fixes']}, {np.isfinite(bag.fixes[:, :2]).all(1).sum()} fixes, "
+            f"up to {_fix_way(bag):.1f} m from the first"
         )
     if "odometry" in bag.topics:
-        lines.append(f"  odometry: {bag.topics['odometry']}, {_odometry_way(bag):.1f} m")
+        lines.append(f"  odometry: {bag.topics['odometry']}, a path of {_odometry_way(bag):.1f} m")
     if bag.seat:
-        ground = "" if bag.seat.ground_known else f" (base_link as high as a Husky's, {BASE_HEIGHT:.3f} m)"
+        ground = "" if bag.seat.ground_known else f" (base_link assumed {BASE_HEIGHT:.3f} m high, as on a Husky)"
         lines.append(
             f"  camera on the robot: {bag.seat.height:.3f} m above the ground{ground}, {bag.seat.offset[0]:.3f} m "
             f"ahead, pitch {bag.seat.pitch:.1f}°, by {bag.topics['transforms']}"
@@ -290,7 +291,7 @@ def _copy_image_set(film: Path, inputs: Path) -> Path:
     outside = [path for path in _image_set(aside / within).paths if not path.is_relative_to(aside)]
     if outside:
         shutil.rmtree(aside)
-        raise InputError(f"{film}: names images by absolute paths, such as {outside[0]}; make them relative to it")
+        raise InputError(f"{film}: names images by absolute paths, such as {outside[0]}; make them relative")
     aside.replace(copy)
     return Path(copy.name) / within
 
@@ -331,11 +332,11 @@ def _lighting(path: Path, kind: str) -> str:
 
 
 def command(options: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin new` with the options parsed by `twin.commands`."""
     config = new_scene(options.scene, options.films, options.camera_height, options.topic or "")
     print(f"wrote {config}")
     if not any(read_toml(config)["metric"].values()):
-        print("fill in [metric] there: without a scale nothing is metric")
+        print("fill in [metric] there: the build needs a metric scale")
     print(f"next: python -m twin.build {options.scene}")
 
 

@@ -3,14 +3,14 @@
     python -m twin.pack scenes/demo --policy first -o demo.twin
     python -m twin.pack scenes/demo --policy first --levels 8 -o scenes/demo.twin
 
-A pack contains what driving needs: the baked field, the MJCF scene with its assets, ground, parts and cameras, tasks,
-robot, and lightings of photos. It contains no films, frames and reports, and not the field as trained. Private data are
-left out: comments and paths of `scene.toml`, photos, dependencies in stamps and, unless asked for, GPS positions.
-`twin.unpack` describes the format.
+A pack contains what driving needs: the baked radiance field, the MJCF scene with its assets, ground, collision parts
+and cameras, tasks, robot, and lightings fitted to photos. It contains no films, frames, reports, or torch model.
+Private data are left out: comments and paths of `scene.toml`, photos, dependencies in stamps and, unless asked for, GPS
+positions. `twin.unpack` describes the format.
 
-Driving in a pack gives the same results as in the scene, bit for bit: in the field, only samples that no ray reads are
-replaced (`brick_layout.samples_read`). With `--levels` below 256, the features are rounded to that number of values.
-The pack is then smaller, but contains a different field.
+Driving in a pack gives the same results as in the scene, bit for bit: only those samples of the radiance field are
+replaced that no ray reads (`brick_layout.samples_read`). With `--levels` below 256, the field's features are rounded to
+that number of values, which makes the pack smaller and changes the field.
 """
 
 import argparse
@@ -39,14 +39,14 @@ from twin.nerf.brick_layout import BrickLayout, samples_read
 from twin.scene import STAGES, SceneDir, Stamp, package_versions, require_stage, stage_result
 
 LEVELS = 256
-"""Default of `--levels`, the number of values of a byte: the field is not rounded."""
-_ZERO = 128  # features are rounded to multiples of the step from this byte, which stands for 0 in the detail
-_FINER = 4  # step of features / step of the density, which is rounded less because it determines surfaces
+"""Default of `--levels`: the number of values of a byte, with which the field is not rounded."""
+_ZERO = 128  # byte that stands for 0 in the detail; rounding gives values at multiples of the step from it
+_FINER = 4  # step of features / step of density; density is rounded less because it determines surfaces
 _VERTEX_STEP = 2  # step of the hash grid's vertices / step of features
 _PACKED = {"metric": ("cameras.json", "cameras.npz"), "field": ("baked.json", "baked.safetensors")}
 _MESH = ("ground.npz", "parts.npz", "visual.npz")
 _TEXT = """\
-A pack of {name}, made by twin {version}: a place to drive in, on MuJoCo, as `twin build` made it of films.
+A pack of {name}, made by twin {version}: a place to drive in, on MuJoCo, as `twin build` made it from films.
 
   pip install twin                       the program, see its README
   twin drive {file}     the Husky drives in it{driver}
@@ -57,7 +57,7 @@ LICENCE
 
 PRIVACY
   The place is shown as its films show it: people, license plates and private ground that are in them may be
-  recognizable in rendered pictures. Whoever passes this file on answers for that.
+  recognizable in rendered pictures. Whoever passes this file on is responsible for that.
   Films, frames, photos and their EXIF headers are not in it. {positions}
 
 Nothing in this file runs when it is opened{zips}. manifest.json has the SHA-256 of every file.
@@ -105,7 +105,7 @@ def pack(
     field = _add_stages(files, scene, levels)
     for path in sorted(scene.lightings.glob("*.json")):
         lighting = read_json(path)
-        if lighting.get("field") == stage_result(scene, "field"):  # others are stale
+        if lighting.get("field") == stage_result(scene, "field"):  # lightings of an older field are left out
             lighting |= {"field": field, "photo": PurePath(str(lighting.get("photo"))).name}
             files[f"lightings/{path.name}"] = json_bytes(lighting)
     head = {
@@ -169,8 +169,8 @@ def _positions(twin: Twin) -> bytes:
 def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
     """Adds the files of each stage that driving needs, with a stamp for these files; returns the field's result.
 
-    The results in the stamps are those of the build, so that lightings and tables remain valid; only a rounded field
-    gets another result.
+    The stamps keep the build's results (content digests), so that lightings and tables remain valid; only a rounded
+    field gets another result.
     """
     results = {}
     for stage in unpack.STAGES_PACKED:
@@ -276,7 +276,7 @@ def command(given: argparse.Namespace) -> None:
     )
     if not given.quiet:
         total = sum(one["bytes"] for one in manifest["files"].values())
-        size = f"{out.stat().st_size / 1e6:.1f} MB, {total / 1e6:.1f} unpacked"
+        size = f"{out.stat().st_size / 1e6:.1f} MB, {total / 1e6:.1f} MB unpacked"
         print(f"{out}: {size}; drive in it: twin drive {out}")
 
 

@@ -3,11 +3,11 @@
     python -m twin.relight scenes/demo photo.jpg --name afternoon
     python -m twin.relight scenes/demo photo.jpg --name afternoon --time 2026-06-01T17:30+02:00 --location 48.14,11.58
 
-This localizes the photo, then fits an appearance embedding and fog so that renderings of the frozen field match the
-photo. The lighting is saved as `<scene>/lightings/afternoon.json`, with an image beside it that shows the photo, the
-field under the fitted lighting, and the field under the most similar filmed lighting. A lighting may have a sun. Its
-direction is given, computed from time and place, or, on demand, searched in the photo (`nerf/sun_fit.py`). Afterwards,
-`twin.load_scene(scene).field()` has the lighting as `lighting="afternoon"` or in mixtures such as
+This localizes the photo, then fits an appearance embedding and fog so that renderings of the frozen radiance field
+match the photo. The lighting is saved as `<scene>/lightings/afternoon.json`, with an image beside it that shows the
+photo, the field under the fitted lighting, and the field under the most similar filmed lighting. A lighting may have a
+sun. Its direction is given, computed from time and place, or, on demand, searched in the photo (`nerf/sun_fit.py`).
+Afterwards, `twin.load_scene(scene).field()` has the lighting as `lighting="afternoon"` or in mixtures such as
 `"sun:afternoon:0.5"`; environments apply its sun and fog to their images.
 """
 
@@ -58,7 +58,7 @@ class PhotoFit:
     embedding: NDArray[np.float32]
     """Appearance embedding, shape (dim,)."""
     fog: Fog
-    """The fitted fog, or none if fog does not improve the fit."""
+    """The fitted fog; without effect if fog does not improve the fit."""
     images: tuple[NDArray, NDArray, NDArray]
     """Photo, field under the fitted lighting and fog, field under `nearest`; RGB in [0, 1], shapes (h, w, 3)."""
     psnr_nearest: float
@@ -70,11 +70,11 @@ class PhotoFit:
     psnr_clear_other_half: float
     """The same mean for fits without fog [dB]."""
     traced: "TracedPhoto | None" = None
-    """The photo with what the field has in its pixels."""
+    """The photo with the field's depth and features at its pixels."""
     fits: tuple["AirFit", ...] = ()
     """The fits to the left half, to the right half and to the whole photo."""
     sun: Sun | None = None
-    """The fitted sun, or none if it does not improve the fit."""
+    """The fitted sun; None if no sun is wanted, or the sun does not improve the fit."""
     sun_from: str = ""
     """Origin of the sun's direction, or the reason why there is no sun."""
     psnr_no_sun_other_half: float | None = None
@@ -159,9 +159,9 @@ class SunSource:
 
 
 def with_sun(field, relit: PhotoFit, casters: ShadowCasters, source: SunSource) -> PhotoFit:
-    """The fit with a sun if that improves the half of the photo that is not fitted, or else the same fit.
+    """The fit with a sun if a sun improves the half of the photo that is not fitted; else `relit` with the reason.
 
-    A sun that is found in the photo must improve it by `_SUN_GAIN`.
+    A sun that is found in the photo must improve that half by `_SUN_GAIN`.
     """
     from twin.nerf.buffers import single_threaded_torch
     from twin.nerf.sun_fit import fit_sun
@@ -172,8 +172,8 @@ def with_sun(field, relit: PhotoFit, casters: ShadowCasters, source: SunSource) 
         lit = fit_sun(field, relit.traced, (left, right), whole, casters, source.toward)
     needed = relit.psnr_other_half + (_SUN_GAIN if source.toward is None else 0.0)
     if not lit.psnr_other_half > needed:
-        seen = f"with a sun {lit.psnr_other_half:.1f} dB" + ("" if source.toward is None else f" ({source.origin})")
-        because = f"the photo is not explained better by one: {seen}"
+        seen = f"{lit.psnr_other_half:.1f} dB with it" + ("" if source.toward is None else f" ({source.origin})")
+        because = f"a sun does not explain the photo better: {seen}"
         return replace(relit, sun_from=because, sun_disagreement=lit.disagreement)
     photo, _, nearest = relit.images
     return replace(
@@ -193,7 +193,7 @@ def with_sun(field, relit: PhotoFit, casters: ShadowCasters, source: SunSource) 
 def find_sun(
     scene: SceneDir, sun: str | None, time: str | None, location: str | None, heading: float | None
 ) -> SunSource | None:
-    """Direction of the sun from the options of the verb; None: no sun is wanted.
+    """Direction of the sun from the options of the command; None: no sun is wanted.
 
     Raises:
         InputError: an option is malformed, options contradict each other, or location or heading are missing and the
@@ -258,7 +258,7 @@ def _two_numbers(option: str, text: str, expected: str) -> tuple[float, float]:
 
 
 def comparison(name: str, relit: PhotoFit) -> NDArray[np.uint8]:
-    """Labelled image of a fit: photo, fitted lighting and nearest filmed lighting side by side."""
+    """Labeled image of a fit: photo, fitted lighting and nearest filmed lighting side by side."""
     from twin.report.video_layout import draw_label
 
     height, width = relit.images[0].shape[:2]
@@ -322,7 +322,7 @@ def relight(
     has_mesh = (scene.stage("mesh") / "visual.npz").exists()
     casters = shadow_casters(scene, BakedField.load(scene.stage("field"))) if source and has_mesh else None
     if source and casters is None:
-        raise InputError("a sun needs the stage mesh, whose surfaces throw the shadows; run python -m twin.build SCENE")
+        raise InputError("a sun needs the build stage mesh, for its shadows; run python -m twin.build SCENE")
     image, facts = load_photo(photo, None)
     try:
         found = register_photo(image, facts, scene)
@@ -370,10 +370,11 @@ def summary(lighting: AddedLighting) -> str:
     x, y, z = np.array(f["camera_to_world"])[:3, 3]
     return (
         f"registered with {f['inliers']} inliers of {f['matches']} matches at ({x:.2f}, {y:.2f}, {z:.2f}) m, "
-        f"{f['from_path_m']:.2f} m from the nearest frame; {f['reprojection_error_px']:.2f} px; "
+        f"{f['from_path_m']:.2f} m from the nearest frame; reprojection error {f['reprojection_error_px']:.2f} px; "
         f"focal length {f['focal_px']:.0f} px ({f['focal_from']})\n"
         f"{lighting.name}: {f['psnr_nearest']:.1f} dB under the nearest filmed lighting ({f['nearest']}), "
-        f"{f['psnr_fitted']:.1f} dB fitted; each half of the image by the other's fit {f['psnr_other_half']:.1f} dB\n"
+        f"{f['psnr_fitted']:.1f} dB fitted; each half of the image under the other half's fit "
+        f"{f['psnr_other_half']:.1f} dB\n"
         + (f"visibility {3.0 / fog.extinction:.0f} m; {clear}" if fog.extinction else "no fog")
         + _sun_line(f)
     )
@@ -384,14 +385,14 @@ def _sun_line(figures: dict) -> str:
     if "sun_azimuth_deg" in figures:
         return (
             f"\nsun at azimuth {figures['sun_azimuth_deg']:.0f}° (counterclockwise from the x axis), elevation "
-            f"{figures['sun_elevation_deg']:.0f}°, {figures['sun_from']}; without it those halves have "
+            f"{figures['sun_elevation_deg']:.0f}°, {figures['sun_from']}; without a sun those halves have "
             f"{figures['psnr_no_sun_other_half']:.1f} dB"
         )
     return f"\nno sun: {figures['sun_from']}" if "sun_from" in figures else ""
 
 
 def command(options: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin relight` with the options parsed by `twin.commands`."""
     given = (options.sun, options.time, options.location, options.heading)
     lighting = relight(options.scene, options.photo, options.name, *given)
     if not options.quiet:

@@ -97,8 +97,8 @@ class HuskyParams:
     center_of_mass: Annotated[tuple[float, float, float], Range(-0.5, 0.5)] = (0.0, 0.0, 0.062)
     """Center of mass of the chassis in the base [m]. The published one, (−.00065, −.085, .062), lies 8.5 cm to the
     right, although the robot is symmetric. With x and y exchanged (`REAR_HEAVY`), the robot turns with chi = 1.43. With
-    this centered one, chi is 1.805, nearer to Clearpath's controller (1.82 to 1.875) and to logs of a real robot (2.15
-    and more)."""
+    the default, which is centered, chi is 1.805, nearer to Clearpath's controller (1.82 to 1.875) and to logs of a real
+    robot (2.15 and more)."""
     payload_mass: Annotated[float, Range(0, 100)] = 0.0
     """Mass on the top plate [kg]."""
     payload_position: Annotated[tuple[float, float, float], Range(-2, 2)] = (0.0, 0.0, 0.35)
@@ -142,8 +142,8 @@ class HuskyParams:
 
     # Controller.
     controller: str = "ros1"
-    """Timing of the wheel controller, a key of `CONTROLLERS`: ros1, ros2 or ros2_50hz. Limits are separate: Clearpath's
-    A200 on ROS 2 has 1 m/s², 1 rad/s and 1 rad/s²."""
+    """Timing of the wheel controller, a key of `CONTROLLERS`: ros1, ros2 or ros2_50hz. The limits below are independent
+    of it; for Clearpath's A200 on ROS 2, set accelerations of 1 m/s² and 1 rad/s², and a yaw rate of 1 rad/s."""
     max_speed: Annotated[float, Range(0.01, 5)] = 1.0
     """Limit of the speed [m/s]."""
     max_acceleration: Annotated[float, Range(0.01, 100)] = 3.0

@@ -82,7 +82,7 @@ def bar(what: str, total: int, unit: str = "it", after: float = 0.0) -> tqdm:
     """A progress bar, which is also a context manager.
 
     In a terminal it is redrawn in place; in a log file it writes a line every 10 s; with `set_quiet`, nothing is shown.
-    It appears after a delay `after` [s], for work that is slow only the first time.
+    It appears after `after` [s], so that work which is usually fast shows no bar.
     """
     every = 0.1 if sys.stderr.isatty() else 10.0
     return _Bar(
@@ -123,7 +123,7 @@ class Stopped(KeyboardInterrupt):
 def stoppable() -> Iterator[None]:
     """Within the block, the first SIGINT, SIGTERM or SIGHUP raises `Stopped`.
 
-    Later ones are ignored, so that cleanup can finish, except SIGINT, which ends the process at once. Signals that were
+    Later signals are ignored, so that cleanup can finish; only SIGINT ends the process at once. Signals that were
     ignored when the process started, for example because of nohup, stay ignored.
     """
     stopping = False
@@ -141,7 +141,7 @@ def stoppable() -> Iterator[None]:
 
 
 class StopNotice:
-    """`number` is that of the first signal that asked the process to stop, or 0."""
+    """`number` is the first signal that asked the process to stop, or 0."""
 
     number = 0
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def command(given: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin train` with the options parsed by `twin.commands`."""
     from twin.learn.train_config import PRESETS, TrainConfig
     from twin.report.policy_card import write_policy_cards
 
@@ -75,7 +75,7 @@ def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
 def _train(
     twin: Twin, folder: Path, config: "TrainConfig", processes: int | None, project: str | None
 ) -> dict[str, Any]:
-    """Trains with progress bars; returns the contents of `choice.json`. `project`: in Weights & Biases, or None."""
+    """Trains with progress bars; returns the contents of `choice.json`. `project`: name in Weights & Biases."""
     try:
         from twin.learn.selection import earlier_choice, train_until_learnt
         from twin.learn.training import prepare_folder

@@ -3,17 +3,18 @@
     python -m twin.trial scenes/my_road monday_1.mcap --policy first --task straight --lighting monday
 
 The bag has the front camera's pictures and camera_info, commands, and poses (RTK, LiDAR or filtered odometry). Pictures
-are localized in the scene, and the poses are fitted to their positions. Then the trial is judged by the twin's rules of
-success and failure. Poses do not show collisions; `--cause collision` states that the recording ends with one.
+are localized in the scene, and the poses are fitted to their positions. Then the twin's rules of success and failure
+are applied to the trial. Poses do not show collisions; `--cause collision` states that the recording ends with a
+collision.
 
 Two files are written to `<scene>/trials/<bag>/`. `trial.mp4` shows the robot's pictures beside the twin's. `trial.json`
 has the outcome; the distance between the final positions of the real robot and of the twin's robot under the same
-commands; the similarity of the pictures; and the fraction of recorded commands that the policy gives again for the
-recorded pictures. The trial is counted in `real.csv`, and listed with its cause in `real_trials.csv` beside it.
+commands; the similarity of the pictures; and the fraction of recorded commands that the policy repeats when it receives
+the recorded pictures. The trial is counted in `real.csv`, and listed with its cause in `real_trials.csv` beside it.
 
     python -m twin.trial scenes/my_road monday_1.mcap monday_2.mcap --task straight --lerobot drives
 
-With `--lerobot`, recordings are written as a dataset for learning instead; see `report/bag_dataset.py`.
+With `--lerobot`, recordings are written as a dataset for learning instead; see `twin/report/bag_dataset.py`.
 """
 
 import argparse
@@ -57,7 +58,7 @@ def record_trial(
     frame: str = FIT,
     topics: dict[str, str] | None = None,
 ) -> tuple[Trial, dict[str, Any], Path]:
-    """Judges a trial and writes its results. Returns its row of `real_trials.csv`, its figures and its folder.
+    """Evaluates a trial and writes its results. Returns its row of `real_trials.csv`, its figures and its folder.
 
     Args:
         root: A built scene.
@@ -166,7 +167,7 @@ class _PolicyOfPictures:
 def _pictures(
     recording: TrialRecording, rectify: Rectifier, policy: Policy, begin: int, end: int
 ) -> tuple[NDArray[np.int64], list[Image], Array]:
-    """Feeds the pictures between start and end to the pilot that runs policies on the robot.
+    """Feeds the pictures between start and end to `Pilot`, the code that runs policies on the robot.
 
     Returns:
         Stamps [ns] (n,) of the pictures that the policy used; these pictures (h, w, 3); and the policy's commands minus
@@ -266,7 +267,7 @@ def summary(row: Trial, figures: dict[str, Any]) -> str:
         )
     if frame["located"]:
         lines.append(
-            f"{frame['located']} pictures located; poses fit them to {frame['residual_m']:.2f} m rms, "
+            f"{frame['located']} pictures located; poses fit their positions to {frame['residual_m']:.2f} m rms, "
             f"{(frame['scale'] - 1.0):+.1%} in scale"
         )
     early = "" if replayed["after_2_s_m"] is None else f"{replayed['after_2_s_m']:.2f} m after 2 s, "
@@ -275,19 +276,19 @@ def summary(row: Trial, figures: dict[str, Any]) -> str:
         "off at the end"
     )
     lines.append(
-        f"pictures against the twin under {seen['lighting']}: {seen['psnr_median']:.1f} dB, "
+        f"PSNR of the pictures against the twin under {seen['lighting']}: {seen['psnr_median']:.1f} dB, "
         f"{seen['psnr_matched_median']:.1f} dB with colors matched, trust {seen['trust_mean']:.2f}"
     )
     if policy["commands"]:
         lines.append(
-            f"the policy gives {policy['same']:.0%} of {policy['commands']} recorded commands again; yaw rates differ "
+            f"the policy repeats {policy['same']:.0%} of {policy['commands']} recorded commands; yaw rates differ "
             f"by {policy['yaw_rate_rms']:.3f} rad/s rms"
         )
     return "\n".join(lines)
 
 
 def command(options: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin trial` with the options parsed by `twin.commands`."""
     names = {"pictures": options.image, "camera": options.camera_info}
     names |= {"poses": options.poses, "commands": options.commands}
     topics = {kind: topic for kind, topic in names.items() if topic}
@@ -303,7 +304,7 @@ def command(options: argparse.Namespace) -> None:
             print(drives_summary(drives, options.lerobot))
         return
     if len(options.bag) > 1:
-        raise InputError(f"{len(options.bag)} bags: a bag is a trial; several are for --lerobot DIR")
+        raise InputError(f"{len(options.bag)} bags: expected the bag of one trial; for several, use --lerobot DIR")
     for name in ("policy", "lighting"):
         if not getattr(options, name):
             raise InputError(f"a trial needs --{name}; without a policy, --lerobot DIR records drives to learn from")

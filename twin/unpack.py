@@ -148,7 +148,7 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
     zips = [name for name in manifest["files"] if name.endswith(".zip")]
     if zips and not trust:
         raise InputError(
-            f"{path} has {zips[0]}, which may run code when it is loaded; if you trust its sender, --trust"
+            f"{path} has {zips[0]}, which may run code when it is loaded; if you trust its sender, add --trust"
         )
     if exists(folder) and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder} exists; give a folder that does not")
@@ -212,9 +212,9 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
     for name, entry in by_name.items():
         kind = stat.S_IFMT(entry.external_attr >> 16)
         if kind not in (0, stat.S_IFREG) or entry.is_dir():
-            raise InputError(f"{path}: {name} is a link or no file; {_CURE}")
+            raise InputError(f"{path}: {name} is not a regular file; {_CURE}")
         if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise InputError(f"{path}: {name} is encrypted or compressed in another way; {_CURE}")
+            raise InputError(f"{path}: {name} is encrypted, or compressed by another method than deflate; {_CURE}")
         if name in head["files"] and entry.file_size != head["files"][name]["bytes"]:
             raise InputError(f"{path}: {name} has {entry.file_size:,} bytes; {MANIFEST} says otherwise; {_CURE}")
     head["name"] = require_text(head["name"])

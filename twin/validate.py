@@ -45,7 +45,7 @@ DEFAULT_LIGHTINGS = (HELD_OUT, str(Condition(HELD_OUT, True)))
 
 _FIRST_SEED, _PER_LIGHTING, _BLOCKS = 1_000_000_000, 1_000, 900_000  # see `lighting_seeds`
 _SEARCH_SEED, _FINAL_SEED = 2_000_000, 3_000_000  # first seeds of the search for the worst lighting, and of its test
-_SEARCH_LIGHTINGS, _SEARCH_EPISODES, _SEARCH_KEPT = 16, 4, 4  # in the first round: lightings, episodes each, kept
+_SEARCH_LIGHTINGS, _SEARCH_EPISODES, _SEARCH_KEPT = 16, 4, 4  # first round: lightings, episodes in each, lightings kept
 _MAX_PROCESSES = 1024
 
 Key = tuple[str, str, str, int]
@@ -72,7 +72,7 @@ class Campaign:
             sources: Sources of the policies by name.
             trust: Allows policy files to run code.
             processes: Number of local worker processes.
-            ray: Address of a Ray cluster to use instead of worker processes; None: none.
+            ray: Address of a Ray cluster; None: worker processes are used.
         """
         self._scene, self.task, self.path = str(twin.scene.root.resolve()), task, path
         self._sources, self._trust, self._processes, self._ray = sources, trust, processes, ray
@@ -178,7 +178,7 @@ def _write_results(twin: Twin) -> dict:
 
 
 def _worst_lightings(path: Path) -> list[dict]:
-    """Results in the worst lighting found, from the final episodes: one cell per policy and task with a search."""
+    """Results of the final episodes, in the worst lighting found: one cell per policy and task with a search."""
     trials = _read_table(path)
     cells = summarize([t for t in trials if t.seed >= _FINAL_SEED])["cells"]
     return [
@@ -253,7 +253,7 @@ def _search_worst_lighting(search: Campaign, policy: str, episodes: int) -> None
     trials_by_lighting: dict[str, list[Trial]] = {name: [] for name in candidates}
     while len(candidates) > 1:
         wanted = [(policy, name, seeds) for name in candidates]
-        trials = search.drive(wanted, f"worst lighting of {len(candidates)}")
+        trials = search.drive(wanted, f"search, worst of {len(candidates)} lightings")
         for trial in trials:
             trials_by_lighting[trial.lighting].append(trial)
         kept = _SEARCH_KEPT if len(candidates) > _SEARCH_KEPT else 1
@@ -261,7 +261,7 @@ def _search_worst_lighting(search: Campaign, policy: str, episodes: int) -> None
         seeds = range(seeds.stop, seeds.stop + 2 * len(seeds))
     # The minimum of many noisy scores is biased, so the lighting found is evaluated in independent episodes.
     final = range(_FINAL_SEED, _FINAL_SEED + episodes)
-    search.drive([(policy, candidates[0], final)], f"{candidates[0]} again")
+    search.drive([(policy, candidates[0], final)], f"test in {candidates[0]}")
 
 
 def _score(trials: Sequence[Trial]) -> tuple[float, float]:
@@ -354,7 +354,7 @@ def _read_table(path: Path) -> list[Trial]:
 
 
 def command(given: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin validate` with the options parsed by `twin.commands`."""
     for name, most in (("episodes", _PER_LIGHTING), ("processes", _MAX_PROCESSES)):
         if not 1 <= getattr(given, name) <= most:
             raise InputError(f"--{name} {getattr(given, name)}; expected 1 to {most}")

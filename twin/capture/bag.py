@@ -52,11 +52,11 @@ TYPES = {
 FROM_WHEELS = ("platform", "wheel", "velocity_controller")
 """A topic with one of these words in its name is taken for odometry computed from the wheels."""
 MIN_POSES = 10
-"""A topic with fewer poses, such as one with the goals that an operator clicks on a map, is used only if no topic has
-this many."""
+"""A topic with fewer poses, such as the goals that an operator clicks on a map, is used only if no topic has this
+many."""
 # A topic with one of these words in its name is used for pictures only if it is given explicitly.
 _OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")
-# [ns] If header and recording times differ by more than this in the median, the headers are of another clock.
+# [ns] If header and recording times differ by more than this in the median, the header times are of another clock.
 _CLOCK = 1_000_000_000
 _MAX_METADATA = 16 << 20  # [bytes] largest accepted metadata.yaml
 _MAX_CHUNK = 1 << 30  # [bytes] largest accepted MCAP chunk, uncompressed
@@ -178,7 +178,7 @@ def choose_pictures(connections: Sequence[Any], path: Path, topic: str = "") -> 
     if topic:
         if topic not in messages_by_topic(connections, (RAW, COMPRESSED)):
             have = join_names(picture_topics(connections), most=12)
-            raise InputError(f"{path}: no pictures on topic {topic}; there are pictures on {have}")
+            raise InputError(f"{path}: no pictures on topic {topic}; expected one of {have}")
         return topic
     found = picture_topics(connections)
     if not found:
@@ -187,7 +187,7 @@ def choose_pictures(connections: Sequence[Any], path: Path, topic: str = "") -> 
 
 
 def choose_camera_info(connections: Iterable[Any], pictures: str) -> str | None:
-    """The CameraInfo topic nearest in name to the pictures' topic, see `_common`; None without a CameraInfo."""
+    """The CameraInfo topic whose name is most like that of the pictures, see `_common`; None without a CameraInfo."""
     found = messages_by_topic(connections, (CAMERA_INFO,))
     return max(found, key=lambda topic: _common(topic, pictures), default=None)
 
@@ -199,7 +199,7 @@ def _common(one: str, other: str) -> int:
 
 
 def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYPES)) -> dict[str, Any]:
-    """Maps each of `kinds`, keys of `TYPES`, to its best connection. Raises InputError if one has none, except imu."""
+    """Maps each of `kinds`, keys of `TYPES`, to its best connection. Raises InputError if any but imu has none."""
     chosen = {}
     for kind in kinds:
         types = TYPES[kind]
@@ -287,8 +287,8 @@ def _imu(message: Any) -> tuple[float, ...]:
 VALUES: dict[str, Callable[[Any], Any]] = {"commands": _twist, "wheels": _wheels, "poses": _pose, "imu": _imu}
 """Kind → function that extracts a message's numbers.
 
-- commands: linear and angular speed
-- wheels: mean speed of the left and of the right wheels, or None if a side is missing
-- poses: x, y and yaw
-- imu: accelerations along x and y
+- commands: linear [m/s] and angular speed [rad/s]
+- wheels: mean speed of the left and of the right wheels [rad/s], or None if a side is missing
+- poses: x, y [m] and yaw [rad]
+- imu: accelerations along x and y [m/s²]
 """

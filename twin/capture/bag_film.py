@@ -1,9 +1,9 @@
-"""Reads the film in a robot's bag, with the camera's calibration, positions and pose on the robot.
+"""Reads the film in a robot's bag, with the camera's calibration, positions and extrinsics.
 
 A picture's *stamp* is its time as selected by `message_times`. Only pictures with a later stamp than all pictures
-before them are used. A *fix* is a satellite position. The *seat* is the camera's pose on the robot: the transform in
-`/tf_static` from the frame named in the pictures' headers to `base_link`. Odometry gives the positions of the lens in
-the odometry's own coordinate frame.
+before them are used. A *fix* is a satellite position. The *extrinsics* are the camera's pose on the robot: the
+transform in `/tf_static` from the frame named in the pictures' headers to `base_link`. Odometry gives the positions of
+the lens in the odometry's own coordinate frame.
 """
 
 from array import array
@@ -46,12 +46,12 @@ _MAX_UNORDERED = 0.02  # largest fraction of pictures that are left out because 
 _MAX_FIX_GAP, _MAX_POSE_GAP = 2.5, 0.5  # [s] longest gaps across which fixes and poses are interpolated
 _BASE, _GROUND = "base_link", "base_footprint"
 _MAX_FRAMES = 10_000  # largest number of coordinate frames read from /tf_static
-_MAX_PIXELS = 1 << 28  # largest accepted size of a compressed picture
+_MAX_PIXELS = 1 << 28  # [px] largest accepted size of a compressed picture
 
 
 @dataclass(frozen=True)
 class CameraSeat:
-    """A camera's pose on the robot."""
+    """A camera's extrinsics: its pose on the robot."""
 
     height: float
     """Height of the lens above flat ground [m]."""
@@ -88,7 +88,7 @@ class BagContents:
     lens: Lens | None
     """The calibrated lens; None without a usable calibration."""
     lens_note: str
-    """Source of the calibration, or the reason why there is none."""
+    """Source of the calibration, or the reason why it is missing."""
     fix_times: NDArray[np.int64]
     """Times of the fixes [ns], increasing, shape (f,)."""
     fixes: Array
@@ -126,14 +126,14 @@ class _Rows:
 
 
 def read_contents(path: Path, topic: str = "") -> BagContents:
-    """Reads the calibration, positions and seat in a bag, and the pictures' stamps; decodes only the first picture.
+    """Reads calibration, positions, extrinsics and stamps of the pictures in a bag; decodes only the first picture.
 
     Args:
         path: See `twin.capture.bag`.
         topic: Topic of the pictures; empty for the topic with the most pictures.
 
     Raises:
-        InputError: the path is not a bag; the bag is damaged or has no pictures; or it has an unknown encoding, an
+        InputError: the path is not a bag; or the bag is damaged, or has no pictures, an unknown encoding, an
             unsupported camera model, or stamps out of order.
     """
     with open_bag(path) as bag:
@@ -193,7 +193,7 @@ def _topics(connections: list[Any], path: Path, topic: str) -> dict[str, str]:
 
 
 def _values(kind: str, message: Any) -> tuple[float, ...]:
-    """The numbers kept of a message: the fix, or position and quaternion of the pose; none of a picture."""
+    """The numbers kept from a message: the fix, or position and quaternion of the pose; none from a picture."""
     if kind == "fixes":
         return fix_of(message)
     if kind == "odometry":
@@ -214,8 +214,8 @@ def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], N
     if late.sum() > max(1.0, _MAX_UNORDERED * len(times)):
         back = float((latest[:-1] - times[1:]).max() * 1e-9)
         raise InputError(
-            f"{where}: {late.sum()} of {len(times)} pictures have stamps that are not later than one before, by up "
-            f"to {back:.3f} s; expected increasing stamps: give the topic of one camera, and record under one clock"
+            f"{where}: {late.sum()} of {len(times)} pictures have stamps that are not later than an earlier one, by "
+            f"up to {back:.3f} s; expected increasing stamps: give the topic of one camera, and record with one clock"
         )
     position = np.flatnonzero(~late)
     return position, times[position]
@@ -342,14 +342,14 @@ def _lens(info: Any, topics: dict[str, str], frame: str, size: tuple[int, int], 
         return None, f"{topic} has no calibration; the camera is calibrated from the film"
     if frame and info.header.frame_id and info.header.frame_id != frame:
         return None, (
-            f"{topic} is of another camera (frame {info.header.frame_id}, the pictures have {frame}); the camera is "
+            f"{topic} is of another camera (frame {info.header.frame_id}, pictures have {frame}); the camera is "
             "calibrated from the film"
         )
     lens = lens_of(info, "rect" in topics["pictures"], f"{path}: {topic}")
     if not same_aspect((lens.width, lens.height), size):
         raise InputError(
             f"{path}: {topic} is for {lens.width}x{lens.height}, but the pictures are {size[0]}x{size[1]}; expected "
-            "one aspect: give camera = under this [[source]]"
+            "the same aspect ratio: give camera = under this [[source]]"
         )
     return lens, f"{topic}: {info.distortion_model or 'no distortion'}"
 

@@ -27,12 +27,13 @@ from twin.geometry.poses import inverse_pose
 from twin.types import Array, Image
 
 PixelMap = NDArray[np.float32]
-"""Raw position of each pinhole pixel for `cv2.remap`, (height, width, 2) [px]; the first pixel's center is (0, 0)."""
+"""For each pixel of the pinhole image, its position in the raw image, (height, width, 2) [px]; as in `cv2.remap`,
+(0, 0) is the center of the first pixel."""
 
 _NEGLIGIBLE_DISTORTION = 0.1  # [px] smaller displacements are ignored
-_MAX_ZOOM = 4.0
+_MAX_ZOOM = 4.0  # largest ratio of the pinhole's focal length to that of the lens
 _MAX_ASPECT_ERROR = 0.01
-_MAX_SIDE = 1_000_000  # [px]
+_MAX_SIDE = 1_000_000  # [px] largest side of an image
 
 
 def camera_to_world(camera_from_world: pycolmap.Rigid3d) -> Array:
@@ -91,7 +92,7 @@ class Lens:
         return Lens(self.model, tuple(float(p) for p in camera.params), width, height)
 
     def fits(self, width: int, height: int) -> bool:
-        """True if an image of this size [px] can be a resized image of this lens: see `same_aspect`."""
+        """True if an image of this size [px] has the aspect ratio of the lens, see `same_aspect`."""
         return same_aspect((width, height), (self.width, self.height))
 
 
@@ -131,7 +132,7 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
 
 
 def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """True if two sizes (width, height) [px] have the same aspect, to 1 % or to one pixel of a side."""
+    """True if two sizes (width, height) [px] have the same aspect ratio, to 1 % or to one pixel of a side."""
     error = abs(a[0] * b[1] - a[1] * b[0])
     return error <= max(_MAX_ASPECT_ERROR * a[0] * b[1], a[0], a[1], b[0], b[1])
 
@@ -164,7 +165,7 @@ def undistorted(image: Image, lens: Lens, nearest: bool = False) -> tuple[Image,
 
 
 def write_pinhole_image(raw: Path, target: Path, pixel_map: PixelMap | None, mask: bool = False) -> None:
-    """Writes one image or mask without distortion; hard-links or copies the file if there is no pixel map."""
+    """Writes an image or mask without distortion; without a pixel map, hard-links or copies the file."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if pixel_map is None:
         try:

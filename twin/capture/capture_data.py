@@ -1,4 +1,4 @@
-"""Data of a capture's sources and kept frames, as used while reading and as stored by stage `capture`.
+"""Sources and kept (selected) frames of a capture, while they are read and as build stage `capture` stores them.
 
 A *mask* marks the pixels of a frame that all later stages ignore: 0 = ignore, any other value = use.
 """
@@ -41,7 +41,7 @@ _ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "intrinsics": ((4,), "f"),
     "odometry": ((3,), "f"),
 }
-"""Stored arrays of `Capture`: shape per frame and `dtype.kind`."""
+"""Arrays of `Capture` that are stored: name → (shape per frame, `dtype.kind`)."""
 
 
 # ---- the stored capture
@@ -109,13 +109,13 @@ class Capture:
 def read_mask(path: Path, width: int, height: int) -> Image:
     """Reads a mask at a frame's size: 0 or 255, shape (height, width).
 
-    Raises InputError: the mask is unreadable, has another aspect than the frame, or ignores all pixels.
+    Raises InputError: the mask is unreadable, has another aspect ratio than the frame, or ignores all pixels.
     """
     mask = decode_image(path, cv2.IMREAD_GRAYSCALE, "write the mask again as an 8-bit PNG")
     if not same_aspect((mask.shape[1], mask.shape[0]), (width, height)):
         raise InputError(
-            f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} but its frame has the aspect of {width}x{height}; "
-            "draw it on an upright frame of this source"
+            f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} but its frame has the aspect ratio of "
+            f"{width}x{height}; draw it on an upright frame of this source"
         )
     use = mask > (_LOSSY_THRESHOLD if path.suffix.lower() in (".jpg", ".jpeg") else 0)
     if not use.any():
@@ -145,7 +145,7 @@ class SourceTask:
     def given_lens(self, native: tuple[int, int]) -> Lens | None:
         """The calibration in `scene.toml`, or None; `native` is the upright size of the input [px].
 
-        Raises InputError: an impossible calibration, or one for another aspect.
+        Raises InputError: an impossible calibration, or a calibration for another aspect ratio.
         """
         camera = self.source.camera
         if camera is None:
@@ -200,7 +200,7 @@ class KeptFrames:
 
 
 class FrameWriter:
-    """Encodes and writes a source's frames and masks in threads; errors are raised at a later frame or at the end."""
+    """Encodes and writes a source's frames and masks in threads; errors are raised by a later `put` or at the end."""
 
     def __init__(self, out: Path, name: str) -> None:
         self._images, self._masks = out / "images" / name, out / "masks" / name

@@ -132,12 +132,12 @@ def _picture_notes(small: list[Image]) -> list[str]:
         )
     if (ratio := _range(brightness)) > _EXPOSURE_RANGE:
         notes.append(
-            f"brightness varies {ratio:.1f}-fold along the film; unless lamps or shade do that, lock the exposure"
+            f"brightness varies {ratio:.1f}-fold along the film; unless lamps or shade cause it, lock the exposure"
         )
     tint = np.array([float(one[..., 0].mean() + 1.0) / float(one[..., 2].mean() + 1.0) for one in small])
     if (ratio := _range(tint)) > _TINT_RANGE:
         notes.append(
-            f"red over blue varies {ratio:.1f}-fold along the film; unless lamps do that, lock the white balance"
+            f"the ratio red / blue varies {ratio:.1f}-fold along the film; unless due to lamps, lock the white balance"
         )
     return notes
 

@@ -148,7 +148,7 @@ def _cameras_bin(path: Path) -> dict[int, Lens]:
         key, model_id, width, height = reader.take("iiQQ")
         model = _MODEL_NAMES.get(model_id)
         if model is None:
-            raise ValueError(f"camera model number {model_id}")
+            raise ValueError(f"unknown camera model number {model_id}")
         params = reader.take(f"{CAMERA_MODELS[model]}d")
         lenses[key] = checked_lens(model, params, width, height, f"{path}: camera {key}")
     return lenses
@@ -162,7 +162,7 @@ def _images_bin(path: Path) -> list[tuple[str, int, Array]]:
         (points,) = reader.take("Q")
         reader.offset += 24 * points
         if reader.offset > len(reader.data):
-            raise ValueError(f"ends after {len(reader.data)} bytes")
+            raise ValueError(f"the file ends early, after {len(reader.data)} bytes")
     return images
 
 
@@ -334,7 +334,7 @@ def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
 
 
 def is_image(path: Path) -> bool:
-    """True if the file exists and its name is that of an image."""
+    """True if the file exists and its name has an image suffix."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and is_file(path)
 
 
@@ -375,7 +375,7 @@ def _rigid_pose(value: Any, where: str) -> Array:
 
 
 def _undo_world_transform(table: dict[str, Any], path: Path) -> tuple[Array, float]:
-    """The inverse of nerfstudio's transform of the world: a rigid transform (4, 4), then a divisor of positions."""
+    """The inverse of nerfstudio's transform of the world: a rigid transform (4, 4), then a division of positions."""
     to_original = np.eye(4)
     if "applied_transform" in table:
         to_original = inverse_pose(_rigid_pose(table["applied_transform"], f"{path}: applied_transform"))

@@ -1,9 +1,9 @@
 """Stage `capture`: converts films and image sets to kept frames of one size with masks, times and a held-out split.
 
 A *source* is one input under one lighting; its *kind* is video, bag, images, colmap or transforms. A *kept* frame is
-upright and scaled to `capture.max_size`, and still has the lens's distortion. Its name is `<source>/<index>`, where the
-index is its position in the whole film, or among all images of the set in natural order.
-*Held-out* frames are never trained on.
+upright and scaled to `capture.max_size`, and still has the lens's distortion; a posed image may remain as stored, and
+is undistorted if distortions differ within its source. A frame's name is `<source>/<index>`, where the index is its
+position in the whole film, or among all images of the set in natural order. *Held-out* frames are never trained on.
 """
 
 from pathlib import Path
@@ -96,16 +96,15 @@ def detect_kind(path: Path) -> str:
     if bags := sorted(file.name for suffix in BAG_SUFFIXES for file in path.glob(f"*{suffix}")):
         raise InputError(f"{path}: a bag without metadata.yaml; give its file, such as {bags[0]}")
     raise InputError(
-        f"{path}: holds no images, no COLMAP model and no transforms.json; give a film, a bag or an image folder"
+        f"{path}: has no images, no COLMAP model and no transforms.json; give a film, a bag or an image folder"
     )
 
 
 def source_files(path: Path, kind: str, images: Path | None = None) -> list[Path]:
     """All files that are read for a source, except the masks given in `scene.toml`.
 
-    For a damaged set, these are the files that can be determined.
-
-    `kind` may be auto; `images` is the separate image folder of a posed set. Raises InputError if `path` is no source.
+    If an image set is damaged, only the files that can be determined are returned. `kind` may be auto; `images` is the
+    separate image folder of a posed set. Raises InputError if `path` is no source.
     """
     kind = detect_kind(path) if kind == "auto" else kind
     if kind == "transforms":
@@ -238,9 +237,7 @@ def _merged(kept: list[KeptFrames], config: CaptureConfig) -> Capture:
     without = [one.info.name for one in kept if not one.poses]
     if 0 < len(without) < len(kept):
         bare = ", ".join(without)
-        runtime.log_line(
-            f"  the poses given are not used: {bare} brings none, so all cameras are reconstructed together"
-        )
+        runtime.log_line(f"  the given poses are not used: {bare} has none, so all cameras are reconstructed together")
     counts = [len(one.index) for one in kept]
     odometry = [row for one in kept for row in one.odometry or [NO_GPS] * len(one.index)]
     return Capture(

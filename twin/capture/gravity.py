@@ -21,18 +21,18 @@ from twin.types import Array
 
 _SIGMA_RIGHT = np.radians(1.0)
 """Mounting error of a camera's right axis [rad]; common to all frames, so averaging does not reduce it."""
-_SIGMA_ROAD = np.radians(1.0)  # [rad] camber of roads
-_SIGMA_PATH = np.radians(0.3)  # [rad] slope of a path relative to the ground
+_SIGMA_ROAD = np.radians(1.0)  # [rad] standard deviation of the tilt of roads by camber
+_SIGMA_PATH = np.radians(0.3)  # [rad] standard deviation of a path's slope relative to the ground
 _PATH_SAMPLES = (
-    3.0  # number of independent heights along a path; far below that of its frames, since it undulates smoothly
+    3.0  # number of independent heights along a path; far fewer than frames, since a path undulates smoothly
 )
 _MIN_VARIANCE_RATIO = 10.0
 """A principal axis of points constrains up only if the variance along it is more than this multiple of the smallest."""
 _MIN_WIDTH = 0.05
 """An axis of the path constrains up only if the path's standard deviation along it is more than this fraction of the
 largest one. A path that is narrower is straight, and undulates as much vertically as sideways."""
-_UNDULATION = 0.003  # lower bound of a path's undulation [fraction of its length]
-_LAYER = 0.06  # half thickness of the road layer [fraction of the drop], for undulation, camber and noise
+_UNDULATION = 0.003  # lower bound of the path's vertical standard deviation [fraction of the largest one]
+_LAYER = 0.06  # half thickness of the road layer, for undulation, camber and noise [fraction of the drop]
 _MAX_TILT = np.radians(25.0)  # largest angle between the road's normal and the cameras' mean up axis [rad]
 MIN_ROAD_POINTS = 20  # road points needed for a reliable road
 _REACHES = (1.0, 2.0, 4.0, 8.0)  # largest offsets [drops] of the points of the road layer, tried in this order
@@ -50,7 +50,7 @@ class Road:
     points: NDArray[np.int64]  # indices of its points, shape (k,)
     drop: float  # median height of the cameras above it
     spread: float  # robust standard deviation of the drops of its points
-    reach: float  # largest offset of its points [drops]: at 1 they are below the path, at more on verges, too
+    reach: float  # largest offset of its points [drops]; 1: below the path, more: on the verges, too
 
     @property
     def reliable(self) -> bool:
@@ -75,7 +75,7 @@ def camera_up(camera_to_world: Array) -> Array:
 def up_from_path(camera_to_world: Array) -> tuple[Array, Array]:
     """Returns up (3,), estimated from the cameras' right axes and path, and the matrix E (3, 3) of this evidence.
 
-    n·E·n is the squared error of a unit vector n as up, in standard deviations.
+    n·E·n is the squared error [standard deviations] if a unit vector n is taken as up.
     """
     right = camera_to_world[:, :3, 0]
     evidence = right.T @ right / len(right) / _SIGMA_RIGHT**2

@@ -36,8 +36,8 @@ _FEATURES = 4000
 _FIRST_FRAMES = 48  # scene frames matched first, evenly spaced over all films
 _BEST_FRAMES = 4  # number of first frames, those with the most matches, whose neighbors are matched next
 _NEIGHBOR_FRAMES = 8  # number of frames, of any lighting, that are matched near each best frame
-_TRACKING_FRAMES = 12  # scene frames near the film's last localized frame that are matched first
-_TRUSTED_FRAMES = 24  # frames with the most matches; matches in other frames are mostly wrong and are not used
+_TRACKING_FRAMES = 12  # number of scene frames, near the last localized film frame, that are matched first
+_TRUSTED_FRAMES = 24  # only the matches of this many frames, those with the most, are used; others are mostly wrong
 _RATIO = 0.8  # largest ratio of the best to the second best distance, Lowe 2004
 _LANDMARK_RADIUS = 1.5  # [px] largest distance from the projection of a sparse point
 _INLIER_TOLERANCE = 0.006  # [longer sides] largest residual of an inlier
@@ -46,7 +46,7 @@ _DISTORTION_INLIERS = 100  # inliers needed to separate distortion from noise
 _LENS_SWITCH_RATIO = 1.25  # a later candidate lens must give this many times the inliers of an earlier one
 _ROBUST_SCALE = 0.0015  # [longer sides] residual from which the robust loss reduces the weight of an inlier
 _MAX_FOCAL_ERROR = 0.02  # largest accepted relative standard error of the focal length
-_MAX_ITERATIONS = 12  # of the parabola fit
+_MAX_ITERATIONS = 12  # largest number of parabola fits
 _FOCAL_STEPS = np.array([0.98, 0.99, 1.0, 1.01, 1.02])  # relative focal lengths of the parabola fit
 
 
@@ -92,8 +92,8 @@ def candidate_lenses(size: tuple[int, int], exif: PhotoExif, scene: SceneDir) ->
     """Candidate lenses of a photo, most likely first.
 
     Each entry consists of the lens at `size`, whether it stays fixed, and its origin. The origin is the photo's EXIF
-    header, the calibration or the estimated camera of a source with the same aspect, or a guess. Only calibrated lenses
-    stay fixed.
+    header, the calibration or the estimated camera of a source with the same aspect ratio, or a guess. Only calibrated
+    lenses stay fixed.
     """
 
     def simple(focal: float) -> Lens:
@@ -219,7 +219,7 @@ def _localize(
     refine_focal: bool,
     distortion: bool = False,
 ) -> _LocalizedFrame | None:
-    """The refined pose with the most inliers among matched pixels (k, 2) and scene points (k, 3); None without a pose.
+    """The refined pose with the most inliers among matched pixels (k, 2) and scene points (k, 3), or None.
 
     `estimate_focal` lets RANSAC vary the focal length; `distortion` refines the distortion if the inliers suffice.
     """
@@ -270,10 +270,8 @@ def match_frame(
 ) -> NDArray[np.int64]:
     """Mutual, distinctive matches of a photo with the landmarks of frame i, shape (m, 2).
 
-    A match holds the indices of the photo's feature and of the sparse point.
-
-    `positions` [px] (n, 2) and unit `descriptors` (n, 128) are the frame's features; `photo` (k, 128) holds the unit
-    descriptors of the photo.
+    A match holds the indices of the photo's feature and of the sparse point. `positions` [px] (n, 2) and unit
+    `descriptors` (n, 128) are the frame's features; `photo` (k, 128) holds the unit descriptors of the photo.
     """
     observed = points.point[points.frame == i]
     if not len(observed) or len(positions) < 2 or not len(photo):

@@ -27,14 +27,14 @@ Pair = tuple[int, int]
 
 SEQUENCE_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """Distances [frames] of sequence pairs within a source: short ones for neighbors, long ones against drift."""
-_WORDS = 32
+_WORDS = 32  # visual words of the VLAD descriptor
 _SAMPLES_PER_FRAME = 150
 _PROBES_PER_SOURCE = 20
-_CROSS_OFFSETS: tuple[int, ...] = (-2, -1, 0, 1, 2)
-_BLIND_OFFSETS: tuple[int, ...] = (-3, -2, -1, 0, 1, 2, 3)
+_CROSS_OFFSETS: tuple[int, ...] = (-2, -1, 0, 1, 2)  # [frames] around the expected counterpart of a frame
+_BLIND_OFFSETS: tuple[int, ...] = (-3, -2, -1, 0, 1, 2, 3)  # [frames] the same without anchors
 _CHUNK_FRAMES = 16
 _CHUNK_PAIRS = 100
-_MIN_FEATURES = 50
+_MIN_FEATURES = 50  # smallest accepted median number of features per frame
 _UNKNOWN_FOCAL = 1.2  # [longer side], COLMAP's default
 
 

@@ -1,4 +1,4 @@
-"""Stage `metric`: transforms cameras and points to the metric *level frame*.
+"""Stage `metric`: transforms cameras and points to metric, level coordinates, the *level frame*.
 
 z points up along the ground's normal; z = 0 is the ground. The origin is on the ground below the first camera. x is the
 initial driving direction, or east if the scale comes from GPS. With metric.up = "poses", the level frame keeps the axes
@@ -31,8 +31,8 @@ from twin.scene import SceneDir
 from twin.types import Array
 
 _INITIAL_FRACTION = 0.08
-"""First fraction of the first source's path; it gives the initial driving direction."""
-_FLOOR_QUANTILE = 0.02  # without a road the floor is at this quantile of the points' heights
+"""Fraction of the first source's path, from its start, that gives the initial driving direction."""
+_FLOOR_QUANTILE = 0.02  # quantile of the points' heights at which the floor is, if no road is found
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
@@ -47,9 +47,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     heights = {source.name: source.camera_height for source in capture.sources}
     sources = select_scale_sources(config.metric, heights)
     if "poses_are_metric" in sources and capture.camera_to_world is None:
-        raise InputError(
-            "metric.poses_are_metric: the input brought no poses; give metric.camera_height or another scale"
-        )
+        raise InputError("metric.poses_are_metric: the input has no poses; give metric.camera_height or another scale")
     up, road = _find_up(cameras, points.xyz, config.metric.up, capture)
     level, floor_source = _ground_level(cameras, points.xyz, up.direction, road)
     east: Array | None = None
@@ -99,7 +97,7 @@ def _find_up(cameras: Cameras, points: Array, method: str, capture: Capture) -> 
         gravity = Gravity(up, float(np.sqrt(np.mean(tilt**2)) / np.sqrt(min(len(cameras), 10))), "cameras")
     elif method == "poses":
         if capture.camera_to_world is None:
-            raise InputError('metric.up = "poses": the input brought no poses; use "ground" or "cameras"')
+            raise InputError('metric.up = "poses": the input has no poses; use "ground" or "cameras"')
         gravity = Gravity(np.array([0.0, 0.0, 1.0]), 0.0, "poses")
     else:
         raise InputError(f"metric.up = {method!r}; expected ground, cameras or poses")

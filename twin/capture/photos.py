@@ -146,11 +146,11 @@ def _finite(value: Any, missing: float = 0.0) -> float:
 def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
     """Reads, scales and writes the images of a set; drops exact duplicates and blank images.
 
-    Raises InputError: an unreadable image, images of different aspects, or only blank images.
+    Raises InputError: an unreadable image, images of different aspect ratios, or only blank images.
     """
     if images.missing:
         runtime.log_line(
-            f"  {task.path.name}: {images.missing} images are listed but do not exist; going on without them"
+            f"  {task.path.name}: {images.missing} images are listed but do not exist; the build goes on without them"
         )
     lenses = images.lenses
     if lenses and (given := task.given_lens((lenses[0].width, lenses[0].height))):
@@ -178,7 +178,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
         if not same_aspect(shape, native):
             raise InputError(
                 f"{path}: {shape[0]}x{shape[1]}, but the images before it are {native[0]}x{native[1]}; "
-                "put images of another shape into a source of their own"
+                "put images of another aspect ratio into a source of their own"
             )
         if shape != size:
             image = np.asarray(resize(image, *size), np.uint8)
@@ -272,7 +272,7 @@ def load_photo(path: Path, lens: Lens | None) -> tuple[Image, PhotoExif]:
     The lens of a posed image usually describes the stored image, so a posed image is rotated upright only if the stored
     image does not fit its lens.
 
-    Raises InputError: the file is missing, empty, truncated or undecodable, or has another aspect than its lens.
+    Raises InputError: the file is missing, empty, truncated or undecodable, or has another aspect ratio than its lens.
     """
     stored = _stored_size(path)
     exif = read_exif(path)

@@ -104,7 +104,7 @@ def scale_from_height(
     """Scale from the known height of the cameras above the road; `points` (m, 3) are all sparse points.
 
     `own` holds the camera height of each source [m]; a source with 0 uses that of `metric`. The uncertainty combines
-    four errors: the tolerance of the given heights, the variation of the reconstructed heights along the path and
+    these errors: the tolerance of the given heights, the variation of the reconstructed heights along the path and
     between sources, the error of the up direction, and the height difference of the ground across the path.
 
     Raises InputError without a road.
@@ -330,12 +330,10 @@ def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generat
 def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> Scale:
     """Scale from `odometry`, the camera positions [m] measured by the robot, shape (n, 3), NaN where unknown.
 
-    Each source has its own coordinate frame.
-
-    The heading of odometry drifts, most on skid-steered wheels, but its lengths are right to a few percent. So the path
-    is divided into stretches of `_STRETCH`. The distance between a stretch's ends by odometry is compared with that in
-    the reconstruction; directions are ignored. `tolerance` is the relative standard deviation of the error that all
-    stretches share; their spread adds to it.
+    Each source has its own coordinate frame. The heading of odometry drifts, most on skid-steered wheels, but its
+    lengths are right to a few percent. So the path is divided into stretches of `_STRETCH`. The distance between a
+    stretch's ends by odometry is compared with that in the reconstruction; directions are ignored. `tolerance` is the
+    relative standard deviation of the error that all stretches share; their spread adds to it.
 
     Raises InputError: too few stretches, or stretches that contradict each other.
     """
@@ -361,7 +359,7 @@ def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> 
     spread = 1.4826 * float(np.median(np.abs(logs - middle)))
     if spread > _MAX_STRETCH_SPREAD:
         raise InputError(
-            f"metric.odometry: the ratio of its lengths to the film's varies by {spread:.0%} (expected at most "
+            f"metric.odometry: length by odometry / reconstructed length varies by {spread:.0%} (expected at most "
             f"{_MAX_STRETCH_SPREAD:.0%}); check the stamps of pictures and odometry, or give the scale another way"
         )
     inliers = np.abs(logs - middle) <= max(3.0 * spread, 1e-3)

@@ -43,16 +43,16 @@ _MAX_THREADS = 16
 _MAX_POINT_ERROR = 20.0
 _MIN_FRAMES = 3
 _PROBE_INLIERS = 25
-_NEAR_STEPS = 3.0  # [median steps] largest distance between the two cameras of a near pair
-_NEAR_PAIRS = 4
-_POSED_PAIRS = 10
+_NEAR_STEPS = 3.0  # [median steps between frames] largest distance between the two cameras of a near pair
+_NEAR_PAIRS = 4  # largest number of near pairs per frame
+_POSED_PAIRS = 10  # the same, if poses are given
 # The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
 _REMAPPING_FRACTION = 0.05
-_TRACKS_PER_VIEW = 300  # point tracks in the first solution, which saves 40 % of its time; others are added later
+_TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
-_MIN_ANGLE = 0.5  # [°] smallest angle between the rays to a point
+_MIN_ANGLE = 0.5  # [°] smallest angle between two rays to a point
 _LOSS_SCALE = 0.5  # [px] scale of the Cauchy loss in the last bundle adjustment
-_REFINEMENTS = 30
+_REFINEMENTS = 30  # largest number of iterations of the last bundle adjustment
 
 
 # ---- the stage
@@ -259,10 +259,10 @@ def _match(matcher: Matcher, rng: np.random.Generator) -> None:
     sequence = sequence_pairs(source_index)
     signatures = frame_signatures(matcher.descriptors(), source_index, rng)
     probes = probe_pairs(source_index, signatures) - sequence
-    matcher.match(sequence | probes, "matches in sequence")
+    matcher.match(sequence | probes, "matches")
     more = expanded_pairs(source_index, probes, matcher.verified(), _PROBE_INLIERS) - matcher.tried
     if more:
-        matcher.match(more, "matches across")
+        matcher.match(more, "more matches")
 
 
 class _Mapper:

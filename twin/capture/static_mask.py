@@ -3,10 +3,11 @@
 There are two kinds of evidence. At a *persistent edge*, the gradient of the brightness has one direction in nearly all
 frames. Camera motion averages a scene's gradients out; those of a fixed pattern remain (Weiss, "Deriving intrinsic
 images from image sequences", ICCV 2001). Under forward motion, edges that point to the vanishing point persist, too,
-such as lanes and kerbs; they are rejected by their directions. An *island* hardly varies, amid much variation.
-Smooth regions such as the sky have no edges and are no islands.
+such as lanes and curbs; they are rejected by their directions. An *island* is a region that hardly varies while its
+surroundings vary much. Smooth regions such as the sky have no edges and are no islands.
 
-A missed spot costs a floater, a false mask costs a part of the place. In case of doubt, nothing is found.
+A missed spot adds an artifact to the radiance field; a wrong mask removes a part of the place. In case of doubt,
+nothing is masked.
 """
 
 from dataclasses import dataclass
@@ -21,22 +22,22 @@ from twin.types import Image
 Mask = NDArray[np.bool_]
 
 MIN_FRAMES = 12
-_MAX_FRAMES = 40  # of more frames, every other one or fewer are used, which saves time
+_MAX_FRAMES = 40  # of more frames, every second or fewer are used, which saves time
 _MAX_SHARE = 0.4  # largest fraction of the picture that is masked
 _MIN_GRADIENT = 2.0  # [gray levels per px] smallest gradient of an edge
 # A persistent edge exceeds the smallest gradient in 90 % of the frames, a likely one in 70 %. Edges of the scene that
-# persist by chance are surrounded by likely edges. Of a fixed object's edges, at least this fraction is persistent.
+# persist by chance are surrounded by likely edges. Of a fixed object's edges, at least half are persistent.
 _PERSISTENT, _LIKELY, _SOLID = 0.1, 0.3, 0.5
 _MIN_EDGE = 16  # [px] fewest persistent pixels of an object
 _MIN_ACROSS = 0.1  # smallest mean cos² between an object's gradients and the rays from any possible vanishing point
-_MIN_DISTANCE = 0.06  # smallest rms distance of that point from the edges' tangents, as a fraction of the width
-_MAX_COHERENCE = 0.5  # largest |median gradient| / mean |gradient| of the scene; more if the camera hardly moves
+_MIN_DISTANCE = 0.06  # smallest rms distance of such a point from the edges' tangents, as a fraction of the width
+_MAX_COHERENCE = 0.5  # largest |median gradient| / mean |gradient| of the scene; larger if the camera hardly moves
 _CALMER = 0.6  # a region between persistent edges is fixed if it varies less than this fraction of its surroundings
 _JOIN, _MARGIN = 4, 2  # [px] edges closer than twice the first are joined; the mask is wider by the second
-# Islands: fewest pixels, largest variation [gray levels], smallest ratio of the variation around to the median and to
-# the 80 % quantile of the variation inside, and smallest brightness [gray levels], since black night hardly varies.
+# Islands: fewest pixels, largest variation [gray levels], smallest ratios of the variation around an island to the
+# median and to the 80 % quantile inside, and smallest brightness [gray levels], since black night hardly varies.
 _ISLAND_AREA, _ISLAND_VARIATION, _AROUND_MEDIAN, _AROUND_MOST, _NIGHT = 40, 15.0, 3.0, 2.5, 15.0
-_NOISE = 2.0  # [gray levels] added to a variation that is divided by
+_NOISE = 2.0  # [gray levels] added to the variation inside before the ratio is formed
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ def _closed(mask: Mask, radius: int) -> Mask:
 
 
 def _components(mask: Mask) -> list[Mask]:
-    """The connected components, 4-neighbors, the largest first."""
+    """The connected components (4-neighbors) of at least `_MIN_EDGE` pixels, the largest first."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     areas = stats[1:, cv2.CC_STAT_AREA]
     return [labels == 1 + label for label in np.argsort(-areas, kind="stable") if areas[label] >= _MIN_EDGE]
@@ -132,10 +133,10 @@ def _solid_edges(surely: Mask, likely: Mask, direction: NDArray[np.float32]) -> 
 
 
 def _crosses_motion(x: NDArray[Any], y: NDArray[Any], direction: NDArray[Any], shape: tuple[int, ...]) -> bool:
-    """True if forward motion to no point in the middle of the picture leaves these edges in place.
+    """True if forward motion would move these edges, for every vanishing point in the middle of the picture.
 
-    A lane's edges lie along the motion: their gradients are perpendicular to the rays from the vanishing point. Around
-    that point hardly anything moves: the tangents of all edges pass close to it.
+    A lane's edges lie along the motion: their gradients are perpendicular to the rays from the vanishing point. Edges
+    around this point hardly move; their tangents pass close to it.
     """
     px, py = np.meshgrid(np.linspace(0.25, 0.75, 17) * shape[1], np.linspace(0.25, 0.7, 15) * shape[0])
     dx, dy = x - px.reshape(-1, 1), y - py.reshape(-1, 1)
@@ -162,7 +163,7 @@ def _with_regions(edges: Mask, variation: NDArray[np.float32]) -> Mask:
 
 
 def _islands(variation: NDArray[np.float32], brightness: NDArray[Any]) -> Mask:
-    """Calm regions (h, w) amid variation that touch no border. Gaps with sky are brighter than what is around them."""
+    """The islands (h, w) that touch no border, except bright ones, which are gaps through which the sky shows."""
     found = np.zeros(variation.shape, bool)
     calm = (variation < 0.5 * cv2.blur(variation, (61, 61))).astype(np.uint8)
     for island in _components(np.asarray(cv2.morphologyEx(calm, cv2.MORPH_OPEN, _disk(1)), bool)):

@@ -1,4 +1,4 @@
-"""Reads films in one pass with little memory: decodes frames, rotates them by the display matrix and selects some.
+"""Reads films in one pass with little memory: decodes frames, selects some and rotates them by the display matrix.
 
 A *film* is a video file, or the pictures of a bag (`bag_film.py`). A *slot* is one of n equal time spans of a film;
 the sharpest frame of each slot is its *candidate*. A candidate in which the image hardly moved since the last kept

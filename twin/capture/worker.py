@@ -1,10 +1,10 @@
 """Runs COLMAP in a separate process, because some of its failures abort the whole process.
 
-The parent starts the *worker*, `python -m twin.capture.worker MODULE:FUNCTION JOB`, which calls the function with
-the *job* (a dictionary in the file JOB) and that file's folder. The parent shows the worker's progress; if the
-worker aborts, it raises an error with a cure. A *message* is one line of JSON on the worker's standard output: {"bar":
-name, "total": n} starts a progress bar, {"step": n} advances it, {"say": text} prints a line, {"error": text} reports
-bad input. COLMAP writes its own log to standard error; the parent copies it to a file.
+The parent starts the *worker*, `python -m twin.capture.worker MODULE:FUNCTION JOB`, which calls the function with the
+*job* (a dictionary in the file JOB) and that file's folder. The parent shows the worker's progress, and raises an error
+with a cure if the worker aborts. A *message* is one line of JSON on the worker's standard output: {"bar": name,
+"total": n} starts a progress bar, {"step": n} advances it, {"say": text} prints a line, {"error": text} reports bad
+input. COLMAP writes its own log to standard error; the parent copies it to a file.
 """
 
 import contextlib
@@ -58,7 +58,7 @@ def run_worker(solve: Callable[[dict[str, Any], Path], None], job: dict[str, Any
     job_file.write_text(json.dumps(job), encoding="utf-8")
     process = subprocess.Popen(
         [sys.executable, "-m", "twin.capture.worker", f"{solve.__module__}:{solve.__qualname__}", str(job_file)],
-        stdin=subprocess.PIPE,  # closes when the parent dies in any way, which ends the worker, too
+        stdin=subprocess.PIPE,  # closes when the parent ends in any way, which ends the worker, too
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -93,8 +93,8 @@ def run_worker(solve: Callable[[dict[str, Any], Path], None], job: dict[str, Any
         name = signal.Signals(-code).name
         cure = _CURES.get(name, _CURES["SIGABRT"])
         words = next((part for part in reversed(tail.split(" | ")) if part.strip()), "no log")[-160:]
-        raise InputError(f"structure from motion died ({name}; {words}); {cure}")
-    raise RuntimeError(f"structure from motion failed with exit status {code}: {tail}")
+        raise InputError(f"COLMAP was ended by {name} ({words}); {cure}")
+    raise RuntimeError(f"COLMAP's worker failed with exit status {code}: {tail}")
 
 
 class _ProgressBars:

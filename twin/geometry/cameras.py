@@ -1,8 +1,8 @@
 """Posed pinhole cameras, sparse points and projection.
 
 OpenCV axes: x right, y down, z forward. Pixel (0, 0) is the *corner* of the top-left pixel, whose center is (0.5, 0.5)
-as in COLMAP. *Depth* is the z coordinate in the camera frame, *distance* is measured along the ray. From stage `metric`
-on, the world frame is metric with z up; in the folder `2_cameras`, it is the frame of the reconstruction.
+as in COLMAP. *Depth* is the z coordinate in the camera frame, *distance* is measured along the ray. World
+coordinates are metric with z up, except in the build folder `2_cameras`, where they are those of the reconstruction.
 """
 
 import os
@@ -26,7 +26,7 @@ _CAMERA_ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "times": ((), "f"),
     "held_out": ((), "b"),
 }
-"""Stored arrays of `Cameras`: shape per frame and `dtype.kind`."""
+"""Arrays of `Cameras` that are stored: name → (shape per frame, `dtype.kind`)."""
 
 
 def opencv_to_mujoco(camera_to_world: Array) -> Array:
@@ -44,7 +44,7 @@ class Cameras:
     sizes: NDArray[np.int64]  # width, height [px], shape (n, 2)
     lightings: tuple[str, ...]  # lighting name per frame
     sources: tuple[str, ...]  # source name per frame
-    times: Array  # time within its source [s], shape (n,)
+    times: Array  # time since the start of the source [s], or a photo's index; shape (n,)
     held_out: NDArray[np.bool_]  # true for test frames, which are never trained on; shape (n,)
     images: Path  # folder with `<name>.png`, undistorted, 8-bit RGB (or gray, read as RGB)
     masks: Path | None = None  # folder with `<name>.png`, 0 = ignore; None if no frame has a mask
@@ -99,7 +99,9 @@ class Cameras:
                 len(texts["names"]),
             )
             if any(len(values) != n for values in texts.values()):
-                raise ValueError(", ".join(f"{len(values)} {name}" for name, values in texts.items()))
+                raise ValueError(
+                    ", ".join(f"{len(values)} {name}" for name, values in texts.items()) + "; expected equal numbers"
+                )
         with wrap_read_errors(folder / "cameras.npz", "build the scene again"):
             arrays = {name: data[name] for name in _CAMERA_ARRAYS}
             check_shapes({name: (arrays[name], (n, *one), kind) for name, (one, kind) in _CAMERA_ARRAYS.items()})
@@ -117,7 +119,7 @@ def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:
 
 
 class PosedCameras(Protocol):
-    """Cameras as a renderer needs them; `Cameras` and `Viewpoints` match this protocol."""
+    """The attributes that a renderer reads; `Cameras` and `Viewpoints` have them."""
 
     @property
     def camera_to_world(self) -> Array: ...
@@ -146,7 +148,7 @@ class Viewpoints:
 def intrinsics_for_size(cameras: PosedCameras, size: tuple[int, int] | None) -> tuple[Array, tuple[int, int]]:
     """Returns intrinsics (n, 4) scaled to one image size, and that size.
 
-    The size is `size` if given, else the one that all cameras share.
+    The size is `size` if given, else the size that all cameras share.
 
     Raises InputError: no size is given and the cameras' sizes differ.
     """
@@ -168,7 +170,7 @@ def pixel_grid(width: int, height: int) -> Array:
 
 
 def unproject(pixels: Array, intrinsics: Array) -> Array:
-    """Rays through pixels in the camera frame with z = 1, so ray × depth is a point. Shapes (..., 2) → (..., 3)."""
+    """Rays through pixels, in camera axes with z = 1, so that ray × depth is a point. Shapes (..., 2) → (..., 3)."""
     fx, fy, cx, cy = np.moveaxis(np.asarray(intrinsics), -1, 0)
     x, y = (pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy
     return np.stack([x, y, np.ones_like(x)], -1)
@@ -196,11 +198,11 @@ def scaled_intrinsics(intrinsics: Array, size: tuple[int, int], new_size: tuple[
 class SparsePoints:
     """m points and their k observations (one per point and frame in which it was matched)."""
 
-    xyz: NDArray[np.float64]  # shape (m, 3), in the same frame as the `Cameras` stored beside them
+    xyz: NDArray[np.float64]  # world coordinates of the `Cameras` in the same folder, shape (m, 3)
     rgb: NDArray[np.uint8]  # shape (m, 3)
     error: NDArray[np.float64]  # mean reprojection error [px], shape (m,)
-    point: NDArray[np.int64]  # point index per observation, shape (k,)
-    frame: NDArray[np.int64]  # frame of each observation, as an index into the `Cameras` stored beside them, shape (k,)
+    point: NDArray[np.int64]  # index of each observation's point, shape (k,)
+    frame: NDArray[np.int64]  # index of each observation's frame in these `Cameras`, shape (k,)
 
     def __len__(self) -> int:
         return len(self.xyz)

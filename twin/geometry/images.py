@@ -18,19 +18,19 @@ from skimage.metrics import structural_similarity
 from twin.errors import InputError
 from twin.files import read_bytes, regular_file, write_bytes
 
-MAX_PIXELS = 2 * 89_478_485  # most pixels of an accepted image; Pillow rejects more as decompression bombs
+MAX_PIXELS = 2 * 89_478_485  # largest number of pixels accepted; Pillow rejects larger images as decompression bombs
 DECODE_ERRORS = (
     *(ArithmeticError, AttributeError, EOFError, LookupError, OSError, SyntaxError, TypeError, ValueError),
     *(AssertionError, MemoryError, NotImplementedError, RuntimeError, struct.error, zlib.error, cv2.error),
 )
 """Exceptions that Pillow and OpenCV raise for damaged files."""
-_MAX_BYTES = 2 << 30  # greatest size of an image file [bytes]
+_MAX_BYTES = 2 << 30  # largest image file [bytes]
 HEIF_SUFFIXES = (".heic", ".heif")
 """Suffixes of photos from phones; reading them needs the extra `heif`."""
-_HEIF = "HEIF"  # Pillow's name of the format
+_HEIF = "HEIF"  # Pillow's name of HEIF and HEIC
 _CURE = "replace or remove it"
 warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # Pillow warns from MAX_PIXELS / 2 on
-warnings.filterwarnings("ignore", module="PIL")  # warnings of flawed headers, whose values count as unknown
+warnings.filterwarnings("ignore", module="PIL")  # about flawed headers, whose values count as unknown
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:

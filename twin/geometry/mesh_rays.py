@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from twin.types import Array
 from twin.warp_runtime import wp
 
-_FAR = 1.0e3  # [m] greatest distance of a query
+_FAR = 1.0e3  # [m] queries find no surface beyond this distance
 
 
 @wp.kernel
@@ -48,7 +48,7 @@ class Surface:
         self._mesh = wp.Mesh(_vectors(vertices), indices)
 
     def cast(self, origins: Array, rays: Array) -> Array:
-        """Distance to the first hit of each ray [ray lengths], negative for a miss; (k, 3), (k, 3) → (k,)."""
+        """Distance to the first hit as a multiple of the ray's length, below 0 for a miss; (k, 3), (k, 3) → (k,)."""
         length = np.linalg.norm(rays, axis=1, keepdims=True)
         return self._launch(_cast, len(origins), _vectors(origins), _vectors(rays / length)) / length[:, 0]
 

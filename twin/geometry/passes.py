@@ -1,9 +1,9 @@
 """Passes: the segments of a filmed path that a robot can drive without interruption.
 
-A film may go down a road twice, come back in the other lane, drive laps, stop, back up, or be cut. Its path is divided
-at *jumps* (a cut, or frames that lie far apart), at *turns* (the camera comes back the way it came) and at *laps* (it
-goes the same way again). Each part between them is a *pass*, named `<source>:<number>`. `twin/geometry/route.py`
-chooses the route from the passes.
+A filming camera may go down a road twice, come back in the other lane, stop or back up; a film may be cut. The path is
+divided at *jumps* (a cut, or frames that lie far apart), at *turns* (the camera comes back the way it came) and at
+*laps* (it goes the same way again). Each part between them is a *pass*, named `<source>:<number>`.
+`twin/geometry/route.py` chooses the route from the passes.
 """
 
 from collections.abc import Sequence
@@ -21,16 +21,16 @@ from twin.geometry.poses import rotation_angle
 from twin.types import Array
 
 SPACING = 0.25  # [m] between the points of a path
-_SMOOTHING = 0.5  # [m] standard deviation of the smoothing; it moves a turn of 5 m radius by 0.5²/(2·5) = 2.5 cm
-_STATIONARY_RADIUS = 0.4  # [m] motion within this radius counts as standing or rocking
+_SMOOTHING = 0.5  # [m] standard deviation of the smoothing, which moves a turn of radius 5 m by 0.5²/(2·5) = 2.5 cm
+_STATIONARY_RADIUS = 0.4  # [m] motion within this radius counts as standing still
 _DEPARTURE_RADIUS = 1.6  # [m] beyond this radius the camera has left, and a later return is another pass
-_JUMP_RATIO = 8.0  # [typical steps] least length of a jump; uneven frame intervals and sudden starts stay below 4
+_JUMP_RATIO = 8.0  # [typical steps] least length of a jump; uneven timing and sudden starts cause at most 4
 _MIN_JUMP = 5.0  # [m] least length of a jump
 _LONG_JUMP, _LONG_RATIO = 12.0, 3.0  # [m], [typical steps]; a step longer than both is a jump in any case
 _JUMP_WINDOW = 4  # steps before and after from which the typical step is computed
 _MAX_MISSING = 20.0  # [frame intervals] longer gaps in time do not raise the allowed step further
-_BESIDE = 5.0  # [m] a path this close to an earlier part of itself retraces it; U-turns of 6 m radius are wider
-_ALONGSIDE = 0.5  # [m] greatest offset, along the path, of the point that it retraces
+_BESIDE = 5.0  # [m] a path this close to an earlier part of itself retraces it; a U-turn of 6 m radius is 12 m wide
+_ALONGSIDE = 0.5  # [m] largest offset along the path between a point and the earlier one that it retraces
 _PARALLEL = np.cos(np.deg2rad(40.0))  # cosine of the greatest angle between a path and the part that it retraces
 _MIN_RETRACE = 1.5  # [m] shorter retraces are noise
 _MIN_LAP = 12.0  # [m] least length of a lap
@@ -38,8 +38,8 @@ _MAX_U_TURN = 25.0  # [m] a longer turn is a loop at the end of the road and sta
 _MIN_PASS = 1.0  # [m] shorter passes are dropped
 _CHORD = 1.0  # [m] length over which headings are measured
 _MIN_PATH_FRAMES = 6
-_MAX_OUTLIER_FRACTION = 0.25  # if more frames of a source look wrong, its path is not smooth and no frame is removed
-_MAX_ROUGHNESS = 0.3  # a path with a larger median residual [median steps] is a set of unordered photos, not a film
+_MAX_OUTLIER_FRACTION = 0.25  # if more frames of a path look wrong, the path is not smooth and no frame is removed
+_MAX_ROUGHNESS = 0.3  # a path with a larger median residual [median steps] is that of unordered photos, not of a film
 _OUTLIER_SIGMAS = 8.0  # an outlier's residual exceeds this many robust standard deviations of all residuals
 _MAX_TURN = np.radians(5.0)  # [rad] smaller deviations from the predicted direction are always allowed
 
@@ -57,7 +57,7 @@ class FilmedPass:
     path: Array
     """Points `SPACING` apart in the direction in which the camera looks, shape (m, 2) [m]."""
     ends_with: str
-    """Reason why it ends: `end` (of the film), `jump`, `turn` or `lap`."""
+    """Reason why the pass ends: `end` (of the film), `jump`, `turn` or `lap`."""
 
     @property
     def length(self) -> float:
@@ -65,7 +65,7 @@ class FilmedPass:
 
 
 def find_passes(cameras: Cameras) -> list[FilmedPass]:
-    """All passes, by source in order of appearance and then in order of time."""
+    """All passes, sorted by source in order of appearance, then by time."""
     found = []
     for index in source_frames(cameras):
         number = 0
@@ -120,11 +120,11 @@ def path_jumps(positions: Array, times: Array, min_jump: float = _MIN_JUMP) -> N
 
 
 def _between_jumps(cameras: Cameras, index: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], str]]:
-    """The pieces of a source between its jumps: the frames of each, and how it ends."""
+    """The parts of a source between its jumps: frames of each part, and the reason why the part ends."""
     inliers = index[path_inliers(cameras.positions[index])]
     jumps = path_jumps(cameras.positions[inliers, :2], cameras.times[inliers])
-    # Outliers are removed before the division, since one at the end of a piece could not be recognized: it has
-    # neighbors on one side only.
+    # Outliers are removed before the division, since an outlier at the end of a part could not be recognized: it
+    # has neighbors on one side only.
     pieces = np.split(inliers, jumps + 1) if len(jumps) else [index]
     return [(piece, "jump" if k < len(jumps) else "end") for k, piece in enumerate(pieces)]
 
@@ -132,7 +132,7 @@ def _between_jumps(cameras: Cameras, index: NDArray[np.int64]) -> list[tuple[NDA
 def _between_retraces(
     positions: Array, frames: NDArray[np.int64], ending: str
 ) -> list[tuple[NDArray[np.int64], Array, str]]:
-    """Frames, path and ending of each pass between the turns and laps of a piece without jumps."""
+    """Frames, path and ending of each pass between the turns and laps of a part without jumps."""
     path = smooth_path(positions[frames])
     cuts = _retraces(path)
     if not cuts:
@@ -153,7 +153,7 @@ def _between_retraces(
 def _retraces(path: Array) -> list[tuple[int, int, str]]:
     """Cuts where a path begins to retrace itself.
 
-    A cut is the index of the pass's last point, that of the next pass's first point, and `turn` or `lap`.
+    A cut has the index of the pass's last point, the index of the next pass's first point, and `turn` or `lap`.
     """
     if len(path) < 3:
         return []
@@ -227,7 +227,7 @@ def path_inliers(positions: Array) -> NDArray[np.bool_]:
 
 
 def remove_stationary(xy: Array) -> Array:
-    """Removes stops and rocking from a path in order of time, (n, 2) → (k, 2).
+    """Removes stops, and small motions to and fro, from a path in order of time, (n, 2) → (k, 2).
 
     After each kept point, the points within `_STATIONARY_RADIUS` of it are skipped, up to the path's last exit from
     that disc. A return after the path was `_DEPARTURE_RADIUS` away is another pass and is kept.
@@ -267,7 +267,7 @@ def smooth_line(corners: Sequence[Array] | Array) -> Array:
 
 
 def resample(xy: Array, curved: bool) -> Array:
-    """Points about `SPACING` apart along a polyline (n ≥ 2, 2), or along a curve through its points."""
+    """Points about `SPACING` apart along a polyline (n ≥ 2, 2) or, if `curved`, along a curve through its points."""
     station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
     # Equal steps close to the spacing, so that the last point is the end of the path.
     count = max(round(float(station[-1]) / SPACING), 1)
@@ -291,8 +291,8 @@ def _smooth(xy: Array, sigma: float) -> Array:
 def path_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
     """Mask (n,) of the frames that lie off the path of their neighbors, for poses (n, 4, 4) in any unit of length.
 
-    `limit` is the allowed position residual [median steps between frames]; more is allowed if the whole path is rough.
-    A path is divided where the film jumps, since the frames before a cut do not predict those after it.
+    `limit` is the allowed position residual [median distances between consecutive frames]; more is allowed if the whole
+    path is rough. The path is divided where the film jumps, since frames before a cut do not predict those after it.
     """
     n = len(camera_to_world)
     if n < _MIN_PATH_FRAMES:
@@ -339,8 +339,8 @@ def _piece_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
 def _path_residuals(camera_to_world: Array) -> tuple[Array, Array]:
     """Deviation of each frame from the pose predicted from its neighbors, for poses in order of time (n, 4, 4), n ≥ 5.
 
-    Two predictions are made, and the smaller residual counts. The chord between neighbors fails in turns; the cubic
-    through them follows turns, but fails where the speed changes.
+    A position has two predictions, and the smaller residual counts: the chord between neighbors fails in turns; the
+    cubic through neighbors follows turns, but fails where the speed changes.
     Returns residuals of position (unit of the poses) and direction [rad], shapes (n,).
     """
     n = len(camera_to_world)

@@ -13,7 +13,7 @@ from twin.types import Array
 
 @dataclass(frozen=True)
 class Similarity:
-    """x ↦ scale · rotation · x + translation, from one frame to another."""
+    """x ↦ scale · rotation · x + translation, from a source frame to a target frame."""
 
     scale: float
     rotation: Array

@@ -1,6 +1,6 @@
 """The route: the line that the robot drives, chosen from the filmed passes.
 
-By default it is the longest line made of a pass and of others of the same lighting that continue it; `[route]` in
+By default it is the longest line of a pass and the passes of the same lighting that continue it; `[route]` in
 scene.toml chooses passes, their direction, or way points. *Station* [m] is the arc length along the route. The
 *corridor* is the area within a half width of the route; it is free, since the camera passed through it.
 """
@@ -18,11 +18,11 @@ from twin.geometry.passes import SPACING, FilmedPass, find_passes, path_directio
 from twin.types import Array
 
 _MIN_LENGTH = 2.0  # [m] least length of a route
-_AS_LONG = 0.98  # lines longer than this share of the longest count as equally long, so that noise does not decide
+_AS_LONG = 0.98  # lines longer than this fraction of the longest count as equally long, so that noise does not decide
 _ASIDE = 0.6  # [m] largest lateral offset between a pass and its continuation; the joined line runs midway
 _BEYOND = 3.0  # [m] least length that a continuation adds
 _AGREE = np.cos(np.deg2rad(40.0))  # least cosine between the headings of joined passes
-_BLEND = 3.0  # [m] before and after a join over which the line goes from one pass to the other
+_BLEND = 3.0  # [m] length before and after a join over which the joined line shifts from one to the other
 _MAX_FOLD = np.cos(np.deg2rad(120.0))  # cosine of the greatest change of heading over `_FOLD_CHORD`
 _FOLD_CHORD = 2.0  # [m] length along the line between the headings that are compared
 _OFF_FILM = 1.0  # [m] largest distance of a line through way points from the filmed paths
@@ -35,13 +35,13 @@ class Route:
     line: Array
     """Points about 0.25 m apart in driving order, shape (m, 2) [m]."""
     chosen: tuple[str, ...]
-    """Names of its passes in driving order; empty if way points were given."""
+    """Names of these passes in driving order; empty if way points were given."""
     passes: tuple[FilmedPass, ...]
-    """All passes."""
+    """All filmed passes, chosen or not."""
 
 
 def filmed_route(cameras: Cameras, config: RouteConfig | None = None) -> Route:
-    """The route of a place.
+    """Chooses the route among the filmed passes.
 
     Raises:
         InputError: the route is shorter than 2 m or folds back on itself, passes that are to be joined lie apart, a
@@ -81,7 +81,7 @@ def route_metrics(route: Route) -> dict[str, object]:
 
 
 def _named(name: str, passes: list[FilmedPass]) -> FilmedPass:
-    """A pass by its name, or the longest one of a source."""
+    """The pass with this name, or the longest pass of the source with this name."""
     fitting = [one for one in passes if name in (one.name, one.source)]
     if not fitting:
         known = ", ".join(f"{one.name} ({one.length:.1f} m)" for one in passes) or "none"
@@ -90,7 +90,7 @@ def _named(name: str, passes: list[FilmedPass]) -> FilmedPass:
 
 
 def _longest_line(passes: list[FilmedPass], max_gap: float) -> tuple[Array, tuple[str, ...]]:
-    """The longest line of a pass continued by others of its lighting, and the names of its passes."""
+    """The longest line of a pass and others of its lighting that continue it, and the names of these passes."""
     lines = []
     for start in passes:
         line, names = start.path, [start.name]
@@ -150,7 +150,7 @@ def _joined(line: Array, one: FilmedPass, max_gap: float) -> Array:
 
 
 def _blended(line: Array, rest: Array) -> Array:
-    """A line joined to its continuation: gradually if they run side by side, by a straight piece across a gap."""
+    """A line joined to its continuation: gradually if they run side by side, by a straight line across a gap."""
     offset = rest[0] - line[-1]
     if np.linalg.norm(offset) > _ASIDE:
         return resample(np.concatenate([line, rest]), curved=False)

@@ -3,8 +3,8 @@
 The sun's plane is perpendicular to the direction towards the sun. Its axes are `right`, which is horizontal, and
 `upward`. A texel stores the largest *height*, the coordinate along the direction towards the sun, of all surfaces in
 it. A point is in shadow if the map is higher than the point by more than a bias, which absorbs the errors of surfaces.
-Several texels around a point are compared and averaged (percentage-closer filtering, Reeves et al. 1987), so that the
-edges of shadows are soft.
+A point is compared with several texels, and the results are averaged (percentage-closer filtering, Reeves et al. 1987),
+so that the edges of shadows are soft.
 """
 
 # mypy: disable-error-code="index, attr-defined, valid-type, arg-type, call-overload, operator"
@@ -26,13 +26,13 @@ from twin.warp_runtime import wp
 TEXEL = 0.15
 """[m] side of a texel."""
 BIAS = 0.3
-"""[m] height by which the map must exceed a point for a shadow; surfaces of a field have errors of this size."""
+"""[m] height by which the map must exceed a point for a shadow: the error of a radiance field's surfaces."""
 ROUGH_BIAS = 0.5
-"""[m] further bias of rough surfaces."""
-_RAMP = 0.2  # [m] further height over which the shadow becomes full
-_LEAST_COSINE = wp.constant(0.1)  # least cosine of incidence for which the slope of a surface is used
-_MAX_SIDE = 4096  # [texels] larger maps get larger texels
-_FULL = 65535  # largest value of a stored texel; 0 means that nothing is there
+"""[m] additional bias of rough surfaces, see `ShadowCasters`."""
+_RAMP = 0.2  # [m] height above the bias over which the shadow becomes full
+_LEAST_COSINE = wp.constant(0.1)  # lower bound of the cosine of incidence when a slope is computed
+_MAX_SIDE = 4096  # [texels] longest side of a map; larger places get larger texels
+_FULL = 65535  # largest value of a stored texel; 0: no surface
 _START = 1.0  # [m] distance from the highest vertex to the plane from which rays are cast
 
 
@@ -52,8 +52,8 @@ def _look_up(
 ):
     """Fraction of the sunlight at a point: the mean over a square of three texels' side around it.
 
-    A texel is compared with the height at its center of the plane through the point, so that slopes do not darken
-    themselves. A point without a normal (0, 0, 0) has a plane that is perpendicular to the light.
+    A texel's height is compared with that of the surface's plane at the texel's center, so that slopes do not shadow
+    themselves. If the normal is (0, 0, 0), the plane is perpendicular to the light.
     """
     i = wp.tid()
     p, n = points[i], normals[i]
@@ -108,13 +108,13 @@ class OrthographicShadowMap:
 
     @staticmethod
     def of_mesh(vertices: Array, faces: NDArray, toward: Array, texel: float = TEXEL) -> "OrthographicShadowMap":
-        """Casts a ray from the sun through each texel of the map of a mesh, vertices (n, 3) [m] and faces (m, 3)."""
+        """The map of a mesh, vertices (n, 3) [m] and faces (m, 3), from a ray of the sun through each texel."""
         return ShadowCasters(vertices, faces).seen_from(toward, texel)
 
     def visibility(self, points: NDArray, normals: NDArray | None = None, bias: float = BIAS) -> Array32:
         """Fraction of the sunlight that reaches points (n, 3) [m], shape (n,); 1 outside the map.
 
-        With the unit normals (n, 3) of the surfaces there, slopes do not throw shadows on themselves.
+        If the unit normals (n, 3) of the surfaces at the points are given, slopes do not shadow themselves.
         """
         right, upward = plane_axes(self.toward)
         # Single precision suffices, as scenes are some hundred meters wide.
@@ -146,11 +146,11 @@ class OrthographicShadowMap:
         if toward.shape != (3,) or abs(np.linalg.norm(toward) - 1.0) > 1e-6 or not toward[2] > 0.0:
             raise ValueError(f"sun {toward.tolist()}; expected a unit vector above the horizon")
         if origin.shape != (2,) or not np.isfinite([*origin, texel, low, step]).all() or min(texel, step) <= 0.0:
-            raise ValueError(f"shadow map at {origin.tolist()} with texels of {texel} m")
+            raise ValueError(f"shadow map: origin {origin.tolist()}, texel {texel} m, step {step} m; expected > 0")
         data = np.frombuffer(base64.b64decode(table["png"], validate=True), np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
         if image is None or image.dtype != np.uint16 or image.ndim != 2 or max(image.shape) > _MAX_SIDE + 1:
-            raise ValueError("the shadow map is no 16-bit picture")
+            raise ValueError(f"shadow map: expected a 16-bit gray picture, at most {_MAX_SIDE + 1} px a side")
         height = np.where(image > 0, low + step * (image.astype(np.float64) - 1.0), -np.inf).astype(np.float32)
         return OrthographicShadowMap(toward, origin, texel, height)
 
@@ -158,8 +158,8 @@ class OrthographicShadowMap:
 class ShadowCasters:
     """Surfaces of a place that throw shadows; `seen_from` makes the map for any sun.
 
-    *Rough* surfaces throw shadows only on what is `ROUGH_BIAS` farther from the sun than the bias of other surfaces
-    demands, so that they do not darken the true surfaces beside them.
+    *Rough* surfaces have larger errors. Their bias is larger by `ROUGH_BIAS`, so that they do not shadow the accurate
+    surfaces beside them.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class ShadowCasters:
         ]
 
     def seen_from(self, toward: Array, texel: float = TEXEL) -> OrthographicShadowMap:
-        """The map for a sun in the direction of a unit vector (3,); `texel` [m] grows if the place is very wide."""
+        """The map for a sun in the direction of a unit vector (3,); `texel` [m] grows for a wide place."""
         toward = np.asarray(toward, np.float64) / np.linalg.norm(toward)
         if not self._parts:
             return OrthographicShadowMap(toward, np.zeros(2), texel, np.full((1, 1), -np.inf, np.float32))

@@ -12,14 +12,14 @@ from twin.errors import InputError
 from twin.geometry.shadow_map import direction
 from twin.types import Array
 
-_YEARS = (1901, 2099)  # years for which the equations of the library hold
+_YEARS = (1901, 2099)  # years for which the equations of `astral` hold
 _MAX_LATITUDE, _MAX_LONGITUDE = 89.9, 180.0  # [°]
-_GPS_SPREAD = 5.0  # ratio of the spread of positions to their error, from which they give a heading
-_GPS_SCALE = (0.7, 1.4)  # accepted scale between a scene and its GPS positions
+_GPS_SPREAD = 5.0  # least ratio of the GPS positions' spread to their error, for a heading
+_GPS_SCALE = (0.7, 1.4)  # accepted ratio of distances by GPS to distances in the scene
 
 
 def parse_time(text: str) -> datetime:
-    """A moment from text such as 2026-06-01T17:30+02:00. Raises InputError: no such form, or no time zone."""
+    """A moment from text such as 2026-06-01T17:30+02:00. Raises InputError: another form, or a year out of range."""
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
@@ -36,7 +36,7 @@ def parse_time(text: str) -> datetime:
 def sun_angles(moment: datetime, latitude: float, longitude: float) -> tuple[float, float]:
     """Compass angle [°] and elevation [°] of the sun, with refraction, at a latitude and a longitude [°].
 
-    Raises InputError: no such place on the globe.
+    Raises InputError: latitude or longitude out of range.
     """
     from astral import Observer
     from astral.sun import azimuth, elevation
@@ -52,7 +52,7 @@ def sun_angles(moment: datetime, latitude: float, longitude: float) -> tuple[flo
 def sun_direction(moment: datetime, latitude: float, longitude: float, heading: float) -> Array:
     """Unit vector (3,) towards the sun in a scene with a heading [°].
 
-    Raises InputError: the sun is not above the horizon, or there is no such place.
+    Raises InputError: the sun is not above the horizon, or latitude or longitude is out of range.
     """
     compass, elevation = sun_angles(moment, latitude, longitude)
     if not elevation > 0.0:
@@ -66,7 +66,7 @@ def sun_direction(moment: datetime, latitude: float, longitude: float, heading: 
 def heading_from_gps(positions: Array, east_north: Array) -> float | None:
     """Heading [°] of a scene from positions of its cameras, in the scene and by GPS, each (n, 2) [m].
 
-    None if fewer than three are known, or if they do not agree well enough.
+    `east_north` is NaN where unknown. None if fewer than three are known or they do not fit.
     """
     known = np.isfinite(east_north).all(1)
     if known.sum() < 3:
