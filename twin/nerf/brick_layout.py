@@ -30,9 +30,9 @@ class BrickLayout:
     density_unit: float
     """Density at raw network output 0 [1/contracted m, see `kernels/space.py`]."""
     near_shape: tuple[int, int, int]
-    """Bricks over the near box."""
+    """Number of near bricks per axis."""
     far_shape: tuple[int, int, int]
-    """Bricks over the contracted cube."""
+    """Number of far bricks per axis."""
 
     @property
     def near_side(self) -> NDArray[np.float64]:
@@ -149,7 +149,7 @@ def check_arrays(layout: BrickLayout, arrays: dict[str, NDArray], dim: int) -> N
     }
     check_shapes({name: (arrays[name], *expected) for name, expected in shapes.items()})
     if hidden % 8 or not hidden:
-        raise ValueError(f"head of {hidden} units; expected a multiple of 8")
+        raise ValueError(f"the head has {hidden} hidden units; expected a multiple of 8")
     for name, index, shape in (("near", near, layout.near_shape), ("far", far, layout.far_shape)):
         inside = not len(index) or (index.min() >= 0 and (index < np.array(shape)).all())
         if not inside or len(np.unique(np.ravel_multi_index(tuple(index.T), shape))) < len(index):

@@ -138,7 +138,7 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
     rng = np.random.default_rng([seed, 7])
     share = min(1.0, _MAX_HITS / max(1, int(0.7 * pixels.start[-1])))
     parts: list[list[NDArray[Any]]] = []
-    with bar("surfaces", len(pixels.cameras), "frame") as progress:
+    with bar("surface points", len(pixels.cameras), "frame") as progress:
         for i in range(len(pixels.cameras)):
             width, height = int(pixels.width[i]), int(pixels.height[i])
             pose, k = pixels.cameras.camera_to_world[i].astype(np.float32), pixels.intrinsics[i].astype(np.float32)
@@ -220,7 +220,7 @@ class _DetailFitter:
         n = len(self.pixels.hits)
         count = min(_RAYS, n)
         errors = []
-        with bar("detail", steps, "step") as progress, single_threaded_torch():
+        with bar("fitting detail", steps, "step") as progress, single_threaded_torch():
             for step in range(steps):
                 start = step * count % (n - count + 1)
                 rows = slice(start, start + count)
