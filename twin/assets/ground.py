@@ -98,7 +98,7 @@ def _interpolate(height: Array, origin: Array, cell: float, xy: Array, order: in
 
 DATA_KINDS = ("field", "points", "path")
 _MIN_UPRIGHT = 0.94  # least z of a unit normal (20° from vertical); steeper surfaces are not ground
-_GATE, _GATE_PER_METER = 0.25, 0.05  # [m, m/m] largest height above or below the path; its growth with distance
+_GATE, _GATE_PER_METER = 0.25, 0.05  # [m, m/m] largest height difference from the path; its growth with distance
 _SIGMA_FIELD = 0.03  # [m] σ of the median of a cell's rendered heights, near the lens
 _SIGMA_POINTS = 0.04  # [m] σ of the median height of a cell's sparse points
 _SIGMA_PATH = 0.012  # [m] σ of path data if the camera is rigidly mounted
@@ -131,7 +131,7 @@ class HeightData:
 def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData:
     """One datum per occupied square of side `cell` [m]: mean x and y and median z of its n points.
 
-    Its σ is (1 + 1/n) times the smallest σ of the points: never less than that, since errors of neighbors correlate.
+    Its σ is (1 + 1/n) times the smallest σ of the points: it is never smaller, since errors of neighbors correlate.
     """
     if len(xyz) == 0:
         return HeightData.empty()
@@ -227,7 +227,7 @@ def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> floa
 
 # ---- fit
 
-_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m]; most nodes of the coarse and the fine grid
+_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m]; upper limits of nodes of either grid
 _MAX_CELLS = 1_500_000
 _SMOOTHING_LENGTH = 0.5  # [m] structures shorter than this are smoothed away as noise
 _EXTRAPOLATION_LENGTH = 8.0  # [m] distance over which a slope continues without data

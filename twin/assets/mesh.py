@@ -6,7 +6,7 @@ the solids, decomposes the solids into convex parts, and clears the corridor of 
 - `visual.npz`: colored triangles
 - `ground.npz`, `ground.png`: the ground as a height field, and its picture from above
 - `parts.npz`: convex parts of the obstacles
-- `route.npz`: for a drive, the route on the ground
+- `route.npz`: the route on the ground, unless the film goes around an object
 """
 
 import time
@@ -37,11 +37,11 @@ _VISUAL_FACES = 150_000
 _MARGIN_ABOVE = 2.0  # [m] margin of the visual mesh's box above the highest obstacle
 _MARGIN_BELOW = 1.0  # [m] margin of the visual mesh's box below the lowest ground
 _VISUAL_GROUND_CELL = 0.4  # [m] smallest width of the ground triangles
-_SPECK_AREA = 0.25  # [m²] smaller components are floaters
+_SPECK_AREA = 0.25  # [m²] smaller components are floaters, false surfaces in the air
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = None) -> dict[str, Any]:
-    """Runs the stage, see `twin.build`. Raises InputError if a route is wanted but the camera hardly moved."""
+    """Runs the stage, see `twin.build`. Raises InputError if the scene has a route but the camera hardly moved."""
     from twin.nerf.field import RadianceField
 
     field = RadianceField.load(scene.stage("field"), device)

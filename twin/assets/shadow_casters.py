@@ -1,6 +1,6 @@
-"""Surfaces of a scene that throw shadows: its visual mesh and, above and around it, depth rendered from the field.
+"""Surfaces of a scene that cast shadows: its visual mesh and, above and around it, depth rendered from the field.
 
-The mesh ends 2 m above `mesh.max_height` and at `mesh.margin` beside the route, but houses and trees beyond it throw
+The mesh ends 2 m above `mesh.max_height` and at `mesh.margin` beside the route, but houses and trees beyond it cast
 shadows, too. So the depth of the field at filmed poses is turned into triangles, which connect neighboring pixels of
 about the same depth. They are less accurate than the mesh, hence *rough*.
 """
@@ -25,7 +25,7 @@ _OVERLAP = 0.5  # [m] by which the triangles begin below the top of the mesh's b
 
 
 def shadow_casters(scene: SceneDir, field: RenderableField) -> ShadowCasters | None:
-    """The surfaces of a scene that throw shadows; None if its mesh stage is not built.
+    """The surfaces of a scene that cast shadows; None if its mesh stage is not built.
 
     Raises InputError if the mesh is damaged.
     """
