@@ -1,7 +1,7 @@
 """Stage `mesh`: collision and visual geometry in meters from the radiance field.
 
 The stage renders views of the field, fits the ground, fuses a distance field above it, extracts the visual surface and
-the solids, decomposes the solids into convex parts, and clears the corridor of them. It writes:
+the solids, decomposes the solids into convex parts, and clears the corridor (`solids.py`) of them. It writes:
 
 - `visual.npz`: colored triangles
 - `ground.npz`, `ground.png`: the ground as a height field, and its picture from above
@@ -174,7 +174,7 @@ def _save_parts(
     if dropped > 0:
         # Parts are sorted by distance from the path; the farthest are the least relevant to the robot.
         kept = kept[: config.mesh.max_parts]
-        runtime.log_line(f"  left out the {dropped} farthest convex parts: mesh.max_parts = {config.mesh.max_parts}")
+        runtime.log_line(f"  left out the {dropped} farthest convex parts, as mesh.max_parts = {config.mesh.max_parts}")
     parts = [part for _, part in kept]
     empty = np.zeros((0, 3))
     np.savez(

@@ -27,7 +27,7 @@ _GROUND_CLEARANCE = 0.1  # [m] everything less than this above the height field 
 _MAX_GROUND_GAP = 0.6  # [m] smaller gaps to the ground are closed, so that nothing hovers
 _EMBEDDING = 0.15  # [m] depth to which parts extend below the ground
 _TILE_SIZE = 3.0  # [m] large obstacles are divided into square columns with this side
-_MIN_VOXELS = 8  # smaller components are noise
+_MIN_VOXELS = 8  # smaller connected components of the solid are noise
 _MIN_HOVERING_VOXELS = 64  # smaller components are noise if they hover
 _HIDDEN_DEPTH = 0.3  # [m] hidden space is solid up to this distance behind a surface
 _MAX_GAP = 0.45  # [m] narrower gaps in the solid are closed
@@ -110,7 +110,7 @@ def solid_pieces(
 
 
 def _solid_distance(volume: Volume) -> NDArray[np.float32]:
-    """Distance field [m] of the solid, eroded: near seen surfaces the fused one, elsewhere one of the solid's voxels.
+    """Distance field [m] of the solid, eroded: near seen surfaces the fused field, elsewhere the solid's blurred mask.
 
     Gaps narrower than `_MAX_GAP`, as in foliage and noise, are closed: the robot cannot pass through them, and each
     lengthens the decomposition.

@@ -28,7 +28,7 @@ from twin.warp_runtime import wp
 
 FREE_SPACE_REACH = 2.5  # free votes reach this many times as far as surface votes
 _HALF_WEIGHT_DEPTH = 5.0  # [m] a vote at this depth has half weight, since pixels and errors grow with depth
-_CLEARANCE = 0.1  # beyond `far`, a view votes `free` only if the surface is further by this fraction of the depth
+_CLEARANCE = 0.1  # beyond `far`, a view votes `free` only if the surface is this fraction of the depth behind the voxel
 _SAME_SURFACE_RATIO = 1.1  # largest depth ratio of neighboring pixels on one surface
 
 

@@ -60,7 +60,7 @@ class BakedField:
         Args:
             layout: Sizes and bounds.
             lightings: Appearance embeddings by name.
-            arrays: `near` and `far` (grid positions of the stored bricks, (s, 3)), `features` (s, 729, CHANNELS) bytes,
+            arrays: `near` and `far` (the stored bricks in their grids, (s, 3)), `features` (s, 729, CHANNELS) bytes,
                 near bricks first, `low` and `step` (CHANNELS,) of the quantization, `near_leap` and `far_leap` (see
                 `brick_layout.skip_distances`), `network.*`, and for random lightings `probes.*` (see
                 `appearance_prior.Probes`).

@@ -53,7 +53,7 @@ class BrickLayout:
 def brick_indices(layout: BrickLayout, near: NDArray, far: NDArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Near and far index (see `kernels/bricks.py`); near bricks have the lower slots.
 
-    `near` and `far` are grid positions of the stored bricks, shape (s, 3).
+    `near` and `far` are the stored bricks' positions in their grids [bricks], shape (s, 3).
     """
     out = []
     for shape, slots, first in ((layout.near_shape, near, 0), (layout.far_shape, far, len(near))):

@@ -57,7 +57,7 @@ class SurfacePixels:
     color: NDArray[np.uint8]
     """Shape (n, 3)."""
     frame: NDArray[np.int32]
-    """Training frames, shape (n,)."""
+    """Index into the training frames, shape (n,)."""
 
 
 def fit_detail(

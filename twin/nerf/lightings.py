@@ -87,7 +87,7 @@ class Lightings:
         return mixed_sunlight(self.sunlight(mixture[0]), self.sunlight(mixture[1]), mixture[2]) if mixture else ()
 
     def sample(self, rng: np.random.Generator) -> Array32:
-        """Samples the embedding (dim,) of a plausible lighting. Raises InputError without probes or success."""
+        """Samples a plausible lighting's embedding (dim,). Raises InputError without probes, or if it finds none."""
         return self.prior.sample(rng)
 
     @cached_property
@@ -208,7 +208,7 @@ def added_lightings(
             if not (0.0 <= fog.extinction < np.inf and all(0.0 <= share <= 1.0 for share in fog.airlight)):
                 raise ValueError(f"extinction {fog.extinction} or airlight {fog.airlight} out of range")
             if vector.ndim != 1 or not np.isfinite(vector).all() or (made_by == result and vector.shape != (dim,)):
-                raise ValueError(f"embedding of shape {vector.shape}, or not finite")
+                raise ValueError(f"the embedding has shape {vector.shape}, not {(dim,)}, or is not finite")
             sun = Sun.from_json(head["sun"]) if head["format"] == _FORMAT else None
         if made_by == result:
             fresh[path.stem], fogs[path.stem] = vector, fog

@@ -7,7 +7,7 @@ picture under the lighting's embedding times a gain. The gain of each color chan
     other surfaces:  ambient + direct · visibility · max(0, n · s)
     far view, sky:   base + toward · ((1 + d · s) / 2)⁴ + up · max(0, d_z)
 
-The coefficients `level` and `direct` differ if the ground lies in shadows of what was not filmed, or if its color
+The coefficients `level` and `direct` differ if the ground lies in shadows of unfilmed objects, or if its color
 saturates. Here n is the normal of the surface, s the direction towards the sun, d the direction of view. The visibility
 comes from a shadow map (`geometry/shadow_map.py`). From z-depth `_NEAR` to `_FAR`, the surface's sum passes into that
 of the far view. The coefficients are fitted to a photo (`sun_fit.py`). They are ratios to the light of the film, in the
@@ -28,7 +28,7 @@ TERMS = ("ambient", "direct", "base", "toward", "up", "level")
 """Names of the terms of the gain."""
 MIN_GAIN, MAX_GAIN = 0.1, 4.0
 """Limits of the gain."""
-_NEAR, _FAR = 30.0, 60.0  # [m] z-depth below which surfaces are lit by their normals alone, and above which not at all
+_NEAR, _FAR = 30.0, 60.0  # [m] z-depth up to which only the sum for surfaces counts; from which only the far view's
 _GLOW = 4  # exponent of the brightening towards the sun
 _SMOOTHING = 9 / 160  # [widths of the picture] window over which points are averaged before normals are computed
 _LEVEL = (0.75, 0.92)  # upward components of unit normals: up to the first, a surface is steep; from the second, level
@@ -42,7 +42,7 @@ class Sun:
     shadows: OrthographicShadowMap
     """The parts of the place that the sun reaches, and its direction."""
     coefficients: Array32
-    """RGB of each of `TERMS`, shape (6, 3)."""
+    """Coefficients of `TERMS` for red, green and blue, shape (6, 3)."""
 
     @property
     def toward(self) -> Array:
@@ -178,7 +178,7 @@ def _levelness(normals: NDArray) -> NDArray:
 def _normals(points: Array32) -> Array32:
     """Unit normals of the surface through points relative to the camera (height, width, 3), towards the camera.
 
-    Level surfaces get the vertical, since the ground in a radiance field is rough.
+    Level surfaces get a vertical normal, since the ground in a radiance field is rough.
     """
     window = max(3, 2 * round(_SMOOTHING * points.shape[1] / 2) + 1)
     smooth = cv2.blur(points, (window, window), borderType=cv2.BORDER_REPLICATE)

@@ -34,11 +34,11 @@ _STARTS = 2  # number of first directions around which the search goes on
 _BASES = 2  # number of bases for which the search goes on, besides that of the embedding fitted without a sun
 _RIDGE = 2e-4  # weight of the squared differences of coefficients from those without a sun
 _PLAIN = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # coefficients of the terms without a sun
-_LIGHT = np.array([True, True, False, False, False, True])  # terms of non-negative coefficient: amounts of light
+_LIGHT = np.array([True, True, False, False, False, True])  # terms with coefficients ≥ 0, since they are light
 _STEPS = 100
 _RAYS, _SEARCH_RAYS = 6_000, 2_500  # pixels of the joint fits and of the searches, evenly spaced over the photo
 _EMBEDDING_RATE, _COEFFICIENT_RATE = 0.03, 0.03  # learning rates
-_EXTINCTION_RATE, _AIRLIGHT_RATE = 0.1, 0.03  # of the logarithm of extinction, and of the airlight
+_EXTINCTION_RATE, _AIRLIGHT_RATE = 0.1, 0.03  # learning rates of the logarithm of extinction and of the airlight
 _PRIOR = 1e-2  # weight of the squared distance from the initial embedding
 _MAX_EXTINCTION = 0.1  # [1/m]
 
@@ -62,7 +62,7 @@ class SunProblem:
 
 @dataclass(frozen=True)
 class LinearFit:
-    """A sun fitted to a base by least squares."""
+    """A sun fitted to a photo by least squares, with one base."""
 
     base: int
     toward: Array
@@ -103,7 +103,7 @@ def _error(fit: LinearFit) -> float:
 
 
 def fit_direction(problem: SunProblem, shadows: OrthographicShadowMap, fog: Fog) -> list[LinearFit]:
-    """Fits each base under a sun with a shadow map, in given fog."""
+    """Fits the coefficients of the sun with this shadow map for each base, in given fog."""
     terms = problem.seen.terms(shadows).astype(np.float64)
     kept = _kept(fog, problem.distances)[:, None]
     target = problem.colors - (1.0 - kept) * np.asarray(fog.airlight)

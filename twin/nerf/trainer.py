@@ -126,7 +126,7 @@ class Trainer:
         self.moving = 0.0
         """Fraction of the training pixels that show movers."""
         self.left: list[LeftObject] = left_objects(self.pixels) if config.transients else []
-        # The field must never learn their colors: some lightings have no pixels without them that would correct it.
+        # The field must never learn the colors of these objects: some lightings have no pixels that would correct them.
         if self.left:
             self._exclude(object_masks(self.pixels, self.left))
         train = self.pixels.cameras

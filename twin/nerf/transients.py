@@ -29,12 +29,12 @@ from twin.types import Array, Array32
 _GRID_CELLS = 80  # cells along a frame's longer side
 _FAR = 300.0  # [m] greatest depth; the sky is taken to be there
 _NEIGHBORS = 14  # frames in which a surface is looked up
-_MIN_SEEN = 4  # least number of other frames that see a cell's surface, or of their surfaces in a cell
+_MIN_SEEN = 4  # least number of observations of a cell's surface in other frames
 _DEPTH_TOLERANCE = 0.1  # a surface is visible in a frame if it is deeper than the frame's depth by less than this share
 _MIN_DIFFERENCE = 0.015  # least difference of a mover's color from that of a black surface [full scale = 1]
 _MIN_CONTRAST = 0.12  # increase of this least difference with brightness
 _MIN_CELLS = 8  # least number of strongly marked cells of a mover
-_WEAK = 0.75  # a mover's weakly marked cells have this share of the least difference
+_WEAK = 0.75  # a mover's weakly marked cells have at least this share of the least difference
 _FIXED = 0.25  # a cell that is marked in more than this share of a film's frames shows no mover
 _SPREADS = 4.0  # least difference, as a multiple of the other frames' median deviation from their median
 

@@ -102,7 +102,7 @@ def composite_backward(
     start: wp.int32,
     outputs_grad: wp.array2d(dtype=Channels),
 ):
-    """Gradient of the network outputs, given the gradients of the composited output and of Σwᵢ/tᵢ.
+    """Loss gradient of the network outputs, given those of the composited output and of Σwᵢ/tᵢ.
 
     Adds the gradient of two regularizers of the weights:
         distortion · (Σᵢⱼ wᵢwⱼ|sᵢ − sⱼ| + ⅓ Σ wᵢ²Δsᵢ), s = log(t + log_offset)      (Barron et al. 2022, eq. 15)

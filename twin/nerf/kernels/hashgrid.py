@@ -1,4 +1,4 @@
-"""Multi-resolution hash encoding (Müller et al. 2022, section 3): forward, hand-written backward, and optimizer.
+"""Multi-resolution hash encoding (Müller et al. 2022, section 3): forward and backward pass, and optimizer.
 
 *Grid position*: see `kernels/space.py`. *Level*: one of several grids of vertices, from coarse to fine. *Table*:
 features of all levels, equally many rows each, `FEATURES` floats per row. A level with no more vertices than rows is
@@ -84,7 +84,7 @@ def encode(
     start: wp.int32,
     features: wp.array2d(dtype=Feature),
 ):
-    """Trilinear features of grid positions from `start` on, shape (n, levels)."""
+    """Trilinearly interpolated features at grid positions from `start` on, shape (n, levels)."""
     i = start + wp.tid()
     p = positions[i]
     for level in range(levels.cells.shape[0]):

@@ -90,7 +90,7 @@ def fast_log(x: wp.float32) -> wp.float32:
 
 @wp.func
 def lowest_bit(bits: wp.int32) -> wp.int32:
-    """Index of the lowest set bit below the sign, read from the exponent of that bit as a float."""
+    """Index of the lowest set bit of a positive number, read from the exponent of that bit as a float."""
     return (wp.cast(float(bits & -bits), wp.int32) >> 23) - 127
 
 
@@ -229,7 +229,7 @@ def unit_ray(k: wp.vec4f, u: wp.float32, v: wp.float32) -> wp.vec3f:
 
 @wp.kernel(enable_backward=False)
 def cone_march(bricks: Bricks, image: ImageBuffers, first: wp.int32, start: wp.array2d(dtype=wp.float32)):
-    """Cone march: finds distances [m] up to which space is empty in the tiles [first, first + dim) of every camera.
+    """Cone march: finds distances [m] up to which space is empty in the tiles from `first` on of every camera.
 
     The unit directions of a tile's rays differ from that of its axis by at most a chord α. So at distance t, the rays
     lie in a ball of radius α·t around a point of the axis.

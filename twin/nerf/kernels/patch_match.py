@@ -1,9 +1,9 @@
 """PatchMatch stereo: fits planes that map windows of a reference frame to similar ones in its source frames.
 
-A *plane* at a pixel is (q, ∂q/∂u, ∂q/∂v): inverse z-depth q [1/m] and its slopes [1/(m px)]. They describe it exactly,
-since its inverse depth is affine in the pixel. A *window* is 5 × 5 pixels `spacing` apart around the pixel; the plane
-maps it to a source frame. The cost is 1 − NCC (normalized cross-correlation), in which window pixels weigh more if they
-resemble the middle one.
+A *plane* at a pixel is (q, ∂q/∂u, ∂q/∂v): inverse z-depth q [1/m] and its slopes [1/(m px)]. This is exact for a plane
+in space, whose inverse depth is affine in the pixel. A *window* is 5 × 5 pixels `spacing` apart around the pixel; the
+plane maps it to a source frame. The cost is 1 − NCC (normalized cross-correlation), in which window pixels weigh more
+if they resemble the middle one.
 Only the two sources of lowest cost are used, since a point may be hidden in the others (Gipuma, Galliani et al. 2015).
 """
 

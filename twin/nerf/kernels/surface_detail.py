@@ -102,8 +102,8 @@ def height_at(grid: DetailGrid, x: wp.float32, y: wp.float32) -> wp.float32:
 def surface_hit(grid: DetailGrid, o: wp.vec3f, ray: wp.vec3f, depth: wp.float32, per_pixel: wp.float32) -> Hit:
     """The hit of a ray from `o` that meets a surface at the z-depth `depth` [m].
 
-    `ray` is the ray's direction with unit z-depth, and `per_pixel` the width of a pixel per meter of depth. The height
-    map is much less steep than the ray, so two steps of a fixed-point iteration find the ground.
+    `ray` is the ray's direction with unit z-depth, and `per_pixel` the width of a pixel per meter of depth. The ground
+    is nearly level, so two steps of a fixed-point iteration find it.
     """
     x0 = o[0] - grid.origin[0]
     y0 = o[1] - grid.origin[1]
