@@ -168,7 +168,7 @@ def _path_data(
     """Data from the camera path, lowered by the camera height. Their σ includes the up-and-down motion of the camera.
 
     Args:
-        cameras: n metric cameras.
+        cameras: n cameras, in meters.
         ground_height: Ground height below each camera, from the other kinds of data [m], shape (n,); None = unknown.
         camera_height: The given height of the camera [m]; 0 = each source's median height above `ground_height`.
     """

@@ -165,8 +165,8 @@ def color_points(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Returns colors (k, 3) of surface points (k, 3) with normals (k, 3), and a mask (k,) of the points that views see.
 
-    The nearest views dominate a color. A view sees a point if the point faces it and the view's depth there agrees with
-    the point's within `tolerance` [m] plus 5 %.
+    The nearest views dominate a color. A view sees a point if the point faces it and the view's depth there differs by
+    less than `tolerance` [m] plus 5 % from the point's depth.
     """
     with wp.ScopedDevice("cpu"):
         colors = wp.zeros(len(points), dtype=wp.vec3)

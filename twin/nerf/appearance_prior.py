@@ -114,7 +114,7 @@ class AppearancePrior:
         misfit, wrong = float(np.sqrt((error**2).mean())), float((error > _OUTLIER_ERROR).mean())
         found = []
         if not misfit <= _MAX_MISFIT:
-            found.append(f"an rms error of {misfit:.3f} from any sum of the filmed lights (limit: {_MAX_MISFIT})")
+            found.append(f"an rms color error of {misfit:.3f} from any sum of filmed lights (limit: {_MAX_MISFIT})")
         if not wrong <= _MAX_OUTLIER_SHARE:
             found.append(f"{wrong:.1%} of the probes off by over {_OUTLIER_ERROR} (limit: {_MAX_OUTLIER_SHARE:.0%})")
         for name, value, low, high in zip(_STATISTICS, picture_statistics(picture), self._low, self._high, strict=True):

@@ -206,7 +206,7 @@ def added_lightings(
             red, green, blue = map(float, head["air"]["airlight"])
             fog = Fog(float(head["air"]["extinction"]), (red, green, blue))
             if not (0.0 <= fog.extinction < np.inf and all(0.0 <= share <= 1.0 for share in fog.airlight)):
-                raise ValueError(f"extinction {fog.extinction} or airlight {fog.airlight} out of range")
+                raise ValueError(f"extinction {fog.extinction} below 0, or airlight {fog.airlight} not in 0 to 1")
             if vector.ndim != 1 or not np.isfinite(vector).all() or (made_by == result and vector.shape != (dim,)):
                 raise ValueError(f"the embedding has shape {vector.shape}, not {(dim,)}, or is not finite")
             sun = Sun.from_json(head["sun"]) if head["format"] == _FORMAT else None

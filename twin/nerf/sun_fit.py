@@ -241,7 +241,7 @@ class SunFit:
     picture: Array32
     """The field in this light, from the photo's pose, shape (h, w, 3)."""
     psnr_other_half: float
-    """Mean PSNR of each half of the photo under the fit to the other half [dB]."""
+    """Mean PSNR of the photo's two halves, each under the fit to the other half [dB]."""
     disagreement: float
     """Angle between the directions found in the two halves [°]; 0 if the direction was given."""
 

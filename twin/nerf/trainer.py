@@ -1,4 +1,4 @@
-"""Stage `field`: trains a radiance field on metric cameras, bakes it, adds detail, and evaluates the result.
+"""Stage `field`: trains a radiance field on frames with known poses, bakes it, adds detail, and evaluates it.
 
 Training takes `nerf.steps` steps, however long they last. On a CPU, the same input gives the same field bit for bit.
 Each step also penalizes density at *free points*: random points near the camera path, where space must be empty.
@@ -53,7 +53,7 @@ from twin.warp_runtime import wp
 
 _EDGE_SHARPNESS = 10.0  # a color contrast of 1/10 divides the plane loss by e
 _MAX_BEND = 0.5  # upper limit of the relative second difference of inverse depth: a larger one is a depth edge
-_HORIZON_SINE = 0.03  # rays whose sine of elevation has a smaller absolute value count as on the horizon
+_HORIZON_SINE = 0.03  # a ray is neither above nor below the horizon if its sine of elevation is between ± this
 # Weights of the loss terms beside the color error.
 _DISTORTION = 0.005
 _DEPTH, _DEPTH_REACH = 0.25, 0.5  # a weight of 1.0 costs 0.6 dB of PSNR, as errors of stereo blur near surfaces

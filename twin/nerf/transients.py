@@ -226,7 +226,7 @@ def _mean_around(color: Array32) -> Array32:
 
 
 def cleaned(strong: NDArray[np.bool_], weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Weakly marked regions with `_MIN_CELLS` strongly marked cells or more, without gaps, and with a cell's margin."""
+    """Weakly marked regions with `_MIN_CELLS` strongly marked cells, with small gaps closed and a margin of a cell."""
     closed = cv2.morphologyEx((strong | weak).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     count, labels = cv2.connectedComponents(opened, connectivity=4)
@@ -239,8 +239,8 @@ def cleaned(strong: NDArray[np.bool_], weak: NDArray[np.bool_]) -> NDArray[np.bo
 
 _VOXEL = 0.25  # [m] side
 _REACH = 18.0  # [m] from the camera, within which stereo is accurate enough
-_BEHIND = (0.5, 0.08)  # a surface farther behind a voxel shows it empty; the greater of [m] and [share of the depth]
-_AT = (0.3, 0.04)  # a surface nearer to a voxel shows it occupied; the same units
+_BEHIND = (0.5, 0.08)  # least distance of a surface behind an empty voxel: greater of [m] and [share of the depth]
+_AT = (0.3, 0.04)  # greatest distance of a surface from an occupied voxel; the same units
 _MIN_KNOWN = 3  # least number of known depths among a voxel's cell and its eight neighbors, to find the voxel empty
 _MIN_FRAMES = 3  # least number of frames to find a voxel occupied, or empty
 _MIN_VOXELS = 24  # smaller objects are left alone: noise of stereo looks like them
@@ -434,7 +434,7 @@ _RED = np.array([230, 20, 20], np.float32)
 
 
 def picture(pixels: TrainingPixels, excluded: list[NDArray[np.bool_]]) -> NDArray[np.uint8]:
-    """Two frames of every lighting with many excluded pixels, which are red; RGB, shape (height, width, 3).
+    """Up to two frames per lighting with many excluded pixels, which are red; RGB, shape (height, width, 3).
 
     At least one pixel must be excluded.
     """

@@ -1,6 +1,6 @@
 """Contraction of unbounded space to a cube, and rays of pinhole cameras.
 
-*Near box*: axis-aligned box [m], not distorted. *Unit position* u: per axis, the offset from the
+*Near box*: axis-aligned box [m], not contracted. *Unit position* u: per axis, the offset from the
 center of the near box divided by its half side; the near box is [−1, 1]³. *Contracted position*: u inside the near box,
 (2 − 1/|u|)·u/|u| outside (Barron et al. 2022, eq. 10, but with the maximum norm), so all of space is in (−2, 2)³.
 *Grid position*: contracted position scaled to [0, 1]³. *Contracted meter*: inside the near box, a meter; outside
@@ -12,7 +12,7 @@ before training, the space outside the near box is no more opaque than the box.
 # mypy: ignore-errors
 from twin.warp_runtime import wp
 
-_TOP = 1.0 - 1.0e-6  # greatest coordinate of a grid position, so that it lies in a cell
+_TOP = 1.0 - 1.0e-6  # greatest coordinate: below 1, so that a grid position lies in a cell
 
 
 @wp.struct
