@@ -22,7 +22,7 @@ _OUTLIER_ERROR = 0.2  # color difference above which a probe is an outlier [full
 _MAX_OUTLIER_SHARE = 0.02  # greatest share of outliers among the probes
 _RANGE_MARGIN = (0.02, 0.1)  # at both ends, filmed ranges grow by the first value plus the second times their width
 _CLIPPED = (0.02, 0.98)  # all channels below the first value: black; all above the second: burnt out
-_CONCENTRATION = 0.7  # of the Dirichlet distribution; values below 1 favor single lightings over even mixtures
+_CONCENTRATION = 0.7  # of the Dirichlet distribution of mixtures; values below 1 favor single lightings
 _RESIDUAL_SCALE = 2.0  # scale of sampled frame residuals; the rule rejects implausible ones
 _MAX_TRIES = 200
 

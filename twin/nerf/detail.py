@@ -1,7 +1,7 @@
 """Fits the detail of a baked field to the training frames; `kernels/surface_detail.py` defines the terms.
 
-Bricks blur surfaces that are seen at grazing angles, most of all the ground: a ray passes through many cells before it
-is blocked. The point where it meets the surface is known more precisely: on the ground to a few centimeters, as the
+Bricks blur surfaces that are seen at grazing angles, above all the ground: a ray passes through many cells before it is
+blocked. The point where it meets the surface is known more precisely: on the ground to a few centimeters, as the
 height of the ground is smooth. Detail adds features at that point, which correct those of the bricks.
 """
 
@@ -37,7 +37,7 @@ _MIN_UPRIGHT = 0.94  # least z of the ground's unit normal (20° from level)
 _MIN_SEEN = 8  # least number of rendered points that determine a height
 _MIN_OPACITY = 0.98  # rays of greater opacity show a surface and nothing behind it
 _MIN_HITS = 24  # least number of training pixels in a stored tile
-_MAX_HITS = 8_000_000  # upper limit of the training pixels used (approximate), 0.5 GB
+_MAX_HITS = 8_000_000  # approximate upper limit of the training pixels used, which take 0.5 GB
 _SHARDS = 4
 _RAYS = 16384  # rays per step
 _RATE, _FINAL_RATE = 0.04, 0.05  # initial learning rate, and the final one as a share of it

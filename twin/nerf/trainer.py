@@ -79,7 +79,7 @@ def plane_loss(inverse_depth: torch.Tensor, color: torch.Tensor) -> torch.Tensor
 def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
     """Mean cost of opacity above the horizon and of transparency below it.
 
-    Without it, training would put surfaces into the sky, since a uniform color fits at any distance. Arguments are the
+    Without this loss, surfaces would appear in the sky, since a uniform color fits at any distance. Arguments are the
     opacity (n,) of rays and the vertical component `up` (n,) of their directions.
     """
     above, below = (up > _HORIZON_SINE).float(), (up < -_HORIZON_SINE).float()
@@ -377,7 +377,7 @@ class Trainer:
 def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
     """Straight segments of the camera path, shape (k, 2, 3) [m]; space closer to them than `near_plane` is empty.
 
-    A segment of 3 times its source's median length or more is a jump between photos: only its ends count.
+    A segment of 3 times its film's median length or more is a jump between photos, so only its ends count.
     """
     pieces = [np.repeat(cameras.positions[:, None], 2, 1)] if near_plane > 0 else []
     for source in dict.fromkeys(cameras.sources):
