@@ -2,7 +2,7 @@
 
 The solid consists of the negative part of the distance field (`tsdf.py`) and of the hidden space up to `_HIDDEN_DEPTH`
 behind it. (A film from a road shows only the fronts of obstacles, but collision needs walls with thickness.) The
-corridor is the space up to a half width beside the route and up to `HEADROOM` above the ground. The camera passed
+corridor is the space up to `Corridor.reach` beside the route and up to `HEADROOM` above the ground. The camera passed
 through it, so it is free.
 """
 

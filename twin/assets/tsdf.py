@@ -1,7 +1,7 @@
 """Fusion of depth maps into a truncated signed distance field (TSDF), and triangle meshes from it.
 
 *Signed distance* [m]: positive in free space, negative behind a surface, valid within ± `band` of it. At each voxel a
-view votes `near` if the surface that it sees is within the band, and `free` if it sees further. (This is the method of
+view votes `near` if the surface that it sees is within ± `band`, and `free` if it sees farther. (This is the method of
 Curless & Levoy 1996, eqs. 3 and 4, with votes for free space added.) So the many views through a *floater*, a false
 surface in the air, outvote the few that show it. At a depth edge the radiance field has a false, slanted surface
 between the near and the far surface. The view sees it edge-on, so the view's `near` votes have little weight, and views

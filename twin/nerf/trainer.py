@@ -100,7 +100,7 @@ _RISE, _FALL = 0.3, 0.1  # step of an opacity grid cell toward a more or a less 
 _LOG_OFFSET = 0.05  # added to distances in the distortion loss's logarithm [share of the near box's longest half side]
 _WARM_UP = 20  # steps of rising learning rate
 _MOVERS_SHARE = 0.3  # share of the steps after which the field is good enough to find movers (`transients.py`)
-_EXPLORATION_SHARE = 0.15  # share of the steps in which sampling narrows down to surfaces; cameras are refined after it
+_EXPLORATION_SHARE = 0.15  # share of the steps, the first ones, in which sampling narrows and cameras are not refined
 
 
 class Trainer:
