@@ -215,8 +215,8 @@ def test_error_names_a_damaged_file(scene):
         for head, words in (
             ({"format": 2}, r"is damaged \(KeyError"),
             (without_air, r"is damaged \(KeyError: 'air'"),
-            (bad_air, r"is damaged \(ValueError: air -0\.1"),
-            (whole | {"air": {"extinction": 0.1, "airlight": [1, 2, 1]}}, r"is damaged \(ValueError: air 0\.1"),
+            (bad_air, r"is damaged \(ValueError: extinction -0\.1"),
+            (whole | {"air": {"extinction": 0.1, "airlight": [1, 2, 1]}}, r"is damaged \(ValueError: extinction 0\.1"),
             (whole | {"format": 4}, "format 4, expected 3; fit it again"),
             (whole | {"format": 3, "sun": {"coefficients": {}}}, r"is damaged \(KeyError: 'ambient'"),
         ):

@@ -6,7 +6,7 @@ exceeds the protrusion bound.
 
 CoACD may crash, so it runs in child processes with a time limit. Its results may vary from run to run, even with one
 seed, so it uses one thread, and its results are cached by a hash of the input. Its parts may be too large, and even
-close doorways, so parts that protrude too far are split.
+block doorways, so parts that protrude too far are split.
 """
 
 import hashlib

@@ -121,7 +121,7 @@ def read_ply(path: Path) -> Gaussians:
     row = np.dtype(names)
     start = len(head) + len(found)
     if len(content) - start < count * row.itemsize:
-        raise InputError(f"{path} is cut off: {count} splats of {row.itemsize} bytes announced; copy it again")
+        raise InputError(f"{path} is cut off: its head announces {count} splats of {row.itemsize} bytes; copy it again")
     rows = np.frombuffer(content, row, count, start)
 
     def columns(*of: str) -> NDArray[np.float32]:

@@ -98,12 +98,12 @@ def _interpolate(height: Array, origin: Array, cell: float, xy: Array, order: in
 
 DATA_KINDS = ("field", "points", "path")
 _MIN_UPRIGHT = 0.94  # least z of a unit normal (20° from vertical); steeper surfaces are not ground
-_GATE, _GATE_PER_METER = 0.25, 0.05  # [m, m/m] largest height above or below the path; its growth with distance
+_GATE, _GATE_PER_METER = 0.25, 0.05  # [m, m/m] largest height difference from the path; its growth with distance
 _SIGMA_FIELD = 0.03  # [m] σ of the median of a cell's rendered heights, near the lens
 _SIGMA_POINTS = 0.04  # [m] σ of the median height of a cell's sparse points
 _SIGMA_PATH = 0.012  # [m] σ of path data if the camera is rigidly mounted
 _LATERAL_OFFSETS = (-0.6, -0.3, 0.0, 0.3, 0.6)  # [m] positions of data beside the path, where the wheels drove
-_CROSS_SLOPE = 0.02  # possible cross slope of a road, which the path does not measure
+_CROSS_SLOPE = 0.02  # [m/m] possible cross slope of a road, which the path does not measure
 _DATA_CELL = 0.25  # [m] side of the squares with one datum each
 _MAX_DEPTH = 18.0  # [m] deeper pixels are not used: the ground there fills only a few pixel rows
 
@@ -131,7 +131,7 @@ class HeightData:
 def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData:
     """One datum per occupied square of side `cell` [m]: mean x and y and median z of its n points.
 
-    Its σ is (1 + 1/n) times the smallest σ of the points: never less than that, since errors of neighbors correlate.
+    Its σ is (1 + 1/n) times the smallest σ of the points: it is never smaller, since errors of neighbors correlate.
     """
     if len(xyz) == 0:
         return HeightData.empty()
@@ -168,7 +168,7 @@ def _path_data(
     """Data from the camera path, lowered by the camera height. Their σ includes the up-and-down motion of the camera.
 
     Args:
-        cameras: n metric cameras.
+        cameras: n cameras, in meters.
         ground_height: Ground height below each camera, from the other kinds of data [m], shape (n,); None = unknown.
         camera_height: The given height of the camera [m]; 0 = each source's median height above `ground_height`.
     """
@@ -227,7 +227,7 @@ def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> floa
 
 # ---- fit
 
-_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m]; most nodes of the coarse and the fine grid
+_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m]; greatest numbers of nodes of the two grids
 _MAX_CELLS = 1_500_000
 _SMOOTHING_LENGTH = 0.5  # [m] structures shorter than this are smoothed away as noise
 _EXTRAPOLATION_LENGTH = 8.0  # [m] distance over which a slope continues without data
@@ -296,7 +296,7 @@ def fit_height(
             robust = (1.0 + ((height[node] - z) / width) ** 2) ** -2
         weight = robust / sigma**2
         system = (smooth + sparse.diags_array(np.bincount(node, weight, count))).tocsc()
-        # The matrix is symmetric positive definite: no pivoting and an ordering of Aᵀ + A make this 4 times as fast.
+        # As the matrix is symmetric positive definite, no pivoting and an ordering of Aᵀ + A make this 4 times as fast.
         factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         height = factors.solve(np.bincount(node, weight * z, count))
     assert height is not None

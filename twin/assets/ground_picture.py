@@ -13,7 +13,7 @@ from twin.geometry.cameras import Cameras, project, scaled_intrinsics
 from twin.nerf.rendering import RenderableField
 
 _TEXEL = 0.025  # [m] side of a texel
-_BEST_DISTANCE = 3.5  # [m] from the lens to a texel; nearer texels are seldom in the image
+_BEST_DISTANCE = 3.5  # [m] horizontal, from the lens to a texel; nearer texels are seldom in the image
 _MAX_DISTANCE = 12.0  # [m]; farther ground keeps its mean color
 _WIDTH = 640  # [px] of the renderings
 _MAX_TEXELS = 12_000_000

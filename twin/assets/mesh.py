@@ -1,12 +1,12 @@
 """Stage `mesh`: collision and visual geometry in meters from the radiance field.
 
 The stage renders views of the field, fits the ground, fuses a distance field above it, extracts the visual surface and
-the solids, decomposes the solids into convex parts, and clears the corridor of them. It writes:
+the solids, decomposes the solids into convex parts, and clears the corridor (`solids.py`) of them. It writes:
 
 - `visual.npz`: colored triangles
 - `ground.npz`, `ground.png`: the ground as a height field, and its picture from above
 - `parts.npz`: convex parts of the obstacles
-- `route.npz`: for a drive, the route on the ground
+- `route.npz`: the route on the ground, unless the film goes around an object
 """
 
 import time
@@ -37,11 +37,11 @@ _VISUAL_FACES = 150_000
 _MARGIN_ABOVE = 2.0  # [m] margin of the visual mesh's box above the highest obstacle
 _MARGIN_BELOW = 1.0  # [m] margin of the visual mesh's box below the lowest ground
 _VISUAL_GROUND_CELL = 0.4  # [m] smallest width of the ground triangles
-_SPECK_AREA = 0.25  # [m²] smaller components are floaters
+_SPECK_AREA = 0.25  # [m²] smaller components are floaters, false surfaces in the air
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = None) -> dict[str, Any]:
-    """Runs the stage, see `twin.build`. Raises InputError if a route is wanted but the camera hardly moved."""
+    """Runs the stage, see `twin.build`. Raises InputError if the scene has a route but the camera hardly moved."""
     from twin.nerf.field import RadianceField
 
     field = RadianceField.load(scene.stage("field"), device)
@@ -174,7 +174,7 @@ def _save_parts(
     if dropped > 0:
         # Parts are sorted by distance from the path; the farthest are the least relevant to the robot.
         kept = kept[: config.mesh.max_parts]
-        runtime.log_line(f"  left out the {dropped} farthest convex parts: mesh.max_parts = {config.mesh.max_parts}")
+        runtime.log_line(f"  left out the {dropped} farthest convex parts, as mesh.max_parts = {config.mesh.max_parts}")
     parts = [part for _, part in kept]
     empty = np.zeros((0, 3))
     np.savez(

@@ -1,6 +1,6 @@
-"""Surfaces of a scene that throw shadows: its visual mesh and, above and around it, depth rendered from the field.
+"""Surfaces of a scene that cast shadows: its visual mesh and, above and around it, depth rendered from the field.
 
-The mesh ends 2 m above `mesh.max_height` and at `mesh.margin` beside the route, but houses and trees beyond it throw
+The mesh ends 2 m above `mesh.max_height` and at `mesh.margin` beside the route, but houses and trees beyond it cast
 shadows, too. So the depth of the field at filmed poses is turned into triangles, which connect neighboring pixels of
 about the same depth. They are less accurate than the mesh, hence *rough*.
 """
@@ -19,13 +19,13 @@ from twin.types import Array
 
 _VIEWS, _WIDTH = 40, 96  # number of rendered poses, and their width [px]
 _REACH = 45.0  # [m] greatest depth
-_MAX_DEPTH_RATIO = 1.15  # of the corners of a triangle; larger ones connect different surfaces
+_MAX_DEPTH_RATIO = 1.15  # between the corners of a triangle; with a larger ratio, it connects different surfaces
 _LEAST_HEIGHT = 1.0  # [m] lowest height above the ground outside the mesh's box
 _OVERLAP = 0.5  # [m] by which the triangles begin below the top of the mesh's box, and within its sides
 
 
 def shadow_casters(scene: SceneDir, field: RenderableField) -> ShadowCasters | None:
-    """The surfaces of a scene that throw shadows; None if its mesh stage is not built.
+    """The surfaces of a scene that cast shadows; None if its mesh stage is not built.
 
     Raises InputError if the mesh is damaged.
     """

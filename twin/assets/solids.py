@@ -1,9 +1,9 @@
 """Closed meshes of the obstacles for the convex decomposition, and the corridor that is kept free of them.
 
-The solid consists of the negative part of the distance field and of the hidden space up to `_HIDDEN_DEPTH` behind it.
-(A film from a road shows only the fronts of obstacles, but collision needs walls with thickness.) The corridor is the
-space up to a half width beside the route and up to `HEADROOM` above the ground. The camera passed through it, so it is
-free.
+The solid consists of the negative part of the distance field (`tsdf.py`) and of the hidden space up to `_HIDDEN_DEPTH`
+behind it. (A film from a road shows only the fronts of obstacles, but collision needs walls with thickness.) The
+corridor is the space up to `Corridor.reach` beside the route and up to `HEADROOM` above the ground. The camera passed
+through it, so it is free.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ _GROUND_CLEARANCE = 0.1  # [m] everything less than this above the height field 
 _MAX_GROUND_GAP = 0.6  # [m] smaller gaps to the ground are closed, so that nothing hovers
 _EMBEDDING = 0.15  # [m] depth to which parts extend below the ground
 _TILE_SIZE = 3.0  # [m] large obstacles are divided into square columns with this side
-_MIN_VOXELS = 8  # smaller components are noise
+_MIN_VOXELS = 8  # smaller connected components of the solid are noise
 _MIN_HOVERING_VOXELS = 64  # smaller components are noise if they hover
 _HIDDEN_DEPTH = 0.3  # [m] hidden space is solid up to this distance behind a surface
 _MAX_GAP = 0.45  # [m] narrower gaps in the solid are closed
@@ -50,7 +50,7 @@ class Corridor:
 def solid_pieces(
     volume: Volume, ground: Ground, corridor: Corridor | None, cameras: Cameras, config: MeshConfig
 ) -> tuple[list[SolidPiece], dict[str, int]]:
-    """Closed meshes of all components that reach `obstacle_height` above the ground, cut into pieces of a tile's width.
+    """Closed meshes of the solid's components that reach `obstacle_height` above the ground, cut into tiles.
 
     Returns:
         The pieces, nearest to the path first; and the numbers of components by kind: `standing` ones, of which the
@@ -110,7 +110,7 @@ def solid_pieces(
 
 
 def _solid_distance(volume: Volume) -> NDArray[np.float32]:
-    """Distance field [m] of the solid: near seen surfaces, the fused field clipped to ± 1 voxel; all surfaces eroded.
+    """Distance field [m] of the solid, eroded: near seen surfaces the fused field, elsewhere the solid's blurred mask.
 
     Gaps narrower than `_MAX_GAP`, as in foliage and noise, are closed: the robot cannot pass through them, and each
     lengthens the decomposition.
@@ -139,7 +139,7 @@ def _close_downwards(field: NDArray, above: NDArray, voxel: float) -> None:
 
 
 def _block_piece(values: NDArray, volume: Volume, start: NDArray) -> SolidPiece | None:
-    """The closed surface of a block of the field, whose first voxel is `start`; None if it is empty."""
+    """Closed surface of a block of the distance field whose first voxel is `start`; None if the block is empty."""
     voxel = volume.voxel
     padded = np.pad(values, 1, constant_values=0.5 * voxel)
     origin = volume.origin + voxel * (start - 1)

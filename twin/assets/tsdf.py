@@ -1,10 +1,11 @@
 """Fusion of depth maps into a truncated signed distance field (TSDF), and triangle meshes from it.
 
 *Signed distance* [m]: positive in free space, negative behind a surface, valid within ± `band` of it. At each voxel a
-view votes `near` if the surface that it sees is within the band, and `free` if it sees further. (This is the method of
-Curless & Levoy 1996, eqs. 3 and 4, with votes for free space added.) So the many views through a floater outvote the
-few that show it. At a depth edge the radiance field has a false, slanted surface between the near and the far
-surface. A view sees it edge-on, so the view's `near` votes have little weight, and views from elsewhere outvote them.
+view votes `near` if the surface that it sees is within ± `band`, and `free` if it sees farther. (This is the method of
+Curless & Levoy 1996, eqs. 3 and 4, with votes for free space added.) So the many views through a *floater*, a false
+surface in the air, outvote the few that show it. At a depth edge the radiance field has a false, slanted surface
+between the near and the far surface. The view sees it edge-on, so the view's `near` votes have little weight, and views
+from elsewhere outvote them.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -27,7 +28,7 @@ from twin.warp_runtime import wp
 
 FREE_SPACE_REACH = 2.5  # free votes reach this many times as far as surface votes
 _HALF_WEIGHT_DEPTH = 5.0  # [m] a vote at this depth has half weight, since pixels and errors grow with depth
-_CLEARANCE = 0.1  # beyond `far`, a view votes `free` only if the surface is further by this fraction of the depth
+_CLEARANCE = 0.1  # beyond `far`, a view votes `free` only if the surface is this fraction of the depth behind the voxel
 _SAME_SURFACE_RATIO = 1.1  # largest depth ratio of neighboring pixels on one surface
 
 
@@ -164,8 +165,8 @@ def color_points(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Returns colors (k, 3) of surface points (k, 3) with normals (k, 3), and a mask (k,) of the points that views see.
 
-    The nearest views dominate a color. A view sees a point if the point faces it and the view's depth there agrees with
-    the point's within `tolerance` [m] plus 5 %.
+    The nearest views dominate a color. A view sees a point if the point faces it and the view's depth there differs by
+    less than `tolerance` [m] plus 5 % from the point's depth.
     """
     with wp.ScopedDevice("cpu"):
         colors = wp.zeros(len(points), dtype=wp.vec3)

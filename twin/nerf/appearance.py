@@ -72,10 +72,10 @@ def initial_appearance(
 
 _STEPS = 40
 _RATE = 0.05  # learning rate of the embedding
-_PRIOR = 1e-3  # weight of the squared distance from the initial embedding; the same as that of residuals in training
+_PRIOR = 1e-3  # weight of the squared distance from the initial embedding; the same as `trainer._RESIDUAL`
 _INITIAL_EXTINCTION = 2.5e-3  # [1/m]
 _EXTINCTION_RATE, _AIRLIGHT_RATE = 0.3, 0.05  # learning rates of the logarithm of extinction and of the airlight
-_MAX_EXTINCTION = 0.1  # [1/m], a visibility of 30 m; a thicker veil in a photo probably lies on the lens
+_MAX_EXTINCTION = 0.1  # [1/m], a visibility of 30 m; a photo that needs more was probably made with a dirty lens
 _FARTHEST_SHARE = 0.25  # share of the rays, the farthest ones, whose mean color initializes the airlight
 
 

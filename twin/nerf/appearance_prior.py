@@ -22,7 +22,7 @@ _OUTLIER_ERROR = 0.2  # color difference above which a probe is an outlier [full
 _MAX_OUTLIER_SHARE = 0.02  # greatest share of outliers among the probes
 _RANGE_MARGIN = (0.02, 0.1)  # at both ends, filmed ranges grow by the first value plus the second times their width
 _CLIPPED = (0.02, 0.98)  # all channels below the first value: black; all above the second: burnt out
-_CONCENTRATION = 0.7  # of the Dirichlet distribution; values below 1 favor single lightings over even mixtures
+_CONCENTRATION = 0.7  # of the Dirichlet distribution of mixtures; values below 1 favor single lightings
 _RESIDUAL_SCALE = 2.0  # scale of sampled frame residuals; the rule rejects implausible ones
 _MAX_TRIES = 200
 
@@ -67,7 +67,7 @@ class AppearancePrior:
         low, high = filmed.min(0), filmed.max(0)
         margin = _RANGE_MARGIN[0] + _RANGE_MARGIN[1] * (high - low)
         self._low, self._high = low - margin, high + margin
-        # Training keeps residuals small, so the lighting of a frame is the nearest one.
+        # Training keeps residuals small, so a frame's lighting is the one with the nearest embedding.
         nearest = np.linalg.norm(frame_vectors[:, None] - vectors, axis=-1).argmin(1)
         self._vectors, self._residuals = vectors, frame_vectors - vectors[nearest]
 
@@ -114,9 +114,9 @@ class AppearancePrior:
         misfit, wrong = float(np.sqrt((error**2).mean())), float((error > _OUTLIER_ERROR).mean())
         found = []
         if not misfit <= _MAX_MISFIT:
-            found.append(f"an rms error of {misfit:.3f} from any sum of the filmed lights (at most {_MAX_MISFIT})")
+            found.append(f"an rms color error of {misfit:.3f} from any sum of filmed lights (limit: {_MAX_MISFIT})")
         if not wrong <= _MAX_OUTLIER_SHARE:
-            found.append(f"{wrong:.1%} of the probes off by over {_OUTLIER_ERROR} (at most {_MAX_OUTLIER_SHARE:.0%})")
+            found.append(f"{wrong:.1%} of the probes off by over {_OUTLIER_ERROR} (limit: {_MAX_OUTLIER_SHARE:.0%})")
         for name, value, low, high in zip(_STATISTICS, picture_statistics(picture), self._low, self._high, strict=True):
             if not low <= value <= high:
                 found.append(f"{name} {value:.3f} (filmed: {low:.3f} to {high:.3f})")

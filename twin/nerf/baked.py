@@ -60,7 +60,7 @@ class BakedField:
         Args:
             layout: Sizes and bounds.
             lightings: Appearance embeddings by name.
-            arrays: `near` and `far` (grid positions of the stored bricks, (s, 3)), `features` (s, 729, CHANNELS) bytes,
+            arrays: `near` and `far` (the stored bricks in their grids, (s, 3)), `features` (s, 729, CHANNELS) bytes,
                 near bricks first, `low` and `step` (CHANNELS,) of the quantization, `near_leap` and `far_leap` (see
                 `brick_layout.skip_distances`), `network.*`, and for random lightings `probes.*` (see
                 `appearance_prior.Probes`).
@@ -120,7 +120,7 @@ class BakedField:
         self._first_bias = p["head.0.bias"], p["head.0"][rows:]
         needed = kernels.cone_march, self._march, detail_kernels.add_detail, self._color_head
         # Loaded here, so that no two threads load them at once.
-        with bar("compiling the renderer, once", len(needed), "part", after=1.0) as progress:
+        with bar("compiling the renderer (first use only)", len(needed), "part", after=1.0) as progress:
             for kernel in needed:
                 kernel.module.load(wp.get_device(device))
                 progress.update()
@@ -181,7 +181,7 @@ class BakedField:
         size: tuple[int, int] | None = None,
         stop: NDArray | None = None,
     ) -> Rendering:
-        """Renders n cameras, without the fog of added lightings.
+        """Renders n cameras, without the fog and the sun of added lightings.
 
         Args:
             cameras: `Cameras` of a scene, or `Viewpoints`.
@@ -306,7 +306,7 @@ class BakedField:
 
     @staticmethod
     def load(folder: Path, device: str = "cpu") -> "BakedField":
-        """Loads a baked field; raises InputError if the folder has none, or one of another format."""
+        """Loads a baked field; raises InputError if it is missing, damaged or of another format."""
         path = folder / "baked.json"
         if not path.exists():
             raise InputError(f"{folder}: contains no baked.json; build the scene (again)")

@@ -30,9 +30,9 @@ class BrickLayout:
     density_unit: float
     """Density at raw network output 0 [1/contracted m, see `kernels/space.py`]."""
     near_shape: tuple[int, int, int]
-    """Bricks over the near box."""
+    """Number of near bricks per axis."""
     far_shape: tuple[int, int, int]
-    """Bricks over the contracted cube."""
+    """Number of far bricks per axis."""
 
     @property
     def near_side(self) -> NDArray[np.float64]:
@@ -53,7 +53,7 @@ class BrickLayout:
 def brick_indices(layout: BrickLayout, near: NDArray, far: NDArray) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Near and far index (see `kernels/bricks.py`); near bricks have the lower slots.
 
-    `near` and `far` are grid positions of the stored bricks, shape (s, 3).
+    `near` and `far` are the stored bricks' positions in their grids [bricks], shape (s, 3).
     """
     out = []
     for shape, slots, first in ((layout.near_shape, near, 0), (layout.far_shape, far, len(near))):
@@ -149,7 +149,7 @@ def check_arrays(layout: BrickLayout, arrays: dict[str, NDArray], dim: int) -> N
     }
     check_shapes({name: (arrays[name], *expected) for name, expected in shapes.items()})
     if hidden % 8 or not hidden:
-        raise ValueError(f"head of {hidden} units; expected a multiple of 8")
+        raise ValueError(f"the head has {hidden} hidden units; expected a multiple of 8")
     for name, index, shape in (("near", near, layout.near_shape), ("far", far, layout.far_shape)):
         inside = not len(index) or (index.min() >= 0 and (index < np.array(shape)).all())
         if not inside or len(np.unique(np.ravel_multi_index(tuple(index.T), shape))) < len(index):

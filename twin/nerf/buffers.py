@@ -121,7 +121,7 @@ class NearBox:
 
 
 def near_box_of_cameras(camera_to_world: NDArray[np.float64], near_half_extent: float = 0.0) -> NearBox:
-    """The near box of cameras (n, 4, 4), z up: contains the path and, ahead of each camera, half the path's extent.
+    """The near box of cameras (n, 4, 4), z up: contains them and the points half the path's extent ahead of each.
 
     The box has a margin, which is smaller vertically, as most of what is filmed from a road lies beside the road. A
     nonzero `near_half_extent` [m] instead gives a cube with that half side around the cameras.
@@ -140,7 +140,7 @@ def near_box_of_cameras(camera_to_world: NDArray[np.float64], near_half_extent: 
 
 
 def opacity_grid_sizes(near_box: NearBox) -> list[tuple[tuple[int, ...], float]]:
-    """Cells per axis, and side of a cell inside the near box [m], of the near and the far opacity grid.
+    """Cells per axis, and side of a cell [contracted m], of the near and the far opacity grid.
 
     The near grid covers the near box, the far grid the contracted cube, which is twice as wide.
     """

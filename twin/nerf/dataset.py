@@ -1,8 +1,8 @@
 """Training data of a field: pixels of the training frames, and depth supervision.
 
 Depth supervision consists of image points (not rounded to pixels) with a known distance along their rays. It has three
-kinds: sparse points in the frames in which they were matched, the ground under the camera path ahead (if the camera
-height is constant), and stereo.
+kinds: sparse points in the frames in which they were matched, the ground under the path ahead of the camera (if the
+camera height is constant), and stereo.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _MAX_POINT_ERROR = 2.0  # [px] greatest reprojection error of a used point
 _MIN_TRACK_LENGTH = 3  # least number of frames in which a used point was matched
 _PATH_REACH = 12.0  # [camera heights] the path is used up to this distance ahead
 _PATH_OFFSETS = (-0.5, 0.0, 0.5)  # [camera heights] lateral offsets at which the ground is assumed level with the path
-_TRIPLE_SPACING = 0.02  # greatest spacing of a triple's pixels [share of the width]
+_TRIPLE_SPACING = 0.02  # greatest spacing of a triple's pixels (see `batch`) [share of the image width]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class DepthSupervision:
     """k known distances along rays."""
 
     frame: NDArray[np.int32]
-    """Training frame, shape (k,)."""
+    """Index into the training frames, shape (k,)."""
     pixel: NDArray[np.float64]
     """(u, v) [px], shape (k, 2)."""
     distance: NDArray[np.float32]
@@ -85,16 +85,16 @@ class TrainingPixels:
         unmasked = np.concatenate([mask.ravel() for mask in masks])
         self.unmasked_index = None if unmasked.all() else np.flatnonzero(unmasked)
         if self.unmasked_index is not None and not len(self.unmasked_index):
-            raise InputError("every training pixel is masked; masks are 0 = ignore, so are they inverted?")
+            raise InputError("every training pixel is masked; in a mask 0 = ignore, so are the masks inverted?")
         self.unmasked = unmasked
         self.points = self._depths_of_points(points, chosen)
         self.path = self._depths_of_path(camera_height) if camera_height > 0.0 else join_depths([])
         self.stereo = join_depths([])  # set from `stereo.stereo_depths`
 
     def exclude(self, marked: list[NDArray[np.bool_]]) -> None:
-        """Excludes more pixels from training, and the depth supervision on them; `marked` has a frame's size each.
+        """Excludes the pixels in `marked` (one mask per frame) and the depth supervision on them from training.
 
-        A frame that would lose every pixel keeps them all.
+        A frame that would lose all its pixels keeps them.
         """
         parts = np.split(self.unmasked, self.start[1:-1])
         kept = [part & ~mark.ravel() for part, mark in zip(parts, marked, strict=True)]
@@ -126,7 +126,7 @@ class TrainingPixels:
         return join_depths(found)
 
     def _depths_of_path(self, camera_height: float) -> DepthSupervision:
-        """Depth supervision from the ground under the path ahead, as far as the path is nearly straight."""
+        """Depth supervision from the ground under the path ahead of each frame, where the path is nearly straight."""
         found = []
         for source in dict.fromkeys(self.cameras.sources):
             frames = np.flatnonzero([s == source for s in self.cameras.sources])
@@ -149,7 +149,7 @@ class TrainingPixels:
         return join_depths(found)
 
     def batch(self, rng: np.random.Generator, shards: int, triples: int, singles: int, supervised: int) -> RayBatch:
-        """Samples random rays, shard after shard.
+        """Samples random rays, shard after shard (a shard is a part of a batch, see `buffers.py`).
 
         Each shard holds `triples` × 3 rays, a triple through equally spaced pixels in a line; then `singles` rays
         through random pixels; then `supervised` rays in equal shares from the available kinds of depth supervision.
@@ -222,7 +222,7 @@ class TrainingPixels:
 def load_frame(
     cameras: Cameras, i: int, max_width: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float64]]:
-    """A frame scaled to at most `max_width` on its longer side: image, mask (true = use), and its intrinsics [px]."""
+    """Reads a frame, scaled to at most `max_width` on its longer side: image, mask (true = use), intrinsics [px]."""
     image = read_image(cameras.image_path(i))
     height, width = image.shape[:2]
     shrink = min(1.0, max_width / max(width, height))

@@ -1,7 +1,7 @@
 """Fits the detail of a baked field to the training frames; `kernels/surface_detail.py` defines the terms.
 
-Bricks blur surfaces that are seen at grazing angles, most of all the ground: a ray passes through many cells before it
-is blocked. The point where it meets the surface is known more precisely: on the ground to a few centimeters, as the
+Bricks blur surfaces that are seen at grazing angles, above all the ground: a ray passes through many cells before it is
+blocked. The point where it meets the surface is known more precisely: on the ground to a few centimeters, as the
 height of the ground is smooth. Detail adds features at that point, which correct those of the bricks.
 """
 
@@ -37,7 +37,7 @@ _MIN_UPRIGHT = 0.94  # least z of the ground's unit normal (20° from level)
 _MIN_SEEN = 8  # least number of rendered points that determine a height
 _MIN_OPACITY = 0.98  # rays of greater opacity show a surface and nothing behind it
 _MIN_HITS = 24  # least number of training pixels in a stored tile
-_MAX_HITS = 8_000_000  # upper limit of the training pixels used (approximate), 0.5 GB
+_MAX_HITS = 8_000_000  # approximate upper limit of the training pixels used, which take 0.5 GB
 _SHARDS = 4
 _RAYS = 16384  # rays per step
 _RATE, _FINAL_RATE = 0.04, 0.05  # initial learning rate, and the final one as a share of it
@@ -57,7 +57,7 @@ class SurfacePixels:
     color: NDArray[np.uint8]
     """Shape (n, 3)."""
     frame: NDArray[np.int32]
-    """Training frames, shape (n,)."""
+    """Index into the training frames, shape (n,)."""
 
 
 def fit_detail(
@@ -138,7 +138,7 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
     rng = np.random.default_rng([seed, 7])
     share = min(1.0, _MAX_HITS / max(1, int(0.7 * pixels.start[-1])))
     parts: list[list[NDArray[Any]]] = []
-    with bar("surfaces", len(pixels.cameras), "frame") as progress:
+    with bar("surface points", len(pixels.cameras), "frame") as progress:
         for i in range(len(pixels.cameras)):
             width, height = int(pixels.width[i]), int(pixels.height[i])
             pose, k = pixels.cameras.camera_to_world[i].astype(np.float32), pixels.intrinsics[i].astype(np.float32)
@@ -220,7 +220,7 @@ class _DetailFitter:
         n = len(self.pixels.hits)
         count = min(_RAYS, n)
         errors = []
-        with bar("detail", steps, "step") as progress, single_threaded_torch():
+        with bar("fitting detail", steps, "step") as progress, single_threaded_torch():
             for step in range(steps):
                 start = step * count % (n - count + 1)
                 rows = slice(start, start + count)

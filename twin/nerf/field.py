@@ -47,7 +47,7 @@ QUERY_POINTS = 65536
 _RENDER_RAYS = 4096  # rays per batch when rendering
 _RENDER_SAMPLES = 24  # samples per ray when rendering
 _HEAD_RAYS = 8192  # rays per batch of the head
-_RENDER_UNIFORM_WEIGHT = 0.02  # uniform share of the sampling distribution when rendering
+_RENDER_UNIFORM_WEIGHT = 0.02  # `floor` of `sampler.sample_rays` when rendering
 _MAX_SEED = 2**31 - 1  # kernels take 32-bit signed seeds
 
 
@@ -255,7 +255,7 @@ class RadianceField:
         return rgb.cpu().numpy()
 
     def render(self, cameras: PosedCameras, lighting: str | NDArray, size: tuple[int, int] | None = None) -> Rendering:
-        """Renders n cameras under one lighting; arguments and errors as for the much faster `BakedField.render`."""
+        """Renders n cameras under one lighting; `BakedField.render` is much faster and explains the arguments."""
         vector = self.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
         intrinsics, (width, height) = intrinsics_for_size(cameras, size)
         n = len(intrinsics)
@@ -308,7 +308,7 @@ class RadianceField:
     def load(folder: Path, device: str | None = None) -> "RadianceField":
         """Loads a field to a device, see `buffers.resolve_device`.
 
-        Raises InputError if the folder has no field, or one of another format.
+        Raises InputError if the folder has no field, or its files are damaged or of another format.
         """
         device = resolve_device(device)
         path = folder / "field.json"
@@ -335,7 +335,7 @@ class RadianceField:
 
 
 def untrained_field(layout: Layout, appearance: Appearance, seed: int, device: str) -> RadianceField:
-    """The field before its first training step, whose density is low and almost uniform."""
+    """The field before its first training step; its density is low and almost uniform."""
     generator = torch.Generator().manual_seed(seed)
     table = (torch.rand(layout.levels, 2**layout.log2_table, hashgrid.FEATURES, generator=generator) - 0.5) * 2e-2
     parameters = network.initial_parameters(

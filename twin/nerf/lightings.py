@@ -87,7 +87,7 @@ class Lightings:
         return mixed_sunlight(self.sunlight(mixture[0]), self.sunlight(mixture[1]), mixture[2]) if mixture else ()
 
     def sample(self, rng: np.random.Generator) -> Array32:
-        """Samples the embedding (dim,) of a plausible lighting. Raises InputError without probes or success."""
+        """Samples a plausible lighting's embedding (dim,). Raises InputError without probes, or if it finds none."""
         return self.prior.sample(rng)
 
     @cached_property
@@ -95,7 +95,7 @@ class Lightings:
         """The prior of plausible embeddings. Raises InputError without probes."""
         if self.probes is None:
             raise InputError(
-                "no probes to check a random lighting on; use the baked field, twin.load_scene(SCENE).field()"
+                "this field has no probes to check random lightings; use the baked one, twin.load_scene(SCENE).field()"
             )
         return appearance_prior.AppearancePrior(self.probes, self.vectors, self.frame_vectors)
 
@@ -206,9 +206,9 @@ def added_lightings(
             red, green, blue = map(float, head["air"]["airlight"])
             fog = Fog(float(head["air"]["extinction"]), (red, green, blue))
             if not (0.0 <= fog.extinction < np.inf and all(0.0 <= share <= 1.0 for share in fog.airlight)):
-                raise ValueError(f"air {fog.extinction}, {fog.airlight}")
+                raise ValueError(f"extinction {fog.extinction} below 0, or airlight {fog.airlight} not in 0 to 1")
             if vector.ndim != 1 or not np.isfinite(vector).all() or (made_by == result and vector.shape != (dim,)):
-                raise ValueError(f"embedding of shape {vector.shape}, or not finite")
+                raise ValueError(f"the embedding has shape {vector.shape}, not {(dim,)}, or is not finite")
             sun = Sun.from_json(head["sun"]) if head["format"] == _FORMAT else None
         if made_by == result:
             fresh[path.stem], fogs[path.stem] = vector, fog

@@ -65,7 +65,7 @@ def trunk_backward(
 
 
 def ray_features(p: dict[str, torch.Tensor], composited: torch.Tensor, harmonics: torch.Tensor) -> torch.Tensor:
-    """Features of rays composited over the background, shape (n, CHANNELS − 1). Slot 0 of `composited` is opacity."""
+    """Features of rays composited over the background, shape (n, CHANNELS − 1); `composited[:, 0]` is opacity."""
     background = torch.relu(harmonics @ p["backdrop.0"] + p["backdrop.0.bias"]) @ p["backdrop.1"]
     return composited[:, 1:] + (1.0 - composited[:, :1]) * background
 

@@ -94,8 +94,8 @@ class PoseRefinement:
     def refined_cameras(self, cameras: Cameras) -> tuple[Cameras, dict[str, float]]:
         """Cameras with corrected poses of all frames, and a summary of the motions of the training frames [m], [°].
 
-        A held-out frame gets the mean correction of the `_NEIGHBORS` training frames that are nearest in time in its
-        source.
+        A held-out frame gets the mean correction of the `_NEIGHBORS` training frames of its film that are nearest in
+        time.
         """
         rotation, translation = (part.detach().cpu().double().numpy() for part in (self.rotation, self.translation))
         every = np.zeros((len(cameras), 6))

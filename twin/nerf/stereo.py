@@ -29,7 +29,7 @@ _WINDOW_SPACING = 240  # a frame's longer side is this many times the spacing of
 _MAX_COST = 0.5  # greatest 1 − NCC of a used cell
 _TOLERANCE = 0.04  # relative difference of inverse depth within which two frames agree
 _MIN_PARALLAX = 0.3  # [px] least shift in a voting source if inverse depth changes by the tolerance
-_MIN_VOTES = 2  # sources that must agree
+_MIN_VOTES = 2  # sources that must agree; one, if a frame has one
 _MIN_POINTS = 20  # least number of sparse points from which a frame's depth range is estimated
 
 
@@ -164,7 +164,7 @@ def choose_sources(cameras: Cameras, intrinsics: Array, depth: Array) -> list[ND
         a, b = point - positions[i], point - positions[others, None]
         cosine = (a * b).sum(-1) / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1) + 1e-12)
         angle = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        # A window does not match its image at twice or half the scale.
+        # A window does not match its image at twice or half the scale, as from twice or half the distance.
         ratio = np.linalg.norm(b, axis=-1) / np.linalg.norm(a, axis=-1)
         spread = np.where(angle < _BEST_ANGLE, 2.0, 8.0)
         rating = (inside * np.exp(-(((angle - _BEST_ANGLE) / spread) ** 2) - (np.log(ratio) / 0.7) ** 2)).sum(-1)

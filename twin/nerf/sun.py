@@ -1,4 +1,4 @@
-"""Sun of an added lighting: a gain on pictures of the field, by which another sun lights the place.
+"""Sun of an added lighting: a gain that turns pictures of the field into pictures under another sun.
 
 A field stores the colors of its films, with their light and shadows in them. The picture under another sun is the
 picture under the lighting's embedding times a gain. The gain of each color channel is a sum of terms:
@@ -7,11 +7,11 @@ picture under the lighting's embedding times a gain. The gain of each color chan
     other surfaces:  ambient + direct · visibility · max(0, n · s)
     far view, sky:   base + toward · ((1 + d · s) / 2)⁴ + up · max(0, d_z)
 
-The two coefficients of direct light differ if the ground lies in shadows of what was not filmed, or if its color
-saturates. Here n is the normal of the surface, s the direction towards the sun, d the direction of view. The
-visibility comes from a shadow map (`geometry/shadow_map.py`). Between `_NEAR` and `_FAR` near and far sums are
-blended. The coefficients are fitted to a photo (`sun_fit.py`). They are ratios to the light of the film, in the film's
-tone curve.
+The coefficients `level` and `direct` differ if the ground lies in shadows of unfilmed objects, or if its color
+saturates. Here n is the normal of the surface, s the direction towards the sun, d the direction of view. The visibility
+comes from a shadow map (`geometry/shadow_map.py`). From z-depth `_NEAR` to `_FAR`, the surface's sum passes into that
+of the far view. The coefficients are fitted to a photo (`sun_fit.py`). They are ratios to the light of the film, in the
+film's tone curve.
 """
 
 from dataclasses import dataclass
@@ -28,10 +28,10 @@ TERMS = ("ambient", "direct", "base", "toward", "up", "level")
 """Names of the terms of the gain."""
 MIN_GAIN, MAX_GAIN = 0.1, 4.0
 """Limits of the gain."""
-_NEAR, _FAR = 30.0, 60.0  # [m] z-depth below which surfaces are lit by their normals alone, and above which not at all
+_NEAR, _FAR = 30.0, 60.0  # [m] z-depth up to which only the sum for surfaces counts; from which only the far view's
 _GLOW = 4  # exponent of the brightening towards the sun
 _SMOOTHING = 9 / 160  # [widths of the picture] window over which points are averaged before normals are computed
-_LEVEL = (0.75, 0.92)  # upward components of normals between which they are replaced more and more by the vertical
+_LEVEL = (0.75, 0.92)  # upward components of unit normals: up to the first, a surface is steep; from the second, level
 _MAX_ENTRY = 100.0  # largest absolute coefficient in a file
 
 
@@ -40,9 +40,9 @@ class Sun:
     """A sun with the gain by which it changes pictures of a field under one embedding."""
 
     shadows: OrthographicShadowMap
-    """The parts of the place that it reaches; contains its direction."""
+    """The parts of the place that the sun reaches, and its direction."""
     coefficients: Array32
-    """RGB of each of `TERMS`, shape (6, 3)."""
+    """Coefficients of `TERMS` for red, green and blue, shape (6, 3)."""
 
     @property
     def toward(self) -> Array:
@@ -52,7 +52,7 @@ class Sun:
     def gain(self, points: Array, normals: Array) -> tuple[Array32, Array32]:
         """Gain of near surfaces at points (n, 3) [m] with unit normals (n, 3), shape (n, 3).
 
-        Also returns the fraction of it that is the direct light's, averaged over the channels, shape (n,).
+        Also returns the fraction of the gain due to direct light, averaged over the channels, shape (n,).
         """
         level = _levelness(normals)[:, None]
         color = level * self.coefficients[5] + (1.0 - level) * self.coefficients[1]
@@ -73,12 +73,12 @@ class Sun:
         """Reads the result of `to_json`. Raises ValueError, KeyError or TypeError if it is damaged."""
         rows = np.array([table["coefficients"][name] for name in TERMS], np.float32)
         if rows.shape != (len(TERMS), 3) or not (np.abs(rows) <= _MAX_ENTRY).all():
-            raise ValueError(f"coefficients of the sun of shape {rows.shape}, or beyond ±{_MAX_ENTRY:g}")
+            raise ValueError(f"the sun's coefficients have shape {rows.shape}, not (6, 3), or exceed ±{_MAX_ENTRY:g}")
         return Sun(OrthographicShadowMap.from_json(table["shadow_map"]), rows)
 
 
 Sunlight = tuple[tuple[Sun, float], ...]
-"""Suns with their weights, which sum to 1 at most; the rest is the light of the film. Empty: the film's light alone."""
+"""Suns with their weights, which sum to at most 1; the rest is the light of the film. Empty: the film's light alone."""
 
 
 def mixed_sunlight(one: Sunlight, other: Sunlight, share: float) -> Sunlight:
@@ -91,12 +91,12 @@ def mixed_sunlight(one: Sunlight, other: Sunlight, share: float) -> Sunlight:
 
 
 def main_sun(sunlight: Sunlight) -> Sun | None:
-    """The sun that has at least half of the weight; None if there is none."""
+    """The sun with a weight of at least one half; None if there is none."""
     return next((sun for sun, weight in sunlight if weight >= 0.5), None)
 
 
 def relit(rgb: Array32, depth: Array32, rays: Array, pose: Array, sunlight: Sunlight) -> Array32:
-    """Returns a picture of the field in sunlight.
+    """Relights a picture of the field.
 
     Args:
         rgb: Shape (height, width, 3).
@@ -178,7 +178,7 @@ def _levelness(normals: NDArray) -> NDArray:
 def _normals(points: Array32) -> Array32:
     """Unit normals of the surface through points relative to the camera (height, width, 3), towards the camera.
 
-    Nearly level surfaces get the vertical, since the ground of a field is rough.
+    Level surfaces get a vertical normal, since the ground in a radiance field is rough.
     """
     window = max(3, 2 * round(_SMOOTHING * points.shape[1] / 2) + 1)
     smooth = cv2.blur(points, (window, window), borderType=cv2.BORDER_REPLICATE)

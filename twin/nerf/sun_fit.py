@@ -1,8 +1,8 @@
 """Fit of a sun to a photo: a search over directions, then a joint fit with the appearance embedding and the fog.
 
-The photo is compared with pictures of the field, its *bases*, whose colors are multiplied by the sun's gain
-(`sun.py`). For one base and one direction, the gain's coefficients are a linear least squares problem, so hundreds of
-directions can be tried. The best base and direction start a gradient descent on coefficients, embedding and fog.
+The photo is compared with *bases*, pictures of the field under several embeddings, times the sun's gain (`sun.py`). For
+one base and one direction, the gain's coefficients are a linear least squares problem, so hundreds of directions can be
+tried. The best base and direction start a gradient descent on coefficients, embedding and fog.
 """
 
 import math
@@ -25,20 +25,20 @@ if TYPE_CHECKING:
     from twin.nerf.field import RadianceField
 
 SEARCH_TEXEL = 0.5
-"""[m] texels of the shadow maps of a search."""
+"""[m] side of the texels of a search's shadow maps."""
 _ELEVATIONS = (8.0, 18.0, 32.0, 50.0)  # [°] elevations of the first directions
 _AZIMUTH_STEP = 22.5  # [°] step of their azimuths
 _ELEVATION_RANGE = (3.0, 80.0)  # [°] of a search
 _REFINEMENTS = (9.0, 5.0, 2.5)  # [°] steps of the further searches around the best directions
 _STARTS = 2  # number of first directions around which the search goes on
-_BASES = 2  # number of bases for which it goes on, besides the fitted embedding
+_BASES = 2  # number of bases for which the search goes on, besides that of the embedding fitted without a sun
 _RIDGE = 2e-4  # weight of the squared differences of coefficients from those without a sun
 _PLAIN = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # coefficients of the terms without a sun
-_LIGHT = np.array([True, True, False, False, False, True])  # terms that are not negative, as light is not
+_LIGHT = np.array([True, True, False, False, False, True])  # terms with coefficients ≥ 0, since they are light
 _STEPS = 100
 _RAYS, _SEARCH_RAYS = 6_000, 2_500  # pixels of the joint fits and of the searches, evenly spaced over the photo
 _EMBEDDING_RATE, _COEFFICIENT_RATE = 0.03, 0.03  # learning rates
-_EXTINCTION_RATE, _AIRLIGHT_RATE = 0.1, 0.03  # of the logarithm of extinction, and of the airlight
+_EXTINCTION_RATE, _AIRLIGHT_RATE = 0.1, 0.03  # learning rates of the logarithm of extinction and of the airlight
 _PRIOR = 1e-2  # weight of the squared distance from the initial embedding
 _MAX_EXTINCTION = 0.1  # [1/m]
 
@@ -62,7 +62,7 @@ class SunProblem:
 
 @dataclass(frozen=True)
 class LinearFit:
-    """A sun fitted to a base by least squares."""
+    """A sun fitted to a photo by least squares, with one base."""
 
     base: int
     toward: Array
@@ -74,7 +74,7 @@ class LinearFit:
 
 
 def search_directions(problem: SunProblem, casters: ShadowCasters, fog: Fog) -> list[LinearFit]:
-    """For each base its best fit, over the directions of a grid and of refinements around the best of them."""
+    """Best fit of each base over a grid of directions, and for promising bases over refinements of the best ones."""
     known: dict[tuple[float, float], list[LinearFit]] = {}
 
     def fits(azimuth: float, elevation: float) -> list[LinearFit]:
@@ -103,7 +103,7 @@ def _error(fit: LinearFit) -> float:
 
 
 def fit_direction(problem: SunProblem, shadows: OrthographicShadowMap, fog: Fog) -> list[LinearFit]:
-    """Fits each base under a sun with a shadow map, in given fog."""
+    """Fits the coefficients of the sun with this shadow map for each base, in given fog."""
     terms = problem.seen.terms(shadows).astype(np.float64)
     kept = _kept(fog, problem.distances)[:, None]
     target = problem.colors - (1.0 - kept) * np.asarray(fog.airlight)
@@ -125,7 +125,7 @@ def _kept(fog: Fog, distances: NDArray) -> NDArray:
 
 
 def _solve(columns: NDArray, target: NDArray) -> NDArray:
-    """Least squares with a weak pull to `_PLAIN`; light is not negative."""
+    """Least squares with a weak pull to `_PLAIN`; the coefficients in `_LIGHT` are not negative."""
     scale = _RIDGE * float((columns**2).mean(0).sum()) * len(columns)
     square = columns.T @ columns + scale * np.eye(len(_PLAIN))
     right = columns.T @ target + scale * _PLAIN
@@ -196,7 +196,7 @@ def fit_jointly(
 
 @dataclass(frozen=True)
 class TracedPhoto:
-    """A photo with what the field has in its pixels."""
+    """A photo with the field's depth and features in its pixels."""
 
     photo: Array32
     """RGB in [0, 1], shape (h, w, 3)."""
@@ -241,7 +241,7 @@ class SunFit:
     picture: Array32
     """The field in this light, from the photo's pose, shape (h, w, 3)."""
     psnr_other_half: float
-    """Mean PSNR of each half of the photo under the fit to the other half [dB]."""
+    """Mean PSNR of the photo's two halves, each under the fit to the other half [dB]."""
     disagreement: float
     """Angle between the directions found in the two halves [°]; 0 if the direction was given."""
 
@@ -264,8 +264,8 @@ def fit_sun(
         traced: The photo.
         halves: Fits to both halves without a sun.
         whole: The fit to the whole photo without a sun.
-        casters: What throws shadows.
-        toward: Direction to the sun, shape (3,); None: it is searched.
+        casters: Surfaces that cast shadows.
+        toward: Direction towards the sun, shape (3,); None: it is searched.
     """
     shape, seen = traced.photo.shape, SeenSurfaces.of(traced.depth, traced.rays, traced.camera_to_world)
     colors, distances = traced.photo.reshape(-1, 3).astype(np.float32), traced.distance.ravel()

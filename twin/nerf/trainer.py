@@ -1,4 +1,4 @@
-"""Stage `field`: trains a radiance field on metric cameras, bakes it, adds detail, and evaluates the result.
+"""Stage `field`: trains a radiance field on frames with known poses, bakes it, adds detail, and evaluates it.
 
 Training takes `nerf.steps` steps, however long they last. On a CPU, the same input gives the same field bit for bit.
 Each step also penalizes density at *free points*: random points near the camera path, where space must be empty.
@@ -53,10 +53,10 @@ from twin.warp_runtime import wp
 
 _EDGE_SHARPNESS = 10.0  # a color contrast of 1/10 divides the plane loss by e
 _MAX_BEND = 0.5  # upper limit of the relative second difference of inverse depth: a larger one is a depth edge
-_HORIZON_SINE = 0.03  # sine of the elevation within which a ray is neither above nor below the horizon
+_HORIZON_SINE = 0.03  # a ray is neither above nor below the horizon if its sine of elevation is between ± this
 # Weights of the loss terms beside the color error.
 _DISTORTION = 0.005
-_DEPTH, _DEPTH_REACH = 0.25, 0.5  # a weight of 1.0 costs 0.6 dB: errors of stereo blur near surfaces
+_DEPTH, _DEPTH_REACH = 0.25, 0.5  # a weight of 1.0 costs 0.6 dB of PSNR, as errors of stereo blur near surfaces
 _PLANE = 0.01
 _FREE = 1e-3
 _SKY, _GROUND = 1e-2, 1e-2
@@ -66,8 +66,8 @@ _RESIDUAL = 1e-3
 def plane_loss(inverse_depth: torch.Tensor, color: torch.Tensor) -> torch.Tensor:
     """Edge-aware planarity loss of triples of rays, from inverse z-depths (3k,) [1/m] and colors (3k, 3).
 
-    The inverse z-depth of a plane is affine in the pixel, so its second difference is zero. On the road,
-    which has little texture, the loss carries the few known depths to the pixels between them.
+    The inverse z-depth of a plane is affine in the pixel, so its second difference is zero. On the road, which has
+    little texture, the loss carries the few known depths to the pixels between them.
     """
     d = inverse_depth.view(-1, 3)
     c = color.view(-1, 3, 3)
@@ -79,7 +79,7 @@ def plane_loss(inverse_depth: torch.Tensor, color: torch.Tensor) -> torch.Tensor
 def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
     """Mean cost of opacity above the horizon and of transparency below it.
 
-    Without it, training would put surfaces into the sky, since a uniform color fits at any distance. Arguments are the
+    Without this loss, surfaces would appear in the sky, since a uniform color fits at any distance. Arguments are the
     opacity (n,) of rays and the vertical component `up` (n,) of their directions.
     """
     above, below = (up > _HORIZON_SINE).float(), (up < -_HORIZON_SINE).float()
@@ -88,7 +88,7 @@ def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
 
 # ---- training
 
-_SHARDS = 4  # shards per batch
+_SHARDS = 4  # shards per batch, see `buffers.py`
 _CELL_PIXELS = 2.0  # projected side of the finest hash cell at the distance of near surfaces [px of a training frame]
 _GROWTH_RANGE = (1.3, 2.2)  # limits of the factor between the cells per axis of consecutive hash levels
 _HIDDEN = 64  # units per hidden layer
@@ -99,8 +99,8 @@ _FINAL_RATE = 0.03  # final learning rates, as a share of the initial ones
 _RISE, _FALL = 0.3, 0.1  # step of an opacity grid cell toward a more or a less opaque sample [share of the difference]
 _LOG_OFFSET = 0.05  # added to distances in the distortion loss's logarithm [share of the near box's longest half side]
 _WARM_UP = 20  # steps of rising learning rate
-_MOVERS_SHARE = 0.3  # share of the steps after which the field is good enough to find movers
-_EXPLORATION_SHARE = 0.15  # share of the steps in which sampling narrows down to surfaces; cameras are refined after it
+_MOVERS_SHARE = 0.3  # share of the steps after which the field is good enough to find movers (`transients.py`)
+_EXPLORATION_SHARE = 0.15  # share of the steps, the first ones, in which sampling narrows and cameras are not refined
 
 
 class Trainer:
@@ -122,11 +122,11 @@ class Trainer:
         if config.stereo:
             self.pixels.stereo, self.stereo = stereo_depths(self.pixels, seed, device)
         self.excluded: list[NDArray[np.bool_]] = []
-        """True where a training frame shows transients, a frame's size each; empty without any."""
+        """One mask per training frame, true on transients; an empty list before the first call of `_exclude`."""
         self.moving = 0.0
         """Fraction of the training pixels that show movers."""
         self.left: list[LeftObject] = left_objects(self.pixels) if config.transients else []
-        # Their colors must never be learned: where they stood, some lightings have no other pixels to correct them.
+        # The field must never learn the colors of these objects: some lightings have no pixels that would correct them.
         if self.left:
             self._exclude(object_masks(self.pixels, self.left))
         train = self.pixels.cameras
@@ -176,7 +176,7 @@ class Trainer:
         return float(np.clip(ratio ** (1.0 / max(1, self.config.levels - 1)), *_GROWTH_RANGE))
 
     def _near_distance(self, near_box: NearBox) -> float:
-        """Distance of near surfaces from the cameras [m]."""
+        """Distance of near surfaces from the cameras [m]: a low quantile of the known distances, if there are any."""
         seen = self.pixels.points.distance
         return float(np.quantile(seen, 0.05)) if len(seen) else 0.25 * near_box.scale
 
@@ -282,7 +282,7 @@ class Trainer:
         self.excluded = [one | other for one, other in zip(before, masks, strict=True)]
 
     def _cell_depths(self) -> list[NDArray[np.float32]]:
-        """The field's z-depths [m] at the centers of every training frame's cells, shapes (rows, columns)."""
+        """The field's z-depths [m] at the centers of every frame's cells (`transients.py`), shapes (rows, columns)."""
         side = cell_size(self.pixels)
         sizes = zip(self.pixels.width, self.pixels.height, strict=True)
         centers = [cell_centers(int(width), int(height), side) for width, height in sizes]
@@ -377,7 +377,7 @@ class Trainer:
 def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
     """Straight segments of the camera path, shape (k, 2, 3) [m]; space closer to them than `near_plane` is empty.
 
-    A segment of 3 times its source's median length or more is a jump between photos: only its ends count.
+    A segment of 3 times its film's median length or more is a jump between photos, so only its ends count.
     """
     pieces = [np.repeat(cameras.positions[:, None], 2, 1)] if near_plane > 0 else []
     for source in dict.fromkeys(cameras.sources):
@@ -397,8 +397,7 @@ def train_field(
     camera_height: float = 0.0,
     device: str | None = None,
 ) -> tuple[RadianceField, dict[str, Any], Cameras, list[NDArray[np.bool_]]]:
-    """Trains a field; returns it, the training metrics, the cameras, refined if so configured, and
-    the excluded pixels of every training frame (`Trainer.excluded`).
+    """Trains a field; returns it, training metrics, cameras (refined if configured), and `Trainer.excluded`.
 
     `camera_height` [m] is the constant height of the camera above the ground, 0 if it is not constant; for `device` see
     `buffers.resolve_device`. Raises InputError if training diverges.
@@ -470,7 +469,7 @@ def without_timings(metrics: dict[str, Any]) -> dict[str, Any]:
 def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = None) -> dict[str, Any]:
     """Runs stage `field`: trains and bakes a field, adds detail, evaluates it on held-out frames, and saves it.
 
-    Saves both the trained and the baked field, and a picture of what was left out; returns the metrics. Raises
+    Saves both the trained and the baked field, and a picture of excluded pixels; returns the metrics. Raises
     InputError without a training frame, on an unreadable frame, on an unavailable device, or if training diverges.
     """
     cameras = Cameras.load(scene.stage("metric"))

@@ -2,11 +2,11 @@
 
 Training leaves out the pixels that show them, so that the field contains only what stays.
 
-*Movers*, and shadows that move: a surface is looked up in other frames of the same lighting. If these agree on a color,
-and the frame's own color differs from it, something else was in front of the surface when the frame was made. Frames
-are divided into *cells* of a few pixels; the depths of the surfaces in them come from a field in training.
+*Movers*, and shadows that move: each surface that a frame shows is looked up in other frames of the same lighting. If
+these agree on a color from which the frame's own differs, something else was in front of the surface, or shaded it.
+Frames are divided into *cells* of a few pixels; the depths of the surfaces in them come from a field in training.
 
-*Objects that left*: stereo within each film tells which voxels are occupied, and which are empty since surfaces behind
+*Objects that left*: stereo within each film shows which voxels are occupied, and which are empty since surfaces behind
 them are seen. A group of voxels that is occupied in one lighting and empty in another is such an object.
 """
 
@@ -29,14 +29,14 @@ from twin.types import Array, Array32
 _GRID_CELLS = 80  # cells along a frame's longer side
 _FAR = 300.0  # [m] greatest depth; the sky is taken to be there
 _NEIGHBORS = 14  # frames in which a surface is looked up
-_MIN_SEEN = 4  # least number of surfaces that must be found in a cell
-_DEPTH_TOLERANCE = 0.1  # a surface is visible in a frame whose own depth there is at most this fraction smaller
-_MIN_DIFFERENCE = 0.015  # least difference of a mover's color from the surface's, on black
-_MIN_CONTRAST = 0.12  # the same, as a share of the brightness
-_MIN_CELLS = 8  # least size of a mover in cells
-_WEAK = 0.75  # a mover's cells have at least this difference, as a share of that of its strongest cells
+_MIN_SEEN = 4  # least number of observations of a cell's surface in other frames
+_DEPTH_TOLERANCE = 0.1  # a surface is visible in a frame if it is deeper than the frame's depth by less than this share
+_MIN_DIFFERENCE = 0.015  # least difference of a mover's color from that of a black surface [full scale = 1]
+_MIN_CONTRAST = 0.12  # increase of this least difference with brightness
+_MIN_CELLS = 8  # least number of strongly marked cells of a mover
+_WEAK = 0.75  # a mover's weakly marked cells have at least this share of the least difference
 _FIXED = 0.25  # a cell that is marked in more than this share of a film's frames shows no mover
-_SPREADS = 4.0  # least difference, as a multiple of the frames' median deviation from their median
+_SPREADS = 4.0  # least difference, as a multiple of the other frames' median deviation from their median
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Cells:
     """Side of a cell [px]."""
 
     def points(self, pixels: TrainingPixels, i: int) -> Array:
-        """The surfaces that the cells of frame i show [m], shape (rows · columns, 3)."""
+        """Points of the surfaces that the cells of frame i show [m], shape (rows · columns, 3)."""
         rays = unproject(self.pixel.reshape(-1, 2), pixels.intrinsics[i])
         pose = pixels.cameras.camera_to_world[i]
         return (rays / rays[:, 2:] * self.depth.reshape(-1, 1)) @ pose[:3, :3].T + pose[:3, 3]
@@ -91,8 +91,8 @@ def neighbors(pixels: TrainingPixels, i: int) -> NDArray[np.int64]:
 def static_depths(pixels: TrainingPixels, cells: list[Cells]) -> list[Array32]:
     """z-depths [m] of the static surfaces in every frame's cells, shapes (rows, columns).
 
-    A field in training has surfaces in front of the frames that show a mover. So every cell gets the median depth of
-    the surfaces of other frames in it, if there are enough.
+    A field in training may contain a mover as a surface close to the cameras that filmed it. So every cell gets the
+    median depth of the surfaces that other frames show in it, if there are `_MIN_SEEN`.
     """
 
     def find(i: int) -> Array32:
@@ -138,7 +138,7 @@ def consensus(pixels: TrainingPixels, cells: list[Cells], i: int) -> tuple[Array
         color = cv2.remap(other.color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(-1, 3)
         nearest = np.clip(np.rint(at).astype(int), 0, [columns - 1, rows - 1])
         visible = inside & (z < (1.0 + _DEPTH_TOLERANCE) * other.depth[nearest[:, 1], nearest[:, 0]])
-        if visible.any():  # exposure and white balance drift from frame to frame
+        if visible.any():  # corrects the drift of exposure and white balance from frame to frame
             color += np.median((own.color.reshape(-1, 3) - color)[visible], 0)
         seen.append(np.where(visible[:, None], color, np.float32(np.nan)))
     stack = np.array(seen)
@@ -156,7 +156,7 @@ def _median(stack: Array32, count: NDArray) -> Array32:
 
 
 def mover_masks(pixels: TrainingPixels, depths: list[Array32]) -> list[NDArray[np.bool_]]:
-    """True where a training frame shows a mover, or a shadow that moves; a frame's size each.
+    """One mask per training frame, true where it shows a mover or a shadow that moves.
 
     `depths` are the z-depths [m] of the surfaces in every frame's cells (`cell_centers`), shapes (rows, columns).
     """
@@ -164,7 +164,7 @@ def mover_masks(pixels: TrainingPixels, depths: list[Array32]) -> list[NDArray[n
     cells = [frame_cells(pixels, i, side, depth) for i, depth in enumerate(depths)]
     static = [replace(one, depth=depth) for one, depth in zip(cells, static_depths(pixels, cells), strict=True)]
 
-    # Depths of the field miss what is behind a mover, medians miss thin things: a mover differs from both.
+    # The field's depths are wrong where it contains the mover, medians at thin things: a mover differs under both.
     def find(i: int) -> NDArray[np.bool_]:
         excess = np.fmin(difference(pixels, cells, i), difference(pixels, static, i))
         return cleaned(excess > 1.0, excess > _WEAK)
@@ -175,7 +175,7 @@ def mover_masks(pixels: TrainingPixels, depths: list[Array32]) -> list[NDArray[n
 
 
 def _without_fixed(marked: list[NDArray[np.bool_]], sources: tuple[str, ...]) -> list[NDArray[np.bool_]]:
-    """Unmarks cells that are marked in many frames of a source: vignetting, and shadows that move with the camera."""
+    """Unmarks cells that are marked in many frames of a film, as by vignetting or shadows that move with the camera."""
     out = list(marked)
     for source in dict.fromkeys(sources):
         own = [i for i, name in enumerate(sources) if name == source]
@@ -193,9 +193,9 @@ def _enlarged(cells: NDArray[np.bool_], side: int, width: int, height: int) -> N
 
 
 def difference(pixels: TrainingPixels, cells: list[Cells], i: int) -> Array32:
-    """Difference of frame i's cells from what other frames show there, shape (rows, columns).
+    """Difference of frame i's cells from what other frames show there / least difference of a mover, (rows, columns).
 
-    Above 1, depths and poses that are not exact cannot explain it. It is 0 where too few frames see the surface.
+    Errors of depths and poses are unlikely to give values above 1. It is 0 where too few frames see the surface.
     """
     median, spread, count = consensus(pixels, cells, i)
     color = cells[i].color
@@ -209,7 +209,7 @@ def difference(pixels: TrainingPixels, cells: list[Cells], i: int) -> Array32:
 def _least_difference(color: Array32, median: Array32) -> Array32:
     """Difference of each cell's color from the most similar surface in its cell or the eight around it.
 
-    Depths and poses are not exact, so textured surfaces are found a cell aside. Shapes (rows, columns, 3) →
+    Depths and poses are not exact, so a surface may be found one cell aside. Shapes (rows, columns, 3) →
     (rows, columns).
     """
     rows, columns = color.shape[:2]
@@ -226,7 +226,7 @@ def _mean_around(color: Array32) -> Array32:
 
 
 def cleaned(strong: NDArray[np.bool_], weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Weakly marked regions, with gaps closed and a margin of one cell, that contain eight strongly marked cells."""
+    """Weakly marked regions with `_MIN_CELLS` strongly marked cells, with small gaps closed and a margin of a cell."""
     closed = cv2.morphologyEx((strong | weak).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     count, labels = cv2.connectedComponents(opened, connectivity=4)
@@ -239,16 +239,16 @@ def cleaned(strong: NDArray[np.bool_], weak: NDArray[np.bool_]) -> NDArray[np.bo
 
 _VOXEL = 0.25  # [m] side
 _REACH = 18.0  # [m] from the camera, within which stereo is accurate enough
-_BEHIND = (0.5, 0.08)  # surface this far behind a voxel shows that it is empty: [m], and as a fraction of the depth
-_AT = (0.3, 0.04)  # surface this far from a voxel shows that it is occupied: the same units
+_BEHIND = (0.5, 0.08)  # least distance of a surface behind an empty voxel: greater of [m] and [share of the depth]
+_AT = (0.3, 0.04)  # greatest distance of a surface from an occupied voxel; the same units
 _MIN_KNOWN = 3  # least number of known depths among a voxel's cell and its eight neighbors, to find the voxel empty
-_MIN_FRAMES = 3  # least number of frames that show a voxel empty, and occupied
+_MIN_FRAMES = 3  # least number of frames to find a voxel occupied, or empty
 _MIN_VOXELS = 24  # smaller objects are left alone: noise of stereo looks like them
 _HIDDEN = 0.7  # [m] an object is hidden by surfaces that are nearer than its nearest voxel by more than this
 _NEAR_PLANE = 0.3  # [m] z-depth from which an object's outline is drawn
-_SHADOW_REACH = 2.5  # [m] from an object, within which ground is taken to be in its shadow if it is dark
-_SHADOW_DARKNESS = 0.8  # brightness of such ground, as a share of that of the ground farther away, at most
-_MIN_AROUND = 20  # least number of cells with ground farther away
+_SHADOW_REACH = 2.5  # [m] dark ground at most this far from an object is taken to be in its shadow
+_SHADOW_DARKNESS = 0.8  # greatest brightness of such ground, as a share of the median brightness farther away
+_MIN_AROUND = 20  # least number of cells with ground farther away, to find a shadow
 _STEREO_CELLS = 160  # cells along a frame's longer side in which stereo depths are looked up
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 _MIN_EXTENT = 0.6  # [m] least extent along the second longest axis
@@ -276,7 +276,7 @@ class LeftObject:
         return np.ptp(self.voxels, axis=0) + _VOXEL
 
     def to_json(self) -> dict[str, Any]:
-        """Its place, size [m] and lightings, for the report."""
+        """Center and size of its bounding box [m], and its lightings, for the report."""
         center, size = ([round(float(x), 2) for x in values] for values in (self.center, self.size))
         return {"center": center, "size": size, "present": list(self.present), "absent": list(self.absent)}
 
@@ -324,7 +324,7 @@ def left_objects(pixels: TrainingPixels) -> list[LeftObject]:
 
 
 def object_masks(pixels: TrainingPixels, objects: list[LeftObject]) -> list[NDArray[np.bool_]]:
-    """True where a training frame shows one of the objects, or its shadow on the ground; a frame's size each."""
+    """One mask per training frame, true where it shows one of the objects, or its shadow on the ground."""
     side = cell_size(pixels)
 
     def find(i: int) -> NDArray[np.bool_]:
@@ -343,7 +343,7 @@ def object_masks(pixels: TrainingPixels, objects: list[LeftObject]) -> list[NDAr
 
 
 def _outline(pixels: TrainingPixels, cells: Cells, i: int, one: LeftObject) -> NDArray[np.bool_]:
-    """True where frame i shows an object, with a margin of a voxel, shape (height, width)."""
+    """True where frame i shows an object, with a margin of half a voxel, shape (height, width)."""
     height, width = int(pixels.height[i]), int(pixels.width[i])
     mask = np.zeros((height, width), np.uint8)
     corners = (one.voxels[:, None] + _VOXEL * _CORNERS).reshape(-1, 3)
@@ -383,7 +383,7 @@ def _shadow(pixels: TrainingPixels, cells: Cells, i: int, one: LeftObject) -> ND
 
 
 def stereo_map(pixels: TrainingPixels, i: int, side: int) -> Array32:
-    """Stereo's z-depths [m] in training frame i by cells of some pixels' side, nan where unknown, (rows, columns)."""
+    """Stereo's z-depths [m] in the cells of `side` pixels of training frame i, nan where unknown, (rows, columns)."""
     known = np.full((int(pixels.height[i]) // side, int(pixels.width[i]) // side), np.nan, np.float32)
     own = pixels.stereo.frame == i
     pixel = pixels.stereo.pixel[own]
@@ -394,7 +394,7 @@ def stereo_map(pixels: TrainingPixels, i: int, side: int) -> Array32:
 
 
 def _voxels(pixels: TrainingPixels) -> Array:
-    """Centers of the voxels that contain stereo points near their camera [m], shape (n, 3)."""
+    """Centers [m] of the voxels that contain stereo points of enough frames near them, shape (n, 3)."""
     near = pixels.stereo.distance < _REACH
     frame, pixel = pixels.stereo.frame[near], pixels.stereo.pixel[near]
     keys = []
@@ -409,7 +409,7 @@ def _voxels(pixels: TrainingPixels) -> Array:
 
 
 def _stands(pixels: TrainingPixels, voxels: Array) -> bool:
-    """True if an object begins below the nearest camera; others are crowns, and lights at night."""
+    """True if an object's lowest voxel is below the nearest camera; others are treetops, or lights at night."""
     positions = pixels.cameras.positions
     nearest = np.argmin(np.linalg.norm(positions[:, :2] - voxels[:, :2].mean(0), axis=1))
     return bool(voxels[:, 2].min() < positions[nearest, 2])
@@ -434,7 +434,7 @@ _RED = np.array([230, 20, 20], np.float32)
 
 
 def picture(pixels: TrainingPixels, excluded: list[NDArray[np.bool_]]) -> NDArray[np.uint8]:
-    """Two frames of every lighting with many excluded pixels, which are red; RGB, shape (height, width, 3).
+    """Up to two frames per lighting with many excluded pixels, which are red; RGB, shape (height, width, 3).
 
     At least one pixel must be excluded.
     """

@@ -6,7 +6,8 @@ sample is `CHANNELS` bytes: raw density and features (see `composite.py`), each 
 2³ cells. The *near* grid covers the near box; the *far* grid, with larger cells, covers the contracted cube.
 """
 
-# Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
+# Warp evaluates annotations, so they contain calls, which mypy does not accept. In a kernel, float() and int() declare
+# a variable that a loop changes.
 # mypy: ignore-errors
 from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.kernels.sampler import inside_near_box, near_box_position
@@ -28,16 +29,16 @@ within eight bytes, and a cache line holds many cells."""
 
 Bytes = wp.types.vector(length=CHANNELS, dtype=wp.uint8)
 
-_MIN_GRADIENT = 1.0e-22  # samples with a smaller squared norm of the gradient are skipped
+_MIN_GRADIENT = 1.0e-22  # positions with a smaller squared norm of the gradient are skipped
 _SIDE = float(CELLS)
 
 
 @wp.struct
 class Bricks:
-    """A baked field in the layout of the march. Grids are flat, the last axis fastest."""
+    """A baked field as `march.py` reads it. Grids are flat, the last axis fastest."""
 
     near_index: wp.array(dtype=wp.int32)
-    """Slot of each brick, or −d if it is not stored, where d is the least skip distance of its blocks."""
+    """Slot of each brick, or −d if it is not stored, where d is the least skip distance (`march.py`) of its blocks."""
     far_index: wp.array(dtype=wp.int32)
     skips: wp.array(dtype=wp.uint8)
     """Skip distances of the stored bricks' blocks, 64 per slot."""
@@ -66,7 +67,7 @@ class BrickIndex:
 
 @wp.struct
 class BrickPosition:
-    """Slot of a grid position (< 0: none), its cell's lowest corner, and the position in the cell."""
+    """Slot of a grid position (< 0: none), index of its cell's lowest sample, and position in the cell."""
 
     slot: wp.int32
     corner: wp.int32
@@ -147,7 +148,7 @@ def interpolate_backward(
     parts: wp.int32,
     gradient: wp.array2d(dtype=Channels),
 ):
-    """Adds the gradient of `interpolate`; launched once per `part` of the slots, which fixes the order of sums."""
+    """Adds the gradient of `interpolate`; launched once per `part` of the slots, so a CPU sums in fixed order."""
     i = wp.tid()
     g = outputs_grad[i]
     if wp.dot(g, g) < _MIN_GRADIENT:
@@ -174,8 +175,8 @@ def adam_step(
     """Takes an Adam step (Kingma and Ba 2015) on samples with a gradient and clears the gradient; β = (0, 0.99).
 
     To save memory there is no momentum, and a sample's features share one second moment. Visits the positions of
-    `interpolate_backward`, as most samples get no gradient. On CUDA, two threads may reach a sample at once: then both
-    take the same step, or the later one finds no gradient and takes none.
+    `interpolate_backward`, as most samples get no gradient. On CUDA, two threads may reach a sample at once: it may
+    then take two steps.
     """
     i = wp.tid()
     g = outputs_grad[i]

@@ -4,7 +4,7 @@ The *bias* of the first layer includes the appearance embedding. Every camera of
 own lighting.
 """
 
-# Warp reads annotations as values.
+# Warp evaluates annotations, so they contain calls, which mypy does not accept.
 # mypy: ignore-errors
 from functools import cache
 from typing import Any
@@ -100,7 +100,7 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
 
     @wp.struct
     class Weights:
-        """Head weights have shape (hidden / 8, other axis), each entry a vector of eight hidden units.
+        """Head weights have shape (hidden / 8, inputs or outputs), each entry a vector of eight hidden units.
 
         Background weights are flat, index = input · n_out + output.
         """
@@ -157,8 +157,7 @@ def color_head_kernel(lanes: int, hidden: int, background_hidden: int) -> tuple[
                     a += g[n] * weights.backdrop_1[n * FEATURES + i]
                 x[i] = a
         # Eight hidden units at a time: each input is read once for all eight, and eight independent sums keep the
-        # processor busy. Both layers are written out: a function for both gives the same bits but is 30 % slower, as
-        # it copies its inputs.
+        # processor busy. Both layers are written out: one function for both would be 30 % slower, as it copies inputs.
         h = Hidden()
         for q in range(weights.head_1_bias.shape[0]):
             s = Eight()

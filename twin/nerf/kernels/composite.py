@@ -1,12 +1,13 @@
-"""Volume rendering of features along rays, with a hand-written backward pass and per-sample regularizers.
+"""Volume rendering of features along rays, with a backward pass and regularizers.
 
-A ray has K strata, bounded by K + 1 edges [m]; their contracted lengths are δᵢ [contracted m]. The network output of a
-sample holds raw density in slot 0 and features in the other slots. The weight of sample i is wᵢ = Tᵢ·(1 − exp(−σᵢδᵢ)),
-where σᵢ is its density and Tᵢ the transmittance up to its stratum (Max 1995). The composited output holds the *opacity*
-Σwᵢ in slot 0 and Σwᵢ·featureᵢ in the other slots.
+A ray has K strata, bounded by K + 1 edges [m]; stratum i has length δᵢ [contracted m] and a sample at distance tᵢ [m].
+The network output of a sample holds *raw density* in channel 0 and features in the others. The weight of sample i is
+wᵢ = Tᵢ·(1 − exp(−σᵢδᵢ)), where σᵢ is its density and Tᵢ the transmittance up to its stratum (Max 1995). The composited
+output holds the *opacity* Σwᵢ in channel 0 and Σwᵢ·featureᵢ in the others. `space.py` defines contracted meters.
 """
 
-# Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
+# Warp evaluates annotations, so they contain calls, which mypy does not accept. In a kernel, float() and int() declare
+# a variable that a loop changes.
 # mypy: ignore-errors
 from twin.warp_runtime import wp
 
@@ -101,12 +102,12 @@ def composite_backward(
     start: wp.int32,
     outputs_grad: wp.array2d(dtype=Channels),
 ):
-    """Gradient of the network outputs, given the gradients of the composited output and of Σwᵢ/tᵢ.
+    """Loss gradient of the network outputs, given those of the composited output and of Σwᵢ/tᵢ.
 
     Adds the gradient of two regularizers of the weights:
         distortion · (Σᵢⱼ wᵢwⱼ|sᵢ − sⱼ| + ⅓ Σ wᵢ²Δsᵢ), s = log(t + log_offset)      (Barron et al. 2022, eq. 15)
-        depth · (Σᵢ wᵢ·min(|tᵢ/target − 1|, reach) + (1 − Σwᵢ)·reach), where a target distance is known: the cost of
-        moving all weight to it, capped to limit the effect of wrong targets.
+        depth · (Σᵢ wᵢ·min(|tᵢ/target − 1|, reach) + (1 − Σwᵢ)·reach), if a target distance is known: the cost of moving
+        all weight to it, capped at reach = `depth_reach` to limit the effect of wrong targets.
     """
     i = start + wp.tid()
     count = strata.distances.shape[1]
@@ -115,7 +116,7 @@ def composite_backward(
     opacity_gradient = gradient[0]
     inverse_gradient = inverse_distance_grad[i]
 
-    # Σⱼ wⱼ|sᵢ − sⱼ| = sᵢ(2Wᵢ − W) − (2Sᵢ − S) with prefix sums W of w and S of w·s, as the samples are sorted.
+    # Σⱼ wⱼ|sᵢ − sⱼ| = sᵢ(2Wᵢ − W) − (2Sᵢ − S) with prefix sums Wᵢ of w and Sᵢ of w·s, as the samples are sorted.
     all_w = float(0.0)
     all_ws = float(0.0)
     for k in range(count):

@@ -1,11 +1,11 @@
-"""Multi-resolution hash encoding (Müller et al. 2022, section 3): forward, hand-written backward, and optimizer.
+"""Multi-resolution hash encoding (Müller et al. 2022, section 3): forward and backward pass, and optimizer.
 
-*Grid position*: see `kernels/space.py`. *Level*: one of several grids of vertices, ordered from coarse to fine. A level
-that fits into its table is stored densely, others are hashed. *Table*: features of all levels, `FEATURES` floats per
-vertex. The backward pass is launched level by level: on a CPU, one thread then sums a whole level in fixed order.
+*Grid position*: see `kernels/space.py`. *Level*: one of several grids of vertices, from coarse to fine. *Table*:
+features of all levels, equally many rows each, `FEATURES` floats per row. A level with no more vertices than rows is
+stored densely, others are hashed. The backward pass is launched level by level: so a CPU sums in fixed order.
 """
 
-# Warp reads annotations as values.
+# Warp evaluates annotations, so they contain calls, which mypy does not accept.
 # mypy: ignore-errors
 from twin.warp_runtime import wp
 
@@ -84,7 +84,7 @@ def encode(
     start: wp.int32,
     features: wp.array2d(dtype=Feature),
 ):
-    """Trilinear features of grid positions [start, start + dim), shape (n, levels)."""
+    """Trilinearly interpolated features at grid positions from `start` on, shape (n, levels)."""
     i = start + wp.tid()
     p = positions[i]
     for level in range(levels.cells.shape[0]):
@@ -123,7 +123,7 @@ def encode_positions_backward(
     features_grad: wp.array2d(dtype=Feature),
     positions_grad: wp.array(dtype=wp.vec3f),
 ):
-    """Gradient of `encode` with respect to grid positions [start, start + dim)."""
+    """Gradient of `encode` with respect to grid positions from `start` on."""
     i = start + wp.tid()
     p = positions[i]
     total = wp.vec3f()

@@ -1,13 +1,14 @@
-"""PatchMatch stereo: fits planes that make source frames look like a reference frame.
+"""PatchMatch stereo: fits planes that map windows of a reference frame to similar ones in its source frames.
 
-A *plane* at a pixel is (q, ∂q/∂u, ∂q/∂v): inverse z-depth q [1/m] and its slopes [1/(m px)]. This is exact, since the
-inverse depth of a plane is affine in the pixel. A *window* is 5 × 5 pixels `spacing` apart around the pixel; the plane
-maps it to a source frame. The cost is 1 − NCC (normalized cross-correlation), in which window pixels weigh more if they
-resemble the middle one.
+A *plane* at a pixel is (q, ∂q/∂u, ∂q/∂v): inverse z-depth q [1/m] and its slopes [1/(m px)]. This is exact for a plane
+in space, whose inverse depth is affine in the pixel. A *window* is 5 × 5 pixels `spacing` apart around the pixel; the
+plane maps it to a source frame. The cost is 1 − NCC (normalized cross-correlation), in which window pixels weigh more
+if they resemble the middle one.
 Only the two sources of lowest cost are used, since a point may be hidden in the others (Gipuma, Galliani et al. 2015).
 """
 
-# Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
+# Warp evaluates annotations, so they contain calls, which mypy does not accept. In a kernel, float() and int() declare
+# a variable that a loop changes.
 # mypy: ignore-errors
 from twin.warp_runtime import wp
 
@@ -16,7 +17,7 @@ _PIXELS = 25
 
 Window = wp.types.vector(length=_PIXELS, dtype=wp.float32)
 
-_WORST_COST = 2.0  # cost in a source that does not contain the window
+_WORST_COST = 2.0  # cost in a source that does not contain the window or has no texture in it
 _GRAY_SIGMA = 0.08  # gray difference at which a window pixel has weight 1/e
 _MAX_RETURN_ERROR = 2.0  # [px] greatest error of a point mapped to a source and back
 _MIN_VARIANCE = 1e-5  # a window with a smaller variance of gray has no texture to match
@@ -43,7 +44,7 @@ class SourceViews:
 
 @wp.func
 def cell_center(row: int, column: int, step: int) -> wp.vec2:
-    """Center of a cell's middle pixel [px]."""
+    """Center [px] of the middle pixel of a cell, a square of `step`² pixels."""
     return wp.vec2(float(column * step + step // 2) + 0.5, float(row * step + step // 2) + 0.5)
 
 
@@ -178,7 +179,7 @@ def sweep(
     planes: wp.array2d(dtype=wp.vec3),
     costs: wp.array2d(dtype=wp.float32),
 ):
-    """Sets the cells of one `parity` (checkerboard) to the best of their own plane, the neighbors' planes and guesses.
+    """Sets the cells of one `parity` (checkerboard) to the best of their own plane and those that the round tries.
 
     Round 0 tries `first`, `second` (q = 0: none) and a random depth; later rounds try the planes of the four neighbors
     (which are of the other parity) and two perturbations that shrink from round to round.

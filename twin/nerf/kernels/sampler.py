@@ -18,7 +18,7 @@ BINS = 256
 _FAR = 100.0  # unit positions beyond this count as the horizon
 _MAX_OPACITY = 0.99  # greatest opacity of a cell
 _STEP = 0.75  # bin length [cells]
-_BINS_BEHIND = 2  # bins that the march takes behind an opaque one
+_BINS_BEHIND = 2  # bins that the march takes after the ray is blocked
 _OPAQUE = 0.02  # a ray with less transmittance counts as blocked
 # A grazing ray passes for meters through cells that contain ground before it reaches the ground. So _DOUBT_SHARE of the
 # weight is distributed as if the opacities of cells were multiplied by _DOUBT.
@@ -118,7 +118,7 @@ def sample_rays(
         t += step
         n += 1
         bounds[n] = t
-        # The surface may lie one cell behind the opaque one, and the march must also reach a target further back.
+        # The surface may lie a cell farther than the grid shows, and the march must also reach a more distant target.
         if doubting < _OPAQUE and t > target:
             beyond += 1
             if beyond > _BINS_BEHIND:

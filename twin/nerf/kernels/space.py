@@ -1,23 +1,23 @@
 """Contraction of unbounded space to a cube, and rays of pinhole cameras.
 
-*Near box*: axis-aligned box [m] that is mapped without distortion. *Unit position* u: per axis, the offset from the
+*Near box*: axis-aligned box [m], not contracted. *Unit position* u: per axis, the offset from the
 center of the near box divided by its half side; the near box is [−1, 1]³. *Contracted position*: u inside the near box,
 (2 − 1/|u|)·u/|u| outside (Barron et al. 2022, eq. 10, but with the maximum norm), so all of space is in (−2, 2)³.
 *Grid position*: contracted position scaled to [0, 1]³. *Contracted meter*: inside the near box, a meter; outside
-it, the length that contracts to a meter, see `expansion`. Density is per contracted meter; so before training, the far
-field is no more opaque than the near field.
+it, the length that contracts to a meter, see `expansion`. Density is per contracted meter, so at a uniform density, as
+before training, the space outside the near box is no more opaque than the box.
 """
 
-# Warp reads annotations as values.
+# Warp evaluates annotations, so they contain calls, which mypy does not accept.
 # mypy: ignore-errors
 from twin.warp_runtime import wp
 
-_TOP = 1.0 - 1.0e-6  # greatest coordinate of a grid position
+_TOP = 1.0 - 1.0e-6  # greatest coordinate: below 1, so that a grid position lies in a cell
 
 
 @wp.struct
 class Contraction:
-    """The near box, in the form that the contraction uses."""
+    """Near box of the contraction."""
 
     center: wp.vec3f
     """[m]"""
@@ -125,7 +125,7 @@ def rays_backward(
     origins_grad: wp.array(dtype=wp.vec3f),
     directions_grad: wp.array(dtype=wp.vec3f),
 ):
-    """Gradients with respect to origins and directions of rays [start, start + dim), at fixed sample distances [m]."""
+    """Gradients with respect to origins and directions of rays from `start` on, at fixed sample distances [m]."""
     i = start + wp.tid()
     o = rays.origins[i]
     d = rays.directions[i]

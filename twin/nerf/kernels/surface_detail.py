@@ -8,7 +8,8 @@ each tile to its slot, or to −1 if it is not stored. The hash grid (Müller et
 share the rows of a table. *Footprint*: width of a pixel on the surface [m]; it determines the levels that a ray uses.
 """
 
-# Warp reads annotations as values. In a kernel, float() and int() declare a variable that a loop changes.
+# Warp evaluates annotations, so they contain calls, which mypy does not accept. In a kernel, float() and int() declare
+# a variable that a loop changes.
 # mypy: ignore-errors
 # ruff: noqa: RUF046
 from twin.nerf.kernels.bricks import Bytes
@@ -32,7 +33,7 @@ MAX_FOOTPRINT = 1.5
 _UNKNOWN = 1.0e3  # [m] a greater interpolated height comes from a node without ground
 _MIN_DESCENT = 0.01  # least descent per meter along a ray that can meet the ground
 _TOLERANCE, _TOLERANCE_PER_METER = 0.08, 0.01  # [m], [m/m] a surface this close to the height map is ground
-_MAX_STRETCH = 4.0  # if a pixel's image on the ground is longer than this times its width, the footprint grows
+_MAX_STRETCH = 4.0  # if a pixel's projection to the ground is longer than this times its width, the footprint grows
 _PRIME_Y = wp.uint32(2654435761)
 _PRIME_Z = wp.uint32(805459861)
 RUN = 16
@@ -80,7 +81,7 @@ def height_of(array: wp.array(dtype=wp.float32), i: wp.int32) -> wp.float32: ...
 
 @wp.func
 def height_at(grid: DetailGrid, x: wp.float32, y: wp.float32) -> wp.float32:
-    """Height of the ground [m] at a distance (x, y) [m] from the grid's corner; `NO_GROUND` where it is unknown."""
+    """Height of the ground [m] at (x, y) [m], relative to the grid's corner; `NO_GROUND` where it is unknown."""
     px = x * grid.per_height_cell
     py = y * grid.per_height_cell
     ix = int(px)
@@ -101,8 +102,8 @@ def height_at(grid: DetailGrid, x: wp.float32, y: wp.float32) -> wp.float32:
 def surface_hit(grid: DetailGrid, o: wp.vec3f, ray: wp.vec3f, depth: wp.float32, per_pixel: wp.float32) -> Hit:
     """The hit of a ray from `o` that meets a surface at the z-depth `depth` [m].
 
-    `ray` is the ray's direction with unit z-depth, and `per_pixel` the width of a pixel per meter of depth. The height
-    map is much less steep than the ray, so two steps of a fixed-point iteration find the ground.
+    `ray` is the ray's direction with unit z-depth, and `per_pixel` the width of a pixel per meter of depth. The ground
+    is nearly level, so two steps of a fixed-point iteration find it.
     """
     x0 = o[0] - grid.origin[0]
     y0 = o[1] - grid.origin[1]
@@ -216,7 +217,7 @@ def interpolate_detail(
     start: wp.int32,
     outputs: wp.array(dtype=Channels),
 ):
-    """Features at hits [start, start + dim): interpolated texels summed over levels, or vertices off the ground."""
+    """Features at hits from `start` on: on the ground texels summed over levels, elsewhere hash grid vertices."""
     i = start + wp.tid()
     hit = hits[i]
     total = Channels()
@@ -344,7 +345,10 @@ def adam_step_detail(
 def sum_levels(
     tiles: wp.array(dtype=wp.vec2i), grid: DetailGrid, values: wp.array(dtype=Channels), total: wp.array(dtype=Channels)
 ):
-    """Adds to every texel the coarser levels at its node; exact, as a level's nodes are nodes of all finer levels."""
+    """Adds to every texel the coarser levels at its node, so that rendering interpolates one level instead of all.
+
+    Both give the same, as a level's nodes are nodes of all finer levels.
+    """
     row = wp.tid()
     tile = tiles[row // TEXELS]
     rest = row % TEXELS
@@ -371,7 +375,7 @@ class DetailBytes:
     """Features as bytes around 128, and the value of one byte step in each channel."""
 
     texels: wp.array(dtype=Bytes)
-    """A texel is the sum of its level and the coarser ones at its node, so a ray reads one level."""
+    """Sums of the levels, see `sum_levels`."""
     texel_step: Channels
     vertices: wp.array(dtype=Bytes)
     vertex_step: Channels
