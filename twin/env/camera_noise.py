@@ -25,7 +25,7 @@ class CameraOptions:
     shutter: float = 0.0
     """Time for which the shutter is open [s]."""
     blur_samples: int = 5
-    """Number of pictures that are averaged for motion blur."""
+    """Number of shifted copies of a picture that are averaged for motion blur."""
 
 
 class CameraNoise:
@@ -38,7 +38,7 @@ class CameraNoise:
         self._last: tuple[float, Array] | None = None
 
     def perturb_pose(self, camera_to_world: Array, time: float) -> Array:
-        """Returns a pose with vibration added, shape (4, 4).
+        """Returns a pose with vibration added, shape (4, 4), and updates the exposure for `apply`.
 
         `time` is the time of the episode [s]; it must not decrease from one call to the next.
         """
@@ -93,13 +93,13 @@ def motion_blur(
     flow = np.where(points[..., 2:] > 0.0, there - here, 0.0)
     out = np.zeros_like(rgb)
     for back in np.linspace(0.0, share, samples):
-        # In OpenCV, the center of the first pixel has the coordinate 0.
+        # In OpenCV, the center of the first pixel has the coordinate 0; here, 0.5.
         at = (here + back * flow - 0.5).astype(np.float32)
         out += cv2.remap(rgb, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return out / np.float32(samples)
 
 
 def soft_clip(rgb: Array32) -> Array32:
-    """Returns colors of at most 1: values above `_KNEE` are compressed smoothly instead of clipped."""
+    """Returns colors of at most 1: values above `_KNEE` are compressed smoothly, not clipped."""
     over = np.maximum(rgb - _KNEE, 0.0)
     return np.minimum(rgb, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))

@@ -67,7 +67,7 @@ class EnvFactory:
         twin = scene if isinstance(scene, Twin) else load_scene(scene)
         require_stage(twin.scene, "mjcf")
         if not twin.scene.has_route:
-            raise InputError(f"{twin.scene.root}: nothing to drive: its build has no route (mjcf.route)")
+            raise InputError(f"{twin.scene.root}: its build has no route to drive (see mjcf.route)")
         world = twin.world()
         if parsed.randomise:
             parsed = dataclasses.replace(parsed, randomise=parsed.randomise.for_robot(world.robot))
@@ -222,7 +222,7 @@ def load(
 
 # ---- model of an episode
 
-_REACH = 1.5  # [m] reach of a robot beyond the corridor's edge: half its length plus the motion of a control step
+_REACH = 1.5  # [m] beyond the corridor's edge; more than half the robot's length plus its motion in a control step
 
 
 def episode_spec(world: World, start: float, end: float, half_width: float, visuals: bool = False) -> mujoco.MjSpec:
@@ -248,7 +248,7 @@ def episode_spec(world: World, start: float, end: float, half_width: float, visu
         center, radius = _bounding_sphere(assets / f"{geom.get('mesh')}.obj")
         return line.query(center[:2])[0] - radius <= half_width + _REACH
 
-    # Parts are removed from the XML: removing a single one from an MjSpec takes milliseconds.
+    # Parts are removed from the XML, since removing a single one from an MjSpec takes milliseconds.
     worldbody, kept = root.find("worldbody"), root.find("asset")
     assert worldbody is not None and kept is not None
     for geom in [g for g in worldbody.findall("geom") if g.get("type") == "mesh" and not wanted(g)]:

@@ -32,7 +32,7 @@ from twin.types import Array
 
 try:
     with warnings.catch_warnings():
-        # On import, dm_control looks for a display and warns if there is none; nothing here needs one.
+        # On import, dm_control looks for a display and warns if there is none; this package needs none.
         warnings.simplefilter("ignore")
         from dm_control import mujoco as dm_mujoco
         from dm_control.mujoco import wrapper
@@ -47,7 +47,7 @@ EnvIndices = Sequence[int] | NDArray[np.int64]
 
 _CODES = {cause: code for code, cause in enumerate(CAUSES, 1)}  # 0: the episode goes on
 BUMPER_OFFSET = 0.5  # [m] from the base to the bumper; the goal is reached when the bumper is at the segment's end
-_SEARCH_WINDOW = (1.0, 3.0)  # [m] the robot's foot is searched this far behind and ahead of the last foot on the route
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] the route's point nearest to the robot is searched this far behind and ahead of the last
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, as multiples of the controller's limits
@@ -108,7 +108,7 @@ class RewardAndTermination:
         self._cause_rewards[[0, _CODES["goal"]]] += terms.step
 
     def begin(self, which: EnvIndices, foot: Array, position: Array) -> None:
-        """Starts episodes near arc lengths, shape (k,), at positions, shape (k, 2) [m]."""
+        """Starts k episodes at positions, shape (k, 2) [m], near the arc lengths `foot`, shape (k,) [m]."""
         self._cause[which], self._anchor_time[which], self._steering[which] = 0, 0.0, 0.0
         self.foot[which], self.cross_track[which] = self._nearest(position, foot)
         self._previous_foot[which], self._anchor[which] = self.foot[which], position

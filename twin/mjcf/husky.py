@@ -67,7 +67,7 @@ def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
     spec.option.timestep = TIMESTEP
     # Euler and RK4 are unstable with a stiff speed servo; implicitfast adds the servo's damping to the mass matrix.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # The pyramidal cone gives the right track ratio, but a torque that is 21 % too low.
+    # The pyramidal friction cone gives the right track ratio, but a torque that is 21 % too low.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = params.slip_stiffness
     spec.option.viscosity = params.ground_viscosity
@@ -354,7 +354,7 @@ def center_of_mass(params: HuskyParams) -> Array:
 
 
 def coulomb_track_ratio(center: Array, curvature_radius: float = 0.0) -> float:
-    """Track ratio chi (effective track over `TRACK`) of four point contacts under Coulomb friction at constant speed.
+    """Track ratio chi (effective track / `TRACK`) of four point contacts under Coulomb friction at constant speed.
 
     It does not depend on the friction coefficient μ.
 

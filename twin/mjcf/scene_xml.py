@@ -153,7 +153,7 @@ def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tup
 def covered_by_ground(vertices: NDArray, ground: Ground) -> NDArray[np.bool_]:
     """Mask of the points (v, 3) within the height field's horizontal bounds that are below it or up to 0.15 m above it.
 
-    Two surfaces within centimeters of each other would flicker, cast shadows on each other and hide the robot's wheels.
+    The visual mesh is left out there: two nearly equal surfaces would flicker, shadow each other and hide wheels.
     """
     rows, columns = ground.height.shape
     cell = (vertices[:, :2] - ground.origin) / ground.cell
@@ -206,7 +206,7 @@ def add_ground(
     # MuJoCo's binary height field: int32 rows, int32 columns, then float32 rows from the low-y edge.
     size = np.array(coarse.height.shape, np.int32)
     (assets / "ground.bin").write_bytes(size.tobytes() + coarse.height.astype(np.float32).tobytes())
-    # The texture spans the field from edge to edge; its first row is at +y. Without a picture, each fine cell is a
+    # The texture spans the height field from edge to edge; its first row is at +y. Without a picture, each fine cell is a
     # texel, with the mean color of the cell's corners.
     finer = round(coarse.cell / ground.cell)
     rows, columns = ((size - 1) * finer + 1 for size in coarse.height.shape)
@@ -353,7 +353,7 @@ def write_obj(path: Path, vertices: NDArray, faces: NDArray, texcoords: NDArray 
     """Writes a Wavefront OBJ of vertices (v, 3) [m] and faces (f, 3), counter-clockwise seen from outside.
 
     `texcoords` are the texture coordinates of each face's corners, u from the left, v from the top, shape (f, 3, 2).
-    trimesh would write a separate vertex for each of them, in a file almost twice as large.
+    trimesh would write a separate vertex for each of these, in a file almost twice as large.
     """
 
     def lines(line: str, rows: NDArray) -> str:
@@ -391,7 +391,7 @@ def face_texture(colors: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.float64
 # ---- portability check
 
 _COMPARED_STEPS = 200
-_MAX_DEVIATION = 0.002  # [m] between the robot bases of the compiled model and of the copy
+_MAX_DEVIATION = 0.002  # [m] largest distance between the robot bases of the compiled model and of the copy
 _XML_PRECISION = 1e-5  # further allowed deviation [fraction of the coordinates], since the XML keeps six digits
 _CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
 
@@ -399,8 +399,8 @@ _CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
 def check_portable(folder: Path, built: mujoco.MjModel) -> dict[str, Any]:
     """Loads a moved copy of the scene in plain MuJoCo and compares its robot's motion with that in the model `built`.
 
-    Returns metrics for the report. `spawn_drift_m` is the distance that the parked robot creeps in 0.4 s, on soft tires
-    on a slope.
+    Returns metrics for the report. `spawn_drift_m` is the distance that the parked robot creeps in 0.4 s on its soft
+    tires, for example on a slope.
 
     Raises:
         RuntimeError: the copy is a different model or its robot moves differently, which is a bug.

@@ -18,7 +18,7 @@ from twin.types import Array
 
 SCENE_XML = "scene.xml"
 GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4
-"""Geom groups of the ground, the visual mesh and the parts, and the site group of route, corridor and goal."""
+"""Geom groups of ground, visual mesh and convex parts (for collision); site group of route, corridor and goal."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,8 @@ def point_at(route: Array, s: Array | float) -> Array:
 def heading_at(route: Array, s: Array | float, window: float = 1.0) -> Array:
     """Heading [rad] at arc lengths s [m], in the shape of s.
 
-    It is the direction of the chord from s - window / 2 to s + window / 2; near an end of the route, that of the chord
-    of this length at the end.
+    It is the direction of the chord from s - window / 2 to s + window / 2; near an end of the route, it is that of
+    the route's first or last chord of this length.
     """
     length = arc_lengths(route)[-1]
     window = min(window, length)
@@ -173,7 +173,7 @@ def total_turn(route: Array) -> float:
 
 
 def corridor_edges(route: Array, half_width: float) -> tuple[Array, Array]:
-    """Left and right edges of the corridor at the vertices and heights of the route, shapes (m, 3)."""
+    """Left and right edges of the corridor beside the vertices of the route, at their heights, shapes (m, 3)."""
     heading = heading_at(route, arc_lengths(route))
     normal = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], -1) * half_width
     return route + normal, route - normal
