@@ -38,7 +38,7 @@ class CameraNoise:
         self._last: tuple[float, Array] | None = None
 
     def perturb_pose(self, camera_to_world: Array, time: float) -> Array:
-        """Returns a pose with vibration added, shape (4, 4), and updates the exposure for `apply`.
+        """Returns the camera's pose with vibration added, shape (4, 4), and updates the exposure for `apply`.
 
         `time` is the time of the episode [s]; it must not decrease from one call to the next.
         """
@@ -79,7 +79,7 @@ class CameraNoise:
 def motion_blur(
     rgb: Array32, depth: Array32, pose: Array, before: Array, share: float, rays: Array, intrinsics: Array, samples: int
 ) -> Array32:
-    """Returns a picture with motion blur: the mean over the camera's motion while the shutter is open.
+    """Returns a picture with motion blur: the mean of copies shifted by the camera's motion while the shutter is open.
 
     The shutter is open during the last fraction `share` of the motion from `before` to `pose`. The world is assumed to
     be static. Shapes and units as in `CameraNoise.apply`.

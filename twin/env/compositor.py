@@ -34,13 +34,13 @@ from twin.warp_runtime import wp
 # ---- objects
 
 _NEAR_PLANE = 0.02  # [m] geoms whose z-depth is smaller than this everywhere are not drawn
-_SMALL_MASK = 800  # [px] in masks up to this size, every pixel gets four rays: finding the edges would take longer
+_SMALL_MASK = 800  # [px] if objects may cover at most this many, each gets four rays: finding edges would take longer
 _SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] offsets of a pixel's four rays
 
 
 @dataclass(frozen=True)
 class RenderedObjects:
-    """Objects in a rectangular window of the picture. Arrays have its height and width, `rgb` also channels."""
+    """Objects in a rectangular window of the picture; arrays have the window's height and width."""
 
     window: tuple[int, int, int, int]
     """Left, top, width, height [px]."""
@@ -262,7 +262,7 @@ def _copy_mesh(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: int) -> None:
 def _mesh_frames(small: mujoco.MjModel) -> tuple[Array, Array]:
     """Positions (n, 3) and rotations (n, 3, 3) of geoms in the frames of their meshes before compilation.
 
-    They are not the identity, since the compiler moves a mesh to its inertial frame.
+    These offsets are not zero, since the compiler moves a mesh to its inertial frame.
     """
     turns = np.empty((small.ngeom, 9))
     for i in range(small.ngeom):
@@ -285,7 +285,7 @@ def _edge_mask(ids: NDArray[np.int32]) -> NDArray[np.bool_]:
 
 Lighting = str | NDArray
 
-_WINDOW_STEP = 32  # [px] sides of foreground windows are multiples of this, so that few sizes occur
+_WINDOW_STEP = 32  # [px] sides of windows with a foreground are multiples of this, so that few sizes occur
 _MAX_WINDOWS = 16  # number of window sizes whose render targets are kept; pictures of 160×90 px need at most 15
 
 
@@ -418,7 +418,7 @@ class _CompositorWorker:
         self._fields: OrderedDict[tuple[int, int], BakedField] = OrderedDict()
 
     def foreground(self, pose: Array, drawn: RenderedObjects, lighting: Lighting) -> Rendering:
-        """The part of the field in front of the drawn objects: arrays (height, width) for the objects' window."""
+        """Renders the part of the field in front of the drawn objects, in the objects' window."""
         left, top, width, height = drawn.window
         across, down = (-(-n // _WINDOW_STEP) * _WINDOW_STEP for n in (width, height))
         stop = np.zeros((1, down, across), np.float32)
@@ -442,7 +442,7 @@ def composite(out: Rendering, inner: tuple, drawn: RenderedObjects, front: Rende
         out: Rendering of the field alone.
         inner: Index that selects the window in the arrays of `out`.
         drawn: Objects in the window.
-        front: The field up to `drawn.depth`, arrays (height, width); its colors are not multiplied by its opacity.
+        front: The field up to `drawn.depth` in the window; its colors are not premultiplied by its opacity.
     """
     cover = drawn.coverage[..., None]
     held = front.opacity[..., None]

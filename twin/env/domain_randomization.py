@@ -27,7 +27,7 @@ PAYLOAD = "payload"
 """Name of a body on the top plate; its mass is zero until an episode sets a payload."""
 
 VERSION = 4
-"""Version of a sample's effects. Increase it with each change of the code by which a sample gives another picture."""
+"""Version of a sample's effects. Increase it whenever a change of the code gives the same sample other pictures."""
 
 KNOWN_WEATHER_FRACTION = 0.6
 """When a photo of the day is available, the strengths of sun and shadows are multiplied by this fraction.
@@ -86,7 +86,7 @@ class Ranges:
     wheel_radius: Range = (0.98, 1.02)
     """Factor by which the robot's own wheel radius is multiplied; the controller always uses the nominal radius."""
     wheel_difference: Range = (-0.006, 0.006)
-    """Right minus left wheel radius, relative to their mean; commanded straight ahead, such a robot turns."""
+    """Right minus left wheel radius, relative to their mean; with a difference, the robot does not drive straight."""
     extinction: Range = (0.0, 0.05)
     """Extinction of the fog [1/m], in addition to the film's haze; 0.05 is a visibility of 60 m."""
     airlight: Range = (0.85, 1.15)
@@ -193,7 +193,7 @@ def condition_options(condition: Condition) -> dict[str, Any]:
 
 
 class NominalModel:
-    """The model's fields without randomization; `apply` writes a sample's randomized fields to a copy of the model."""
+    """Nominal values of the model's randomized fields; `apply` writes a sample's values to a copy of the model."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         """`model` is the compiled `episode_spec`."""

@@ -39,7 +39,7 @@ _LOOKAHEAD = 1.0  # [m] distance along the route to the point that the robot ste
 _GAIN_RATE = 0.15  # fraction of the gain's error that is corrected per control step
 _GAIN_RANGE = (0.5, 2.5)  # lowest and highest gain
 _GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; at smaller yaw rates, the measured ratio is mostly noise
-_SEARCH_WINDOW = (1.0, 3.0)  # [m] the foot is searched this far behind and ahead of the largest arc length reached
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point is searched this far behind and ahead of the largest arc length reached
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ class RecordedDrive:
 
     @property
     def max_cross_track(self) -> float:
-        """[m]"""
+        """Largest distance from the route [m]."""
         return float(np.abs(self.cross_track).max())
 
     @property
     def mean_cross_track(self) -> float:
-        """[m]"""
+        """Mean distance from the route [m]."""
         return float(np.abs(self.cross_track).mean())
 
 
@@ -207,7 +207,7 @@ Policy = Callable[[NDArray[np.uint8]], NDArray]
 
 
 class Driver(Protocol):
-    """Called once per control step; `step.first()` is true at the start of an episode."""
+    """Chooses the action of each control step; `step.first()` is true at the start of an episode."""
 
     def __call__(self, environment: "control.Environment", step: "dm_env.TimeStep") -> Array: ...
 

@@ -27,10 +27,10 @@ from twin.nerf.sun import Sunlight, mixed_sunlight
 from twin.types import Array32
 
 VERSION = 2
-"""Version of `LightingSets.sample`. Increase it with each change of the code by which a seed gives other lightings."""
+"""Version of `LightingSets.sample`. Increase it whenever a change of the code gives a seed other lightings."""
 
 _SEED = 20_240_315  # random seed of `Anchors`; constant, so that all runs with a build have the same sets
-_POOL_SIZE = 200  # random lightings among which anchors are chosen
+_POOL_SIZE = 200  # number of random lightings among which anchors are chosen
 _EXTRA_ANCHORS = 8  # number of anchors besides the filmed lightings
 _MARGIN = 1.25  # a lighting is in a set if the other's nearest anchor is more than this many times as far as its own
 _MAX_TRIES = 60  # largest number of proposals per sample; about one in ten is near the chosen anchor
@@ -38,14 +38,14 @@ _MAX_TRIES = 60  # largest number of proposals per sample; about one in ten is n
 
 @dataclass(frozen=True)
 class EpisodeLighting:
-    """Lighting of one episode: an appearance embedding with its fog and suns, or a drift between two."""
+    """Lighting of one episode: an appearance embedding with its fog and suns, or a drift from one to another."""
 
     name: str
-    """Name of the lighting or of its set; `<name> → <name>` with drift; the value of `observe` without a field."""
+    """Name of the lighting or its set, `<name> → <name>` with drift; without a field, the value of `Options.observe`."""
     start: Array32
     """Embedding at the beginning, shape (dim,)."""
     end: Array32 | None = None
-    """Embedding after `duration`; None: constant."""
+    """Embedding after `duration`; None: no drift."""
     duration: float = 0.0
     """[s]"""
     fog: Fog | None = None

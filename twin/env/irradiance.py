@@ -8,8 +8,8 @@ divided by an assumed albedo.
 The irradiance for other normals is fitted to *upright probes*: points of the field on surfaces that rise above the
 ground. A probe's color is divided by its mean color over the field's lightings, which cancels its albedo. The mean
 lighting is assumed to be a uniform sky over dim ground. The light from each direction of `SIDE_DIRECTIONS` has two
-parts: one is proportional to the local ground irradiance, like that of the sun or a lamp; the other is the same
-everywhere, like that of the sky.
+parts: one is proportional to the local ground irradiance, like light from the sun or a lamp; the other is the same
+everywhere, like light from the sky.
 
 The estimator stores the probes' composited features. From these, the color network computes the probes' colors under
 any embedding in a millisecond.
@@ -37,10 +37,10 @@ from twin.types import Array
 GROUND_ALBEDO = 0.37
 """Assumed color of the ground along the route under irradiance 1: worn asphalt reflects about 11 % of the light, which
 the tone curve of a film (exponent 1 / 2.2) shows as 0.37. With 0.38 (12 %), obstacles at night missed the threshold of
-`benchmarks/overlay.py` (PSNR 6 dB above that of unshaded obstacles), so that benchmark is no independent test."""
+`benchmarks/overlay.py` (PSNR 6 dB above unshaded obstacles), so that benchmark does not test 0.37 independently."""
 
 SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-"""Horizontal directions from which the estimated light comes, shape (4, 3)."""
+"""Horizontal directions for which the incoming light is estimated, shape (4, 3)."""
 
 _CAMERA_HEIGHT, _CAMERA_PITCH = 1.0, 8.0  # [m], [°] height and downward pitch of the views from which probes are taken
 _CAMERA_STEP = 2.0  # [m] distance along the route between two views
@@ -52,7 +52,7 @@ _MAX_GROUND_PROBES, _MAX_UPRIGHT_PROBES = 3000, 1500
 _KERNEL_STD = 1.5  # [m] standard deviation of the Gaussian weights of ground probes around a position
 _BOUNCE = 0.25  # assumed ratio of the ground's radiance to the sky's in the mean of the field's lightings
 _UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky by which the ground gets 1
-_MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # limits of the sun's share of the light, and of cot(sun's elevation)
+_MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # upper limits of the sun's share of the light, and of cot(sun's elevation)
 _MIN_COLOR = 0.02  # a probe whose mean color is darker is not used
 _MAX_BRIGHTNESS = 1.5  # probes above this multiple of the highest ground irradiance count as lamps and are not used
 _NEIGHBORS = 8  # number of ground probes that give the ground irradiance at an upright probe
@@ -102,7 +102,7 @@ class Irradiance:
         return up * ground + basis @ self.constant + (basis @ self.proportional) * ground
 
     def sun(self, xy: Array) -> tuple[float, Array]:
-        """The sun's share of the light at a position (2,), and the direction to the sun, shape (3,).
+        """The sun's share of the ground irradiance at a position (2,), and the direction to the sun, shape (3,).
 
         Sky and sun both contribute to the ground irradiance and to the irradiance of upright surfaces. Averaged over
         all azimuths, an upright surface gets `_UPRIGHT_SKY` times what the ground gets from the sky, and cot e / π
@@ -126,7 +126,7 @@ class Irradiance:
 def _basis(normals: Array) -> Array:
     """Weights, shape (n, 5), of the rows of `Irradiance.constant` for normals (n, 3).
 
-    The first weight is 1 − max(0, z); the others are the cosines between normal and `SIDE_DIRECTIONS`, at least 0.
+    For a normal n, the first weight is 1 − max(0, n_z); the others are max(0, n · d) for each d of `SIDE_DIRECTIONS`.
     """
     return np.column_stack([1.0 - np.maximum(normals[:, 2], 0.0), np.maximum(normals @ SIDE_DIRECTIONS.T, 0.0)])
 
@@ -203,14 +203,14 @@ class IrradianceEstimator:
         for c in range(3):
             usable = (self._mean[:, c] > _MIN_COLOR) & (seen[:, c] < _MAX_BRIGHTNESS * up[:, c].max())
             rows = np.concatenate([self._rows, self._rows * ground[:, c : c + 1]], 1)[usable]
-            # The Cholesky factor of the normal equations replaces the many rows; the minimum stays the same.
+            # For speed, the Cholesky factor of the normal equations replaces the rows; the minimum stays the same.
             square = np.linalg.cholesky(rows.T @ rows + 1e-6 * len(rows) * np.eye(10))
             found[:, c], _ = nnls(square.T, np.linalg.solve(square, rows.T @ sides[usable, c]))
         return Irradiance(self._xy, up, found[:5], found[5:], *known)
 
 
 def _gains(sunlight: Sunlight, points: Array, normals: Array) -> tuple[Array, Array]:
-    """Gain of suns at points (n, 3) [m] with normals (n, 3), shape (n, 3), and its share by direct light, (n,)."""
+    """Gain of suns (n, 3) at points (n, 3) [m] with normals (n, 3), and the fraction of it that is direct light (n,)."""
     gain = np.full((len(points), 3), 1.0 - sum(weight for _, weight in sunlight))
     direct = np.zeros(len(points))
     for sun, weight in sunlight:
@@ -265,7 +265,7 @@ def _surface_points(field: BakedField, route: Array) -> _SurfacePoints:
         facing = (normals * toward).sum(-1)
         around = np.stack([depth[1:-1, 2:], depth[1:-1, :-2], depth[2:, 1:-1], depth[:-2, 1:-1]])
         z = depth[1:-1, 1:-1]
-        # At a depth edge the neighbors belong to another surface.
+        # At a depth edge, neighboring pixels belong to another surface.
         valid = (np.abs(around - z) < 0.15 * z).all(0) & (out.opacity[0, 1:-1, 1:-1] > 0.97) & (facing > 0.05)
         valid &= z < _MAX_DEPTH
         directions = (inner - pose[:3, 3])[valid]
@@ -329,7 +329,7 @@ from the foot. They account for the size of the sun's disk and halo, and for the
 _FILL = 0.85  # assumed fraction of its bounding boxes' length and width that an obstacle fills
 _SKY_LOSS_BELOW = 0.75  # fraction of the sky's light lost below an obstacle; below 1, since it does not fill its box
 _SKY_REACH = 1.2  # [m] ground within this distance of an obstacle loses part of the sky's light
-_MAX_SHADOW = 4.0  # [m] largest length of a shadow behind the foot
+_MAX_SHADOW = 4.0  # [m] largest distance of a shadow's end from the foot
 _SHADOW_TOLERANCE = 0.15  # [m] surfaces at most this far above or below the foot count as ground
 _MAX_DISTANCE = 25.0  # [m] shadows of obstacles farther from the camera than this are not drawn
 
@@ -338,9 +338,9 @@ class ContactShadows:
     """Soft shadows of a model's obstacles on the reconstructed ground.
 
     The light is assumed to come from a uniform sky and from one sun; `Irradiance.sun` estimates the sun's direction and
-    share. Ground beside an obstacle loses the light of the part of the sky that the obstacle hides. Ground in the
-    obstacle's shadow also loses sunlight; the penumbra widens with the distance from the obstacle. Two upright boxes,
-    one around the lower geoms and one around the upper geoms, approximate an obstacle.
+    share of the light. Ground beside an obstacle loses the light of the part of the sky that the obstacle hides. Ground
+    in the obstacle's shadow also loses sunlight; the penumbra widens with the distance from the obstacle. Two upright
+    boxes, one around the lower geoms and one around the upper geoms, approximate an obstacle.
     """
 
     def __init__(self, model: mujoco.MjModel, geoms: NDArray[np.int64]):

@@ -177,7 +177,7 @@ def _solid_shadows(rng: np.random.Generator) -> Array32:
 
 
 def _patches(rng: np.random.Generator, radius: float, cover: float) -> Array32:
-    """Pattern (side, side) of patches of about `radius` [texels], 1 where dark; `cover` is the fraction that is dark."""
+    """Pattern (side, side) of patches of about `radius` [texels], 1 where dark; a fraction `cover` is dark."""
     # The smoothing is periodic, so that the pattern repeats without a seam.
     frequency = np.fft.fftfreq(_SIDE)[:, None] ** 2 + np.fft.rfftfreq(_SIDE) ** 2
     smooth = np.exp(-2.0 * (np.pi * radius) ** 2 * frequency)

@@ -206,8 +206,8 @@ def add_ground(
     # MuJoCo's binary height field: int32 rows, int32 columns, then float32 rows from the low-y edge.
     size = np.array(coarse.height.shape, np.int32)
     (assets / "ground.bin").write_bytes(size.tobytes() + coarse.height.astype(np.float32).tobytes())
-    # The texture spans the height field from edge to edge; its first row is at +y. Without a picture, each fine cell is a
-    # texel, with the mean color of the cell's corners.
+    # The texture spans the height field from edge to edge; its first row is at +y. Without a picture, each fine cell is
+    # a texel, with the mean color of the cell's corners.
     finer = round(coarse.cell / ground.cell)
     rows, columns = ((size - 1) * finer + 1 for size in coarse.height.shape)
     rgb = ground.rgb[:rows, :columns].astype(np.uint16)
