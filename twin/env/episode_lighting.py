@@ -41,7 +41,7 @@ class EpisodeLighting:
     """Lighting of one episode: an appearance embedding with its fog and suns, or a drift from one to another."""
 
     name: str
-    """Name of the lighting or its set, `<name> → <name>` with drift; without a field, the value of `Options.observe`."""
+    """Name of the lighting or its set, `<name> → <name>` with drift; without a field, the option `observe`."""
     start: Array32
     """Embedding at the beginning, shape (dim,)."""
     end: Array32 | None = None

@@ -52,7 +52,7 @@ _MAX_GROUND_PROBES, _MAX_UPRIGHT_PROBES = 3000, 1500
 _KERNEL_STD = 1.5  # [m] standard deviation of the Gaussian weights of ground probes around a position
 _BOUNCE = 0.25  # assumed ratio of the ground's radiance to the sky's in the mean of the field's lightings
 _UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky by which the ground gets 1
-_MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # upper limits of the sun's share of the light, and of cot(sun's elevation)
+_MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # upper limits of the sun's share of the light and of cot(elevation)
 _MIN_COLOR = 0.02  # a probe whose mean color is darker is not used
 _MAX_BRIGHTNESS = 1.5  # probes above this multiple of the highest ground irradiance count as lamps and are not used
 _NEIGHBORS = 8  # number of ground probes that give the ground irradiance at an upright probe
@@ -210,7 +210,7 @@ class IrradianceEstimator:
 
 
 def _gains(sunlight: Sunlight, points: Array, normals: Array) -> tuple[Array, Array]:
-    """Gain of suns (n, 3) at points (n, 3) [m] with normals (n, 3), and the fraction of it that is direct light (n,)."""
+    """Gain of suns (n, 3) at points (n, 3) [m] with normals (n, 3), and the direct light's fraction of it (n,)."""
     gain = np.full((len(points), 3), 1.0 - sum(weight for _, weight in sunlight))
     direct = np.zeros(len(points))
     for sun, weight in sunlight:

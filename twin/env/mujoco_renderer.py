@@ -116,7 +116,7 @@ def mujoco_rays(rays: Array) -> Array32:
 
 
 class SceneRenderer:
-    """Renders the front cameras' views with MuJoCo's own shading; has the interface of `Compositor`.
+    """Renders the front cameras' views with MuJoCo's own shading; interface of `Compositor` without `sunlight`.
 
     Obstacles and the robot are lit by the model's own lights. The place is drawn either as ground and visual mesh, in
     the filmed colors, or as Gaussian splats. Splats and geoms occlude each other, and the ground shows through the gaps
@@ -126,7 +126,7 @@ class SceneRenderer:
     def __init__(
         self, model: mujoco.MjModel, size: tuple[int, int], max_envs: int, splats: Gaussians | None = None
     ) -> None:
-        """`model` was made by `episode_spec` with visuals; `splats`, if given, replace its visual mesh.
+        """`model` must come from `episode_spec` with `visuals`; `splats`, if given, replace its visual mesh.
 
         The other arguments are those of `Compositor`.
         """
@@ -229,7 +229,7 @@ class SceneCamera:
         size: tuple[int, int],
         obstacles: Sequence[ObstacleConfig] = (),
     ) -> None:
-        """`size`: width, height [px]. The attribute `obstacles` may be set to some of them; the rest is not shown."""
+        """`size`: width, height [px]. To show only some of `obstacles`, set the attribute `obstacles` to these."""
         spec = mujoco.MjSpec.from_file(str(world.model_path))
         self.obstacles = tuple(obstacles)
         add_obstacles(spec, self.obstacles, world)

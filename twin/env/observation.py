@@ -45,7 +45,7 @@ class PixelObserver:
         Args:
             renderer: Renders the envs.
             field: Contains the lightings; None if MuJoCo renders the mesh, or splats, under MuJoCo's lights.
-            trust: Computes the trust of images from the filmed frames.
+            trust: Computes the trust of the images, see `trust.py`.
             options: Options of the envs.
             envs: Physics and task of every env.
         """

@@ -81,7 +81,7 @@ def place(obstacles: Sequence[ObstacleConfig], data: mujoco.MjData, time: float)
             data.mocap_pos[mocap] = (x, y, ground_height(model, x, y) - _SINK_DEPTH)
             data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
     if wanted:
-        raise InputError(f"the model has no {', '.join(wanted)}; name it in [[obstacle]], or add it with add_obstacles")
+        raise InputError(f"the model has no {', '.join(wanted)}; add it to scene.toml as [[obstacle]], or by add_obstacles")
 
 
 def obstacle_pose(obstacle: ObstacleConfig, route: Array, time: float) -> tuple[float, float, float]:
@@ -135,7 +135,7 @@ def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
 def random_obstacles(
     world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
 ) -> tuple[ObstacleConfig, ...]:
-    """Samples static obstacles `random_<number>` along the route; a robot can pass each of them within the corridor.
+    """Samples static obstacles `random_<number>` along the route; within the corridor, a robot can pass each of them.
 
     Raises:
         InputError: the route is too short for `count` obstacles.

@@ -221,7 +221,7 @@ def parse_options(given: dict[str, Any]) -> Options:
 
 
 def state_size(options: Options) -> int:
-    """Number of the privileged state's components, from the first on, that are observed besides images."""
+    """Number k of components of the privileged state that are observed besides images: its first k."""
     return {None: 0, ODOMETRY: 2}.get(options.state, sum(STATE_SIZES.values()))
 
 
