@@ -39,7 +39,7 @@ _LOOKAHEAD = 1.0  # [m] distance along the route to the point that the robot ste
 _GAIN_RATE = 0.15  # fraction of the gain's error that is corrected per control step
 _GAIN_RANGE = (0.5, 2.5)  # lowest and highest gain
 _GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; at smaller yaw rates, the measured ratio is mostly noise
-_SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point is searched this far behind and ahead of the largest arc length so far
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point is searched this far behind and ahead of the farthest one so far
 
 
 @dataclass(frozen=True)

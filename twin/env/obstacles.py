@@ -81,7 +81,7 @@ def place(obstacles: Sequence[ObstacleConfig], data: mujoco.MjData, time: float)
             data.mocap_pos[mocap] = (x, y, ground_height(model, x, y) - _SINK_DEPTH)
             data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
     if wanted:
-        raise InputError(f"the model has no {', '.join(wanted)}; add it to scene.toml as [[obstacle]], or by add_obstacles")
+        raise InputError(f"the model has no {', '.join(wanted)}; add it as [[obstacle]], or by add_obstacles")
 
 
 def obstacle_pose(obstacle: ObstacleConfig, route: Array, time: float) -> tuple[float, float, float]:

@@ -39,7 +39,7 @@ class HuskyPhysics:
     """Steps one Husky in one model."""
 
     move_obstacles: Callable[[float], None] | None = None
-    """Sets the poses of moving obstacles at a time [s]. `step` calls it before each segment of substeps."""
+    """Sets the poses of moving obstacles at a time [s]. `step` calls it before each segment, for the segment's end."""
 
     def __init__(
         self, model: mujoco.MjModel, params: HuskyParams | None = None, data: mujoco.MjData | None = None

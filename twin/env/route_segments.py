@@ -44,7 +44,7 @@ _STANDARD_SPECS = {
 STANDARD_TASKS = tuple(_STANDARD_SPECS)
 """Names of the standard tasks."""
 
-_LENGTH_TOLERANCE = 0.05  # relative shortfall allowed for a standard task: smoothing and scale errors shorten routes
+_LENGTH_TOLERANCE = 0.05  # relative shortfall allowed in standard tasks, as smoothing and scale errors shorten routes
 _STEP = 0.25  # [m] between tested starts
 
 
@@ -64,7 +64,7 @@ def find_task(name: str, world: World, configured: tuple[TaskConfig, ...] = ()) 
         total, length = arc_lengths(world.route)[-1], _STANDARD_SPECS[name].length
         why = f"the route ({total:.1f} m) has no such segment of {length:g} m"
         if longest:
-            why += f"; the longest has {longest[1]:.1f} m and starts at {longest[0]:.1f} m"
+            why += f"; the longest is {longest[1]:.1f} m long and starts at {longest[0]:.1f} m"
     raise InputError(
         f"task {name!r}: {why}; there are {there}; define another in scene.toml: "
         '[[task]] name = "mine", start = 0.0, length = 20.0'
@@ -95,7 +95,7 @@ def scene_tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[s
 
 
 def _fitting_starts(route: Array, standard: _StandardTask, length: float) -> Array:
-    """Starts [m] of all segments of a length [m] that fit a standard task; those with the most central turn first."""
+    """Start arc lengths [m] of segments of a given length that fit a standard task; the most central turn first."""
     total = float(arc_lengths(route)[-1])
     s = np.append(np.arange(0.0, total, _STEP), total)
     heading = np.unwrap(heading_at(route, s))

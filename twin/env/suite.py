@@ -88,7 +88,7 @@ class EnvFactory:
     def make_env(
         self, seed: int | None, evaluator: tuple[RewardAndTermination, int] | None = None
     ) -> tuple[DrivePhysics, DriveTask]:
-        """Returns physics, with a copy of the model, and task of a new environment; arguments as in `DriveTask`."""
+        """Returns physics, with its own copy of the model, and task of a new environment. Arguments: see `DriveTask`."""
         physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
         return physics, DriveTask(self.world, self.segment, self.options, self.obstacles, self.model, seed, evaluator)
 
@@ -179,7 +179,7 @@ class DriveEnvironment(control.Environment):
         return self._with_pixels(step)
 
     def relight(self, step: dm_env.TimeStep, lighting: EpisodeLighting) -> dm_env.TimeStep:
-        """Replaces the lighting at an episode's start; returns its first step, `step`, in the new lighting."""
+        """Replaces the lighting at an episode's start; returns its first step `step` with images in the new lighting."""
         self.pixels.set_lighting(0, lighting, fill=True)
         return self._with_pixels(step)
 
@@ -222,7 +222,7 @@ def load(
 
 # ---- model of an episode
 
-_REACH = 1.5  # [m] beyond the corridor's edge; more than half the robot's length plus its motion in a control step
+_REACH = 1.5  # [m] reach beyond the corridor's edge; exceeds half the robot's length plus its motion in a control step
 
 
 def episode_spec(world: World, start: float, end: float, half_width: float, visuals: bool = False) -> mujoco.MjSpec:

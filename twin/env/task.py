@@ -39,7 +39,7 @@ try:
         from dm_control.rl import control
 except ModuleNotFoundError as error:
     raise InputError(
-        f"{error}: driving in a scene needs dm_control, which installs on Python 3.11 and 3.12; this is "
+        f"{error}: driving in a scene needs dm_control, which installs on Python 3.11 and 3.12; this is Python "
         f"{sys.version_info.major}.{sys.version_info.minor}"
     ) from None
 
@@ -177,7 +177,7 @@ class RewardAndTermination:
 
 
 class DrivePhysics(dm_mujoco.Physics):
-    """A dm_control Physics of one robot, with quantities of `HuskyPhysics`."""
+    """A dm_control Physics of one robot, with properties of `HuskyPhysics`."""
 
     _params = HuskyParams()
 
@@ -222,7 +222,7 @@ class DrivePhysics(dm_mujoco.Physics):
         with self.check_invalid_state():
             self.robot.step(nstep * self.timestep())
 
-    # Quantities of `HuskyPhysics`; `camera_to_world` is the pose from which the newest image was taken.
+    # Properties of `HuskyPhysics`; `camera_to_world` is the pose from which the newest image was taken.
     planar_pose = property(attrgetter("robot.planar_pose"))
     base_to_world = property(attrgetter("robot.base_to_world"))
     delayed_data = property(attrgetter("robot.delayed_data"))
@@ -271,7 +271,7 @@ class DriveTask(control.Task):
         self.episode_seed = 0
         """Seed of the current episode."""
         self.sample = RandomizationSample()
-        """Robot and weather of the current episode."""
+        """Randomized robot and weather of the current episode."""
         self._record = self.sample.record()
         self.obstacles: tuple[ObstacleConfig, ...] = ()
         """Obstacles of the current episode."""

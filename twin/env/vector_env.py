@@ -173,7 +173,7 @@ class ProcessVectorEnv:
                 for c, message in messages.items():
                     self._children[c].send(message)
                 replies = {c: self._children[c].receive() for c in requests}  # all, even if one is an error
-            except BaseException:  # replies may be pending, which the next request would read
+            except BaseException:  # otherwise, the next request would read pending replies
                 self.close()
                 raise
         for error, _ in replies.values():
@@ -220,7 +220,7 @@ class _Child:
             code = self.process.wait()
             raise InputError(
                 f"a process of the vector environment ended with exit status {code}; expected it to run. "
-                + ("If memory ran out, use fewer (processes=1 starts none)" if code == -9 else "See its messages above")
+                + ("If memory ran out, use fewer; processes=1 starts none" if code == -9 else "See its messages above")
             ) from None
 
 
@@ -241,7 +241,7 @@ def serialize(value: Any) -> bytes:
 
 
 class VectorEnvServer:
-    """Executes requests. A request names a method of this class or of its `LocalVectorEnv`, with arguments."""
+    """Executes requests: names of methods of this class or of its `LocalVectorEnv`, each with its arguments."""
 
     envs: LocalVectorEnv
 
@@ -285,7 +285,7 @@ def serve() -> None:
     """Serves a parent's requests. Command line arguments: socket, process id of the parent, number of cores to use."""
     socket, parent, share = map(int, sys.argv[1:])
     os.set_inheritable(socket, False)
-    # SIGTERM may reach all processes, but the parent still needs this one while it saves its state; then it ends it.
+    # SIGTERM may reach all processes. This one ignores it: the parent saves its state, and then ends this process.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     runtime.limit_cores(share)
     server = VectorEnvServer()

@@ -14,7 +14,7 @@ from twin.types import Array, Array32
 # ---- fog
 
 _HORIZON_DISTANCE = 40.0  # [m] pixels beyond this depth have nearly the horizon's color
-_MIN_HORIZON_SHARE = 0.01  # fraction of pixels that must be beyond `_HORIZON_DISTANCE` to give the horizon's color
+_MIN_HORIZON_SHARE = 0.01  # least fraction of pixels beyond `_HORIZON_DISTANCE` from which the horizon's color is taken
 
 
 class FogSample:
@@ -149,7 +149,7 @@ class CastShadows:
             self._pattern = np.maximum(self._pattern, _solid_shadows(rng))
 
     def apply(self, rgb: Array32, depth: Array32, points: Array) -> Array32:
-        """Returns the picture with shadows. Arguments as in `DirectionalRelighting.apply`, but points in the world."""
+        """Returns the picture with shadows. Arguments as in `DirectionalRelighting.apply`, but world points."""
         flat = points[..., :2] - points[..., 2:] * self._slant
         across, down = np.moveaxis(flat @ self._to_texel.T % _SIDE, -1, 0).astype(np.float32)
         dark = cv2.remap(self._pattern, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).astype(np.float32)

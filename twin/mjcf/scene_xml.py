@@ -290,7 +290,10 @@ def _add_robot(
     """
     length = float(arc_lengths(route)[-1])
     if length < _MIN_ROUTE:
-        raise InputError(f"the route has {length:.2f} m, expected at least {_MIN_ROUTE:g} m; set mjcf.route = false")
+        raise InputError(
+            f"the route is {length:.2f} m long, expected at least {_MIN_ROUTE:g} m; film a longer path, or set "
+            "mjcf.route = false for a scene without a robot"
+        )
     yaw = float(heading_at(route, 0.0))
     rows, columns = ground.height.shape
     edge = np.minimum(
@@ -317,8 +320,8 @@ def _add_robot(
     moved = float(np.linalg.norm(data.qpos[:2] - position[:2]))
     if not moved < 0.05 or abs(data.qpos[2] - position[2]) > 0.1:
         raise InputError(
-            f"the robot does not rest at the start of the route: moved {moved:.2f} m, "
-            f"{data.qpos[2] - position[2]:+.2f} m up in {_SETTLE_TIME:g} s, expected < 0.05 m, ± 0.1 m; "
+            f"the robot does not rest at the start of the route: it moved {moved:.2f} m sideways and "
+            f"{data.qpos[2] - position[2]:+.2f} m up in {_SETTLE_TIME:g} s, expected < 0.05 m and ± 0.1 m; "
             "an obstacle is there: raise mesh.obstacle_height"
         )
     spec.add_key(name="spawn", qpos=data.qpos)

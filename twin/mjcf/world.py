@@ -116,7 +116,7 @@ def arc_lengths(route: Array) -> Array:
 
 
 def point_at(route: Array, s: Array | float) -> Array:
-    """Points (..., d) of a route (m, d) at arc lengths s (...) [m]; s is clamped to the ends."""
+    """Points (..., d) of a route (m, d) at arc lengths s (...) [m]; s is clamped to the route's ends."""
     knots = arc_lengths(route)
     return np.stack([np.interp(s, knots, route[:, k]) for k in range(route.shape[1])], -1)
 
@@ -166,7 +166,7 @@ def nearest_on_route(
 
 
 def total_turn(route: Array) -> float:
-    """Total change of heading along the route [rad], positive to the left; full turns count."""
+    """Total change of heading along the route [rad], positive to the left; a full turn adds 2π."""
     s = np.append(np.arange(0.0, arc_lengths(route)[-1], 0.25), np.inf)
     heading = np.unwrap(heading_at(route, s))
     return float(heading[-1] - heading[0])
