@@ -11,7 +11,7 @@ from twin.types import Array, Array32
 _VIBRATION_TIME = 0.05  # [s] correlation time of the vibration
 _DRIFT_TIME = 5.0  # [s] correlation time of the exposure
 _MAX_SHUTTER = 0.5  # the shutter is open for at most this fraction of the time between two pictures
-_KNEE = 0.75  # colors above this value are compressed so that none exceeds 1
+_KNEE = 0.75  # colors above this value are compressed to at most 1
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class CameraOptions:
     shutter: float = 0.0
     """Time for which the shutter is open [s]."""
     blur_samples: int = 5
-    """Number of shifted copies of a picture that are averaged for motion blur."""
+    """Number of shifted pictures that are averaged for motion blur."""
 
 
 class CameraNoise:
@@ -40,7 +40,7 @@ class CameraNoise:
     def perturb_pose(self, camera_to_world: Array, time: float) -> Array:
         """Returns the camera's pose with vibration added, shape (4, 4), and updates the exposure for `apply`.
 
-        `time` is the time of the episode [s]; it must not decrease from one call to the next.
+        `time` is the time of the episode [s]; it must not decrease between calls.
         """
         step = np.inf if self._time is None else max(time - self._time, 0.0)
         self._time = time

@@ -183,7 +183,7 @@ class VectorController:
         return SubstepSchedules(speeds, times, np.cumsum(checks[:-1], 0, dtype=np.int32), checks[1:])
 
     def _update(self, which: NDArray[np.int64]) -> Array:
-        """Runs one update and returns the speeds of the left and right wheels [rad/s], shape (k, 2)."""
+        """See `Controller.update`; shape (k, 2)."""
         time, arrivals = self.time[which], self._arrivals[:, which]
         newest = len(arrivals) - 1 - np.argmax((arrivals <= time + _TIME_TOLERANCE)[::-1], axis=0)
         arrived = np.take_along_axis(arrivals, newest[None], 0)[0]

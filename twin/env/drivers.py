@@ -33,7 +33,7 @@ if TYPE_CHECKING:  # not imported at run time: `follow_route` works without dm_c
 
 # ---- pure pursuit
 
-GOAL_RADIUS = 1.0  # [m] a robot within this distance of the goal has reached it
+GOAL_RADIUS = 1.0  # [m] distance from the goal at which it is reached
 
 _LOOKAHEAD = 1.0  # [m] distance along the route to the point that the robot steers to
 _GAIN_RATE = 0.15  # fraction of the gain's error that is corrected per control step

@@ -65,7 +65,7 @@ class EpisodeLighting:
         return ((1.0 - share) * self.start + share * self.end).astype(np.float32)
 
     def fog_at(self, time: float) -> Fog | None:
-        """The fog after `time` [s]; None: no fog beyond the film's haze."""
+        """The fog after `time` [s]; None as for `fog`."""
         return self.fog if self.end is None else mixed(self.fog, self.end_fog, self._share(time))
 
     def sunlight_at(self, time: float) -> Sunlight:
@@ -170,8 +170,6 @@ def sample_lighting(
     lighting: str | Sequence[str], drift: bool, duration: float, sets: LightingSets, rng: np.random.Generator
 ) -> EpisodeLighting:
     """Samples the lighting of an episode. With `drift`, it changes during `duration` [s].
-
-    A single named lighting drifts into another filmed lighting.
 
     Raises:
         InputError: a lighting is unknown, a set has no lighting, or there is no second lighting for the drift.

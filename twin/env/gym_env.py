@@ -12,9 +12,9 @@ of `RewardAndTermination.state`: float32, clipped to the bounds of the observati
 observations are a dict of images (`pixels`) and numbers (`state`).
 
 `info` contains `cause` (why the episode ended; empty before its end), `is_success`, `progress` [m], `start` [m] (offset
-of the start along the route segment), `cross_track` [m], `lighting`, `trust`, `randomisation`, `episode_seed`, `speed`
-[m/s] and `touched`. `lighting` is the name of the episode's lighting; for a sampled lighting, it is the name of the
-set and the nearest mixture of filmed lightings: `training: sun 0.62, night 0.38`.
+of the start along the route segment), `cross_track` [m], `speed` [m/s], `touched`, `randomisation`, `episode_seed` and,
+with images, `trust` and `lighting`. `lighting` is the name of the episode's lighting; for a sampled lighting, it is the
+name of the set and the nearest mixture of filmed lightings: `training: sun 0.62, night 0.38`.
 """
 
 from collections.abc import Sequence

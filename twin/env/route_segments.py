@@ -42,7 +42,6 @@ _STANDARD_SPECS = {
     "right_turn": _StandardTask(60.0, (-np.deg2rad(120), -np.deg2rad(60)), np.deg2rad(20)),
 }
 STANDARD_TASKS = tuple(_STANDARD_SPECS)
-"""Names of the standard tasks."""
 
 _LENGTH_TOLERANCE = 0.05  # relative shortfall allowed in standard tasks, as smoothing and scale errors shorten routes
 _STEP = 0.25  # [m] between tested starts

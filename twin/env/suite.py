@@ -88,7 +88,7 @@ class EnvFactory:
     def make_env(
         self, seed: int | None, evaluator: tuple[RewardAndTermination, int] | None = None
     ) -> tuple[DrivePhysics, DriveTask]:
-        """Returns physics, with its own copy of the model, and task of a new environment. Arguments: see `DriveTask`."""
+        """Returns physics and task of a new environment, with its own copy of the model. Arguments as in `DriveTask`."""
         physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
         return physics, DriveTask(self.world, self.segment, self.options, self.obstacles, self.model, seed, evaluator)
 
@@ -127,11 +127,11 @@ class EnvFactory:
 
 
 def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
-    """Returns a digest of everything that determines an episode, except for seed and driver.
+    """Returns a digest of everything in the scene, task and condition that determines an episode.
 
     The digest covers the field, the MJCF scene with its robot, the task's route segment, the obstacles of `scene.toml`,
-    and the photo lightings that the condition names. For a condition with sampled lightings, it also covers the version
-    of the lighting sets; for a randomized condition, the version and ranges of the randomization.
+    and the photo lightings that the condition names. For the lightings `training` and `held-out`, it also covers the
+    version of the sets; for a randomized condition, the version and ranges of the randomization.
 
     Raises:
         InputError: see `EnvFactory.open`.
@@ -179,7 +179,7 @@ class DriveEnvironment(control.Environment):
         return self._with_pixels(step)
 
     def relight(self, step: dm_env.TimeStep, lighting: EpisodeLighting) -> dm_env.TimeStep:
-        """Replaces the lighting at an episode's start; returns its first step `step` with images in the new lighting."""
+        """Replaces the lighting at an episode's start; returns its first step, `step`, with images in the new light."""
         self.pixels.set_lighting(0, lighting, fill=True)
         return self._with_pixels(step)
 

@@ -56,5 +56,4 @@ def task_table(world: World, segment: RouteSegment, options: Options) -> dict[st
 
 
 def write_task(path: Path, world: World, segment: RouteSegment, options: Options) -> None:
-    """Writes `task_table` to a file."""
     write_json(path, task_table(world, segment, options))

@@ -14,7 +14,7 @@ from twin.types import Array, Array32
 # ---- fog
 
 _HORIZON_DISTANCE = 40.0  # [m] pixels beyond this depth have nearly the horizon's color
-_MIN_HORIZON_SHARE = 0.01  # least fraction of pixels beyond `_HORIZON_DISTANCE` from which the horizon's color is taken
+_MIN_HORIZON_SHARE = 0.01  # fraction of pixels that must be beyond `_HORIZON_DISTANCE` to give the horizon's color
 
 
 class FogSample:

@@ -203,7 +203,7 @@ def add_husky(
 
 
 def stiffen_for_rest(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Raises tire and servo stiffness in place to at least the published values; returns the model.
+    """Increases tire and servo stiffness in place to at least the published values; returns the model.
 
     With softer tires or servos a robot creeps down any slope and never comes to rest.
     """
