@@ -29,7 +29,7 @@ class CameraOptions:
 
 
 class CameraNoise:
-    """Imperfections of one camera in one episode; the same seed and the same times give the same result."""
+    """Imperfections of one camera in one episode; same seed and times give the same result."""
 
     def __init__(self, options: CameraOptions, rng: np.random.Generator):
         self._options, self._rng = options, rng

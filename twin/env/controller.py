@@ -1,4 +1,4 @@
-"""The Husky's wheel controller: turns commands into wheel speeds, for one robot or for many at once.
+"""The Husky's wheel controller: turns commands into wheel speeds, for one robot or many.
 
 A *command* is forward speed v [m/s] and yaw rate ω [rad/s]. It reaches the controller `command_latency` after it was
 given. The controller runs periodically, by default at 10 Hz, and uses the newest command that has arrived. If this

@@ -37,7 +37,7 @@ GOAL_RADIUS = 1.0  # [m] distance from the goal at which it is reached
 
 _LOOKAHEAD = 1.0  # [m] distance along the route to the point that the robot steers to
 _GAIN_RATE = 0.15  # fraction of the gain's error that is corrected per control step
-_GAIN_RANGE = (0.5, 2.5)  # lowest and highest gain
+_GAIN_RANGE = (0.5, 2.5)
 _GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; at smaller yaw rates, the measured ratio is mostly noise
 _SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point is searched this far behind and ahead of the farthest one so far
 
@@ -59,7 +59,7 @@ class RecordedDrive:
     cross_track: Array
     """Signed distance from the route, positive to the left [m], shape (k,)."""
     progress: Array
-    """Arc length of the point of the route nearest to the robot [m], shape (k,)."""
+    """Arc length of the route's point nearest to the robot [m], shape (k,)."""
     touched: tuple[str, ...]
     """Sorted names of the touched geoms except the ground."""
     outcome: str

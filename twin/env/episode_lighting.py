@@ -7,8 +7,8 @@
     "training"           sampled from the training set, see `LightingSets`
     "held-out"           sampled from the held-out set
 
-With drift, the lighting of an episode changes gradually into a second lighting, which is sampled in the same way. If
-the option names a single lighting, the second one is another filmed lighting.
+With drift, an episode's lighting changes gradually into a second one, sampled in the same way. If the option names a
+single lighting, the second one is another filmed lighting.
 """
 
 from collections.abc import Sequence
@@ -29,8 +29,8 @@ from twin.types import Array32
 VERSION = 2
 """Version of `LightingSets.sample`. Increase it whenever a change of the code gives a seed other lightings."""
 
-_SEED = 20_240_315  # random seed of `Anchors`; constant, so that all runs with a build have the same sets
-_POOL_SIZE = 200  # number of random lightings among which anchors are chosen
+_SEED = 20_240_315  # fixed random seed of `Anchors`: all runs with a build have the same sets
+_POOL_SIZE = 200  # number of lightings among which anchors are chosen
 _EXTRA_ANCHORS = 8  # number of anchors besides the filmed lightings
 _MARGIN = 1.25  # a lighting is in a set if the other's nearest anchor is more than this many times as far as its own
 _MAX_TRIES = 60  # largest number of proposals per sample; about one in ten is near the chosen anchor
@@ -95,10 +95,10 @@ class LightingSets:
 
     The distance of two lightings is the rms difference of the colors that they give to the field's *probes* (rays with
     stored features, see `nerf/appearance_prior.py`). The first anchors are the filmed lightings; they belong to the
-    training set. More are chosen one by one from random lightings of a fixed seed, each as far as possible from all
-    anchors before it. Every second one of these, from the first on, belongs to the held-out set. A lighting belongs to
-    the set of its nearest anchor, or to no set if an anchor of the other set is nearly as near. All anchors of a set
-    are sampled equally often; otherwise a lighting unlike all others, such as night, would be rare.
+    training set. More are chosen one by one from random ones of a fixed seed, each as far as possible from all anchors
+    before it. Every second one of these, from the first on, belongs to the held-out set. A lighting belongs to the set
+    of its nearest anchor, or to no set if an anchor of the other set is nearly as near. All anchors of a set are
+    sampled equally often; otherwise a lighting unlike all others, such as night, would be rare.
     """
 
     def __init__(self, field: BakedField) -> None:
