@@ -76,7 +76,7 @@ def test_missing_task_lists_those_that_exist():
     with pytest.raises(InputError, match=r"'right_turn': .*no such segment of 60 m; there are .*straight \(30.0 m"):
         find_task("right_turn", world)
     short = route_world((17.0, 0.0))
-    with pytest.raises(InputError, match=r"the longest is 17.0 m from 0.0 m; there are route"):
+    with pytest.raises(InputError, match=r"the longest is 17.0 m long and starts at 0.0 m; there are route"):
         find_task("straight", short)
     assert find_task("straight", route_world((29.0, 0.0))).length == pytest.approx(29.0, abs=0.01)
 

@@ -11,7 +11,7 @@ from twin.types import Array, Array32
 _VIBRATION_TIME = 0.05  # [s] correlation time of the vibration
 _DRIFT_TIME = 5.0  # [s] correlation time of the exposure
 _MAX_SHUTTER = 0.5  # the shutter is open for at most this fraction of the time between two pictures
-_KNEE = 0.75  # colors above this value are compressed so that none exceeds 1
+_KNEE = 0.75  # colors above this value are compressed to at most 1
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,11 @@ class CameraOptions:
     shutter: float = 0.0
     """Time for which the shutter is open [s]."""
     blur_samples: int = 5
-    """Number of pictures that are averaged for motion blur."""
+    """Number of shifted pictures that are averaged for motion blur."""
 
 
 class CameraNoise:
-    """Imperfections of one camera in one episode; the same seed and the same times give the same result."""
+    """Imperfections of one camera in one episode; same seed and times give the same result."""
 
     def __init__(self, options: CameraOptions, rng: np.random.Generator):
         self._options, self._rng = options, rng
@@ -38,9 +38,9 @@ class CameraNoise:
         self._last: tuple[float, Array] | None = None
 
     def perturb_pose(self, camera_to_world: Array, time: float) -> Array:
-        """Returns a pose with vibration added, shape (4, 4).
+        """Returns the camera's pose with vibration added, shape (4, 4), and updates the exposure for `apply`.
 
-        `time` is the time of the episode [s]; it must not decrease from one call to the next.
+        `time` is the time of the episode [s]; it must not decrease between calls.
         """
         step = np.inf if self._time is None else max(time - self._time, 0.0)
         self._time = time
@@ -79,7 +79,7 @@ class CameraNoise:
 def motion_blur(
     rgb: Array32, depth: Array32, pose: Array, before: Array, share: float, rays: Array, intrinsics: Array, samples: int
 ) -> Array32:
-    """Returns a picture with motion blur: the mean over the camera's motion while the shutter is open.
+    """Returns a picture with motion blur: the mean of copies shifted by the camera's motion while the shutter is open.
 
     The shutter is open during the last fraction `share` of the motion from `before` to `pose`. The world is assumed to
     be static. Shapes and units as in `CameraNoise.apply`.
@@ -93,13 +93,13 @@ def motion_blur(
     flow = np.where(points[..., 2:] > 0.0, there - here, 0.0)
     out = np.zeros_like(rgb)
     for back in np.linspace(0.0, share, samples):
-        # In OpenCV, the center of the first pixel has the coordinate 0.
+        # In OpenCV, the center of the first pixel has the coordinate 0; here, 0.5.
         at = (here + back * flow - 0.5).astype(np.float32)
         out += cv2.remap(rgb, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return out / np.float32(samples)
 
 
 def soft_clip(rgb: Array32) -> Array32:
-    """Returns colors of at most 1: values above `_KNEE` are compressed smoothly instead of clipped."""
+    """Returns colors of at most 1: values above `_KNEE` are compressed smoothly, not clipped."""
     over = np.maximum(rgb - _KNEE, 0.0)
     return np.minimum(rgb, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))

@@ -1,6 +1,6 @@
 """Compositor: draws obstacles, other robots and the robot's own body into renderings of a radiance field.
 
-Objects are shaded with the irradiance estimated from the field, and obstacles throw contact shadows. In pixels that an
+Objects are shaded with the irradiance estimated from the field, and obstacles cast contact shadows. In pixels that an
 object covers, the field is rendered a second time, only up to the object's depth. The object is blended with this
 foreground by the foreground's opacity, so that leaves in front of an object hide it.
 """
@@ -34,37 +34,37 @@ from twin.warp_runtime import wp
 # ---- objects
 
 _NEAR_PLANE = 0.02  # [m] geoms whose z-depth is smaller than this everywhere are not drawn
-_SMALL_MASK = 800  # [px] masks up to this size are supersampled in every pixel: finding edges would take longer
-_SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] offsets of the samples at edges
+_SMALL_MASK = 800  # [px] if objects may cover at most this many, each gets four rays: finding edges would take longer
+_SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] offsets of a pixel's four rays
 
 
 @dataclass(frozen=True)
 class RenderedObjects:
-    """Objects in a rectangular window of the picture; arrays (height, width), `rgb` (height, width, 3)."""
+    """Objects in a rectangular window of the picture; arrays have the window's height and width."""
 
     window: tuple[int, int, int, int]
     """Left, top, width, height [px]."""
     coverage: Array32
-    """Fraction of a pixel that objects cover."""
+    """Fraction of each pixel that objects cover."""
     rgb: Array32
     """Shaded color; 0 where no object covers the pixel."""
     depth: Array32
-    """z-depth of the covered part [m]; 0 where no object covers the pixel."""
+    """Mean z-depth of the objects in the pixel [m]; 0 where no object covers the pixel."""
 
 
 class ObjectRenderer:
     """Draws obstacles and robots of one model, one env at a time. Not thread-safe.
 
     It casts rays into a second model, which has only the geoms of obstacles and robots. There is one ray in each pixel
-    that a geom's bounding box may cover; pixels at edges have four, for smooth outlines. The second model's lights give
-    surfaces a color that encodes their normal. An object's shaded color is its own color times the irradiance for its
-    normal.
+    that a geom's bounding box may cover; pixels at outlines of geoms have four, so that outlines are smooth. The second
+    model's lights give surfaces a color that encodes their normal. An object's shaded color is its own color times the
+    irradiance for its normal.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: int, size: tuple[int, int]):
         """
         Args:
-            model: Its geoms in the obstacles' group and in the robot's visual group are drawn.
+            model: Its geoms in the obstacles' and the robot's visual group are drawn, except for the camera's housing.
             camera: Index of the camera in the model.
             size: Width, height of the picture [px].
         """
@@ -138,7 +138,7 @@ class ObjectRenderer:
     def render(
         self, data: mujoco.MjData, pose: Array, mask: NDArray[np.bool_], irradiance: Irradiance | None
     ) -> RenderedObjects | None:
-        """Draws the pixels of a mask from `visible_mask`; None if no geom covers them.
+        """Draws the geoms in the pixels of a mask from `visible_mask`; returns None if no geom covers any of them.
 
         Objects are shaded with `irradiance`; if it is None, they have their own, unshaded colors.
         """
@@ -183,7 +183,7 @@ class ObjectRenderer:
         return mujoco_rays(unproject(pixels, self._intrinsics))
 
     def _cast(self, rays: Array32) -> tuple[NDArray[np.int32], Array32, Array32]:
-        """Casts rays (n, 3); returns the drawn geom that each hits (−1: none), the unit normal and the z-depth [m]."""
+        """Casts rays (n, 3); returns the indices in `geoms` of the geoms hit (−1: none), normals and z-depths [m]."""
         count, most = len(rays), self._caster.max_rays
         if count > most:  # more rays than fit into one cast
             parts = [self._cast(rays[k : k + most]) for k in range(0, count, most)]
@@ -198,7 +198,7 @@ class ObjectRenderer:
     def _shader(
         self, data: mujoco.MjData, irradiance: Irradiance | None
     ) -> Callable[[NDArray[np.int32], Array32], Array32]:
-        """Returns a function that converts drawn geoms (n,) and normals (n, 3) to colors (n, 3), 0 for geom −1."""
+        """Returns a function that converts indices in `geoms` (n,) and normals (n, 3) to colors (n, 3), 0 for −1."""
         ground = irradiance.ground(data.xpos[self._bodies, :2]) if irradiance else None
 
         def shade(geom: NDArray[np.int32], normals: Array32) -> Array32:
@@ -262,7 +262,7 @@ def _copy_mesh(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: int) -> None:
 def _mesh_frames(small: mujoco.MjModel) -> tuple[Array, Array]:
     """Positions (n, 3) and rotations (n, 3, 3) of geoms in the frames of their meshes before compilation.
 
-    The frames differ because the compiler moves a mesh to its inertial frame.
+    These offsets are not zero, since the compiler moves a mesh to its inertial frame.
     """
     turns = np.empty((small.ngeom, 9))
     for i in range(small.ngeom):
@@ -285,7 +285,7 @@ def _edge_mask(ids: NDArray[np.int32]) -> NDArray[np.bool_]:
 
 Lighting = str | NDArray
 
-_WINDOW_STEP = 32  # [px] sides of foreground windows are multiples of this, so that few sizes occur
+_WINDOW_STEP = 32  # [px] sides of windows with a foreground are multiples of this, so that few sizes occur
 _MAX_WINDOWS = 16  # number of window sizes whose render targets are kept; pictures of 160×90 px need at most 15
 
 
@@ -303,17 +303,18 @@ class Compositor:
     ):
         """
         Args:
-            model: A model with this camera, to whose spec `add_obstacles` added obstacles, or at least the route.
+            model: Contains the camera, and the route that `add_obstacles` stores even if there are no obstacles.
             field: Radiance field of the place.
             size: Width, height of the pictures [px].
-            max_envs: Largest number of envs per call.
+            max_envs: Largest number of envs per call of `render`.
             shaded: False draws obstacles in their own, unshaded colors, for comparison.
             camera: Name of the camera.
         """
         self.size, self.max_envs, self._field = size, max_envs, field
         self._camera = model.camera(camera).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
-        # Warp's default device is global to the process, and worker threads change it.
+        # Warp's default device is global to the process. Workers set it to the CPU and restore it, which is safe in
+        # parallel only if it is always the CPU.
         wp.set_device("cpu")
         count = min(max_envs, available_cores()) if field.device == "cpu" else 1
         # On a GPU there is one worker, since all threads would share one CUDA stream. Workers are created one after the
@@ -417,7 +418,7 @@ class _CompositorWorker:
         self._fields: OrderedDict[tuple[int, int], BakedField] = OrderedDict()
 
     def foreground(self, pose: Array, drawn: RenderedObjects, lighting: Lighting) -> Rendering:
-        """The part of the field in front of the drawn objects: arrays (height, width) for the objects' window."""
+        """Renders the part of the field in front of the drawn objects, in the objects' window."""
         left, top, width, height = drawn.window
         across, down = (-(-n // _WINDOW_STEP) * _WINDOW_STEP for n in (width, height))
         stop = np.zeros((1, down, across), np.float32)
@@ -441,7 +442,7 @@ def composite(out: Rendering, inner: tuple, drawn: RenderedObjects, front: Rende
         out: Rendering of the field alone.
         inner: Index that selects the window in the arrays of `out`.
         drawn: Objects in the window.
-        front: The field up to `drawn.depth`, arrays (height, width); its colors are not multiplied by its opacity.
+        front: The field up to `drawn.depth` in the window; its colors are not premultiplied by its opacity.
     """
     cover = drawn.coverage[..., None]
     held = front.opacity[..., None]

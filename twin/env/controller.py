@@ -1,11 +1,11 @@
-"""The Husky's wheel controller: turns commands into wheel speeds, for one robot or for many at once.
+"""The Husky's wheel controller: turns commands into wheel speeds, for one robot or many.
 
-A *command* is forward speed v [m/s] and yaw rate ω [rad/s]. A command arrives `command_latency` after it was given.
-The controller runs periodically, by default at 10 Hz, and uses the newest command that has arrived. If this command is
-older than the time-out, by default 0.25 s, the controller stops the robot (see `twin.robot.CONTROLLERS`). The
-controller limits v and ω, and then their changes per period. It converts them to the speeds of the left and right
-wheels, and scales both down if one exceeds `max_wheel_speed`. This reproduces Clearpath's controller: ROS's
-diff_drive_controller with its speed limiter, followed by the limit of husky_hardware.
+A *command* is forward speed v [m/s] and yaw rate ω [rad/s]. It reaches the controller `command_latency` after it was
+given. The controller runs periodically, by default at 10 Hz, and uses the newest command that has arrived. If this
+command arrived longer ago than the time-out, by default 0.25 s, the controller stops the robot (see
+`twin.robot.CONTROLLERS`). The controller limits v and ω, and then their changes per period. It converts v and ω to the
+speeds of the left and right wheels, and scales both down if one exceeds `max_wheel_speed`. This reproduces Clearpath's
+controller: ROS's diff_drive_controller with its speed limiter, followed by husky_hardware's limit of wheel speed.
 """
 
 from collections import deque
@@ -28,7 +28,7 @@ _TIME_TOLERANCE = 1e-9  # [s] times that differ by less count as equal
 
 
 def limit_command(command: Array, previous: Array, params: HuskyParams, period: float = CONTROL_PERIOD) -> Array:
-    """Returns commands after the limits of speed and acceleration, shape (..., 2).
+    """Returns commands limited in speed and acceleration, shape (..., 2).
 
     `previous` are the limited commands one `period` [s] ago, shape (..., 2).
     """
@@ -38,7 +38,7 @@ def limit_command(command: Array, previous: Array, params: HuskyParams, period: 
 
 
 def limit_change(wanted: Array, previous: Array, step: Array) -> Array:
-    """Returns the values nearest to `wanted` that differ from the previous ones by at most `step`."""
+    """Returns the values nearest to `wanted` that differ from `previous` by at most `step`."""
     return np.clip(wanted, previous - step, previous + step)
 
 
@@ -76,7 +76,7 @@ class Controller:
 
     @property
     def limited_command(self) -> Array:
-        """v [m/s], ω [rad/s] after the limits, shape (2,)."""
+        """Command of the last update after the limits: v [m/s], ω [rad/s], shape (2,)."""
         return self._limited.copy()
 
     def command(self, time: float, v: float, yaw_rate: float) -> None:
@@ -109,15 +109,15 @@ class SubstepSchedules:
     speeds: Array
     """Speeds of the left and right wheels in each segment [rad/s], shape (p, n, 2)."""
     times: Array
-    """End of each segment [s], infinite for unused ones, shape (p, n)."""
+    """Time at the end of each segment [s], infinite for unused segments, shape (p, n)."""
     segment: Int32Array
-    """Segment of each substep, shape (steps, n)."""
+    """Index of the segment that contains each substep, shape (steps, n)."""
     checks: Int32Array
     """1 where a substep ends a segment, else 0, shape (steps, n)."""
 
 
 class VectorController:
-    """Controllers of n robots that differ only in `command_latency`; results are those of `HuskyPhysics.schedule`."""
+    """Controllers of n robots that differ only in `command_latency`; results equal those of `HuskyPhysics.schedule`."""
 
     def __init__(self, params: HuskyParams, count: int, period: float, timestep: float, check_steps: int) -> None:
         """
@@ -140,7 +140,7 @@ class VectorController:
         self._limited, self._speeds = np.zeros((count, 2)), np.zeros((count, 2))
 
     def begin(self, which: NDArray[np.int64], latency: Array, steps_to_update: NDArray[np.int64]) -> None:
-        """Resets k robots to rest, without pending commands.
+        """Resets the k robots `which` to rest, without pending commands.
 
         `latency` (k,) is their `command_latency` [s], `steps_to_update` (k,) the substeps until their first update.
         """
@@ -153,7 +153,7 @@ class VectorController:
         self._arrivals[:, which], self._limited[which], self._speeds[which] = -np.inf, 0.0, 0.0
 
     def schedules(self, which: NDArray[np.int64], commands: Array) -> SubstepSchedules:
-        """Gives commands to k robots and runs their controllers for one control step.
+        """Gives commands to the k robots `which` and runs their controllers for one control step.
 
         The commands are v [m/s] and ω [rad/s], shape (k, 2). The time of the other robots does not advance;
         their schedules are undefined.
@@ -163,7 +163,8 @@ class VectorController:
             ring[-1, which] = new
         n = len(self.time)
         speeds, times = np.zeros((self.max_segments, n, 2)), np.full((self.max_segments, n), np.inf)
-        checks = np.zeros((self._steps + 1, n), np.int32)  # row k + 1: substep k; its cumulative sum is the segment
+        # Row i + 1 is 1 where substep i ends a segment. So rows 0 to i add up to the index of substep i's segment.
+        checks = np.zeros((self._steps + 1, n), np.int32)
         left = np.zeros(n, int)
         left[which] = self._steps
         robots = np.arange(n)
@@ -182,7 +183,7 @@ class VectorController:
         return SubstepSchedules(speeds, times, np.cumsum(checks[:-1], 0, dtype=np.int32), checks[1:])
 
     def _update(self, which: NDArray[np.int64]) -> Array:
-        """Runs one update and returns the speeds of the left and right wheels [rad/s], shape (k, 2)."""
+        """See `Controller.update`; shape (k, 2)."""
         time, arrivals = self.time[which], self._arrivals[:, which]
         newest = len(arrivals) - 1 - np.argmax((arrivals <= time + _TIME_TOLERANCE)[::-1], axis=0)
         arrived = np.take_along_axis(arrivals, newest[None], 0)[0]

@@ -27,7 +27,7 @@ PAYLOAD = "payload"
 """Name of a body on the top plate; its mass is zero until an episode sets a payload."""
 
 VERSION = 4
-"""Version of a sample's effects. Raise it if the same sample gives other fog, relighting, shadows or distractors."""
+"""Version of a sample's effects. Increase it whenever a change of the code gives the same sample other pictures."""
 
 KNOWN_WEATHER_FRACTION = 0.6
 """When a photo of the day is available, the strengths of sun and shadows are multiplied by this fraction.
@@ -35,12 +35,13 @@ KNOWN_WEATHER_FRACTION = 0.6
 It was tuned with `benchmarks/day.py` in the simulated world of `twin.reality`, where true pictures of each day are
 available. The benchmark renders the twin with a photo's appearance and fog. It compares two changes of a policy's
 steering: (a) from these renderings to the true pictures of the day; (b) from these renderings to ones with sampled sun
-and shadows. The ratio of (a) to (b), with 90 % intervals over policies and days, is 0.8 (0.6 to 0.96) for the full
-randomization. With this fraction it is 1.1 (0.8 to 1.4) for the part of the change that is constant over a day, and 1.2
-(1.0 to 1.4) for the part that varies along the route.
+and shadows. At a ratio (a) / (b) of 1, the sampled weather changes the steering as much as the day does. The ratio,
+with 90 % intervals over policies and days, is 0.8 (0.6 to 0.96) for the full randomization. With this fraction it is
+1.1 (0.8 to 1.4) for the part of the change that is constant over a day, and 1.2 (1.0 to 1.4) for the part that varies
+along the route.
 
-The policies are the twelve finished ones of Table 1 in docs/benchmarks.md; the days are ten of its twenty days: the
-five stated weathers and days 1 to 5. So a forecast for these policies and days is not independent of this value."""
+The policies are the twelve finished ones of Table 1 in docs/benchmarks.md; the days are ten of its twenty: the five
+designed weathers and days 1 to 5. So a forecast for these policies and days is not independent of this value."""
 
 _PAYLOAD_SIDE = 0.3  # [m] the payload has the inertia of a cube with this side
 _TIRE_SUFFIX = "_tyre"
@@ -77,7 +78,7 @@ class Ranges:
     payload: Range = (0.0, 20.0)
     """Mass on the top plate [kg]."""
     latency: Range = (0.0, 0.1)
-    """Delay until a command takes effect, added to the robot's own [s]."""
+    """Delay of commands, in addition to the robot's own `command_latency` [s]."""
     camera_shift: Range = (-0.02, 0.02)
     """Translation of the front camera along each of its axes [m]."""
     camera_turn: Range = (-1.0, 1.0)
@@ -85,20 +86,20 @@ class Ranges:
     wheel_radius: Range = (0.98, 1.02)
     """Factor by which the robot's own wheel radius is multiplied; the controller always uses the nominal radius."""
     wheel_difference: Range = (-0.006, 0.006)
-    """Right minus left wheel radius, relative to their mean; it makes a robot that ignores its images drift."""
+    """Right minus left wheel radius, relative to their mean; with a difference, the robot does not drive straight."""
     extinction: Range = (0.0, 0.05)
-    """Extinction of the fog [1/m], added to the film's; 0.05 is a visibility of 60 m."""
+    """Extinction of the fog [1/m], in addition to the film's haze; 0.05 is a visibility of 60 m."""
     airlight: Range = (0.85, 1.15)
     """Ratio of the fog's brightness to that of the sky at the horizon."""
     sunlight: Range = (0.0, 0.7)
-    """Strength of `DirectionalRelighting`."""
+    """Strength of `weather.DirectionalRelighting`."""
     shade: Range = (0.0, 0.75)
-    """Strength of `CastShadows`: fraction of a color lost in full shadow."""
+    """Strength of `weather.CastShadows`: fraction of a color lost in full shadow."""
     bystanders: Range = (0, 4)
     """Number of distractor objects beside the corridor: cones, boxes, bollards in any color."""
     hold_known: bool = False
     """True: measured parameters of the robot are held fixed (see `for_robot`). Under lightings fitted to a photo, the
-    weather is weaker (see `RandomizationSample.for_known_weather`)."""
+    weather is randomized less (see `RandomizationSample.for_known_weather`)."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a value is not a range, or lies outside the allowed bounds."""
@@ -118,14 +119,14 @@ class Ranges:
                 )
 
     def by_name(self) -> dict[str, Range]:
-        """Every range by its name."""
+        """All ranges by name."""
         return {one.name: getattr(self, one.name) for one in fields(self) if one.name != "hold_known"}
 
     def for_robot(self, robot: HuskyParams) -> "Ranges":
         """These ranges for a scene's robot. With `hold_known`, measured parameters are held at the robot's values.
 
         A parameter counts as measured if `robot.toml` or `[robot]` gives a value other than the published one. Real
-        trials use one robot: a success rate over many sampled robots would measure robustness, not that one's success.
+        trials use one robot: a rate over many sampled robots would measure robustness, not the success of that robot.
         """
         if not self.hold_known:
             return self
@@ -135,7 +136,7 @@ class Ranges:
         return replace(self, **held)
 
     def sample(self, rng: np.random.Generator) -> "RandomizationSample":
-        """One episode's values, sampled in the order of the fields."""
+        """Samples one episode's values, in the order of the fields."""
         values: dict[str, Any] = {}
         for name, pair in self.by_name().items():
             if name == "bystanders":
@@ -192,7 +193,7 @@ def condition_options(condition: Condition) -> dict[str, Any]:
 
 
 class NominalModel:
-    """The model's fields without randomization; `apply` writes a sample's randomized fields to a copy of the model."""
+    """Nominal values of the model's randomized fields; `apply` writes a sample's values to a copy of the model."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         """`model` is the compiled `episode_spec`."""

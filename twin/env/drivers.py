@@ -33,13 +33,13 @@ if TYPE_CHECKING:  # not imported at run time: `follow_route` works without dm_c
 
 # ---- pure pursuit
 
-GOAL_RADIUS = 1.0  # [m]
+GOAL_RADIUS = 1.0  # [m] distance from the goal at which it is reached
 
 _LOOKAHEAD = 1.0  # [m] distance along the route to the point that the robot steers to
 _GAIN_RATE = 0.15  # fraction of the gain's error that is corrected per control step
 _GAIN_RANGE = (0.5, 2.5)
 _GAIN_MIN_YAW_RATE = 0.15  # [rad/s]; at smaller yaw rates, the measured ratio is mostly noise
-_SEARCH_WINDOW = (1.0, 3.0)  # [m] the foot is searched this far behind and ahead of the last one
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point is searched this far behind and ahead of the farthest one so far
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ class RecordedDrive:
     cross_track: Array
     """Signed distance from the route, positive to the left [m], shape (k,)."""
     progress: Array
-    """Arc length of the nearest point of the route [m], shape (k,)."""
+    """Arc length of the route's point nearest to the robot [m], shape (k,)."""
     touched: tuple[str, ...]
-    """Sorted names of the touched geoms; the ground is not among them."""
+    """Sorted names of the touched geoms except the ground."""
     outcome: str
     """goal, touched, off_corridor or timeout."""
 
@@ -71,12 +71,12 @@ class RecordedDrive:
 
     @property
     def max_cross_track(self) -> float:
-        """[m]"""
+        """Largest distance from the route [m]."""
         return float(np.abs(self.cross_track).max())
 
     @property
     def mean_cross_track(self) -> float:
-        """[m]"""
+        """Mean distance from the route [m]."""
         return float(np.abs(self.cross_track).mean())
 
 
@@ -90,7 +90,7 @@ def pursuit_curvature(pose: Array, target: Array) -> float:
 class PurePursuit:
     """Converts a sequence of poses to commands that follow the route.
 
-    The *foot* is the point of the route that is nearest to the robot.
+    The *foot* is the point of the route nearest to the robot.
     """
 
     def __init__(self, route: Array, speed: float, max_yaw_rate: float, start: float = 0.0) -> None:
@@ -135,7 +135,7 @@ def follow_route(
         world: Route, goal and corridor.
         physics: Physics of the world's model; it is reset.
         speed: [m/s]; wheels reach at most 1 m/s, so turns are slower.
-        timeout: [s]; None: three times the duration of the route, plus 10 s.
+        timeout: [s]; None: 3 · route length / speed + 10 s.
     """
     speed = min(speed, physics.params.max_speed)
     length = float(arc_lengths(world.route)[-1])
@@ -207,7 +207,7 @@ Policy = Callable[[NDArray[np.uint8]], NDArray]
 
 
 class Driver(Protocol):
-    """Called once per control step; `step.first()` is true at the start of an episode."""
+    """Chooses the action of each control step; `step.first()` is true at the start of an episode."""
 
     def __call__(self, environment: "control.Environment", step: "dm_env.TimeStep") -> Array: ...
 

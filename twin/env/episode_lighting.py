@@ -1,14 +1,14 @@
 """Lighting of an episode: an appearance embedding, which may be sampled. The option `lighting` is one of
 
-    "sun"                a lighting by its name, or that of a frame (`sun/000012`)
+    "sun"                the lighting of this name; `sun/000012`: the lighting of one frame
     "sun:night:0.3"      a mixture: 30 % of the way from sun to night
     ("sun", "night")     one of several lightings or mixtures, sampled for every episode
     "any"                any lighting that could have been filmed, sampled by `field.sample_lighting`
-    "training"           sampled from the training set
+    "training"           sampled from the training set, see `LightingSets`
     "held-out"           sampled from the held-out set
 
-With drift, the lighting of an episode changes gradually into a second lighting, which is sampled in the same way. If
-the option names a single lighting, the second one is another filmed lighting.
+With drift, an episode's lighting changes gradually into a second one, sampled in the same way. If the option names a
+single lighting, the second one is another filmed lighting.
 """
 
 from collections.abc import Sequence
@@ -27,31 +27,31 @@ from twin.nerf.sun import Sunlight, mixed_sunlight
 from twin.types import Array32
 
 VERSION = 2
-"""Version of the sampling from a set. Raise it if a change gives other lightings for the same random generator."""
+"""Version of `LightingSets.sample`. Increase it whenever a change of the code gives a seed other lightings."""
 
-_SEED = 20_240_315  # random seed of the anchors; constant, so that all runs with a build have the same sets
-_POOL_SIZE = 200  # random lightings among which anchors are chosen
+_SEED = 20_240_315  # fixed random seed of `Anchors`: all runs with a build have the same sets
+_POOL_SIZE = 200  # number of lightings among which anchors are chosen
 _EXTRA_ANCHORS = 8  # number of anchors besides the filmed lightings
-_MARGIN = 1.25  # a lighting belongs to a set if the other set's nearest anchor is this many times farther than its own
-_MAX_TRIES = 60  # proposals per sample; about one in ten is near the chosen anchor
+_MARGIN = 1.25  # a lighting is in a set if the other's nearest anchor is more than this many times as far as its own
+_MAX_TRIES = 60  # largest number of proposals per sample; about one in ten is near the chosen anchor
 
 
 @dataclass(frozen=True)
 class EpisodeLighting:
-    """Lighting of one episode: an appearance embedding with its fog, or a drift between two."""
+    """Lighting of one episode: an appearance embedding with its fog and suns, or a drift from one to another."""
 
     name: str
-    """Name of the lighting or of its set; `<name> → <name>` with drift; the option `observe` without a field."""
+    """Name of the lighting or its set, `<name> → <name>` with drift; without a field, the option `observe`."""
     start: Array32
     """Embedding at the beginning, shape (dim,)."""
     end: Array32 | None = None
-    """Embedding after `duration`; None: constant."""
+    """Embedding after `duration`; None: no drift."""
     duration: float = 0.0
     """[s]"""
     fog: Fog | None = None
-    """Fog at the beginning, if fitted to a photo; None: the film's."""
+    """Fog at the beginning, if fitted to a photo; None: no fog beyond the film's haze."""
     end_fog: Fog | None = None
-    """Fog after `duration`, if fitted to a photo; None: the film's."""
+    """Fog after `duration`; None as for `fog`."""
     sunlight: Sunlight = ()
     """Suns at the beginning; empty: the light of the film."""
     end_sunlight: Sunlight = ()
@@ -65,7 +65,7 @@ class EpisodeLighting:
         return ((1.0 - share) * self.start + share * self.end).astype(np.float32)
 
     def fog_at(self, time: float) -> Fog | None:
-        """The fog after `time` [s]; None: the film's."""
+        """The fog after `time` [s]; None as for `fog`."""
         return self.fog if self.end is None else mixed(self.fog, self.end_fog, self._share(time))
 
     def sunlight_at(self, time: float) -> Sunlight:
@@ -85,7 +85,7 @@ class Anchors:
     embeddings: Array32
     """Shape (k, dim)."""
     probe_colors: Array32
-    """Shape (k, 3·probes)."""
+    """Colors of the field's probes under each lighting, shape (k, 3·probes)."""
     held_out: NDArray[np.bool_]
     """True for anchors of the held-out set, shape (k,)."""
 
@@ -93,22 +93,22 @@ class Anchors:
 class LightingSets:
     """Training and held-out lightings of one field: disjoint sets, which are the same for all seeds.
 
-    The distance of two lightings is the rms difference of the probes' colors (see `nerf/appearance_prior.py`). The
-    first anchors are the filmed lightings; they belong to the training set. Further anchors are chosen one by one from
-    random lightings of a fixed seed: each is as far as possible from all anchors before it. Every second one of these,
-    from the first on, belongs to the held-out set. A lighting belongs to the set of its nearest anchor, or to no set if
-    an anchor of the other set is nearly as near. All anchors of a set are sampled equally often; otherwise night would
-    be rare.
+    The distance of two lightings is the rms difference of the colors that they give to the field's *probes* (rays with
+    stored features, see `nerf/appearance_prior.py`). The first anchors are the filmed lightings; they belong to the
+    training set. More are chosen one by one from random lightings of a fixed seed, each as far as possible from all
+    anchors before it. Every second one of these, from the first on, belongs to the held-out set. A lighting belongs to
+    the set of its nearest anchor, or to no set if an anchor of the other set is nearly as near. All anchors of a set
+    are sampled equally often; otherwise a lighting unlike all others, such as night, would be rare.
     """
 
     def __init__(self, field: BakedField) -> None:
         self.field = field
-        # Photos added later must not move the sets: a lighting used for training could become held out.
+        # If photos added later moved the sets, a lighting used for training could become held out.
         self._filmed = field.lightings_by_name.filmed()
 
     @cached_property
     def anchors(self) -> Anchors:
-        """The anchors of both sets. Raises InputError: the field has no probes, so lightings cannot be compared."""
+        """Anchors of both sets. Raises InputError: the field has no probes, so lightings cannot be compared."""
         filmed = list(self._filmed.vectors)
         rng = np.random.default_rng(_SEED)
         pool = [self._filmed.sample(rng) for _ in range(_POOL_SIZE)]
@@ -132,7 +132,7 @@ class LightingSets:
         own = np.flatnonzero(self.anchors.held_out == (which == HELD_OUT))
         anchor = int(rng.choice(own))
         prior = self._filmed.prior
-        # If no sample is near the anchor, for example at the edge of the filmed lightings, the anchor itself is used.
+        # If no proposal is near the anchor, for example at the edge of the filmed lightings, the anchor itself is used.
         for embedding in chain((prior.propose(rng) for _ in range(_MAX_TRIES)), [self.anchors.embeddings[anchor]]):
             # Most proposals are plausible, but few are near the anchor, so nearness is tested first.
             if self.set_and_anchor(embedding) == (which, anchor) and not prior.violations(embedding):
@@ -171,10 +171,8 @@ def sample_lighting(
 ) -> EpisodeLighting:
     """Samples the lighting of an episode. With `drift`, it changes during `duration` [s].
 
-    A single named lighting drifts into another filmed lighting.
-
     Raises:
-        InputError: a lighting is unknown, or none is found.
+        InputError: a lighting is unknown, a set has no lighting, or there is no second lighting for the drift.
     """
     name, start, fog, suns = _sample_one(lighting, sets, rng)
     if not drift:

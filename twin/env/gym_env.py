@@ -7,14 +7,14 @@ The prefix `twin:` makes Gymnasium import `twin`, which registers the environmen
 as those of stable-baselines3's SubprocVecEnv.
 
 Actions in [-1, 1] span the action range of the dm_control environment. Observations are images: uint8, shape
-(3 · stack, height, width), the newest three channels last. With `pixels=False`, they are the privileged state of
-`RewardAndTermination.state`: float32, clipped to the bounds of the observation space. With the option `state`, they are
-a dict of images (`pixels`) and numbers (`state`).
+(3 · stack, height, width), the newest three channels last. With `pixels=False`, an observation is the privileged state
+of `RewardAndTermination.state`: float32, clipped to the bounds of the observation space. With the option `state`,
+observations are a dict of images (`pixels`) and numbers (`state`).
 
 `info` contains `cause` (why the episode ended; empty before its end), `is_success`, `progress` [m], `start` [m] (offset
-of the start along the route segment), `cross_track` [m], `lighting`, `trust`, `randomisation`, `episode_seed`, `speed`
-[m/s] and `touched`. `lighting` is the name of the episode's lighting. A sampled one has the name of its set and the
-nearest mixture of filmed lightings: `training: sun 0.62, night 0.38`.
+of the start along the route segment), `cross_track` [m], `speed` [m/s], `touched`, `randomisation`, `episode_seed` and,
+with images, `trust` and `lighting`. `lighting` is the name of the episode's lighting; for a sampled lighting, it is the
+name of the set and the nearest mixture of filmed lightings: `training: sun 0.62, night 0.38`.
 """
 
 from collections.abc import Sequence

@@ -8,10 +8,11 @@ divided by an assumed albedo.
 The irradiance for other normals is fitted to *upright probes*: points of the field on surfaces that rise above the
 ground. A probe's color is divided by its mean color over the field's lightings, which cancels its albedo. The mean
 lighting is assumed to be a uniform sky over dim ground. The light from each direction of `SIDE_DIRECTIONS` has two
-parts: one is proportional to the local ground irradiance, like that of the sun or a lamp; the other is the same
-everywhere, like that of the sky.
+parts: one is proportional to the local ground irradiance, like light from the sun or a lamp; the other is the same
+everywhere, like light from the sky.
 
-The estimator stores the probes' composited features; from them, any embedding gives their colors in a millisecond.
+The estimator stores the probes' composited features. From these, the color network computes the probes' colors under
+any embedding in a millisecond.
 """
 
 import threading
@@ -36,22 +37,22 @@ from twin.types import Array
 GROUND_ALBEDO = 0.37
 """Assumed color of the ground along the route under irradiance 1: worn asphalt reflects about 11 % of the light, which
 the tone curve of a film (exponent 1 / 2.2) shows as 0.37. With 0.38 (12 %), obstacles at night missed the threshold of
-`benchmarks/overlay.py` (6 dB better than unshaded). So that benchmark is no independent test of this value."""
+`benchmarks/overlay.py` (PSNR 6 dB above unshaded obstacles), so that benchmark does not test 0.37 independently."""
 
 SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-"""Horizontal directions from which the estimated light comes, shape (4, 3)."""
+"""Horizontal directions for which the incoming light is estimated, shape (4, 3)."""
 
 _CAMERA_HEIGHT, _CAMERA_PITCH = 1.0, 8.0  # [m], [°] height and downward pitch of the views from which probes are taken
 _CAMERA_STEP = 2.0  # [m] distance along the route between two views
 _VIEW_SIZE, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
 _MAX_GROUND_DEPTH, _MAX_DEPTH = 7.0, 12.0  # [m] largest z-depth of ground probes and of all probes
-_GROUND_TOLERANCE = 0.12  # [m] largest height of ground probes above or below the route, plus 5 % of the distance to it
-_MIN_UPRIGHT_HEIGHT = 0.3  # [m] only probes at more than this height above the ground count as upright
+_GROUND_TOLERANCE = 0.12  # [m] + 5 % of the distance from the route: largest height of ground probes above or below it
+_MIN_UPRIGHT_HEIGHT = 0.3  # [m] only probes more than this above the route's height count as upright
 _MAX_GROUND_PROBES, _MAX_UPRIGHT_PROBES = 3000, 1500
 _KERNEL_STD = 1.5  # [m] standard deviation of the Gaussian weights of ground probes around a position
-_BOUNCE = 0.25  # ratio of the ground's radiosity to the sky's, in the mean of the field's lightings
-_UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under a uniform sky; that of the ground is 1
-_MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # limits of the sun's share of light and of its elevation's cotangent
+_BOUNCE = 0.25  # assumed ratio of the ground's radiance to the sky's in the mean of the field's lightings
+_UPRIGHT_SKY = 0.5 * (1.0 + _BOUNCE)  # irradiance of upright surfaces under the uniform sky that gives level ground 1
+_MAX_SUN_SHARE, _MAX_SUN_COTANGENT = 0.8, 3.0  # upper limits of the sun's share of the light and of cot(elevation)
 _MIN_COLOR = 0.02  # a probe whose mean color is darker is not used
 _MAX_BRIGHTNESS = 1.5  # probes above this multiple of the highest ground irradiance count as lamps and are not used
 _NEIGHBORS = 8  # number of ground probes that give the ground irradiance at an upright probe
@@ -68,15 +69,15 @@ class Irradiance:
     up: Array
     """Ground irradiance at these positions, shape (k, 3)."""
     constant: Array
-    """Constant light on surfaces that do not face up, shape (5, 3): undirected, then from each of `SIDE_DIRECTIONS`."""
+    """The light's part that is the same everywhere, shape (5, 3): undirected, then from each of `SIDE_DIRECTIONS`."""
     proportional: Array
-    """Ratio of the proportional light to the ground irradiance, shape (5, 3); rows as in `constant`."""
+    """The part that is proportional to the ground irradiance, divided by it, shape (5, 3); rows as in `constant`."""
     known_sun: Array | None = None
     """Direction to the sun, shape (3,), if the lighting has one; None: `sun` estimates it."""
     sun_share: Array | None = None
-    """Share of the light at `xy` that comes from the known sun, shape (k,)."""
+    """The known sun's share of the ground irradiance at `xy`, shape (k,)."""
     _cache: dict[tuple[float, float], Array] = field(default_factory=dict, repr=False, compare=False)
-    """Ground irradiance by position: most objects stand still, so positions recur."""
+    """Ground irradiance by position. Most objects stand still, so positions recur."""
 
     def ground(self, xy: Array) -> Array:
         """Ground irradiance at positions (n, 2) [m], shape (n, 3)."""
@@ -86,7 +87,7 @@ class Irradiance:
         found = self._cache.get((x, y))
         if found is None:
             distance2 = (self.xy[:, 0] - x) ** 2 + (self.xy[:, 1] - y) ** 2
-            # Far from all probes the second term selects the nearest ones.
+            # Far from all probes, the second term selects the nearest ones.
             weight = np.exp(-0.5 * distance2 / _KERNEL_STD**2) + 1e-6 / (1.0 + distance2**2)
             found = weight @ self.up / weight.sum()
             if len(self._cache) >= _POSITIONS_CACHED:
@@ -95,18 +96,18 @@ class Irradiance:
         return found
 
     def irradiance(self, ground: Array, normals: Array) -> Array:
-        """Irradiance, shape (n, 3), of unit normals (n, 3) at places with the ground irradiance `ground` (n, 3)."""
+        """Irradiance, shape (n, 3), for unit normals (n, 3) at places with the ground irradiance `ground` (n, 3)."""
         basis = _basis(normals)
         up = np.maximum(normals[:, 2:], 0.0)
         return up * ground + basis @ self.constant + (basis @ self.proportional) * ground
 
     def sun(self, xy: Array) -> tuple[float, Array]:
-        """The sun's share of the light at a position (2,), and the direction to the sun, shape (3,).
+        """The sun's share of the ground irradiance at a position (2,), and the direction to the sun, shape (3,).
 
         Sky and sun both contribute to the ground irradiance and to the irradiance of upright surfaces. Averaged over
-        all azimuths, an upright surface gets `_UPRIGHT_SKY` times the sky's contribution to the ground, and cot e / π
-        times that of a sun at elevation e. Only the sun lights one side more than the opposite side: by cot e times its
-        contribution to the ground. So the light on upright surfaces gives both the sun's share and e.
+        all azimuths, an upright surface gets `_UPRIGHT_SKY` times what the ground gets from the sky, and cot e / π
+        times what the ground gets from a sun at elevation e. Only the sun lights one side more than the opposite side:
+        by cot e times what the ground gets from it. So the light on upright surfaces gives both the sun's share and e.
         """
         if self.known_sun is not None and self.sun_share is not None:
             nearest = int(((self.xy - xy) ** 2).sum(1).argmin())
@@ -125,7 +126,7 @@ class Irradiance:
 def _basis(normals: Array) -> Array:
     """Weights, shape (n, 5), of the rows of `Irradiance.constant` for normals (n, 3).
 
-    The first is one minus the normal's upward part; the others are its clipped cosines to `SIDE_DIRECTIONS`.
+    For a normal n, the first weight is 1 − max(0, n_z); the others are max(0, n · d) for each d of `SIDE_DIRECTIONS`.
     """
     return np.column_stack([1.0 - np.maximum(normals[:, 2], 0.0), np.maximum(normals @ SIDE_DIRECTIONS.T, 0.0)])
 
@@ -168,7 +169,7 @@ class IrradianceEstimator:
         self._rows = _basis(self._upright.normals)
 
     def estimate(self, lighting: str | NDArray, sunlight: Sunlight = ()) -> Irradiance:
-        """The irradiance of a lighting, by name or embedding (dim,), in sunlight. Recent estimates are cached."""
+        """The irradiance of a lighting, by name or embedding (dim,), and its suns. Recent estimates are cached."""
         embedding = self._field.embedding(lighting) if isinstance(lighting, str) else np.asarray(lighting, np.float32)
         key = embedding.tobytes(), sunlight
         with self._lock:
@@ -202,14 +203,14 @@ class IrradianceEstimator:
         for c in range(3):
             usable = (self._mean[:, c] > _MIN_COLOR) & (seen[:, c] < _MAX_BRIGHTNESS * up[:, c].max())
             rows = np.concatenate([self._rows, self._rows * ground[:, c : c + 1]], 1)[usable]
-            # The Cholesky factor of the normal equations replaces the many rows; the minimum stays the same.
+            # For speed, the Cholesky factor of the normal equations replaces the rows; the minimum stays the same.
             square = np.linalg.cholesky(rows.T @ rows + 1e-6 * len(rows) * np.eye(10))
             found[:, c], _ = nnls(square.T, np.linalg.solve(square, rows.T @ sides[usable, c]))
         return Irradiance(self._xy, up, found[:5], found[5:], *known)
 
 
 def _gains(sunlight: Sunlight, points: Array, normals: Array) -> tuple[Array, Array]:
-    """Gain of sunlight at points (n, 3) [m] with normals (n, 3), shape (n, 3), and the suns' share of it, (n,)."""
+    """Gain of suns (n, 3) at points (n, 3) [m] with normals (n, 3), and the direct light's fraction of it (n,)."""
     gain = np.full((len(points), 3), 1.0 - sum(weight for _, weight in sunlight))
     direct = np.zeros(len(points))
     for sun, weight in sunlight:
@@ -264,7 +265,7 @@ def _surface_points(field: BakedField, route: Array) -> _SurfacePoints:
         facing = (normals * toward).sum(-1)
         around = np.stack([depth[1:-1, 2:], depth[1:-1, :-2], depth[2:, 1:-1], depth[:-2, 1:-1]])
         z = depth[1:-1, 1:-1]
-        # At a depth edge the neighbors belong to another surface.
+        # At a depth edge, neighboring pixels belong to another surface.
         valid = (np.abs(around - z) < 0.15 * z).all(0) & (out.opacity[0, 1:-1, 1:-1] > 0.97) & (facing > 0.05)
         valid &= z < _MAX_DEPTH
         directions = (inner - pose[:3, 3])[valid]
@@ -312,7 +313,7 @@ def _nearest_indices(positions: Array, xy: Array) -> NDArray[np.int64]:
 
 
 def _uniform_sky_irradiance(normals: Array) -> Array:
-    """Irradiance (n,) for unit normals (n, 3) under a uniform sky over ground of radiosity `_BOUNCE`; 1 facing up."""
+    """Irradiance (n,) for unit normals (n, 3) under a uniform sky over dim ground; 1 for a level surface."""
     up = normals[:, 2]
     return 0.5 * (1.0 + up) + 0.5 * (1.0 - up) * _BOUNCE
 
@@ -323,27 +324,27 @@ BOX_CORNERS = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).resha
 """Corners of a box around the origin, in half sides, shape (8, 3)."""
 
 _PENUMBRA = 0.03, 0.10
-"""Half width of the penumbra at an obstacle's foot [m], and its growth per meter behind the foot. They account for the
-size of the sun's disk and halo, and for the error of the estimated direction."""
-_FILL = 0.85  # fraction of a box's sides that an obstacle really fills
-_SKY_LOSS_BELOW = 0.75  # fraction of the sky's light lost straight below an obstacle, which does not fill its box
+"""Half width of the penumbra at an obstacle's foot (its origin on the ground) [m], and its growth per meter of distance
+from the foot. They account for the size of the sun's disk and halo, and for the error of the estimated direction."""
+_FILL = 0.85  # assumed fraction of its bounding boxes' length and width that an obstacle fills
+_SKY_LOSS_BELOW = 0.75  # fraction of the sky's light lost below an obstacle; below 1, since it does not fill its box
 _SKY_REACH = 1.2  # [m] ground within this distance of an obstacle loses part of the sky's light
-_MAX_SHADOW = 4.0  # [m] largest length of a shadow behind the foot
+_MAX_SHADOW = 4.0  # [m] largest distance of a shadow's end from the foot
 _SHADOW_TOLERANCE = 0.15  # [m] surfaces at most this far above or below the foot count as ground
-_MAX_DISTANCE = 25.0  # [m] shadows further from the camera than this are not drawn
+_MAX_DISTANCE = 25.0  # [m] shadows of obstacles farther from the camera than this are not drawn
 
 
 class ContactShadows:
     """Soft shadows of a model's obstacles on the reconstructed ground.
 
     The light is assumed to come from a uniform sky and from one sun; `Irradiance.sun` estimates the sun's direction and
-    share. Ground beside an obstacle loses the light of the part of the sky that the obstacle hides. Ground in the
-    obstacle's shadow also loses sunlight; the penumbra widens with the distance from the obstacle. Two upright boxes,
-    one around the lower geoms and one around the upper geoms, approximate an obstacle.
+    share of the light. Ground beside an obstacle loses the light of the part of the sky that the obstacle hides. Ground
+    in the obstacle's shadow also loses sunlight; the penumbra widens with the distance from the obstacle. Two upright
+    boxes, one around the lower geoms and one around the upper geoms, approximate an obstacle.
     """
 
     def __init__(self, model: mujoco.MjModel, geoms: NDArray[np.int64]):
-        """`geoms` are those that are drawn; only obstacles among them throw shadows."""
+        """`geoms` are the drawn geoms; only those of obstacles cast shadows."""
         self._boxes: dict[int, Array] = {}
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
@@ -354,7 +355,7 @@ class ContactShadows:
 
     @property
     def bodies(self) -> tuple[int, ...]:
-        """The obstacles' bodies."""
+        """Indices of the obstacles' bodies."""
         return tuple(self._boxes)
 
     def darken(
@@ -426,7 +427,7 @@ def _light_loss(boxes: Array, points: Array, turn: Array, share: float, sun: Arr
 
 
 def _smooth_step(x: Array) -> Array:
-    """A smooth step from 0 to 1 around x = 0, over about ±2."""
+    """A smooth step from 0 to 1, nearly all of it between x = −2 and 2."""
     return 0.5 + 0.5 * np.tanh(x)
 
 

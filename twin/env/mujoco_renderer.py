@@ -116,7 +116,7 @@ def mujoco_rays(rays: Array) -> Array32:
 
 
 class SceneRenderer:
-    """Renders the front cameras' views with MuJoCo's own shading; has the interface of `Compositor`.
+    """Renders the front cameras' views with MuJoCo's own shading; interface of `Compositor` without `sunlight`.
 
     Obstacles and the robot are lit by the model's own lights. The place is drawn either as ground and visual mesh, in
     the filmed colors, or as Gaussian splats. Splats and geoms occlude each other, and the ground shows through the gaps
@@ -126,7 +126,7 @@ class SceneRenderer:
     def __init__(
         self, model: mujoco.MjModel, size: tuple[int, int], max_envs: int, splats: Gaussians | None = None
     ) -> None:
-        """`model` was made by `episode_spec` with visuals; `splats`, if given, replace its visual mesh.
+        """`model` must come from `episode_spec` with `visuals`; `splats`, if given, replace its visual mesh.
 
         The other arguments are those of `Compositor`.
         """
@@ -217,7 +217,7 @@ _SMOOTHING = 0.15  # low-pass gain of the camera heading per control step (0.1 s
 _PART_GROUPS = [3]
 _PART_ALPHA = 0.45
 _EDGE_RGB = (20, 20, 30)
-_OCCLUSION_TOLERANCE = 0.6  # [m] parts are also drawn if they are at most this far behind the visible surface
+_OCCLUSION_TOLERANCE = 0.6  # [m] parts at most this far behind the visible surface are drawn, too
 
 
 class SceneCamera:
@@ -229,7 +229,7 @@ class SceneCamera:
         size: tuple[int, int],
         obstacles: Sequence[ObstacleConfig] = (),
     ) -> None:
-        """`size`: width, height [px]. The attribute `obstacles` may be set to a subset; the others are not shown."""
+        """`size`: width, height [px]. To show only some of `obstacles`, set the attribute `obstacles` to these."""
         spec = mujoco.MjSpec.from_file(str(world.model_path))
         self.obstacles = tuple(obstacles)
         add_obstacles(spec, self.obstacles, world)
@@ -261,7 +261,7 @@ class SceneCamera:
         self.data.cam_xmat[self._camera] = pose[:3, :3].ravel()
         if len(self._casters) == 1:
             return self._cast(self._casters[0])[0]
-        # Warp's CPU kernels run on one thread each and release the GIL.
+        # Warp's CPU kernels run on one thread each and release the GIL, so the two casts run in parallel.
         with ThreadPoolExecutor(2) as pool:
             (rgb, depth), (part_rgb, part_depth) = pool.map(self._cast, self._casters)
         part = self._casters[1].hit_geoms().reshape(depth.shape)
@@ -278,8 +278,8 @@ class SceneCamera:
 def blend_parts(rgb: Image, depth: NDArray, part_rgb: Image, part_depth: NDArray, identity: NDArray) -> Image:
     """Draws the visible collision parts half transparent, with outlines, over a picture (h, w, 3).
 
-    The z-depths `depth` and `part_depth` [m] have shape (h, w); `depth` is 0 where rays hit nothing. `identity` is the
-    id of the nearest part, −1 where there is none.
+    The z-depths `depth` and `part_depth` [m] have shape (h, w); `depth` is 0 where rays hit nothing. `identity` (h, w)
+    is the id of the nearest part, −1 where there is none.
     """
     visible = (identity >= 0) & ((depth <= 0) | (part_depth <= depth + _OCCLUSION_TOLERANCE))
     edge = np.zeros_like(visible)

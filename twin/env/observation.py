@@ -45,7 +45,7 @@ class PixelObserver:
         Args:
             renderer: Renders the envs.
             field: Contains the lightings; None if MuJoCo renders the mesh, or splats, under MuJoCo's lights.
-            trust: Computes the trust of images from the filmed frames.
+            trust: Computes the trust of the images, see `trust.py`.
             options: Options of the envs.
             envs: Physics and task of every env.
         """
@@ -87,7 +87,7 @@ class PixelObserver:
         """Sets up the weather of env i's episode under its lighting."""
         o, task = self.options, self.envs[i][1]
         fog = self.lightings[i].fog_at(0.0)  # type: ignore[union-attr]
-        # `fog` is None without a photo; a photo of a clear day gives a fog of extinction 0.
+        # Lightings fitted to a photo always have a fog; for a clear day, its extinction is 0.
         if fog is not None and o.randomise and o.randomise.hold_known:
             task.set_weather(task.sample.for_known_weather())
         has_weather = fog is not None or o.randomise

@@ -71,7 +71,7 @@ class ObstacleModel:
         self.add(mujoco.mjtGeom.mjGEOM_MESH, color, meshname=name)
 
     def frustum(self, low: float, high: float, radii: tuple[float, float], color: Color, sides: int = 20) -> None:
-        """Adds an upright truncated cone between two heights [m]."""
+        """Adds an upright truncated cone with `radii` at the heights `low` and `high` [m]."""
         angle = np.arange(sides) * 2 * np.pi / sides
         ring = np.stack([np.cos(angle), np.sin(angle)], 1)
         rings = [np.column_stack([r * ring, np.full(sides, z)]) for r, z in zip(radii, (low, high), strict=True)]

@@ -3,7 +3,7 @@
 *Station* is the arc length on the route [m], *lateral* the signed distance from it, positive to the left [m]. An
 obstacle is a mocap body `obstacle_<name>`, which forces do not move; its geoms are `obstacle_<name>_<number>`. One
 model serves many episodes: `place` sets the poses of an episode's obstacles, and parks the others far below the ground.
-The model stores the route as the numeric `obstacle_route`.
+The model stores the route as the custom numeric `obstacle_route`.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ STATIC_KINDS = ("cone", "box", "bollard")
 _ROUTE_NUMERIC = "obstacle_route"
 _PARKED_HEIGHT = -100.0  # [m], far below the ground
 _ROBOT_HALF_WIDTH = 0.34  # [m]
-_CLEARANCE = 0.15  # [m] smallest gap for a robot that passes a random obstacle within the corridor
+_CLEARANCE = 0.15  # [m] smallest gap between a random obstacle and a robot that passes it within the corridor
 _RANDOM_MARGIN = 0.5  # [m] a random obstacle's near edge is at most this far beyond the corridor's edge
 _MAX_TRIES = 20  # a distractor object is left out if this many samples give it no free position
 _ROBOT_RADIUS = 0.6  # [m] distance from the robot's base to its farthest corner
@@ -42,7 +42,7 @@ def body_name(obstacle: ObstacleConfig, number: int) -> str:
 
 
 def add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[ObstacleConfig], world: World) -> None:
-    """Adds the bodies of obstacles to a scene, below the ground; `place` moves them in the compiled model.
+    """Adds obstacles' bodies, below the ground, and the route to a scene; `place` moves them in the compiled model.
 
     Raises:
         InputError: a kind is unknown, or two obstacles have the same name.
@@ -60,12 +60,12 @@ def add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[ObstacleConfig], worl
 
 
 def place(obstacles: Sequence[ObstacleConfig], data: mujoco.MjData, time: float) -> None:
-    """Sets the mocap poses of an episode's obstacles at a time [s], and parks all others in the model.
+    """Sets the mocap poses of an episode's obstacles at a time [s], and parks the model's other obstacles.
 
     Call it before every step if an obstacle moves, and once after each `mj_resetData`, which parks all of them.
 
     Raises:
-        InputError: the model has no such obstacle.
+        InputError: the model lacks an obstacle of the episode.
     """
     model = data.model
     wanted = {body_name(one, k): one for k, one in enumerate(obstacles)}
@@ -81,7 +81,7 @@ def place(obstacles: Sequence[ObstacleConfig], data: mujoco.MjData, time: float)
             data.mocap_pos[mocap] = (x, y, ground_height(model, x, y) - _SINK_DEPTH)
             data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
     if wanted:
-        raise InputError(f"the model has no {', '.join(wanted)}; name it in [[obstacle]], or add it with add_obstacles")
+        raise InputError(f"the model has no {', '.join(wanted)}; add it as [[obstacle]], or by add_obstacles")
 
 
 def obstacle_pose(obstacle: ObstacleConfig, route: Array, time: float) -> tuple[float, float, float]:
@@ -118,7 +118,7 @@ def stored_route(model: mujoco.MjModel) -> Array:
 
 
 def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
-    """Bilinear height [m] of the geom `ground`, an upright height field; beyond its edge, the height of the edge."""
+    """Height [m] of the height field `ground`, interpolated bilinearly; beyond its edge, the height of the edge."""
     geom = model.geom("ground")
     k = int(geom.dataid[0])
     rows, columns, adr = int(model.hfield_nrow[k]), int(model.hfield_ncol[k]), int(model.hfield_adr[k])
@@ -135,7 +135,7 @@ def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
 def random_obstacles(
     world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
 ) -> tuple[ObstacleConfig, ...]:
-    """Samples static obstacles `random_<number>` along the route; a robot can pass each of them within the corridor.
+    """Samples static obstacles `random_<number>` along the route; within the corridor, a robot can pass each of them.
 
     Raises:
         InputError: the route is too short for `count` obstacles.
@@ -145,7 +145,7 @@ def random_obstacles(
     if room <= 0.0 or count > room:
         raise InputError(f"{count} obstacles on a route of {length:.1f} m; expected at most {max(0, int(room))}")
     spacing = min(_SPACING, 0.8 * room / max(count, 1))
-    # Sorted uniform samples plus multiples of the spacing are uniform over all arrangements that keep it.
+    # Sorted uniform samples plus multiples of the spacing are uniform over all arrangements that keep this spacing.
     free = np.sort(rng.uniform(0.0, room - spacing * (count - 1), count)) if count else np.zeros(0)
     out = []
     for k, station in enumerate(_FREE_ENDS[0] + free + spacing * np.arange(count)):
@@ -184,7 +184,7 @@ def random_distractors(
 # ---- obstacles of an episode
 
 _COLOR_SEED = 7  # random seed of the distractor objects' colors
-_ROUTE_STEP = 0.25  # [m] between points of a segment's route
+_ROUTE_STEP = 0.25  # [m] distance between points of a segment's route
 
 
 class EpisodeObstacles:

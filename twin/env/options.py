@@ -1,4 +1,4 @@
-"""Options of an environment, their checks, and the check of actions.
+"""Options of an environment with their checks, and the check of actions.
 
 Defaults are those of DriveEnv-NeRF (arXiv 2403.15791) where the paper states them.
 """
@@ -46,7 +46,7 @@ class Rewards:
     progress: float = 0.0
     """Reward per meter along the route; backward motion counts negative."""
     cross_track: float = 0.0
-    """Reward per step at or beyond the corridor's edge; within it, proportional to the distance from the route."""
+    """Reward per step at or beyond the corridor's edge; inside, proportional to the distance from the route."""
     steering: float = 0.0
     """Reward per step at the largest yaw rate; it is proportional to the square of the commanded yaw rate."""
 
@@ -65,7 +65,7 @@ class Options:
     pixels: bool = True
     """True: observations are images; False: they are `RewardAndTermination.state`, which needs no field."""
     state: str | None = None
-    """Numbers observed besides the images: `odometry` (speed [m/s], yaw rate [rad/s]), `privileged` (the state of
+    """Numbers observed besides the images: `odometry` (speed [m/s], yaw rate [rad/s]), `privileged` (all of
     `RewardAndTermination.state`, which needs the map), or None."""
     action: str = TWIST
     """`twist`: v [m/s] and ω [rad/s]; `steering`: ω [rad/s] only, at a fixed speed."""
@@ -82,13 +82,13 @@ class Options:
     start_heading: float = 10.0
     """The start's heading relative to the route is sampled uniformly within ± this [°]."""
     start_along: float = 0.0
-    """Half of the episodes start further along the route segment. The offset is a fraction of the segment's length,
+    """If positive, half of the episodes start beyond the segment's start, by a fraction of the segment's length that is
     sampled uniformly between 0 and this."""
     observe: str = NERF
     """Origin of the images. `nerf`: the field. `simulator`: MuJoCo's renderer with the extracted mesh, under MuJoCo's
     lights. `splats`: MuJoCo's renderer with the Gaussian splats of a file; obstacles and robot have MuJoCo's lights."""
     splats: str | Path | None = None
-    """3D Gaussian splats (.ply) in the scene's frame (meters, z up), for `observe="splats"`; they have one lighting."""
+    """3D Gaussian splats (.ply) in the scene's frame (meters, z up), for `observe="splats"`; their light is fixed."""
     lighting: str | Sequence[str] = TRAINING
     """Lighting of the episodes; see `episode_lighting.py`."""
     lighting_drift: bool = False
@@ -149,7 +149,7 @@ IMAGE_SIZE: Check = (
 _CHECKS: dict[str, Check] = {
     "rewards": (
         lambda value: isinstance(value, Rewards) and _are_numbers(value),
-        f"Rewards, or a dict of numbers, at most {_MAX_NUMBER:,.0f} in size",
+        f"Rewards, or a dict of numbers, within ±{_MAX_NUMBER:,.0f}",
     ),
     "control_timestep": (
         lambda x: _is_number(x) and 0.01 <= x <= COMMAND_TIMEOUT,
@@ -174,7 +174,7 @@ _CHECKS: dict[str, Check] = {
             isinstance(value, str)
             or (isinstance(value, Sequence) and len(value) > 0 and all(isinstance(name, str) for name in value))
         ),
-        "a name, or several",
+        "a name, or a list of names",
     ),
     "lighting_drift": _BOOLEAN,
     "obstacles": (
@@ -183,11 +183,11 @@ _CHECKS: dict[str, Check] = {
             or (_is_sequence(value) and all(isinstance(one, ObstacleConfig) for one in value))
             or _is_integer(value, 0, _MAX_OBSTACLES)
         ),
-        f"'scene', a whole number from 0 to {_MAX_OBSTACLES}, or ObstacleConfigs",
+        f"'scene', a whole number from 0 to {_MAX_OBSTACLES}, or a list of ObstacleConfig",
     ),
     "camera": (
         lambda value: value is None or (isinstance(value, CameraOptions) and _are_numbers(value)),
-        f"None, or CameraOptions of numbers, at most {_MAX_NUMBER:,.0f} in size",
+        f"None, or CameraOptions of numbers within ±{_MAX_NUMBER:,.0f}",
     ),
     "randomise": (lambda value: value is None or isinstance(value, Ranges), "True, False, None or Ranges"),
     "device": _one_of(CPU, CUDA),
@@ -221,7 +221,7 @@ def parse_options(given: dict[str, Any]) -> Options:
 
 
 def state_size(options: Options) -> int:
-    """Number of components of the privileged state observed besides images: the first ones of `STATE_SIZES`."""
+    """Number k of components of the privileged state that are observed besides images: its first k."""
     return {None: 0, ODOMETRY: 2}.get(options.state, sum(STATE_SIZES.values()))
 
 

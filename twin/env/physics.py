@@ -21,9 +21,9 @@ from twin.types import Array
 
 TIME_TOLERANCE = 1e-6  # [s] simulation times that differ by less count as equal, because of rounding
 
-_CHECK_PERIOD = 0.01  # [s] time between two contact checks; each check also records all poses
+_CHECK_PERIOD = 0.01  # [s] time between two contact checks; if images are delayed, each check also records all poses
 _SETTLE_TIME = 0.3  # [s] time that `set_pose` simulates, so that the robot settles on the ground
-_RAY_START = 50.0  # [m] least height, above the ground's origin, from which rays are cast to find the ground's height
+_RAY_START = 50.0  # [m] least height, above the ground's origin, from which rays are cast down to find its height
 
 
 class _Snapshot(NamedTuple):
@@ -39,7 +39,7 @@ class HuskyPhysics:
     """Steps one Husky in one model."""
 
     move_obstacles: Callable[[float], None] | None = None
-    """Sets the poses of moving obstacles at a time [s]. Called before a run of substeps, with the time of its end."""
+    """Sets the poses of moving obstacles at a time [s]. `step` calls it before each segment, for the segment's end."""
 
     def __init__(
         self, model: mujoco.MjModel, params: HuskyParams | None = None, data: mujoco.MjData | None = None
@@ -201,7 +201,7 @@ class HuskyPhysics:
 
     @property
     def base_to_world(self) -> Array:
-        """Shape (4, 4)."""
+        """Pose of the base, shape (4, 4)."""
         return _pose(self.data.xpos[self._body], self.data.xmat[self._body])
 
     @property

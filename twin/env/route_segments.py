@@ -20,13 +20,13 @@ class RouteSegment:
 
     name: str
     start: float
-    """Arc length of its start [m]."""
+    """Arc length of the start [m]."""
     length: float
     """[m]"""
 
     @property
     def end(self) -> float:
-        """Arc length of its end [m]."""
+        """Arc length of the end [m]."""
         return self.start + self.length
 
 
@@ -34,7 +34,7 @@ class RouteSegment:
 class _StandardTask:
     length: float  # [m]
     turn: tuple[float, float]  # lowest and highest total turn [rad], positive to the left
-    max_excursion: float  # [rad] largest excess of the heading over the range between its first and last value
+    max_excursion: float  # [rad] largest deviation of the heading from the range between its first and last value
 
 
 _STANDARD_SPECS = {
@@ -42,10 +42,9 @@ _STANDARD_SPECS = {
     "right_turn": _StandardTask(60.0, (-np.deg2rad(120), -np.deg2rad(60)), np.deg2rad(20)),
 }
 STANDARD_TASKS = tuple(_STANDARD_SPECS)
-"""Names of the standard tasks."""
 
-_LENGTH_TOLERANCE = 0.05  # relative shortfall allowed for a standard task, since scale and smoothing shorten a route
-_STEP = 0.25  # [m]
+_LENGTH_TOLERANCE = 0.05  # relative shortfall allowed in standard tasks, as smoothing and scale errors shorten routes
+_STEP = 0.25  # [m] between tested starts
 
 
 def find_task(name: str, world: World, configured: tuple[TaskConfig, ...] = ()) -> RouteSegment:
@@ -57,14 +56,14 @@ def find_task(name: str, world: World, configured: tuple[TaskConfig, ...] = ()) 
     found = scene_tasks(world, configured)
     if name in found:
         return found[name]
-    there = ", ".join(f"{s.name} ({s.length:.1f} m from {s.start:.1f} m)" for s in found.values())
+    there = ", ".join(f"{s.name} ({s.length:.1f} m long, starts at {s.start:.1f} m)" for s in found.values())
     why = "unknown"
     if name in _STANDARD_SPECS:
         longest = _longest_fit(world.route, _STANDARD_SPECS[name])
         total, length = arc_lengths(world.route)[-1], _STANDARD_SPECS[name].length
         why = f"the route ({total:.1f} m) has no such segment of {length:g} m"
         if longest:
-            why += f"; the longest is {longest[1]:.1f} m from {longest[0]:.1f} m"
+            why += f"; the longest is {longest[1]:.1f} m long and starts at {longest[0]:.1f} m"
     raise InputError(
         f"task {name!r}: {why}; there are {there}; define another in scene.toml: "
         '[[task]] name = "mine", start = 0.0, length = 20.0'
@@ -88,14 +87,14 @@ def scene_tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[s
         if task.start + task.length > total + 1e-6:
             raise InputError(
                 f"task {task.name!r}: from {task.start:g} m to {task.start + task.length:g} m, but the route is "
-                f"{total:.2f} m long; shorten it in scene.toml"
+                f"{total:.2f} m long; shorten the task in scene.toml"
             )
         found[task.name] = RouteSegment(task.name, task.start, task.length)
     return found
 
 
 def _fitting_starts(route: Array, standard: _StandardTask, length: float) -> Array:
-    """Arc lengths [m] at which segments of a length that fit a standard task start; the most central turn first."""
+    """Start arc lengths [m] of segments of a given length that fit a standard task; the most central turn first."""
     total = float(arc_lengths(route)[-1])
     s = np.append(np.arange(0.0, total, _STEP), total)
     heading = np.unwrap(heading_at(route, s))
@@ -107,13 +106,13 @@ def _fitting_starts(route: Array, standard: _StandardTask, length: float) -> Arr
         if standard.turn[0] <= turn <= standard.turn[1] and excursion <= standard.max_excursion:
             starts.append(start)
             half = int(np.argmin(np.abs(inside - (inside[0] + inside[-1]) / 2)))
-            # A straight segment has no turn to center, so its first fit is used.
+            # A straight segment has no turn to center, so the first that fits comes first.
             off_center.append(abs(half / len(inside) - 0.5) if abs(turn) > np.deg2rad(30) else 0.0)
     return np.array(starts)[np.argsort(np.array(off_center), kind="stable")] if starts else np.zeros(0)
 
 
 def _longest_fit(route: Array, standard: _StandardTask) -> tuple[float, float] | None:
-    """Start and length [m] of the longest fitting segment; None if none reaches 2 m."""
+    """Start and length [m] of the longest fitting segment, to within 1 m; None if none exceeds 2 m."""
     for length in np.arange(min(standard.length, float(arc_lengths(route)[-1])), 2.0, -1.0):
         if (starts := _fitting_starts(route, standard, float(length))).size:
             return float(starts[0]), float(length)

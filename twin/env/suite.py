@@ -67,7 +67,7 @@ class EnvFactory:
         twin = scene if isinstance(scene, Twin) else load_scene(scene)
         require_stage(twin.scene, "mjcf")
         if not twin.scene.has_route:
-            raise InputError(f"{twin.scene.root}: nothing to drive: its build has no route (mjcf.route)")
+            raise InputError(f"{twin.scene.root}: its build has no route to drive (see mjcf.route)")
         world = twin.world()
         if parsed.randomise:
             parsed = dataclasses.replace(parsed, randomise=parsed.randomise.for_robot(world.robot))
@@ -88,7 +88,7 @@ class EnvFactory:
     def make_env(
         self, seed: int | None, evaluator: tuple[RewardAndTermination, int] | None = None
     ) -> tuple[DrivePhysics, DriveTask]:
-        """Returns physics, with a copy of the model, and task of a new environment; arguments as in `DriveTask`."""
+        """Returns physics and task of a new environment with its own copy of the model; arguments as in `DriveTask`."""
         physics = DrivePhysics.of(copy.copy(self.model), self.world.robot)
         return physics, DriveTask(self.world, self.segment, self.options, self.obstacles, self.model, seed, evaluator)
 
@@ -127,11 +127,11 @@ class EnvFactory:
 
 
 def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
-    """Returns a digest of everything that determines an episode, except for seed and driver.
+    """Returns a digest of everything in the scene, task and condition that determines an episode.
 
     The digest covers the field, the MJCF scene with its robot, the task's route segment, the obstacles of `scene.toml`,
-    and the photo lightings that the condition names. For a condition with sampled lightings, it also covers the version
-    of the lighting sets; for a randomized condition, the version and ranges of the randomization.
+    and the photo lightings that the condition names. For the lightings `training` and `held-out`, it also covers the
+    version of the sets; for a randomized condition, the version and ranges of the randomization.
 
     Raises:
         InputError: see `EnvFactory.open`.
@@ -179,7 +179,7 @@ class DriveEnvironment(control.Environment):
         return self._with_pixels(step)
 
     def relight(self, step: dm_env.TimeStep, lighting: EpisodeLighting) -> dm_env.TimeStep:
-        """Replaces the lighting at an episode's start; returns its first step, `step`, in the new lighting."""
+        """Replaces the lighting at an episode's start; returns its first step, `step`, with images in the new light."""
         self.pixels.set_lighting(0, lighting, fill=True)
         return self._with_pixels(step)
 
@@ -222,7 +222,7 @@ def load(
 
 # ---- model of an episode
 
-_REACH = 1.5  # [m] reach of a robot beyond the corridor's edge: half its length plus the motion of a control step
+_REACH = 1.5  # [m] reach beyond the corridor's edge; exceeds half the robot's length plus its motion in a control step
 
 
 def episode_spec(world: World, start: float, end: float, half_width: float, visuals: bool = False) -> mujoco.MjSpec:
@@ -248,7 +248,7 @@ def episode_spec(world: World, start: float, end: float, half_width: float, visu
         center, radius = _bounding_sphere(assets / f"{geom.get('mesh')}.obj")
         return line.query(center[:2])[0] - radius <= half_width + _REACH
 
-    # Parts are removed from the XML: removing a single one from an MjSpec takes milliseconds.
+    # Parts are removed from the XML, since removing a single one from an MjSpec takes milliseconds.
     worldbody, kept = root.find("worldbody"), root.find("asset")
     assert worldbody is not None and kept is not None
     for geom in [g for g in worldbody.findall("geom") if g.get("type") == "mesh" and not wanted(g)]:

@@ -32,14 +32,14 @@ from twin.types import Array
 
 try:
     with warnings.catch_warnings():
-        # On import, dm_control looks for a display and warns if there is none; nothing here needs one.
+        # On import, dm_control looks for a display and warns if there is none; this package needs none.
         warnings.simplefilter("ignore")
         from dm_control import mujoco as dm_mujoco
         from dm_control.mujoco import wrapper
         from dm_control.rl import control
 except ModuleNotFoundError as error:
     raise InputError(
-        f"{error}: driving in a scene needs dm_control, which installs on Python 3.11 and 3.12; this is "
+        f"{error}: driving in a scene needs dm_control, which installs on Python 3.11 and 3.12; this is Python "
         f"{sys.version_info.major}.{sys.version_info.minor}"
     ) from None
 
@@ -47,7 +47,7 @@ EnvIndices = Sequence[int] | NDArray[np.int64]
 
 _CODES = {cause: code for code, cause in enumerate(CAUSES, 1)}  # 0: the episode goes on
 BUMPER_OFFSET = 0.5  # [m] from the base to the bumper; the goal is reached when the bumper is at the segment's end
-_SEARCH_WINDOW = (1.0, 3.0)  # [m] the robot's foot is searched this far behind and ahead of the last foot on the route
+_SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point of the route is searched this far behind and ahead of the last one
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, as multiples of the controller's limits
@@ -108,7 +108,7 @@ class RewardAndTermination:
         self._cause_rewards[[0, _CODES["goal"]]] += terms.step
 
     def begin(self, which: EnvIndices, foot: Array, position: Array) -> None:
-        """Starts episodes near arc lengths, shape (k,), at positions, shape (k, 2) [m]."""
+        """Starts k episodes at positions, shape (k, 2) [m], near the arc lengths `foot`, shape (k,) [m]."""
         self._cause[which], self._anchor_time[which], self._steering[which] = 0, 0.0, 0.0
         self.foot[which], self.cross_track[which] = self._nearest(position, foot)
         self._previous_foot[which], self._anchor[which] = self.foot[which], position
@@ -177,7 +177,7 @@ class RewardAndTermination:
 
 
 class DrivePhysics(dm_mujoco.Physics):
-    """A dm_control Physics of one robot, with quantities of `HuskyPhysics`."""
+    """A dm_control Physics of one robot, with properties of `HuskyPhysics`."""
 
     _params = HuskyParams()
 
@@ -222,7 +222,7 @@ class DrivePhysics(dm_mujoco.Physics):
         with self.check_invalid_state():
             self.robot.step(nstep * self.timestep())
 
-    # Quantities of `HuskyPhysics`; `camera_to_world` is the pose from which the newest image was taken.
+    # Properties of `HuskyPhysics`; `camera_to_world` is the pose from which the newest image was taken.
     planar_pose = property(attrgetter("robot.planar_pose"))
     base_to_world = property(attrgetter("robot.base_to_world"))
     delayed_data = property(attrgetter("robot.delayed_data"))
@@ -271,7 +271,7 @@ class DriveTask(control.Task):
         self.episode_seed = 0
         """Seed of the current episode."""
         self.sample = RandomizationSample()
-        """Robot and weather of the current episode."""
+        """Randomized robot and weather of the current episode."""
         self._record = self.sample.record()
         self.obstacles: tuple[ObstacleConfig, ...] = ()
         """Obstacles of the current episode."""

@@ -23,8 +23,8 @@ def task_table(world: World, segment: RouteSegment, options: Options) -> dict[st
     """The contents of the file, in the scene's frame (z up), meters, seconds, radians.
 
     `line` (m, 3) is on the ground, in driving order; a *station* is a horizontal arc length along it. Trials start at
-    the station `start`, up to `offset` beside the line and turned by up to `heading` from its direction. They succeed
-    at the station `goal`. They fail
+    `start.station`, up to `start.offset` beside the line and turned by up to `start.heading` from its direction. They
+    succeed when the base reaches the station `goal`. They fail
 
     - when the base is further than `half_width` from the line;
     - when the robot touches an object;
@@ -56,5 +56,4 @@ def task_table(world: World, segment: RouteSegment, options: Options) -> dict[st
 
 
 def write_task(path: Path, world: World, segment: RouteSegment, options: Options) -> None:
-    """Writes `task_table` to a file."""
     write_json(path, task_table(world, segment, options))

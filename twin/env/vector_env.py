@@ -1,8 +1,9 @@
 """Vector environments: `make_vector_env` steps n environments in one process, in several processes, or on a GPU.
 
 Much of a step is Python code (visibility, contacts, reward), which the interpreter's lock limits to one core per
-process. So a `ProcessVectorEnv` starts *child* processes. Each child has a `LocalVectorEnv` and executes its parent's
-requests. Requests and replies are sent as pickles over a socket. The number of processes does not affect the results.
+process. So a `ProcessVectorEnv` starts *child* processes. Each child process has a `LocalVectorEnv` and executes its
+parent's requests. Requests and replies are sent as pickles over a socket. The number of processes does not affect the
+results.
 """
 
 import contextlib
@@ -166,13 +167,13 @@ class ProcessVectorEnv:
             if not self._end.alive:
                 raise InputError(
                     "the vector environment is closed: by close(), by an interrupted step, or because one of its "
-                    "processes ended; expected an open one, so make a new one"
+                    "processes ended; make a new one"
                 )
             try:
                 for c, message in messages.items():
                     self._children[c].send(message)
                 replies = {c: self._children[c].receive() for c in requests}  # all, even if one is an error
-            except BaseException:  # some requests may have been sent, and their replies may be pending
+            except BaseException:  # otherwise, the next request would read pending replies
                 self.close()
                 raise
         for error, _ in replies.values():
@@ -192,7 +193,7 @@ class ProcessVectorEnv:
 
 
 class _Child:
-    """A child process and the parent's end of its socket."""
+    """A child process, which uses `share` cores, and the parent's end of its socket."""
 
     def __init__(self, share: int) -> None:
         self.pipe, theirs = Pipe()
@@ -219,7 +220,7 @@ class _Child:
             code = self.process.wait()
             raise InputError(
                 f"a process of the vector environment ended with exit status {code}; expected it to run. "
-                + ("If memory ran out, use fewer processes (1 starts none)" if code == -9 else "See its messages above")
+                + ("If memory ran out, use fewer; processes=1 starts none" if code == -9 else "See its messages above")
             ) from None
 
 
@@ -240,7 +241,7 @@ def serialize(value: Any) -> bytes:
 
 
 class VectorEnvServer:
-    """Executes requests: names and arguments of methods of this class or of its `LocalVectorEnv`."""
+    """Executes requests: names of methods of this class or of its `LocalVectorEnv`, each with its arguments."""
 
     envs: LocalVectorEnv
 
@@ -281,10 +282,10 @@ class VectorEnvServer:
 
 
 def serve() -> None:
-    """Serves a parent's requests; arguments of the process: socket, process id of the parent, number of cores."""
+    """Serves a parent's requests. Command line arguments: socket, process id of the parent, number of cores to use."""
     socket, parent, share = map(int, sys.argv[1:])
     os.set_inheritable(socket, False)
-    # The signal may reach all processes; the parent saves its state, and then ends this process.
+    # SIGTERM may reach all processes. This one ignores it: the parent saves its state, and then ends this process.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     runtime.limit_cores(share)
     server = VectorEnvServer()

@@ -36,7 +36,7 @@ _RANDOMIZED_FIELDS = (
 _UPLOADED_FIELDS = ("qpos", "qvel", "act", "qacc_warmstart")
 _STATE_FIELDS = (*_UPLOADED_FIELDS, "ctrl", "sensordata", "actuator_force")
 
-_MAX_CONTACTS, _MAX_ROWS = 96, 384  # capacity per environment; the demo scene needs a third of it
+_MAX_CONTACTS, _MAX_ROWS = 96, 384  # capacity per environment; the demo scene needs a third of each
 _OVERFLOWS = mjw.OverflowType.NEFC | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE | mjw.OverflowType.CCD
 
 
@@ -68,7 +68,7 @@ def _record_positions(
     qpos: wp.array2d(dtype=float),
     history: wp.array3d(dtype=float),
 ):
-    """Records the positions at the end of each segment: each substep overwrites the record of the one before."""
+    """Records positions; each substep overwrites its segment's record, so that the record is of the segment's end."""
     env, i = wp.tid()
     history[segment[k, env], env, i] = qpos[env, i]
 
@@ -101,9 +101,9 @@ class GpuSimulation:
 
     The state (positions, velocities, the solver's last accelerations) is kept in arrays that contain all environments.
     A control step uploads it, runs the substeps with the controllers' schedules, and downloads the new state and the
-    touched geoms. The environments' own `MjData` is only updated by `sync`, which takes far longer than a download. The
-    device computes in single precision with another solver: episodes are similar to those of MuJoCo, but not
-    bit-identical. On a GPU, they are not repeatable either, since the order of contacts varies.
+    touched geoms. The environments' own `MjData` are updated by `sync` only, since this takes far longer than a
+    download. The device computes in single precision with another solver: episodes are similar to those of MuJoCo, but
+    not bit-identical. On a GPU, they are not repeatable either, since the order of contacts varies.
     """
 
     def __init__(self, envs: Sequence[DrivePhysics], period: float, device: str) -> None:
@@ -146,7 +146,7 @@ class GpuSimulation:
             self._upload()
             self._graph: Any = None
             if device != "cpu":
-                # The graph is captured now, while nothing else uses the GPU; the first run compiles the kernels.
+                # The CUDA graph is captured now, while nothing else uses the GPU; the first run compiles the kernels.
                 self._advance()
                 with wp.ScopedCapture() as capture:
                     self._advance()

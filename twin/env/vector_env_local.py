@@ -164,7 +164,7 @@ class LocalVectorEnv:
     def make_view(self, size: tuple[int, int]) -> PixelObserver:
         """Returns an observer that renders current episodes at another size (width, height), without camera noise.
 
-        Its stacks have one image. It changes neither the observations nor any random draw; `pixels` must exist.
+        Its stacks have one image. It needs `pixels`, and changes neither observations nor random numbers.
         """
         options = dataclasses.replace(self.options, size=size, stack=1, camera=None)
         factory = dataclasses.replace(self.factory, options=options)

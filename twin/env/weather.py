@@ -117,8 +117,8 @@ _PATCH_COVER = (0.2, 0.6)  # smallest and largest fraction of the plane that pat
 # Ranges of counts (without the upper end), and of sizes [m] before a low sun stretches the pattern.
 _HOUSES, _HOUSE_SIDE = (1, 4), (3.0, 12.0)
 _POSTS, _POST_WIDTH, _POST_LENGTH = (0, 8), (0.1, 0.5), (2.0, 10.0)
-_OVERSAMPLING = 4  # resolution factor at which solid shadows are drawn, for smooth edges
-_SHADOW_TINT = np.array([1.0, 0.95, 0.85], np.float32)  # blue loses less, since the sky's bluer light remains
+_OVERSAMPLING = 4  # resolution factor at which shadows of houses and posts are drawn, for smooth edges
+_SHADOW_TINT = np.array([1.0, 0.95, 0.85], np.float32)  # RGB: blue loses less, since the sky's bluer light remains
 
 
 class CastShadows:
@@ -138,7 +138,7 @@ class CastShadows:
         stretch = max(1.0, flat / sun[2])
         self._to_texel = np.stack([along / stretch, [-along[1], along[0]]]) / _TEXEL
         self._loss: Array32 = np.float32(strength) * _SHADOW_TINT
-        kind = rng.integers(3)  # patches, solids, both
+        kind = rng.integers(3)  # 0: patches, 1: straight edges, 2: both
         self._pattern = np.zeros((_SIDE, _SIDE), np.float32)
         if kind != 1:
             radius = np.exp(rng.uniform(*np.log(_PATCH_RADIUS)))
@@ -149,7 +149,7 @@ class CastShadows:
             self._pattern = np.maximum(self._pattern, _solid_shadows(rng))
 
     def apply(self, rgb: Array32, depth: Array32, points: Array) -> Array32:
-        """Returns the picture with shadows. Arguments as in `DirectionalRelighting.apply`, but points in the world."""
+        """Returns the picture with shadows. Arguments as in `DirectionalRelighting.apply`, but world points."""
         flat = points[..., :2] - points[..., 2:] * self._slant
         across, down = np.moveaxis(flat @ self._to_texel.T % _SIDE, -1, 0).astype(np.float32)
         dark = cv2.remap(self._pattern, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).astype(np.float32)
@@ -177,7 +177,7 @@ def _solid_shadows(rng: np.random.Generator) -> Array32:
 
 
 def _patches(rng: np.random.Generator, radius: float, cover: float) -> Array32:
-    """Pattern (side, side) of patches, 1 where dark: radius about `radius` [texels], fraction `cover` of the plane."""
+    """Pattern (side, side) of patches of about `radius` [texels], 1 where dark; a fraction `cover` is dark."""
     # The smoothing is periodic, so that the pattern repeats without a seam.
     frequency = np.fft.fftfreq(_SIDE)[:, None] ** 2 + np.fft.rfftfreq(_SIDE) ** 2
     smooth = np.exp(-2.0 * (np.pi * radius) ** 2 * frequency)
@@ -190,7 +190,7 @@ def _patches(rng: np.random.Generator, radius: float, cover: float) -> Array32:
 # ---- weather of an episode
 
 _SUN_ELEVATION = (10.0, 55.0)  # [°]
-_KNOWN_ELEVATION = (5.0, 85.0)  # [°] a pattern of shadows has a direction and a finite length
+_KNOWN_ELEVATION = (5.0, 85.0)  # [°] limits for a known sun, so that its shadows have a direction and a finite length
 
 
 def _within_elevations(sun: Array) -> Array:
@@ -210,7 +210,7 @@ class Weather:
         fog: Fog | None = None,
         known_sun: Array | None = None,
     ) -> None:
-        """`known_sun` is the direction (3,) to the sun of the episode's lighting, which is then not sampled."""
+        """`known_sun` is the direction (3,) to the sun of the episode's lighting; None: a random sun."""
         self.fog = fog
         """Fog of the episode's lighting, if fitted to a photo; updated while the lighting drifts. None: no fog beyond
         the haze that the film contains."""

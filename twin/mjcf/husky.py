@@ -2,7 +2,7 @@
 
 `twin.robot` defines constants and frames; `add_husky` lists the names in the model. `python -m twin.mjcf.husky` writes
 `twin/assets/husky/`: the robot alone in `husky.xml`, and on a plane in `scene.xml`. To attach the robot to another
-scene, and to list the options of that scene that are wrong for it:
+scene, and to list the options of that scene that are wrong for the robot:
 
     husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tires need these
     robot = mujoco.MjSpec.from_file(str(husky.HUSKY_XML))
@@ -67,7 +67,7 @@ def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
     spec.option.timestep = TIMESTEP
     # Euler and RK4 are unstable with a stiff speed servo; implicitfast adds the servo's damping to the mass matrix.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # The pyramidal cone gives the right track ratio, but a torque that is 21 % too low.
+    # The pyramidal friction cone gives the right track ratio, but a torque that is 21 % too low.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = params.slip_stiffness
     spec.option.viscosity = params.ground_viscosity
@@ -77,7 +77,7 @@ def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
 
 @dataclass(frozen=True)
 class WrongOption:
-    """An option of a model whose value makes the robot's tires skid unrealistically."""
+    """A wrong option of a model: with its value, the robot's tires skid unrealistically."""
 
     option: str
     found: str
@@ -142,8 +142,8 @@ def check(model: mujoco.MjModel) -> list[WrongOption]:
 COSTS = {
     "cone": "a pyramidal cone turns with 23 % too little torque, and creeps down a slope at 9 cm/s",
     "impratio": "at 1, a parked robot creeps down a slope ten times faster, at 7 mm/s",
-    "integrator": "with Euler and RK4 the wheels hop (3 m/s² at the camera), with three times the torque",
-    "timestep": "at 10 ms the wheels hop (10 m/s²), with three times the torque, and the robot turns 26 % slower",
+    "integrator": "with Euler and RK4 the wheels hop (3 m/s² at the camera), at three times the motor torque",
+    "timestep": "at 10 ms the wheels hop (10 m/s²), at three times the motor torque, and the robot turns 26 % slower",
     "iterations": "with 1, a parked robot creeps down a slope at 15 cm/s",
     "tolerance": "at 1e-2, a parked robot creeps down a slope at 9 mm/s",
     "contact": "with MuJoCo's default contacts the wheels hop (14 m/s²), and the robot turns 28 % slower",
@@ -203,7 +203,7 @@ def add_husky(
 
 
 def stiffen_for_rest(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Raises tire and servo stiffness in place to at least the published values; returns the model.
+    """Increases tire and servo stiffness in place to at least the published values; returns the model.
 
     With softer tires or servos a robot creeps down any slope and never comes to rest.
     """
@@ -354,7 +354,7 @@ def center_of_mass(params: HuskyParams) -> Array:
 
 
 def coulomb_track_ratio(center: Array, curvature_radius: float = 0.0) -> float:
-    """Track ratio chi (effective track over `TRACK`) of four point contacts under Coulomb friction at constant speed.
+    """Track ratio chi (effective track / `TRACK`) of four point contacts under Coulomb friction at constant speed.
 
     It does not depend on the friction coefficient μ.
 
@@ -471,7 +471,7 @@ def _mast(base: mujoco.MjsBody, camera: tuple[float, float, float]) -> None:
 
 
 def camera_mount_geoms(model: mujoco.MjModel, camera: int) -> NDArray[np.int64]:
-    """Geoms to leave out of a camera's images: the housing, lenses and bracket on its own body, shape (k,).
+    """Geoms to leave out of a camera's images: the housing, lenses and bracket on the camera's body, shape (k,).
 
     Randomization and latency move the camera but not these geoms, so they could block its view.
     """

@@ -153,7 +153,7 @@ def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tup
 def covered_by_ground(vertices: NDArray, ground: Ground) -> NDArray[np.bool_]:
     """Mask of the points (v, 3) within the height field's horizontal bounds that are below it or up to 0.15 m above it.
 
-    Two surfaces within centimeters of each other would flicker, cast shadows on each other and hide the robot's wheels.
+    The visual mesh is left out there: two nearly equal surfaces would flicker, shadow each other and hide wheels.
     """
     rows, columns = ground.height.shape
     cell = (vertices[:, :2] - ground.origin) / ground.cell
@@ -206,8 +206,8 @@ def add_ground(
     # MuJoCo's binary height field: int32 rows, int32 columns, then float32 rows from the low-y edge.
     size = np.array(coarse.height.shape, np.int32)
     (assets / "ground.bin").write_bytes(size.tobytes() + coarse.height.astype(np.float32).tobytes())
-    # The texture spans the field from edge to edge; its first row is at +y. Without a picture, each fine cell is a
-    # texel, with the mean color of the cell's corners.
+    # The texture spans the height field from edge to edge; its first row is at +y. Without a picture, each fine cell is
+    # a texel, with the mean color of the cell's corners.
     finer = round(coarse.cell / ground.cell)
     rows, columns = ((size - 1) * finer + 1 for size in coarse.height.shape)
     rgb = ground.rgb[:rows, :columns].astype(np.uint16)
@@ -290,7 +290,10 @@ def _add_robot(
     """
     length = float(arc_lengths(route)[-1])
     if length < _MIN_ROUTE:
-        raise InputError(f"the route has {length:.2f} m, expected at least {_MIN_ROUTE:g} m; set mjcf.route = false")
+        raise InputError(
+            f"the route is {length:.2f} m long, expected at least {_MIN_ROUTE:g} m; film a longer path, or set "
+            "mjcf.route = false for a scene without a robot"
+        )
     yaw = float(heading_at(route, 0.0))
     rows, columns = ground.height.shape
     edge = np.minimum(
@@ -317,8 +320,8 @@ def _add_robot(
     moved = float(np.linalg.norm(data.qpos[:2] - position[:2]))
     if not moved < 0.05 or abs(data.qpos[2] - position[2]) > 0.1:
         raise InputError(
-            f"the robot does not rest at the start of the route: moved {moved:.2f} m, "
-            f"{data.qpos[2] - position[2]:+.2f} m up in {_SETTLE_TIME:g} s, expected < 0.05 m, ± 0.1 m; "
+            f"the robot does not rest at the start of the route: it moved {moved:.2f} m sideways and "
+            f"{data.qpos[2] - position[2]:+.2f} m up in {_SETTLE_TIME:g} s, expected < 0.05 m and ± 0.1 m; "
             "an obstacle is there: raise mesh.obstacle_height"
         )
     spec.add_key(name="spawn", qpos=data.qpos)
@@ -353,7 +356,7 @@ def write_obj(path: Path, vertices: NDArray, faces: NDArray, texcoords: NDArray 
     """Writes a Wavefront OBJ of vertices (v, 3) [m] and faces (f, 3), counter-clockwise seen from outside.
 
     `texcoords` are the texture coordinates of each face's corners, u from the left, v from the top, shape (f, 3, 2).
-    trimesh would write a separate vertex for each of them, in a file almost twice as large.
+    trimesh would write a separate vertex for each of these, in a file almost twice as large.
     """
 
     def lines(line: str, rows: NDArray) -> str:
@@ -391,7 +394,7 @@ def face_texture(colors: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.float64
 # ---- portability check
 
 _COMPARED_STEPS = 200
-_MAX_DEVIATION = 0.002  # [m] between the robot bases of the compiled model and of the copy
+_MAX_DEVIATION = 0.002  # [m] largest distance between the robot bases of the compiled model and of the copy
 _XML_PRECISION = 1e-5  # further allowed deviation [fraction of the coordinates], since the XML keeps six digits
 _CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
 
@@ -399,8 +402,8 @@ _CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
 def check_portable(folder: Path, built: mujoco.MjModel) -> dict[str, Any]:
     """Loads a moved copy of the scene in plain MuJoCo and compares its robot's motion with that in the model `built`.
 
-    Returns metrics for the report. `spawn_drift_m` is the distance that the parked robot creeps in 0.4 s, on soft tires
-    on a slope.
+    Returns metrics for the report. `spawn_drift_m` is the distance that the parked robot creeps in 0.4 s on its soft
+    tires, for example on a slope.
 
     Raises:
         RuntimeError: the copy is a different model or its robot moves differently, which is a bug.

@@ -18,7 +18,7 @@ from twin.types import Array
 
 SCENE_XML = "scene.xml"
 GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4
-"""Geom groups of the ground, the visual mesh and the parts, and the site group of route, corridor and goal."""
+"""Geom groups of ground, visual mesh and convex parts (for collision); site group of route, corridor and goal."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def arc_lengths(route: Array) -> Array:
 
 
 def point_at(route: Array, s: Array | float) -> Array:
-    """Points (..., d) of a route (m, d) at arc lengths s (...) [m]; s is clamped to the ends."""
+    """Points (..., d) of a route (m, d) at arc lengths s (...) [m]; s is clamped to the route's ends."""
     knots = arc_lengths(route)
     return np.stack([np.interp(s, knots, route[:, k]) for k in range(route.shape[1])], -1)
 
@@ -124,8 +124,8 @@ def point_at(route: Array, s: Array | float) -> Array:
 def heading_at(route: Array, s: Array | float, window: float = 1.0) -> Array:
     """Heading [rad] at arc lengths s [m], in the shape of s.
 
-    It is the direction of the chord from s - window / 2 to s + window / 2; near an end of the route, that of the chord
-    of this length at the end.
+    It is the direction of the chord from s - window / 2 to s + window / 2; near an end of the route, it is that of
+    the route's first or last chord of this length.
     """
     length = arc_lengths(route)[-1]
     window = min(window, length)
@@ -166,14 +166,14 @@ def nearest_on_route(
 
 
 def total_turn(route: Array) -> float:
-    """Total change of heading along the route [rad], positive to the left; full turns count."""
+    """Total change of heading along the route [rad], positive to the left; a full turn adds 2π."""
     s = np.append(np.arange(0.0, arc_lengths(route)[-1], 0.25), np.inf)
     heading = np.unwrap(heading_at(route, s))
     return float(heading[-1] - heading[0])
 
 
 def corridor_edges(route: Array, half_width: float) -> tuple[Array, Array]:
-    """Left and right edges of the corridor at the vertices and heights of the route, shapes (m, 3)."""
+    """Left and right edges of the corridor beside the vertices of the route, at their heights, shapes (m, 3)."""
     heading = heading_at(route, arc_lengths(route))
     normal = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], -1) * half_width
     return route + normal, route - normal
