@@ -20,7 +20,7 @@ from twin.nerf.rendering import Rendering
 from twin.robot import PixelCamera
 from twin.types import Array, Image
 
-_PROBES = 8  # number of pictures by which a lighting is chosen
+_PROBES = 8  # largest number of pictures by which a lighting is chosen
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class JudgedTrial:
         if not (cause or self.cause):
             raise InputError(
                 f"{where}: the recording ends after {self.times[-1]:.1f} s and {self.progress[-1]:.1f} m without an "
-                "outcome; record to the end, or say what ended it, such as --cause collision"
+                "outcome; record to the end, or state what ended the trial, such as --cause collision"
             )
         return replace(self, cause=cause or self.cause)
 
@@ -120,10 +120,10 @@ class TrialViews:
     twin: list[Image]
     """The rendered views, RGB uint8 (h, w, 3), one per picture."""
     psnr: Array
-    """[dB], shape (n,)."""
+    """Peak signal-to-noise ratio [dB], shape (n,)."""
     matched_psnr: Array
-    """PSNR [dB], shape (n,), after the mean and standard deviation of each color were matched to the robot's picture;
-    only shapes and shadows affect it."""
+    """PSNR [dB], shape (n,), after the mean and standard deviation of each color channel were matched to the robot's
+    picture, so brightness, contrast and tint of the whole picture do not affect it."""
     trust: Array
     """See `twin.env.trust`, shape (n,)."""
 
@@ -138,7 +138,7 @@ def view(
         poses: x, y [m], yaw [rad] of the base, shape (n, 3).
         pictures: RGB uint8 (h, w, 3) of `camera`.
         camera: A pinhole camera with the pictures' size.
-        lighting: Name of a lighting; None: the filmed or added lighting with the best median PSNR.
+        lighting: Name of a lighting; None: the field's lighting with the best median PSNR over up to 8 pictures.
     """
     field, trust = factory.field, factory.trust
     assert field is not None and trust is not None  # the options have pixels
@@ -169,6 +169,6 @@ def view(
 
 
 def _matched(picture: Array, reference: Array) -> Array:
-    """The picture with each color scaled to the mean and standard deviation of that color in the reference."""
+    """The picture with each color channel scaled to the mean and standard deviation of the reference's channel."""
     mean, std = picture.mean((0, 1)), picture.std((0, 1))
     return np.clip((picture - mean) / np.maximum(std, 1e-3) * reference.std((0, 1)) + reference.mean((0, 1)), 0.0, 1.0)

@@ -48,9 +48,9 @@ REACHED, NO_BETTER, ALL_STEPS = ENDS = ("reached", "no better", "steps")
 
 _BATCHES = (8, 12, 20)  # numbers of episodes; a test may be broken off after each batch
 _TEST_EPISODES = sum(_BATCHES)
-_BETTER = 0.02  # least improvement of the success rate (absolute) and of the mean distance along the route (relative)
+_BETTER = 0.02  # least improvement that counts: of the success rate (absolute), of the mean distance (relative)
 _FINALISTS = 3
-_STREAM = 7  # see `training._TRAINING_STREAM`
+_STREAM = 7  # part of the seed of the test episodes; see `training._TRAINING_STREAM`
 _PLACE = 5.0  # [m] length of the route sections in which failures are counted
 
 
@@ -100,7 +100,7 @@ class PolicyTest:
 
 
 def next_segment(config: TrainConfig, tests: Sequence[PolicyTest]) -> Segment:
-    """The segment that follows the tests so far."""
+    """The segment of the training that follows these tests."""
     last = tests[-1].step if tests else 0
     settled = min(last + config.settle, config.steps)
     if tests and tests[-1].reached(config.success):
@@ -143,9 +143,9 @@ def train_until_learnt(
     tests' scores, as `tests/...`.
 
     Returns:
-        The contents of `choice.json`: the number of steps; the required success rate and whether it is reached; the
-        reason why the training ended; the tests; `chosen`, the final test, with its condition; and a sentence on where
-        and why episodes failed.
+        The contents of `choice.json`: the steps done and allowed; the required success rate and whether it is reached;
+        the reason why the training ended; the tests; `chosen`, the final test, with its condition; and a sentence on
+        where and why episodes failed.
     """
     if before := earlier_choice(twin, folder, config):
         return before
@@ -242,7 +242,7 @@ def _test(config: TrainConfig, step: int, drive: Callable[[Sequence[int]], list[
 
 
 def _seeds(config: TrainConfig) -> tuple[int, ...]:
-    """Seeds of the test episodes, then of the fresh ones."""
+    """Seeds of the test episodes, then of those of the final test."""
     sequence = np.random.SeedSequence([config.seed, _STREAM])
     return tuple(int(seed) for seed in sequence.generate_state(_TEST_EPISODES + FRESH_EPISODES))
 

@@ -1,11 +1,11 @@
 """Drivetrain model, fitted to a log: how the robot's controller and servos turn commands into wheel speeds.
 
-The model applies the limits of `twin.env.controller` to many windows at once. Its step is 0.01 s instead of 0.1 s, so
-that it is smooth in its parameters. (A real controller reacts up to one period late, but then makes the whole change of
-a period in one step. On average, the two effects cancel.) *Mean speed* is the mean of the two sides' wheel speeds
-[rad/s], *half speed* is half of right minus left. Each of the two has a gain, since wheel commands may be in units of
-another robot (DRIVE's log assumes a Husky with wheels of 0.3 m). For commands v and ω, the gain of the mean speed is 1,
-and that of the half speed is the controller's separation multiplier.
+The model applies the limits of `twin.env.controller` to many windows of a log at once. Its step is 0.01 s instead of
+0.1 s, so that wheel speeds are smooth functions of its parameters. (A real controller reacts up to one period late, but
+then makes the whole change of a period in one step. On average, the two effects cancel.) *Mean speed* is the mean of
+the two sides' wheel speeds [rad/s], *half speed* is half of right minus left. Each of the two has a gain, since wheel
+commands may be in units of another robot (DRIVE's log assumes a Husky with wheels of 0.3 m). For commands v and ω, the
+gain of the mean speed is 1, and that of the half speed is the controller's separation multiplier.
 """
 
 from dataclasses import dataclass, replace

@@ -207,7 +207,7 @@ def toml_text(comment: str, previous: dict[str, Any], identified: dict[str, tupl
     """
     lines = ["# " + "".join(c if c.isprintable() else "?" for c in comment)]
     if not identified:
-        lines.append("# But nothing in it could be identified; the fields below are those of the previous file.")
+        lines.append("# Nothing could be identified from this log; the fields below are those of the previous file.")
     lines += [f"{name} = {toml_value(value, _DIGITS)}" for name, value in previous.items() if name not in identified]
     for name, (value, error) in identified.items():
         lines.append(
