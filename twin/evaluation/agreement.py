@@ -76,7 +76,7 @@ class Estimate:
     missing: str = ""
     """Reason why there is no value; empty if there is one."""
     no_interval: str = ""
-    """Reason why the value has no interval; empty if it has one, and for errors and scores, which never have one."""
+    """Reason why the value has no interval; empty if it has one, and for `twin_error`, `brier` and `log`."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Agreement:
     bias: Estimate
     """Mean over policies of real minus twin rate."""
     coverage: Estimate
-    """Fraction of cells with `CellPair.within_chance`."""
+    """Fraction of cells for which `CellPair.within_chance` is true."""
     corrected_coverage: Estimate
     """Fraction of policies whose real rate lies in the interval predicted from policies of other trainings."""
     mean_real: Estimate
@@ -170,7 +170,7 @@ def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
         if c.trials < MIN_TRIALS
     ]
     if short:
-        out.append(f"cells of fewer than {MIN_TRIALS} trials: {join_names(short)}; or leave these cells out")
+        out.append(f"each cell needs {MIN_TRIALS} trials: {join_names(short)}; or leave these cells out")
     return out
 
 

@@ -65,7 +65,7 @@ class Candidate:
     real: Estimate
     """Mean rate of its real cells; the interval holds for further days."""
     real_ranks: tuple[float, ...]
-    """Probability of each rank on the road among driven candidates; empty if this one is not driven, or no other."""
+    """Probability of each rank on the road among driven candidates; empty unless this and another one are driven."""
     corrected: Estimate
     """Real rate, predicted from its twin score and the rates of the driven candidates of other trainings."""
     trained: Estimate = _NOT_KNOWN
@@ -78,7 +78,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class LeftOutLighting:
-    """Prediction of real from twin rates under one lighting, by a line fitted under the task's other lightings."""
+    """Prediction of real rates under one lighting from the twin's, by a line fitted under the other lightings."""
 
     task: str
     lighting: str
@@ -153,7 +153,7 @@ class Forecast:
 
 
 def _without_nulls(value: Any) -> Any:
-    """Removes entries that are null from a JSON value, so that the dataclasses' fields get their defaults."""
+    """Removes null entries from a JSON value, so that the dataclasses' fields get their defaults."""
     if isinstance(value, dict):
         return {key: _without_nulls(item) for key, item in value.items() if item is not None}
     return [_without_nulls(item) for item in value] if isinstance(value, list) else value
@@ -313,7 +313,7 @@ def _rates_over_days(rows: Sequence[Sequence[Cell]], road: bool = True) -> list[
 
 
 def _mean_rate(cells: Sequence[Cell]) -> Estimate:
-    """Mean of the cells' rates, with an interval over episodes under these lightings."""
+    """Mean of the cells' rates, with an interval over episodes under the cells' lightings."""
     return Estimate(*mean_rate([c.successes for c in cells], [c.trials for c in cells]), sum(c.trials for c in cells))
 
 

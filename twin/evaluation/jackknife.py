@@ -2,9 +2,9 @@
 
 The *estimand* of an interval is the mean of the statistic over repeated experiments at the same place, each with the
 same numbers of new trainings, days and trials. If there are several places, each repetition also has new places. For a
-mean rate or a bias, this is the value in the population. For a correlation or MMRV (`statistics.mmrv`), it is the
-average result of such an experiment, including the noise of its few days and trials. An interval says nothing about the
-measured policies on the measured days.
+mean rate or a bias, this is the value in the population. For a correlation, MMRV (`statistics.mmrv`) or regret, it is
+the average result of such an experiment, including the noise of its few days and trials. An interval says nothing about
+the measured policies on the measured days.
 
 Units vary independently of each other: a *training* (checkpoints of a run are one unit), a *day* (a lighting of the
 real trials, left out of the twin and the road together), a *place* (with all its policies and days). With one place,
@@ -23,7 +23,7 @@ freedom are Satterthwaite's, but at least (trainings − 1) / 2, since few days 
 trainings + days − 2. There is no interval for fewer units than those for which its coverage was tested. There is also
 none if leaving units out changes nothing, since the variance cannot be estimated then.
 
-A bootstrap of 90 % intervals had a coverage of only 0.5 to 0.8: policies that it samples twice raise correlations, and
+90 % intervals by a bootstrap had a coverage of only 0.5 to 0.8: policies that it samples twice raise correlations, and
 trials that it resamples lower the agreement of twin and real rates.
 """
 
@@ -94,7 +94,7 @@ class PairedCells:
     def rates(self, kept: Array | None = None) -> dict[str, Array]:
         """Mean twin and real rates of the policies, shapes (..., n), over the cells in the mask `kept` (n, k).
 
-        By default, all cells are kept. Policies without a kept cell are left out.
+        Policies without a kept cell are left out.
         """
         weight = self.weight if kept is None else self.weight * kept
         total = weight.sum(-1)
@@ -193,8 +193,7 @@ def jackknife_interval(statistic: Statistic, data: PairedCells, confidence: floa
     """Ends of the interval of a statistic at one place, shapes (...).
 
     Among experiments along leading axes, those whose units do not determine a variance get nan. Raises
-    UndefinedStatistic: there are too few units (the message has the number needed); or, for a single experiment, the
-    variance is not determined.
+    UndefinedStatistic: there are too few units; or, for a single experiment, the variance is not determined.
     """
     trainings, days = data.trainings, data.days
     lacking = [

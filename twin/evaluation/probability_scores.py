@@ -1,6 +1,6 @@
 """Scores of predicted success probabilities: Brier and log scores, calibration, false alarms and misses.
 
-A predictor gives a probability p of success for each cell, the real trials of a policy on a day. Outcomes are 1 or 0:
+A predictor gives a probability p of success for each cell (a policy's real trials on a day). An outcome is 1 or 0:
 
     Brier score: mean over a cell's trials of (p − outcome)²
     log score: mean over a cell's trials of −log of the outcome's predicted probability

@@ -15,8 +15,8 @@ of a policy have the same outcome (706 of 720 cells in docs/benchmarks.md). Few 
 ρ without this prior: with a uniform one, 90 % intervals from four days had a coverage of 0.79. All policies share ρ.
 All parameters are integrated over a grid, so intervals need neither sampling nor a seed. A policy's rate is shrunk
 towards the rates of the other policies, more strongly if these are alike; it is not shrunk towards one half. The
-beta-binomial distribution is Skellam's (J. R. Stat. Soc. B 10, 1948);
-for hierarchical models see Gelman et al., Bayesian Data Analysis, section 5.3.
+beta-binomial distribution is Skellam's (J. R. Stat. Soc. B 10, 1948); for hierarchical models see Gelman et al.,
+Bayesian Data Analysis, section 5.3.
 
 Policies of one experiment drive on the same days, and a bad day is bad for all of them. So their cells are not
 independent, and the product of their likelihoods is a *composite* likelihood. It is raised to the power

@@ -259,7 +259,7 @@ def prediction_powered_mean(
     n, more = len(y), len(further)
     _check_count(n)
     if more < 2:
-        raise UndefinedStatistic(f"{more} policies driven in the twin only; 2 are needed: validate further ones")
+        raise UndefinedStatistic(f"{more} policies driven in the twin only; 2 are needed: validate further policies")
     powers = _left_out_powers(f, y, n / more) if power is None else np.full(n, power)
     mean_power = float(powers.mean())
     value = mean_power * further.mean() + float((y - powers * f).mean())

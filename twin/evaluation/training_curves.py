@@ -1,4 +1,4 @@
-"""Success during training, from a run's `episodes.csv`: a curve, and the rate just before a policy was saved."""
+"""Success rate in training, from a run's `episodes.csv`: a curve, and the value just before a policy was saved."""
 
 import csv
 import io
@@ -34,7 +34,7 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
         policies: Names, `run` or `run/checkpoint`.
 
     Returns:
-        By policy, JSON-able: its run; the step at which it was saved; task, observe and lighting of the training; the
+        By policy, JSON-able: its run; the step at which it was saved; the training's task, observe and lighting; the
         `rate_summary` of the last `RECENT_EPISODES` episodes of `read_episodes` up to that step; `first_step`, at which
         the first of them ended; and `test`, the run's final test if this policy drove in it, else None.
     """
@@ -160,7 +160,7 @@ def write_success_curve(folder: Path) -> Path:
             _plot_choice(axes, read_json(folder / CHOICE_FILE))
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    axes.set(xlabel="steps of all environments", ylabel="success in training", ylim=(-0.04, 1.04), xlim=(0, None))
+    axes.set(xlabel="steps of all environments", ylabel="success rate", ylim=(-0.04, 1.04), xlim=(0, None))
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
     plt.close(figure)

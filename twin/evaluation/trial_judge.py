@@ -36,7 +36,7 @@ class JudgedTrial:
     progress: Array
     """Distance along the task's route segment [m], shape (k,)."""
     cause: str
-    """One of `twin.config.CAUSES`; empty if the recording ends before an outcome."""
+    """Cause of the trial's end, one of `twin.config.CAUSES`; empty if the recording ends before an outcome."""
     start_heading: float
     """Yaw relative to the route at the start [rad]."""
     rewards: Array
@@ -55,7 +55,7 @@ class JudgedTrial:
         if not (cause or self.cause):
             raise InputError(
                 f"{where}: the recording ends after {self.times[-1]:.1f} s and {self.progress[-1]:.1f} m without an "
-                "outcome; record to the end, or state what ended the trial, such as --cause collision"
+                "outcome; record to the end, or give the cause, such as --cause collision"
             )
         return replace(self, cause=cause or self.cause)
 
@@ -114,7 +114,7 @@ def replay(factory: EnvFactory, start: Array, times: Array, command_times: Array
 
 @dataclass(frozen=True)
 class TrialViews:
-    """The robot's pictures beside the twin's, from the same poses."""
+    """The twin's renderings from the poses of the robot's pictures, and their agreement with these."""
 
     lighting: str
     twin: list[Image]
@@ -122,8 +122,8 @@ class TrialViews:
     psnr: Array
     """Peak signal-to-noise ratio [dB], shape (n,)."""
     matched_psnr: Array
-    """PSNR [dB], shape (n,), after the mean and standard deviation of each color channel were matched to the robot's
-    picture, so brightness, contrast and tint of the whole picture do not affect it."""
+    """PSNR [dB], shape (n,), with the mean and standard deviation of each color channel matched to the robot's picture,
+    so global brightness, contrast and tint do not affect it."""
     trust: Array
     """See `twin.env.trust`, shape (n,)."""
 
@@ -141,7 +141,7 @@ def view(
         lighting: Name of a lighting; None: the field's lighting with the best median PSNR over up to 8 pictures.
     """
     field, trust = factory.field, factory.trust
-    assert field is not None and trust is not None  # the options have pixels
+    assert field is not None and trust is not None  # the options enable pictures
     robot = factory.make_env(0)[0].robot
     seen = []
     for pose in poses:

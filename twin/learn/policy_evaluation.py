@@ -81,7 +81,7 @@ def run_episodes(
     seeds: Sequence[int],
     watch: Callable[[], object] = lambda: None,
 ) -> list[EpisodeResult]:
-    """Drives one episode per seed, in all environments in parallel; returns results in the order of the seeds.
+    """Drives one episode per seed, in parallel environments; returns results in the order of the seeds.
 
     `envs` must render pictures; their current episodes are abandoned. `watch` is called after every episode.
     """

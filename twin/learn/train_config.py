@@ -52,7 +52,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
 _CHOICES = {"observe": (NERF, SIMULATOR), "action": (STEERING, TWIST), "device": (CPU, CUDA)}
 
 _ROBOT_ONLY = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
-"""Randomizes the robot; the place looks as filmed."""
+"""Randomizes only the robot; the place looks as filmed."""
 
 
 def _numbers(value: Any) -> list[Any]:
@@ -86,8 +86,8 @@ class TrainConfig:
     steering: float = 0.5
     """Fraction of the step reward that is lost at full steering."""
     entropy: float = -0.5
-    """Target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 corresponds to a
-    standard deviation of 0.15, and -1 to 0.09."""
+    """Target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 means a standard
+    deviation of 0.15, and -1 one of 0.09."""
     start_along: float = 0.9
     """Half of the episodes start at a random point in this first fraction of the route segment, the others at its
     beginning. All start beside the route and at an angle to it, so that a policy practices returning to the middle."""
@@ -120,7 +120,7 @@ class TrainConfig:
     colours: float = 1.0
     """Strength of color augmentation in updates (`replay_buffer.py`); applied only if the lighting varies."""
     checkpoints: int = 20
-    """Number of policies saved in `steps` steps, at equal intervals; each test saves one more."""
+    """Number of policies saved in `steps` steps; each test saves one more."""
     test_every: int = 3_000
     """Number of steps between two tests of the policy (`selection.py`)."""
     settle: int = 2_000
@@ -184,7 +184,7 @@ class TrainConfig:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "cpu": {},
-    # Pictures have the full resolution, as in arXiv 2403.15791. This preset has not been measured on a GPU yet.
+    # Pictures have the full resolution, as in arXiv 2403.15791. Not measured on a GPU yet.
     "gpu": {
         "pool": 1,
         "convolutions": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),

@@ -39,11 +39,11 @@ from twin.types import Array, Image
 # ---- estimation from poses
 
 
-_MIN_FRAMES, _MIN_WAY = 16, 6.0  # fewest frames; shortest path [m]
+_MIN_FRAMES, _MIN_WAY = 16, 6.0  # least number of frames; shortest path [m]
 _PARTS = 8  # number of consecutive parts of the film for the jackknife
 _NOISE, _OUTLYING = 0.01, 0.03  # [m] standard deviation of a sum of sideways steps; threshold of the robust loss
 _PIVOT = 0.1  # [m] prior standard deviation of the turning point's forward offset from the base's origin
-_ROUNDS = 3  # alternations between estimating base poses and extrinsics
+_ROUNDS = 3  # number of alternations between estimating base poses and extrinsics
 _FAR_OFF, _JUMP = 8.0, 3.0  # multiples of the median deviation (outliers) and of the median step (jumps)
 
 

@@ -32,7 +32,7 @@ from twin.types import Array
 Kinds = tuple[int, ...]
 """The kind of each residual component, numbered from 0."""
 
-DEGREES_OF_FREEDOM = 3.0  # fits of ν to DRIVE's log gave 2.6 to 3.2
+DEGREES_OF_FREEDOM = 3.0  # fits of ν to the public DRIVE log gave 2.6 to 3.2
 
 _MIN_SCALE = 1e-3  # [m], [rad] or [rad/s] smallest σ; logs are not more accurate
 _ROUNDS, _SETTLED = 10, 0.05  # limit of alternations of scales and model; relative change of converged scales

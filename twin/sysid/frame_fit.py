@@ -20,12 +20,12 @@ from twin.types import Array
 from twin_policy import Rectifier
 
 SCENE_FRAME, FIT = "scene", "pictures"
-"""The poses are in the scene's frame, or their frame is to be fitted to localized pictures."""
+"""The poses are in the scene's frame, or their frame is fitted to localized pictures."""
 _LOCATED = 24  # largest number of pictures that are localized in the scene
 _MIN_LOCATED, _MIN_WAY = 5, 2.0  # least number of pictures; [m] least distance of the farthest pose from the first
 _MAX_RESIDUAL = 0.25  # [m] largest accepted `FrameFit.residual`
-_OUTLIER = 3.0  # pictures whose residual is above this multiple of the median are left out
-_ROUNDS = 5  # number of fits, each without the outliers of the one before
+_OUTLIER = 3.0  # pictures whose residual is above this multiple of the median, and above 0.05 m, are left out
+_ROUNDS = 5  # number of fits, each without the last one's outliers
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,6 @@ def scene_frame(recording: TrialRecording, frame: str, start: int, scene: SceneD
     """The frame of a recording's poses in a built scene.
 
     Args:
-        recording: The recording.
         frame: `SCENE_FRAME` or `FIT`.
         start: Time [ns] from which pictures are used.
         scene: The scene, with its ground.

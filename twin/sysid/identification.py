@@ -39,7 +39,7 @@ _GROUND_FIELDS = {  # field of HuskyParams → parameters of `tires`
     "wheel_radius": ("radius_left", "radius_right"),
     "servo_gain": ("log10_servo_gain",),
 }
-_DIGITS = 6  # digits of numbers in robot.toml
+_DIGITS = 6  # significant digits of numbers in robot.toml
 _NO_TWIST = "the log's commands are wheel speeds, which bypass the controller's own multiplier; needs v and ω"
 
 

@@ -424,7 +424,7 @@ def _finite(columns: dict[str, Array], where: str) -> None:
 
 # ---- plausibility
 
-_MIN_WINDOWS = 20  # least number to fit to; half as many to score on
+_MIN_WINDOWS = 20  # least number of windows to fit to; half as many to score on
 _MIN_TURNS = 10  # least number of windows that turn by more than `_TURN`; a quarter as many to each side
 _TURN = 0.25  # [rad]
 
@@ -481,8 +481,11 @@ def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, 
     commanded = windows.commanded_speeds[:, -1] * WHEEL_RADIUS
     end = windows.wheels[:, -1] * WHEEL_RADIUS
     measured = np.stack([end.mean(1), (end[:, 1] - end[:, 0]) / 2], -1)
-    of_wheels = "the mean of cmd_left and cmd_right", "the difference of cmd_left and cmd_right"
-    names = ("cmd_v", "cmd_yaw_rate") if windows.twist else of_wheels
+    names = (
+        ("cmd_v", "cmd_yaw_rate")
+        if windows.twist
+        else ("the mean of cmd_left and cmd_right", "the difference of cmd_left and cmd_right")
+    )
     for i, name in enumerate(names):
         use = (np.abs(measured[:, i]) > 0.5 * _MOVING) & (np.abs(commanded[:, i]) > 0)
         cures = {

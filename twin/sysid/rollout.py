@@ -29,7 +29,7 @@ Complex = NDArray[np.complex128]
 """Gravity along x (real part) and along y (imaginary part) [m/s²]."""
 
 GRAVITY = 9.81  # [m/s²]
-MAX_SLOPE = 0.2  # fraction of gravity; readings above 11° are bumps or glitches
+MAX_SLOPE = 0.2  # fraction of gravity; readings are clipped to this (11°), since larger ones are bumps or glitches
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def smooth_slopes(
 
 MAX_POSE_LAG, MAX_POSE_LEAD = 4, 3  # samples by which poses may be behind and ahead of the wheel speeds
 LEAD_SAMPLES = MAX_POSE_LAG + MAX_POSE_AGE  # samples before time zero in the result
-COARSE_TIMESTEP = 0.005  # [s] for the start of a fit; poses after 2 s differ by up to 1 cm and 0.8° from the scene's
+COARSE_TIMESTEP = 0.005  # [s] for the start of a fit; after 2 s, up to 1 cm and 0.8° off the poses at the scene's
 
 _SETTLE = 1.0  # [s] at rest before a simulation
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -1,9 +1,9 @@
 """Tires and ground, fitted to the poses of a log.
 
 All terms are parameters of the MJCF: contact coefficients, `impratio`, and the viscosity of a medium around the tires
-alone. By default, the ground is hard: only sliding friction and a small rolling resistance matter. Two more parameters
-belong to the log: the offset of the pose sensor from the base's origin, and the delay of poses against wheel speeds.
-The height of the center of mass is fitted only on slopes, as poses on level ground do not depend on it.
+alone. By default, the ground is hard: only sliding friction and a small rolling resistance matter. Two properties of
+the log are also fitted: the offset of the pose sensor from the base's origin, and the delay of poses against wheel
+speeds. The height of the center of mass is fitted only on slopes, as poses on level ground do not depend on it.
 """
 
 from collections.abc import Callable
@@ -23,10 +23,10 @@ from twin.types import Array
 # ---- choice of terms
 #
 # Four point contacts under Coulomb friction turn with the same track ratio chi at every speed and friction, and move
-# the body at the mean speed of the wheels. A Husky on grass (DRIVE's log) turns with chi 2.0 in gentle bends and 2.3 in
-# hard ones; in hard turns it moves at 0.4 to 0.7 of the wheels' mean speed, though it slips only 2.5 % when it goes
-# straight. Each model below was fitted to the even groups of that log and scored on its odd ones (median pose error
-# after 2 s):
+# the body at the mean speed of the wheels. A Husky on grass (public DRIVE log) turns with chi 2.0 in gentle bends and
+# 2.3 in hard ones; in hard turns it moves at 0.4 to 0.7 of the wheels' mean speed, though it slips only 2.5 % when it
+# goes straight. Each model below was fitted to the even groups of that log and scored on its odd ones (median pose
+# error after 2 s):
 #
 #     Coulomb, friction and center of mass fitted       0.23 m, 13 to 26°
 #     + spin friction of the contact patch              0.21 m, 6°: turns correctly, but moves as fast as its wheels
@@ -174,7 +174,7 @@ def fit_ground(
         )
     fitting = np.flatnonzero(windows.fitting)
     if len(fitting) < _MANY:  # fitting a delay that is near zero would bias the other parameters
-        refused["pose_late"] = f"pose_late = 0 s: not fitted to {len(fitting)} windows; needs {_MANY}"
+        refused["pose_late"] = f"pose_late = 0 s: not fitted to {len(fitting)} windows; needs {_MANY} or more"
     table = [
         Parameter(name, mean, std, low, high, defaults[name], unit, cure)
         for name, (mean, std, low, high, unit, cure) in _TABLE.items()

@@ -1,8 +1,8 @@
 """A trial on the road, read from the robot's bag: pictures, calibration, poses and commands.
 
-Times are nanoseconds (`twin.capture.bag.message_times`). Poses are planar, in the frame of their topic (odometry, RTK);
-`frame_fit.py` finds the pose of that frame in the scene, from pictures located there. Pictures are read from the bag
-only when they are needed.
+Times are nanoseconds (`twin.capture.bag.message_times`). Poses are planar, in the frame of their ROS topic (odometry,
+RTK); `frame_fit.py` finds the pose of that frame in the scene, from pictures located there. Pictures are read from the
+bag only when they are needed.
 """
 
 from collections.abc import Iterator
@@ -52,7 +52,7 @@ class TrialRecording:
     pose_times: NDArray[np.int64]
     """Stamps of the poses [ns], increasing, shape (p,)."""
     poses: Array
-    """x, y [m] and yaw [rad], continuous, shape (p, 3)."""
+    """x, y [m] and yaw [rad] without jumps of 2π, shape (p, 3)."""
     uprightness: Array
     """Cosine of the robot's tilt, shape (p,); 1 if the poses come from satellite fixes."""
     command_times: NDArray[np.int64]
