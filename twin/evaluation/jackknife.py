@@ -16,7 +16,7 @@ Econ. Stat. 29, 2011); each part is computed by leaving one unit out (Efron and 
 V_both is the variance from leaving out one training on one day; V_training and V_day each contain it. For a linear
 statistic of many units, such as the bias, all of V_both is subtracted. For the other statistics, subtracting all made
 intervals too narrow where leaving out a unit changes ranks, and subtracting nothing made them too wide
-(`benchmarks/intervals.py`). If V is not positive, the larger of V_training and V_day is used instead.
+(`benchmarks/intervals.py`). If V ≤ 0, V is the larger of V_training and V_day.
 
 The interval is the estimate ± Student's t times √V, on a scale on which the statistic is less skewed. The degrees of
 freedom are Satterthwaite's, but at least (trainings − 1) / 2, since few days made intervals too wide, and at most
@@ -44,7 +44,7 @@ from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
 
 MIN_TRAININGS, MIN_DAYS, MIN_PLACES = 8, 4, 5
-"""Numbers of trainings, days and places below which a statistic has no interval, unless stated otherwise below."""
+"""Numbers of trainings, days and places below which a statistic has no interval, except for those below."""
 MIN_PEARSON_TRAININGS = 12
 """Number of trainings below which Pearson's correlation has no interval, since a single policy may determine it."""
 MIN_BIAS_TRAININGS, MIN_BIAS_DAYS = 5, 3

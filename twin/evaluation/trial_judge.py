@@ -36,7 +36,7 @@ class JudgedTrial:
     progress: Array
     """Distance along the task's route segment [m], shape (k,)."""
     cause: str
-    """Cause of the trial's end, one of `twin.config.CAUSES`; empty if the recording ends before an outcome."""
+    """Cause of the end, one of `twin.config.CAUSES`; empty if the recording ends before an outcome."""
     start_heading: float
     """Yaw relative to the route at the start [rad]."""
     rewards: Array
@@ -114,11 +114,11 @@ def replay(factory: EnvFactory, start: Array, times: Array, command_times: Array
 
 @dataclass(frozen=True)
 class TrialViews:
-    """The twin's renderings from the poses of the robot's pictures, and their agreement with these."""
+    """Renderings from the poses of the robot's pictures, and their agreement with these."""
 
     lighting: str
     twin: list[Image]
-    """The rendered views, RGB uint8 (h, w, 3), one per picture."""
+    """RGB uint8 (h, w, 3), one per picture."""
     psnr: Array
     """Peak signal-to-noise ratio [dB], shape (n,)."""
     matched_psnr: Array
@@ -138,7 +138,7 @@ def view(
         poses: x, y [m], yaw [rad] of the base, shape (n, 3).
         pictures: RGB uint8 (h, w, 3) of `camera`.
         camera: A pinhole camera with the pictures' size.
-        lighting: Name of a lighting; None: the field's lighting with the best median PSNR over up to 8 pictures.
+        lighting: Name of a lighting; None: the field's lighting with the best median PSNR.
     """
     field, trust = factory.field, factory.trust
     assert field is not None and trust is not None  # the options enable pictures
@@ -169,6 +169,6 @@ def view(
 
 
 def _matched(picture: Array, reference: Array) -> Array:
-    """The picture with each color channel scaled to the mean and standard deviation of the reference's channel."""
+    """Scales each color channel of a picture to the mean and standard deviation of the reference's channel."""
     mean, std = picture.mean((0, 1)), picture.std((0, 1))
     return np.clip((picture - mean) / np.maximum(std, 1e-3) * reference.std((0, 1)) + reference.mean((0, 1)), 0.0, 1.0)

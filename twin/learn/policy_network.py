@@ -22,7 +22,7 @@ GROUND_MEAN, GROUND_STD = 128.0, 48.0
 """Mean and standard deviation of a normalized color in the lower half of a picture."""
 NOISE_STD = 4.0
 """Added to the measured standard deviation of a color, so that noise in uniform pictures is not amplified."""
-_OPSET, _IR = 17, 8  # versions of ONNX's operators and file format, old enough for the ONNX Runtime on a robot
+_OPSET, _IR = 17, 8  # ONNX operator and file versions, old enough for the ONNX Runtime on a robot
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,9 @@ class Architecture:
         if any(len(one) != 3 for one in self.convolutions) or not 1 <= len(self.convolutions) <= 8:
             raise ValueError("convolutions: expected 1 to 8, each (channels, kernel, stride)")
         if len(self.hidden) > 8 or min(self.grid) < 1:
-            raise ValueError(f"over 8 hidden layers, or pictures of {self.size} px are too small for the convolutions")
+            raise ValueError(
+                f"more than 8 hidden layers, or pictures of {self.size} px are too small for the convolutions"
+            )
 
     @property
     def channels(self) -> int:

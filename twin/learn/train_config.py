@@ -87,7 +87,7 @@ class TrainConfig:
     """Fraction of the step reward that is lost at full steering."""
     entropy: float = -0.5
     """Target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 means a standard
-    deviation of 0.15, and -1 one of 0.09."""
+    deviation of 0.15, and -1 means 0.09."""
     start_along: float = 0.9
     """Half of the episodes start at a random point in this first fraction of the route segment, the others at its
     beginning. All start beside the route and at an angle to it, so that a policy practices returning to the middle."""

@@ -72,7 +72,7 @@ def wandb_run(project: str, folder: Path, config: Mapping[str, Any]) -> Iterator
     try:
         import wandb
     except ImportError:
-        raise InputError("--wandb needs more: pip install '.[wandb]'") from None
+        raise InputError("--wandb needs more: pip install 'twin[wandb]'") from None
     entity, _, name = project.rpartition("/")
     try:
         run = wandb.init(

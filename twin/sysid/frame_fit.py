@@ -23,9 +23,9 @@ SCENE_FRAME, FIT = "scene", "pictures"
 """The poses are in the scene's frame, or their frame is fitted to localized pictures."""
 _LOCATED = 24  # largest number of pictures that are localized in the scene
 _MIN_LOCATED, _MIN_WAY = 5, 2.0  # least number of pictures; [m] least distance of the farthest pose from the first
-_MAX_RESIDUAL = 0.25  # [m] largest accepted `FrameFit.residual`
-_OUTLIER = 3.0  # pictures whose residual is above this multiple of the median, and above 0.05 m, are left out
-_ROUNDS = 5  # number of fits, each without the last one's outliers
+_MAX_RESIDUAL = 0.25  # [m] largest `FrameFit.residual`
+_OUTLIER = 3.0  # pictures with residuals above this multiple of the median, and above 0.05 m, are left out
+_ROUNDS = 5  # number of fits
 
 
 @dataclass(frozen=True)

@@ -170,7 +170,7 @@ class Windows:
         return np.stack([a + b, b - a], -1) / 2
 
     def select(self, which: NDArray) -> "Windows":
-        """Some of the windows, by mask or index; in the result, none counts as following another."""
+        """Some of the windows, by mask or index; none of them counts as following another."""
         wheels = self.wheels[which]
         return Windows(
             self.commands[which],
