@@ -175,7 +175,7 @@ def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
 
 
 def unit_counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, Indices]:
-    """Successes and trials of each policy's units, shapes (n, k); a unit is a cell if `by_day`, else a trial."""
+    """Successes and trials of each policy's independent units, shapes (n, k): cells if `by_day`, else trials."""
     if by_day:
         return padded_counts([[(c.successes, c.trials) for c in row] for row in rows])
     won = [sum(c.successes for c in row) for row in rows]

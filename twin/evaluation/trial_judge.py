@@ -2,7 +2,7 @@
 
 `judge` applies the environment's `RewardAndTermination` to the recorded poses, sampled once per control step. The
 operator reports outcomes that poses do not show, such as a collision. `replay` drives the twin's robot by the recorded
-commands, from the same start. `view` renders the field from the poses at which the robot took its pictures.
+commands, from the same start. `view` renders the radiance field from the poses of the robot's pictures.
 """
 
 from dataclasses import dataclass, replace

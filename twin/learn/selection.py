@@ -1,7 +1,7 @@
 """Decides when a training ends and which of its policies is kept, by tests between segments of the training.
 
 A *test* drives the newest policy, without exploration, in whole episodes like those of the training. All tests of a run
-use the same episodes, and the training never uses these. A test is broken off once more episodes have failed than the
+use the same episodes, and the training never uses these. A test stops as soon as more episodes have failed than the
 required success rate `config.success` allows. The training ends
 
 - when a test *reaches* the required rate;
@@ -10,7 +10,7 @@ required success rate `config.success` allows. The training ends
 
 In the first two cases, `config.settle` more steps with a falling learning rate (`training.py`) and one more test
 follow. The kept policy is the one with most successes among those that drove a whole test; the mean reward breaks ties.
-If no policy reached the required rate, the best `_FINALISTS` drive whole tests before the choice. The best of several
+If no policy reached the required rate, the best `_FINALISTS` policies drive whole tests first. The best of several
 results is biased upwards by luck. So the kept policy drives fresh episodes, which no decision used, in a *final test*.
 If the lighting varies, these episodes have held-out lightings and everything randomized, as in `twin validate` by
 default.
@@ -46,7 +46,7 @@ PATIENCE = 4
 REACHED, NO_BETTER, ALL_STEPS = ENDS = ("reached", "no better", "steps")
 """Reasons to end a training."""
 
-_BATCHES = (8, 12, 20)  # numbers of episodes; a test may be broken off after each batch
+_BATCHES = (8, 12, 20)  # numbers of episodes; a test may stop after each batch
 _TEST_EPISODES = sum(_BATCHES)
 _BETTER = 0.02  # least improvement that counts: of the success rate (absolute), of the mean distance (relative)
 _FINALISTS = 3
@@ -231,7 +231,7 @@ def _most(values: list[Any]) -> tuple[Any, int]:
 
 
 def _test(config: TrainConfig, step: int, drive: Callable[[Sequence[int]], list[EpisodeResult]]) -> PolicyTest:
-    """Tests a policy in batches of episodes; stops once more have failed than the required success rate allows."""
+    """Tests a policy in batches of episodes; stops as soon as more have failed than the required success rate allows."""
     allowed = int(_TEST_EPISODES * (1.0 - config.success) + 1e-9)
     seeds, driven = _seeds(config), list[EpisodeResult]()
     for start, end in pairwise(np.cumsum([0, *_BATCHES]).tolist()):

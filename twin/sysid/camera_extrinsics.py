@@ -1,4 +1,4 @@
-"""Extrinsics and focal length of the robot's front camera, estimated from its film of the built place.
+"""Extrinsics and focal length of the robot's front camera, estimated from its film of the built scene.
 
 `capture/localize.py` localizes the film's frames. The extrinsics are the camera's height above flat ground and its
 rotation from straight ahead: yaw to the left, pitch down, roll to the right. Height, pitch and roll follow from the
