@@ -231,7 +231,7 @@ def _most(values: list[Any]) -> tuple[Any, int]:
 
 
 def _test(config: TrainConfig, step: int, drive: Callable[[Sequence[int]], list[EpisodeResult]]) -> PolicyTest:
-    """Tests a policy in batches of episodes; stops as soon as more have failed than the required success rate allows."""
+    """Tests a policy in batches of episodes; stops when more have failed than the required success rate allows."""
     allowed = int(_TEST_EPISODES * (1.0 - config.success) + 1e-9)
     seeds, driven = _seeds(config), list[EpisodeResult]()
     for start, end in pairwise(np.cumsum([0, *_BATCHES]).tolist()):
