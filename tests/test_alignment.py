@@ -247,7 +247,7 @@ def test_a_log_that_identifies_nothing_keeps_previous_fields():
     result = aligned()
     assert "fitted: nothing" in summary(result)
     text = robot_toml(result, {"friction": 0.3}, "log")
-    assert "nothing in it could be identified" in text and "friction = 0.3\n" in text
+    assert "Nothing could be identified from this log" in text and "friction = 0.3\n" in text
 
 
 def test_fields_of_the_scene_that_override_fitted_ones_are_named(tmp_path, monkeypatch, capsys):

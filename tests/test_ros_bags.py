@@ -47,7 +47,7 @@ def test_poses_of_the_wheels_are_refused_and_those_of_pictures_used(table, tmp_p
     times = begin + (np.arange(0, 10, 0.5) * 1e9).astype(np.int64)
     poses = np.column_stack([np.arange(20.0), np.zeros(20), np.linspace(0, 1, 20)])
     found = read_bag(bag, FilmedPoses(times, poses))
-    assert len(found["time"]) == ROWS and "the built scene, 20 of them" in capsys.readouterr().err
+    assert len(found["time"]) == ROWS and "20 poses in the built scene" in capsys.readouterr().err
     np.testing.assert_allclose(found["x"], np.minimum(np.floor((found["time"] + 1e-6) / 0.5), 19))
 
 

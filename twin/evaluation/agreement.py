@@ -2,10 +2,9 @@
 
 A *group* is the policies of one task, or of all tasks, that were driven on the road. A *cell* is the trials of one
 policy on one task under one lighting. A *day* is a lighting of the real trials; a *training* is a run, with all its
-checkpoints. Every number is an `Estimate`: a value with its count, or the reason why there is no value. A value has a
-90 % interval if `benchmarks/intervals.py` confirmed this coverage; otherwise it has the reason why there is no
-interval. Intervals hold for the population from which the trainings and days are a sample, not for the measured cells
-(see `jackknife` and `rate_model`).
+checkpoints. A statistic is an `Estimate`: a value with its sample size, or the reason why there is no value. A value
+has a 90 % interval only if `benchmarks/intervals.py` confirmed this coverage. Intervals hold for the population from
+which the trainings and days are a sample, not for the measured cells (see `jackknife` and `rate_model`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -57,9 +56,9 @@ from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
 
 DEPENDENT = "none: policies, and their predictions, depend on each other"
-"""Reason why a fraction of policies or cells has no interval."""
+"""Reason why a fraction of, or a mean over, policies or cells has no interval."""
 
-_MAXIMUM = "none at one place: the value depends on the best policy alone"
+_MAXIMUM = "none for a single place, since the value depends on the best policy alone"
 
 Cells = Mapping[tuple[str, str, str], Cell]
 """The twin's cells by `Cell.key`."""
@@ -67,7 +66,7 @@ Cells = Mapping[tuple[str, str, str], Cell]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its interval, or the reason for its absence."""
+    """A number with its interval; if either is missing, the reason."""
 
     value: float | None = None
     low: float | None = None
@@ -77,7 +76,7 @@ class Estimate:
     missing: str = ""
     """Reason why there is no value; empty if there is one."""
     no_interval: str = ""
-    """Reason why the value has no interval, and the data that an interval needs; empty if there is an interval."""
+    """Reason why the value has no interval; empty if it has one, and for `twin_error`, `brier` and `log`."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ class CellPair:
     bias: Estimate
     """Real minus twin rate."""
     within_chance: bool
-    """True if Newcombe's interval of the difference, with independent trials, contains 0."""
+    """True if Newcombe's interval of the difference, which treats trials as independent, contains 0."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +134,7 @@ class Agreement:
     bias: Estimate
     """Mean over policies of real minus twin rate."""
     coverage: Estimate
-    """Fraction of cells with `CellPair.within_chance`."""
+    """Fraction of cells for which `CellPair.within_chance` is true."""
     corrected_coverage: Estimate
     """Fraction of policies whose real rate lies in the interval predicted from policies of other trainings."""
     mean_real: Estimate
@@ -155,7 +154,7 @@ class Agreement:
 
 
 def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
-    """Texts that list the data that a statistic of these real cells still needs."""
+    """Messages that name the data that are still missing for statistics of these real cells."""
     policies = len({cell.policy for cell in real})
     out = []
     if policies < MIN_POLICIES:
@@ -171,12 +170,12 @@ def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
         if c.trials < MIN_TRIALS
     ]
     if short:
-        out.append(f"cells of fewer than {MIN_TRIALS} trials: {join_names(short)}; or leave these cells out")
+        out.append(f"each cell needs {MIN_TRIALS} trials: {join_names(short)}; or leave these cells out")
     return out
 
 
 def unit_counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, Indices]:
-    """Successes and trials of each policy's units, shapes (n, k); a unit is a cell if `by_day`, else a trial."""
+    """Successes and trials of each policy's independent units, shapes (n, k): cells if `by_day`, else trials."""
     if by_day:
         return padded_counts([[(c.successes, c.trials) for c in row] for row in rows])
     won = [sum(c.successes for c in row) for row in rows]
@@ -291,7 +290,7 @@ def _mean_real(data: PairedCells, further: Sequence[float]) -> Estimate:
         mean = prediction_powered_mean(twin=rates["twin"], real=rates["real"], twin_only=further)
     except UndefinedStatistic as refusal:
         return Estimate(missing=str(refusal))
-    alike = "none: its formula treats the trials of a day as independent"
+    alike = "none: the formula of the interval treats the trials of a day as independent"
     return Estimate(mean.value, n=data.policies + len(further), no_interval=alike)
 
 
@@ -301,7 +300,7 @@ TWIN, RECALIBRATED, OTHERS, SHUFFLED = (
     "without the twin: mean of the other trainings",
     "the twin, its days shuffled",
 )
-"""Names of predictors."""
+"""Names of the predictors in `PredictorScore`."""
 
 
 def _probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> dict[str, Any]:

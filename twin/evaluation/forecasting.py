@@ -1,9 +1,9 @@
 """Forecast of real success rates from rates in the twin. `report/` makes pages and tables from these numbers.
 
-A *candidate* is a policy on a task. Its twin score is the mean of its rates under the *compared lightings*: the twin's
-lightings with which real cells of the task are compared, or all lightings if there are no real trials. A candidate is
-*driven* if it has real trials. A *day* is a lighting of the real trials; a *training* is a run, with all its
-checkpoints. `agreement` compares the driven candidates of one task, or of all tasks, with the twin.
+A *candidate* is a policy on a task. Its twin score is the mean of its success rates in the twin under the *compared
+lightings*: those with which the task's real trials are compared, or all lightings if there are no real trials. A
+candidate is *driven* if it has real trials. A *day* is a lighting of the real trials; a *training* is a run, with all
+its checkpoints. `agreement` compares the driven candidates of one task, or of all tasks, with the twin.
 """
 
 from collections.abc import Mapping, Sequence
@@ -65,11 +65,11 @@ class Candidate:
     real: Estimate
     """Mean rate of its real cells; the interval holds for further days."""
     real_ranks: tuple[float, ...]
-    """Probability of each rank on the road among driven candidates; empty unless this one and another are driven."""
+    """Probability of each rank on the road among driven candidates; empty unless this and another one are driven."""
     corrected: Estimate
     """Real rate, predicted from its twin score and the rates of the driven candidates of other trainings."""
     trained: Estimate = _NOT_KNOWN
-    """Success rate in training before the policy was saved."""
+    """Success rate in the last training episodes before the policy was saved."""
 
     @property
     def driven(self) -> bool:
@@ -78,7 +78,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class LeftOutLighting:
-    """Prediction of the real rates under one lighting from the rates under the task's other lightings."""
+    """Prediction of real rates under one lighting from the twin's, by a line fitted under the other lightings."""
 
     task: str
     lighting: str
@@ -86,7 +86,7 @@ class LeftOutLighting:
     twin_error: Estimate
     """Mean absolute difference of twin and real rates."""
     corrected_error: Estimate
-    """Mean absolute difference of predicted and real rates, with a correction fitted under the other lightings."""
+    """Mean absolute difference of predicted and real rates."""
     coverage: Estimate
     """Fraction of cells whose real rate lies in the predicted interval."""
 
@@ -98,8 +98,8 @@ class TrialAllocation:
     task: str
     policies: int
     basis: str
-    """`road`: the trials are added to the real ones. `twin`: fewer than two policies have real trials, so the road is
-    assumed to have the twin's rates."""
+    """`road`: the trials are added to those already driven. `twin`: fewer than two policies have real trials, so the
+    road is assumed to have the twin's rates."""
     winner_now: float | None = None
     """See `RankingConfidence.winner`."""
     order_now: float | None = None
@@ -153,7 +153,7 @@ class Forecast:
 
 
 def _without_nulls(value: Any) -> Any:
-    """Removes entries that are null from a JSON value, so that the dataclasses' fields get their defaults."""
+    """Removes null entries from a JSON value, so that the dataclasses' fields get their defaults."""
     if isinstance(value, dict):
         return {key: _without_nulls(item) for key, item in value.items() if item is not None}
     return [_without_nulls(item) for item in value] if isinstance(value, list) else value
@@ -270,7 +270,7 @@ def _corrected(
             too_few = f"{len(others)} policies of other trainings driven, {MIN_POLICIES} needed"
             out.append(Estimate(missing=missing or too_few))
         elif {c.lighting for c in mine} != set(lightings):
-            out.append(Estimate(missing=f"not validated under {join_names(lightings)}, as the driven policies are"))
+            out.append(Estimate(missing=f"not validated under all compared lightings ({join_names(lightings)})"))
         else:
             line = LinearCorrection.fit(twin=[f for f, _ in others], real=[y for _, y in others])
             score = scores[i][0] if i in scores else _mean_rate(mine).value
@@ -313,12 +313,12 @@ def _rates_over_days(rows: Sequence[Sequence[Cell]], road: bool = True) -> list[
 
 
 def _mean_rate(cells: Sequence[Cell]) -> Estimate:
-    """Mean of the cells' rates, with an interval over episodes under these lightings."""
+    """Mean of the cells' rates, with an interval over episodes under the cells' lightings."""
     return Estimate(*mean_rate([c.successes for c in cells], [c.trials for c in cells]), sum(c.trials for c in cells))
 
 
 def _left_out(task: str, real: Sequence[Cell], twin: Cells) -> list[LeftOutLighting]:
-    """Predicts the real rates under each lighting of a task from the rates under its other lightings."""
+    """Predicts the real rates under each lighting of a task by a line fitted under its other lightings."""
     lightings = [cell.lighting for cell in real]
     names = list(dict.fromkeys(lightings))
     twin_rate, real_rate = np.array([_scores([cell], twin) for cell in real]).T

@@ -2,9 +2,9 @@
 
 The *estimand* of an interval is the mean of the statistic over repeated experiments at the same place, each with the
 same numbers of new trainings, days and trials. If there are several places, each repetition also has new places. For a
-mean rate or a bias, this is the value in the population. For a correlation, MMRV or regret, it is the average result of
-such an experiment, including the noise of its few days and trials. An interval says nothing about the measured policies
-on the measured days.
+mean rate or a bias, this is the value in the population. For a correlation, MMRV (`statistics.mmrv`) or regret, it is
+the average result of such an experiment, including the noise of its few days and trials. An interval says nothing about
+the measured policies on the measured days.
 
 Units vary independently of each other: a *training* (checkpoints of a run are one unit), a *day* (a lighting of the
 real trials, left out of the twin and the road together), a *place* (with all its policies and days). With one place,
@@ -15,15 +15,16 @@ Econ. Stat. 29, 2011); each part is computed by leaving one unit out (Efron and 
 
 V_both is the variance from leaving out one training on one day; V_training and V_day each contain it. For a linear
 statistic of many units, such as the bias, all of V_both is subtracted. For the other statistics, subtracting all made
-intervals too narrow where ranks jump, and subtracting nothing made them too wide (`benchmarks/intervals.py`).
+intervals too narrow where leaving out a unit changes ranks, and subtracting nothing made them too wide
+(`benchmarks/intervals.py`). If V ≤ 0, V is the larger of V_training and V_day.
 
 The interval is the estimate ± Student's t times √V, on a scale on which the statistic is less skewed. The degrees of
-freedom are Satterthwaite's, clipped to between (trainings − 1) / 2, since few days made intervals too wide, and
+freedom are Satterthwaite's, but at least (trainings − 1) / 2, since few days made intervals too wide, and at most
 trainings + days − 2. There is no interval for fewer units than those for which its coverage was tested. There is also
 none if leaving units out changes nothing, since the variance cannot be estimated then.
 
-A bootstrap was worse (coverage 0.5 to 0.8). It samples some policies twice, which raises correlations. Resampled trials
-make twin and real rates agree less than the observed ones do.
+90 % intervals by a bootstrap had a coverage of only 0.5 to 0.8: policies that it samples twice raise correlations, and
+trials that it resamples lower the agreement of twin and real rates.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -43,11 +44,11 @@ from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
 
 MIN_TRAININGS, MIN_DAYS, MIN_PLACES = 8, 4, 5
-"""Number of units below which a correlation or MMRV has no interval."""
+"""Numbers of trainings, days and places below which a statistic has no interval, except for those below."""
 MIN_PEARSON_TRAININGS = 12
 """Number of trainings below which Pearson's correlation has no interval, since a single policy may determine it."""
 MIN_BIAS_TRAININGS, MIN_BIAS_DAYS = 5, 3
-"""Number of units below which a mean difference has no interval."""
+"""Numbers of trainings and days below which a mean difference at one place has no interval."""
 
 _SHARE_OF_BOTH = 0.5  # fraction of V_both that is subtracted; see the module's docstring
 _LARGEST = 0.999  # correlations are clipped to ± this before Fisher's transform
@@ -93,7 +94,7 @@ class PairedCells:
     def rates(self, kept: Array | None = None) -> dict[str, Array]:
         """Mean twin and real rates of the policies, shapes (..., n), over the cells in the mask `kept` (n, k).
 
-        By default, all cells are kept. Policies without a kept cell are left out.
+        Policies without a kept cell are left out.
         """
         weight = self.weight if kept is None else self.weight * kept
         total = weight.sum(-1)
@@ -174,12 +175,12 @@ STATISTICS = {
     "mmrv": Statistic(mmrv_batched, _identity, _identity, 0.0, 1.0),
     "bias": Statistic(mean_bias, _identity, _identity, -1.0, 1.0, True, MIN_BIAS_TRAININGS, MIN_BIAS_DAYS),
 }
-"""Statistics that have intervals. Regret and agreement of the winner have none at one place, since they depend on the
-best policy alone."""
+"""Statistics that have intervals. Regret and agreement of the winner have none for a single place, since they depend on
+the best policy alone."""
 
 
 def mean_over_tasks(statistic: Callable[..., tuple[Array, Array]], data: PairedCells) -> tuple[Array, Array]:
-    """Means over tasks of two statistics that are defined only within a task."""
+    """Means, over the tasks with two policies or more, of the two values that `statistic` returns."""
     rates = data.rates()
     each = [statistic(twin=rates["twin"][..., of], real=rates["real"][..., of]) for of in data.strata if len(of) > 1]
     return np.mean([one[0] for one in each], 0), np.mean([one[1] for one in each], 0)
@@ -192,8 +193,7 @@ def jackknife_interval(statistic: Statistic, data: PairedCells, confidence: floa
     """Ends of the interval of a statistic at one place, shapes (...).
 
     Among experiments along leading axes, those whose units do not determine a variance get nan. Raises
-    UndefinedStatistic: there are too few units (the message has the number needed); or, for a single experiment, the
-    variance is not determined.
+    UndefinedStatistic: there are too few units; or, for a single experiment, the variance is not determined.
     """
     trainings, days = data.trainings, data.days
     lacking = [
@@ -241,7 +241,7 @@ def place_interval(
 def mean_difference_interval(
     differences: Array, confidence: float = CONFIDENCE, limits: tuple[float, float] = (-1.0, 1.0)
 ) -> tuple[float, float, float]:
-    """Mean of the differences of two setups, and the ends of its interval by Student's t.
+    """Mean difference of two training setups, and the ends of its interval by Student's t.
 
     Args:
         differences: One value per pair of trainings or per place, shape (n,).

@@ -1,9 +1,9 @@
 """Scores of predicted success probabilities: Brier and log scores, calibration, false alarms and misses.
 
-A predictor gives a probability p of success for each cell (policy, day) of the road, in which y of m trials succeed:
+A predictor gives a probability p of success for each cell (a policy's real trials on a day). An outcome is 1 or 0:
 
-    Brier score: mean over trials of (p − outcome)²
-    log score: mean over trials of −log of the outcome's predicted probability
+    Brier score: mean over a cell's trials of (p − outcome)²
+    log score: mean over a cell's trials of −log of the outcome's predicted probability
 
 The best value of both scores is 0. They are *proper*: the expected score is best if p is the true probability (Gneiting
 and Raftery, J. Am. Stat. Assoc. 102, 2007). The twin's scores are compared with those of baselines: `other_trainings`
@@ -107,7 +107,8 @@ def other_trainings(data: PairedCells, groups: Indices) -> Array:
     """Baseline: for each policy, the mean real rate of policies of the same group in other trainings, shape (n,).
 
     This mean includes, with the weight of one policy, the mean rate of all policies of other trainings. `groups`
-    contains the group of each policy, such as its setup; if all are equal, all policies of other trainings count alike.
+    contains the group of each policy, such as its training setup; if all are equal, all policies of other trainings
+    count alike.
     """
     real = data.rates()["real"]
     out = np.full(data.policies, 0.5)
@@ -148,7 +149,7 @@ def _logistic_line(x: Array, rate: Array) -> tuple[float, float]:
 
 
 def calibration(probability: Array, rate: Array, trials: Indices) -> tuple[CalibrationBin, ...]:
-    """Calibration curve of cells, shapes (c,); bins without cells are left out."""
+    """Calibration curve of cells, shapes (c,); bins without trials are left out."""
     edges = np.array(CALIBRATION_EDGES)
     index = np.clip(np.searchsorted(edges, probability, "right") - 1, 0, len(edges) - 2)
     out = []

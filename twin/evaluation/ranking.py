@@ -59,7 +59,7 @@ def expected_confidence(rates: Array, more: int, seed: int, so_far: bool = True)
         rates: Samples of the true rates, shape (samples, n).
         more: Further trials per policy.
         seed: Seed of the simulated trials.
-        so_far: True: the ranking also uses the trials from which `rates` were sampled; False: the further ones only.
+        so_far: True: the ranking also uses the trials on which the posterior is based; False: only the further ones.
     """
     won = np.random.default_rng(seed).binomial(more, rates)
     if so_far:
@@ -68,7 +68,7 @@ def expected_confidence(rates: Array, more: int, seed: int, so_far: bool = True)
         known = (strength * mean + won) / (strength + more)
     else:
         known = won.astype(float)
-    # Of policies tied in the posterior mean, each is equally likely to be ranked first.
+    # Policies tied in the posterior mean are equally likely to be ranked first.
     leading = np.isclose(known, known.max(-1, keepdims=True), rtol=0.0, atol=1e-12)
     good = rates >= rates.max(-1, keepdims=True) - MARGIN
     winner = ((leading & good).sum(-1) / leading.sum(-1)).mean()

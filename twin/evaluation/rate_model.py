@@ -12,11 +12,11 @@ A Beta distribution with mean p and intra-class correlation ρ is Beta(p/ρ − 
 trials of a day have the same outcome; with ρ = 0, they are independent. τ has a uniform prior, and μ has Jeffreys'. For
 the twin's rates (`road=False`), ρ has a uniform prior. For the road, its prior is Beta(5, 1): on most days, all trials
 of a policy have the same outcome (706 of 720 cells in docs/benchmarks.md). Few days do not suffice to estimate such a
-ρ: with a uniform prior, 90 % intervals from four days had a coverage of 0.79. All parameters are integrated over a
-grid, so intervals need neither sampling nor a seed. A policy's rate is shrunk towards the rates of the other policies,
-more strongly if these are alike; it is not shrunk towards one half. All policies share ρ, so even two days suffice to
-estimate it if eight policies drove on them. The beta-binomial distribution is Skellam's (J. R. Stat. Soc. B 10, 1948);
-for hierarchical models see Gelman et al., Bayesian Data Analysis, section 5.3.
+ρ without this prior: with a uniform one, 90 % intervals from four days had a coverage of 0.79. All policies share ρ.
+All parameters are integrated over a grid, so intervals need neither sampling nor a seed. A policy's rate is shrunk
+towards the rates of the other policies, more strongly if these are alike; it is not shrunk towards one half. The
+beta-binomial distribution is Skellam's (J. R. Stat. Soc. B 10, 1948); for hierarchical models see Gelman et al.,
+Bayesian Data Analysis, section 5.3.
 
 Policies of one experiment drive on the same days, and a bad day is bad for all of them. So their cells are not
 independent, and the product of their likelihoods is a *composite* likelihood. It is raised to the power
@@ -40,7 +40,7 @@ from twin.types import Array, Indices
 MIN_RATE_DAYS = 2
 """Number of days below which a policy's rate over days has no interval."""
 MIN_SETUP_TRAININGS = 4
-"""Number of trainings below which a setup's rate has no interval."""
+"""Number of trainings below which the rate of a training setup has no interval."""
 
 _EDGES = np.concatenate([[0.0], expit(np.linspace(-7.5, 7.5, 47)), [1.0]])
 """Edges of the grid of rates."""

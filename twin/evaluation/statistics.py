@@ -6,7 +6,7 @@ axis; leading axes are separate experiments. The arguments `twin` and `real` are
 changes results: regret and rank violations are differences of real rates.
 
 Functions raise `UndefinedStatistic` if the data do not determine a statistic. Functions whose names end in `_batched`
-work over leading axes, for resampling, and return nan instead of raising it.
+work over leading axes, for resampling, and raise nothing; a correlation that is not determined is nan.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ MIN_TRIALS = 5
 """Number of trials per cell below which neither agreement nor predictions are given."""
 
 _MIN_POINTS = 3  # smallest number of policies for a correlation
-_DECIMALS = 12  # scores that are equal to so many decimals are tied; further decimals depend on the order of summation
+_DECIMALS = 12  # scores equal to this many decimals are tied; further decimals depend on the order of summation
 _MIN_VARIANCE = 1e-12  # scores with a smaller variance count as equal
 
 
@@ -56,11 +56,11 @@ def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDEN
 
 
 def mean_rate(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
-    """Unweighted mean of the rates of k cells, shape (k,), and the ends of its interval.
+    """Unweighted mean of the rates of k cells with nᵢ trials, shape (k,), and the ends of its interval.
 
-    The interval is Wilson's for k² / Σ 1/nᵢ trials: if all cells have the same true rate, a binomial rate of so many
-    trials has the same variance as the mean. If the true rates differ, the variance is smaller, so the
-    interval is too wide rather than too narrow.
+    The interval is Wilson's for k² / Σ 1/nᵢ trials: if all cells have the same true rate, the rate in this many trials
+    has the same variance as the mean. If the true rates differ, the mean's variance is smaller, so the interval is too
+    wide rather than too narrow.
     """
     n = np.asarray(trials, float)
     mean = float(np.mean(np.asarray(successes, float) / n))
@@ -84,7 +84,7 @@ def rate_over_days(rates: ArrayLike, confidence: float = CONFIDENCE) -> tuple[fl
     outcome: with an intra-class correlation ρ of 1, the design effect 1 + (m − 1) ρ equals the number m of trials of a
     day (Kish, Survey Sampling, 1965, section 5.4), so k days count as k trials in Wilson's interval. If the trials of
     a day differ, the variance is smaller, so the interval is too wide rather than too narrow. It holds for further days
-    of the same policies, not for further policies. Raises ValueError: no rate, or one outside [0, 1].
+    of the same policies, not for further policies. Raises ValueError: no rate, or a rate outside [0, 1].
     """
     days = np.asarray(rates, float)
     if days.ndim != 1 or not len(days) or not ((days >= 0.0) & (days <= 1.0)).all():
@@ -243,7 +243,7 @@ def prediction_powered_mean(
     For each policy, λ is tuned on the other policies (leave one out), so the estimate is exactly unbiased. With a λ
     tuned on all policies it would be biased (Mani et al., arXiv 2505.20178). The interval uses Student's t with n − 1
     degrees of freedom and is not clipped to [0, 1]. In simulation, the coverage of a 90 % interval is 0.91 to 0.93 for
-    policies of varied quality, but 0.8 for six policies most of which fail.
+    policies of varied quality, but only 0.8 for six policies if most of them fail.
 
     Args:
         twin: fᵢ, shape (n,).
@@ -259,7 +259,7 @@ def prediction_powered_mean(
     n, more = len(y), len(further)
     _check_count(n)
     if more < 2:
-        raise UndefinedStatistic(f"{more} policies driven in the twin only; 2 are needed: validate further ones")
+        raise UndefinedStatistic(f"{more} policies driven in the twin only; 2 are needed: validate further policies")
     powers = _left_out_powers(f, y, n / more) if power is None else np.full(n, power)
     mean_power = float(powers.mean())
     value = mean_power * further.mean() + float((y - powers * f).mean())
@@ -305,7 +305,7 @@ class LinearCorrection:
         return LinearCorrection(slope, float(f.mean()), float(y.mean()), residual_std, squares, len(y))
 
     def predict(self, twin: ArrayLike, confidence: float = CONFIDENCE) -> tuple[Array, Array, Array]:
-        """Predicts the real scores that policies with these twin scores reach in as many trials as the fitted ones.
+        """Predicts the real scores of policies with these twin scores, in as many trials as the fitted policies had.
 
         Returns values and ends of their intervals, clipped to [0, 1], each of the shape of `twin`. The interval is the
         prediction interval of simple regression (Draper and Smith, Applied Regression Analysis, section 3.1). It is

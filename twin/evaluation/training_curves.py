@@ -1,4 +1,4 @@
-"""Success during training, from a run's `episodes.csv`: a curve, and the rate just before a policy was saved."""
+"""Success rate in training, from a run's `episodes.csv`: a curve, and the value just before a policy was saved."""
 
 import csv
 import io
@@ -22,8 +22,8 @@ from matplotlib.axes import Axes
 
 CHOICE_FILE = "choice.json"
 """File of a run that records the selection of its policy; see `learn/selection.py`."""
-_MAX_BINS = 25  # points of a curve
-_MIN_EPISODES = 5  # per point
+_MAX_BINS = 25  # largest number of points in a curve
+_MIN_EPISODES = 5  # smallest number of episodes per point
 
 
 def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[str, Any]]:
@@ -31,12 +31,12 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
 
     Args:
         root: The scene folder.
-        policies: Names as in tables, `run` or `run/checkpoint`.
+        policies: Names, `run` or `run/checkpoint`.
 
     Returns:
-        By policy, JSON-able: its run; the step at which it was saved; task, observe and lighting of the training; the
+        By policy, JSON-able: its run; the step at which it was saved; the training's task, observe and lighting; the
         `rate_summary` of the last `RECENT_EPISODES` episodes of `read_episodes` up to that step; `first_step`, at which
-        the first of them ended; and `test`, the run's final test if it drove this policy, else None.
+        the first of them ended; and `test`, the run's final test if this policy drove in it, else None.
     """
     digests = validated_digests(root)
     out = {}
@@ -66,7 +66,7 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
 
 
 def _final_test(folder: Path) -> dict[str, Any] | None:
-    """A run's final test: step of the tested policy, condition of the episodes, and `rate_summary`; None without it."""
+    """A run's final test: step of the policy, condition of the episodes, and `rate_summary`; None if there was none."""
     path = folder / CHOICE_FILE
     if not _is_there(path):
         return None
@@ -89,7 +89,7 @@ def validated_digests(root: Path) -> dict[str, Any]:
 
 
 def _is_there(path: Path) -> bool:
-    """True for an existing regular file. A name that is invalid as a file name, as a table may contain, gives False."""
+    """True for an existing regular file; False also for a policy name from a table that cannot be a file name."""
     try:
         return bool(regular_file(path))
     except InputError:
@@ -139,7 +139,7 @@ def _plot_choice(axes: Axes, choice: dict[str, Any]) -> None:
     tried, chosen = choice["candidates"], choice["chosen"]
     shares = [one["successes"] / one["trials"] for one in tried]
     counts = sorted({one["trials"] for one in tried})
-    label = f"tests without exploration, {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} episodes"
+    label = f"tests without exploration, {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} episodes each"
     axes.plot([one["step"] for one in tried], shares, "o", color="#d95f02", fillstyle="none", label=label)
     rate = chosen["successes"] / chosen["trials"]
     low, high = wilson(chosen["successes"], chosen["trials"])
@@ -160,7 +160,7 @@ def write_success_curve(folder: Path) -> Path:
             _plot_choice(axes, read_json(folder / CHOICE_FILE))
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    axes.set(xlabel="steps of all environments", ylabel="success in training", ylim=(-0.04, 1.04), xlim=(0, None))
+    axes.set(xlabel="steps of all environments", ylabel="success rate", ylim=(-0.04, 1.04), xlim=(0, None))
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
     plt.close(figure)

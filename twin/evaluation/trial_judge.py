@@ -2,7 +2,7 @@
 
 `judge` applies the environment's `RewardAndTermination` to the recorded poses, sampled once per control step. The
 operator reports outcomes that poses do not show, such as a collision. `replay` drives the twin's robot by the recorded
-commands, from the same start. `view` renders the field from the poses at which the robot took its pictures.
+commands, from the same start. `view` renders the radiance field from the poses of the robot's pictures.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from twin.nerf.rendering import Rendering
 from twin.robot import PixelCamera
 from twin.types import Array, Image
 
-_PROBES = 8  # number of pictures by which a lighting is chosen
+_PROBES = 8  # largest number of pictures by which a lighting is chosen
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class JudgedTrial:
     progress: Array
     """Distance along the task's route segment [m], shape (k,)."""
     cause: str
-    """One of `twin.config.CAUSES`; empty if the recording ends before an outcome."""
+    """Cause of the end, one of `twin.config.CAUSES`; empty if the recording ends before an outcome."""
     start_heading: float
     """Yaw relative to the route at the start [rad]."""
     rewards: Array
@@ -55,7 +55,7 @@ class JudgedTrial:
         if not (cause or self.cause):
             raise InputError(
                 f"{where}: the recording ends after {self.times[-1]:.1f} s and {self.progress[-1]:.1f} m without an "
-                "outcome; record to the end, or say what ended it, such as --cause collision"
+                "outcome; record to the end, or give the cause, such as --cause collision"
             )
         return replace(self, cause=cause or self.cause)
 
@@ -114,16 +114,16 @@ def replay(factory: EnvFactory, start: Array, times: Array, command_times: Array
 
 @dataclass(frozen=True)
 class TrialViews:
-    """The robot's pictures beside the twin's, from the same poses."""
+    """Renderings from the poses of the robot's pictures, and their agreement with these."""
 
     lighting: str
     twin: list[Image]
-    """The rendered views, RGB uint8 (h, w, 3), one per picture."""
+    """RGB uint8 (h, w, 3), one per picture."""
     psnr: Array
-    """[dB], shape (n,)."""
+    """Peak signal-to-noise ratio [dB], shape (n,)."""
     matched_psnr: Array
-    """PSNR [dB], shape (n,), after the mean and standard deviation of each color were matched to the robot's picture;
-    only shapes and shadows affect it."""
+    """PSNR [dB], shape (n,), with the mean and standard deviation of each color channel matched to the robot's picture,
+    so global brightness, contrast and tint do not affect it."""
     trust: Array
     """See `twin.env.trust`, shape (n,)."""
 
@@ -138,10 +138,10 @@ def view(
         poses: x, y [m], yaw [rad] of the base, shape (n, 3).
         pictures: RGB uint8 (h, w, 3) of `camera`.
         camera: A pinhole camera with the pictures' size.
-        lighting: Name of a lighting; None: the filmed or added lighting with the best median PSNR.
+        lighting: Name of a lighting; None: the field's lighting with the best median PSNR.
     """
     field, trust = factory.field, factory.trust
-    assert field is not None and trust is not None  # the options have pixels
+    assert field is not None and trust is not None  # the options enable pictures
     robot = factory.make_env(0)[0].robot
     seen = []
     for pose in poses:
@@ -169,6 +169,6 @@ def view(
 
 
 def _matched(picture: Array, reference: Array) -> Array:
-    """The picture with each color scaled to the mean and standard deviation of that color in the reference."""
+    """Scales each color channel of a picture to the mean and standard deviation of the reference's channel."""
     mean, std = picture.mean((0, 1)), picture.std((0, 1))
     return np.clip((picture - mean) / np.maximum(std, 1e-3) * reference.std((0, 1)) + reference.mean((0, 1)), 0.0, 1.0)

@@ -216,7 +216,7 @@ def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
 def read_counts(path: Path) -> dict[tuple[str, str, str], tuple[int, int]]:
     """Trials and successes by policy, task (empty if not given) and lighting in a results table.
 
-    Raises InputError as `read_results` does; names are not compared with the twin's.
+    Raises InputError: no such file, or a malformed table. Names, duplicates and sums are not checked.
     """
     return {
         (row["policy"], row.get("task", ""), row["lighting"]): (

@@ -1,7 +1,7 @@
 """Trained policies: reading, writing and running them, without torch and stable-baselines3.
 
     policy = load_policy("scenes/demo/runs/night_owl")
-    action = policy(pixels)                 # from uint8 (12, 90, 160), the newest picture last; numbers in [-1, 1]
+    action = policy(pixels)                 # pixels: uint8 (12, 90, 160), newest picture last; action: in [-1, 1]
     v, yaw_rate = policy.command(action)    # m/s, rad/s
 
 A *policy folder* contains three files. `policy.json` describes the control, the network's sizes and the training.
@@ -31,7 +31,7 @@ from twin.learn.policy_network import Architecture, onnx_bytes
 from twin.types import Array32, Image
 
 ActFunction = Callable[[Image], Array32]
-"""Stacks (n, 3 · stack, height, width) → actions (n, actions)."""
+"""Stacks of pictures (n, 3 · stack, height, width) → actions (n, actions)."""
 
 JSON, WEIGHTS, ONNX = "policy.json", "policy.safetensors", "policy.onnx"
 FORMAT, VERSION = "twin policy", 2
@@ -184,7 +184,7 @@ def load_policy(source: str | Path, trust: bool = False) -> Policy:
         return _from_onnx(path)
     if path.is_file() and path.suffix == ".zip":
         if not trust:
-            raise InputError(f"{path}: a stable-baselines3 zip runs code when it is loaded; if you trust it, --trust")
+            raise InputError(f"{path}: loading a stable-baselines3 zip runs code from it; if you trust it, add --trust")
         return _from_zip(path)
     if path.exists():
         raise InputError(f"{path}: expected a policy folder, an .onnx file or a stable-baselines3 .zip")
@@ -234,7 +234,7 @@ def _from_onnx(path: Path) -> Policy:
     inputs = [one for one in model.graph.input if one.name not in names]
     shapes = [[d.dim_value for d in one.type.tensor_type.shape.dim] for one in (*inputs, *model.graph.output)]
     fits = len(inputs) == 1 and [len(shape) for shape in shapes] == [4, 2]
-    # Here a dynamic axis has size 0.
+    # A dynamic axis has dim_value 0.
     if not fits or shapes[0][1] % 3 or 0 in shapes[0][1:] or shapes[0][0] > 1 or shapes[1][1] not in (1, 2):
         raise InputError(
             f"{path}: inputs and outputs {shapes}; expected one input (n, 3 · stack, height, width) and one output "
@@ -286,7 +286,7 @@ def _from_callable(name: str) -> Policy:
         outputs = [output_of(stack) for stack in stacks]
         if any(one.shape != example.shape for one in outputs):
             raise InputError(
-                f"policy {name}: returned {short_repr(outputs)}; expected {example.shape[0]} number(s) as at first"
+                f"policy {name}: returned {short_repr(outputs)}; expected {example.shape[0]} number(s), as at first"
             )
         return np.stack(outputs)
 
@@ -302,11 +302,11 @@ def _from_zip(path: Path) -> Policy:
     try:
         from stable_baselines3 import SAC
     except ImportError:
-        raise InputError(f"{path}: needs stable-baselines3; pip install twin[learn]") from None
+        raise InputError(f"{path}: needs stable-baselines3; pip install '.[learn]'") from None
     try:
         model = SAC.load(path, device="cpu")
     except Exception as error:  # damaged zips and pickles raise many kinds of errors
-        raise InputError(f"{path}: not a SAC of stable-baselines3: {type(error).__name__}: {error}") from None
+        raise InputError(f"{path}: not a SAC model of stable-baselines3: {type(error).__name__}: {error}") from None
     shape, actions = model.observation_space.shape, model.action_space.shape
     if shape is None or len(shape) != 3 or shape[0] % 3 or actions not in ((1,), (2,)):
         raise InputError(

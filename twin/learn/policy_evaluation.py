@@ -1,8 +1,8 @@
 """Evaluation of policies on numbered episodes of a task, on this machine or a Ray cluster.
 
 Seed and lighting determine an *episode*: its start, robot and light do not depend on the policy, the machine or other
-episodes. So all policies drive the same episodes, and the *chunks* of a campaign, groups of episodes that one process
-drives, can run in any order.
+episodes. So all policies drive the same episodes, and *chunks*, groups of episodes that one process drives, can run in
+any order.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ from twin.runtime import die_with_parent, ignore_terminal_signals, signals_held,
 CHUNK = 16
 """Largest number of episodes in a chunk."""
 
-_ENVS = 8  # number of episodes driven at once
+_ENVS = 8  # number of episodes driven in parallel
 _SAMPLED_LIGHTING = re.compile(r"drawn_(\d+)")
 
 
@@ -54,7 +54,7 @@ class EpisodeChunk:
 class EpisodeResult:
     """Result of an episode, with progress [m], mean trust of its pictures (`env/trust.py`), and sum of its rewards.
 
-    `lighting` is the sampled lighting.
+    `lighting` is the lighting's name and, if it was sampled, its mixture; see `LocalVectorEnv.info`.
     """
 
     seed: int
@@ -81,7 +81,7 @@ def run_episodes(
     seeds: Sequence[int],
     watch: Callable[[], object] = lambda: None,
 ) -> list[EpisodeResult]:
-    """Drives one episode per seed, in all environments at once; returns results in the order of the seeds.
+    """Drives one episode per seed, in parallel environments; returns results in the order of the seeds.
 
     `envs` must render pictures; their current episodes are abandoned. `watch` is called after every episode.
     """
@@ -101,8 +101,8 @@ def run_episodes(
         for i in which:
             trusts[driving[i]].append(float(envs.pixels.trust[i]))
         pictures = envs.observation()
-        # Stacks are passed one by one: in a batch, sums have another order, and the last bit of an action can decide
-        # whether a robot hits the kerb.
+        # The policy gets one stack of pictures at a time: in a batch, sums have another order, and the last bit of an
+        # action can decide whether a robot hits the curb.
         out = envs.step(np.stack([policy(pictures[i]) for i in which]), which)
         rewards[[driving[i] for i in which]] += out.reward
         for i in [i for i, ended in zip(which, out.over, strict=True) if ended]:
@@ -115,7 +115,7 @@ def run_episodes(
 
 
 def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[list[EpisodeResult]]:
-    """Drives chunks in worker processes on this machine; yields the chunks' results in order.
+    """Drives chunks on this machine, in several worker processes or in this one; yields the chunks' results in order.
 
     The workers end with this process. Raises InputError: an error of `run_chunk`, or a worker ended, most likely
     because memory ran out.
@@ -145,7 +145,7 @@ def with_sampled_lighting(factory: EnvFactory, number: int) -> EnvFactory:
     assert factory.field is not None
     name = f"drawn_{number}"
     if name not in factory.field.lightings:
-        # Sampled from the filmed lightings only, so that lightings sampled before have no effect.
+        # Sampled from the filmed lightings only, so that lightings sampled earlier have no effect.
         filmed = factory.field.lightings_by_name.filmed()
         factory.field.add_lightings({name: filmed.sample(np.random.default_rng(number))})
     return factory

@@ -3,7 +3,7 @@
 A *stack* is uint8 (3 · stack, height, width), the newest picture last. Preprocessing has two steps. First, blocks of
 `pool` × `pool` pixels are averaged. Then each color of each picture is scaled so that the lower half, where the ground
 is, has a fixed mean and standard deviation; this removes exposure, white balance and most of the lighting. Both steps
-return bytes, so that training and driving use the same values.
+return uint8, so that training and driving use the same values.
 
 The *encoder* is that of DrQ (Kostrikov et al. 2020) at another size: convolutions with ReLU, then a linear layer with
 layer normalization and tanh. Hidden layers with ReLU follow, and a tanh that gives actions in [-1, 1].
@@ -22,7 +22,7 @@ GROUND_MEAN, GROUND_STD = 128.0, 48.0
 """Mean and standard deviation of a normalized color in the lower half of a picture."""
 NOISE_STD = 4.0
 """Added to the measured standard deviation of a color, so that noise in uniform pictures is not amplified."""
-_OPSET, _IR = 17, 8  # old enough for the ONNX Runtime on a robot
+_OPSET, _IR = 17, 8  # ONNX operator and file versions, old enough for the ONNX Runtime on a robot
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,9 @@ class Architecture:
         if any(len(one) != 3 for one in self.convolutions) or not 1 <= len(self.convolutions) <= 8:
             raise ValueError("convolutions: expected 1 to 8, each (channels, kernel, stride)")
         if len(self.hidden) > 8 or min(self.grid) < 1:
-            raise ValueError(f"pictures of {self.size} px are too small for the convolutions")
+            raise ValueError(
+                f"more than 8 hidden layers, or pictures of {self.size} px are too small for the convolutions"
+            )
 
     @property
     def channels(self) -> int:

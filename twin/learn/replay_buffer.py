@@ -1,6 +1,6 @@
 """A replay buffer that stores single pictures instead of stacks, and color augmentation of its samples.
 
-Each environment has a *ring* (buffer) in a file, to which its pictures are written once, in order, across episodes. A
+Each environment has a *ring* buffer in a file, to which its pictures are written once, in order, across episodes. A
 *transition* stores its *age*, the number of steps since its episode began, and the index of the newest picture before
 it. The stack before the transition ends with this picture, the stack after it with the next picture of the ring. If the
 episode has too few pictures for a stack, its first one is repeated. A buffer that stores both stacks, of four pictures
@@ -23,14 +23,14 @@ from twin.files import allocate
 
 # ---- color augmentation
 
-_GAMMA, _CONTRAST, _TINT = 0.25, 0.25, 0.08  # standard deviations of their logarithms
+_GAMMA, _CONTRAST, _TINT = 0.25, 0.25, 0.08  # standard deviations of the logarithms of the random factors
 _KNOTS, _SHADING = (3, 5), 0.4  # brightness pattern: knots down and across; standard deviation of the logarithm
-_MAX_COVERS, _COVER_SIDES = 4, (0.1, 0.5)  # bound of the number of rectangles, exclusive; their sides / the picture's
+_MAX_COVERS, _COVER_SIDES = 4, (0.1, 0.5)  # rectangles: the number is less than 4; range of sides / the picture's
 _LEVELS = np.arange(256) / 255.0
 
 
 def augment_colors(stacks: NDArray[np.uint8], strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Randomizes the colors of stacks, to prepare policies for skies and shadows that no lighting of the field shows.
+    """Randomizes the colors of stacks, to prepare policies for skies and shadows that no filmed lighting shows.
 
     The policy's normalization removes brightness, contrast and tint of the whole ground; this function randomizes what
     remains. Each stack is changed in its own way, but all pictures of a stack alike, which preserves motion:
@@ -41,7 +41,7 @@ def augment_colors(stacks: NDArray[np.uint8], strength: float, rng: np.random.Ge
         covers   rectangles in uniform colors, so that steering does not rely on a single object in the background
 
     Args:
-        stacks: Shape (k, 3 · stack, height, width), the colors of one picture next to each other.
+        stacks: Shape (k, 3 · stack, height, width); the three color channels of a picture are adjacent.
         strength: Factor by which the standard deviations are multiplied; 0 changes nothing.
     """
     count, channels, height, width = stacks.shape
@@ -78,7 +78,7 @@ _ROWS = ("actions", "rewards", "ends", "newest", "age", "states", "states_after"
 
 
 class ReplaySamples(NamedTuple):
-    """Samples as in stable-baselines3, and privileged states."""
+    """Samples as in stable-baselines3, and the robot's states before and after, which only the critics receive."""
 
     observations: torch.Tensor
     actions: torch.Tensor
@@ -204,7 +204,7 @@ class FrameReplayBuffer(ReplayBuffer):
         if self.shift:
             before, after = self._shifted(before), self._shifted(after)
         if self.color_strength:
-            # Targets are computed from the stacks after transitions, which stay unchanged (SVEA, Hansen et al. 2021).
+            # Stacks after transitions stay unchanged, since targets are computed from them (SVEA, Hansen et al. 2021).
             half = batch_size // 2
             before[:half] = augment_colors(before[:half], self.color_strength, self.rng)
         rest = self.actions[row, env_index], after, self.ends[row, env_index, None], self.rewards[row, env_index, None]
@@ -212,7 +212,7 @@ class FrameReplayBuffer(ReplayBuffer):
         return ReplaySamples(*(torch.as_tensor(part, device=self.device) for part in parts))
 
     def is_complete(self, row: NDArray, env_index: NDArray) -> NDArray[np.bool_]:
-        """True for each transition whose pictures are all still in the ring; shapes (k,) → (k,)."""
+        """True for each transition whose pictures are all among the newest `_reach` of the ring; shapes (k,) → (k,)."""
         oldest = self.newest[row, env_index] - np.minimum(self.age[row, env_index], self.stack - 1)
         return oldest >= self.written[env_index] - self._reach
 

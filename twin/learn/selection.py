@@ -1,7 +1,7 @@
 """Decides when a training ends and which of its policies is kept, by tests between segments of the training.
 
 A *test* drives the newest policy, without exploration, in whole episodes like those of the training. All tests of a run
-use the same episodes, and the training never uses these. A test is broken off once more episodes have failed than the
+use the same episodes, and the training never uses these. A test stops as soon as more episodes have failed than the
 required success rate `config.success` allows. The training ends
 
 - when a test *reaches* the required rate;
@@ -10,7 +10,7 @@ required success rate `config.success` allows. The training ends
 
 In the first two cases, `config.settle` more steps with a falling learning rate (`training.py`) and one more test
 follow. The kept policy is the one with most successes among those that drove a whole test; the mean reward breaks ties.
-If no policy reached the required rate, the best `_FINALISTS` drive whole tests before the choice. The best of several
+If no policy reached the required rate, the best `_FINALISTS` policies drive whole tests first. The best of several
 results is biased upwards by luck. So the kept policy drives fresh episodes, which no decision used, in a *final test*.
 If the lighting varies, these episodes have held-out lightings and everything randomized, as in `twin validate` by
 default.
@@ -46,11 +46,11 @@ PATIENCE = 4
 REACHED, NO_BETTER, ALL_STEPS = ENDS = ("reached", "no better", "steps")
 """Reasons to end a training."""
 
-_BATCHES = (8, 12, 20)  # numbers of episodes; a test may be broken off after each batch
+_BATCHES = (8, 12, 20)  # numbers of episodes; a test may stop after each batch
 _TEST_EPISODES = sum(_BATCHES)
-_BETTER = 0.02  # least improvement of the success rate (absolute) and of the mean distance along the route (relative)
+_BETTER = 0.02  # least improvement that counts: of the success rate (absolute), of the mean distance (relative)
 _FINALISTS = 3
-_STREAM = 7  # see `training._TRAINING_STREAM`
+_STREAM = 7  # part of the seed of the test episodes; see `training._TRAINING_STREAM`
 _PLACE = 5.0  # [m] length of the route sections in which failures are counted
 
 
@@ -100,7 +100,7 @@ class PolicyTest:
 
 
 def next_segment(config: TrainConfig, tests: Sequence[PolicyTest]) -> Segment:
-    """The segment that follows the tests so far."""
+    """The segment of the training that follows these tests."""
     last = tests[-1].step if tests else 0
     settled = min(last + config.settle, config.steps)
     if tests and tests[-1].reached(config.success):
@@ -143,9 +143,9 @@ def train_until_learnt(
     tests' scores, as `tests/...`.
 
     Returns:
-        The contents of `choice.json`: the number of steps; the required success rate and whether it is reached; the
-        reason why the training ended; the tests; `chosen`, the final test, with its condition; and a sentence on where
-        and why episodes failed.
+        The contents of `choice.json`: the steps done and allowed; the required success rate and whether it is reached;
+        the reason why the training ended; the tests; `chosen`, the final test, with its condition; and a sentence on
+        where and why episodes failed.
     """
     if before := earlier_choice(twin, folder, config):
         return before
@@ -231,7 +231,7 @@ def _most(values: list[Any]) -> tuple[Any, int]:
 
 
 def _test(config: TrainConfig, step: int, drive: Callable[[Sequence[int]], list[EpisodeResult]]) -> PolicyTest:
-    """Tests a policy in batches of episodes; stops once more have failed than the required success rate allows."""
+    """Tests a policy in batches of episodes; stops when more have failed than the required success rate allows."""
     allowed = int(_TEST_EPISODES * (1.0 - config.success) + 1e-9)
     seeds, driven = _seeds(config), list[EpisodeResult]()
     for start, end in pairwise(np.cumsum([0, *_BATCHES]).tolist()):
@@ -242,7 +242,7 @@ def _test(config: TrainConfig, step: int, drive: Callable[[Sequence[int]], list[
 
 
 def _seeds(config: TrainConfig) -> tuple[int, ...]:
-    """Seeds of the test episodes, then of the fresh ones."""
+    """Seeds of the test episodes, then of those of the final test."""
     sequence = np.random.SeedSequence([config.seed, _STREAM])
     return tuple(int(seed) for seed in sequence.generate_state(_TEST_EPISODES + FRESH_EPISODES))
 

@@ -52,7 +52,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
 _CHOICES = {"observe": (NERF, SIMULATOR), "action": (STEERING, TWIST), "device": (CPU, CUDA)}
 
 _ROBOT_ONLY = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
-"""Randomizes the robot; the place looks as filmed."""
+"""Randomizes only the robot; the place looks as filmed."""
 
 
 def _numbers(value: Any) -> list[Any]:
@@ -67,7 +67,7 @@ class TrainConfig:
 
     task: str = "straight"
     observe: str = NERF
-    """`nerf`: pictures of the field; `simulator`: MuJoCo's pictures of the extracted mesh."""
+    """`nerf`: pictures of the radiance field; `simulator`: MuJoCo's pictures of the extracted mesh."""
     lighting: str = TRAINING
     """See `env/episode_lighting.py`; by default, a lighting is sampled for every episode."""
     seed: int = 0
@@ -76,6 +76,7 @@ class TrainConfig:
     steps: int = 24_000
     """Largest number of steps."""
     worlds: int = 8
+    """Number of environments."""
     action: str = STEERING
     """See `Control` for `action`, `speed` and `yaw_rate`."""
     speed: float = 1.0
@@ -85,11 +86,11 @@ class TrainConfig:
     steering: float = 0.5
     """Fraction of the step reward that is lost at full steering."""
     entropy: float = -0.5
-    """Target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 corresponds to a
-    standard deviation of 0.15, and -1 to 0.09."""
+    """Target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 means a standard
+    deviation of 0.15, and -1 means 0.09."""
     start_along: float = 0.9
-    """Half of the episodes start at a random point of this first fraction of the segment, the others at its beginning.
-    All start beside the route and at an angle to it, so that a policy practices returning to the middle."""
+    """Half of the episodes start at a random point in this first fraction of the route segment, the others at its
+    beginning. All start beside the route and at an angle to it, so that a policy practices returning to the middle."""
     randomise: bool = True
     """Randomizes the robot in every episode; if the lighting varies, also the weather and distractor objects."""
     privileged: bool = True
@@ -119,7 +120,7 @@ class TrainConfig:
     colours: float = 1.0
     """Strength of color augmentation in updates (`replay_buffer.py`); applied only if the lighting varies."""
     checkpoints: int = 20
-    """Number of policies saved during the training."""
+    """Number of policies saved in `steps` steps; each test saves one more."""
     test_every: int = 3_000
     """Number of steps between two tests of the policy (`selection.py`)."""
     settle: int = 2_000
@@ -142,7 +143,7 @@ class TrainConfig:
         if self.lighting in (HELD_OUT, ANY):
             raise InputError(
                 f"lighting = {self.lighting!r}: held-out lightings are reserved for python -m twin.validate; "
-                f"expected {TRAINING!r} or a name"
+                f"expected {TRAINING!r} or the name of a lighting"
             )
 
     @property
@@ -165,7 +166,7 @@ class TrainConfig:
 
     def options(self) -> dict[str, Any]:
         # The goal's reward equals the discounted sum of step rewards for ever; for less, a policy would linger before
-        # the goal. The loss of reward beside the route keeps policies off the kerb, where one disturbance ends an
+        # the goal. The loss of reward beside the route keeps policies off the curb, where one disturbance ends an
         # episode.
         goal = Rewards.step * self.gamma / (1.0 - self.gamma)
         rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
@@ -183,7 +184,7 @@ class TrainConfig:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "cpu": {},
-    # Pictures have the full resolution, as in arXiv 2403.15791. This preset was not measured on a GPU yet.
+    # Pictures have the full resolution, as in arXiv 2403.15791. Not measured on a GPU yet.
     "gpu": {
         "pool": 1,
         "convolutions": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),

@@ -6,7 +6,7 @@ runs/<name>/
   tests.json, choice.json                 tests of policies, and the selection (`selection.py`)
   checkpoints/<steps>/                    policies saved during the training
   episodes.csv                            episodes driven in training
-  log.csv                                 speed, memory, entropy coefficient and value at every save
+  log.csv                                 speed, memory, entropy coefficient and the critics' mean value at every save
   tensorboard/                            losses and other values logged by stable-baselines3
   state/                                  the saved state (`sac.py`) and the replay buffer's pictures
 """
@@ -75,7 +75,7 @@ class Segment:
     """A part of a training."""
 
     until: int
-    """Steps at its end, where a checkpoint is saved."""
+    """Number of steps done at its end, where a checkpoint is saved."""
     settle_from: int | None
     """Step from which the learning rate falls, to its lowest value at the segment's end; None: it follows its cycle."""
     why: str = ""
@@ -258,7 +258,7 @@ def cycle_rate(config: TrainConfig, step: int) -> float:
     """Learning rate at a step, without settling: constant in the first half of each cycle, then falling linearly.
 
     Cycles have about `config.cycle` steps and divide `config.steps` evenly. After 12,000 steps in one place, 40 and 37
-    of 40 test episodes succeeded in two trainings with the falling rate, and 35 in one with a constant rate; see
+    of 40 test episodes succeeded in two trainings with the falling rate, and 35 of 40 in one with a constant rate; see
     docs/findings.md.
     """
     length = config.steps / max(1, round(config.steps / config.cycle))
@@ -299,8 +299,8 @@ def check_same(folder: Path, settings: dict[str, Any]) -> None:
         raise InputError(f"{folder} was trained by an earlier version, which had no {new[0]}; give another --run")
     if previous["road"] != settings["road"]:
         raise InputError(
-            f"{folder} was trained before the scene was rebuilt, its task or obstacles changed, or twin samples "
-            "episodes differently; give another --run"
+            f"{folder} was trained before the scene was rebuilt, its task or obstacles were changed, or twin changed "
+            "the sampling of episodes; give another --run"
         )
     for name in settings:
         if name not in ("steps", "success") and previous.get(name) != settings[name]:

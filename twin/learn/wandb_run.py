@@ -1,8 +1,8 @@
 """Shows a training as a run of Weights & Biases (wandb.ai), if the package `wandb` is installed.
 
-The run gets the training's configuration, and numbers over the training's steps: those of `tensorboard/` under the same
-names, and those of `episodes.csv`, `log.csv` and `tests.json` as `episodes/...`, `log/...` and `tests/...`. At the end,
-it gets the plot of the success rate and a film of the kept policy. A resumed training continues its run. wandb's own
+The run gets the training's configuration, and curves over its steps: those of `tensorboard/` under the same names, and
+those of `episodes.csv`, `log.csv` and `tests.json` as `episodes/...`, `log/...` and `tests/...`. At the end, it gets
+the plot of the success rate and a film of the selected policy. A resumed training continues its run. wandb's own
 environment variables apply: with `WANDB_MODE=offline`, the run is only written to `runs/<name>/wandb`.
 """
 
@@ -38,7 +38,7 @@ class WandbRun(KVWriter):
         run.define_metric("*", step_metric=_STEP)
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        """Logs the numbers among the values."""
+        """Logs those values that are numbers."""
         numbers = {
             name: value.item() if isinstance(value, np.generic) else value
             for name, value in key_values.items()
@@ -86,7 +86,7 @@ def wandb_run(project: str, folder: Path, config: Mapping[str, Any]) -> Iterator
             settings=wandb.Settings(console="off"),  # otherwise wandb captures the progress bar
         )
     except wandb.Error as error:
-        cure = "wandb login, or set WANDB_MODE=offline"
+        cure = "run wandb login, or set WANDB_MODE=offline"
         raise InputError(f"--wandb {project}: {' '.join(str(error).split())}; {cure}") from None
     with run:
         write_json(folder / ID_FILE, {"project": project, "id": run.id})

@@ -1,4 +1,4 @@
-"""Extrinsics and focal length of the robot's front camera, estimated from its film of the built place.
+"""Extrinsics and focal length of the robot's front camera, estimated from its film of the built scene.
 
 `capture/localize.py` localizes the film's frames. The extrinsics are the camera's height above flat ground and its
 rotation from straight ahead: yaw to the left, pitch down, roll to the right. Height, pitch and roll follow from the
@@ -39,11 +39,11 @@ from twin.types import Array, Image
 # ---- estimation from poses
 
 
-_MIN_FRAMES, _MIN_WAY = 16, 6.0  # fewest frames; shortest path [m]
-_PARTS = 8  # consecutive parts of the film for the jackknife
+_MIN_FRAMES, _MIN_WAY = 16, 6.0  # least number of frames; shortest path [m]
+_PARTS = 8  # number of consecutive parts of the film for the jackknife
 _NOISE, _OUTLYING = 0.01, 0.03  # [m] standard deviation of a sum of sideways steps; threshold of the robust loss
 _PIVOT = 0.1  # [m] prior standard deviation of the turning point's forward offset from the base's origin
-_ROUNDS = 3  # alternations between estimating base poses and extrinsics
+_ROUNDS = 3  # number of alternations between estimating base poses and extrinsics
 _FAR_OFF, _JUMP = 8.0, 3.0  # multiples of the median deviation (outliers) and of the median step (jumps)
 
 
@@ -51,7 +51,7 @@ _FAR_OFF, _JUMP = 8.0, 3.0  # multiples of the median deviation (outliers) and o
 class CameraExtrinsics:
     """Values or standard errors of a camera's height [m] and angles [°].
 
-    An error of the principal point shifts the image as yaw and pitch do. They absorb it, as intended.
+    An error of the principal point shifts the image as yaw and pitch do; the estimated yaw and pitch correct it, too.
     """
 
     height: float
@@ -190,9 +190,9 @@ def _relative_to_base(
 def _base_pose(
     position: Array, heading: float, ground_at: Callable[[Array], Array], lens: Array
 ) -> tuple[Array, Array]:
-    """Origin [m] and axes (3, 3) of a base at rest with its lens, at `lens` [m] in the base, at x, y = `position`."""
+    """Origin [m] and axes (3, 3) of a base at rest whose lens, at `lens` [m] in its frame, is at x, y = `position`."""
     rotation = Rotation.from_euler("Z", heading).as_matrix()
-    arm = lens + np.array([0.0, 0.0, BASE_HEIGHT])  # from the ground
+    arm = lens + np.array([0.0, 0.0, BASE_HEIGHT])  # lens, from the ground below the base's origin
     for _ in range(2):  # a tilted base moves its lens sideways
         origin, (w, x, y, z) = rest_pose(ground_at, position - (rotation @ arm)[:2], heading)
         rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
@@ -203,8 +203,8 @@ def _base_pose(
 
 _CHOICE = CaptureConfig(fps=2.0, max_frames=90)
 _WORST_TURN, _WORST_HEIGHT = 0.3, 0.03  # [°], [m] largest accepted standard errors
-_WORST_ERROR = 3.0  # [px at 1280] largest accepted median reprojection error
-_PICTURES, _WIDTH = 3, 640  # frames in the comparison, and their width [px]
+_WORST_ERROR = 3.0  # [px] largest accepted median reprojection error if the longer side is 1280 px
+_PICTURES, _WIDTH = 3, 640  # number of frames in the comparison, and their largest width [px]
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ class CameraCalibration:
         }
         if not self.focal_given:
             lens, error = self.registration.lens, self.registration.focal_error
-            errors = (error, error, None, None) if error else None  # a bag's calibration has no errors
+            errors = (error, error, None, None) if error else None  # a bag's calibration has no standard errors
             out["camera_intrinsics"] = tuple(map(float, lens.intrinsics)), errors
             out["camera_size"] = (lens.width, lens.height), None
         return out

@@ -1,11 +1,11 @@
 """Drivetrain model, fitted to a log: how the robot's controller and servos turn commands into wheel speeds.
 
-The model applies the limits of `twin.env.controller` to many windows at once. Its step is 0.01 s instead of 0.1 s, so
-that it is smooth in its parameters. (A real controller reacts up to one period late, but then makes the whole change of
-a period in one step. On average, the two effects cancel.) *Mean speed* is the mean of the two sides' wheel speeds
-[rad/s], *half speed* is half of right minus left. Each of the two has a gain, since wheel commands may be in units of
-another robot (DRIVE's log assumes a Husky with wheels of 0.3 m). For commands v and ω, the gain of the mean speed is 1,
-and that of the half speed is the controller's separation multiplier.
+The model applies the limits of `twin.env.controller` to many windows of a log at once. Its step is 0.01 s instead of
+0.1 s, so that wheel speeds are smooth functions of its parameters. (A real controller reacts up to one period late, but
+then makes the whole change of a period in one step. On average, the two effects cancel.) *Mean speed* is the mean of
+the two sides' wheel speeds [rad/s], *half speed* is half of right minus left. Each of the two has a gain, since wheel
+commands may be in units of another robot (the public DRIVE log assumes a Husky with wheels of 0.3 m). For commands v
+and ω, the gain of the mean speed is 1, and that of the half speed is the controller's separation multiplier.
 """
 
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ CONTROL_STEP = 0.01  # [s] of the simulation
 EXTRA_SAMPLES = 5  # samples after a window's end, for poses measured after it
 
 _HISTORY = 20  # samples of the previous window from which delayed commands are taken
-_CHAIN = 3  # previous windows over which a ramp is simulated: six seconds
+_CHAIN = 3  # number of previous windows over which a ramp is simulated: six seconds
 _PER_SAMPLE = round(PERIOD / CONTROL_STEP)
 _SIDES: Kinds = (0, 0)  # residuals of the left and the right wheels [rad/s]
 
@@ -76,9 +76,9 @@ class Drivetrain:
 def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array, Array]:
     """Servo targets and the resulting wheel speeds, starting from each window's first wheel speeds.
 
-    A window that follows another one begins with the other's delayed commands and continues the other's acceleration
-    ramp. The wheel speeds do not show how far the ramp has come, since they lag behind it. In all other windows, the
-    wheels keep their speed until the first command arrives.
+    A window that follows the previous one begins with the previous window's delayed commands and continues its
+    acceleration ramp. The measured wheel speeds do not show how far the ramp has come, since they lag behind it. In all
+    other windows, the wheels keep their speed until the first command arrives.
 
     Returns:
         Targets and lagged wheel speeds, left and right [rad/s], each of shape (n, (k + EXTRA_SAMPLES) · 5, 2),

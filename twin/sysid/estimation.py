@@ -2,8 +2,8 @@
 
 A *parameter* has a normal prior; the residuals of a window follow a multivariate Student's t distribution (below). A
 parameter is *identified* if its standard error, with all free parameters fitted together, is at most `_MAX_ERROR_SHARE`
-of its prior's standard deviation. While some are not, the least certain one is fixed at its default and the others are
-fitted again.
+of its prior's standard deviation. Of the others, the least certain is fixed at its default, until all that remain are
+identified; these are then fitted again.
 """
 
 from collections.abc import Callable
@@ -32,10 +32,10 @@ from twin.types import Array
 Kinds = tuple[int, ...]
 """The kind of each residual component, numbered from 0."""
 
-DEGREES_OF_FREEDOM = 3.0  # fits of ν to DRIVE's log gave 2.6 to 3.2
+DEGREES_OF_FREEDOM = 3.0  # fits of ν to the public DRIVE log gave 2.6 to 3.2
 
-_MIN_SCALE = 1e-3  # [m], [rad], [m/s], [rad/s]; logs are not more accurate
-_ROUNDS, _SETTLED = 10, 0.05  # most alternations of scales and model; relative change at which scales have converged
+_MIN_SCALE = 1e-3  # [m], [rad] or [rad/s] smallest σ; logs are not more accurate
+_ROUNDS, _SETTLED = 10, 0.05  # limit of alternations of scales and model; relative change of converged scales
 _ITERATIONS, _CLOSE = 500, 1e-4  # the same for expectation maximization
 
 
@@ -117,10 +117,10 @@ def _per_window(factor: Array, like: Array) -> Array:
 # ---- maximum a posteriori estimation
 
 _MAX_ERROR_SHARE = 0.5  # largest standard error of an identified parameter, in prior standard deviations
-_MIN_CURVATURE = 0.1  # smallest curvature as a fraction of that of the squares, see `_inverse_curvature`
+_MIN_CURVATURE = 0.1  # smallest curvature / that of the least-squares step, see `_inverse_curvature`
 _STEP = 0.05  # step of finite differences, in prior standard deviations
 _NATS = 0.02  # [nat] a search ends when a step gains less; it is the loss at 0.2 standard errors from the maximum
-_EVALUATIONS = 50  # most evaluations per round of the search, not counting those for Jacobians
+_EVALUATIONS = 50  # limit of evaluations per round of the search, not counting those for Jacobians
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def maximize_posterior(
 
     Args:
         residuals: Returns the residuals of every window for values by name, shape (n, instants, c).
-        reach: Scale of the first step in prior standard deviations; choose less near the solution. A step is at most
+        reach: Scale of the first step in prior standard deviations; near the solution choose less. A step is at most
             √(reach · distance to the bound).
     """
     # In units of `reach` prior standard deviations from the start, SciPy's first step and tolerances have the same
@@ -210,9 +210,10 @@ def fit_parameters(
     reach: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Fit:
-    """Fits the parameters that the data identify; the others keep their defaults. Arguments as `maximize_posterior`.
+    """Fits the parameters that the data identify; the others keep their defaults.
 
-    `groups` (n,) has the group of each window; residuals within a group may be correlated.
+    `groups` (n,) has the group of each window; residuals within a group may be correlated. For the other arguments see
+    `maximize_posterior`.
     """
     free = list(table)
     values = {p.name: start[p.name] for p in table}

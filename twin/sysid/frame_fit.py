@@ -1,7 +1,7 @@
 """The frame of a recording's poses in the scene: rotation and shift, fitted to pictures that were localized there.
 
-Poses of a trial are in the frame of their topic (odometry, RTK). Pictures, evenly spaced along the drive, are localized
-in the scene. The frame is fitted to the positions of the robot's base at these pictures.
+Poses of a trial are in the frame of their ROS topic (odometry, RTK). Pictures, evenly spaced along the drive, are
+localized in the scene. The frame is fitted to the positions of the robot's base at these pictures.
 """
 
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ from twin.types import Array
 from twin_policy import Rectifier
 
 SCENE_FRAME, FIT = "scene", "pictures"
-"""The poses are in the scene's frame, or their frame is to be fitted to localized pictures."""
-_LOCATED = 24  # number of pictures that are localized in the scene
+"""The poses are in the scene's frame, or their frame is fitted to localized pictures."""
+_LOCATED = 24  # largest number of pictures that are localized in the scene
 _MIN_LOCATED, _MIN_WAY = 5, 2.0  # least number of pictures; [m] least distance of the farthest pose from the first
-_MAX_RESIDUAL = 0.25  # [m] rms
-_OUTLIER = 3.0  # pictures whose residual is above this multiple of the median are left out
-_ROUNDS = 5
+_MAX_RESIDUAL = 0.25  # [m] largest `FrameFit.residual`
+_OUTLIER = 3.0  # pictures with residuals above this multiple of the median, and above 0.05 m, are left out
+_ROUNDS = 5  # number of fits
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class FrameFit:
     scale: float = 1.0
     """Meters of the scene per meter of the poses, from the same pictures; reported only, not applied to poses."""
     located: int = 0
-    """Pictures used."""
+    """Number of pictures used."""
 
     def __call__(self, poses: Array) -> Array:
         """Poses (n, 3) in the scene."""
@@ -54,7 +54,6 @@ def scene_frame(recording: TrialRecording, frame: str, start: int, scene: SceneD
     """The frame of a recording's poses in a built scene.
 
     Args:
-        recording: The recording.
         frame: `SCENE_FRAME` or `FIT`.
         start: Time [ns] from which pictures are used.
         scene: The scene, with its ground.
@@ -89,7 +88,7 @@ def fit_frame(poses: Array, located: Array, where: str) -> FrameFit:
         where: The recording's name in errors.
 
     Raises:
-        InputError: too few pictures, too short a way, or poses that do not fit.
+        InputError: too few pictures, too short a path, or poses that do not fit.
     """
     source, target = (one[:, 0] + 1j * one[:, 1] for one in (poses, located))
     way = float(np.abs(source - source[:1]).max(initial=0.0))
@@ -97,7 +96,7 @@ def fit_frame(poses: Array, located: Array, where: str) -> FrameFit:
         raise InputError(
             f"{where}: {len(poses)} pictures were located in the scene, over {way:.1f} m; expected {_MIN_LOCATED} over "
             f"{_MIN_WAY:g} m: is it the same place, in light like that of a film? If the poses are already in the "
-            "scene's frame, --frame scene"
+            "scene's frame, give --frame scene"
         )
     use = np.ones(len(poses), bool)
     for _ in range(_ROUNDS):

@@ -39,7 +39,7 @@ _GROUND_FIELDS = {  # field of HuskyParams → parameters of `tires`
     "wheel_radius": ("radius_left", "radius_right"),
     "servo_gain": ("log10_servo_gain",),
 }
-_DIGITS = 6  # digits of numbers in robot.toml
+_DIGITS = 6  # significant digits of numbers in robot.toml
 _NO_TWIST = "the log's commands are wheel speeds, which bypass the controller's own multiplier; needs v and ω"
 
 
@@ -207,7 +207,7 @@ def toml_text(comment: str, previous: dict[str, Any], identified: dict[str, tupl
     """
     lines = ["# " + "".join(c if c.isprintable() else "?" for c in comment)]
     if not identified:
-        lines.append("# But nothing in it could be identified; the fields below are those of the previous file.")
+        lines.append("# Nothing could be identified from this log; the fields below are those of the previous file.")
     lines += [f"{name} = {toml_value(value, _DIGITS)}" for name, value in previous.items() if name not in identified]
     for name, (value, error) in identified.items():
         lines.append(

@@ -1,8 +1,8 @@
-"""Kinematic models of skid steering, which are baselines for the fitted model, and the scores of predictions.
+"""Kinematic models of skid steering, which are baselines for the fitted MuJoCo model, and the scores of predictions.
 
 *Nominal*: a differential drive whose wheels roll without slip. *ICR model* (Mandow et al. 2007): each side's tread has
 an instantaneous center of rotation at its own lateral offset. Its five parameters are these offsets, a slip factor per
-side and a common forward offset; they are fitted with the same robust loss as the MJCF.
+side and a common forward offset; they are fitted with the same robust loss as the MuJoCo model.
 """
 
 from dataclasses import asdict, dataclass

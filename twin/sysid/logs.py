@@ -35,7 +35,7 @@ from twin.types import Array
 PERIOD = 0.05  # [s] between two samples of a window
 DURATION = 2.0  # [s]
 SAMPLES = round(DURATION / PERIOD)
-MAX_POSE_AGE = 20  # most samples between the measurement of a window's first pose and the window's start
+MAX_POSE_AGE = 20  # largest number of samples from the measurement of a window's first pose to the window's start
 
 TWIST = ("cmd_v", "cmd_yaw_rate")
 WHEEL_COMMANDS = ("cmd_left", "cmd_right")
@@ -43,12 +43,12 @@ WHEEL_SPEEDS = ("left_wheel_vel", "right_wheel_vel")
 POSE = ("x", "y", "yaw")
 ACCELERATION = ("acceleration_x", "acceleration_y")
 
-_MAX_GAP = 0.5  # [s] between two rows of a table; windows with a longer one are left out
-_MIN_INTERVAL = 5e-4  # [s] median between rows; a shorter one means that time is not in seconds
-_FAST = 1.75  # samples; if a sensor's period is shorter, times of appearance are used, see `measurement_times`
-_JITTER = 4  # most samples between measurement and appearance of a pose, apart from the common delay
+_MAX_GAP = 0.5  # [s] largest gap between two rows of a table; windows with a longer gap are left out
+_MIN_INTERVAL = 5e-4  # [s] least median interval between rows; a shorter one means that time is not in seconds
+_FAST = 1.75  # [samples] if the pose sensor's period is shorter, times of appearance are used: `measurement_times`
+_JITTER = 4  # largest number of samples from measurement to appearance of a pose, apart from the common delay
 _UNSTEADY = 0.1  # if a larger fraction of windows contradicts the period, the sensor counts as aperiodic
-_DROPOUT = 30  # samples; windows without a fresh pose for longer are left out if the wheels turn
+_DROPOUT = 30  # [samples] windows without a fresh pose for longer are left out if the wheels turn
 _TURNING = 0.5  # [rad/s] mean of both sides' wheel speeds above which the wheels count as turning
 _STANDING = 0.05  # [rad/s], [m/s]; windows in which wheels and commands never reach it are left out
 _MAX_BYTES = 512 << 20  # largest log, unpacked
@@ -64,9 +64,9 @@ def measurement_times(fresh: NDArray[np.bool_]) -> Array:
 
     A pose sensor measures at a steady rate, but its poses reach the log with varying delay: between fresh poses that
     appear 0.05 s apart, a robot moves as far as between those that appear 0.15 s apart. (In turning windows of DRIVE's
-    log, yaw is smooth to 0.3° over the number of the fresh pose, but only to 0.7° over its time of appearance.) So the
-    n-th fresh pose counts as measured n periods after the first. Lost poses are counted, too: if a pose and all later
-    ones are late by more than half a period, poses before it were lost.
+    log, yaw is smooth to 0.3° as a function of the fresh pose's number, but only to 0.7° as one of its time of
+    appearance.) So the n-th fresh pose counts as measured n periods after the first. Lost poses are counted, too: if a
+    pose and all later ones are late by more than half a period, poses before it were lost.
 
     Times of appearance are used instead for windows that contradict the period by more than `_JITTER`, and for the
     whole log if many windows do so or if the sensor is fast.
@@ -106,7 +106,7 @@ def _steady(appeared: Array, period: float) -> Array:
     start = float(np.median(appeared - period * number))
     if start > period / 2:  # the robot rested, or the first poses were lost
         first = start - period * np.ceil(start / period)
-    else:  # the window begins with a pose
+    else:  # the window begins with a fresh pose
         first = start = min(start, 0.0)
     first = max(first, -MAX_POSE_AGE)
     return np.append(first, np.maximum(first, start + period * number))
@@ -153,7 +153,8 @@ class Windows:
     def preceding_wheels(self) -> Array:
         """Wheel speeds in the `DURATION` before each window and at its start [rad/s], shape (n, k + 1, 2).
 
-        If the window follows the previous one, they are that one's; otherwise the speed at the start is repeated.
+        If the window follows the previous one, they are the previous window's; otherwise the speed at the start is
+        repeated.
         """
         out = np.repeat(self.wheels[:, :1], self.wheels.shape[1] + 1, 1)
         follows = np.flatnonzero(self.follows)
@@ -169,7 +170,7 @@ class Windows:
         return np.stack([a + b, b - a], -1) / 2
 
     def select(self, which: NDArray) -> "Windows":
-        """Some of the windows, by mask or index; none of them follows another."""
+        """Some of the windows, by mask or index; none of them counts as following another."""
         wheels = self.wheels[which]
         return Windows(
             self.commands[which],
@@ -217,7 +218,7 @@ def read_log(path: Path) -> Windows:
         if columns.get("icp_x", np.zeros(0)).ndim == 2:
             return _published_windows(columns, str(path))
         return cut_windows(columns, str(path))
-    raise InputError(f"{path}: expected a log in .csv, .npz or a bag; convert it to one of those")
+    raise InputError(f"{path}: expected a log in .csv, .npz or a bag; convert it to one of these")
 
 
 def _read_csv(path: Path) -> dict[str, Array]:
@@ -240,7 +241,7 @@ def read_npz(path: Path) -> dict[str, Array]:
 
 
 def cut_windows(columns: dict[str, Array], where: str) -> Windows:
-    """Cuts a table into windows; a sample takes the newest row at its instant.
+    """Cuts a table into windows; a sample has the values of the newest row at its instant.
 
     Args:
         columns: Columns by name, shape (rows,) each; see the module's head.
@@ -375,7 +376,7 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
 
 
 def resample_poses(poses: Array, late: Array, before: int) -> Array:
-    """Resamples poses from the measurement of the first one on, relative to it, to shape (n, k + MAX_POSE_AGE + 1, 3).
+    """Poses every `PERIOD` [s] since the first one was measured, relative to it, shape (n, k + MAX_POSE_AGE + 1, 3).
 
     Args:
         poses: `PERIOD` [s] apart, shape (n, m, 3); extrapolated linearly beyond the last one.
@@ -423,7 +424,7 @@ def _finite(columns: dict[str, Array], where: str) -> None:
 
 # ---- plausibility
 
-_MIN_WINDOWS = 20  # least number to fit to; half as many to score on
+_MIN_WINDOWS = 20  # least number of windows to fit to; half as many to score on
 _MIN_TURNS = 10  # least number of windows that turn by more than `_TURN`; a quarter as many to each side
 _TURN = 0.25  # [rad]
 
@@ -465,10 +466,10 @@ def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, 
     cures = {
         _DEGREE: "wheel speeds look like °/s; multiply them by π/180",
         1 / WHEEL_RADIUS: "wheel speeds look like m/s; divide them by the wheel's radius",
-        1000.0: "poses look like millimetres; divide them by 1000",
+        1000.0: "poses look like millimeters; divide them by 1000",
     }
     ratio = _median(distance[straight] / np.abs(mean[straight]))
-    yield ratio, (0.3, 2.0), "the robot moves {:.3g} m for each metre its wheels roll", cures
+    yield ratio, (0.3, 2.0), "the robot moves {:.3g} m for each meter its wheels roll", cures
     rate = np.abs(windows.poses[:, -1, 2]) / DURATION
     turning = np.maximum(np.abs(half), rate * TRACK / 2) > _MOVING
     cures = {
@@ -480,12 +481,19 @@ def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, 
     commanded = windows.commanded_speeds[:, -1] * WHEEL_RADIUS
     end = windows.wheels[:, -1] * WHEEL_RADIUS
     measured = np.stack([end.mean(1), (end[:, 1] - end[:, 0]) / 2], -1)
-    names = ("cmd_v", "cmd_yaw_rate") if windows.twist else ("the mean of the wheel commands", "their difference")
+    names = (
+        ("cmd_v", "cmd_yaw_rate")
+        if windows.twist
+        else ("the mean of cmd_left and cmd_right", "the difference of cmd_left and cmd_right")
+    )
     for i, name in enumerate(names):
         use = (np.abs(measured[:, i]) > 0.5 * _MOVING) & (np.abs(commanded[:, i]) > 0)
-        cures = {_DEGREE: f"{name} looks like degrees; multiply by π/180", 1 / _DEGREE: f"{name} looks π/180 too small"}
+        cures = {
+            _DEGREE: f"{name} looks like degrees; multiply by π/180",
+            1 / _DEGREE: f"{name} looks π/180 times too small; divide by π/180",
+        }
         ratio = _median(np.abs(measured[use, i] / commanded[use, i]))
-        yield ratio, (0.1, 6.0), f"wheels do {{:.3g}} times what {name} asks for", cures
+        yield ratio, (0.1, 6.0), f"the wheels turn {{:.3g}} times as fast as {name} requires", cures
 
 
 def _check_ratio(

@@ -16,7 +16,7 @@ from twin.sysid.logs import DURATION, PERIOD, Windows
 from twin.types import Array
 
 _MEASURED, _MODEL, _OTHER = "#444444", "#d1495b", "#3d7ea6"
-_SHOWN = 3  # windows in the plot of wheel speeds
+_SHOWN = 3  # largest number of windows in the plot of wheel speeds
 
 
 def write_plots(folder: Path, windows: Windows, fitted: Prediction, baseline: Prediction) -> list[Path]:
@@ -89,7 +89,7 @@ def _plot_wheels(windows: Windows, fitted: Prediction) -> plt.Figure:
         axis.set(title=f"window {i}", xlabel="time [s]")
     axes[0, 0].set_ylabel("wheel speed [rad/s]")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    figure.suptitle("Wheel speeds after a change of command, held-out windows")
+    figure.suptitle("Wheel speeds in held-out windows in which they change much")
     return figure
 
 
@@ -99,7 +99,7 @@ def _plot_errors(windows: Windows, fitted: Prediction, baseline: Prediction) -> 
     for prediction, color in ((baseline, _OTHER), (fitted, _MODEL)):
         for axis, values in zip(axes, prediction.errors, strict=True):
             _plot_distribution(axis, values[score], color, prediction.name)
-    axes[0].set(xlabel="position error [m]", ylabel="fraction of windows below", xlim=(0, 0.8))
+    axes[0].set(xlabel="position error [m]", ylabel="fraction of windows with a smaller error", xlim=(0, 0.8))
     axes[1].set(xlabel="yaw error [°]", xlim=(0, 60))
     axes[0].legend(frameon=False, loc="lower right")
     figure.suptitle(f"Errors after {DURATION:.0f} s, held-out windows; thin lines: median and 90th percentile")

@@ -1,7 +1,7 @@
 """Simulates the windows of a log with the Husky's MJCF on a plane, in parallel threads of `mujoco.rollout`.
 
-Each simulation starts with the robot settled on the plane. Before time zero its wheels turn as in the log before the
-window (`Windows.preceding_wheels`), which gives body and tires their momentum. From time zero on, the servos receive
+Each simulation starts with the robot settled on the plane. Before time zero, the window's start, its wheels turn as in
+the log (`Windows.preceding_wheels`), which gives body and tires their momentum. From time zero on, the servos receive
 the targets of the drivetrain model. The only other input from the log is the slope of the ground, as tilted gravity.
 """
 
@@ -29,7 +29,7 @@ Complex = NDArray[np.complex128]
 """Gravity along x (real part) and along y (imaginary part) [m/s²]."""
 
 GRAVITY = 9.81  # [m/s²]
-MAX_SLOPE = 0.2  # fraction of gravity; readings above 11° are bumps or glitches
+MAX_SLOPE = 0.2  # fraction of gravity; readings are clipped to this (11°), since larger ones are bumps or glitches
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,8 @@ def slope_gravity(windows: Windows, model: IcrModel) -> Array:
     a window is noisy, but consecutive windows have similar slopes. So the readings are smoothed (`smooth_slopes`) with
     their most probable statistics (`fit_slope_model`); the noisier the IMU, the closer the result is to level ground.
     Subtracting the log's median removes errors that are constant in the robot's frame (mounting of the IMU, a pitched
-    chassis). Headings and accelerations of the motion come from wheel speeds: poses are to be predicted.
+    chassis). Headings and accelerations of the motion come from wheel speeds; poses are not used, as the model is to
+    predict them.
 
     Args:
         windows: All windows of a log; without accelerations the result is zero.
@@ -126,7 +127,7 @@ def smooth_slopes(
 
 MAX_POSE_LAG, MAX_POSE_LEAD = 4, 3  # samples by which poses may be behind and ahead of the wheel speeds
 LEAD_SAMPLES = MAX_POSE_LAG + MAX_POSE_AGE  # samples before time zero in the result
-COARSE_TIMESTEP = 0.005  # [s] for the start of a fit; poses after 2 s are up to 1 cm and 0.8° off
+COARSE_TIMESTEP = 0.005  # [s] for the start of a fit; after 2 s, up to 1 cm and 0.8° off the poses at the scene's
 
 _SETTLE = 1.0  # [s] at rest before a simulation
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -198,7 +199,7 @@ def simulate_windows(
 def _lag_compensated(wheels: Array, count: int, lag: float) -> Array:
     """Targets with which servos follow wheel speeds (n, k, 2), `PERIOD` [s] apart, despite a first-order lag [s].
 
-    Between samples the wheel speeds are interpolated linearly. Shape (n, (k − 1) · count, 2).
+    Between samples the wheel speeds are interpolated linearly. Shape (n, (k − 1) · count, 2), `count` per sample.
     """
     share = (np.arange(count) + 0.5)[:, None] / count
     change = np.diff(wheels, axis=1)[:, :, None]

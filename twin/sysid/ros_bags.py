@@ -1,4 +1,4 @@
-"""Reads drive logs from bags: tables with a row per joint state, and the newest values of the other topics.
+"""Converts bags to drive logs: tables with a row per joint state and the newest values of the other topics.
 
 If a bag has no joint states, the wheel speeds are computed from the wheels' odometry by the inverse of Clearpath's
 kinematics. Poses that come from the wheels are not used, since they hide the wheels' slip. If a bag has no other poses,
@@ -108,7 +108,7 @@ def read_bag(path: Path, filmed: FilmedPoses | None = None) -> dict[str, Array]:
             rows["poses"] = [(float(t), *pose) for t, pose in zip(since, filmed.poses.tolist(), strict=True)]
     empty = [kind for kind, found in rows.items() if not found]
     if empty:
-        raise InputError(f"{path}: no usable message of {', '.join(empty)}; expected some; record those topics")
+        raise InputError(f"{path}: no usable message of {', '.join(empty)}; expected at least one; record these topics")
     return _columns({kind: np.array(found) for kind, found in rows.items()})
 
 
@@ -124,7 +124,7 @@ def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tu
                 "bag's pictures"
             )
         kinds.remove("poses")
-        runtime.log_line(f"{path}: its pictures give the poses in the built scene, {len(filmed.times)} of them")
+        runtime.log_line(f"{path}: {len(filmed.times)} poses in the built scene are taken from its pictures")
     if not messages_by_topic(connections, TYPES["wheels"]):
         from_wheels = messages_by_topic(connections, (ODOMETRY,))
         names = [name for name in from_wheels if is_from_wheels(name)]

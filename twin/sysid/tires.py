@@ -1,9 +1,9 @@
 """Tires and ground, fitted to the poses of a log.
 
 All terms are parameters of the MJCF: contact coefficients, `impratio`, and the viscosity of a medium around the tires
-alone. By default, the ground is hard: only sliding friction and a small rolling resistance matter. Two more parameters
-belong to the log: the offset of the pose sensor from the base's origin, and the delay of poses against wheel speeds.
-The height of the center of mass is fitted only on slopes, as poses on level ground do not depend on it.
+alone. By default, the ground is hard: only sliding friction and a small rolling resistance matter. Two properties of
+the log are also fitted: the offset of the pose sensor from the base's origin, and the delay of poses against wheel
+speeds. The height of the center of mass is fitted only on slopes, as poses on level ground do not depend on it.
 """
 
 from collections.abc import Callable
@@ -23,10 +23,10 @@ from twin.types import Array
 # ---- choice of terms
 #
 # Four point contacts under Coulomb friction turn with the same track ratio chi at every speed and friction, and move
-# the body at the mean speed of the wheels. A Husky on grass (DRIVE's log) turns with chi 2.0 in gentle bends and 2.3 in
-# hard ones; in hard turns it moves at 0.4 to 0.7 of the wheels' mean speed, though it slips only 2.5 % when it goes
-# straight. Each model below was fitted to the even groups of that log and scored on its odd ones (median pose error
-# after 2 s):
+# the body at the mean speed of the wheels. A Husky on grass (public DRIVE log) turns with chi 2.0 in gentle bends and
+# 2.3 in hard ones; in hard turns it moves at 0.4 to 0.7 of the wheels' mean speed, though it slips only 2.5 % when it
+# goes straight. Each model below was fitted to the even groups of that log and scored on its odd ones (median pose
+# error after 2 s):
 #
 #     Coulomb, friction and center of mass fitted       0.23 m, 13 to 26°
 #     + spin friction of the contact patch              0.21 m, 6°: turns correctly, but moves as fast as its wheels
@@ -44,19 +44,20 @@ from twin.types import Array
 # drag on all bodies, or on the chassis alone, had a 5 % higher loss; a sliding support that carries part of the weight
 # had a 1 % higher one (it was better straight on and worse in turns).
 #
-# In MuJoCo's elliptic cone (condim 6) sliding, spinning and rolling friction share one limit: a tire that rolls at v
-# and slides at u has the fraction u / √(u² + (v Crr / μ)²) of its grip sideways. So grip grows with u / v, the slip
-# ratio, at first in proportion, as in a brush model of stiffness μ / Crr. On hard ground Crr is small and the tire
-# obeys Coulomb's law; on soft ground a rolling tire turns more easily than a standing one. The fitted Crr describes
-# this effect; the Crr that motor currents show (`benchmarks/motor_currents.py`) describes power, and may differ.
+# In MuJoCo's elliptic cone (condim 6) sliding, spinning and rolling friction share one limit: a tire (friction μ,
+# rolling resistance Crr) that rolls at v and slides at u has the fraction u / √(u² + (v Crr / μ)²) of its grip
+# sideways. So grip grows with u / v, the slip ratio, at first in proportion, as in a brush model of stiffness μ / Crr.
+# On hard ground Crr is small and the tire obeys Coulomb's law; on soft ground a rolling tire turns more easily than a
+# standing one. The fitted Crr describes this effect; the Crr that motor currents show (`benchmarks/motor_currents.py`)
+# describes power, and may differ.
 
 _MANY = 100  # with fewer windows the delay of poses is not fitted, and the coarse search uses all windows
 _NEAR = 0.25  # `reach` of the search that starts near the solution
 _TURNS, _BENDS = "hard turns at several speeds", "gentle bends as well as hard turns"
 _BRAKING = "hard braking, or slopes"
 # Prior mean and standard deviation, lowest and highest value, unit, cure. Prior means are those of soft ground and of
-# the published robot without load; publications differ about its center of mass by one standard deviation of the prior
-# of x. Creep, the inverse of slip stiffness, is fitted because slip is proportional to it.
+# the published robot without load; the prior std of `center_of_mass_x` is the difference between publications. Creep,
+# the inverse of slip stiffness, is fitted because slip is proportional to it.
 _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "friction": (0.3, 0.2, 0.05, 1.5, "", _TURNS),
     "spin_friction": (0.03, 0.03, 0.0, 0.3, "m", _TURNS),
@@ -168,10 +169,12 @@ def fit_ground(
     refused: dict[str, str] = {}
     if not slope.any():
         height = defaults["center_of_mass_z"]
-        refused["center_of_mass_z"] = f"center_of_mass_z = {height:.4g} m: on level ground, needs {_BRAKING}"
+        refused["center_of_mass_z"] = (
+            f"center_of_mass_z = {height:.4g} m: not fitted on level ground; needs slopes, and an IMU"
+        )
     fitting = np.flatnonzero(windows.fitting)
     if len(fitting) < _MANY:  # fitting a delay that is near zero would bias the other parameters
-        refused["pose_late"] = f"pose_late = 0 s: from {len(fitting)} windows, needs {_MANY}"
+        refused["pose_late"] = f"pose_late = 0 s: not fitted to {len(fitting)} windows; needs {_MANY} or more"
     table = [
         Parameter(name, mean, std, low, high, defaults[name], unit, cure)
         for name, (mean, std, low, high, unit, cure) in _TABLE.items()

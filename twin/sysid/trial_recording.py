@@ -1,8 +1,8 @@
 """A trial on the road, read from the robot's bag: pictures, calibration, poses and commands.
 
-Times are nanoseconds (`twin.capture.bag.message_times`). Poses are planar, in the frame of their topic (odometry, RTK);
-`frame_fit.py` finds the pose of that frame in the scene, from pictures located there. Pictures are read from the bag
-only when they are needed.
+Times are nanoseconds (`twin.capture.bag.message_times`). Poses are planar, in the frame of their ROS topic (odometry,
+RTK); `frame_fit.py` finds the pose of that frame in the scene, from pictures located there. Pictures are read from the
+bag only when they are needed.
 """
 
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ from twin.errors import InputError
 from twin.types import Array, Image
 from twin_policy import Camera, PictureError, Rectifier
 
-_STEP = 0.3  # [m] a fix's heading is the direction of motion from this far before it to this far after it
+_STEP = 0.3  # [m] a satellite fix's heading is the direction of motion from this far before it to this far after it
 _MOVING = 0.02  # [m/s], [rad/s]; a drive starts with the first command that exceeds this
 
 
@@ -52,9 +52,9 @@ class TrialRecording:
     pose_times: NDArray[np.int64]
     """Stamps of the poses [ns], increasing, shape (p,)."""
     poses: Array
-    """x, y [m] and yaw [rad], continuous, shape (p, 3)."""
+    """x, y [m] and yaw [rad] without jumps of 2π, shape (p, 3)."""
     uprightness: Array
-    """Cosine of the robot's tilt, shape (p,); 1 if the poses come from fixes."""
+    """Cosine of the robot's tilt, shape (p,); 1 if the poses come from satellite fixes."""
     command_times: NDArray[np.int64]
     """Stamps of the commands [ns], in order, shape (c,)."""
     commands: Array
@@ -67,7 +67,7 @@ class TrialRecording:
         return np.stack([np.interp(since, knots, column) for column in self.poses.T], -1)
 
     def pictures(self, stamps: NDArray[np.int64]) -> Iterator[tuple[int, Any]]:
-        """Yields stamp and picture (something with `decode()`) of the pictures with these stamps, in order."""
+        """Yields stamp and picture (an object with `decode()`) of the pictures with these stamps, in order."""
         wanted = set(stamps.tolist())
         shift = dict(zip(self.arrival.tolist(), self.shutter.tolist(), strict=True))
         with open_bag(self.path) as bag:
@@ -218,7 +218,7 @@ def _value(kind: str, message: Any) -> Any:
 
 
 def _poses(times: NDArray[np.int64], rows: list[Any], where: str) -> tuple[NDArray[np.int64], Array, Array]:
-    """Times, poses and uprightness in order, from planar poses with uprightness, or from fixes."""
+    """Times, poses and uprightness in order, from planar poses with uprightness, or from satellite fixes."""
     times, index = np.unique(times, return_index=True)
     table = np.array(rows, float)[index]
     keep = np.isfinite(table).all(1)
