@@ -127,7 +127,7 @@ class PlaceRun:
         self.run.must("twin.reality", "compare", self.scene, cores=self.jobs)
 
     def photos(self) -> None:
-        """Adds the days' lightings, and records in `photos.json` of the scene which photos' poses were found."""
+        """Adds the days' lightings, and records in the scene's `photos.json` which photos' poses were found."""
         done = dict(read_json(self._photos)) if self._photos.exists() else {}
         for day in (day for day in self.days if day not in done):
             photo = self.scene / "photos" / f"{day}.png"

@@ -1,7 +1,7 @@
 """Record of a place in files under version control: every episode and trial, and the policies' digests.
 
     results/version_N/place_P/
-      place.json            figures of build and trainings; robot and camera, and which values training does not sample
+      place.json            figures of build and trainings; robot and camera, with values outside training's ranges
       policies.json         digest of every policy, written before the first trial
       episodes.csv.gz       a row per episode in the twin
       trials.csv.gz         a row per trial in the simulated reality

@@ -64,7 +64,7 @@ class Run:
         return scene / "runs" / self.name
 
     def checkpoints(self, scene: Path) -> list[Path]:
-        """Checkpoints for the forecast: for each of `SHARES`, the last saved at most 100 steps after that share."""
+        """Checkpoints for the forecast: for each of `SHARES`, the last one up to 100 steps after that share."""
         saved = sorted((self.folder(scene) / "checkpoints").glob("*"), key=lambda path: int(path.name))
         before = [[path for path in saved if int(path.name) <= share * STEPS[self.task] + 100] for share in SHARES]
         return [some[-1] for some in before if some]

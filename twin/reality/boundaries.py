@@ -22,7 +22,7 @@ def thickness(kind: str) -> float:
 def add_boundary(place: KnownPlace, name: str, spec: BoundarySpec, skin: str, stations: Array, lateral: float) -> None:
     """Adds a boundary at a lateral [m]: pieces of length `BAY` that begin at the stations [m].
 
-    `skin` is its atlas cell. One bollard stands at each station.
+    `skin` is the boundary's atlas cell. One bollard stands at each station.
     """
     if not len(stations):
         return

@@ -66,7 +66,7 @@ def measure(scene: SceneDir) -> dict[str, Any]:
     Returns:
         `figures`, and `camera_errors_m`: position errors after a similarity alignment [m], as a list per source.
 
-        `figures`, lengths [m], angles [°]: `frames` (number), `ate_m`, `ate_max_m` (absolute trajectory error after a
+        `figures`, lengths in m, angles in °: `frames` (number), `ate_m`, `ate_max_m` (absolute trajectory error after a
         similarity alignment: rms and maximum), `scale_error` (ratio of a length in the twin to the true length, minus
         1), `ate_rigid_m`, `ate_rigid_max_m` (the same after the rigid alignment), `rotation_median_deg`, `tilt_deg`
         (angle between the twin's vertical and the true one), `ground_median_m`, `ground_p95_m`, `ground_bias_m` (height

@@ -1,4 +1,4 @@
-"""Lightings of sampled places, and skies with the far view, such as hills, above the horizon."""
+"""Lightings and skies of sampled places; a sky contains the far view, such as hills."""
 
 from dataclasses import replace
 

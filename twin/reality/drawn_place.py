@@ -1,4 +1,4 @@
-"""Builds a place from its description: ground, objects, textures, lightings.
+"""Builds a place from its description (`PlaceSpec`): ground, objects, textures, lightings.
 
 Objects are placed one after the other: houses, lamps and boundaries first, then poles, cars, furniture and trees. An
 object is left out if its footprint touches the road, a side road, the corridor along the driven line or an earlier
@@ -88,7 +88,7 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
 
 @cache
 def build_number(number: int, displaced: bool = False) -> KnownPlace:
-    """Builds the sampled place with a number, 1 or more."""
+    """Builds the place with a number, 1 or more."""
     return build(draw(number), displaced)
 
 
@@ -101,8 +101,8 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
     def strip(name: str, texture: str, laterals: Array, lifts: Array | None = None, gaps: int = 0) -> None:
         """Adds a mesh strip along the road with vertices at `laterals` [m], left first.
 
-        It lies on the ground, or `lifts` [m] above the driven line. With `gaps` (1 = left, −1 = right) it has gaps at
-        that side's side roads.
+        It lies on the ground, or `lifts` [m] above the driven line. `gaps` (1 = left, −1 = right) leaves gaps for the
+        side roads on that side.
         """
         xy = road.at(stations[None], laterals[:, None])
         z = road.ground_height(xy)
@@ -370,7 +370,7 @@ def _scatter(
 def _moved(
     other_day: np.random.Generator | None, place: KnownPlace, site: Site, at: tuple[float, float], radius: float
 ) -> tuple[float, float]:
-    """Station and lateral [m] of a movable object: as filmed, or, on another day, up to 1.5 m away if that is free."""
+    """Station and lateral [m] of a movable object: `at`, or, on another day, a free spot up to 1.5 m along the road."""
     if other_day is None:
         return at
     moved = at[0] + float(other_day.uniform(-1.5, 1.5)), at[1]

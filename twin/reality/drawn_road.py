@@ -22,7 +22,7 @@ _LAND_SAMPLE = 2.0  # [m] between points of the line whose heights determine the
 _LAND_SMOOTHING = 3.0  # [m] length over which these heights are smoothed
 _DROP_LENGTH = 0.8  # [m] over which a curb drops beside a side road
 MOUTH_REACH = 26.0  # [m] from the road's edge to the end of a side road
-_CHUNK = 40_000  # points whose land height is evaluated together
+_CHUNK = 40_000  # points whose land height is computed together
 
 
 class DrawnRoad:
@@ -64,7 +64,7 @@ class DrawnRoad:
         curvature = np.where(s < 0.0, 0.0, self._curvatures[k])
         along = s - self._starts[k]
         heading = self._headings[k] + curvature * along
-        # The chord of an arc of angle a is its length times sinc(a / 2), in the direction of the mean heading.
+        # The chord of an arc of angle a is the arc's length times sinc(a / 2), in the direction of the mean heading.
         half = 0.5 * curvature * along
         chord = along * np.sinc(half / np.pi)
         middle = self._headings[k] + half
@@ -142,7 +142,7 @@ class DrawnRoad:
         return out
 
     def grade(self, station: ArrayLike) -> Array:
-        """Sampled slope along the line, without its unevenness."""
+        """Sampled slope along the line, without the unevenness."""
         knots = np.arange(len(self.line.grades)) * GRADE_STEP
         return np.interp(np.asarray(station, float), knots, self.line.grades)
 

@@ -1,4 +1,4 @@
-"""Buildings: blocks with windows, sills and doors, under flat or pitched roofs."""
+"""Buildings with windows, sills and doors, under flat or pitched roofs."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ def add_block(
     size: tuple[float, float, float],
     windows: tuple[int, int],
 ) -> None:
-    """Adds a block with a roof slab, windows, sills and doors.
+    """Adds a building: a box with a roof slab, windows, sills and doors.
 
     Args:
         place: The place.
@@ -71,7 +71,7 @@ def add_block(
     place.objects.append(
         PlaceObject(f"{name}_glass", "obstacle", primitives.join([place.cell(f"window{k}", p) for k, p in panes]))
     )
-    # Windows that are lit after dark have two meshes, by day and lit; `true_world.world_spec` selects one.
+    # A window that is lit after dark has a mesh for day and one for dark; `true_world.world_spec` selects one.
     day = primitives.join([place.cell(f"window{k}", p) for k, p in lit])
     dark = primitives.join([place.cell(f"lit{k % 8}", p) for k, p in lit])
     place.objects.append(PlaceObject(f"{name}_day", "obstacle", day, "windows_by_day"))
@@ -80,7 +80,7 @@ def add_block(
 
 # ---- houses under pitched roofs
 
-_STOREY = 2.75  # [m]
+_STOREY = 2.75  # [m] of a floor
 _EAVES = 0.45  # [m] overhang of a roof
 
 

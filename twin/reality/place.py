@@ -50,7 +50,7 @@ _CARS = ((31.2, -5.2, "white"), (12.6, -4.9, "blue"), (66.0, 5.4, "red"))
 
 
 def _add_street_furniture(place: KnownPlace, rng: np.random.Generator | None = None) -> None:
-    """Adds street furniture, cars and barriers; displaces cones, bins, crates and cars if there is a generator."""
+    """Adds street furniture, cars and barriers; displaces cones, bins, crates and cars if `rng` is given."""
     for k, lamp in enumerate(_LAMPS):
         add_lamp_post(place, k, *lamp)
     for k, (station, lateral, turn) in enumerate(_SIGNS):
@@ -78,7 +78,7 @@ def _displaced(
 ) -> tuple[float, float]:
     """Station and lateral, displaced at random by at most `along` and `across` [m]; unchanged without a generator.
 
-    An object comes no closer to the center line than `_MIN_LATERAL`, or than it was if it was closer.
+    An object nearer to the center line than `_MIN_LATERAL` comes no nearer; others stay at least that far away.
     """
     if rng is None:
         return station, lateral

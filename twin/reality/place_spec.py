@@ -108,7 +108,7 @@ class SurfaceSpec:
     """`asphalt`, `concrete`, `pavers`, `gravel`."""
     tone: Rgb
     coarseness: float
-    """Contrast of the grain."""
+    """Relative contrast of the grain."""
     patches: float
     """Repairs per meter of road."""
     cracks: float

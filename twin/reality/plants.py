@@ -151,7 +151,7 @@ def add_bare_tree(place: KnownPlace, k: int, spot: tuple[float, float], height: 
 
 
 def add_shrub(place: KnownPlace, k: int, spot: tuple[float, float], height: float, skin: str) -> None:
-    """Adds a shrub; only its middle is solid."""
+    """Adds a shrub, of which only the middle is solid."""
     rng = place.rng(2, k)
     foot = place.spot(*spot)
     ball = rng.normal(size=(650, 3))

@@ -28,7 +28,7 @@ from twin.warp_runtime import wp
 # ---- model to arrays
 
 _MAX_LEVELS = 6
-_MIN_SIDE = 8  # [px] least side of a mip level
+_MIN_SIDE = 8  # [px] smaller mip levels are not made
 _SMOOTH_COSINE = 0.8  # at smaller cosines between vertex and face normal, the face normal is used, as in MuJoCo
 
 

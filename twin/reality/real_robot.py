@@ -1,8 +1,8 @@
 """The robots of the real test: Huskies by number, with equations of motion independent of MuJoCo and the twin.
 
 The chassis is a rigid body with three degrees of freedom in the plane of the ground beneath it. Each of four tires has
-its own load and slip; a geared motor drives the two tires of a side. Height, pitch and roll follow the ground
-under the tires as lightly damped oscillators of 6.5 to 11 Hz, which bumps and the road's texture excite.
+its own load and slip; a geared motor drives the two tires of a side. Height, pitch and roll follow the ground under the
+tires as lightly damped oscillators of 6.5 to 11 Hz, which bumps and the road's texture excite.
 
 Tire: the averaged lumped LuGre model (Canudas de Wit, Tsiotras, Velenis, Basset, Gissinger 2003, Vehicle System
 Dynamics 39(3)) in its anisotropic planar form (Velenis, Tsiotras, Canudas de Wit, Sorine 2005, same journal 43(1)). For
@@ -434,7 +434,7 @@ class RealRobot:
 
     @property
     def tilt(self) -> float:
-        """Angle between the chassis's and the world's up axes, to second order [rad]."""
+        """Angle between the chassis's and the world's up axes, for small pitch and roll [rad]."""
         return hypot(self._attitude[1], self._attitude[2])
 
     @property

@@ -27,9 +27,9 @@ from twin.reality.trial_place import place_on_test_day, shadow_range
 from twin.runtime import track
 from twin.types import Array
 
-LIGHTING = "overcast"  # of the film, if the place has it
+LIGHTING = "overcast"  # of the film, if the place has this lighting
 
-_STATIONS = (4.0, 30.0)  # [m] of the film
+_STATIONS = (4.0, 30.0)  # [m] start and end of the film
 _SPEED = 0.6  # [m/s]
 _WEAVE_AMPLITUDE, _WEAVE_PERIOD = 0.5, 11.0  # [m] to either side, and along the road; fitting extrinsics needs turns
 _LATERAL_GAIN, _HEADING_GAIN = 0.8, 1.5  # [rad/m], [1/s]

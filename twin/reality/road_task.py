@@ -85,7 +85,7 @@ class RoadTask:
         return np.append(0.0, np.cumsum(np.hypot(*np.diff(self.line, axis=0).T)))
 
     def at(self, station: float) -> tuple[float, float, float]:
-        """x, y [m] of the line at a station, and its heading [rad] over 1 m around it."""
+        """x, y [m] of the line at a station, and the line's heading [rad] over 1 m around the station."""
         knots, total = self.knots, float(self.knots[-1])
 
         def point(s: float) -> Array:

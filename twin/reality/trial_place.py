@@ -19,7 +19,7 @@ _LENGTH_TOLERANCE = 0.98  # least length of the route, as a fraction of the long
 def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) -> Array:
     """The route on the true ground [m], shape (m, 3).
 
-    As in a build, the route is the path of the first film that is at least 98 % as long as the longest film's path.
+    As in a build, it is the path of the first film whose path has at least 98 % of the longest path's length.
     """
     plan, line = plan or FilmingPlan(), line or RoadLine()
     paths = [smooth_path(trajectory(plan, line, lighting)[1][:, :3, 3]) for lighting in plan.lightings]
