@@ -51,7 +51,7 @@ class PlaceRecord:
 def freeze(folder: Path, runs: dict[str, Path]) -> None:
     """Records the digests of trained policies; `runs` maps their names to folders.
 
-    Raises InputError: the record has other digests, that is, policies of an earlier training.
+    Raises InputError: the record has other digests, so other policies would drive than those recorded.
     """
     digests = {name: digest_file(path / "policy.json") for name, path in runs.items()}
     record = folder / POLICIES

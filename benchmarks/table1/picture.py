@@ -60,7 +60,7 @@ def main() -> None:
         _caption("The twin in training: randomized lighting, sun, shadows and haze"),
         *_rows([_first(given.scene, seed, randomise=True) for seed in _SEEDS]),
         _caption(
-            f"The test road in {len(_SHOWN)} of its {len(WEATHER)} weathers, which were not filmed; objects were moved"
+            f"The test road in {len(_SHOWN)} of its {len(WEATHER)} weathers, which were not filmed; objects have moved"
         ),
         *_rows(road, _SHOWN),
         _caption("The twin with appearance and haze fitted to one photo of each of these days"),

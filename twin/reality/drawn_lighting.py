@@ -1,4 +1,4 @@
-"""Lightings and skies of sampled places; a sky contains the far view, such as hills."""
+"""Lightings and skies of randomly sampled places; a sky contains the far view, such as hills."""
 
 from dataclasses import replace
 

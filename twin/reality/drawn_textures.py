@@ -1,4 +1,4 @@
-"""Textures of sampled places: ground, walls, roofs (see `surfaces.py`), and the atlas with all other surfaces."""
+"""Textures of randomly sampled places: ground, walls, roofs (see `surfaces.py`), and the atlas with all the rest."""
 
 from dataclasses import replace
 from functools import cache

@@ -48,7 +48,7 @@ class FilmingPlan:
     oversize: float = 1.0
     """Ratio of the size at which a frame is rendered to the film's size; the frame is then shrunk."""
     crf: int = 29
-    """Quality of the H.264 film; lower is better."""
+    """Constant rate factor of H.264; less is better quality."""
     camera_height: float = CAMERA_HEIGHT
     """Mean height of the lens above the ground [m]."""
     pitch: float = float(np.deg2rad(8.0))
@@ -266,7 +266,7 @@ def write_video(frames: Iterable[NDArray[np.uint8]], plan: FilmingPlan, path: Pa
 def depth_maps(
     lighting: str, place: KnownPlace, plan: FilmingPlan, poses: Array
 ) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
-    """Indices (k,) of about ten frames and their depth maps [m], shape (k, h, w).
+    """Indices (k,) of up to ten frames and their depth maps [m], shape (k, h, w).
 
     The maps have a quarter of the film's width and height, or a third if its height is not a multiple of four.
     """

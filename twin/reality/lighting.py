@@ -51,7 +51,7 @@ class Lighting:
     glow_sun: Color = (0.0, 0.0, 0.0)
     """Brightening of the sky around the first sun."""
     wet: float = 0.0
-    """Darkening of the wet ground, 0 to 1."""
+    """Fraction by which wet ground is darker, 0 to 1."""
     visibility: float = float("inf")
     """Distance on the ground over which haze transmits 1/e of the light [m]; haze has the color of the horizon."""
 
@@ -257,7 +257,7 @@ _HIGH_SUN, _LOW_SUN = (
     np.array([1.0, 0.60, 0.34]),
 )  # colors of a high sun and of a sun at the horizon
 _REDDENING_ANGLE = 14.0  # [°] of elevation over which the red of a low sun falls to 1/e
-_MEAN_BRIGHTNESS = 0.3  # mean value of an image for which a day's exposure is chosen
+_MEAN_BRIGHTNESS = 0.3  # mean image value at which a day's exposure aims
 
 
 def _day(number: int) -> Lighting:
@@ -302,7 +302,7 @@ def daylight(
         clouds: Cloud cover, 0 to 1; above 0.8 no direct sunlight.
         veil: Thickness of high cloud in front of the sun, 0 to 1.
         visibility: Distance at which haze transmits 1/e of the light [m].
-        wet: Darkening of the wet ground, 0 to 1.
+        wet: Fraction by which wet ground is darker, 0 to 1.
         tint: White balance, positive is warmer.
         brightness: Relative exposure.
     """

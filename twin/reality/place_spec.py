@@ -1,7 +1,7 @@
-"""Descriptions of sampled places: plain numbers and names, which `place_sampling.py` samples.
+"""Descriptions of randomly sampled places: plain numbers and names, which `place_sampling.py` samples.
 
-`drawn_place.py` builds a place from its description. The *driven line* is the path of the first film and of the
-robot's tasks; the road need not be symmetrical about it. Stations and laterals are defined as in `centerline.py`.
+`drawn_place.py` builds a place from its description. The *driven line* is the line that the first film and the
+robot's tasks follow; the road need not be symmetrical about it. Stations and laterals are those of `centerline.py`.
 """
 
 from dataclasses import dataclass

@@ -216,7 +216,7 @@ class AutoExposure:
         return float(np.log(self._camera.exposure_target / max(brightness, 1e-3)))
 
     def see(self, brightness: float, time: float) -> None:
-        """Updates the exposure to a picture at a time [s]; `brightness` is its mean at `Lighting.exposure`."""
+        """Updates the exposure after a picture at a time [s], whose mean at `Lighting.exposure` is `brightness`."""
         c, steps = self._camera, max(1, round((time - self._time) / 0.01))
         dt, self._time = (time - self._time) / steps, time
         wanted = float(np.clip(self._wanted(brightness), -c.exposure_range, c.exposure_range))

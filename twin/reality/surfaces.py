@@ -1,4 +1,4 @@
-"""Textures of sampled places: roads, verges, land, walls and roofs. Conventions as in `textures.py`."""
+"""Textures of randomly sampled places: roads, verges, land, walls, roofs. Conventions as in `textures.py`."""
 
 import cv2
 import numpy as np
