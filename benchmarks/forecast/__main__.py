@@ -1,22 +1,22 @@
-"""Forecast experiment: measures how well the twin predicts success on the road at places not used in development.
+"""Forecast experiment: how well the twin predicts success on simulated roads at places not used in development.
 
     python benchmarks/forecast WORK [--minutes 150] [--jobs 2] [--places 100 101] [--ray ADDRESS]
     python benchmarks/forecast --tables                     only scores the recorded results, in seconds
 
-`protocol.toml` fixes every number in advance; `place_record.py` keeps every episode and trial in `results/`; the scores
-are defined in `place_scores.py`. Steps at a place, each a command of `twin` that resumes where it was interrupted:
+`protocol.toml` fixes every number in advance. `place_record.py` keeps every episode and trial in `results/`.
+`place_scores.py` defines the scores. Steps at a place, made of commands of `twin` that resume where they stopped:
 
 - film: generates the place from its number, and films it under its lightings.
-- build: builds the twin; aligns the robot to a drive log and a film of its own camera; builds again with this robot.
+- build: builds the twin; aligns the robot to a drive log and to a film by its camera; builds again with this robot.
 - photos: adds each day's lighting to the twin, from one photo by the robot's camera. If the photo's pose is not found,
-  held-out lightings replace that day's lighting.
-- train: trains one policy per setup, and records the policies' digests before any of them drives.
+  held-out lightings, which no training uses, replace that day's lighting.
+- train: trains one policy per setup (training options), and records the policies' digests before any of them drives.
 - validate: drives every policy in the twin, under the lighting of each day and under held-out lightings.
-- drive: drives every policy in the reality, on each day, on the task that the twin exported.
+- drive: drives every policy in the simulated reality, on each day, on the task that the twin exported.
 
-WORK holds the scenes (1 GB a place). After a kill, or when `--minutes` are over, the same command continues. A place of
-60 m takes about two hours on two cores. No recorded row is removed. If a command fails, its place stays unfinished, and
-the next place begins.
+WORK holds the scenes (1 GB a place). After a kill, or at the end of `--minutes`, the same command continues. A place of
+60 m takes about two hours on two cores. No recorded row is removed. If a command fails, its place remains unfinished,
+and the next place begins.
 """
 
 import argparse
@@ -44,7 +44,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 from record import save
 
 RESULTS = Path(__file__).with_name("results")
-_GRACE = 60.0  # [s] given to a command to save its state
+_GRACE = 60.0  # [s] for a command to save its state
 
 
 class TimeIsUp(Exception):
@@ -94,7 +94,7 @@ class Commands:
         self._running.discard(process)
 
     def must(self, *arguments: str | Path, cores: int = 1) -> None:
-        """Runs a command. Raises InputError: the command failed."""
+        """Runs a command. Raises InputError if it fails."""
         status = self(*arguments, cores=cores)
         if status:
             raise InputError(f"{' '.join(map(str, arguments))}: exit status {status}; see its message above")
@@ -127,7 +127,7 @@ class PlaceRun:
         self.run.must("twin.reality", "compare", self.scene, cores=self.jobs)
 
     def photos(self) -> None:
-        """Adds the days' lightings; `photos.json` in the scene records for each day if the photo's pose was found."""
+        """Adds the days' lightings, and records in the scene's `photos.json` which photos' poses were found."""
         done = dict(read_json(self._photos)) if self._photos.exists() else {}
         for day in (day for day in self.days if day not in done):
             photo = self.scene / "photos" / f"{day}.png"
@@ -181,7 +181,7 @@ class PlaceRun:
             list(pool.map(one, self.protocol.setups))
 
     def write_record(self) -> None:
-        """Writes all episodes and trials so far to the record."""
+        """Writes to the record all episodes and trials so far."""
         episodes = self.scene / "validation" / "episodes.csv"
         wanted = {HELD_OUT_CONDITION, *map(by_photo, self.days)}
         if episodes.exists():

@@ -4,9 +4,9 @@
       place.json            figures of build and trainings; robot and camera, with values outside training's ranges
       policies.json         digest of every policy, written before the first trial
       episodes.csv.gz       a row per episode in the twin
-      trials.csv.gz         a row per trial in the reality
+      trials.csv.gz         a row per trial in the simulated reality
 
-The same tables give the same bytes. No row of a record is ever lost or changed.
+The same tables give the same bytes. A table that would lose or change a recorded row is refused.
 """
 
 import gzip
@@ -37,7 +37,7 @@ class PlaceRecord:
 
     place: int
     policies: tuple[str, ...]
-    """Names of the setups, in the protocol's order."""
+    """Names of the trainings' setups, in the protocol's order."""
     days: tuple[str, ...]
     twin: Array
     """Successes and episodes in the twin under the lighting of each day's photo, or under held-out lightings if the
@@ -45,13 +45,13 @@ class PlaceRecord:
     held_out: Array
     """Successes and episodes under held-out lightings, shape (n, 2)."""
     real: Array
-    """Successes and trials in the reality, shape (n, k, 2)."""
+    """Successes and trials in the simulated reality, shape (n, k, 2)."""
 
 
 def freeze(folder: Path, runs: dict[str, Path]) -> None:
-    """Records the digests of trained policies; `runs` names their folders.
+    """Records the digests of trained policies; `runs` maps their names to folders.
 
-    Raises InputError: the record has other digests, so the policies to be driven would not be those recorded.
+    Raises InputError: the record has other digests, so other policies would drive than those recorded.
     """
     digests = {name: digest_file(path / "policy.json") for name, path in runs.items()}
     record = folder / POLICIES
@@ -64,7 +64,7 @@ def freeze(folder: Path, runs: dict[str, Path]) -> None:
 def keep(path: Path, trials: list[Trial]) -> None:
     """Writes a table of trials, sorted.
 
-    Raises InputError: the existing table has rows that are not among `trials`; it is kept.
+    Raises InputError: the existing table, which is kept, has rows that are not among `trials`.
     """
     new = sorted(trials, key=lambda one: (one.policy, one.task, one.lighting, one.seed))
     gone = set(read_trials(path)) - set(new) if path.exists() else set()

@@ -1,16 +1,16 @@
 """Scores of a forecast experiment over places, from the recorded tables alone.
 
 The forecast of a policy on a day is its success rate in the twin under the lighting of that day's photo, or under
-held-out lightings if the photo's pose was not found. One kind of baseline is the success on the road at *other places*,
-which does not use the twin. The other is the twin's rates with the days shuffled.
+held-out lightings if the photo's pose was not found. Baselines are the success on the road at *other places*, which
+does not use the twin, and the twin's rates with the days shuffled.
 
-- *within places*: mean over places of Spearman, MMRV and regret of the place's policies. *over all*: the statistic of
-  the policies of all places together.
-- single days: mean over places of the log and Brier scores of all cells. *gain* is a baseline's log score minus the
-  twin's; it is above 0 if the twin is better.
+- *within places*: mean over places of Spearman, MMRV (`twin.evaluation.statistics.mmrv`) and regret among the place's
+  policies. *over all*: the statistic of the policies of all places together.
+- single days: mean over places of the log and Brier scores of all cells (a policy on a day). *gain* is a predictor's
+  log score minus that of the twin by photos; it is above 0 if the twin is better.
 
 Intervals (90 %) have the place as their unit (`twin.evaluation.jackknife`), so they hold for experiments at other
-places. There are none for fewer than five places.
+places. Fewer than five places give no intervals.
 """
 
 from collections.abc import Callable
@@ -96,7 +96,8 @@ def _held_out(one: PlaceRecord) -> Array:
 def _elsewhere(places: list[PlaceRecord], one: PlaceRecord, by_setup: bool) -> Array:
     """Success on the road at other places, shape (n,).
 
-    The mean of all setups; if `by_setup`, each setup's mean, shrunk by one added place with the mean of all setups.
+    This is the mean of all setups. If `by_setup`, it is each setup's mean, including one added place at which the
+    setup has the mean of all setups.
     """
     others = [_real(other).mean(1) for other in places if other is not one]
     if not others:
@@ -120,7 +121,7 @@ def _predicted(places: list[PlaceRecord], one: PlaceRecord, name: str) -> Array:
 
 
 def _cells(places: list[PlaceRecord], one: PlaceRecord, name: str) -> PairedCells:
-    """Predicted and real rates for the rankings; the twin's are ratios of counts, without shrinkage."""
+    """Predicted and real rates for the rankings. The twin's are ratios of counts, not shrunk as in `_twin`."""
     predicted = one.twin[..., 0] / one.twin[..., 1] if name == TWIN else _predicted(places, one, name)
     n, k = predicted.shape
     day = np.broadcast_to(np.arange(k), (n, k))
@@ -160,7 +161,7 @@ def _alone(data: PairedCells) -> dict[str, float | None]:
 
 
 def _over_places(statistic: Statistic, places: list[PairedCells], pooled: bool) -> dict[str, float | None]:
-    """A statistic over places with its interval; None for values that are undefined."""
+    """A statistic over places with its interval; None for undefined values."""
     if not places:
         return {"value": None, "low": None, "high": None}
     try:
@@ -217,7 +218,7 @@ def _gain(log: list[float], twin: list[float]) -> dict[str, float | None]:
 
 
 def _met(protocol: Protocol, out: dict[str, Any]) -> dict[str, bool | None]:
-    """Acceptance criterion → True if it is reached; None if its figure is undefined."""
+    """Acceptance criterion → whether it is met; None if its figure is undefined."""
     ranking = out["ranking"][TWIN]
     varied = [row["real"] for row in out["road"] if row["setup"] == next(iter(protocol.setups))]
     figures = {
@@ -269,7 +270,9 @@ def tables(protocol: Protocol, found: dict[str, Any]) -> str:
     for row in found["road"]:
         ends = f"{row['low']:.2f} to {row['high']:.2f}"
         rates = f"{row['twin']:.2f} | {row['held_out']:.2f}"
-        lines.append(f"| {row['place']} | {row['setup']} | {row['real']:.2f} of {row['trials']} | {ends} | {rates} |")
+        lines.append(
+            f"| {row['place']} | {row['setup']} | {row['real']:.2f} ({row['trials']} trials) | {ends} | {rates} |"
+        )
     lines += [
         "",
         "| probability predicted by the twin | mean | success on the road | cells | trials |",

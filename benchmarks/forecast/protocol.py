@@ -36,7 +36,7 @@ class Protocol:
         return f"version_{self.version}"
 
     def days_of(self, place: int) -> list[str]:
-        """Names of the days of a place's trials."""
+        """Names of the days of trials at a place."""
         return [f"day_{10 * place + k + 1}" for k in range(self.days)]
 
     def options_of(self, setup: str, lightings: list[str]) -> list[str]:
@@ -59,7 +59,10 @@ def read_protocol(path: Path = PROTOCOL) -> Protocol:
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: {error}; expected the fields of benchmarks/forecast/protocol.toml") from None
     faults = [
-        (len(set(places)) != len(places) or not places, f"places = {list(places)}; expected different numbers"),
+        (
+            len(set(places)) != len(places) or not places,
+            f"places = {list(places)}; expected different numbers, 1 or more",
+        ),
         (not 1 <= protocol.days <= 10, f"days = {protocol.days}; expected 1 to 10, the days of a place"),
         (len(setups) < MIN_POLICIES, f"{len(setups)} setups; expected {MIN_POLICIES} or more"),
         (protocol.trials < MIN_TRIALS, f"trials = {protocol.trials}; expected {MIN_TRIALS} or more"),

@@ -13,7 +13,7 @@ Steps, each a command of `twin` that resumes where it was interrupted:
 - forecast: forecasts real success, once from held-out lightings, once from the photos.
 
 The defaults are the published plan; the same call with more seeds adds runs. `results.json` beside this file records
-every run. If the new record has fewer runs, policies, days or trials, the file is kept, the new record is written to
+every run. If the new record has fewer runs, policies, days or trials, this file is kept, the new record is written to
 `results.json.partial`, and the command ends with status 2. `--results` gives another file for the record. `plan.py`
 defines setups, sizes and checkpoints. After all steps the command prints the tables of `scores.py`, the paper's table
 and the forecasts. `scores.py` itself needs only `results.json`.
@@ -136,7 +136,9 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--setups", nargs="+", choices=SETUPS, default=list(SETUPS))
-    parser.add_argument("--steps", nargs="*", choices=STAGES, default=list(STAGES), help="no names: the tables only")
+    parser.add_argument(
+        "--steps", nargs="*", choices=STAGES, default=list(STAGES), help="no names: only save and print results"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="number of runs in parallel, each on one core")
     parser.add_argument("--results", type=Path, default=RESULTS, help="the record (default: the one beside this file)")
     given = parser.parse_args()
@@ -165,7 +167,7 @@ def main() -> int:
         return status
     print(tables(results))
     print(f"\nThe paper's table, over all {len(WEATHER)} weathers\n\n{table(results)}")
-    print("\nForecasts over all weathers; coverage of their 90 % intervals: benchmarks/intervals.py")
+    print("\nForecasts over all weathers; benchmarks/intervals.py measures the coverage of their 90 % intervals")
     for kind in ("forecast", "forecast_by_photo"):
         for task, group in results[kind].items():
             print(kind, task, json.dumps(group))

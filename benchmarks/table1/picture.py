@@ -30,7 +30,7 @@ from twin.report.forecast_report import rates_against_road
 from twin.types import Image
 
 _WIDTH, _GAP, _LINE = 1640, 8, 34  # [px] total width, gap between images, height of a caption
-_PER_ROW = 5  # images
+_PER_ROW = 5  # images in a row
 _SEEDS = range(1, 1 + _PER_ROW)  # seeds of the episodes in the twin's images
 _SHOWN = list(WEATHER)[: 2 * _PER_ROW]
 _PAPER = {
@@ -41,7 +41,7 @@ _PAPER = {
     SERIES[0]: "#2b6cd9",
     SERIES[1]: "#d97a06",
 }
-_TRIAL = 7_000_000  # seed of a real trial
+_TRIAL = 7_000_000  # seed of the trials on the test road
 
 
 def main() -> None:
@@ -57,13 +57,13 @@ def main() -> None:
     agreement = rates_against_road(Forecast.load(given.scene / "forecast"))
     curve = cv2.imread(str(write_success_curve(run)))[..., ::-1]
     parts = [
-        _caption("The twin in training: randomised lighting, sun, shadows and haze"),
+        _caption("The twin in training: randomized lighting, sun, shadows and haze"),
         *_rows([_first(given.scene, seed, randomise=True) for seed in _SEEDS]),
         _caption(
-            f"The test road in {len(_SHOWN)} of its {len(WEATHER)} weathers, which were not filmed; objects were moved"
+            f"The test road in {len(_SHOWN)} of its {len(WEATHER)} weathers, which were not filmed; objects have moved"
         ),
         *_rows(road, _SHOWN),
-        _caption("The twin under the appearance and the haze of one photo of each of these days"),
+        _caption("The twin with appearance and haze fitted to one photo of each of these days"),
         *_rows([_first(given.scene, 1, lighting=name) for name in _SHOWN], _SHOWN),
         _side_by_side(_in_paper_colors(agreement), curve),
     ]

@@ -1,4 +1,4 @@
-"""Design of the experiment: setups, tasks, runs, and the policies that are driven on the road.
+"""Design of the table 1 experiment: setups, tasks, runs, and the policies that drive on the road.
 
 A *setup* is a set of training options. A *run* trains a setup on a task with a seed. Each run contributes its finished
 policy and its checkpoints at a quarter and at half of the steps, so that the policies vary in quality. This selection
@@ -23,7 +23,7 @@ SETUPS: dict[str, tuple[str, ...]] = {
 }
 """Name → options of `twin.train`."""
 STEPS = {"straight": 12_000, "right": 16_000}
-"""Largest number of steps. Published runs used all; trainings now end once they have learned (`learn.selection`)."""
+"""Largest number of steps. Published runs took all of them; newer runs may end earlier (`learn.selection`)."""
 SHARES = (0.25, 0.5)
 """Fractions of a run's steps at which checkpoints are taken for the forecast."""
 EPISODES = 50
@@ -31,10 +31,10 @@ EPISODES = 50
 LIGHTINGS = {"final": (HELD_OUT, str(Condition(HELD_OUT, True))), "checkpoint": (str(Condition(HELD_OUT, True)),)}
 """Lightings in the twin for finished policies and for checkpoints.
 
-Forecasts use the randomized condition. The paper's table, which has only finished policies, uses the other one.
+Forecasts use the randomized condition, `+randomised`; the paper's table, of finished policies only, uses both.
 """
 PHOTOS = tuple(str(Condition(name, True)) for name in WEATHER)
-"""Lightings of the twin fitted to a photo of each test day, for forecasts per weather."""
+"""Lightings of the twin, each fitted to a photo of a test day, for forecasts per weather."""
 PHOTO_EPISODES = 5
 """Episodes in the twin per policy and weather."""
 TRIALS = MIN_TRIALS
@@ -64,7 +64,7 @@ class Run:
         return scene / "runs" / self.name
 
     def checkpoints(self, scene: Path) -> list[Path]:
-        """Checkpoints for the forecast: for each of `SHARES`, the last one saved no more than 100 steps after it."""
+        """Checkpoints for the forecast: for each of `SHARES`, the last one up to 100 steps after that share."""
         saved = sorted((self.folder(scene) / "checkpoints").glob("*"), key=lambda path: int(path.name))
         before = [[path for path in saved if int(path.name) <= share * STEPS[self.task] + 100] for share in SHARES]
         return [some[-1] for some in before if some]
@@ -74,9 +74,9 @@ class Run:
         if not (path / "config.json").exists():
             return False
         planned = read_json(path / "config.json")["steps"]
-        if planned != steps:  # the learning rate schedule depends on the total, so a longer run is another training
+        if planned != steps:  # learning rates depend on the total, so a longer run is another training
             raise SystemExit(f"{path} is a run of {planned} steps, not of {steps}; move it away")
-        return (path / CHOICE_FILE).exists()  # it may have ended before the largest number of steps
+        return (path / CHOICE_FILE).exists()  # a run may end before the largest number of steps
 
 
 def runs(seeds: list[int], tasks: list[str], setups: list[str]) -> list[Run]:

@@ -231,7 +231,7 @@ class DayScores:
 
 
 def probabilities(policies: Sequence[PolicyRecord], days: Sequence[str]) -> tuple[PairedCells, dict[str, np.ndarray]]:
-    """The cells, and each predictor's probability of success in them, (n, k); baselines use only other trainings."""
+    """The cells, and each predictor's probability of success in them (n, k); baselines use only other trainings."""
     counts_ = np.array([[policy.twin[day] for day in days] for policy in policies])
     twin = twin_probabilities(counts_[..., 0], counts_[..., 1])
     data = paired_cells(policies, days, twin)

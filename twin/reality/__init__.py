@@ -1,9 +1,9 @@
-"""The known-truth world: generated places that are filmed like real ones and in which the real test drives.
+"""The known-truth world: generated places, filmed like real ones, in which policies drive in the *real test*.
 
-Place 0 is the campus road. The rest of `twin` imports nothing from this package. Only `comparison.py`, `twin reality
-drive` for a task in the scene's frame, benchmarks and tests read the truth beside a scene.
+Place 0, the campus road, is designed; the others are random. The rest of `twin` imports nothing from this package.
+Only `comparison.py`, `twin reality drive` with a task file, benchmarks and tests read a scene's folder `truth`.
 """
 
-SEED = 20  # seed of everything random in this world: places, textures, skies, films, robots, cameras
+SEED = 20  # seed of all that is random in this world: places, textures, skies, films, robots, cameras; not of trials
 REALITY_VERSION = 2
 """Version of the robot, camera and judge of the real test. In version 1 these three were parts of the twin."""

@@ -1,4 +1,4 @@
-"""`twin reality`: commands of the known-truth world.
+"""`twin reality`: films a generated place whose truth is known, drives in it, and measures builds of it.
 
     python -m twin.reality film [--place NUMBER] --out DIR
     python -m twin.reality compare DIR
@@ -9,10 +9,10 @@
     python -m twin.reality bag --lighting dawn --out dawn_1
     python -m twin.reality photo --lighting dawn --out dawn.png
 
-`film` writes a scene folder: `scene.toml`, `input/<lighting>.mp4` and `truth/`. `compare` measures a build against that
-truth. `drive` runs the real test. `log` writes a drive log, for `twin.align`. `onboard` writes a film from the robot's
-camera, also for `twin.align`. `bag` writes a robot's recording of a trial, for `twin.trial`. `photo` writes a photo in
-the weather of a trial, for `twin.relight`. All seeds are fixed in the code, so the same command writes the same files.
+`film` writes a scene folder: `scene.toml`, `input/*.mp4` and `truth/`. `compare` measures a build against that truth.
+`drive` drives policies in weather that was not filmed. `log` writes a drive log, for `twin.align`. `onboard` writes a
+film by the robot's camera, also for `twin.align`. `bag` writes a robot's recording of a trial, for `twin.trial`.
+`photo` writes a photo in the weather of a trial, for `twin.relight`. The same command writes the same files.
 """
 
 import argparse
@@ -66,17 +66,18 @@ def film(
 ) -> Truth:
     """Films every pass of a plan under every lighting into the scene folder `out`, and saves the truth there.
 
-    With `traffic`, walkers and cars move through every film, and cars are parked in all lightings but the last. The
-    truth does not contain them. `renderer_of` returns the renderer for a lighting and a place; by default that is
-    `filming.Renderer`, the only one that shows moving traffic.
+def scene_task(given: str, scene: Path | None, place: int) -> str | RoadTask:
+    """Returns a task's name unchanged; reads a JSON file and transforms its task to the true frame.
+
+    Raises:
+        InputError: no scene, a scene without truth, or one of another place.
+    """
 
     Raises:
         InputError: `out` is not empty and has no folder `truth`.
     """
     if out.is_dir() and any(out.iterdir()) and not (out / "truth").is_dir():
-        raise InputError(
-            f"{out} is not empty and has no truth/, so it is not a scene of this world; give another --out"
-        )
+        raise InputError(f"{out} is not empty and has no truth/, so this command did not write it; give another --out")
     (out / "input").mkdir(parents=True, exist_ok=True)
     place = build_number(number) if number else places.build()
     parked = parked_cars(place, plan.start, plan.length) if traffic else []
@@ -193,12 +194,17 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
         print(setup)
 
 
+<<<<<<< HEAD
 def scene_task(given: str, scene: Path | None, place: int) -> str | RoadTask:
     """The task in a JSON file, transformed from its scene's frame to the true frame; a task's name stays as it is.
 
     Raises:
         InputError: no scene, a scene without truth, or one of another place.
     """
+=======
+def _task(given: str, scene: Path | None, place: int) -> str | RoadTask:
+    """Returns a task's name unchanged; reads a JSON file and transforms its task to the true frame."""
+>>>>>>> 6e17c1db0005b92e0903037f2957a90daebd5008
     if not given.endswith(".json"):
         return given
     if scene is None:

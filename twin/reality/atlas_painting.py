@@ -1,4 +1,4 @@
-"""The atlas: one texture with a cell for every small surface, from bark to windows."""
+"""Paints an atlas: one texture image with a square cell for each small surface, from bark to windows."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -51,14 +51,14 @@ class AtlasColors:
 
 
 def to_uint8(image: NDArray) -> NDArray[np.uint8]:
-    """An image in [0, 1] in 8 bits."""
+    """Converts an image in [0, 1] to 8 bits."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def paint_atlas(
     rng: Callable[[int], np.random.Generator], names: tuple[str, ...], colors: AtlasColors
 ) -> NDArray[np.float32]:
-    """The image of an atlas; `rng(k)` is the random generator of cell k."""
+    """The image of an atlas in [0, 1]; `rng(k)` is the random generator of cell k."""
     rows = max(8, -(-len(names) // 8))
     image = np.zeros((rows * ATLAS_CELL, 8 * ATLAS_CELL, 3), np.float32)
     for k, name in enumerate(names):

@@ -22,7 +22,7 @@ def thickness(kind: str) -> float:
 def add_boundary(place: KnownPlace, name: str, spec: BoundarySpec, skin: str, stations: Array, lateral: float) -> None:
     """Adds a boundary at a lateral [m]: pieces of length `BAY` that begin at the stations [m].
 
-    `skin` is its atlas cell. Bollards stand at the stations, one at each.
+    `skin` is the boundary's atlas cell. One bollard stands at each station.
     """
     if not len(stations):
         return
@@ -51,7 +51,7 @@ def add_boundary(place: KnownPlace, name: str, spec: BoundarySpec, skin: str, st
 
 
 def _bay(place: KnownPlace, spec: BoundarySpec, skin: str, length: float) -> MeshPart:
-    """One piece of a boundary: x runs along the boundary from the middle of the piece, and its foot is at z = 0."""
+    """One piece of a boundary, with x along the boundary and the origin on the ground in the middle of the piece."""
     h, parts = spec.height, []
 
     def bar(x: float, size: tuple[float, float, float], base: float, y: float = 0.0, cell: str = skin) -> None:

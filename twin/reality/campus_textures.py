@@ -1,4 +1,4 @@
-"""Textures of the campus road (place 0): ground, walls and the atlas of everything else."""
+"""Textures of the campus road (place 0): ground, walls and the atlas with all other surfaces."""
 
 from functools import cache
 
@@ -10,7 +10,7 @@ from twin.reality.atlas_painting import AtlasColors, paint_atlas, to_uint8
 from twin.reality.centerline import END, PAVEMENT_WIDTH, ROAD_HALF_WIDTH, START, VERGE_WIDTH
 from twin.reality.place_objects import CELLS
 
-_ROAD_PIXEL = 0.0125  # [m] size of a texel of the road
+_ROAD_PIXEL = 0.0125  # [m] size of a texel
 _VERGE_PIXEL = 0.022
 _WALL_PIXEL = 0.03
 

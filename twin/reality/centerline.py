@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike
 
 from twin.types import Array
 
-ROAD_HALF_WIDTH = 3.0  # [m] width of the asphalt from the center line to the face of the kerb
+ROAD_HALF_WIDTH = 3.0  # [m] from the center line to the face of the curb
 KERB_HEIGHT = 0.11  # [m] above the adjacent asphalt
 KERB_WIDTH = 0.16  # [m]
-VERGE_WIDTH = 5.6  # [m] width of the ground from the kerb to the open land; on the left it includes the pavement
-PAVEMENT_WIDTH = 1.7  # [m] width of the slabs along the left kerb
-START, END = -6.0, 88.0  # [m] stations between which the road is paved
+VERGE_WIDTH = 5.6  # [m] from the curb to the open land; on the left this includes the sidewalk
+PAVEMENT_WIDTH = 1.7  # [m] of the sidewalk along the left curb
+START, END = -6.0, 88.0  # [m] stations of the ends of the road
 VERGE_SLOPE = 0.025  # slope of the verges, which rise away from the road
 _CROWN = 0.018  # slope of the road from its crown to either side
 _CROWN_ROUNDING = 0.35  # [m] half width of the rounding of the crown
@@ -89,7 +89,7 @@ def undulation(xy: ArrayLike) -> Array:
 
 
 def cross_profile(lateral: ArrayLike) -> Array:
-    """Height above the undulation [m]: crowned asphalt, a kerb, and a verge that rises outwards."""
+    """Height above the undulation [m]: crowned asphalt, a curb, and a verge that rises outwards."""
     away = np.abs(np.asarray(lateral, float))
     crown = -_CROWN * (np.sqrt(away**2 + _CROWN_ROUNDING**2) - _CROWN_ROUNDING)
     edge = -_CROWN * (np.hypot(ROAD_HALF_WIDTH, _CROWN_ROUNDING) - _CROWN_ROUNDING)

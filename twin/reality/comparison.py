@@ -2,8 +2,8 @@
 
 The *twin frame* is the metric frame of the build, the *true frame* that of the generated world. All figures except
 `ate_m`, `ate_max_m` and `scale_error` are measured after a rigid alignment of the twin's cameras with the true ones.
-The alignment has no scale, because an error of the twin's scale is an error for a robot. Obstacles and meshes are
-compared only where a camera could see them.
+The alignment does not correct the twin's scale, since a wrong scale misleads a robot. Obstacles and meshes are compared
+only where a camera could see them.
 """
 
 from pathlib import Path
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
 
 _NEAR_ROUTE = 10.0  # [m] from the route; surfaces farther away are not compared
 _MAX_HEIGHT = 3.0  # [m] above the ground; higher points of obstacles are not compared
-_MIN_HEIGHT = 0.15  # [m] above the ground; lower points belong to the ground or a kerb
+_MIN_HEIGHT = 0.15  # [m] above the ground; lower points belong to the ground or a curb
 _INTRUSION_HEIGHTS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.5)  # [m] heights above the ground at which the corridor must be free
 _RAYS = (96, 54)  # columns and rows of rays per camera that find the visible surface
-_MAX_CAMERAS = 48  # number of cameras whose rays find the visible surface
+_MAX_CAMERAS = 48  # largest number of cameras whose rays find the visible surface
 _MAX_DEPTH = 20.0  # [m] pixels with a larger true depth are not compared
 _MESH_KEYS = (
     *("mesh_accuracy_median_m", "mesh_accuracy_mean_m", "mesh_completeness_mean_m"),
     *("mesh_completeness_5cm", "mesh_completeness_10cm", "mesh_chamfer_m"),
 )
-_MAX_DISTANCE = 1.0  # [m] means count larger distances as this one
+_MAX_DISTANCE = 1.0  # [m] larger distances count as this in a mean
 _VISIBLE_CELL = 0.1  # [m] side of a cell; the visible surface is thinned to one point per cell
 
 
@@ -50,7 +50,7 @@ def compare(scene: SceneDir) -> dict[str, Any]:
         The written table: the entries of `measure`, and `of`, the content digest of each compared stage.
 
     Raises:
-        InputError: the scene has no truth, or its mesh stage has not been built.
+        InputError: the scene has no truth, or a stage up to the mesh has not been built.
     """
     if not (scene.truth / "truth.npz").exists():
         raise InputError(f"{scene.root} has no truth; only scenes of `python -m twin.reality film` have one")
@@ -66,22 +66,23 @@ def measure(scene: SceneDir) -> dict[str, Any]:
     Returns:
         `figures`, and `camera_errors_m`: position errors after a similarity alignment [m], as a list per source.
 
-        `figures`, lengths [m], angles [°]: `frames` (their number), `ate_m`, `ate_max_m` (absolute trajectory error
-        after a similarity alignment: rms and maximum), `scale_error` (a length in the twin over the true length, minus
+        `figures`, lengths in m, angles in °: `frames` (number), `ate_m`, `ate_max_m` (absolute trajectory error after a
+        similarity alignment: rms and maximum), `scale_error` (ratio of a length in the twin to the true length, minus
         1), `ate_rigid_m`, `ate_rigid_max_m` (the same after the rigid alignment), `rotation_median_deg`, `tilt_deg`
         (angle between the twin's vertical and the true one), `ground_median_m`, `ground_p95_m`, `ground_bias_m` (height
         of the ground inside the corridor: median and 95 % quantile of the absolute error, median of the signed error),
-        `obstacle_accuracy_m` (visible surface of the convex parts to the true surface), `obstacle_completeness_m`
-        (true surface to parts), `obstacle_median_m` (the larger of the two), `corridor_intrusions` (number of convex
-        parts in the corridor), `route_median_m` (twin's route to the true center line), `depth_median_m`,
-        `depth_relative` (depth of the field, up to a true depth of 20 m).
+        `obstacle_accuracy_m` (median distance from the convex parts' visible surface to the true surface),
+        `obstacle_completeness_m` (median distance from the true surface to the parts), `obstacle_median_m` (the larger
+        of the two), `corridor_intrusions` (number of convex parts in the corridor), `route_median_m` (median distance
+        of the twin's route from the true center line), `depth_median_m`, `depth_relative` (median error of the field's
+        depth, absolute and relative, up to a true depth of 20 m).
 
-        The `mesh_*` figures compare the visual mesh with the true surface, at any height within 10 m of the route;
-        parts that no camera could see do not count: `mesh_accuracy_median_m`, `mesh_accuracy_mean_m` (mesh to true
-        surface), `mesh_completeness_mean_m` (true surface to mesh), `mesh_completeness_5cm`, `mesh_completeness_10cm`
-        (fraction of the true surface within that distance of the mesh; the latter also per kind of object: `_ground`,
-        `_obstacle`, `_foliage`), `mesh_chamfer_m` (half the sum of the two means). Means count distances above 1 m as
-        1 m. A figure is None where its stage produced nothing to measure.
+        The `mesh_*` figures compare the visual mesh with the true surface, at any height within 10 m of the route, in
+        parts that a camera could see: `mesh_accuracy_median_m`, `mesh_accuracy_mean_m` (distance from mesh to true
+        surface), `mesh_completeness_mean_m` (from true surface to mesh), `mesh_completeness_5cm` and
+        `mesh_completeness_10cm` (fraction of the true surface within this distance of the mesh; the latter also per
+        kind of object: `_ground`, `_obstacle`, `_foliage`), `mesh_chamfer_m` (half the sum of the two means). In means,
+        distances above 1 m count as 1 m. A figure is None if its stage produced nothing to measure.
     """
     truth = Truth.load(scene.truth)
     cameras = Cameras.load(scene.stage("metric"))
@@ -99,7 +100,7 @@ def measure(scene: SceneDir) -> dict[str, Any]:
 
 
 def matched_poses(truth: Truth, cameras: Cameras) -> Array:
-    """True poses of all frames of a build, shape (n, 4, 4)."""
+    """True poses of a build's cameras, shape (n, 4, 4)."""
     out = np.empty((len(cameras), 4, 4))
     for source in sorted(set(cameras.sources)):
         rows = np.array([s == source for s in cameras.sources])
@@ -111,8 +112,8 @@ def matched_poses(truth: Truth, cameras: Cameras) -> Array:
 def align_rigid(poses: Array, true_poses: Array) -> Similarity:
     """The rigid transform that best maps camera poses onto the true ones, shapes (n, 4, 4).
 
-    Each camera contributes its center and the tips of its axes, 1 m long: the centers alone do not determine the roll
-    about a straight path.
+    Each camera contributes its center and the tips of its axes, 1 m long, because centers on a straight path do not
+    determine the roll about it.
     """
 
     def tripods(p: Array) -> Array:
@@ -214,7 +215,7 @@ def mesh_quality(to_true: Array, to_mesh: Array) -> dict[str, float]:
         to_true: Distances of mesh points from the true surface [m], shape (n,).
         to_mesh: Distances of true surface points from the mesh [m], shape (m,).
     """
-    # The nearest surface beyond `_MAX_DISTANCE` belongs to another object; its distance says nothing about the build.
+    # A nearest surface beyond `_MAX_DISTANCE` belongs to another object; its distance says nothing about the build.
     accuracy, completeness = (float(np.minimum(d, _MAX_DISTANCE).mean()) for d in (to_true, to_mesh))
     near = [float((to_mesh <= reach).mean()) for reach in (0.05, 0.1)]
     values = (float(np.median(to_true)), accuracy, completeness, *near, 0.5 * (accuracy + completeness))
@@ -245,14 +246,14 @@ def intrudes(vertices: Array, faces: NDArray[np.int32], truth: Truth) -> bool:
 
 
 def _obstacle_points(points: Array, truth: Truth) -> Array:
-    """The points of obstacles: near the filmed route, `_MIN_HEIGHT` to `_MAX_HEIGHT` above the ground."""
+    """Keeps the points near the filmed route that are `_MIN_HEIGHT` to `_MAX_HEIGHT` above the ground."""
     points = _near_route(points, truth)
     height = points[:, 2] - truth.ground_height(points[:, :2])
     return points[(height > _MIN_HEIGHT) & (height < _MAX_HEIGHT)]
 
 
 def _near_route(points: Array, truth: Truth) -> Array:
-    """The points near the filmed route, at any height."""
+    """Keeps the points near the filmed route, at any height."""
     station, lateral = truth.route.project(points[:, :2])
     along = (station > truth.start) & (station < truth.start + truth.length + _NEAR_ROUTE)
     return points[along & (np.abs(lateral) < _NEAR_ROUTE)]
@@ -284,7 +285,7 @@ def _depth_errors(folder: Path, truth: Truth, to_truth: Similarity) -> dict[str,
 def depth_errors(
     field: "BakedField | RadianceField", truth: Truth, to_truth: Similarity, reach: float = _MAX_DEPTH
 ) -> dict[str, float | None]:
-    """Median depth errors of a field against the true depth up to `reach` [m], in three frames of each film."""
+    """Median errors of a field's depth, for true depths up to `reach` [m], in three frames of each film."""
     errors, relative = [], []
     for name, film in truth.films.items():
         lighting = truth.lighting(name)

@@ -1,4 +1,4 @@
-"""Lightings of drawn places, and their skies with the far view."""
+"""Lightings and skies of randomly sampled places; a sky contains the far view, such as hills."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from twin.reality.place_streams import stream
 from twin.reality.textures import fbm
 from twin.types import Array
 
-_COLUMNS = 4096  # columns of a skyline, which surrounds the place
+_COLUMNS = 4096  # columns of a skyline, over a full turn
 
 
 def place_lightings(spec: PlaceSpec) -> dict[str, Lighting]:
@@ -65,7 +65,7 @@ def _lighting(light: LightSpec, spec: PlaceSpec) -> Lighting:
 
 
 def _ray(light: LightSpec) -> Rgb:
-    """Direction of the light's rays."""
+    """Unit vector along the rays of sun or moon."""
     up, azimuth = np.deg2rad(light.elevation), np.deg2rad(light.azimuth)
     return float(-np.cos(up) * np.cos(azimuth)), float(-np.cos(up) * np.sin(azimuth)), float(-np.sin(up))
 
@@ -83,7 +83,7 @@ def place_sky(spec: PlaceSpec, lighting: Lighting) -> NDArray[np.uint8]:
 
 
 def skyline(horizon: HorizonSpec, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Elevation angle [rad] of the far view around the horizon, and its shade: shapes (columns,) and (512, columns).
+    """Elevation angle [rad] of the far view's upper edge, and its shade: shapes (columns,) and (512, columns).
 
     Row r of the shade lies at an elevation of 0.2 r / 511 rad. The shade is a factor on the lighting's skyline color.
     """

@@ -1,7 +1,7 @@
-"""A place built from its description: ground, objects, textures, lightings.
+"""Builds a place from its description (`PlaceSpec`): ground, objects, textures, lightings.
 
-Objects are placed one after the other: houses, lamps and boundaries first, then poles, cars, furniture and trees. A
-candidate is dropped if its footprint touches the road, the mouth of a side road, the free corridor or an earlier
+Objects are placed one after the other: houses, lamps and boundaries first, then poles, cars, furniture and trees. An
+object is left out if its footprint touches the road, a side road, the corridor along the driven line or an earlier
 footprint.
 """
 
@@ -27,7 +27,7 @@ from twin.types import Array
 _STEP = 0.5  # [m] between vertices along the road
 _LAND_STEP = 1.5  # [m] between vertices of the land
 _LAND_MARGIN = 48.0  # [m] width of the land around the road
-_FIELD_MARGIN = 14.0  # [m] width of `GroundLayout.field` around the driven line
+_FIELD_MARGIN = 14.0  # [m] from the driven line to the edges of `GroundLayout.field`
 _MIN_GAP = 0.35  # [m] between footprints
 
 
@@ -88,7 +88,7 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
 
 @cache
 def build_number(number: int, displaced: bool = False) -> KnownPlace:
-    """Builds the drawn place with a number from 1 on."""
+    """Builds the place with a number, 1 or more."""
     return build(draw(number), displaced)
 
 
@@ -99,10 +99,10 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
     section = road.section
 
     def strip(name: str, texture: str, laterals: Array, lifts: Array | None = None, gaps: int = 0) -> None:
-        """Adds a strip along the road through laterals, left first.
+        """Adds a mesh strip along the road with vertices at `laterals` [m], left first.
 
-        It lies on the ground, or `lifts` [m] above the driven line. With `gaps` (1 = left, −1 = right) it is open at
-        the mouths on that side.
+        It lies on the ground, or `lifts` [m] above the driven line. `gaps` (1 = left, −1 = right) leaves gaps for the
+        side roads on that side.
         """
         xy = road.at(stations[None], laterals[:, None])
         z = road.ground_height(xy)
@@ -175,7 +175,7 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
 
 
 class Site:
-    """Occupied ground: the road, the mouths of side roads, the free corridor, and the footprints of placed objects.
+    """Occupied ground: road, side roads, the corridor along the driven line, and the footprints of placed objects.
 
     A footprint is a rectangle: its center [m], half sizes [m] and the direction of its first axis [rad].
     """
@@ -187,13 +187,13 @@ class Site:
     def take(
         self, center: Array, half: tuple[float, float], yaw: float, clear: float = CLEARANCE, gap: float = _MIN_GAP
     ) -> bool:
-        """Occupies a footprint and returns True, or returns False if it is not free.
+        """Occupies a footprint if it is free; returns True if it was.
 
         Args:
             center: x, y [m].
             half: Half sizes along and across `yaw` [m].
             yaw: Direction of the first axis [rad].
-            clear: Least distance from the road's edge or kerb [m].
+            clear: Least distance from the road's edge or curb [m].
             gap: Least distance from other footprints [m].
         """
         corners = _corners(center, half, yaw)
@@ -239,12 +239,12 @@ def _spot(place: KnownPlace, station: float, lateral: float) -> Array:
 
 
 def _edge(spec: PlaceSpec, side: int) -> float:
-    """Distance of the kerb's outer edge from the driven line on a side (1 = left) [m]."""
+    """Distance of the curb's outer edge from the driven line on a side (1 = left) [m]."""
     return (spec.section.left if side > 0 else spec.section.right) + spec.section.kerb_width
 
 
 def _verge(spec: PlaceSpec, side: int) -> float:
-    """Width of pavement and verge on a side [m]."""
+    """Width of sidewalk and verge on a side [m]."""
     return spec.section.sides[0 if side > 0 else 1].width
 
 
@@ -257,7 +257,7 @@ def _reach(spec: PlaceSpec) -> tuple[float, float]:
 
 
 def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tuple[House, str, Rgb, Rgb]]:
-    """Adds rows of houses; returns by name the house, the material and color of its walls, and its roof's color."""
+    """Adds rows of houses; returns, by name, house, wall material, wall color and roof color."""
     rng, houses = stream(spec.number, "houses", 1), spec.houses
     out: dict[str, tuple[House, str, Rgb, Rgb]] = {}
     first, last = _reach(spec)
@@ -358,7 +358,7 @@ def _add_poles(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
 def _scatter(
     rng: np.random.Generator, spec: PlaceSpec, amount: float, near: float, far: float
 ) -> list[tuple[float, float]]:
-    """Random stations and laterals: `amount` per 100 m of road, `near` to `far` beyond the kerb [m]."""
+    """Random stations and laterals [m]: `amount` per 100 m of road, at `near` to `far` from the curb."""
     first, last = _reach(spec)
     out = []
     for _ in range(int(rng.poisson(amount * (last - first) / 100.0))):
@@ -370,7 +370,7 @@ def _scatter(
 def _moved(
     other_day: np.random.Generator | None, place: KnownPlace, site: Site, at: tuple[float, float], radius: float
 ) -> tuple[float, float]:
-    """Station and lateral [m] of a movable object: as filmed, or on another day up to 1.5 m along the road if free."""
+    """Station and lateral [m] of a movable object: `at`, or, on another day, a free spot up to 1.5 m along the road."""
     if other_day is None:
         return at
     moved = at[0] + float(other_day.uniform(-1.5, 1.5)), at[1]

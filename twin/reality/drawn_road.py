@@ -1,9 +1,9 @@
-"""The road of a drawn place (sampled at random, see `place_sampling.py`): its driven line in plan, and the height of
-the ground on and around it.
+"""The road of a place sampled by `place_sampling.py`: the driven line in plan, and the height of the ground on and
+around it.
 
 Along the line, the height follows the sampled grades and a slight unevenness; across the line, it follows the sampled
-cross section. The section ends with the verge. There, the ground blends into open land: a smooth surface through the
-heights of the whole line, plus swells.
+cross section. On the verge, the ground blends into open land, whose height is a weighted mean of the heights of the
+whole line, plus swells.
 """
 
 from functools import cached_property
@@ -16,17 +16,17 @@ from twin.reality.place_streams import stream
 from twin.types import Array
 
 _CROWN_ROUNDING = 0.3  # [m] half width of the rounding of a crown
-_BUMP_LENGTHS = (5.0, 20.0)  # [m] wave lengths of the unevenness
-_SWELL_LENGTHS = (25.0, 80.0)  # [m] wave lengths of the swells of the land
-_LAND_SAMPLE = 2.0  # [m] between the heights of the line that determine the land
+_BUMP_LENGTHS = (5.0, 20.0)  # [m] range of wavelengths of the unevenness
+_SWELL_LENGTHS = (25.0, 80.0)  # [m] range of wavelengths of the land's swells
+_LAND_SAMPLE = 2.0  # [m] between points of the line whose heights determine the land
 _LAND_SMOOTHING = 3.0  # [m] length over which these heights are smoothed
-_DROP_LENGTH = 0.8  # [m] over which a kerb drops beside the mouth of a side road
+_DROP_LENGTH = 0.8  # [m] over which a curb drops beside a side road
 MOUTH_REACH = 26.0  # [m] from the road's edge to the end of a side road
-_CHUNK = 40_000  # points whose land height is evaluated together
+_CHUNK = 40_000  # points whose land height is computed together
 
 
 class DrawnRoad:
-    """The driven line and the ground of a drawn place. Like `centerline.RoadLine`, it is a `DrivenLine`."""
+    """The driven line and the ground of a sampled place, as a `place_objects.DrivenLine`."""
 
     def __init__(self, spec: PlaceSpec) -> None:
         self.spec, self.section, self.line = spec, spec.section, spec.line
@@ -64,7 +64,7 @@ class DrawnRoad:
         curvature = np.where(s < 0.0, 0.0, self._curvatures[k])
         along = s - self._starts[k]
         heading = self._headings[k] + curvature * along
-        # The chord of an arc of angle a is its length times sinc(a / 2), in the direction of the mean heading.
+        # The chord of an arc of angle a is the arc's length times sinc(a / 2), in the direction of the mean heading.
         half = 0.5 * curvature * along
         chord = along * np.sinc(half / np.pi)
         middle = self._headings[k] + half
@@ -73,7 +73,7 @@ class DrawnRoad:
         return np.stack([x, y], -1)
 
     def project(self, xy: ArrayLike) -> tuple[Array, Array]:
-        """Station and lateral [m] of points relative to the nearest point of the line, (..., 2) → (...), (...)."""
+        """Stations and laterals [m] of points relative to the nearest part of the line, (..., 2) → (...), (...)."""
         xy = np.asarray(xy, float)
         best_station, best_lateral = np.zeros(xy.shape[:-1]), np.full(xy.shape[:-1], np.inf)
         last = len(self._curvatures) - 1
@@ -106,7 +106,7 @@ class DrawnRoad:
         return np.maximum(lateral - self.section.left, -self.section.right - lateral)
 
     def mouth_weight(self, station: ArrayLike, side: int) -> Array:
-        """1 inside the mouths of side roads on a side (1 = left, −1 = right), falling to 0 beside them."""
+        """1 at side roads on a side (1 = left, −1 = right), falling to 0 within `_DROP_LENGTH` beside them."""
         station = np.asarray(station, float)
         out = np.zeros(station.shape)
         for mouth in self.line.mouths:
@@ -116,7 +116,7 @@ class DrawnRoad:
         return out
 
     def mouths(self, side: int) -> list[Mouth]:
-        """Mouths on a side."""
+        """Side roads on a side."""
         return [mouth for mouth in self.line.mouths if mouth.side == side]
 
     def _surface(self, lateral: Array) -> Array:
@@ -131,7 +131,7 @@ class DrawnRoad:
         return height(lateral) - height(0.0)
 
     def cross_profile(self, station: ArrayLike, lateral: ArrayLike) -> Array:
-        """Height of road, kerb and verge above the driven line [m], without the blend into the land."""
+        """Height of road, curb and verge above the driven line [m], without the blend into the land."""
         station, lateral = np.broadcast_arrays(np.asarray(station, float), np.asarray(lateral, float))
         section = self.section
         out = self._surface(np.clip(lateral, -section.right, section.left))
@@ -142,7 +142,7 @@ class DrawnRoad:
         return out
 
     def grade(self, station: ArrayLike) -> Array:
-        """Sampled slope along the line, without its unevenness."""
+        """Sampled slope along the line, without the unevenness."""
         knots = np.arange(len(self.line.grades)) * GRADE_STEP
         return np.interp(np.asarray(station, float), knots, self.line.grades)
 

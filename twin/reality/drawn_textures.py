@@ -1,4 +1,4 @@
-"""Textures of drawn places: ground, walls, roofs and the atlas of everything else; `surfaces.py` paints them."""
+"""Textures of randomly sampled places: ground, walls, roofs (see `surfaces.py`), and the atlas with all the rest."""
 
 from dataclasses import replace
 from functools import cache
@@ -20,7 +20,7 @@ DRAWN_CELLS = (
     *(f"paint{k}" for k in range(6)),
     *("boundary_left", "boundary_right", "chimney", "shutter", "cabinet", "stone", "pole", "birch"),
 )
-"""Names of the cells of a drawn place's atlas, row by row."""
+"""Names of the cells of a sampled place's atlas, row by row."""
 
 _ROAD_PIXEL, _VERGE_PIXEL, _LAND_PIXEL, _WALL_PIXEL = 0.0135, 0.022, 0.09, 0.035  # [m]
 

@@ -1,4 +1,4 @@
-"""Films of the known-truth world: trajectory of a camera on a cart, exposure, sensor noise and video encoding.
+"""Films of the known-truth world: trajectory of the camera, exposure, sensor noise and video encoding.
 
 A *film* is a sequence of frames at a fixed rate under one lighting; the true pose of every frame is known. Every film
 has its own speed, lateral wander and shake, so that no two films share a viewpoint.
@@ -26,7 +26,7 @@ from twin.runtime import track
 from twin.types import Array
 from twin.warp_runtime import wp
 
-CAMERA_HEIGHT = 1.2  # [m] mean height of the lens above the ground; it varies by less than 1 cm
+CAMERA_HEIGHT = 1.2  # [m] mean height of the lens above the ground, from which it deviates by less than 1 cm
 OUT = PassSpec("out", 0.0, False)
 
 
@@ -49,7 +49,7 @@ class FilmingPlan:
     oversize: float = 1.0
     """Ratio of the size at which a frame is rendered to the film's size; the frame is then shrunk."""
     crf: int = 29
-    """Quality of the H.264 film; lower is better."""
+    """Constant rate factor of H.264; less is better quality."""
     camera_height: float = CAMERA_HEIGHT
     """Mean height of the lens above the ground [m]."""
     pitch: float = float(np.deg2rad(8.0))
@@ -63,7 +63,7 @@ class FilmingPlan:
 
     @staticmethod
     def of(spec: PlaceSpec) -> "FilmingPlan":
-        """The plan that films a drawn place as its description says."""
+        """The plan of a sampled place's films, from its description."""
         film = spec.film
         return FilmingPlan(
             lightings=tuple(light.name for light in spec.lights),
@@ -115,7 +115,7 @@ def trajectory(plan: FilmingPlan, route: DrivenLine, film: str, one: PassSpec = 
     xy = route.at(station, lateral)
     lift = 0.004 * plan.shake * smooth_noise(rng, times, 1.1)
     position = np.concatenate([xy, (route.ground_height(xy) + plan.camera_height + lift)[:, None]], 1)
-    # Heading of the cart: direction of the center line plus the slope of the lateral wander.
+    # Heading: direction of the center line 0.6 m ahead plus the slope of the lateral wander.
     drift = np.gradient(lateral, station)
     ahead, turned = (-0.6, np.pi) if one.backwards else (0.6, 0.0)
     yaw = route.heading(station + ahead) + turned + np.arctan(drift)
@@ -170,7 +170,7 @@ class Renderer:
             )
 
     def move_to(self, time: float) -> None:
-        """Places the movers as they are at a time of the film [s]."""
+        """Moves the movers to their poses at a time of the film [s]."""
         model, data = self._host
         for mover in self._movers:
             foot, yaw = mover.pose(time)
@@ -207,7 +207,7 @@ class Renderer:
 def sensor_image(
     rng: np.random.Generator, light: NDArray[np.float32], lighting: Lighting, exposure: float
 ) -> NDArray[np.uint8]:
-    """Converts linear RGB (h, w, 3) to an 8-bit image: vignetting, exposure, highlight roll-off and sensor noise."""
+    """Converts linear RGB (h, w, 3) to 8 bits: vignetting, exposure, white balance, highlight roll-off, noise."""
     height, width = light.shape[:2]
     y, x = np.mgrid[:height, :width]
     radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width / 2) ** 2
@@ -221,7 +221,7 @@ def sensor_image(
 
 
 def exposures(lighting: Lighting, times: Array) -> Array:
-    """Relative exposure of each frame: it drifts slowly, as under automatic exposure."""
+    """Relative exposure of each frame, which drifts slowly, as automatic exposure does."""
     rng = np.random.default_rng([SEED, 12, sum(map(ord, lighting.name))])
     return np.exp(lighting.drift * smooth_noise(rng, times, 11.0))
 
@@ -273,9 +273,9 @@ def write_video(frames: Iterable[NDArray[np.uint8]], plan: FilmingPlan, path: Pa
 def depth_maps(
     lighting: str, place: KnownPlace, plan: FilmingPlan, poses: Array
 ) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
-    """Indices (k,) of about ten frames and their depth maps [m], shape (k, h, w).
+    """Indices (k,) of up to ten frames and their depth maps [m], shape (k, h, w).
 
-    The maps have a quarter of the film's width and height, or a third if the height is no multiple of four.
+    The maps have a quarter of the film's width and height, or a third if its height is not a multiple of four.
     """
     part = 4 if plan.height % 4 == 0 else 3
     small = replace(plan, width=plan.width // part, height=plan.height // part, samples=1, oversize=1.0)

@@ -1,4 +1,4 @@
-"""Buildings: blocks with windows, sills and doors, under flat or pitched roofs."""
+"""Buildings with windows, sills and doors, under flat or pitched roofs."""
 
 from dataclasses import dataclass, replace
 
@@ -17,10 +17,10 @@ def add_block(
     size: tuple[float, float, float],
     windows: tuple[int, int],
 ) -> None:
-    """Adds a block with a roof slab, windows, sills and doors.
+    """Adds a building: a box with a roof slab, windows, sills and doors.
 
     Args:
-        place: The place that it is added to.
+        place: The place.
         name: Name of the object and of the texture of its walls.
         center: x, y [m].
         size: Width (x), depth (y) and height [m].
@@ -71,7 +71,7 @@ def add_block(
     place.objects.append(
         PlaceObject(f"{name}_glass", "obstacle", primitives.join([place.cell(f"window{k}", p) for k, p in panes]))
     )
-    # Windows that are lit after dark have a mesh for the day and one for the dark; the lighting selects one of them.
+    # A window that is lit after dark has a mesh for day and one for dark; `true_world.world_spec` selects one.
     day = primitives.join([place.cell(f"window{k}", p) for k, p in lit])
     dark = primitives.join([place.cell(f"lit{k % 8}", p) for k, p in lit])
     place.objects.append(PlaceObject(f"{name}_day", "obstacle", day, "windows_by_day"))
@@ -80,18 +80,18 @@ def add_block(
 
 # ---- houses under pitched roofs
 
-_STOREY = 2.75  # [m]
+_STOREY = 2.75  # [m] of a floor
 _EAVES = 0.45  # [m] overhang of a roof
 
 
 @dataclass(frozen=True)
 class House:
-    """A house with its front along the road. In its own frame x runs along the front and the front faces −y."""
+    """A house with its front along the road. In the house's frame, x runs along the front, which faces −y."""
 
     center: Array
     """x, y [m]."""
     yaw: float
-    """Direction of its x axis [rad]."""
+    """Direction of the house's x axis [rad]."""
     width: float
     """Width along the front [m]."""
     depth: float
@@ -106,12 +106,12 @@ class House:
 
     @property
     def eaves(self) -> float:
-        """Height of the walls [m]."""
+        """Height of the eaves above the ground floor [m]."""
         return 0.45 + _STOREY * self.storeys
 
     @property
     def roof_size(self) -> tuple[float, float]:
-        """Length along the ridge and length of the slope of one side [m]."""
+        """Length of the ridge, and of one side from ridge to eaves [m]."""
         along, across = (self.depth, self.width) if self.roof == "cross_gable" else (self.width, self.depth)
         half = across if self.roof == "shed" else 0.5 * across
         return along + 2 * _EAVES, (half + _EAVES) / np.cos(self._slope)
@@ -165,7 +165,7 @@ def add_house(place: KnownPlace, name: str, house: House, lit_windows: float) ->
 
 
 def _roof(house: House, top: float) -> tuple[list[MeshPart], float, list[MeshPart]]:
-    """The slopes of a roof, the height of its ridge [m] and its gables, in the house's frame."""
+    """The sides of a roof, the height of its ridge [m] and its gables, in the house's frame."""
     turned = house.roof == "cross_gable"
     w, d = (house.depth, house.width) if turned else (house.width, house.depth)  # along and across the ridge
     slope, o = np.tan(house._slope), _EAVES
@@ -229,7 +229,7 @@ def _roof(house: House, top: float) -> tuple[list[MeshPart], float, list[MeshPar
 def _openings(
     place: KnownPlace, house: House, floor: float, rng: np.random.Generator, lit_windows: float, trim: list[MeshPart]
 ) -> tuple[list[MeshPart], list[tuple[int, MeshPart]]]:
-    """Windows that stay dark, and (kind, pane) of those lit after dark; adds doors, sills and shutters to `trim`."""
+    """Panes that stay dark, and (kind, pane) of those lit after dark; adds doors, sills and shutters to `trim`."""
     panes: list[MeshPart] = []
     lit: list[tuple[int, MeshPart]] = []
     wide, tall = {

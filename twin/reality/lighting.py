@@ -1,6 +1,6 @@
 """Lightings of the known-truth world: lights, sky, haze and the camera's exposure under them.
 
-`LIGHTINGS` are those of the campus road's films; `WEATHER` are those of the real test, which are never filmed. Colors
+`LIGHTINGS` are those of films of the campus road; `WEATHER` are those of the real test, which are not filmed. Colors
 are display values, not radiometric ones: the renderer adds lights linearly and clips at 1, and `filming.py` applies
 exposure and a tone curve.
 """
@@ -51,7 +51,7 @@ class Lighting:
     glow_sun: Color = (0.0, 0.0, 0.0)
     """Brightening of the sky around the first sun."""
     wet: float = 0.0
-    """Darkening of the wet ground, 0 to 1."""
+    """Fraction by which wet ground is darker, 0 to 1."""
     visibility: float = float("inf")
     """Distance on the ground over which haze transmits 1/e of the light [m]; haze has the color of the horizon."""
 
@@ -142,7 +142,7 @@ def sky_cube_map(
     t, s = np.meshgrid(np.arange(width), np.arange(width), indexing="ij")
     a, b = (2 * (s + 0.5) / width - 1), (2 * (t + 0.5) / width - 1)
     one = np.ones_like(a)
-    # OpenGL cube-face order +X −X +Y −Y +Z −Z; MuJoCo reads it with its y axis along the world's z.
+    # OpenGL's order of cube faces: +X −X +Y −Y +Z −Z; MuJoCo takes the cube's y axis along the world's z.
     cube = [(one, -b, -a), (-one, -b, a), (a, one, b), (a, -one, -b), (a, -b, one), (-a, -b, -one)]
     rays = np.stack([np.stack(face, -1) for face in cube])
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -192,7 +192,7 @@ def apply_haze(
     Args:
         light: Linear RGB, shape (h, w, 3).
         depth: z-depth [m], 0 = sky, shape (h, w).
-        rays: Rays of the pixels at z = 1 in the camera, shape (h, w, 3).
+        rays: Rays of the pixels with z = 1 in the camera frame, shape (h, w, 3).
         camera_to_world: OpenCV axes, shape (4, 4).
         lighting: Its `visibility` applies at the ground; its `horizon` is the color of the haze.
         ground: Height of the ground [m].
@@ -202,7 +202,7 @@ def apply_haze(
     world = rays @ camera_to_world[:3, :3].T
     per_depth = np.linalg.norm(rays, axis=-1)
     length = np.where(depth > 0.0, depth * per_depth, _SKY)
-    # Without the bound of −3, the extinction along a ray to below the ground could become arbitrarily large.
+    # The bound of −3 limits the extinction along rays that go below the ground.
     rise = np.clip(world[..., 2] / per_depth * length / _HAZE_HEIGHT, -3.0, 60.0)
     start = np.exp(-max(float(camera_to_world[2, 3]) - ground, 0.0) / _HAZE_HEIGHT)
     level = np.abs(rise) < 1e-4
@@ -255,13 +255,13 @@ _DAYS = 15
 _HIGH_SUN, _LOW_SUN = (
     np.array([1.0, 0.94, 0.83]),
     np.array([1.0, 0.60, 0.34]),
-)  # colors of a high sun and of one at the horizon
+)  # colors of a high sun and of a sun at the horizon
 _REDDENING_ANGLE = 14.0  # [°] of elevation over which the red of a low sun falls to 1/e
-_MEAN_BRIGHTNESS = 0.3  # mean value of an image for which a day's exposure is chosen
+_MEAN_BRIGHTNESS = 0.3  # mean image value at which a day's exposure aims
 
 
 def _day(number: int) -> Lighting:
-    """A random day: sun, clouds and haze are sampled with a fixed seed, and its colors follow from these."""
+    """A random day, the same for the same number: sun, clouds and haze are sampled; the colors follow from these."""
     rng = np.random.default_rng([SEED, 51, number])
     elevation, azimuth = rng.uniform(6.0, 60.0), rng.uniform(0.0, 2.0 * np.pi)
     clouds, veil = rng.uniform(0.1, 1.0), rng.uniform(0.0, 1.0)
@@ -293,16 +293,16 @@ def daylight(
     tint: float,
     brightness: float,
 ) -> Lighting:
-    """The lighting of a day; its colors follow from sun, clouds and haze.
+    """The lighting of a day; the colors follow from sun, clouds and haze.
 
     Args:
         name: Name of the lighting.
         elevation: Elevation of the sun [°].
         azimuth: Azimuth of the sun, counterclockwise from +x [rad].
-        clouds: Cloud cover, 0 to 1; above 0.8 the sun casts no shadow.
+        clouds: Cloud cover, 0 to 1; above 0.8 no direct sunlight.
         veil: Thickness of high cloud in front of the sun, 0 to 1.
         visibility: Distance at which haze transmits 1/e of the light [m].
-        wet: Darkening of the wet ground, 0 to 1.
+        wet: Fraction by which wet ground is darker, 0 to 1.
         tint: White balance, positive is warmer.
         brightness: Relative exposure.
     """
@@ -430,13 +430,13 @@ WEATHER: dict[str, Lighting] = {
         *(_day(number) for number in range(1, 1 + _DAYS)),
     )
 }
-"""Lightings of the real test by name: five designed ones and 15 random days.
+"""Lightings of the real test by name: five designed weathers and 15 random days.
 
-None is filmed; a build sees at most a photo of one. The sun's position and color differ from those in every film, and
-the air may be hazy or the ground wet.
+None is filmed; a build gets at most one photo of each. The sun's position and color differ from those in every film,
+and the air may be hazy or the ground wet.
 
-The five designed ones were used during development. `twin.env.domain_randomization.KNOWN_WEATHER_FRACTION` was measured
-on images of these five and of days 1 to 5. Days 6 to 15 took no part in any choice.
+The designed weathers were used during development. `twin.env.domain_randomization.KNOWN_WEATHER_FRACTION` was tuned on
+images of these and of days 1 to 5. Days 6 to 15 were not used during development.
 """
 
 
@@ -456,7 +456,7 @@ def weather(name: str) -> Lighting:
 
 
 def weather_index(name: str) -> int:
-    """Unique number of a weather: its index in `WEATHER`; later days continue the count."""
+    """Unique number of a weather: its index in `WEATHER`; days after the last of `WEATHER` continue the count."""
     weather(name)
     if name in WEATHER:
         return list(WEATHER).index(name)

@@ -1,10 +1,10 @@
-"""Sampling of the driven line of a drawn place: straights and bends in plan, grades, unevenness and side roads."""
+"""Samples the driven line of a place: straights and bends in plan, grades, unevenness and side roads."""
 
 import numpy as np
 
 from twin.reality.place_spec import GRADE_STEP, RUN_OUT, LineSpec, Mouth, Piece, SectionSpec
 
-_SEPARATION = 28.0  # [m] least distance of points that are more than twice this far apart along the line
+_SEPARATION = 28.0  # [m] least distance in plan of points that are more than twice this far apart along the line
 
 
 def sample_line(rng: np.random.Generator, setting: str, section: SectionSpec) -> LineSpec:
@@ -33,7 +33,7 @@ def sample_line(rng: np.random.Generator, setting: str, section: SectionSpec) ->
 
 
 def _pieces(rng: np.random.Generator, setting: str, section: SectionSpec, length: float) -> tuple[Piece, ...]:
-    """Straights and bends up to a total length [m]; S-bends have no straight between their bends."""
+    """Straights and bends of a total length of at least `length` [m]; bends in a row turn to alternate sides."""
     pieces: list[Piece] = []
     bendy = {"town": 0.6, "works": 0.6}.get(setting, 1.0)
     straight = rng.random() < 0.75
@@ -48,7 +48,7 @@ def _pieces(rng: np.random.Generator, setting: str, section: SectionSpec, length
             angle = np.deg2rad(rng.uniform(20.0, 100.0)) * bendy
             piece = Piece(min(radius * float(angle), 45.0), (1.0 if left else -1.0) / radius)
         last = straight
-        straight = rng.random() < 0.55 if not last else False  # a second bend turns to the other side
+        straight = rng.random() < 0.55 if not last else False  # no two straights in a row
         if not last:
             left = not left if not straight else bool(rng.random() < 0.5)
         pieces.append(piece)

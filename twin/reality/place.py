@@ -1,7 +1,7 @@
 """The campus road, place 0: the designed place in which the demo was filmed.
 
 The tables give the station and lateral [m] of each object, and the properties that differ between objects of a kind.
-Before station 80 m, no solid object comes within 1.6 m of the center line; barriers and trees close the road's end.
+Before station 80 m, no solid object is within 1.6 m of the center line; barriers and trees close the road's end.
 """
 
 import numpy as np
@@ -45,12 +45,12 @@ _CRATES = (  # station, lateral, side [m]
     *((18.5, -5.0, 1.1), (18.6, -6.3, 0.9), (29.5, -5.6, 1.2)),
     *((45.5, 6.5, 1.0), (54.0, -5.3, 1.15), (65.0, -4.9, 1.0)),
 )
-_MIN_LATERAL = 2.15  # [m] no displacement moves an object closer to the center line than this
+_MIN_LATERAL = 2.15  # [m] least distance from the center line to which an object is displaced
 _CARS = ((31.2, -5.2, "white"), (12.6, -4.9, "blue"), (66.0, 5.4, "red"))
 
 
 def _add_street_furniture(place: KnownPlace, rng: np.random.Generator | None = None) -> None:
-    """Adds street furniture, cars and barriers; with a generator, cones, bins, crates and cars are displaced."""
+    """Adds street furniture, cars and barriers; displaces cones, bins, crates and cars if `rng` is given."""
     for k, lamp in enumerate(_LAMPS):
         add_lamp_post(place, k, *lamp)
     for k, (station, lateral, turn) in enumerate(_SIGNS):
@@ -78,7 +78,7 @@ def _displaced(
 ) -> tuple[float, float]:
     """Station and lateral, displaced at random by at most `along` and `across` [m]; unchanged without a generator.
 
-    An object stays at least `_MIN_LATERAL` from the center line. One that was closer moves no closer.
+    An object nearer to the center line than `_MIN_LATERAL` comes no nearer; others stay at least that far away.
     """
     if rng is None:
         return station, lateral

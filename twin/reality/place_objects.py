@@ -92,7 +92,7 @@ class Solid:
 
     kind: str
     center: Array
-    """Center of its volume [m], shape (3,)."""
+    """Center of the shape [m], shape (3,)."""
     half: tuple[float, float, float]
     """Half sizes of a box, or radius, half height and 0 for a cylinder [m]."""
     yaw: float = 0.0
@@ -119,12 +119,12 @@ class KnownPlace:
     textures: Callable[[], dict[str, NDArray[np.uint8]]]
     """Returns all textures by name, uint8 RGB."""
     lightings: Mapping[str, Any]
-    """`Lighting`s of its films by name."""
+    """`Lighting`s of the films by name."""
     sky: Callable[[Any], NDArray[np.uint8]]
     """Returns the cube map of the sky under a lighting; see `lighting.sky_cube_map`."""
     number: int = 0
     seed: tuple[int, ...] = (SEED,)
-    """Seed of the details of its objects."""
+    """Seed of the objects' details."""
     atlas: Atlas = field(default_factory=Atlas)
     objects: list[PlaceObject] = field(default_factory=list)
     lamp_heads: list[Array] = field(default_factory=list)
@@ -144,7 +144,7 @@ class KnownPlace:
         return self.atlas.cell(name, part)
 
     def rng(self, *key: int) -> np.random.Generator:
-        """The random generator of one object."""
+        """The random generator for a key, such as the kind and number of an object."""
         return np.random.default_rng([*self.seed, *key])
 
 

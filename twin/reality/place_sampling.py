@@ -1,8 +1,8 @@
-"""Sampling of places: the description of a drawn place, with the place's number as seed.
+"""Samples the descriptions of places, with the place's number as seed.
 
 `draw(number)` returns the description of a place from number 1 on; place 0 is the campus road, designed in `place.py`.
-Every aspect of a place (its line, its surface, its trees, ...) has its own random stream, see `place_streams.py`;
-`line_sampling.py` samples the line. The *setting*, such as `village`, sets probabilities and ranges of all aspects.
+Every aspect of a place, such as the surface or the trees, has its own random stream, see `place_streams.py`. The line
+is sampled in `line_sampling.py`. The *setting*, such as `village`, sets probabilities and ranges of all aspects.
 """
 
 import colorsys
@@ -42,10 +42,10 @@ def draw(number: int) -> PlaceSpec:
     """The description of the place with a number, always the same.
 
     Raises:
-        InputError: `number` < 1; place 0 has no description of this kind.
+        InputError: `number` < 1; place 0 has no `PlaceSpec`.
     """
     if number < 1:
-        raise InputError(f"place {number}: drawn places have the numbers from 1 on")
+        raise InputError(f"place {number}: expected 1 or more; place 0 is not sampled")
     setting = _pick(stream(number, "setting"), dict(zip(SETTINGS, (3, 4, 4, 2, 2, 2, 3), strict=True)))
     section = _section(stream(number, "section"), setting)
     line = sample_line(stream(number, "line"), setting, section)
@@ -85,7 +85,7 @@ def _subset(rng: np.random.Generator, items: tuple[T, ...], least: int, most: in
 
 
 def _shade(rng: np.random.Generator, base: Rgb, spread: float) -> Rgb:
-    """Samples a color near `base`: its brightness varies by up to `spread`, its hue by about a fifth of that."""
+    """Samples a color near `base`: the brightness varies by up to `spread`, the channels with σ = 0.2 `spread`."""
     red, green, blue = np.clip(
         np.array(base) * rng.uniform(1.0 - spread, 1.0 + spread) + rng.normal(0.0, 0.2 * spread, 3), 0.03, 0.93
     ).tolist()

@@ -1,7 +1,7 @@
-"""Descriptions of drawn places: plain numbers and names, which `place_sampling.py` samples.
+"""Descriptions of randomly sampled places: plain numbers and names, which `place_sampling.py` samples.
 
-`drawn_place.py` builds a place from its description. The *driven line* is the line that the first film follows and that
-the robot's tasks lie on. Stations and laterals are relative to it; the road need not be symmetrical about it.
+`drawn_place.py` builds a place from its description. The *driven line* is the line that the first film and the
+robot's tasks follow; the road need not be symmetrical about it. Stations and laterals are those of `centerline.py`.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ Rgb = tuple[float, float, float]
 
 SETTINGS = ("town", "suburb", "village", "works", "park", "forest", "field")
 FREE_HALF_WIDTH = 1.5  # [m] half width of the corridor along the driven line that is free of solid objects
-CLEARANCE = 0.15  # [m] least distance of solid objects from the corridor; their usual one from the road or its kerb
+CLEARANCE = 0.15  # [m] least distance of solid objects from the corridor, and by default from road and curb
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Mouth:
-    """A side road that opens onto the road, at right angles to it."""
+    """The mouth of a side road, which joins the road at right angles."""
 
     station: float
     """Station of its middle [m]."""
@@ -44,9 +44,9 @@ class LineSpec:
 
     pieces: tuple[Piece, ...]
     length: float
-    """Driven length [m]; the pieces go on beyond it, and before the start the line is straight."""
+    """Driven length [m]; the pieces continue beyond it, and before the start the line is straight."""
     grades: tuple[float, ...]
-    """Slopes along the line at stations 0, `GRADE_STEP`, ...; linear between these, constant beyond."""
+    """Slopes along the line at stations 0, `GRADE_STEP`, ...; interpolated linearly, constant beyond."""
     bumps: float
     """Standard deviation of the unevenness along the road [m]."""
     mouths: tuple[Mouth, ...]
@@ -54,23 +54,23 @@ class LineSpec:
     """Standard deviation of the land's swells away from the road [m]."""
 
 
-GRADE_STEP = 20.0  # [m]
+GRADE_STEP = 20.0  # [m] between grades
 RUN_OUT = 26.0  # [m] of road beyond the driven length
 RUN_IN = 8.0  # [m] of road before the start
 
 
 @dataclass(frozen=True)
 class Side:
-    """The ground beside the road on one side, from the kerb outwards: a pavement, then a verge."""
+    """The ground beside the road on one side, from the curb outwards: a sidewalk, then a verge."""
 
     pavement: float
-    """Width of the pavement [m]; 0 for none."""
+    """Width of the sidewalk [m]; 0 for none."""
     paving: str
-    """Surface of the pavement: `slabs`, `pavers`, `asphalt`, `gravel`."""
+    """Surface of the sidewalk: `slabs`, `pavers`, `asphalt`, `gravel`."""
     verge: str
-    """Ground beyond the pavement: `grass`, `earth`, `gravel`, `meadow`."""
+    """Ground beyond the sidewalk: `grass`, `earth`, `gravel`, `meadow`."""
     width: float
-    """Width of pavement and verge together [m]."""
+    """Width of sidewalk and verge together [m]."""
     slope: float
     """Slope of the verge, positive where it rises away from the road."""
 
@@ -84,7 +84,7 @@ class SectionSpec:
     right: float
     """Distance of the right edge from the driven line [m]."""
     shape: str
-    """`crown`: falls from its middle to both edges; `camber`: falls from the left edge to the right."""
+    """`crown`: falls from the middle to both edges; `camber`: falls from the left edge to the right."""
     crossfall: float
     """Slope across the road; negative for a camber that falls to the left."""
     kerb_height: float
@@ -108,7 +108,7 @@ class SurfaceSpec:
     """`asphalt`, `concrete`, `pavers`, `gravel`."""
     tone: Rgb
     coarseness: float
-    """Contrast of the grain."""
+    """Relative contrast of the grain."""
     patches: float
     """Repairs per meter of road."""
     cracks: float
@@ -139,11 +139,11 @@ class HousesSpec:
     density: float
     """Buildings per 100 m and side; 0 for none."""
     setback: tuple[float, float]
-    """Range of the distance of their fronts from the verge [m]."""
+    """Range of the distance of the fronts from the line 1 m inside the verge's outer edge [m]."""
     front: tuple[float, float]
     """Range of the width along the road [m]."""
     storeys: tuple[int, int]
-    """Least and largest number of storeys."""
+    """Least and largest number of floors."""
     roofs: tuple[str, ...]
     """Kinds to choose from: `gable`, `cross_gable` (gable to the road), `hip`, `flat`, `shed`."""
     pitch: float
@@ -169,9 +169,9 @@ class BoundarySpec:
     """[m]"""
     color: Rgb
     covered: float
-    """Fraction of the length that it covers."""
+    """Fraction of the length that has the boundary."""
     distance: float
-    """Distance from the outer edge of the kerb, or from the road's edge without one [m]."""
+    """Distance from the outer edge of the curb, or from the road's edge if there is none [m]."""
 
 
 @dataclass(frozen=True)
@@ -235,14 +235,14 @@ class LampsSpec:
 
 @dataclass(frozen=True)
 class HorizonSpec:
-    """The far view."""
+    """The far view, above the horizon."""
 
     kind: str
     """`hills`, `trees`, `towers`, `flat`, `mountains`."""
     height: float
     """Mean elevation angle of the skyline [rad]."""
     roughness: float
-    """Deviation of the elevation angle [rad]."""
+    """Standard deviation of the elevation angle [rad]."""
     period: float
     """Width of the largest features [rad]."""
     tint: Rgb
@@ -262,7 +262,7 @@ class LightSpec:
     clouds: float
     """Cloud cover, 0 to 1."""
     haze: float
-    """Visibility [m]; infinite where the air is clear."""
+    """`Lighting.visibility` [m]; infinite for clear air."""
     warmth: float
     """White balance: positive is warmer."""
 
@@ -303,7 +303,7 @@ class FilmSpec:
     size: tuple[int, int]
     """Width, height [px]."""
     shake: float
-    """Amplitude of the shake relative to that of a cart."""
+    """Amplitude of the shake relative to a cart's."""
     calibrated: bool
     """True if `scene.toml` states the intrinsics."""
 
@@ -334,7 +334,7 @@ def tasks(line: LineSpec) -> dict[str, tuple[float, float]]:
     """The tasks on a driven line, by name: start station and length of a segment [m].
 
     `whole` always exists; `straight`, `right_turn`, `left_turn`, `s_bend`, `junction` and `slope` exist if the line has
-    such a segment. No task reaches into the last 4 % + 0.5 m of the line, because a twin's route may be shorter than
+    such a segment. All tasks end before the last 4 % + 0.5 m of the line, because a twin's route may be shorter than
     the true one.
     """
     end = 0.96 * line.length - 0.5

@@ -41,7 +41,7 @@ def add_tree(place: KnownPlace, k: int, station: float, lateral: float, height: 
 
 
 def add_hedge(place: KnownPlace, k: int, stations: Array, lateral: float) -> None:
-    """Adds a hedge of pieces 1 m long that begin at stations [m]."""
+    """Adds a hedge of pieces 1 m long, which begin at the stations [m]."""
     rng = place.rng(3, k)
     core, solids, centers = [], [], []
     for station in stations:
@@ -76,13 +76,13 @@ def add_tufts(place: KnownPlace, rng: np.random.Generator, station: Array, later
     place.objects.append(PlaceObject("tufts", "detail", place.cell("leaf2", blades)))
 
 
-# ---- trees of drawn places
+# ---- trees of sampled places
 
 
 def add_crowned_tree(
     place: KnownPlace, k: int, spot: tuple[float, float], height: float, crown: float, slender: float, skin: str
 ) -> None:
-    """Adds a broadleaf tree at a station and lateral [m]; the larger `slender`, the higher its crown for its width."""
+    """Adds a broadleaf tree at a station and lateral [m]; a larger `slender` gives a higher crown of the same width."""
     rng = place.rng(2, k)
     foot = place.spot(*spot)
     lean = np.append(rng.normal(0, 0.03 * height, 2), 0.0)
@@ -151,7 +151,7 @@ def add_bare_tree(place: KnownPlace, k: int, spot: tuple[float, float], height: 
 
 
 def add_shrub(place: KnownPlace, k: int, spot: tuple[float, float], height: float, skin: str) -> None:
-    """Adds a shrub; only its middle is solid."""
+    """Adds a shrub, of which only the middle is solid."""
     rng = place.rng(2, k)
     foot = place.spot(*spot)
     ball = rng.normal(size=(650, 3))
@@ -175,7 +175,7 @@ def _grow(
     crown: float,
     skin: str,
 ) -> None:
-    """Adds the wood of a plant with the trunk's collision shape (height `stem`, `radius` [m]), and its leaves."""
+    """Adds a plant's wood, with the trunk's collision shape (height `stem`, `radius` [m]), and the plant's leaves."""
     centers = centers[centers[:, 2] > foot[2] + 0.1]
     trunk = Solid("cylinder", foot + up(0.5 * stem), (radius * 1.1, 0.5 * stem + 0.1, 0.0))
     bark = "birch" if skin == "leaf3" and place.atlas.names[-1] == "birch" else f"bark{k % 3}"

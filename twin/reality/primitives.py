@@ -23,7 +23,7 @@ class MeshPart:
     """Shape (n, 2)."""
 
     def in_window(self, low: Array, high: Array) -> "MeshPart":
-        """The same surface with its texture coordinates mapped from [0, 1]² into a window of an atlas."""
+        """The same surface, with texture coordinates mapped from [0, 1]² into a window of an atlas."""
         return replace(self, uv=low + np.clip(self.uv, 0.0, 1.0) * (np.asarray(high) - low))
 
     def moved(self, origin: Array, yaw: float = 0.0) -> "MeshPart":
@@ -34,7 +34,7 @@ class MeshPart:
 
 
 def join(parts: list[MeshPart]) -> MeshPart:
-    """Several meshes as one."""
+    """Joins meshes into one."""
     starts = np.cumsum([0] + [len(p.vertices) for p in parts])
     return MeshPart(
         np.concatenate([p.vertices for p in parts]),
@@ -46,7 +46,7 @@ def join(parts: list[MeshPart]) -> MeshPart:
 def grid(points: Array, uv: Array) -> MeshPart:
     """A surface through a lattice of points, shapes (rows, columns, 3) and (rows, columns, 2).
 
-    It faces up if rows run across a road from its left edge and columns along the road.
+    It faces up if the row index increases from a road's left to its right, and the column index along the road.
     """
     rows, columns = points.shape[:2]
     i = np.arange(rows * columns).reshape(rows, columns)
@@ -91,7 +91,7 @@ def walls(width: float, depth: float, low: float, high: float) -> MeshPart:
 def prism(outline: Array, width: float) -> MeshPart:
     """A convex outline in the x–z plane, shape (n, 2), extruded along y by `width` [m], centered on y = 0.
 
-    Each side face shows the whole texture; the caps show its bounding box.
+    Each side face shows the whole texture; on the caps, the texture fills the outline's bounding box.
     """
     n = len(outline)
     low, size = outline.min(0), np.ptp(outline, axis=0)
@@ -137,10 +137,10 @@ def tube(
 def leaves(
     rng: np.random.Generator, centers: Array, size: tuple[float, float], light: Array, uv_size: float = 0.08
 ) -> MeshPart:
-    """Foliage: small bent rhombi around centers, shape (n, 3), with gaps between them.
+    """Leaves: small bent rhombi around centers, shape (n, 3).
 
-    Each leaf shows a window of the texture that is `uv_size` wide. `light` in [0, 1], shape (n,), places the window
-    between the left and the right edge, up to a random shift.
+    Each leaf shows a window of the texture that is `uv_size` wide. `light`, shape (n,), places the window from the left
+    edge (0) to the right edge (1), with a random shift.
     """
     n = len(centers)
     long, short = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))

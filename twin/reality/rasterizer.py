@@ -1,4 +1,4 @@
-"""A CPU rasterizer for the images of the robot's camera in the known-truth world: small images in a few milliseconds.
+"""CPU rasterizer for the images of the robot's camera in the known-truth world: small images in a few milliseconds.
 
 The static world is flattened once into triangles, mip-mapped textures, lights and a shadow map. An image takes two
 passes over 2 × 2 samples per pixel: the first finds each sample's nearest triangle, the second computes its color.
@@ -36,8 +36,8 @@ depth 0.
 # ---- model to arrays
 
 _MAX_LEVELS = 6
-_MIN_SIDE = 8  # [px] least side of a mip level
-_SMOOTH_COSINE = 0.8  # below this cosine between vertex and face normal, the face normal is used, as in MuJoCo
+_MIN_SIDE = 8  # [px] smaller mip levels are not made
+_SMOOTH_COSINE = 0.8  # at smaller cosines between vertex and face normal, the face normal is used, as in MuJoCo
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ def sun_visibility(shadows: ShadowMap, point: wp.vec3, normal: wp.vec3):
 
 
 def render_shadow_map(corners: wp.array, flat: FlatScene, reach: ShadowRange = SHADOW_RANGE) -> ShadowMap:
-    """The map of the first directional light that casts shadows; an empty map with `sun` = −1 if there is none."""
+    """The shadow map of the first directional light that casts shadows; if none does, an empty map with `sun` = −1."""
     out = ShadowMap()
     casting = np.flatnonzero(flat.sun_shadows)
     out.sun = int(casting[0]) if len(casting) else -1
@@ -263,7 +263,7 @@ _UNBOUNDED = 1.0e30  # [samples]
 _NO_TRIANGLE = 1 << 62
 _DEPTH_STEPS = 1.0e5  # [1/m] resolution of a key's depth
 _INDEX_BITS = 20
-_MAX_TAPS = 6  # most texture lookups along a footprint's longer axis
+_MAX_TAPS = 6  # largest number of texture lookups along a footprint's longer axis
 
 
 @wp.kernel
@@ -382,7 +382,7 @@ def _sample_texture(
 
 @wp.func
 def _sky(texels: wp.array[wp.uint8], level: wp.vec3i, ray: wp.vec3):
-    """Color of a cube map along a world ray; six faces are stacked in OpenGL's order, and y is along the world's z."""
+    """Color of a cube map along a world ray; faces are stacked in OpenGL's order, the cube's y is the world's z."""
     x, y, z = ray[0], ray[2], -ray[1]
     ax, ay, az = wp.abs(x), wp.abs(y), wp.abs(z)
     face = int(0)  # noqa: RUF046 - int() declares a variable that Warp can change

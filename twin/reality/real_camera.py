@@ -1,9 +1,9 @@
-"""The front camera of the robot of the real test, by number: its extrinsics, and all effects between light and picture.
+"""The real test's robot cameras, by number: extrinsics, and all effects between light and picture.
 
 The light comes from `rasterizer.py`. *Haze* depends on the length of a ray and on height (`lighting.py`). *Shutter*:
 rows are read one after another while the robot moves, and each is exposed for some time. *Lens*: dirt, vignetting, and
 bloom around light beyond the sensor's range. *Exposure*: a second-order automatic exposure, which lags behind the
-brightness of the pictures and overshoots. *White balance* drifts over seconds. *Sensor*: noise and a response curve.
+brightness of the pictures and overshoots. *White balance*: drifts over seconds. *Sensor*: noise and a response curve.
 *Compression*: JPEG.
 """
 
@@ -46,9 +46,9 @@ class HiddenCamera:
     turn_right: float
     """Rotation about the camera's rightward axis, in addition to the nominal pitch [°]."""
     turn_up: float
-    """Rotation about its upward axis [°]."""
+    """Rotation about the camera's upward axis [°]."""
     turn_back: float
-    """Rotation about its backward axis [°]."""
+    """Rotation about the camera's backward axis [°]."""
     zoom: float
     """Focal length relative to the nominal one."""
     center_x: float
@@ -66,7 +66,7 @@ class HiddenCamera:
 
     # Exposure and color.
     exposure_target: float
-    """Mean brightness at which automatic exposure aims."""
+    """Mean brightness at which automatic exposure aims, as a fraction of the sensor's range."""
     exposure_range: float
     """Largest deviation of the logarithm of the exposure from that of `Lighting.exposure`."""
     exposure_rate: float
@@ -216,7 +216,7 @@ class AutoExposure:
         return float(np.log(self._camera.exposure_target / max(brightness, 1e-3)))
 
     def see(self, brightness: float, time: float) -> None:
-        """Takes the mean brightness that a picture at a time [s] has at `Lighting.exposure`."""
+        """Updates the exposure after a picture at a time [s], whose mean at `Lighting.exposure` is `brightness`."""
         c, steps = self._camera, max(1, round((time - self._time) / 0.01))
         dt, self._time = (time - self._time) / steps, time
         wanted = float(np.clip(self._wanted(brightness), -c.exposure_range, c.exposure_range))
@@ -227,7 +227,7 @@ class AutoExposure:
 
 
 class RealCamera:
-    """The robot's camera in one trial; the same generator and the same drive give the same pictures."""
+    """The robot's camera in one trial; the same random generator and drive give the same pictures."""
 
     def __init__(
         self,
@@ -345,7 +345,7 @@ def motion_between(before: Array, after: Array, middle: Array) -> Array:
 
 
 def dirt_mask(camera: HiddenCamera, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Opacity of the dirt on the lens, shape (h, w, 1); its spots scale with the size of the picture."""
+    """Opacity of the dirt on the lens, shape (h, w, 1); the spots scale with the size of the picture."""
     width, height = size
     rng = np.random.default_rng([SEED, 202, camera.number])
     y, x = np.mgrid[:height, :width].astype(np.float32) / width

@@ -1,7 +1,7 @@
-"""The judge of a trial on the road: decides when the trial ends, and the cause, such as goal, collision or timeout.
+"""The judge of a trial on the road decides when the trial ends, and why: goal, collision, timeout, ...
 
 It uses the task's numbers and the robot's position, tilt and contact, and shares no code with the twin's
-`RewardAndTermination`. A test compares both on a thousand paths.
+`RewardAndTermination`. A test compares the two on a thousand paths.
 """
 
 from bisect import bisect_left, bisect_right
@@ -13,7 +13,7 @@ _BEHIND, _AHEAD = 1.5, 4.0  # [m] range of the search for the nearest point: beh
 
 
 class RealJudge:
-    """Follows one trial at a time."""
+    """Judges one trial at a time."""
 
     def __init__(self, task: RoadTask) -> None:
         self._task = task
@@ -60,7 +60,7 @@ class RealJudge:
 
     @property
     def progress(self) -> float:
-        """Station since the task's start [m]."""
+        """Distance along the line from the task's start [m]."""
         return self.station - self._task.start
 
     def _locate(self, x: float, y: float) -> None:

@@ -1,13 +1,13 @@
-"""The robot of the real test: a Husky by number, with equations of motion of its own, without MuJoCo.
+"""The robots of the real test: Huskies by number, with equations of motion independent of MuJoCo and the twin.
 
 The chassis is a rigid body with three degrees of freedom in the plane of the ground beneath it. Each of four tires has
-its own load and its own slip; one geared motor drives the two tires of a side. Height, pitch and roll follow the ground
-under the tires as lightly damped oscillators of 6.5 to 11 Hz, which bumps and the road's texture excite.
+its own load and slip; a geared motor drives the two tires of a side. Height, pitch and roll follow the ground under the
+tires as lightly damped oscillators of 6.5 to 11 Hz, which bumps and the road's texture excite.
 
 Tire: the averaged lumped LuGre model (Canudas de Wit, Tsiotras, Velenis, Basset, Gissinger 2003, Vehicle System
 Dynamics 39(3)) in its anisotropic planar form (Velenis, Tsiotras, Canudas de Wit, Sorine 2005, same journal 43(1)). For
 the deflection z of the bristles [m] along the tire's two axes i, slip velocity v, friction coefficients μ, rolling
-speed u = |r ω| and the patch's length L:
+speed u = |r ω| and the length L of the contact patch:
 
     dz_i/dt = v_i − (σ₀ |M v| / (μ_i² g) + κ₀ u / L) z_i,    |M v| = √((μ_x v_x)² + (μ_y v_y)²)
     F_i = −(σ₀ z_i + σ₁ dz_i/dt) N,    κ₀ = 7/6 (Deur 2001, IFAC Workshop Advances in Automotive Control)
@@ -18,10 +18,10 @@ its force; a tire at rest holds like a spring.
 
 Loads: the tires are four equal springs. A tire's load is the sum of its shares of the weight, of the load transfer by
 acceleration (h ΣF / wheelbase along, h ΣF / track across, with the center of mass at height h) and of the load that a
-warp of the ground shifts between the diagonals. Motor: torque k i, current i = (U − k ω) / R within its limit; U is at
-most the battery's voltage, which sags by its resistance times the current drawn. A velocity loop (PI) per side sets U;
-a controller turns commands into the target speeds of both loops. Controller and loops have their own clocks, whose
-periods jitter.
+warp of the ground shifts between the diagonals. Motor: torque k i, current i = (U − k ω) / R within its limit. The
+voltage U is at most the battery's, which sags by the battery's resistance times the current. A velocity loop (PI) per
+side sets U; a controller turns commands into the target speeds of both loops. Controller and loops have their own
+clocks, whose periods jitter.
 
 `draw_robot` samples robots from `RANGES`; `TRAINED` is a copy of the ranges that the twin's training randomizes.
 """
@@ -41,7 +41,7 @@ from twin.types import Array
 
 _EMPTY_MASS = 56.582  # [kg]
 _WHEELBASE, _TRACK, _RADIUS = 0.512, 0.5708, 0.1651  # [m]
-_EMPTY_HEIGHT = 0.18  # [m] of the empty robot's center of mass above the ground
+_EMPTY_HEIGHT = 0.18  # [m] height of the empty robot's center of mass
 _EMPTY_YAW_INERTIA = 4.0  # [kg m²]: chassis 2.03, four wheels of 2.64 kg at 0.38 m, and the wheels' own inertia
 _WHEEL_INERTIA = 0.0441  # [kg m²]
 _GEAR = 79.0
@@ -57,7 +57,7 @@ _GROUND_STEPS = 10  # steps between two samples of the ground: 2 cm at 1 m/s
 _KAPPA = 7.0 / 6.0
 _STRIBECK_SPEED = 0.1  # [m/s]
 _LOAD_LAG = 0.03  # [s] time constant with which loads follow the forces
-_HISTORY = 2.0  # [s] for which poses are kept, since the camera asks for past ones
+_HISTORY = 2.0  # [s] for which poses are kept, since a picture shows a past pose
 _TIRES = ((1, 1, 0), (1, -1, 1), (-1, 1, 0), (-1, -1, 1))  # front or rear, left or right, index of the side
 
 
@@ -73,9 +73,9 @@ class HiddenRobot:
     payload_height: float = 0.45
     """Height of the payload's center above the ground [m]."""
     center_forward: float = -0.02
-    """Center of mass, ahead of the middle between the axles [m]."""
+    """Distance of the center of mass ahead of the middle of the four wheels [m]."""
     center_left: float = 0.0
-    """Center of mass, to the left of that point [m]."""
+    """Distance of the center of mass to the left of this point [m]."""
 
     # Tires.
     friction: float = 0.7
@@ -93,7 +93,7 @@ class HiddenRobot:
     rolling_resistance: float = 0.02
     """Ratio of the resisting force to the load."""
     wheel_radius: float = 1.0
-    """Mean radius, relative to the nominal one that the controller uses."""
+    """Mean radius, relative to the nominal radius that the controller uses."""
     wheel_difference: float = 0.0
     """Relative excess of the right tires' radius over the left ones'."""
     tire_stiffness: float = 50_000.0
@@ -109,7 +109,7 @@ class HiddenRobot:
 
     # Drivetrain.
     torque_constant: float = 0.035
-    """Torque constant of a motor, net of the gear's losses [N m/A]; also its back-EMF [V s/rad]."""
+    """Torque constant of a motor, net of the gear's losses [N m/A]; also the back-EMF constant [V s/rad]."""
     resistance: float = 0.35
     """Resistance of a motor with its leads [Ω]."""
     current_limit: float = 24.0
@@ -188,9 +188,9 @@ TRAINED: dict[str, tuple[float, float]] = {
     "wheel_radius": (0.98, 1.02),
     "wheel_difference": (-0.006, 0.006),
 }
-"""Ranges that training randomizes by default, for the published robot; a test compares them with the twin's values."""
+"""Default ranges of training with Clearpath's robot, as published; a test compares them with the twin's values."""
 
-_CONTROLLERS = ((0.1, 0.25), (0.05, 0.5), (0.02, 0.5))  # period, timeout [s] of Clearpath's configurations
+_CONTROLLERS = ((0.1, 0.25), (0.05, 0.5), (0.02, 0.5))  # period, timeout [s] in configurations by Clearpath
 
 
 def draw_robot(number: int) -> HiddenRobot:
@@ -215,7 +215,7 @@ def draw_robot(number: int) -> HiddenRobot:
 
 
 class RealRobot:
-    """One Husky on the ground of a place. The *base* is the point on the ground in the middle between the wheels."""
+    """One Husky on the ground of a place. The *base* is the point on the ground in the middle of the wheels."""
 
     def __init__(self, robot: HiddenRobot, place: KnownPlace) -> None:
         self.robot = robot
@@ -321,7 +321,7 @@ class RealRobot:
             self._target[i] = 0.0 if abs(speed) < r.deadband else speed / _RADIUS
 
     def _velocity_loop(self) -> None:
-        """Runs the PI loops of both sides; at the limit of the battery's voltage, a loop's integral stays constant."""
+        """Runs the PI loops of both sides; a loop's integral stays constant while the battery limits the voltage."""
         r = self.robot
         elapsed = self._time - self._last_loop
         self._last_loop = self._time
@@ -339,7 +339,7 @@ class RealRobot:
     # ---- motion
 
     def _advance(self) -> None:
-        """Advances tires, wheels and body by a semi-implicit step: first the bristles, then the forces they exert."""
+        """Advances tires, wheels and body by a semi-implicit step: first the bristles, then what their forces move."""
         r = self.robot
         mass, vx, vy, rate = self._mass, self._vx, self._vy, self._rate
         _, pitch, roll = self._rest
@@ -434,7 +434,7 @@ class RealRobot:
 
     @property
     def tilt(self) -> float:
-        """Angle between the chassis's and the world's up axes [rad]."""
+        """Angle between the chassis's and the world's up axes, for small pitch and roll [rad]."""
         return hypot(self._attitude[1], self._attitude[2])
 
     @property
@@ -459,7 +459,7 @@ class RealRobot:
         return self._current[0], self._current[1]
 
     def base_to_world(self, at: float) -> Array:
-        """Pose of the base (4, 4), axes forward, left, up, at a past time [s] of at most the last 2 s."""
+        """Pose of the base (4, 4), axes forward, left, up, at a time [s] in the last 2 s."""
         return pose_matrix(self._pose_at(at))
 
     def _pose_at(self, at: float) -> tuple[float, ...]:
@@ -516,7 +516,7 @@ class Solids:
         ahead, aside = float(c * off[0] + s * off[1]), float(c * off[1] - s * off[0])
         if self._round[i]:
             return hypot(max(abs(ahead) - long, 0.0), max(abs(aside) - wide, 0.0)) < self._half[i, 0]
-        # Separating axes of two rectangles: the axes of either.
+        # The separating axes of two rectangles are the axes of both.
         turn = float(self._yaw[i]) - yaw
         ct, st = cos(turn), sin(turn)
         a, b = float(self._half[i, 0]), float(self._half[i, 1])
@@ -527,7 +527,7 @@ class Solids:
 
 
 def follow(line: Array, pose: tuple[float, float, float], station: float, speed: float, most: float) -> float:
-    """Yaw rate [rad/s] that steers a base at x, y, yaw towards the line (m, 2): pure pursuit.
+    """Yaw rate [rad/s] that steers the base towards a line, by pure pursuit.
 
     Args:
         line: Points (x, y) of the line [m], shape (m, 2).

@@ -27,18 +27,18 @@ from twin.reality.trial_place import place_on_test_day, shadow_range
 from twin.runtime import track
 from twin.types import Array
 
-LIGHTING = "overcast"
+LIGHTING = "overcast"  # of the film, if the place has this lighting
 
-_STATIONS = (4.0, 30.0)  # [m] along the road
+_STATIONS = (4.0, 30.0)  # [m] start and end of the film
 _SPEED = 0.6  # [m/s]
-_WEAVE_AMPLITUDE, _WEAVE_PERIOD = 0.5, 11.0  # [m] to either side, [m] along the road; weaving makes the robot turn
+_WEAVE_AMPLITUDE, _WEAVE_PERIOD = 0.5, 11.0  # [m] to either side, and along the road; fitting extrinsics needs turns
 _LATERAL_GAIN, _HEADING_GAIN = 0.8, 1.5  # [rad/m], [1/s]
 _FPS = 4
 _CONTROL_STEP = 0.05  # [s]
 
 
 def write_film(path: Path, setup: Setup) -> None:
-    """Drives the robot down the road and writes a film by its camera, at 4 frames per second.
+    """Drives the robot down the road and writes a film by the robot's camera, at 4 frames per second.
 
     Raises:
         InputError: `path` does not end in .mp4, or is a folder.
@@ -70,7 +70,7 @@ def write_photo(lighting: str, path: Path, setup: Setup) -> None:
 
 
 def robot_and_camera(setup: Setup, light: Lighting) -> tuple[RealRobot, RealCamera]:
-    """The robot at rest at the first station of `_STATIONS`, and its camera at the full image size."""
+    """The robot at rest at the start of `_STATIONS`, and its camera with the native image size."""
     place, numbers, size = place_on_test_day(setup.place), draw_camera(setup.camera), native_size()
     robot = RealRobot(draw_robot(setup.robot), place)
     set_on_line(robot, place.route, _STATIONS[0])
@@ -122,11 +122,11 @@ _MAX_TRIES = 40
 
 
 def record_log(duration: float, setup: Setup) -> dict[str, Array]:
-    """A drive log of `duration` [s] on the straight segment: columns by name, each of shape (rows,).
+    """A drive log of `duration` [s] near the road's start: columns by name, each of shape (rows,).
 
     Random commands, as from a joystick, drive the robot forwards, backwards and through turns, but keep it on the road.
-    The log has the commands and, with measurement noise, wheel speeds, accelerations and surveyed poses in the frame of
-    the first pose.
+    The log has the commands and, with measurement noise, wheel speeds, accelerations and poses, as surveyed, in the
+    frame of the first pose.
 
     Raises:
         InputError: `duration` < 10 s.

@@ -1,4 +1,4 @@
-"""The task of a trial: a line on the road, its width, start, goal and limits, as numbers.
+"""The task of a trial, as numbers: a line on the road, the corridor's width, start, goal and limits.
 
 The twin writes a task as JSON (`twin export SCENE --task NAME --task-file FILE`); `read_task` reads it and transforms
 it from the scene's frame into the true one. Without a twin, `task_of_place` gives a place's tasks on its filmed path,
@@ -27,7 +27,7 @@ CAMPUS_TASKS = {"straight": (0.0, 30.0), "right_turn": (0.25, 60.0), "route": (0
 
 _WRITE = "write one: python -m twin.export SCENE --task NAME --task-file FILE"
 _HALF_WIDTH = 1.0  # [m]
-_BUMPER = 0.5  # [m] distance of the bumper ahead of the base
+_BUMPER = 0.5  # [m] from the base to the front bumper
 _STUCK = (0.1, 5.0)  # [m], [s]
 _MAX_TILT = radians(60.0)
 _START_OFFSET, _START_HEADING = 0.3, radians(10.0)  # [m], [rad]
@@ -46,9 +46,9 @@ class RoadTask:
     start: float
     """Station near which trials start [m]."""
     start_offset: float
-    """Bound of the start's distance from the line [m]."""
+    """Largest distance of a start from the line [m]."""
     start_heading: float
-    """Bound of the angle between the robot and the line at the start [rad]."""
+    """Largest angle between robot and line at a start [rad]."""
     goal: float
     """Station that the base must reach [m]."""
     time_limit: float
@@ -85,7 +85,7 @@ class RoadTask:
         return np.append(0.0, np.cumsum(np.hypot(*np.diff(self.line, axis=0).T)))
 
     def at(self, station: float) -> tuple[float, float, float]:
-        """x, y [m] of the line at a station, and its heading [rad] over 1 m around it."""
+        """x, y [m] of the line at a station, and the line's heading [rad] over 1 m around the station."""
         knots, total = self.knots, float(self.knots[-1])
 
         def point(s: float) -> Array:
@@ -119,7 +119,7 @@ def read_task(path: Path, to_truth: Similarity | None = None) -> RoadTask:
 
 
 def parse_task(table: dict[str, Any], to_truth: Similarity | None = None) -> RoadTask:
-    """A task from the contents of its file. Raises KeyError, TypeError or ValueError for missing or wrong entries."""
+    """A task from its file's contents. Raises KeyError, TypeError or ValueError for missing or wrong entries."""
     line = np.array(table["line"], float)
     line = to_truth.points(line) if to_truth else line
     start, limits = table["start"], table["limits"]

@@ -1,7 +1,7 @@
 """A ROS 2 bag of one trial of the real test, as a real Husky would record it, for `twin.trial`.
 
-The robot runs `twin_policy`'s pilot on JPEG pictures of its camera; without a policy, it follows the task's line. The
-bag has those pictures, camera_info, commands, and poses with the accuracy of RTK, in a frame of their own. Recording
+The robot runs `twin_policy`'s pilot on its camera's JPEG pictures; without a policy, it follows the task's line. The
+bag has these pictures, camera_info, commands, and poses with the accuracy of RTK, in a frame of their own. Recording
 continues for 1.5 s after the trial's end.
 """
 
@@ -27,13 +27,13 @@ from twin.runtime import bar
 from twin.types import Array
 from twin_policy import Camera, CompressedPicture, Limits, OnnxPolicy, Pilot
 
-_START = 1_700_000_000  # [s] time of the first trial
+_START = 1_700_000_000  # [s] Unix time of the first trial
 _APART = 400  # [s] between the starts of two trials
-_WEATHERS, MOST_SEED = 1000, 999  # upper bounds; times must fit into ROS's 32-bit seconds
+_WEATHERS, MOST_SEED = 1000, 999  # upper bounds, so that times fit into ROS's 32-bit seconds
 _WIDTH = 640  # [px] width of the camera's stream
 _QUALITY = 92  # JPEG quality
 _POSITION_NOISE, _YAW_NOISE = 0.01, 0.003  # [m], [rad]
-_FRAME = (0.7, 251.0, -38.0)  # yaw [rad], x, y [m] of the true frame in the poses' frame
+_FRAME = (0.7, 251.0, -38.0)  # yaw [rad], x, y [m] of the true frame in the bag's frame of poses
 _AFTER = 1.5  # [s] recorded after the end of the trial
 _TOPICS = {
     "picture": ("/sensors/camera_0/color/compressed", "sensor_msgs/msg/CompressedImage"),
@@ -131,7 +131,7 @@ def write_robot_bag(
 
 
 def _measured(base_to_world: Array, rng: np.random.Generator) -> Array:
-    """A pose of the base (4, 4) in the poses' frame, with noise."""
+    """A pose of the base (4, 4), in the bag's frame of poses and with noise."""
     yaw, x, y = _FRAME
     frame = np.eye(4)
     frame[:3, :3], frame[:2, 3] = Rotation.from_euler("z", yaw).as_matrix(), (x, y)
@@ -166,7 +166,7 @@ class BagMessages:
         model: str = "plumb_bob",
         distortion: Sequence[float] = (0.0,) * 5,
     ) -> Any:
-        """A message with fx, fy, cx, cy [px]; cx, cy are from the first pixel's corner, in ROS from its center."""
+        """A message with fx, fy, cx, cy [px]; these cx, cy are from the first pixel's corner, ROS's from its center."""
         fx, fy, cx, cy = intrinsics
         k = np.array([fx, 0, cx - 0.5, 0, fy, cy - 0.5, 0, 0, 1.0])
         p = np.array([fx, 0, cx - 0.5, 0, 0, fy, cy - 0.5, 0, 0, 0, 1.0, 0])

@@ -1,6 +1,6 @@
 """Street furniture and vehicles: each function adds one object with its collision shapes to a place.
 
-Stations and laterals are those of the place's route; angles are relative to the direction of travel there.
+Stations and laterals are those of the place's route; angles are relative to its direction at the station.
 """
 
 from itertools import pairwise
@@ -26,7 +26,7 @@ def add_crate(place: KnownPlace, k: int, station: float, lateral: float, side: f
     yaw = place.heading(station) + 0.37 * k
     stack = [place.cell("crate", primitives.box((side, side, side)).moved(foot, yaw))]
     solids = [Solid("box", foot + up(side / 2), (side / 2, side / 2, side / 2), yaw)]
-    if k % 2 == 0:  # a smaller one on top
+    if k % 2 == 0:  # a smaller crate on top
         top = foot + np.array([0.1, 0.05, side])
         stack.append(place.cell("planks", primitives.box((0.7, 0.7, 0.6)).moved(top, yaw + 0.4)))
         solids.append(Solid("box", top + up(0.3), (0.35, 0.35, 0.3), yaw + 0.4))
@@ -42,7 +42,7 @@ def add_lamp_post(
     arms: tuple[float, ...] = (1.5,),
     shines: bool = True,
 ) -> None:
-    """Adds a lamp post with a head at the end of each arm [m]; arms reach towards the road, negative ones outwards."""
+    """Adds a lamp post with a head on each arm; lengths of arms [m] are positive towards the road."""
     foot = place.spot(station, lateral)
     top = foot + up(height)
     parts = [
@@ -109,7 +109,7 @@ def add_sign(
     foot = place.spot(station, lateral)
     yaw = place.heading(station) + turn
     c, s = np.cos(yaw), np.sin(yaw)
-    across = np.array([s, -c])  # from the left to the right as a reader sees them
+    across = np.array([s, -c])  # from left to right as a reader of the sign sees it
     wide, low, high = size
     face = foot[:2] - 0.05 * np.array([c, s])
     left, right = face - across * wide / 2, face + across * wide / 2
@@ -170,7 +170,7 @@ def add_bin(place: KnownPlace, k: int, station: float, lateral: float, skin: str
     place.objects.append(PlaceObject(f"bin_{k}", "obstacle", part, "atlas", (solid,)))
 
 
-# ---- furniture of drawn places
+# ---- furniture of sampled places
 
 # Length, width, height [m]; side views of body and windows as corners (x, z) in units of length and height, x ahead.
 _VEHICLES: dict[str, tuple[tuple[float, float, float], list[tuple[float, float]], list[tuple[float, float]]]] = {
@@ -205,7 +205,7 @@ def vehicle_size(kind: str) -> tuple[float, float]:
 
 
 def add_vehicle(place: KnownPlace, k: int, station: float, lateral: float, turn: float, kind: str, skin: str) -> None:
-    """Adds a parked vehicle."""
+    """Adds a vehicle."""
     (length, width, height), body, cabin = _VEHICLES[kind]
     foot, yaw = place.spot(station, lateral), place.heading(station) + turn
     ahead = np.array([np.cos(yaw), np.sin(yaw)])

@@ -1,4 +1,4 @@
-"""Surfaces of drawn places: roads, verges, land, walls and roofs. Conventions as in `textures.py`."""
+"""Textures of randomly sampled places: roads, verges, land, walls, roofs. Conventions as in `textures.py`."""
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ def road(
     pixel: float,
     zebras: tuple[float, ...] = (),
 ) -> Array32:
-    """The road's surface: rows from its left edge to its right, columns along it; lengths and `pixel` [m].
+    """The road's surface: rows from the left edge to the right, columns along the road; lengths and `pixel` [m].
 
     `zebras` are the distances of zebra crossings from the first column [m].
     """
@@ -260,7 +260,7 @@ def land(rng: np.random.Generator, surface: SurfaceSpec, shape: tuple[int, int],
 
 
 def paving(rng: np.random.Generator, surface: SurfaceSpec, shape: tuple[int, int], pixel: float, kind: str) -> Array32:
-    """A pavement: rows across it, columns along it."""
+    """A sidewalk: rows across it, columns along it."""
     if kind == "gravel":
         return turf(rng, surface, shape, pixel, "gravel")
     level = float(rng.uniform(0.26, 0.42) if kind == "asphalt" else rng.uniform(0.42, 0.62))
@@ -283,7 +283,7 @@ def paving(rng: np.random.Generator, surface: SurfaceSpec, shape: tuple[int, int
 
 
 def wall(rng: np.random.Generator, kind: str, color: Rgb, shape: tuple[int, int], pixel: float) -> Array32:
-    """A wall of a material, weathered at foot and eaves."""
+    """A wall of a material (see `HousesSpec.walls`), weathered at foot and eaves."""
     if kind == "bricks":
         image = textures.bricks(rng, shape, pixel, color)
     elif kind == "plaster":
@@ -292,7 +292,7 @@ def wall(rng: np.random.Generator, kind: str, color: Rgb, shape: tuple[int, int]
         image = tinted(color, fbm(rng, shape, 2.0 / pixel, 2.0), 0.07, 0.4 * fbm(rng, shape, 2.0 / pixel, 8))
         dark = (0.4 * color[0], 0.4 * color[1], 0.4 * color[2])
         if kind == "boards":
-            unit = (0.18, 40.0) if rng.random() < 0.6 else (40.0, 0.16)  # lying or standing boards
+            unit = (0.18, 40.0) if rng.random() < 0.6 else (40.0, 0.16)  # horizontal or vertical boards
             _slab_field(rng, image, unit, pixel, 0.09, dark, 0.03)
         elif kind == "stone":
             _slab_field(rng, image, (0.32, 0.5), pixel, 0.2, (0.30, 0.28, 0.24), 0.035, 2)
@@ -310,7 +310,7 @@ def wall(rng: np.random.Generator, kind: str, color: Rgb, shape: tuple[int, int]
 
 
 def roof(rng: np.random.Generator, houses: HousesSpec, color: Rgb, shape: tuple[int, int], pixel: float) -> Array32:
-    """A roof: rows from its ridge to its eaves."""
+    """A roof: rows from ridge to eaves."""
     image = tinted(color, fbm(rng, shape, 3.0 / pixel, 2.0), 0.10, 0.6 * fbm(rng, shape, 2.0 / pixel, 8))
     dark = (0.45 * color[0], 0.45 * color[1], 0.45 * color[2])
     if "sheet" in houses.walls:

@@ -1,7 +1,7 @@
 """Procedural textures: RGB in [0, 1], shape (rows, columns, 3), with detail at every scale.
 
-Nothing repeats along the road: a repeating texture would cause false matches in structure from motion. Each texture has
-its own random generator, so a change of one leaves the others as they are.
+Nothing repeats along the road, since a repeating texture causes false matches in structure from motion. Each texture
+has its own random generator, so a change of one does not change the others.
 """
 
 import cv2
@@ -26,13 +26,13 @@ def fbm(rng: np.random.Generator, shape: tuple[int, int], coarsest: float, fines
 
 
 def blend(image: NDArray, color: tuple[float, float, float], weight: NDArray) -> None:
-    """Blends a color into an image in place; `weight` in [0, 1], shape (rows, columns)."""
+    """Blends a color into an image, in place; `weight` in [0, 1], shape (rows, columns)."""
     w = weight[..., None].astype(np.float32)
     image += w * (np.asarray(color, np.float32) - image)
 
 
 def tinted(base: tuple[float, float, float], noise: NDArray, contrast: float, tint: NDArray | None = None) -> Array32:
-    """A color modulated by noise with zero mean; `tint` shifts it between warm and cold."""
+    """A color modulated by noise with zero mean; positive values of `tint` shift it to warm, negative ones to cold."""
     image = np.asarray(base, np.float32) * (1.0 + contrast * noise[..., None].astype(np.float32))
     if tint is not None:
         image = image * (1.0 + tint[..., None] * np.array([0.10, 0.02, -0.10], np.float32))
@@ -65,7 +65,7 @@ def speckle(rng: np.random.Generator, image: NDArray, count: int, sizes: tuple[f
 
 
 def grains(rng: np.random.Generator, image: Array32, share: float, colors: NDArray) -> None:
-    """Colors a fraction `share` of single texels in place, like the stones in asphalt."""
+    """Recolors a fraction `share` of the texels, in place, like the stones in asphalt."""
     hit = rng.random(image.shape[:2]) < share
     shade = rng.uniform(0.75, 1.15, (int(hit.sum()), 1))
     image[hit] = 0.35 * image[hit] + 0.65 * colors[rng.integers(0, len(colors), int(hit.sum()))] * shade
@@ -136,7 +136,7 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
         blob = np.clip(1.6 - np.hypot(rr - center[1], cc - center[0]) / (0.6 * size), 0, 1)
         blend(image[rr[0, 0] : rr[-1, 0] + 1, cc[0, 0] : cc[0, -1] + 1], (0.12, 0.12, 0.13), 0.6 * blob)
     _markings(rng, image, lateral, pixel)
-    for station in np.arange(4.0, length, 11.0):  # manholes and gullies
+    for station in np.arange(4.0, length, 11.0):  # manholes and storm drains
         station += rng.uniform(-3, 3)
         manhole(image, (int(station / pixel), int(rng.uniform(0.3, 0.7) * rows)), int(0.32 / pixel))
         gully(image, int((station + 4.0) / pixel), rng.random() < 0.5, pixel)
@@ -174,7 +174,7 @@ def manhole(image: Array32, center: tuple[int, int], radius: int) -> None:
 
 
 def gully(image: Array32, column: int, left: bool, pixel: float) -> None:
-    """Draws the grating of a gully at the left or right edge of the road."""
+    """Draws the grate of a storm drain at the left or right edge of the road."""
     rows = image.shape[0]
     across, along = int(0.34 / pixel), int(0.55 / pixel)
     r0 = 2 if left else rows - 2 - across
@@ -214,7 +214,7 @@ def slabs(rng: np.random.Generator, shape: tuple[int, int], pixel: float, slab: 
 
 
 def kerb(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Array32:
-    """Kerb stones 0.9 m long, with rows across the profile of the kerb and columns along the kerb."""
+    """Curb stones 0.9 m long, with rows across the profile of the curb and columns along the curb."""
     return slabs(rng, shape, pixel, (10.0, 0.9)) * np.float32(0.95)
 
 
@@ -276,7 +276,7 @@ def window(rng: np.random.Generator, lit: bool, style: str = "cross", frames: ND
         image[:] = np.array([0.20, 0.24, 0.30]) + (0.38 * (1 - down) ** 1.5)[..., None] * np.array([0.8, 0.95, 1.1])
         image *= rng.uniform(0.65, 1.15)
     image *= 1.0 + 0.10 * fbm(rng, (96, 72), 30, 3.0)[..., None]
-    for side in (0, 1):  # curtains, drawn unevenly
+    for side in (0, 1):  # curtains of unequal width
         width = int(rng.uniform(2, 26))
         folds = 0.75 + 0.25 * np.sin(np.arange(width) * rng.uniform(0.7, 1.6))
         tone = rng.uniform(0.45, 0.9) * np.array([1.0, rng.uniform(0.8, 1.0), rng.uniform(0.6, 1.0)])
@@ -307,7 +307,7 @@ def bark(
 
 
 def leaf(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Array32:
-    """Leaf tones from dark (left) to light (right); `primitives.leaves` gives each leaf a window of this texture."""
+    """Leaf tones from dark (left) to light (right); `primitives.leaves` assigns each leaf a window of this texture."""
     image = tinted(base, fbm(rng, shape, 60, 1.0, 0.85), 0.20, 0.8 * fbm(rng, shape, 30, 6))
     image *= np.linspace(0.35, 1.35, shape[1], dtype=np.float32)[None, :, None]
     return np.clip(image, 0.03, 1.0)

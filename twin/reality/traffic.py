@@ -1,6 +1,6 @@
-"""Traffic in the films of a place: walkers and cars that move, and parked cars that have left in the last lighting.
+"""Traffic in the films of a place: walkers, moving cars, and parked cars that are absent in the last lighting.
 
-Traffic is in the films only: not in the place's truth, nor in its real test. A twin should thus contain none of it.
+Only the films have traffic; truth and real test have none. A twin should therefore contain none.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from twin.reality.primitives import MeshPart
 from twin.reality.street_furniture import VEHICLES, add_vehicle, vehicle_size
 from twin.types import Array
 
-_WALKERS, _CARS, _PARKED = 3, 2, 4  # number of walkers and moving cars per film, and of parked cars
+_WALKERS, _CARS, _PARKED = 3, 2, 4  # walkers and moving cars per film; parked cars
 _WALKING_SPEED, _CAR_SPEED = (1.1, 1.7), (4.0, 8.0)  # ranges [m/s]
 _MEETING_DISTANCE = (
     5.0,
@@ -39,9 +39,9 @@ class Mover:
 
 
 def movers(place: KnownPlace, film: str, times: Array, cameras: Array) -> list[Mover]:
-    """The walkers and cars that move during a film; the same place and film give the same.
+    """The walkers and cars that move during a film, always the same for a place and a film.
 
-    Every walker crosses the road in front of the camera. The first car meets the camera, and the others overtake it.
+    Every walker crosses the road in front of the camera. The first car is oncoming; the others overtake the camera.
 
     Args:
         film: Name of the film.
@@ -89,7 +89,7 @@ def movers(place: KnownPlace, film: str, times: Array, cameras: Array) -> list[M
 
 
 def parked_cars(place: KnownPlace, start: float, length: float) -> list[PlaceObject]:
-    """Cars parked along the segment that begins at station `start` and has `length` [m]; not added to the place."""
+    """Cars parked along `length` [m] of the road from station `start` on; they are not added to the place."""
     rng = np.random.default_rng([SEED, 52, place.number])
     before = len(place.objects)
     for k in range(_PARKED):

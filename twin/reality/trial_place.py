@@ -1,4 +1,4 @@
-"""The place with a number on the day of the trials: cones, bins, crates and cars have moved since the film."""
+"""A place on the day of the trials: cones, bins, crates and cars have moved since the film."""
 
 from functools import cache
 
@@ -13,13 +13,13 @@ from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.rasterizer import SHADOW_RANGE
 from twin.types import Array
 
-_LENGTH_TOLERANCE = 0.98  # least length of the path that becomes the route, as a fraction of the longest path
+_LENGTH_TOLERANCE = 0.98  # least length of the route, as a fraction of the longest path
 
 
 def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) -> Array:
-    """The route: the filmed path on the true ground [m], shape (m, 3).
+    """The route on the true ground [m], shape (m, 3).
 
-    As in a build, the route is the path of the first film whose length is within 2 % of the longest.
+    As in a build, it is the path of the first film whose path has at least 98 % of the longest path's length.
     """
     plan, line = plan or FilmingPlan(), line or RoadLine()
     paths = [smooth_path(trajectory(plan, line, lighting)[1][:, :3, 3]) for lighting in plan.lightings]
@@ -30,12 +30,12 @@ def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) 
 
 @cache
 def place_on_test_day(number: int = 0) -> KnownPlace:
-    """The place with a number on the day of the trials, when some objects have moved since the film."""
+    """The place with a number on the day of the trials."""
     return build_number(number, displaced=True) if number else places.build(displaced=True)
 
 
 def shadow_range(place: KnownPlace) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """The box [m] in which the rasterizer casts shadows."""
+    """The box in which the rasterizer casts shadows: lowest and highest corner [m]."""
     if place.number == 0:
         return SHADOW_RANGE
     (x0, y0), (x1, y1) = place.layout.field

@@ -1,4 +1,4 @@
-"""The known-truth world as a MuJoCo model for rendering: it has visual geoms only, and nothing in it collides."""
+"""The known-truth world as a MuJoCo model for rendering, with visual geoms only; nothing collides."""
 
 from collections.abc import Mapping
 
@@ -33,7 +33,7 @@ def sky_visibility(place: KnownPlace, points: Array) -> Array:
 
 
 def ground_visibility(place: KnownPlace) -> dict[str, Array]:
-    """A coarse sky-visibility map for each ground texture; its rows and columns run along the texture's."""
+    """A coarse sky-visibility map for each ground texture, with rows and columns along those of the texture."""
     first, last = place.layout.stations
     along = np.linspace(first, last, round((last - first) / _OCCLUSION_STEP))
     grids = {}
@@ -55,9 +55,9 @@ def ground_visibility(place: KnownPlace) -> dict[str, Array]:
 def world_spec(
     lighting: Lighting | str, place: KnownPlace, moving: Mapping[str, MeshPart] | None = None
 ) -> mujoco.MjSpec:
-    """A place under one lighting, with textures, lights and a camera named `film`.
+    """Model of a place under one lighting, with textures, lights and a camera named `film`.
 
-    Ground geoms are in group 0, all others in group 1. Each of `moving`, name → mesh, is a mocap body of that name.
+    Ground geoms are in group 0, all others in group 1. Each mesh of `moving` becomes a mocap body of its name.
     """
     light = place.lightings[lighting] if isinstance(lighting, str) else lighting
     model = mujoco.MjSpec()

@@ -1,7 +1,7 @@
-"""Ground truth of a generated scene: poses, some depth maps, and the place, which is rebuilt from its parameters.
+"""Ground truth of a generated scene: poses, some depth maps, and the place, which is rebuilt from parameters.
 
 `python -m twin.reality film` writes it to `<scene>/truth`. A build must not read it; `twin/reality/comparison.py`,
-`python -m twin.reality drive`, benchmarks and tests do.
+`python -m twin.reality drive`, benchmarks and tests read it.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -146,6 +146,6 @@ class Truth:
 
 
 def fingerprint(place: KnownPlace) -> list[float]:
-    """Identifies a version of the place: counts of objects and vertices, mean and deviation of the vertices."""
+    """Identifies a version of the place: numbers of objects and vertices, mean and standard deviation of vertices."""
     vertices = np.concatenate([obj.part.vertices for obj in place.objects])
     return [len(place.objects), len(vertices), *vertices.mean(0).tolist(), *vertices.std(0).tolist()]
