@@ -25,9 +25,9 @@ An interval must contain its *estimand* in 90 % of the worlds. The estimands are
 - predicted: the observed real rate of a policy, predicted from its rate in the twin and from the other trainings.
 
 Prints coverage; a dash means that a forecast of that shape has no such interval. A world without an interval does not
-count: a forecast would print none, because its units do not determine one. *refused* is the largest fraction of such
-worlds over the agreement statistics. In shapes of more than ten policies, rates are estimated in a quarter of the
-worlds. The seed is fixed. Takes ten minutes on one core.
+count: a forecast would print none, because its trainings and days do not determine one. *refused* is the largest
+fraction of such worlds over the agreement statistics. In shapes of more than ten policies, rates are estimated in a
+quarter of the worlds. The seed is fixed. A run takes ten minutes on one core.
 """
 
 import argparse
@@ -57,8 +57,8 @@ from record import add_record_options, save
 
 WORLDS = 1000
 _MEAN_OVER = 6000  # worlds that estimate the mean of a statistic
-_BATCH = 250
-_RATE_WORLDS = 250  # worlds of `WORLDS` in which rates are estimated, for more policies than `_USERS_POLICIES`
+_BATCH = 250  # worlds simulated together
+_RATE_WORLDS = 250  # of `WORLDS`, in which rates are estimated for more than `_USERS_POLICIES` policies
 _USERS_POLICIES = 10
 _QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)
 
@@ -69,7 +69,7 @@ class Shape:
 
     places: int
     setups: int
-    """Setups per place; 0: each training has a setup drawn at random."""
+    """Setups per place; 0: the setup of each training is random."""
     trainings: int
     """Trainings per place."""
     checkpoints: int
@@ -92,7 +92,7 @@ class Kind:
     training: float
     place: float
     checkpoint: float
-    """Mean difference in quality between the last and the first checkpoint; its standard deviation is a third of it."""
+    """Mean difference in quality between last and first checkpoint; the standard deviation is a third of the mean."""
     day: float
     cell: float
     shared: float
@@ -123,7 +123,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Worlds:
-    """Simulated worlds, shapes (worlds, places, policies, days)."""
+    """Simulated worlds; `twin` and `real` have the shape (worlds, places, policies, days)."""
 
     kind: Kind
     shape: Shape
@@ -367,7 +367,7 @@ def _predicted(worlds: Worlds) -> Hits:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, default=WORLDS)
-    parser.add_argument("--shapes", nargs="+", default=[], help="beginnings of the names of shapes; none: all")
+    parser.add_argument("--shapes", nargs="+", default=[], help="beginnings of the names of shapes (default: all)")
     add_record_options(parser)
     given = parser.parse_args()
     shapes = {k: v for k, v in SHAPES.items() if not given.shapes or k.startswith(tuple(given.shapes))}

@@ -1,4 +1,4 @@
-"""Coverage of the scale's stated uncertainty over simulated captures.
+"""Coverage of the stated uncertainty of the metric scale over simulated captures.
 
     python benchmarks/scale.py [--first 1] [--count 200]
 
