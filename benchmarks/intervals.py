@@ -7,9 +7,10 @@ p succeeds on day d at the rate
 
     road: logit = s (q_p + day_d + cell_pd)            twin: the same with a sharpness, bias and noise of its own
 
-where q_p is a setup's mean plus the effects of place, training and checkpoint. Day and cell effects are correlated
-between twin and road: a low sun, for example, makes both harder. With a large sharpness s, a policy succeeds in all
-trials of a day or in none, as in 706 of the 720 cells of Table 1. The kind `recorded` is fitted to Table 1.
+where q_p is a setup's mean plus the effects of place, training and checkpoint, and a *cell* is a policy on a day. Day
+and cell effects are correlated between twin and road: a low sun, for example, makes both harder. With a large sharpness
+s, a policy succeeds in all trials of a day or in none, as in 706 of the 720 cells of Table 1. The kind `recorded` is
+fitted to Table 1.
 
 An interval must contain its *estimand* in 90 % of the worlds. The estimands are:
 
@@ -56,7 +57,7 @@ sys.path.append(str(Path(__file__).parent))
 from record import add_record_options, save
 
 WORLDS = 1000
-_MEAN_OVER = 6000  # worlds that estimate the mean of a statistic
+_MEAN_OVER = 6000  # worlds from which the mean of a statistic is estimated
 _BATCH = 250  # worlds simulated together
 _RATE_WORLDS = 250  # of `WORLDS`, in which rates are estimated for more than `_USERS_POLICIES` policies
 _USERS_POLICIES = 10

@@ -46,7 +46,7 @@ def draw(figures: dict[str, dict[str, Any]], path: Path) -> None:
     for column, marker, label in (
         ("psnr_small_lower", "s", "at 160×90, lower half"),
         ("psnr_small", "o", "at 160×90"),
-        ("psnr", "^", "at the size of training"),
+        ("psnr", "^", "at the training resolution"),
     ):
         axes.plot(minutes, [row[column] for row in figures.values()], marker=marker, label=label)
     top = [row["psnr_small_lower"] for row in figures.values()]

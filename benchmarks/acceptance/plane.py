@@ -96,7 +96,7 @@ def scrubbing(subject: Subject) -> list[Row]:
     return [
         Row("B4", "wheel torque / Coulomb torque", float(np.abs(turn.torque).mean() / 2 / expected), 0.95, 1.05),
         Row("B5", "motor power / dissipated power", float(turn.power.mean() / turn.dissipated.mean()), 0.97, 1.05),
-        Row("B5", "least motor power", float(turn.power.min()), 0.0, math.inf, "W"),
+        Row("B5", "smallest motor power", float(turn.power.min()), 0.0, math.inf, "W"),
     ]
 
 
