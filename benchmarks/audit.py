@@ -263,7 +263,7 @@ class _Rammer:
 
 
 def _toward(pose: Array, target: Array) -> tuple[float, float]:
-    """Command at full speed towards a point, turning on the spot if it is far to the side."""
+    """Command at full speed towards a point; a turn on the spot if the point is more than 1 rad aside."""
     x, y = target - pose[:2]
     error = float(heading_error(np.arctan2(y, x), pose[2]))
     return (1.0 if abs(error) < 1.0 else 0.0), float(np.clip(2.0 * error, -1.0, 1.0))

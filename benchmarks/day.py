@@ -4,10 +4,9 @@
 
 The scene was built from films of the generated place (`twin reality`) and has a lighting fitted to one photo of each
 day (`benchmarks/table1`, step `photos`). From eight other stations of the road, images of every day are compared with
-renderings from the same poses under the photo's appearance and fog. The figures are PSNR, and for
-steering a ratio: the policies' change of steering from rendering to image, divided by the change that randomized sun
-and shadows cause. *Lasting* change: rms over days of the mean over stations. *Local* change: rms of the deviations from
-this mean.
+renderings from the same poses under the photo's appearance and fog. The figures are PSNR, and for steering a ratio: the
+policies' change of steering from rendering to image, divided by the change that randomized sun and shadows cause.
+*Lasting* change: rms over days of the mean over stations. *Local* change: rms of the deviations from this mean.
 """
 
 import argparse
@@ -148,7 +147,9 @@ def main() -> int:
     responses: dict[float, list[NDArray]] = {scale: [] for scale in SCALES}
     for source in track(given.policies, "policies", unit="policy"):
         policy = load_policy(str(find_policy(given.scene, source)), False)
-        places = slice(1, STRAIGHT if Path(source).name.startswith("straight") else None)  # photos show station 0
+        places = slice(
+            1, STRAIGHT if Path(source).name.startswith("straight") else None
+        )  # the lightings' photos show station 0
         before = steering(policy, fogged[:, places])
         gaps.append(steering(policy, truth[:, places]) - before)
         for scale, many in pictures.items():

@@ -38,7 +38,7 @@ def worker(*arguments: str | Path | int, cores: int = 1) -> dict[str, Any]:
 
 
 def speed(scene: Path, quick: bool) -> dict[str, Any]:
-    """Environment steps per second with pixels and one obstacle in view: one environment on one core, eight on two.
+    """Environment steps per second with pixels and one obstacle in view: one environment on one core, 8 or 64 on two.
 
     `ratio_to_software_gl`: speed of one environment divided by that of the same environment with `mujoco.Renderer`
     images of the extracted mesh in software OpenGL (Mesa through EGL); both alternate in one process.

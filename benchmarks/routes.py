@@ -52,7 +52,7 @@ class Filming:
     lines: tuple[Array, ...]
     """True lines (m, 2) [m]; those across a permitted gap are included."""
     longest: float
-    """Length of the longest path filmed without interruption [m], less turning maneuvers."""
+    """Length of the longest path filmed without interruption [m], without turning maneuvers."""
 
 
 def drawn_line(rng: np.random.Generator, length: float) -> Array:
@@ -152,7 +152,7 @@ def draw_filming(number: int) -> Filming:
 def _filmed(
     rng: np.random.Generator, kind: str, source: str, lighting: str, pieces: list[Array], spacing: float
 ) -> Cameras:
-    """Frames about `spacing` [m] apart along pieces of the way, with noise of position and heading."""
+    """Frames about `spacing` [m] apart along pieces of the way, with noise in position and heading."""
     xy, heading, times, now = list[Array](), list[float](), list[float](), 0.0
     frame_time = 0.5
     for piece in pieces:

@@ -1,4 +1,4 @@
-"""Benchmark of transients: loss of a twin by walkers, cars and objects that left, against films without them.
+"""Benchmark of transients: effect of walkers, cars and objects that left on a twin, against films without them.
 
     python -m twin.reality film --place N --out CLEAN && twin build CLEAN
     python -m twin.reality film --place N --traffic --out TRAFFIC && twin build TRAFFIC

@@ -11,8 +11,8 @@ only a photo: there, the policies drive only in the twin. A policy's rate is the
   covariate predicts.
 - mean: the mean real rate over the driven days; its interval is Student's t over days.
 - powered: prediction-powered inference (PPI++, `prediction_powered_mean`): the same mean plus λ times the
-  difference between the twin's rates on the further days and on the driven days. It is unbiased even if the twin is
-  wrong. λ is tuned on other trainings.
+  difference between the twin's rates on the further days and on the driven days. This estimate is unbiased even if
+  the twin is wrong. λ is tuned on other trainings.
 
 Prints, by number of real trials per policy: width and coverage of the 90 % intervals, root mean square error, and how
 often the policy with the highest estimate is within 5 points of the best of its task. *Middling* policies have a

@@ -5,8 +5,8 @@
 `twin view` runs in a separate process; the browser draws without a GPU. A picture counts when the browser has decoded
 it. "Moving" is a drag of the mouse at 25 events a second; "at rest" begins when the mouse button is released. The
 random part clicks, drags, presses keys and moves sliders at random, and compares memory at its end with memory after
-its first fifth. The number of cores that other programs use is measured, too: speeds are meaningful only if it is
-small.
+its first fifth. The number of cores that other programs use is measured, too: speeds are meaningful only if this
+number is small.
 """
 
 import argparse
