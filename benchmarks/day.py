@@ -147,9 +147,7 @@ def main() -> int:
     responses: dict[float, list[NDArray]] = {scale: [] for scale in SCALES}
     for source in track(given.policies, "policies", unit="policy"):
         policy = load_policy(str(find_policy(given.scene, source)), False)
-        places = slice(
-            1, STRAIGHT if Path(source).name.startswith("straight") else None
-        )  # the lightings' photos show station 0
+        places = slice(1, STRAIGHT if Path(source).name.startswith("straight") else None)  # 0 is the photo's station
         before = steering(policy, fogged[:, places])
         gaps.append(steering(policy, truth[:, places]) - before)
         for scale, many in pictures.items():
