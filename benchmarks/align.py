@@ -1,11 +1,11 @@
 """Benchmark of the aligned Husky model against logs of real Huskies.
 
-Prints the figures of `python -m twin.align`, and measured motor currents on asphalt beside simulated torques.
+Prints the figures of `twin align` for a log on grass, and measured motor currents on asphalt beside simulated torques.
 
     python benchmarks/align.py [--data FOLDER] [--work FOLDER] [--json FILE]
 
-`--data` holds `husky_drive` and `borealtc_asphalt`. A run takes about 20 minutes on two cores of the machine in
-`docs/benchmarks.md`. The exit status is 1 if a target is missed.
+The folder `--data` contains the logs `husky_drive` and `borealtc_asphalt`. A run takes about 20 minutes on two cores of
+the machine in `docs/benchmarks.md`. The exit status is 1 if a target is missed.
 """
 
 import argparse
@@ -28,7 +28,7 @@ _LOG = Path("husky_drive") / "husky_drive_dev.npz"
 _ASPHALT = "borealtc_asphalt"
 
 TARGETS = {"position_m": 0.12, "yaw_deg": 4.7, "wheels_rad_s": 0.3}
-"""Upper limits of the median errors over held-out windows."""
+"""Upper limits of the median errors over held-out windows of the log, 2 s each."""
 
 
 def turning_efforts(data: Path) -> dict[str, dict[str, float]]:
@@ -55,9 +55,9 @@ def turning_efforts(data: Path) -> dict[str, dict[str, float]]:
 
 
 def against_kinematics(figures: dict[str, Any]) -> list[str]:
-    """One line per assumption on the slope: medians of the model and of the kinematic baseline over held-out windows.
+    """One line per assumption on the ground: median errors of model and kinematic baseline over held-out windows.
 
-    The baseline does not use the slope, so only the first line, on level ground, gives both the same information.
+    The baseline assumes level ground, so the two have the same information only in the first line.
     """
     held_out = {name: score["held_out"] for name, score in figures["scores"].items()}
     base, lines = held_out["icr_kinematics"], []
@@ -91,7 +91,7 @@ def main() -> int:
         result, folder = align_to_log("husky", options.data / _LOG, work)
         figures = json.loads((folder / "alignment" / "align.json").read_text(encoding="utf-8"))
     print(summary(result))
-    print("MJCF against the kinematic baseline, pose after 2 s, median over windows not fitted to:")
+    print("MJCF against the kinematic baseline, pose after 2 s, median error over held-out windows:")
     print("\n".join(against_kinematics(figures)))
     rows = verdicts(figures)
     for name, value, target, met in rows:

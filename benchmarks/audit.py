@@ -4,11 +4,10 @@ Two *explorers* drive the robot. The *random* one follows a random walk. The *gr
 in episodes, and rams convex parts of the collision geometry at full speed while roaming. *Episodes* end by the task's
 rules; *roaming* has no task, so the robot can push against walls, slide along them and climb them for long.
 
-*Tunnelling*: the robot penetrates a part deeper than `_TUNNEL_DEPTH`. *Climbing*: the base is more than
-`_CLIMB_HEIGHT` above its standing height. *Wall sliding*: the robot touches a part and moves faster than
-`_SLIDE_SPEED`, which is legitimate while roaming and a flaw of the rules in an episode. *Gap*: the visual mesh is
-inside the robot's body without a contact. A *false success* is an episode that reached its goal after any of these
-events.
+*Tunnelling*: the robot penetrates a part deeper than `_TUNNEL_DEPTH`. *Climbing*: the base is more than `_CLIMB_HEIGHT`
+above its standing height. *Wall sliding*: the robot touches a part and moves faster than `_SLIDE_SPEED`, which is
+legitimate while roaming and a flaw of the rules in an episode. *Gap*: a vertex of the visual mesh is inside the robot's
+body without a contact. A *false success* is an episode that reached its goal after any of these events.
 """
 
 import time
@@ -35,9 +34,9 @@ EVENTS = ("tunnelling", "climbing", "wall_sliding", "gap")
 _TUNNEL_DEPTH = 0.05  # [m]
 _CLIMB_HEIGHT = 0.08  # [m]
 _SLIDE_SPEED = 0.2  # [m/s]
-_BODY = ((-0.40, 0.40), (-0.22, 0.22), (0.02, 0.20))  # [m] x, y, z ranges in the base frame, inside its hulls
+_BODY = ((-0.40, 0.40), (-0.22, 0.22), (0.02, 0.20))  # [m] x, y, z in the base frame, inside its hulls
 _ROAM_WIDTH = 6.0  # [m] the robot roams at most this far from the route
-_ROAM_TIME = 20.0  # [s] between relocations of the robot
+_ROAM_TIME = 20.0  # [s] after which the robot is moved to a random pose
 _CONTROL_PERIOD = 0.1  # [s]
 _PUSH_STEPS, _BACK_STEPS = 60, 15  # control steps towards a part, and away from it
 
@@ -51,9 +50,9 @@ class Findings:
     episodes: Counter = field(default_factory=Counter)
     """Number of episodes by cause of termination."""
     touching: int = 0
-    """Control steps with a contact."""
+    """Number of control steps with a contact."""
     events: Counter = field(default_factory=Counter)
-    """Control steps with an event, by the name of the event; those of episodes have the prefix `episode_`."""
+    """Number of control steps with an event, by its name; in episodes the name has the prefix `episode_`."""
     places: dict[str, list[list[float]]] = field(default_factory=dict)
     """x, y [m] of the first 20 occurrences of each event."""
     false_successes: int = 0
@@ -218,7 +217,7 @@ def _roam(
 
 
 class _Wanderer:
-    """Commands from a random walk of speed and yaw rate."""
+    """Commands a random walk of speed and yaw rate."""
 
     def __init__(self, rng: np.random.Generator, reverse: bool = False) -> None:
         self._rng, self._lowest, self._v, self._yaw_rate = rng, -1.0 if reverse else 0.0, 0.5, 0.0
@@ -264,7 +263,7 @@ class _Rammer:
 
 
 def _toward(pose: Array, target: Array) -> tuple[float, float]:
-    """Command at full speed towards a point, turning on the spot if it is far to the side."""
+    """Command at full speed towards a point; a turn on the spot if the point is more than 1 rad aside."""
     x, y = target - pose[:2]
     error = float(heading_error(np.arctan2(y, x), pose[2]))
     return (1.0 if abs(error) < 1.0 else 0.0), float(np.clip(2.0 * error, -1.0, 1.0))

@@ -4,11 +4,11 @@
 
 SCENE is a generated place (`twin reality film`). For each film, FOLDER/bags gets a ROS 2 bag with the film's pictures
 (raw, so that both builds read the same pixels) and their camera_info. The bag also contains other data that a robot
-records, made from the true poses: odometry that is 2 % too long and drifts by a degree per meter, GPS fixes whose error
-is a random walk with a standard deviation of 1 m, and /tf_static. Both scenes get their scale from the camera's height.
-Then the bags' scene gets its scale from odometry, and then from GPS. Prints the figures of both builds, and the error
-of each scale.
-With --again, the scene is built from the films twice, which shows how much two builds from the same input differ.
+records, made from the true poses: odometry whose lengths are 2 % too long and whose heading drifts by 1° per meter, GPS
+fixes whose error is a random walk with a standard deviation of 1 m, and /tf_static. Both scenes get their scale from
+the camera's height. Then the bags' scene gets its scale from odometry, and then from GPS. Prints the figures of both
+builds, and the error of each scale. With --again, the scene is built from the films twice, which shows how much two
+builds from the same input differ.
 """
 
 import argparse
@@ -39,11 +39,11 @@ from twin.scene import SceneDir
 
 _START = 1_700_000_000 * 10**9  # [ns]
 _RATE = 20.0  # [Hz] of odometry
-_FIX_RATE = 5.0  # [Hz]
+_FIX_RATE = 5.0  # [Hz] of GPS fixes
 _LONG, _TURN = 1.02, np.radians(1.0)  # odometry: factor of lengths, drift of the heading [rad/m]
 _WANDER = 1.0  # [m] standard deviation of the fixes' error
 _AHEAD, _BASE = 0.36, 0.13  # [m] lens ahead of the base, base above the ground
-_EARTH = 6_378_137.0  # [m]
+_EARTH = 6_378_137.0  # [m] radius
 _QUICK = ("nerf.steps=400", "nerf.rays=2048", "nerf.max_width=240", "nerf.bake_steps=60", "nerf.max_bricks=2500")
 FIGURES = (
     ("capture", "frames"),
@@ -175,11 +175,11 @@ def figures(root: Path, report: dict[str, Any]) -> dict[str, Any]:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Builds a generated place from films and from bags made of them.")
     parser.add_argument("scene", type=Path, help="a folder written by `twin reality film`")
-    parser.add_argument("--work", type=Path, required=True, help="folder for bags and both scenes")
+    parser.add_argument("--work", type=Path, required=True, help="folder for the bags and the scenes")
     parser.add_argument("--films", nargs="+", metavar="NAME", help="default: all")
-    parser.add_argument("--again", action="store_true", help="build the films twice")
+    parser.add_argument("--again", action="store_true", help="build the scene from the films twice")
     parser.add_argument("--until", choices=("metric", "mjcf"), default="mjcf", help="last stage (default %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="a small field, for the tiny place")
+    parser.add_argument("--quick", action="store_true", help="train a small field, enough for a tiny place")
     add_record_options(parser)
     options = parser.parse_args()
     truth = Truth.load(options.scene / "truth")

@@ -47,7 +47,7 @@ class Chromium:
     def __init__(self, size: tuple[int, int] = (1280, 720)) -> None:
         """`size`: width, height [px] of the page."""
         program = find_chromium()
-        assert program, "no chromium; ask `find_chromium` first"
+        assert program, "Chromium is not installed; call `find_chromium` first"
         self.errors: list[str] = []
         self.log: list[str] = []
         self._ids = itertools.count(1)
@@ -129,7 +129,9 @@ class Chromium:
             value = self.evaluate(condition) if isinstance(condition, str) else condition()
             if value:
                 return value
-            assert time.monotonic() < end, f"not within {seconds:g} s: {condition}; {self.errors}"
+            assert time.monotonic() < end, (
+                f"still false after {seconds:g} s: {condition}; errors of the page: {self.errors}"
+            )
             time.sleep(0.05)
 
     def screenshot(self) -> bytes:
@@ -145,9 +147,9 @@ class Chromium:
             self.mouse(kind, x, y, button="left", buttons=1, clickCount=1)
 
     def click_on(self, kind: str, text: str) -> None:
-        """Clicks the first visible element that matches a CSS selector `kind` and has a text.
+        """Clicks the first visible element that matches the CSS selector `kind` and whose text is `text`.
 
-        The text of an empty element is that of its row in viser's panel.
+        An element without text counts as having the text of its row in viser's panel.
         """
         found = self.wait(
             f"""(() => {{

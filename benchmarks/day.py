@@ -1,12 +1,12 @@
-"""Appearance gap between the twin and another day, given a photo of the day, compared with weather randomization.
+"""Differences between the twin under the photo of a day and pictures of that day, compared with randomized weather.
 
     python benchmarks/day.py SCENE [--days NAME ...] [--policies RUN ...] [--json FILE] [--pictures FOLDER]
 
-The scene was built from the film of the known-truth world and has a lighting from one photo of each day
-(`benchmarks/table1`, step `photos`). From eight other stations of the road, images of every day are compared with
-renderings from the same poses under the photo's appearance and fog. The figures are PSNR, and the change of the
-policies' steering divided by the change that randomized sun and shadows cause. *Lasting* change: rms over days of the
-mean over stations. *Local* change: rms of the deviations from this mean.
+The scene was built from films of the generated place (`twin reality`) and has a lighting fitted to one photo of each
+day (`benchmarks/table1`, step `photos`). From eight other stations of the road, images of every day are compared with
+renderings from the same poses under the photo's appearance and fog. The figures are PSNR, and for steering a ratio: the
+policies' change of steering from rendering to image, divided by the change that randomized sun and shadows cause.
+*Lasting* change: rms over days of the mean over stations. *Local* change: rms of the deviations from this mean.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from twin.reality.truth import Truth
 from twin.runtime import track
 
 STATIONS = (4.0, 10.0, 17.0, 24.0, 31.0, 37.0, 42.0, 48.0, 54.0)  # [m]; the lightings come from photos at the first one
-STRAIGHT = 4  # number of stations on the straight segment
+STRAIGHT = 4  # number of stations on the straight segment, the photo's included
 SIZE = (160, 90)
 DRAWS = 8  # weather samples per day
 RESAMPLED = 500  # bootstrap samples for 90 % intervals
@@ -91,10 +91,10 @@ def main() -> int:
     parser.add_argument(
         "--days", nargs="+", choices=WEATHER, default=list(WEATHER), metavar="NAME", help="default: all"
     )
-    parser.add_argument("--policies", nargs="*", default=[], help="runs of the scene, named after their task")
+    parser.add_argument("--policies", nargs="*", default=[], help="runs of the scene; names begin with the task")
     add_record_options(parser)
     parser.add_argument(
-        "--pictures", type=Path, help="folder for images: the day, the twin, the twin with randomised weather"
+        "--pictures", type=Path, help="folder for images: the day, the twin, the twin with randomized weather"
     )
     given = parser.parse_args()
     twin = load_scene(given.scene)
@@ -147,7 +147,7 @@ def main() -> int:
     responses: dict[float, list[NDArray]] = {scale: [] for scale in SCALES}
     for source in track(given.policies, "policies", unit="policy"):
         policy = load_policy(str(find_policy(given.scene, source)), False)
-        places = slice(1, STRAIGHT if Path(source).name.startswith("straight") else None)  # photos show station 0
+        places = slice(1, STRAIGHT if Path(source).name.startswith("straight") else None)  # 0 is the photo's station
         before = steering(policy, fogged[:, places])
         gaps.append(steering(policy, truth[:, places]) - before)
         for scale, many in pictures.items():

@@ -4,8 +4,8 @@
 
 Pictures of 1280×720 px arrive as JPEG or BGRA from a camera with distortion; each is decoded, rectified, scaled,
 stacked and given to the policy. Latency is the time from a picture's arrival to its command, on one core that no other
-program should use meanwhile. Without --policy, measures policies that have the sizes of `twin train`'s presets and
-random weights.
+program should use meanwhile. Without --policy, the benchmark measures policies with random weights and the sizes of
+`twin train`'s presets.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from twin_policy import Camera, CompressedPicture, Limits, OnnxPolicy, Pilot, Ra
 TARGETS = {"pictures_per_s": ("≥", 50.0), "latency_median_ms": ("≤", 15.0)}
 _LENS = Camera((1280, 720), (533.1, 533.4, 641.2, 355.8), "plumb_bob", (-0.045, 0.012, 0.0004, -0.0003, -0.005))
 _KINDS = ("jpeg", "bgra8")
-_STEP = 100_000_000  # [ns]
+_STEP = 100_000_000  # [ns] between pictures
 
 
 def picture() -> np.ndarray:
@@ -77,7 +77,7 @@ def measure(policy: OnnxPolicy, kind: str, count: int) -> dict[str, Any]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policy", type=Path, help="policy folder")
-    parser.add_argument("--count", type=int, default=1000, help="pictures of each kind")
+    parser.add_argument("--count", type=int, default=1000, help="number of pictures of each kind")
     add_record_options(parser)
     options = parser.parse_args()
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

@@ -4,7 +4,7 @@
 
 Prints a table; `env_sections.py` defines each figure. The robot drives the tasks `straight` and `right_turn`, or the
 whole route in a scene that has neither. Speeds are for 160×90 images, 10 Hz control and 2 ms physics; each is the best
-of several short runs in a separate process that is bound to the stated number of cores.
+of one to eight short runs in a separate process that is bound to the stated number of cores.
 """
 
 import argparse

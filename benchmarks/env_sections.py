@@ -38,13 +38,14 @@ def worker(*arguments: str | Path | int, cores: int = 1) -> dict[str, Any]:
 
 
 def speed(scene: Path, quick: bool) -> dict[str, Any]:
-    """Environment steps per second with pixels and one obstacle in view: one environment on one core, eight on two.
+    """Environment steps per second with pixels and one obstacle in view: one environment on one core, 8 or 64 on two.
 
-    `ratio_to_software_gl`: speed of one environment over that of the same environment with `mujoco.Renderer` images of
-    the extracted mesh in software OpenGL (Mesa through EGL); both alternate in one process. `ratio_to_one_process`:
-    speed of a vector env in two processes over that of one in a single process with two threads; their runs alternate.
+    `ratio_to_software_gl`: speed of one environment divided by that of the same environment with `mujoco.Renderer`
+    images of the extracted mesh in software OpenGL (Mesa through EGL); both alternate in one process.
+    `ratio_to_one_process`: speed of a vector env in two processes divided by that of a vector env in one process with
+    two threads; their runs alternate.
     `cpu_ms_per_step`: processor time, which depends less than wall time on other load of the machine.
-    `load_s`: `twin.load` and the first reset with cached kernels.
+    `load_s`: time of `twin.load` and the first reset with cached kernels.
     """
     runs = 1 if quick else 4
     out = worker("single", scene, runs)
@@ -61,7 +62,7 @@ def memory(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def driver(scene: Path, quick: bool) -> dict[str, Any]:
-    """Success rate of the scripted driver and of the blind one, without obstacles, by task.
+    """Success rates of the scripted driver and of one that drives straight on (`blind`), without obstacles, by task.
 
     Each rate is over `driver.n` episodes with seeds 0, 1, ...; in `driver.random_robot` the robot is sampled from the
     default ranges of domain randomization.
@@ -104,7 +105,7 @@ def audit(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def soak(scene: Path, quick: bool) -> dict[str, Any]:
-    """Endurance: NaNs and memory growth over random steps with pixels, with everything randomized per episode."""
+    """Endurance: non-finite values and memory growth over random steps, with everything randomized per episode."""
     return worker("soak", scene, 400 if quick else 100_000, cores=2)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-_STEPS = 60  # per timed run
+_STEPS = 60  # environment steps per timed run
 
 
 def standard_tasks(scene: Path) -> list[str]:
@@ -162,12 +162,12 @@ def memory(scene: Path, count: int) -> dict[str, Any]:
     envs.begin([0])
     envs.close()
     peaks = [resource.getrusage(who).ru_maxrss * 1024 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    # ru_maxrss of the children is that of the largest one; the others have about the same.
+    # ru_maxrss of the children is that of the largest child; the other children use about as much memory.
     return {f"worlds{count}.bytes": peaks[0] + peaks[1] * getattr(envs, "processes", 0)}
 
 
 def soak(scene: Path, steps: int) -> dict[str, Any]:
-    """Non-finite states and memory growth over random steps of eight environments."""
+    """Non-finite values and memory growth over random steps of eight environments."""
     import psutil
 
     from twin.env.suite import EnvFactory
@@ -209,7 +209,7 @@ def gpu(scene: Path, count: int) -> dict[str, Any]:
     envs.begin(range(count))
     begin, steps = 0.0, 30
     for k in range(steps + 3):
-        if k == 3:  # kernels are compiled and the graph is captured
+        if k == 3:  # by now, kernels are compiled and the CUDA graph is captured
             warp.synchronize()
             begin = time.perf_counter()
         envs.step(_ahead(envs))

@@ -1,6 +1,6 @@
 """Benchmark of exported files against the film: PSNR of their ray-cast images at held-out frames.
 
-    python benchmarks/exports.py --scene scenes/demo --only mesh      # the .glb, against colors per vertex
+    python benchmarks/exports.py --scene scenes/demo --only mesh      # the .glb's texture, against colors per vertex
     python benchmarks/exports.py --scene scenes/demo --only splats    # the .ply in MuJoCo Warp's splat renderer
 
 `mesh` scores only pixels that show the mesh. The textured mesh and the one with colors per vertex have the same
@@ -103,7 +103,7 @@ def score_mesh(twin: Twin, lighting: str, size: tuple[int, int]) -> None:
     content = gltf.textured_glb(vertices, faces, fine)
     seconds = time.perf_counter() - start
     read = trimesh.load(io.BytesIO(content), file_type="glb", process=False).to_geometry()
-    read.vertices = read.vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]  # y up to z up
+    read.vertices = read.vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]  # glTF has y up, the scene z
     texture = read.visual.material.baseColorTexture
     print(f"{lighting}: texture {texture.size[0]}×{texture.size[1]}, {len(content) / 1e6:.1f} MB, {seconds:.0f} s")
     drawings = {"colors per vertex": MeshDrawing(plain), "texture": MeshDrawing(read)}
@@ -140,7 +140,7 @@ def score_splats(twin: Twin, lighting: str, size: tuple[int, int], frames: int) 
     spec = mujoco.MjSpec()
     spec.worldbody.add_camera(name="eye")
     spec.worldbody.add_geom(size=[0.01] * 3, pos=[0, 0, -1000])
-    spec.stat.extent = 20.0  # draws up to 1 km, as far as the scene does
+    spec.stat.extent = 20.0  # so MuJoCo draws up to 1 km, as in the scene
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -162,7 +162,7 @@ def score_splats(twin: Twin, lighting: str, size: tuple[int, int], frames: int) 
     for name, values in scores.items():
         print(
             f"{lighting}: {name}: {np.mean(values):.2f} dB over {len(values)} held-out frames of {size[0]}×{size[1]}, "
-            f"{np.median(seconds[name]):.2f} s of a core each"
+            f"{np.median(seconds[name]):.2f} s of processor time each"
         )
 
 

@@ -76,7 +76,12 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
     add_record_options(parser)
     parser.add_argument(
-        "--budgets", nargs="+", type=int, default=[60, 300, 1200], metavar="S", help="training times of the fox [s]"
+        "--budgets",
+        nargs="+",
+        type=int,
+        default=[60, 300, 1200],
+        metavar="S",
+        help="training times of section `fox` [s]",
     )
     parser.add_argument("--quick", action="store_true", help="tiny settings that only test the script")
     options = parser.parse_args()

@@ -19,7 +19,7 @@ from twin.nerf import buffers
 from twin.scene import SceneDir
 
 _MARGIN = 0.05  # fraction of a budget kept for errors of the predicted pace
-_PROBE_STEPS = 150
+_PROBE_STEPS = 150  # training steps that measure the pace
 _NEAR = 10.0  # [m] depth errors are evaluated up to this depth
 
 Figures = dict[str, Any]
@@ -40,7 +40,7 @@ class Pace:
 def timed_fit(
     cameras: Cameras, points: SparsePoints, config: NerfConfig, steps: int, device: str = "cpu"
 ) -> tuple[Any, float, Pace]:
-    """The field after this many steps, the wall time of the call [s], and its pace."""
+    """Trains a field for `steps` steps; returns the field, the wall time [s] and the pace."""
     from twin.nerf.trainer import train_field
 
     began = time.perf_counter()
@@ -52,7 +52,7 @@ def timed_fit(
 def fox(bench: Bench) -> Figures:
     """Training within budgets on the fox capture.
 
-    The poses are the given ones, every 8th image of 270×480 px is held out, and settings are the defaults.
+    Poses are those of the capture, every 8th image (270×480 px) is held out, and settings are the defaults.
     """
     cameras, points = _fox_scene(bench)
     config = replace(NerfConfig(), max_width=bench.pick(NerfConfig().max_width, 96))
@@ -195,7 +195,7 @@ def _first_frame(bench: Bench, place: Path, views: Path) -> Figures:
 
 
 def depth(bench: Bench) -> Figures:
-    """Error of rendered depth against the known truth up to 10 m, at the true cameras."""
+    """Error of rendered depth against the known truth up to 10 m, at the true camera poses."""
     from twin.reality.comparison import align_rigid, depth_errors, matched_poses
     from twin.reality.truth import Truth
 
@@ -214,7 +214,7 @@ def depth(bench: Bench) -> Figures:
 
 
 def train(bench: Bench) -> Figures:
-    """Peak memory of training on 200 frames of the scene, in their size in training, in a separate process."""
+    """Peak memory of a separate process that trains on 200 frames of the scene, at the size used in training."""
     row = worker("memory", bench.scene, bench.pick(200, 12), bench.pick(60, 3))
     size = "{:.0f}x{:.0f}".format(*row["size"])
     return {"train.peak_bytes": row["peak_bytes"], "train.frames": row["frames"], "train.frame_size": size}

@@ -136,7 +136,7 @@ def first(place: str, views: str) -> dict[str, Any]:
 
 
 def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
-    """Peak resident memory of training on this many frames; the scene's frames repeat if there are too few."""
+    """Peak resident memory of training on `count` frames; the scene's frames repeat if there are fewer."""
     from dataclasses import replace
 
     import numpy as np

@@ -1,12 +1,12 @@
-"""Fuzzer: every reader and every verb must accept hostile input, or refuse it with a message of one line.
+"""Fuzzer: every reader of files and every verb (`twin VERB`) must accept hostile input, or refuse it in one line.
 
     python benchmarks/fuzz.py --cases 50000 --seed 1 [--only TARGET] [--case K] [--command-line 60]
 
 A case depends on (seed, target, number) alone, so `--only TARGET --case K` repeats it. `fuzzing/cases.py` defines when
-a case passes; `fuzzing/targets.py` lists the targets. Cases run in one child process at a time. If the process
-dies, the case counts as a failure, and a new process runs the remaining cases.
+a case passes; `fuzzing/targets.py` lists the targets. Cases run in a child process. If it dies, the case counts as a
+failure, and a new child runs the remaining cases.
 
-Prints a table, then every failure; the exit status is 1 if there are any.
+Prints a table, then every failure; the exit status is 1 if a case failed.
 """
 
 import argparse
@@ -46,8 +46,8 @@ from fuzzing.cases import (
 _HERE = Path(__file__).resolve().parent
 _ROOT = _HERE.parent
 _MAX_DATA = 8 << 30  # [bytes] limit of the child's data segment, so that no case uses up the memory
-_START_SECONDS = 600.0  # time limit for the child to make its samples
-_WARM_UP_SECONDS = 10.0
+_START_SECONDS = 600.0  # time limit for the child to write its valid samples
+_WARM_UP_SECONDS = 10.0  # time limit of a target's first call, which is not a case
 
 
 @dataclass
@@ -251,11 +251,11 @@ def table(rows: dict[str, Row]) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Fuzzes every reader and every verb with hostile input.")
-    parser.add_argument("--cases", type=int, default=50_000, help="total of all targets (default %(default)s)")
+    parser.add_argument("--cases", type=int, default=50_000, help="number of cases (default %(default)s)")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", metavar="TARGET", help="one target")
-    parser.add_argument("--case", type=int, metavar="K", help="one case of that target")
-    parser.add_argument("--command-line", type=int, default=0, metavar="N", help="further cases on the command line")
+    parser.add_argument("--only", metavar="TARGET", help="run only this target")
+    parser.add_argument("--case", type=int, metavar="K", help="run only case K of that target")
+    parser.add_argument("--command-line", type=int, default=0, metavar="N", help="further cases, run as commands")
     parser.add_argument(
         "--limit", type=float, default=MAX_SECONDS, help="time limit of a case [s] (default %(default)g)"
     )

@@ -2,9 +2,9 @@
 
     python benchmarks/husky.py [--scene BUILT_SCENE] [--only A1 B6 ...] [--json FILE]
 
-With `--scene`, also measures chi (the track ratio) of the scene's robot on the scene's ground, and the simulation speed
-there. A run takes 40 s on the machine in `docs/benchmarks.md`. The exit status is 1 if a row fails or a negative
-control passes.
+With `--scene`, the script also measures chi (the track ratio) of the scene's robot on the scene's ground, and the
+simulation speed there. A run takes 40 s on the machine in `docs/benchmarks.md`. The exit status is 1 if a row fails or
+a negative control passes.
 """
 
 import argparse

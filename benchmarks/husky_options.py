@@ -1,11 +1,11 @@
-"""Effects of scene options that do not suit the Husky's tires, see `twin.mjcf.husky.check`.
+"""Effects of a scene's options on the Husky's tires, and whether `twin.mjcf.husky.check` reports them.
 
     python benchmarks/husky_options.py [--json FILE]
 
 The robot turns on the spot at a commanded 1 rad/s, on a plane and on a flat road as the mesh stage reconstructs it.
 Prints yaw rate and motor torque, divided by those with the right options on the plane; motor power divided by the power
 that the contacts dissipate (1 if energy is conserved); vertical acceleration at the camera (jolt); and the speed of the
-robot when parked on a slope (creep). Takes a minute.
+robot when parked on a slope (creep). A run takes a minute.
 """
 
 import argparse
@@ -102,12 +102,12 @@ class Cost:
     ground_jolt: float
     """Vertical acceleration at the camera on that road [m/s²]."""
     creep: float
-    """Speed after 2 s of the robot parked on a slope that is 2° less steep than the one on which it slides [mm/s]."""
+    """Speed [mm/s] 2 s after the robot is parked on a slope that is 2° less steep than the one on which it slides."""
     faults: int
     """Number of options that `check` reports as wrong."""
 
     def differs(self, right: "Cost") -> bool:
-        """True if yaw rate differs by 2 % or torque by 5 % from the right options, or if jolt or creep is large."""
+        """True if yaw rate differs by 2 % or torque by 5 % from `right`, or if jolt or creep is large."""
         turns = abs(self.yaw_rate / right.yaw_rate - 1) < 0.02 and abs(self.ground_yaw_rate / right.yaw_rate - 1) < 0.02
         quiet = self.jolt < 0.2 and self.ground_jolt < 1.0
         return not (turns and quiet and abs(self.torque / right.torque - 1) < 0.05 and self.creep < 5.0)

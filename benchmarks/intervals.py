@@ -7,9 +7,10 @@ p succeeds on day d at the rate
 
     road: logit = s (q_p + day_d + cell_pd)            twin: the same with a sharpness, bias and noise of its own
 
-where q_p is a setup's mean plus the effects of place, training and checkpoint. Day and cell effects are correlated
-between twin and road: a low sun, for example, makes both harder. With a large sharpness s, a policy succeeds in all
-trials of a day or in none, as in 706 of the 720 cells of Table 1. The kind `recorded` is fitted to Table 1.
+where q_p is a setup's mean plus the effects of place, training and checkpoint, and a *cell* is a policy on a day. Day
+and cell effects are correlated between twin and road: a low sun, for example, makes both harder. With a large sharpness
+s, a policy succeeds in all trials of a day or in none, as in 706 of the 720 cells of Table 1. The kind `recorded` is
+fitted to Table 1.
 
 An interval must contain its *estimand* in 90 % of the worlds. The estimands are:
 
@@ -25,9 +26,9 @@ An interval must contain its *estimand* in 90 % of the worlds. The estimands are
 - predicted: the observed real rate of a policy, predicted from its rate in the twin and from the other trainings.
 
 Prints coverage; a dash means that a forecast of that shape has no such interval. A world without an interval does not
-count: a forecast would print none, because its units do not determine one. *refused* is the largest fraction of such
-worlds over the agreement statistics. In shapes of more than ten policies, rates are estimated in a quarter of the
-worlds. The seed is fixed. Takes ten minutes on one core.
+count: a forecast would print none, because its trainings and days do not determine one. *refused* is the largest
+fraction of such worlds over the agreement statistics. In shapes of more than ten policies, rates are estimated in a
+quarter of the worlds. The seed is fixed. A run takes ten minutes on one core.
 """
 
 import argparse
@@ -56,9 +57,9 @@ sys.path.append(str(Path(__file__).parent))
 from record import add_record_options, save
 
 WORLDS = 1000
-_MEAN_OVER = 6000  # worlds that estimate the mean of a statistic
-_BATCH = 250
-_RATE_WORLDS = 250  # worlds of `WORLDS` in which rates are estimated, for more policies than `_USERS_POLICIES`
+_MEAN_OVER = 6000  # worlds from which the mean of a statistic is estimated
+_BATCH = 250  # worlds simulated together
+_RATE_WORLDS = 250  # of `WORLDS`, in which rates are estimated for more than `_USERS_POLICIES` policies
 _USERS_POLICIES = 10
 _QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)
 
@@ -69,7 +70,7 @@ class Shape:
 
     places: int
     setups: int
-    """Setups per place; 0: each training has a setup drawn at random."""
+    """Setups per place; 0: the setup of each training is random."""
     trainings: int
     """Trainings per place."""
     checkpoints: int
@@ -92,7 +93,7 @@ class Kind:
     training: float
     place: float
     checkpoint: float
-    """Mean difference in quality between the last and the first checkpoint; its standard deviation is a third of it."""
+    """Mean difference in quality between last and first checkpoint; the standard deviation is a third of the mean."""
     day: float
     cell: float
     shared: float
@@ -123,7 +124,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Worlds:
-    """Simulated worlds, shapes (worlds, places, policies, days)."""
+    """Simulated worlds; `twin` and `real` have the shape (worlds, places, policies, days)."""
 
     kind: Kind
     shape: Shape
@@ -367,7 +368,7 @@ def _predicted(worlds: Worlds) -> Hits:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, default=WORLDS)
-    parser.add_argument("--shapes", nargs="+", default=[], help="beginnings of the names of shapes; none: all")
+    parser.add_argument("--shapes", nargs="+", default=[], help="beginnings of the names of shapes (default: all)")
     add_record_options(parser)
     given = parser.parse_args()
     shapes = {k: v for k, v in SHAPES.items() if not given.shapes or k.startswith(tuple(given.shapes))}

@@ -28,7 +28,7 @@ _MAX_VARIATION = 0.06  # [m/s] speed range of a steady side; the encoders resolv
 _MIN_SPEED = 0.1  # [m/s]
 _MAX_STRAIGHT, _MIN_TURNING = 0.04, 0.08  # [m/s] largest and smallest speed difference of the sides
 _MIN_SAMPLES = 30  # steady samples of each kind
-_MAX_SIMULATED = 150  # turning samples simulated
+_MAX_SIMULATED = 150  # turning samples simulated; at most twice this number
 
 
 @dataclass(frozen=True)

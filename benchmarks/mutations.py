@@ -2,8 +2,9 @@
 
     python benchmarks/mutations.py [--only WORDS]
 
-A mutation changes one line in a copy of the last commit. It is *red* if a test fails. The exit status is 1 if a
-mutation is not red, or if its line does not occur exactly once in the file; the list of mutations must then be updated.
+A mutation changes one line in a copy of the last commit. A mutation is *red* if a test then fails. The exit status is 1
+if a mutation is not red, or if its line does not occur exactly once in the file; the list of mutations must then be
+updated.
 """
 
 import argparse
@@ -110,7 +111,7 @@ MUTATIONS = (
         _REAL,
     ),
     Mutation(
-        "no drawn day is hazy",
+        "no sampled day is hazy",
         "twin/reality/lighting.py",
         "hazy, wet = rng.uniform() < 0.4,",
         "hazy, wet = rng.uniform() < 0.0,",
@@ -124,7 +125,7 @@ def is_red(mutation: Mutation, root: Path) -> bool:
     path = root / mutation.path
     text = path.read_text(encoding="utf-8")
     if text.count(mutation.line) != 1:
-        print(f"{mutation.path}: {mutation.line!r} is there {text.count(mutation.line)} times; expected once")
+        print(f"{mutation.path}: {mutation.line!r} occurs {text.count(mutation.line)} times; expected once")
         return False
     path.write_text(text.replace(mutation.line, mutation.broken), encoding="utf-8")
     files = [f"tests/test_{name}.py" for name in mutation.tests]
@@ -143,7 +144,7 @@ def is_red(mutation: Mutation, root: Path) -> bool:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="", metavar="WORDS", help="mutations with these words in their names")
+    parser.add_argument("--only", default="", metavar="WORDS", help="run mutations whose names contain WORDS")
     options = parser.parse_args()
     chosen = [one for one in MUTATIONS if options.only in one.name]
     with tempfile.TemporaryDirectory() as folder:

@@ -6,8 +6,9 @@ published ones; the weights are random, as only time is measured. The code follo
 every sample passes through every network on concatenated inputs, as in nerfstudio's torch implementation.
 `nerfacto_tuned.py` renders the same image with optimized torch code.
 
-Shapes: r rays, s samples on each, s + 1 *edges* that bound them. *Spacing* is the coordinate in [0, 1] along a ray;
-it is uniform in distance up to one unit, and in inverse distance beyond.
+Shapes: r rays, s samples on each, s + 1 *edges* that bound the samples. The *near box* is [-1, 1]³, where space is not
+contracted; half its side is the unit of length. *Spacing* is a coordinate in [0, 1] along a ray: uniform in distance up
+to one unit, and in inverse distance beyond.
 """
 
 import itertools
@@ -25,7 +26,7 @@ _PROPOSAL_FINEST = (128, 256)
 _PROPOSAL_LEVELS, _PROPOSAL_LOG2, _PROPOSAL_HIDDEN = 5, 17, 16
 _LEVELS, _LOG2, _FINEST, _HIDDEN = 16, 19, 2048, 64
 _COARSEST = 16
-FEATURES = 2  # per level
+FEATURES = 2  # per level of a hash grid
 GEOMETRY, _APPEARANCE, HARMONICS = 15, 32, 16
 NEAR, FAR = 0.05, 1000.0  # [half sides of the near box]
 _PADDING = 0.01  # added to every weight before resampling, so that no interval has probability zero

@@ -18,7 +18,7 @@ _PRIMES = (1, 2654435761 - 2**32, 805459861)  # as signed 32-bit numbers; only t
 
 
 def tuned(proposals: tuple[Proposal, ...], field: Field) -> Nerfacto:
-    """The renderer; call `frame` with `CHUNK`."""
+    """The optimized renderer; call its method `frame` with `CHUNK`."""
     return Nerfacto(tuple(TunedProposal(proposal) for proposal in proposals), TunedField(field))
 
 

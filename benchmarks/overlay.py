@@ -1,12 +1,12 @@
-"""Benchmark of the compositor: obstacles in the twin against the same ones in the true world.
+"""Benchmark of the compositor: obstacles in the twin against the same obstacles in the true world.
 
     python benchmarks/overlay.py --scene BUILT_SCENE_WITH_TRUTH [--json FILE] [--pictures FOLDER]
 
 The scene was filmed without obstacles. At several places along the route, each obstacle is composited into the twin and
-rendered in the known-truth world, in the same colors. Both are rendered from the same pose of the robot's front camera
-at 160×90, with the film's camera response and without noise. *Obstacle pixels* are those that show the obstacle in the
-truth. *Unshaded* is the composite with plain colors, without shading. A drive along the route also
-compares the visual with the collision geometry, see `twin/report/visual_vs_collision.py`.
+rendered in the true world (the generated place that was filmed), in the same colors. Both are rendered from the same
+pose of the robot's front camera at 160×90, with the film's camera response and without noise. PSNR is over the pixels
+that show the obstacle in the truth. *Unshaded* is the composite with plain colors, without shading. The visual and the
+collision geometry are also compared, along a drive on the route, see `twin/report/visual_vs_collision.py`.
 """
 
 import argparse
@@ -39,7 +39,7 @@ from twin.reality.truth import Truth
 
 SIZE = (160, 90)
 KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")
-PLACES = tuple(  # station, lateral [m], yaw [°], distance [m] from the camera to the obstacle
+PLACES = tuple(  # station, lateral [m], yaw [°], distance [m] from the robot along the route
     (float(s), lateral, yaw, ahead)
     for s, lateral, yaw, ahead in (
         *((7.0, 0.3, 20.0, 3.0), (13.0, -0.7, -70.0, 5.0), (19.0, 0.9, 130.0, 4.0), (25.0, 0.0, 0.0, 6.5)),
@@ -59,7 +59,7 @@ TARGETS = {
 
 
 class TrueWorld:
-    """The known-truth world under one lighting, with one movable obstacle of every kind."""
+    """The true world under one lighting, with one movable obstacle of every kind."""
 
     def __init__(self, truth: Truth, lighting: str, intrinsics: np.ndarray) -> None:
         spec = reality.world_spec(lighting, truth.place)

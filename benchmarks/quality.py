@@ -1,4 +1,4 @@
-"""Picture quality against time: held-out scores of a scene's field at each `nerf.quality`.
+"""Picture quality against training time: held-out scores of a scene's field at each `nerf.quality`.
 
     python benchmarks/quality.py SCENE [--qualities draft standard high] [--json FILE] [--picture docs/quality.png]
 
@@ -46,7 +46,7 @@ def draw(figures: dict[str, dict[str, Any]], path: Path) -> None:
     for column, marker, label in (
         ("psnr_small_lower", "s", "at 160×90, lower half"),
         ("psnr_small", "o", "at 160×90"),
-        ("psnr", "^", "at the size of training"),
+        ("psnr", "^", "at the training resolution"),
     ):
         axes.plot(minutes, [row[column] for row in figures.values()], marker=marker, label=label)
     top = [row["psnr_small_lower"] for row in figures.values()]
@@ -63,7 +63,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--qualities", nargs="+", choices=tuple(QUALITIES), default=list(QUALITIES))
-    parser.add_argument("--picture", type=Path, help="plot to write")
+    parser.add_argument("--picture", type=Path, help="write the plot to this file")
     add_record_options(parser)
     options = parser.parse_args()
     figures: dict[str, dict[str, Any]] = {}

@@ -1,4 +1,4 @@
-"""Benchmark of the real test: speed of its rasterizer, difference from the film's renderer, and errors of a route.
+"""Benchmark of the simulated real test: speed of its rasterizer, difference from the film's renderer, error of a route.
 
     python benchmarks/reality.py [--scene BUILT_SCENE_WITH_TRUTH] [--json FILE] [--pictures FOLDER]
     python benchmarks/reality.py --sheet docs/places.jpg
@@ -69,7 +69,7 @@ def pictures(folder: Path | None) -> Iterator[tuple[str, float]]:
 
 
 def places_of_tasks(scene: Path) -> Iterator[tuple[str, float]]:
-    """Names and values: distances of a built scene's route from the true route, and the station where it begins."""
+    """Names and values: distances of a built route from the true route, and the true station where it begins [m]."""
     twin = load_scene(scene)
     truth = Truth.load(twin.scene.truth)
     cameras = Cameras.load(twin.scene.stage("metric"))
@@ -104,8 +104,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, help="a built scene with truth")
     add_record_options(parser)
-    parser.add_argument("--pictures", type=Path, help="folder for pictures: rasterised, film, difference")
-    parser.add_argument("--sheet", type=Path, help="picture of the places 1 to 30 to write, and nothing else")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures: rasterized, film, difference")
+    parser.add_argument("--sheet", type=Path, help="only write a picture of the places 1 to 30 to this file")
     options = parser.parse_args()
     if options.sheet:
         contact_sheet(options.sheet)

@@ -102,9 +102,9 @@ def kills(times: int, folder: Path, only: str | None = None, seed: int = 0) -> d
     """Kills builds, trainings and validations at random times, resumes them, and compares them with undisturbed ones.
 
     Args:
-        times: Number of kills of each verb.
+        times: Number of kills of each command.
         folder: Folder for the scenes.
-        only: "build", "train" or "validate" kills only this verb; None kills all three.
+        only: "build", "train" or "validate" kills only this command; None kills all three.
         seed: Seed of the kill times.
     """
     each = {"build": _killed_builds, "train": _killed_trainings, "validate": _killed_validations}
@@ -140,7 +140,7 @@ def _killed_after(command: list[str], seconds: float) -> bool:
 
 
 def _leftovers(root: Path) -> list[str]:
-    """Temporary files, which a finished verb must have removed."""
+    """Temporary files, which a finished command must have removed."""
     names = [path for path in root.rglob("*") if ".partial" in path.name or path.name.endswith((".lock", ".old"))]
     return [str(path.relative_to(root)) for path in names]
 
@@ -176,7 +176,7 @@ def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[s
     subprocess.run(_build_command(root), cwd=_ROOT, check=True)
     wanted, longest = _results(root, stages), max(_seconds(root).values())
     killed = finished = different = 0
-    sfm_until = times // 5  # a fifth of the kills hit a build from scratch
+    sfm_until = times // 5  # the first fifth of the kills hits builds from scratch
     while killed < times:
         from_start = killed < sfm_until
         for name in list(STAGES)[0 if from_start else 3 :]:
@@ -217,7 +217,7 @@ train(twin.load_scene(sys.argv[1]), Path(sys.argv[2]), small)
 
 
 def _killed_trainings(times: int, folder: Path, rng: np.random.Generator) -> dict[str, Any]:
-    """Kills trainings. Each resumes from its last save, so the kills hit all parts of a training."""
+    """Kills trainings. A killed training resumes from its last save, so the kills hit all parts of a training."""
     from tiny_twin import tiny_twin
 
     root = folder / "trained"
@@ -333,7 +333,7 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
 
 
 def fill(disk: Path, leave: int) -> Path:
-    """Writes a file that leaves this many bytes of a disk free."""
+    """Writes a file that leaves `leave` bytes of a disk free."""
     path = disk / "filling"
     facts = os.statvfs(disk)
     with path.open("wb") as file:
@@ -444,8 +444,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("test", choices=("endurance", "kills", "disk"))
     parser.add_argument("--steps", type=int, default=1_000_000, help="control steps of endurance (default %(default)s)")
-    parser.add_argument("--times", type=int, default=50, help="kills of each verb (default %(default)s)")
-    parser.add_argument("--only", choices=("build", "train", "validate"), help="a single verb to kill")
+    parser.add_argument("--times", type=int, default=50, help="kills of each command (default %(default)s)")
+    parser.add_argument("--only", choices=("build", "train", "validate"), help="kill only this command")
     parser.add_argument("--json", type=Path, help="write the results here")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:

@@ -4,9 +4,10 @@
 
 The number of a filming seeds it. Numbers 1 to 999 are for development; those from 1,000 on are for reports, each used
 once. A filming is a set of camera poses along a random line, with errors like those of structure from motion, so no
-pictures are needed. Prints a row per filming: the kind, the route's largest distance from the filmed line, its largest
-step, its sharpest turn over 2 m, and its length divided by that of the longest path filmed without interruption. The
-exit status is 1 if a route is more than 0.3 m off the filmed line, has a step above 0.3 m, or turns by more than 120°.
+pictures are needed. Prints a row per filming: the kind, the route's largest distance from the filmed line, the largest
+step between its points, its sharpest turn over 2 m, and its length divided by that of the longest path filmed without
+interruption. The exit status is 1 if a route is more than 0.3 m off the filmed line, has a step above 0.3 m, or turns
+by more than 120°.
 """
 
 import argparse
@@ -38,7 +39,7 @@ KINDS = (
     "two_lightings_one_reversed",
     "jump_ahead",
 )
-_DENSE = 0.05  # [m]
+_DENSE = 0.05  # [m] between points of a line
 _MAX_OFF, _MAX_STEP, _MAX_TURN = 0.3, 0.3, 120.0  # [m], [m], [°]
 
 
@@ -51,7 +52,7 @@ class Filming:
     lines: tuple[Array, ...]
     """True lines (m, 2) [m]; those across a permitted gap are included."""
     longest: float
-    """Length of the longest path filmed without interruption [m], less turning maneuvers."""
+    """Length of the longest path filmed without interruption [m], without turning maneuvers."""
 
 
 def drawn_line(rng: np.random.Generator, length: float) -> Array:
@@ -151,7 +152,7 @@ def draw_filming(number: int) -> Filming:
 def _filmed(
     rng: np.random.Generator, kind: str, source: str, lighting: str, pieces: list[Array], spacing: float
 ) -> Cameras:
-    """Frames about `spacing` [m] apart along pieces of the way, with noise of position and heading."""
+    """Frames about `spacing` [m] apart along pieces of the way, with noise in position and heading."""
     xy, heading, times, now = list[Array](), list[float](), list[float](), 0.0
     frame_time = 0.5
     for piece in pieces:
@@ -198,7 +199,7 @@ def _filmed(
 
 
 def measure(filming: Filming) -> dict[str, float]:
-    """Distance from the filmed line [m], largest step [m], sharpest turn over 2 m [°], length / `longest`."""
+    """Largest distance from the filmed line [m], largest step [m], sharpest turn over 2 m [°], length / `longest`."""
     route = filmed_route(filming.cameras)
     line, film = route.line, np.concatenate(filming.lines)
     off = np.array([np.linalg.norm(film - point, axis=1).min() for point in line])

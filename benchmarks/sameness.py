@@ -4,8 +4,8 @@
 
 The tree of COMMIT films and builds a tiny scene. Both trees then open that build, drive the same episodes, train the
 same few steps, validate the trained policy, and rebuild field, mesh and scene from the same cameras. The digests of the
-results are compared; the exit status is 1 if any differs. The scripts use public names only, so they run before and
-after renames. Structure from motion is not compared, as it is not repeatable.
+results are compared; the exit status is 1 if any differs. Both trees run the same scripts, which use public names only,
+so that renaming private ones does not break them. Structure from motion is not compared, as it is not repeatable.
 """
 
 import argparse
@@ -138,7 +138,7 @@ def main() -> int:
     different = [name for name in was if now.get(name) != was[name]] + [name for name in now if name not in was]
     for name in different:
         print(f"differs: {name}")
-    print(f"{len(was) - sum(name in was for name in different)} of {len(was)} the same as {options.commit}")
+    print(f"{len(was) - sum(name in was for name in different)} of {len(was)} results equal those of {options.commit}")
     return int(bool(different))
 
 

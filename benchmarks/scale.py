@@ -1,9 +1,9 @@
-"""Coverage of the scale's stated uncertainty over simulated captures.
+"""Coverage of the stated uncertainty of the metric scale over simulated captures.
 
     python benchmarks/scale.py [--first 1] [--count 200]
 
 A capture is a simulated drive with known truth: the camera's height is measured with an error; the road has slope,
-crossfall, a crown and a kerb; structure from motion bends the path and scatters points. The number of a capture seeds
+crossfall, a crown and a curb; structure from motion bends the path and scatters points. The number of a capture seeds
 it: 1 to 999 are for development; those from 1,000 on are for reports, each used once. Prints how often the truth lies
 within one and two standard deviations, and the median error. The errors of structure from motion are simulated, so this
 does not replace tests with reconstructed captures.

@@ -1,12 +1,12 @@
-"""Gain of a sun in lightings of photos: one photo per day, compared with pictures of that day from there and elsewhere.
+"""Benchmark of suns fitted to photos: one photo per day, compared with pictures of the day from there and elsewhere.
 
     python benchmarks/sun.py SCENE [--place N] [--camera N] [--days N ...] [--json FILE] [--pictures FOLDER]
 
-The scene was built from the film of a generated place (`twin reality film`). For each day, by number, a lighting is
+The scene was built from films of a generated place (`twin reality film`). For each day, by number, a lighting is
 fitted to a photo from the start of the road as `twin relight` does, but at the true pose of the photo: without a sun
-(`embedding`), with the sun searched in the photo, and with the true sun. Printed are the nearest filmed lighting's PSNR
-of the photo, the PSNR of each half of the photo under the fit to the other half, and the mean PSNR of pictures of the
-day from other stations of the road [dB]. *Sunny* days are those on which the sun casts shadows.
+(`embedding`), with the sun searched in the photo, and with the true sun. Prints, in dB: the PSNR of the photo under the
+nearest filmed lighting, the PSNR of each half of the photo under the fit to the other half, and the mean PSNR of
+pictures of the day from other stations of the road. *Sunny* days are those on which the sun casts shadows.
 """
 
 import argparse

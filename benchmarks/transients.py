@@ -1,12 +1,12 @@
-"""Transients: what walkers, cars and objects that left cost a twin, against a film of the same place without them.
+"""Benchmark of transients: effect of walkers, cars and objects that left on a twin, against films without them.
 
     python -m twin.reality film --place N --out CLEAN && twin build CLEAN
     python -m twin.reality film --place N --traffic --out TRAFFIC && twin build TRAFFIC
     python benchmarks/transients.py CLEAN TRAFFIC [WITHOUT] [--json FILE]
 
-Both films have the same camera poses, exposure and noise. Every build is scored on its held-out frames as the clean
-film shows them: the static place alone. WITHOUT is an optional build of the same films with `nerf.transients = false`.
-A *ghost* is visual geometry above the true ground of the corridor, on a grid of 0.25 m.
+CLEAN and TRAFFIC are filmed with the same camera poses, exposure and noise. Every build is scored on its held-out
+frames as the clean films show them: the static place alone. WITHOUT is an optional build of TRAFFIC's films with
+`nerf.transients = false`. A *ghost* is visual geometry 0.1 to 2 m above the true ground of the corridor.
 """
 
 import argparse
@@ -66,7 +66,7 @@ def scores(scene: SceneDir, films: Path) -> dict[str, Any]:
 
 
 def ghosts(scene: SceneDir) -> dict[str, float]:
-    """Cells of the true corridor with visual geometry above its ground, their greatest height [m], and solid parts."""
+    """Number of cells of the true corridor with ghosts, greatest height of these [m], number of convex parts in it."""
     truth = Truth.load(scene.truth)
     cameras = Cameras.load(scene.stage("metric"))
     to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
@@ -91,9 +91,9 @@ def _stands_on(part: np.ndarray, floor: np.ndarray) -> bool:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("clean", type=Path, help="built scene of the film without traffic")
-    parser.add_argument("traffic", type=Path, help="built scene of the film with traffic")
-    parser.add_argument("without", type=Path, nargs="?", help="the same films, built with nerf.transients=false")
+    parser.add_argument("clean", type=Path, help="built scene of the films without traffic")
+    parser.add_argument("traffic", type=Path, help="built scene of the films with traffic")
+    parser.add_argument("without", type=Path, nargs="?", help="films with traffic, nerf.transients=false")
     add_record_options(parser)
     given = parser.parse_args()
     found: dict[str, Any] = {}

@@ -7,15 +7,17 @@ it with replacement. On some of these days the policies drive on the road, five 
 only a photo: there, the policies drive only in the twin. A policy's rate is then estimated in four ways:
 
 - alone: from the real trials, by the model of `twin.evaluation.rate_model`.
-- twin: the same model with the policy's rate in the twin as covariate; the estimate shrinks towards its prediction.
+- twin: the same model with the policy's rate in the twin as covariate; the estimate shrinks towards the rate that the
+  covariate predicts.
 - mean: the mean real rate over the driven days; its interval is Student's t over days.
 - powered: prediction-powered inference (PPI++, `prediction_powered_mean`): the same mean plus λ times the
-  difference between the twin's rates on the further days and on the driven days. It is unbiased even if the twin is
-  wrong. λ is tuned on other trainings.
+  difference between the twin's rates on the further days and on the driven days. This estimate is unbiased even if
+  the twin is wrong. λ is tuned on other trainings.
 
 Prints, by number of real trials per policy: width and coverage of the 90 % intervals, root mean square error, and how
 often the policy with the highest estimate is within 5 points of the best of its task. *Middling* policies have a
-rate of 2 to 98 %; for the others a few trials suffice even without the twin. The seed is fixed. Takes two minutes.
+rate of 2 to 98 %; for the others a few trials suffice even without the twin. The seed is fixed. A run takes two
+minutes.
 """
 
 import argparse
@@ -41,7 +43,7 @@ DAYS = (2, 3, 4, 6, 8, 12, 16)
 TRIALS = 5  # per policy and day
 PHOTOS = 20
 """Days with a photo and no trials."""
-MARGIN = 0.05
+MARGIN = 0.05  # difference in rate up to which a policy counts as the best
 WAYS = ("alone", "twin", "mean", "powered")
 _LEAST_DAYS = 5  # fewest driven days for an interval of `mean` or `powered`
 _EXPERIMENTS = 60

@@ -5,8 +5,8 @@
 `twin view` runs in a separate process; the browser draws without a GPU. A picture counts when the browser has decoded
 it. "Moving" is a drag of the mouse at 25 events a second; "at rest" begins when the mouse button is released. The
 random part clicks, drags, presses keys and moves sliders at random, and compares memory at its end with memory after
-its first fifth. The number of cores that other programs use is measured, too: speeds are meaningful only if it is
-small.
+its first fifth. The number of cores that other programs use is measured, too: speeds are meaningful only if this
+number is small.
 """
 
 import argparse
@@ -61,7 +61,7 @@ class Served:
         )
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
-        assert line.startswith("open http"), f"twin view said {line!r}"
+        assert line.startswith("open http"), f"twin view printed {line!r}; expected its address"
         self.url, self.served_after = line.split()[1], time.monotonic() - self.began
 
     @property
@@ -125,7 +125,7 @@ def drag(browser: Chromium, seconds: float) -> float:
 
 
 def rest(browser: Chromium, seconds: float = 6.0) -> float:
-    """Time from the last event to the fine picture in the browser [s]."""
+    """Time from the last event to the picture at full resolution in the browser [s]."""
     began = time.monotonic()
     width = 0
     while time.monotonic() - began < seconds:
@@ -247,7 +247,7 @@ def main(arguments: list[str] | None = None) -> int:
     add_record_options(parser)
     given = parser.parse_args(arguments)
     if find_chromium() is None:
-        return print_error("no chromium on this machine; install Debian's package chromium")
+        return print_error("Chromium is not installed; install Debian's package chromium")
     figures = measure(given.scene, given.minutes)
     print(json.dumps(figures, indent=2, ensure_ascii=False))
     for name, (sense, target) in TARGETS.items():

@@ -1,4 +1,4 @@
-"""Runs the README's commands in order on a copy of the checkout, before a release; takes an hour.
+"""Runs the README's commands in order in a copy of the last commit, before a release; takes an hour.
 
     python benchmarks/walk.py [--shell bash|zsh] [--index] [--until WORDS]
 
@@ -23,7 +23,7 @@ _INHERITED = ("PYTHONPATH", "VIRTUAL_ENV")  # would make the copy use another ch
 
 
 def commands(text: str, index: bool) -> list[str]:
-    """Commands in the shell blocks of a page, without the skipped ones; a line joined by `&&` gives several."""
+    """Commands in the shell blocks of a page, without the skipped ones; a line with `&&` gives several."""
     blocks = re.findall(r"^```sh\n(.*?)^```$", text, re.S | re.M)
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines() if line.strip()]
     lines = [line for line in lines if "my_road" not in line and "pytest" not in line]
@@ -34,7 +34,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shell", choices=tuple(_START), default="bash", help="(default: %(default)s)")
     parser.add_argument("--index", action="store_true", help="fetch PyTorch from its own index, as the README does")
-    parser.add_argument("--until", metavar="WORDS", help='stop after the first command with these words, e.g. "build"')
+    parser.add_argument(
+        "--until", metavar="WORDS", help='stop after the first command that contains WORDS, e.g. "build"'
+    )
     options = parser.parse_args()
     environment = {name: value for name, value in os.environ.items() if name not in _INHERITED}
     with tempfile.TemporaryDirectory() as folder:

@@ -37,7 +37,7 @@ def trained() -> nn.Module:
 
 @torch.no_grad()
 def act(pixels: np.ndarray) -> np.ndarray:
-    """Action in [-1, 1] of the speed and the yaw rate, from pictures (12, height, width)."""
+    """Speed and yaw rate as an action in [-1, 1], shape (2,), from a stack of four pictures (12, height, width)."""
     return trained()(torch.as_tensor(pixels[None]).float() / 255.0 - 0.5)[0].numpy()
 
 
@@ -60,7 +60,7 @@ def main(arguments: list[str] | None = None) -> None:
     optimizer = torch.optim.Adam(model.parameters(), 1e-3)
     for step in range(given.steps):
         some = torch.randint(len(actions), (64,), generator=generator)
-        # At its start a drive has the first picture several times, as in the environment.
+        # At the start of a drive, the stack has the first picture several times, as in the environment.
         stack = [pictures[some - frame[some].clamp(max=back)] for back in reversed(range(STACK))]
         loss = (model(torch.cat(stack, 1).float() / 255.0 - 0.5) - actions[some]).square().mean()
         optimizer.zero_grad()

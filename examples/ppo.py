@@ -1,7 +1,7 @@
 """PPO of stable-baselines3 on pictures and odometry: python examples/ppo.py scenes/demo --steps 200000
 
-Needs pip install 'twin[learn]'. PPO needs more steps than `twin train`, whose SAC is tuned to this task; this shows how
-any algorithm of stable-baselines3 is connected.
+Needs pip install 'twin[learn]'. PPO needs more steps than `twin train`, whose SAC is tuned to this task; the example
+shows how to connect any algorithm of stable-baselines3.
 """
 
 import argparse
@@ -18,7 +18,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--task", default="straight")
     parser.add_argument("--steps", type=int, default=200_000)
     parser.add_argument("--worlds", type=int, default=8)
-    parser.add_argument("--rollout", type=int, default=256, help="steps of each world between updates")
+    parser.add_argument("--rollout", type=int, default=256, help="steps of each environment between updates")
     parser.add_argument("--out", default="ppo.zip")
     given = parser.parse_args(arguments)
 

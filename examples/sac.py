@@ -43,7 +43,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("scene")
     parser.add_argument("--task", default="straight")
     parser.add_argument("--steps", type=int, default=20_000)
-    parser.add_argument("--warmup", type=int, default=500, help="steps of random driving at first")
+    parser.add_argument("--warmup", type=int, default=500, help="number of first steps, with random actions")
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--out", default="sac.safetensors")
     given = parser.parse_args(arguments)

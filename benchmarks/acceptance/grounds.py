@@ -9,8 +9,8 @@ from twin.assets.ground import DATA_KINDS, Ground, HeightData, fit_low_passed
 from twin.config import MeshConfig
 from twin.types import Array
 
-_SPACING = 0.25  # [m] between data, as in `twin.assets.ground`
-_FIELD_NOISE, _PATH_NOISE = 0.03, 0.012  # [m] σ of rendered and of camera path heights, as in `twin.assets.ground`
+_SPACING = 0.25  # [m] between data points, as in `twin.assets.ground`
+_FIELD_NOISE, _PATH_NOISE = 0.03, 0.012  # [m] σ of heights from the field and from the camera path, as there
 _LATERAL_OFFSETS = np.array([-0.6, -0.3, 0.0, 0.3, 0.6])  # [m] from the path
 
 

@@ -38,7 +38,7 @@ def composition(subject: Subject) -> list[Row]:
         "flags": model.opt.disableflags != 0 or model.opt.enableflags != 0,
     }
     violated = [name for name, wrong in violations.items() if wrong]
-    return [Row("A1", f"what does not belong: {', '.join(violated) or 'nothing'}", float(len(violated)), 0.0, 0.0)]
+    return [Row("A1", f"foreign elements: {', '.join(violated) or 'none'}", float(len(violated)), 0.0, 0.0)]
 
 
 def measures(subject: Subject) -> list[Row]:
@@ -54,7 +54,7 @@ def measures(subject: Subject) -> list[Row]:
         (2 * size[1], WHEEL_WIDTH),
     )
     worst = max(abs(float(a) / b - 1.0) for a, b in pairs)
-    return [Row("A2", "mass with 10 kg payload, L, B, r, width off the table", 100 * worst, 0.0, 1.0, "%")]
+    return [Row("A2", "error of mass with 10 kg payload, wheelbase, track, wheel size", 100 * worst, 0.0, 1.0, "%")]
 
 
 def track_ratios(subject: Subject) -> list[Row]:
@@ -96,7 +96,7 @@ def scrubbing(subject: Subject) -> list[Row]:
     return [
         Row("B4", "wheel torque / Coulomb torque", float(np.abs(turn.torque).mean() / 2 / expected), 0.95, 1.05),
         Row("B5", "motor power / dissipated power", float(turn.power.mean() / turn.dissipated.mean()), 0.97, 1.05),
-        Row("B5", "least motor power", float(turn.power.min()), 0.0, math.inf, "W"),
+        Row("B5", "smallest motor power", float(turn.power.min()), 0.0, math.inf, "W"),
     ]
 
 

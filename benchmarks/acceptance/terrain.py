@@ -34,12 +34,12 @@ def flat_ground(subject: Subject) -> list[Row]:
             Row("E1", f"{label}: jolt straight, 1 m/s", run.jolt, 0.0, 1.0, "m/s²"),
             Row("E1", f"{label}: jolt on R = 1 m", arc.jolt, 0.0, 1.0, "m/s²"),
             Row("E1", f"{label}: jolt turning at 1 rad/s", spot.jolt, 0.0, 1.0, "m/s²"),
-            Row("E1", f"{label}: dz per frame", 1000 * _rms(run.per_frame(run.camera_z)), 0.0, 0.3, "mm rms"),
-            Row("E1", f"{label}: dpitch per frame", pitching, 0.0, 0.05, "° rms"),
+            Row("E1", f"{label}: change of z per frame", 1000 * _rms(run.per_frame(run.camera_z)), 0.0, 0.3, "mm rms"),
+            Row("E1", f"{label}: change of pitch per frame", pitching, 0.0, 0.05, "° rms"),
             Row("E2", f"{label}: chi / plane's", spot.chi / turn.chi, 0.95, 1.05),
             Row("E2", f"{label}: turning power / plane's", ratio, 0.95, 1.05),
-            Row("E2", f"{label}: turning, more than on the plane", float(extra), -math.inf, 10.0, "W"),
-            Row("E2", f"{label}: straight, more than on the plane", float(extra_straight), -math.inf, 10.0, "W"),
+            Row("E2", f"{label}: turning power − plane's", float(extra), -math.inf, 10.0, "W"),
+            Row("E2", f"{label}: power driving straight − plane's", float(extra_straight), -math.inf, 10.0, "W"),
         ]
     return rows
 

@@ -111,7 +111,7 @@ def _mutate_npz(rng: Random, path: Path) -> None:
 
 
 def stage_parts(case: Case) -> None:
-    """A corrupted file of sparse points, a capture or cameras, without a stamp."""
+    """A corrupted file of sparse points, of a capture or of cameras, without a stamp."""
     from twin.capture.capture_data import Capture, SourceInfo
     from twin.geometry.cameras import Cameras, SparsePoints
 

@@ -1,10 +1,11 @@
 """One fuzz case and its oracle.
 
-A target passes if it returns, or raises `InputError` with one line of fewer than `MAX_MESSAGE` characters. A verb
-passes if it exits with 0, or with 2 and one such line on standard error. Every other outcome is a failure: another
-exception, too much time or memory, a file changed outside the case's folder, a planted payload that ran.
+A target passes if it returns, or raises `InputError` with one line of fewer than `MAX_MESSAGE` characters. A verb (a
+subcommand of `twin`) passes if it exits with 0, or with 2 and one such line on standard error. Every other outcome is a
+failure: another exception (but for too long a file name), too much time or memory, a file changed outside the case's
+folder, a planted payload that ran.
 
-A working folder contains the folders `case` (only there may the case write), `cwd` and `kept` (both must not change),
+A working folder contains `case` (the only folder that the case may write to), `cwd` and `kept` (which must not change),
 and the file `marker` if a payload has run.
 """
 
@@ -51,7 +52,7 @@ class Target:
     name: str
     """Part of the seed of its cases."""
     weight: float
-    """Relative number of its cases."""
+    """Share of its cases, relative to the weights of other targets."""
     run: Callable[[Case], bool | None]
     """Runs a case; returns False if a verb refused its input."""
 
@@ -182,7 +183,7 @@ def _text(error: BaseException) -> str:
 
 
 def _source_line(error: BaseException) -> str:
-    """Innermost source line of twin in the traceback, or of a library if there is none of twin."""
+    """Innermost source line of twin in the traceback; if it has none, the innermost line of all."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = [frame for frame in frames if "/twin/" in frame.filename]
     frame = (ours or frames)[-1]
@@ -215,7 +216,7 @@ def snapshot(work: Path) -> dict[str, tuple[int, ...]]:
 
 
 def changed_files(before: dict[str, tuple[int, ...]], after: dict[str, tuple[int, ...]]) -> list[str]:
-    """Names whose entries differ between two snapshots, without the marker."""
+    """Names of files whose entries differ between two snapshots, without the marker."""
     return sorted(
         name for name in before.keys() | after.keys() if before.get(name) != after.get(name) and name != "marker"
     )
@@ -227,7 +228,7 @@ def _reset_peak_memory() -> None:
 
 
 def _peak_memory() -> int:
-    """Peak resident memory [bytes] since the last reset, or since the start of the process without such a reset."""
+    """Peak resident memory [bytes] since the last reset, or since the process began if the system has no reset."""
     try:
         status = Path("/proc/self/status").read_text()
         return int(status.split("VmHWM:")[1].split()[0]) << 10

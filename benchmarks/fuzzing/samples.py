@@ -63,7 +63,7 @@ class Samples:
 
     @cached_property
     def twin(self) -> Path:
-        """A small built scene with two policies, a run and validated episodes."""
+        """A small built scene with two policies, the table of a training and validated episodes."""
         from tiny_runs import tiny_runs
         from tiny_twin import tiny_twin
 
@@ -91,7 +91,7 @@ class Samples:
 
     @cached_property
     def bags(self) -> dict[str, bytes]:
-        """Bags of ten pictures with calibration, poses, fixes and transforms, by suffix, and metadata.yaml."""
+        """By suffix: ROS 2 bags with pictures, calibration, poses, fixes, transforms; a ROS 1 bag; metadata.yaml."""
         from bag_of_film import camera_info, drive, pictures, seat, write, write_ros1
 
         from twin.capture.camera_models import Lens

@@ -76,7 +76,7 @@ def train_config(case: Case) -> None:
 
 
 def _keywords(rng: Random, kind: type) -> dict[str, Any]:
-    """Hostile values for one or two fields of a dataclass, rarely for an unknown one."""
+    """Hostile values for one or two fields of a dataclass; in 5 % of calls also for an unknown field."""
     names = [one.name for one in dataclasses.fields(kind)]
     out = {rng.choice(names): hostile_value(rng) for _ in range(rng.choice((1, 1, 2)))}
     if rng.random() < 0.05:
@@ -90,7 +90,7 @@ def _known(keywords: dict[str, Any], kind: type) -> dict[str, Any]:
 
 
 def actions(case: Case) -> bool:
-    """A hostile action: the environment steps or raises ValueError, and its next observation is finite either way."""
+    """A hostile action: the environment must step or raise ValueError, and its next observation must be finite."""
     rng, environment = case.rng, case.samples.environment
     environment.reset()
     good = np.array([0.5, 0.1])

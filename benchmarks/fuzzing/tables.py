@@ -65,7 +65,7 @@ def log_csv(case: Case) -> None:
 
 
 def log_npz(case: Case) -> None:
-    """A log with up to two hostile columns; in some cases, its file is then forged or corrupted."""
+    """A log with up to two hostile columns; in some cases, its file is then given a false header or corrupted."""
     from twin.sysid.logs import read_log
 
     rng, columns = case.rng, dict(case.samples.log)

@@ -1,4 +1,4 @@
-"""Fuzz target of verbs: command lines that a verb must refuse or finish quickly."""
+"""Fuzz target of verbs (subcommands of `twin`): command lines that a verb must refuse or finish quickly."""
 
 import os
 import shutil
@@ -116,7 +116,7 @@ def _value(case: Case, option: str, valid: Sequence[str]) -> str:
 
 
 def _scene(case: Case) -> str:
-    """A scene on which every verb ends soon: missing, no folder, not built, invalid, or with truncated stages."""
+    """A scene on which every verb ends soon: missing, a file, not built, invalid, or with truncated stages."""
     rng, root = case.rng, case.folder / "scene"
     what = rng.choice(("unbuilt", "missing", "file", "junk", "damaged"))
     if what == "missing":
@@ -143,7 +143,7 @@ def _scene(case: Case) -> str:
 
 
 def _copy_with_truncated_stages(rng: Random, root: Path, good: Path) -> None:
-    """Copies a built scene and cuts the last byte of one file of every stage, so that none can be opened."""
+    """Copies a built scene and cuts the last byte of one file of every stage, so that no stage can be opened."""
     for name in ("scene.toml", "runs", "build"):
         source = good / name
         shutil.copytree(source, root / name) if source.is_dir() else shutil.copyfile(source, root / name)

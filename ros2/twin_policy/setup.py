@@ -1,4 +1,4 @@
-"""Installs with pip, and with colcon as an ament_python package; setuptools of Humble (59) knows no [project] table."""
+"""Installs with pip, or colcon as an ament_python package. Humble's setuptools (59) cannot read a [project] table."""
 
 from setuptools import setup
 

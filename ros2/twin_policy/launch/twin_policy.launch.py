@@ -12,18 +12,18 @@ ARGUMENTS = {
     "policy": ("", "policy folder, or policy.onnx"),
     "namespace": ("", "the robot's namespace, such as a200_0000"),
     "image": ("sensors/camera_0/color/image", "topic of the pictures"),
-    "image_compressed": ("sensors/camera_0/color/compressed", "topic of JPEG pictures, if compressed is true"),
+    "image_compressed": ("sensors/camera_0/color/compressed", "topic of JPEG or PNG pictures, if compressed is true"),
     "camera_info": ("sensors/camera_0/color/camera_info", "topic of the calibration"),
     "cmd_vel": ("cmd_vel", "topic of the commands"),
-    "joy": ("joy_teleop/joy", "topic of the joystick, if deadman_button is given"),
+    "joy": ("joy_teleop/joy", "topic of the joystick, if deadman_button is 0 or more"),
 }
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Every topic is an argument; all else is in the file of parameters."""
+    """Arguments: `ARGUMENTS`, and `parameters`, the file with all other settings."""
     settings = Path(get_package_share_directory("twin_policy")) / "config" / "twin_policy.yaml"
     arguments = [DeclareLaunchArgument(k, default_value=v, description=d) for k, (v, d) in ARGUMENTS.items()]
-    arguments.append(DeclareLaunchArgument("parameters", default_value=str(settings), description="YAML of parameters"))
+    arguments.append(DeclareLaunchArgument("parameters", default_value=str(settings), description="parameters (YAML)"))
     node = Node(
         package="twin_policy",
         executable="policy_node",

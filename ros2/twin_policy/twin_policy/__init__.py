@@ -1,5 +1,5 @@
-"""Drives a robot by a policy of `twin`: pictures in, commands out. Needs NumPy, OpenCV and ONNX Runtime; neither ROS
-nor `twin`.
+"""Drives a robot by a policy of `twin`: pictures in, commands out. Needs NumPy, OpenCV and ONNX Runtime, but neither
+ROS nor `twin`.
 
     policy = OnnxPolicy("runs/first")
     pilot = Pilot(policy, Limits())

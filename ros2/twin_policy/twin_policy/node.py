@@ -1,7 +1,7 @@
 """ROS 2 node: pictures and camera_info in, velocity commands and diagnostics out, with a deadman switch.
 
 A driving command is published once, as soon as the policy has processed its picture. Stops are published at
-`watchdog_rate`. When the deadman switch is released, they end after one second, so that another source may drive.
+`watchdog_rate`; after the deadman switch is released, only for one second, so that another node may drive the robot.
 """
 
 import signal
@@ -123,7 +123,7 @@ class PolicyNode(Node):
         self._diagnostics.publish(array)
 
     def stop(self) -> None:
-        """Publishes a stop, for the end of the process."""
+        """Publishes a stop; called at the end of the process."""
         self._publish(Command(cause="shutdown"))
 
 

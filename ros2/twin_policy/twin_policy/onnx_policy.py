@@ -72,7 +72,7 @@ class OnnxPolicy:
         self.name = path.parent.name if path.name == "policy.onnx" else path.stem
         self._actions = 1 if self.action == "steering" else 2
         (self._input,) = self._session.get_inputs()
-        self.run(np.zeros(self.stack_shape, np.uint8))  # the first run is slow; it also shows whether the shapes fit
+        self.run(np.zeros(self.stack_shape, np.uint8))  # the first run is slow, and fails if the shapes do not fit
 
     @property
     def stack_shape(self) -> tuple[int, int, int]:

@@ -1,4 +1,4 @@
-"""Pictures of a robot's camera: decoded, rectified and scaled to what a policy was trained on.
+"""Pictures of a robot's camera: decoded, rectified and scaled to the camera that a policy was trained with.
 
 Decoded pictures are RGB, uint8, shape (height, width, 3). In a `Camera`, pixel (0, 0) is the outer corner of the
 top-left pixel, as in `twin` and COLMAP; in ROS's CameraInfo it is that pixel's center, and cx and cy are 0.5 smaller.
@@ -38,7 +38,7 @@ ENCODINGS = (*_CHANNELS, *_BAYER, *_YUV)
 
 _COEFFICIENTS = {"": (0,), "none": (0,), "plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 _MAX_SIDE = 16_384  # [px] largest side of a picture
-_MAX_OVERSAMPLING = 16
+_MAX_OVERSAMPLING = 16  # largest number of samples per pixel and axis
 _EXACT = 1e-6  # [px] intrinsics that differ by less count as equal
 
 
@@ -108,7 +108,7 @@ class Camera:
     intrinsics: tuple[float, float, float, float]
     """fx, fy, cx, cy [px]; (0, 0) is the outer corner of the top-left pixel."""
     model: str = ""
-    """plumb_bob, rational_polynomial, equidistant (fisheye), or empty for none."""
+    """plumb_bob, rational_polynomial, equidistant (fisheye), or empty for no distortion."""
     distortion: tuple[float, ...] = ()
     """Coefficients in the order of CameraInfo: k1, k2, p1, p2, k3, ..., or k1 to k4 of equidistant."""
 
@@ -129,7 +129,7 @@ class Camera:
     def from_info(info: Any, rectified: bool = False) -> "Camera":
         """The camera of a sensor_msgs/CameraInfo (ROS 2's fields, or ROS 1's).
 
-        `rectified`: the topic carries pictures after image_proc's rectification, whose camera is the matrix P.
+        `rectified`: the pictures were rectified by image_proc, so their camera is the matrix P.
         """
         k, p, d = (getattr(info, name, getattr(info, name.upper(), ())) for name in "kpd")
         k, p = list(map(float, k)), list(map(float, p))
@@ -145,7 +145,7 @@ class Camera:
         return Camera((width // across, height // down), intrinsics, model, distortion)
 
     def resized(self, size: tuple[int, int]) -> "Camera":
-        """The same camera at another size: scaled by the width, the height cropped or extended about its middle."""
+        """The same camera at another size: scaled to its width, cropped or extended to its height about the middle."""
         scale = size[0] / self.size[0]
         fx, fy, cx, cy = (float(x) * scale for x in self.intrinsics)
         cut = (self.size[1] * scale - size[1]) / 2

@@ -1,8 +1,8 @@
 """The pilot turns pictures into commands by a policy, and stops the robot when something is wrong.
 
 As in twin's environment, a policy sees a stack of the last few pictures, `timestep` apart, the newest last; the first
-picture after standing fills the whole stack. Pictures that come faster are left out. A *stop* is a command of zeros
-with a *cause*. It empties the stack, and the robot rests before the next picture counts as the first one.
+picture after standing fills the whole stack. Pictures that come faster are skipped. A *stop* is a command of zeros
+with a *cause*. A stop empties the stack, and the robot rests before the next picture counts as the first of an episode.
 
 A pilot has two clocks: `clock`, which also stamps the pictures, and `steady`, which never jumps. Both return
 nanoseconds. A pilot is not thread-safe.
@@ -73,7 +73,7 @@ class Command:
 
 
 class Pilot:
-    """Drives by one policy and one camera."""
+    """Drives a robot by one policy and one camera."""
 
     def __init__(
         self,
@@ -88,14 +88,14 @@ class Pilot:
             policy: Determines the pictures' size, the stack and the control step.
             limits: None: the defaults.
             pinhole: The camera that the policy was trained with; None: the policy's own; if it has none, the robot's,
-                without distortion, scaled by its width.
+                without distortion, scaled to the policy's width.
             clock: Clock of the pictures' stamps [ns].
             steady: A clock that never jumps [ns].
         """
         self.policy, self.limits = policy, limits or Limits()
         self.counts: Counter[str] = Counter()
-        """Numbers of pictures that were used, between (two control steps), doubled, reordered, late, lost, waiting
-        (during a stop) or refused; and of stops."""
+        """Numbers of stops, and of pictures that were used, between (two control steps), doubled, reordered, late,
+        lost, waiting (during a stop) or refused."""
         self.duration = 0.0
         """Time from the arrival of the last used picture to its command [s]."""
         self._pinhole, self._clock, self._steady = pinhole or policy.camera, clock, steady
@@ -216,7 +216,7 @@ class Pilot:
         seconds = abs(age) * 1e-9
         if age > self._nanoseconds(self.limits.timeout):
             self.counts["late"] += 1
-            if not self._command.drives:  # a driving command, whose picture is older still, expires by itself
+            if not self._command.drives:  # a driving command has an older picture, so it expires by itself
                 self._command = Command(
                     cause=f"pictures are {seconds:.2f} s old; expected at most {self.limits.timeout:g}"
                 )
@@ -237,8 +237,8 @@ class Pilot:
         else:
             self.stack = np.repeat(newest[None], self.policy.stack, 0)
             self._due = stamp
-        # Pictures are due on a grid of control steps, since the camera's rate need not be a multiple of theirs. After a
-        # missed step, the grid begins anew.
+        # Pictures are due on a grid of control steps, since the camera's rate need not be a multiple of the policy's.
+        # After a missed step, the grid begins anew.
         self._due += step
         if self._due <= stamp:
             self._due = stamp + step
