@@ -66,12 +66,9 @@ def film(
 ) -> Truth:
     """Films every pass of a plan under every lighting into the scene folder `out`, and saves the truth there.
 
-def scene_task(given: str, scene: Path | None, place: int) -> str | RoadTask:
-    """Returns a task's name unchanged; reads a JSON file and transforms its task to the true frame.
-
-    Raises:
-        InputError: no scene, a scene without truth, or one of another place.
-    """
+    With `traffic`, walkers and cars move through every film, and the films of all lightings but the last show parked
+    cars. The truth contains none of them. `renderer_of` returns the renderer for a lighting and a place; the default is
+    `filming.Renderer`, the only one that shows moving traffic.
 
     Raises:
         InputError: `out` is not empty and has no folder `truth`.
@@ -194,17 +191,12 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
         print(setup)
 
 
-<<<<<<< HEAD
 def scene_task(given: str, scene: Path | None, place: int) -> str | RoadTask:
-    """The task in a JSON file, transformed from its scene's frame to the true frame; a task's name stays as it is.
+    """Returns a task's name unchanged; reads a JSON file and transforms its task to the true frame.
 
     Raises:
         InputError: no scene, a scene without truth, or one of another place.
     """
-=======
-def _task(given: str, scene: Path | None, place: int) -> str | RoadTask:
-    """Returns a task's name unchanged; reads a JSON file and transforms its task to the true frame."""
->>>>>>> 6e17c1db0005b92e0903037f2957a90daebd5008
     if not given.endswith(".json"):
         return given
     if scene is None:
