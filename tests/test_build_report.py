@@ -202,7 +202,7 @@ def test_nothing_is_fetched_from_elsewhere(scene: SceneDir) -> None:
     write_json(scene.stage("review") / "review.json", {"pictures": told})
     write_image(scene.stage("field") / "excluded.jpg", np.zeros((4, 4, 3), np.uint8))
     html = page(scene, REPORT)
-    assert "were not used" in html
+    assert "pixels not used for training" in html
     parser = read(html)
     assert {link for link in parser.links if not link.startswith(("#", "data:"))} == {"review.mp4", "report.json"}
     assert "http" not in html and "url(" not in html.replace("url(#", "")
@@ -424,7 +424,7 @@ def test_errors_against_ground_truth_are_shown_where_it_is_known(scene: SceneDir
 def test_charts_are_drawn_from_the_report(scene: SceneDir) -> None:
     text = read(page(scene, REPORT)).text
     assert "24.3 dB (n = 10)" in text
-    assert "How training went" in text and "How far off the route it drove" in text
+    assert "PSNR during training" in text and "Cross-track error of the drive" in text
     assert "Ground and solid parts" not in text  # no mesh stage on disk
 
 
