@@ -7,7 +7,8 @@ world/robot/camera                        the front camera with its pictures
 world/obstacles                           positions of the obstacles
 speed/wanted, yaw_rate/wanted             speed and yaw rate that the driver commands
 speed/driven, yaw_rate/driven             speed and yaw rate of the robot
-cross_track, progress, trust, reward      [m], [m], 0 to 1, per step
+cross_track, progress                     distance from the route, and along it [m]
+trust, reward                             trust in the picture, 0 to 1; reward of each control step
 events                                    lighting, randomization, and how the drive ended
 """
 
