@@ -2,7 +2,7 @@
 
     DIR/transforms.json                every frame
     DIR/transforms_<lighting>.json     frames of one lighting, for `ns-train ... --data FILE`, if there are several
-    DIR/images/..., DIR/masks/...      undistorted frames; masks, if a frame has one: 0 = ignore
+    DIR/images/..., DIR/masks/...      undistorted frames; masks, if any frame has one: 0 = ignore
     DIR/points.ply                     sparse points, from which splatfacto starts
 
 Cameras have OpenGL axes (x right, y up, looking along −z). World coordinates are the scene's: meters, z up

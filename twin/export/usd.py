@@ -63,11 +63,11 @@ def write_usd(
     world: World | None,
     selected: str,
 ) -> None:
-    """Writes the file, as `.usdz`, or binary `.usd` or `.usdc`.
+    """Writes a `.usdz`, or a binary `.usd` or `.usdc`.
 
     Args:
-        path: The file.
-        splats: Splats by lighting, which differ in `rgb` only.
+        path: The file; its suffix selects the format.
+        splats: Splats by lighting; they differ only in `rgb`.
         mesh: Vertices (v, 3) [m] and faces (f, 3) of the visual mesh.
         colors: Colors of the mesh's vertices by lighting, shape (v, 3).
         parts: Convex parts.
@@ -100,8 +100,8 @@ def write_usd(
         robot = world.robot if world else HuskyParams()
         tires, bare = (
             _friction(stage, f"/World/Materials/{name}", value)
-            # In MuJoCo the wheels' friction holds on every surface. Programs that average the friction of two surfaces,
-            # as PhysX does, get the same value if the ground has it, too.
+            # In MuJoCo, a wheel's contacts have the wheel's friction. Programs that average the friction of two
+            # surfaces, as PhysX does, get the same value if the ground has it, too.
             for name, value in (("TiresAndGround", robot.friction), ("Chassis", 1.0))
         )
         _add_collision(stage, model, parts, tires)
