@@ -275,8 +275,8 @@ def limitations(forecast: Forecast) -> list[Caution]:
             cure = "drive all under the same lightings; else the rates mix effects of policy and light."
             out.append(Caution(what, cure))
     what = (
-        "The twin has no other traffic and no wet ground. Of the weather it has only haze, sun and shadows. It lacks what "
-        "has changed since the films."
+        "The twin has no other traffic and no wet ground. Of the weather it has only haze, sun and shadows. Changes "
+        "since the films are missing, too."
     )
     return [*out, Caution(what, "only real trials measure these effects; spread them over several days.")]
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from twin.learn.policy import Policy
     from twin.view.page import Page
 
-_HEAD_START = 6.0  # [s] longest time for which loading the robot waits for the first picture
+_HEAD_START = 6.0  # [s] longest wait for the first picture before the robot is loaded
 _MIN_SIDE, _MAX_SIDE, _MAX_FPS = 16, 4096, 120  # of a film: sides [px], frames per second
 
 
