@@ -1,7 +1,8 @@
 """Writes `report.html`: what a build did, how good the result is, and how to improve it.
 
 The page is self-contained except for the review video, a file beside it. Pictures come from the stage folders. Figures
-show data from these folders and from the report. The text comes from `build_sections.py`.
+show data from these folders and from the report. The text comes from `build_sections.py` and
+`build_topics.py`.
 """
 
 import shlex
@@ -24,7 +25,7 @@ from twin.scene import SceneDir, stage_result
 
 _MAX_REPROJECTION = 4.0  # [px] right end of the histogram of reprojection errors
 _MAX_TRACK_LENGTH = 30.0  # [frames] right end of the histogram of track lengths
-_EXCLUDED = "Frames of each lighting. Red: pixels not used for training, since things seem to have moved there."
+_EXCLUDED = "Frames of each lighting. Red pixels were not used: they seem to show things that moved or went away."
 
 
 def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:

@@ -28,7 +28,7 @@ _MIN_REGISTERED = 0.9  # a caution is given if fewer of the frames have a camera
 _LARGE_SCALE_UNCERTAINTY = 0.03  # [relative] a caution is given if it is larger
 _LOW_PSNR = 18.0  # [dB]
 _FEW_HELD_OUT = 3  # a caution is given if a lighting has fewer held-out frames
-_LOW_LIGHTING_AGREEMENT = 0.7  # [share of places] 0.5 is chance
+_LOW_LIGHTING_AGREEMENT = 0.7  # fraction of poses (`cross_lighting_facts`); 0.5 is chance
 
 _SCALE_SOURCES = {
     "camera_height": "the camera’s height above the ground",
@@ -272,7 +272,12 @@ def cross_lighting_facts(report: dict[str, Any]) -> tuple[list[Fact], list[Cauti
             what = f"Only {share:.0%} of the places filmed in other light resemble “{name}” when rendered in it."
             cure = "film every light along the same path; lights that look very similar reach about 50% at best."
             cautions.append(Caution(what, cure))
-    moves = ("field.cross_lighting.depth_moves_m", "depth", "{:.3f} m", "largest change by lighting; zero by design")
+    moves = (
+        "field.cross_lighting.depth_moves_m",
+        "depth",
+        "{:.3f} m",
+        "largest change between lightings; zero by design",
+    )
     what = "Depth moves by up to {:.3f} m with the light."
     cautions += cautions_above(report, (moves[0], 1e-3, what, "this is a bug; please report it."))
     return facts + (facts_of(report, moves) if follows else []), cautions

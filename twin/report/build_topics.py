@@ -95,7 +95,7 @@ def truth_section(report: dict[str, Any]) -> Section:
             "compare SCENE)"
         )
         return Section(name, title, "", not_applicable=reason)
-    kinds = {"ground": "ground", "obstacle": "obstacles up to full height", "foliage": "leaves"}
+    kinds = {"ground": "ground", "obstacle": "obstacles of any height", "foliage": "leaves"}
     shares = {kind: truth.get(f"mesh_completeness_10cm_{kind}") for kind in kinds}
     complete = [f"{number(share, '{:.0%}')} of {kinds[kind]}" for kind, share in shares.items() if share is not None]
     by_kind = join_names(complete) if complete else "completeness of the mesh"
@@ -118,7 +118,12 @@ def truth_section(report: dict[str, Any]) -> Section:
         ("obstacle_completeness_m", "true surface to solid parts", "{:.3f} m", "median: completeness of the parts"),
         ("mesh_accuracy_median_m", "visual mesh to true surface", "{:.3f} m", "median: accuracy of the mesh"),
         ("mesh_accuracy_mean_m", "the same, mean", "{:.3f} m", "errors above 1 m count as 1 m"),
-        ("mesh_completeness_5cm", "true surface within 5 cm of the mesh", "{:.0%}", "of what the cameras saw nearby"),
+        (
+            "mesh_completeness_5cm",
+            "true surface within 5 cm of the mesh",
+            "{:.0%}",
+            "of surfaces in view, up to 10 m from the route",
+        ),
         ("mesh_completeness_10cm", "true surface within 10 cm of the mesh", "{:.0%}", by_kind),
         ("mesh_chamfer_m", "visual mesh, Chamfer distance", "{:.3f} m", "mean of both directions, each up to 1 m"),
         ("corridor_intrusions", "parts inside the true corridor", "{}", "the corridor must be free"),

@@ -72,7 +72,7 @@ class CameraPath:
         knots = np.array([view.time for view in self.views]) - self.views[0].time
         poses = np.array([view.camera_to_world for view in self.views])
         t = np.clip(times, 0.0, knots[-1])
-        # A cubic spline overshoots where the camera stands still. So in that case, and for two views, PCHIP is used.
+        # A cubic spline overshoots where the camera stands still. In this case, and for two views, PCHIP is used.
         still = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).min() < 1e-6
         curve = PchipInterpolator if still or len(knots) == 2 else CubicSpline
         out = np.tile(np.eye(4), (len(t), 1, 1))
@@ -144,7 +144,9 @@ def _parse_view(row: Any, number: int, field: BakedField) -> KeyView:
         raise ValueError(f"view {number}: the upper left 3×3 of camera_to_world is no rotation")
     time, fov = float(row["time"]), float(row.get("fov", 60.0))
     if not np.isfinite(time) or not _MIN_FOV <= fov <= _MAX_FOV:
-        raise ValueError(f"view {number}: time {time}, fov {fov}; expected an angle from {_MIN_FOV:g} to {_MAX_FOV:g}°")
+        raise ValueError(
+            f"view {number}: time {time}, fov {fov}; expected a finite time, and fov from {_MIN_FOV:g} to {_MAX_FOV:g}°"
+        )
     given = row.get("lighting", field.lightings[0])
     if isinstance(given, str):
         return KeyView(time, pose, fov, named_lighting(field, given))

@@ -7,7 +7,7 @@ hook of the `websockets` library. `open_server` wraps this hook while viser open
 sites whose names point here cannot read it (DNS rebinding). A handshake must come from the server's own page.
 *Token.* If the server is bound to any other address, each request needs the token: the first one in its address, later
 ones as a cookie. Without TLS both can be read on the network.
-*Script.* The page gets `page.js`, which reports held keys to the socket `/keys` and hands dropped photos to the page.
+*Script.* The page contains `page.js`, which reports held keys to the socket `/keys` and uploads dropped photos.
 """
 
 import asyncio
