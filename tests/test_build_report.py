@@ -266,7 +266,7 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("mesh", "mesh.ground", {"corridor_coverage": 0.2}, "Only 20%"),
     ("mjcf", "mjcf.spawn_touched", ["part_0003"], "part_0003"),
     ("review", "review.follower.reached_goal", False, "did not reach the goal"),
-    ("review", "review.follower.touched", ["part_0001"], "It touched part_0001."),
+    ("review", "review.follower.touched", ["part_0001"], "The robot touched part_0001."),
     ("seen_touched", "seen_touched.median_m", 0.052, "differ by 0.052 m"),
     (
         "seen_touched",

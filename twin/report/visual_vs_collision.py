@@ -6,10 +6,11 @@ but is not visible. Differences are measured in three ways:
 
 - on the ground: as heights, since a centimeter of height is decimeters along a ray at a low angle
 - on obstacles: as distances to the nearest surface of the other geometry
-- in the corridor: visual-only geometry by its height above the collision ground, collision-only parts by their gap
+- in the corridor: visual-only geometry by its height above the collision ground, collision-only parts by their gap,
+  collision-only ground by the height above what is visible
 
 Frames are matched within a film, so the field's depth is determined only where one film shows a place from two
-directions. At other places (mainly just ahead of a drive's first frame) the depth may differ from build to build.
+directions. At other places (mainly just ahead of a film's first frame) the depth may differ from build to build.
 Collision-only geometry at such places is reported separately, as `unfilmed_ghost_m`.
 """
 
