@@ -44,7 +44,7 @@ STATISTICS = (
     (
         "mean_real",
         "mean on the road",
-        "mean real rate of such policies, with or without real trials (prediction-powered estimate)",
+        "mean real rate of policies like these, driven or not (prediction-powered estimate)",
     ),
 )
 """Name of a field of `Agreement`, its short name on the page, and its meaning."""
