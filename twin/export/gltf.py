@@ -99,8 +99,7 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
         total = np.stack([np.bincount(own[seen] - start, rgb[seen, c], stop - start) for c in range(3)], 1)
         with np.errstate(invalid="ignore"):
             means[start:stop] = total / n[:, None]
-        # Texels that no view shows get the mean color of their face. A face that no view shows gets the mean color of
-        # the nearest other face, below.
+        # Texels that no view shows get the mean color of their face; faces that no view shows, that of the nearest.
         rgb[~seen] = np.nan_to_num(means[own[~seen]], nan=-1.0)
         texture[y[own] + j, x[own] + i] = np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
         start = stop
@@ -119,10 +118,7 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
 
 
 def _turned(corners: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Rotates the order of each face's corners so that the first is opposite the longest edge.
-
-    Returns the corners (f, 3, 3) and their indices in the face (f, 3).
-    """
+    """Corners (f, 3, 3), rotated so that the first is opposite the longest edge, and their former indices (f, 3)."""
     edges = np.linalg.norm(np.roll(corners, -1, 1) - np.roll(corners, 1, 1), axis=-1)
     order = (np.argmax(edges, 1)[:, None] + np.arange(3)) % 3
     return np.take_along_axis(corners, order[:, :, None], 1).astype(np.float64), order

@@ -122,7 +122,7 @@ def truth_section(report: dict[str, Any]) -> Section:
             "mesh_completeness_5cm",
             "true surface within 5 cm of the mesh",
             "{:.0%}",
-            "of surfaces in view, up to 10 m from the route",
+            "of that seen within 10 m of the route",
         ),
         ("mesh_completeness_10cm", "true surface within 10 cm of the mesh", "{:.0%}", by_kind),
         ("mesh_chamfer_m", "visual mesh, Chamfer distance", "{:.3f} m", "mean of both directions, each up to 1 m"),

@@ -1,4 +1,4 @@
-"""Writes a drive as a recording for Rerun (rerun.io): pictures, poses, commands, trust and rewards on one timeline [s].
+"""Writes a drive as a recording for Rerun (rerun.io), with one timeline [s]:
 
 world/route, world/corridor, world/goal   the route and the corridor's edges as lines, the goal as a point
 world/driven                              the robot's path so far
@@ -8,7 +8,7 @@ world/obstacles                           positions of the obstacles
 speed/wanted, yaw_rate/wanted             speed and yaw rate that the driver commands
 speed/driven, yaw_rate/driven             speed and yaw rate of the robot
 cross_track, progress                     distance from the route, and along it [m]
-trust, reward                             trust in the picture, 0 to 1; reward of each control step
+trust, reward                             trust in the picture, 0 to 1; reward per step
 events                                    lighting, randomization, and how the drive ended
 """
 

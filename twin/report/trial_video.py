@@ -1,6 +1,6 @@
 """Video of a trial on the road: the robot's picture beside the twin's from the same pose, map, curves and outcome.
 
-The twin's *replay* is the drive of the simulated robot with the recorded commands (`twin.evaluation.trial_judge`).
+*Replay*: the drive of the simulated robot by the recorded commands (`twin.evaluation.trial_judge`).
 """
 
 from collections.abc import Sequence

@@ -29,7 +29,7 @@ PALETTE = ((255, 183, 77), (100, 181, 246), (186, 104, 200), (129, 199, 132), (2
 """Colors of the filmed lightings, in their order."""
 
 _UP = np.array([0.0, 0.0, 0.04])  # [m] lift of lines and areas, so that the ground does not hide them
-_GROUND_CELL, _GROUND_FACES = 0.25, 40_000  # [m] width of faces, or wider so that there are at most so many
+_GROUND_CELL, _GROUND_FACES = 0.25, 40_000  # [m] smallest width of faces, and their largest number
 _FRUSTUM_DEPTH = 0.2  # [m] size of a drawn camera
 _CLICK_ANGLE = 0.5  # [°] largest angle between the ray of a click and the camera that it selects
 _GAMMA = 2.2
@@ -68,9 +68,7 @@ def scene_layers(scene: viser.SceneApi, twin: Twin, field: BakedField) -> list[L
     if _has(twin, "mesh"):
         mesh = twin.scene.stage("mesh")
         out += [
-            Layer(
-                "mesh", "the filmed surface, as twin export writes it", lambda path: [_visual_mesh(scene, path, twin)]
-            ),
+            Layer("mesh", "the filmed surface, as twin exports it", lambda path: [_visual_mesh(scene, path, twin)]),
             Layer("ground", "the height field that the wheels roll on", lambda path: [_ground(scene, path, twin)]),
         ]
         if (mesh / "parts.npz").exists():

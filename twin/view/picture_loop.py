@@ -164,7 +164,7 @@ class PictureLoop:
 def picture_size(page: tuple[int, int], area: int) -> tuple[int, int] | None:
     """Even width and height [px] of a picture with a page's aspect ratio and about `area` pixels at most.
 
-    A page with fewer pixels has pictures of its own size. None: the page is too small for a picture.
+    A small page has pictures of its own size. None: the page is too small for a picture.
     """
     width, height = page
     if min(width, height) < 8:
