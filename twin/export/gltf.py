@@ -99,7 +99,7 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
         total = np.stack([np.bincount(own[seen] - start, rgb[seen, c], stop - start) for c in range(3)], 1)
         with np.errstate(invalid="ignore"):
             means[start:stop] = total / n[:, None]
-        # Texels that no view shows get the mean color of their face; faces that no view shows, that of the nearest.
+        # Texels that no view shows get the mean color of their face; faces that no view shows get the nearest face's.
         rgb[~seen] = np.nan_to_num(means[own[~seen]], nan=-1.0)
         texture[y[own] + j, x[own] + i] = np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
         start = stop

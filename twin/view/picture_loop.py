@@ -23,7 +23,7 @@ COARSE_AREA, FINE_AREA = 320 * 180, 1280 * 720
 _REST = 0.12  # [s] without a change, after which the fine picture is rendered
 _MIN_PERIOD = 0.045  # [s] between two coarse pictures of a page; the browser needs CPU time, too
 _COARSE_QUALITY, _FINE_QUALITY = 80, 92
-_DEPTH_MARGIN, _DEPTH_SHARE = 0.06, 0.01  # [m] + fraction of depth by which a visible layer may lie behind the picture
+_DEPTH_MARGIN, _DEPTH_SHARE = 0.06, 0.01  # layers are drawn up to [m] + fraction of depth behind the picture's surface
 _MAX_DEPTH = 160.0  # [m] about the largest depth that viser can transmit; the picture hides layers beyond it
 
 
