@@ -197,7 +197,7 @@ def _task_verdict(task: str, cells: list[dict[str, Any]]) -> Verdict:
     # Policies are compared only in the lightings that all of them drove in.
     common = set.intersection(*lightings.values())
     if not common:
-        return Verdict(f"On {task} no light was used for all policies, so the best policy is not known.", "mixed")
+        return Verdict(f"On {task} no lighting was used for all policies, so the best policy is not known.", "mixed")
     shared = {policy: [c for c in cells if c["policy"] == policy and c["lighting"] in common] for policy in lightings}
     means = {policy: sum(c["rate"] for c in mine) / len(common) for policy, mine in shared.items()}
     best = max(means, key=lambda policy: means[policy])
