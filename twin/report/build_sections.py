@@ -28,7 +28,7 @@ _MIN_REGISTERED = 0.9  # a caution is given if fewer of the frames have a camera
 _LARGE_SCALE_UNCERTAINTY = 0.03  # [relative] a caution is given if it is larger
 _LOW_PSNR = 18.0  # [dB]
 _FEW_HELD_OUT = 3  # a caution is given if a lighting has fewer held-out frames
-_LOW_LIGHTING_AGREEMENT = 0.7  # fraction of poses (`cross_lighting_facts`); 0.5 is chance
+_LOW_LIGHTING_AGREEMENT = 0.7  # fraction of places, see `cross_lighting_facts`; 0.5 is chance
 
 _SCALE_SOURCES = {
     "camera_height": "the camera’s height above the ground",
@@ -257,14 +257,14 @@ def field_section(report: dict[str, Any]) -> Section:
 
 
 def cross_lighting_facts(report: dict[str, Any]) -> tuple[list[Fact], list[Caution]]:
-    """Facts and cautions on places that are rendered in a lighting without film of them (`twin.nerf.evaluate`)."""
+    """Facts and cautions about filmed places that are rendered in another lighting (`twin.nerf.evaluate`)."""
     cross = pick(report, "field.cross_lighting") or {}
     follows, own, shown = (numbers(cross.get(key)) for key in ("colour_follows", "to_filmed_rms", "to_shown_rms"))
     facts, cautions = [], []
     for name, share in follows.items():
         rms = f"{number(shown.get(name), '{:.0%}')} to this film, {number(own.get(name), '{:.0%}')} to their own"
         meaning = (
-            "of the poses filmed in other lightings, rendered in this one, have a mean color closer to this one’s film "
+            "of the places filmed in other lightings, rendered in this one, have a mean color nearer to this one’s film "
             f"than to their own. RMS color error: {rms}"
         )
         facts.append(Fact(f"{name}, swapped in", f"{share:.0%}", meaning))

@@ -192,7 +192,7 @@ def _bias(group: Agreement) -> Verdict:
 
 
 def _skill(group: Agreement) -> list[Verdict]:
-    """Verdict on how well the twin predicts single days, compared with the mean of other trainings, if it has scores."""
+    """Verdict on how well the twin predicts single days, compared with the mean of other trainings, if scored."""
     gains = {it.predictor: it.gain for it in group.scores}
     gain = gains.get(OTHERS)
     if gain is None or gain.value is None:
