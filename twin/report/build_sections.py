@@ -264,8 +264,8 @@ def cross_lighting_facts(report: dict[str, Any]) -> tuple[list[Fact], list[Cauti
     for name, share in follows.items():
         rms = f"{number(shown.get(name), '{:.0%}')} to this film, {number(own.get(name), '{:.0%}')} to their own"
         meaning = (
-            "of the places filmed in other lightings, rendered in this one, have a mean color nearer to this one’s film "
-            f"than to their own. RMS color error: {rms}"
+            "of the places filmed in other lightings, rendered in this one, have a mean color closer to its film than "
+            f"to their own. RMS color error: {rms}"
         )
         facts.append(Fact(f"{name}, swapped in", f"{share:.0%}", meaning))
         if share < _LOW_LIGHTING_AGREEMENT:
