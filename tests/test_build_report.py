@@ -266,7 +266,7 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("mesh", "mesh.ground", {"corridor_coverage": 0.2}, "Only 20%"),
     ("mjcf", "mjcf.spawn_touched", ["part_0003"], "part_0003"),
     ("review", "review.follower.reached_goal", False, "did not reach the goal"),
-    ("review", "review.follower.touched", ["part_0001"], "It touched part_0001."),
+    ("review", "review.follower.touched", ["part_0001"], "The robot touched part_0001."),
     ("seen_touched", "seen_touched.median_m", 0.052, "differ by 0.052 m"),
     (
         "seen_touched",
@@ -424,7 +424,7 @@ def test_errors_against_ground_truth_are_shown_where_it_is_known(scene: SceneDir
 def test_charts_are_drawn_from_the_report(scene: SceneDir) -> None:
     text = read(page(scene, REPORT)).text
     assert "24.3 dB (n = 10)" in text
-    assert "How training went" in text and "How far off the route it drove" in text
+    assert "PSNR during training" in text and "Cross-track error of the drive" in text
     assert "Ground and solid parts" not in text  # no mesh stage on disk
 
 

@@ -291,7 +291,7 @@ def test_without_real_trials_statistics_are_missing() -> None:
     assert made.groups == made.pairs == made.left_out == ()
     text = Text(forecast_page(made)).text
     assert "Nothing is known yet about the road" in text and "Limitations" in text
-    assert any("Whether the road ranks" in caution.what for caution in limitations(made))
+    assert any("unknown how well the twin ranks" in caution.what for caution in limitations(made))
     (plan,) = made.plans
     assert plan.basis == "twin" and plan.more_for_winner is not None and plan.more_for_winner > 0
 

@@ -1,4 +1,4 @@
-"""`twin export`: writes a built place for other programs.
+"""`twin export`: writes a built scene for other programs.
 
     python -m twin.export scenes/demo --usd road.usdz
     python -m twin.export scenes/demo --glb road.glb --ply road.ply --lighting night
@@ -60,7 +60,7 @@ def export(
     task_file: Path | None = None,
     task: str | None = None,
 ) -> list[str]:
-    """Writes the given files and folders; returns a summary line for each. Colors are without the fog of lightings.
+    """Writes the given files and folders; returns a summary line for each. Colors do not include a lighting's fog.
 
     Raises:
         InputError: nothing to write, the scene is not built, the lighting or task is unknown, an output folder does not
@@ -90,7 +90,7 @@ def export(
         world = twin.world()
         segment = find_task(task, world, load_config(twin.scene.config_file).task)
         write_task(task_file, world, segment, Options())
-        lines.append(f"{task_file}: {task}, {segment.length:.1f} m from {segment.start:.1f} m of the route, z up [m]")
+        lines.append(f"{task_file}: {task}, {segment.length:.1f} m long, starts {segment.start:.1f} m along the route")
     if folders:
         cameras = twin.cameras()
         points = SparsePoints.load(require_stage(twin.scene, "metric"))
@@ -104,7 +104,7 @@ def export(
 def _field_files(
     twin: Twin, lighting: str | None, usd_file: Path | None, glb: Path | None, ply: Path | None
 ) -> list[str]:
-    """Writes the files whose colors are rendered from the field."""
+    """Writes the files with colors rendered from the radiance field; returns their summary lines."""
     field, cameras = twin.field(), twin.cameras()
     lighting = lighting or field.lightings[0]
     field.embedding(lighting)  # raises InputError early if the name is unknown

@@ -1,10 +1,10 @@
-"""COLMAP workspace of a built place: frames, cameras and sparse points for training programs, in the scene's frame.
+"""COLMAP workspace of a built scene: images, cameras and sparse points, for programs that train radiance fields.
 
     DIR/images/<source>/<number>.png     undistorted frames
     DIR/masks/<source>/<number>.png.png  for frames with a mask; 0 = ignore
     DIR/sparse/0/cameras.txt, images.txt, points3D.txt
 
-World: meters, z up. Observations are the projections of the points, since detected features are not kept.
+Coordinates are the scene's: meters, z up. The 2D points are projected 3D points, as the detected features are not kept.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from twin.geometry.poses import inverse_pose
 
 
 def write_colmap(folder: Path, cameras: Cameras, points: SparsePoints) -> None:
-    """Writes the text model into `folder/sparse/0`; `points` are those stored with the cameras."""
+    """Writes COLMAP's text files to `folder/sparse/0`; `points.frame` are indices into `cameras`."""
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
     keys = [(*size.tolist(), *k.tolist()) for size, k in zip(cameras.sizes, cameras.intrinsics, strict=True)]
@@ -59,5 +59,5 @@ def write_colmap(folder: Path, cameras: Cameras, points: SparsePoints) -> None:
 
 
 def _lines(head: str, rows: Iterable[tuple]) -> str:
-    """Lines of values under a comment; floating-point numbers keep all their digits."""
+    """Text: a comment `head`, then one line per row; floating-point numbers keep all digits."""
     return "\n".join([f"# {head}", *(" ".join(map(str, row)) for row in rows), ""])

@@ -1,9 +1,9 @@
 """glTF file (`.glb`) of the visual mesh with a texture baked from the radiance field under one lighting.
 
-Every face has its own square of the texture, its *tile*, with the resolution of the nearest camera. A *texel* is a
-point of the face's plane. Its color is a mean over the rendered views in which it is visible; the sharper a view shows
-it, the more the view counts. The material is unlit (KHR_materials_unlit): filmed colors include the light. glTF is y
-up.
+Every face has its own square of the texture, its *tile*. On the face, a *texel* (pixel of the texture) is about as
+large as a pixel of the nearest rendered view. Its color is a mean over the views that show its point of the face; near
+and frontal views have the largest weights. The material is unlit (KHR_materials_unlit), since filmed colors include the
+light. In glTF, y points up.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -28,14 +28,14 @@ from twin.warp_runtime import wp
 VIEWS, WIDTH, FAR = 96, 640, 100.0
 """Number of views that the texture is baked from, their width [px], and the z-depth where background starts [m]."""
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-_SIDE = 4096  # [px] side of the texture; every viewer supports this size
-_MIN_TEXEL = 0.01  # [m]
-_MAX_TILE = 256  # [px]
+_SIDE = 4096  # [px] largest width of the texture; every viewer supports this size
+_MIN_TEXEL = 0.01  # [m] side on the face
+_MAX_TILE = 256  # [px] side
 _COARSER = 1.1  # factor by which texels grow until all tiles fit
-_DEPTH_TOLERANCE = 0.03  # relative difference of depth up to which a vertex is visible
-# The mesh is smoother than the field, so a texel may lie in front of or behind the surface that a view shows.
+_DEPTH_TOLERANCE = 0.03  # a vertex is visible up to this relative difference from the rendered depth
+# Larger for texels: the mesh is smoother than the field, so a face may lie before or behind the surface in a view.
 _TEXEL_TOLERANCE = 0.08
-_SHARPNESS = 2.0  # a view's weight is this power of cos(slant) / depth²
+_SHARPNESS = 2.0  # a view's weight is this power of cos(angle between ray and normal) / depth²
 _CHUNK = 2_000_000  # texels computed at once
 _JPEG_QUALITY = 95
 
@@ -71,7 +71,7 @@ def textured_glb(vertices: Array, faces: NDArray, views: Views) -> bytes:
 
 
 def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[np.float64]]:
-    """The texture (h, w, 3), and coordinates (f, 3, 2) in it of the faces' corners, u from the left, v from the top.
+    """Returns the texture (h, w, 3) and texture coordinates (f, 3, 2) of the faces' corners: u from left, v from top.
 
     Raises:
         InputError: no view shows the mesh.
@@ -99,7 +99,7 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
         total = np.stack([np.bincount(own[seen] - start, rgb[seen, c], stop - start) for c in range(3)], 1)
         with np.errstate(invalid="ignore"):
             means[start:stop] = total / n[:, None]
-        # Texels that no view shows get the mean color of their face; faces that no view shows are filled below.
+        # Texels that no view shows get the mean color of their face; faces that no view shows get the nearest face's.
         rgb[~seen] = np.nan_to_num(means[own[~seen]], nan=-1.0)
         texture[y[own] + j, x[own] + i] = np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
         start = stop
@@ -118,14 +118,14 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
 
 
 def _turned(corners: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Corners (f, 3, 3) of faces, the first one opposite the longest edge, and their cyclic order (f, 3)."""
+    """Corners (f, 3, 3), rotated so that the first is opposite the longest edge, and their former indices (f, 3)."""
     edges = np.linalg.norm(np.roll(corners, -1, 1) - np.roll(corners, 1, 1), axis=-1)
     order = (np.argmax(edges, 1)[:, None] + np.arange(3)) % 3
     return np.take_along_axis(corners, order[:, :, None], 1).astype(np.float64), order
 
 
 def _tile_sides(corner: Array, views: Views) -> NDArray[np.int64]:
-    """Sides of the faces' tiles [px] such that a texel is as large as a pixel of the nearest view, shape (f,)."""
+    """Sides (f,) of the tiles [px]: texels are as large as a pixel of the nearest view, or larger so that all fit."""
     legs = np.linalg.norm(corner[:, 1:] - corner[:, :1], axis=-1).max(1)
     nearest = cKDTree(views.camera_to_world[:, :3, 3]).query(corner.mean(1))[0]
     texel = np.maximum(nearest / views.intrinsics[:, 0].mean(), _MIN_TEXEL)

@@ -1,12 +1,12 @@
-"""nerfstudio data set of a built place: frames and cameras for other training programs, in the scene's metric frame.
+"""nerfstudio data set of a built scene: images, cameras and sparse points, for training fields or splats elsewhere.
 
     DIR/transforms.json                every frame
-    DIR/transforms_<lighting>.json     frames of one lighting: ns-train ... nerfstudio-data --data FILE
-    DIR/images/..., DIR/masks/...      undistorted frames; masks, if the place has any: 0 = ignore
+    DIR/transforms_<lighting>.json     frames of one lighting, for `ns-train ... --data FILE`, if there are several
+    DIR/images/..., DIR/masks/...      undistorted frames; masks, if any frame has one: 0 = ignore
     DIR/points.ply                     sparse points, from which splatfacto starts
 
-Cameras have OpenGL axes (x right, y up, looking along −z); the world is in meters, z up, and not transformed
-(`applied_transform` is the identity). By default, nerfstudio itself rotates, centers and scales the poses.
+Cameras have OpenGL axes (x right, y up, looking along −z). World coordinates are the scene's: meters, z up
+(`applied_transform` is the identity). By default, nerfstudio then rotates, centers and scales the poses.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ POINTS = "points.ply"
 
 
 def write_nerfstudio(folder: Path, cameras: Cameras, points: SparsePoints, masked: bool) -> None:
-    """Writes `transforms.json`, one more for each of several lightings, and the points.
+    """Writes `transforms.json`, a file per lighting if there are several, and the points.
 
     `masked`: every frame has a mask; nerfstudio requires masks for all frames or for none.
     """
@@ -36,7 +36,7 @@ def write_nerfstudio(folder: Path, cameras: Cameras, points: SparsePoints, maske
 
 
 def transforms(cameras: Cameras, frames: Sequence[int], masked: bool) -> dict[str, Any]:
-    """The contents of a `transforms.json` with some of the frames; held-out frames are its validation and test set."""
+    """The contents of a `transforms.json` with these frames; the held-out ones are its validation and test set."""
     poses = opencv_to_mujoco(cameras.camera_to_world)  # MuJoCo's camera axes are OpenGL's
     listed = []
     for i in frames:

@@ -1,4 +1,4 @@
-"""USD file of a built place (splats, collision, robot), for Isaac Sim and other programs that read UsdPhysics.
+"""USD file of a built scene (splats, collision, robot), for Isaac Sim and other programs that read UsdPhysics.
 
     /World                      variant sets `lighting` (colors) and `appearance` (splats, or the mesh)
         Place/Splats            ParticleField3DGaussianSplat
@@ -11,8 +11,8 @@
         Sun, Sky, PhysicsScene
 
 Meters, kilograms, z up. Bodies, masses, joints, shapes and cameras are read from the compiled MuJoCo model, so they are
-those of the simulation. There, a belt couples the wheels of a side. UsdPhysics has no belt, so each wheel has a drive
-with half of the side's gain and torque. Splats emit light; sun and sky light the robot and added objects.
+those of the simulation. In MuJoCo, a belt couples the wheels of a side. UsdPhysics has no belt, so each wheel has a
+drive with half of the side's gain and torque. Splats emit light; sun and sky light the robot and added objects.
 """
 
 import shutil
@@ -35,12 +35,12 @@ from twin.types import Array
 
 SUFFIXES = (".usdz", ".usd", ".usdc")
 _SH_CONSTANT = 0.28209479177387814  # spherical harmonic of degree 0, 1 / (2 √π)
-_APERTURE = 20.955  # [tenths of a meter] width of a camera's film; only its ratio to the focal length has an effect
+_APERTURE = 20.955  # [tenths of a meter] width of a camera's sensor; only its ratio to the focal length has an effect
 _CLIPPING = 0.01, 1000.0  # [m] nearest and farthest depth that cameras show
-_RING, _SHOULDER, _SHOULDER_OFFSET = 32, 16, 0.6  # vertices around a tire's middle and shoulder; offset / half width
+_RING, _SHOULDER, _SHOULDER_OFFSET = 32, 16, 0.6  # vertices at a tire's middle, per shoulder; shoulder's y / half width
 _CURVE_WIDTH, _GOAL_RADIUS = 0.05, 0.2  # [m]
 _SUN_INTENSITY, _SKY_INTENSITY = 1500.0, 600.0  # [nit]
-_SPLAT_EXTENT = 3.0  # standard deviations of a splat that its extent includes
+_SPLAT_EXTENT = 3.0  # [standard deviations of a splat] half size of its bounding box
 
 
 def require_usd() -> None:
@@ -63,11 +63,11 @@ def write_usd(
     world: World | None,
     selected: str,
 ) -> None:
-    """Writes the file, as `.usdz`, or binary `.usd` or `.usdc`.
+    """Writes a `.usdz`, or a binary `.usd` or `.usdc`.
 
     Args:
-        path: The file.
-        splats: Splats by lighting, which differ in `rgb` only.
+        path: The file; its suffix selects the format.
+        splats: Splats by lighting; they differ only in `rgb`.
         mesh: Vertices (v, 3) [m] and faces (f, 3) of the visual mesh.
         colors: Colors of the mesh's vertices by lighting, shape (v, 3).
         parts: Convex parts.
@@ -76,7 +76,7 @@ def write_usd(
         selected: The lighting that is selected in the file.
 
     Raises:
-        InputError: another suffix, usd-core is missing, or two lightings would have one name.
+        InputError: the suffix is not supported, usd-core is missing, or two lightings would have the same name.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: expected a file ending in {', '.join(SUFFIXES)}")
@@ -100,8 +100,8 @@ def write_usd(
         robot = world.robot if world else HuskyParams()
         tires, bare = (
             _friction(stage, f"/World/Materials/{name}", value)
-            # In MuJoCo the wheels' friction holds on every surface. Programs that average the friction of two surfaces,
-            # as PhysX does, get the same value if the ground has it, too.
+            # In MuJoCo, a wheel's contacts have the wheel's friction. Programs that average the friction of two
+            # surfaces, as PhysX does, get the same value if the ground has it, too.
             for name, value in (("TiresAndGround", robot.friction), ("Chassis", 1.0))
         )
         _add_collision(stage, model, parts, tires)
@@ -200,7 +200,7 @@ def _add_physics(stage: Any, model: mujoco.MjModel) -> None:
 
 
 def _friction(stage: Any, path: str, value: float) -> Any:
-    """A material with static and dynamic friction, for collisions alone."""
+    """A material for collisions only, with one value for static and dynamic friction."""
     from pxr import UsdPhysics, UsdShade
 
     material = UsdShade.Material.Define(stage, path)
@@ -235,7 +235,7 @@ def _add_collision(stage: Any, model: mujoco.MjModel, parts: Parts, material: An
 
 
 def ground_triangles(model: mujoco.MjModel) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """The height field `ground` of a model as MuJoCo's triangles: vertices (v, 3) [m] and faces (f, 3), facing up."""
+    """The height field `ground`, triangulated as MuJoCo does: vertices (v, 3) [m] and faces (f, 3), facing up."""
     geom = model.geom("ground")
     field = int(geom.dataid[0])
     rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
@@ -302,7 +302,7 @@ def _add_robot(stage: Any, model: mujoco.MjModel, tires: Any, bare: Any) -> None
 
 
 def _add_geom(stage: Any, parent: str, model: mujoco.MjModel, index: int, material: Any) -> None:
-    """Adds a geom to its link: colliders as guides, visual geoms in their colors. Other geoms are left out."""
+    """Adds a geom to its link: a collider as a guide (not drawn), a visual geom in its color. Others are left out."""
     from pxr import UsdGeom, Vt
 
     geom = model.geom(index)
@@ -390,11 +390,11 @@ def _add_camera(stage: Any, parent: str, model: mujoco.MjModel, index: int) -> N
     out.CreateProjectionAttr(UsdGeom.Tokens.perspective)
     out.CreateFocalLengthAttr(float(fx) * scale)
     out.CreateHorizontalApertureAttr(_APERTURE)
-    # A USD camera has one focal length. So if pixels are not square, the height of the film is scaled.
+    # A USD camera has one focal length. So if pixels are not square, the height of the sensor is scaled.
     stretch = scale * float(fx / fy)
     out.CreateVerticalApertureAttr(float(sensor[1]) * stretch)
-    # MuJoCo counts the principal point's offset from the center positive to the left and up; USD shifts the film in
-    # the opposite direction.
+    # MuJoCo's offset of the principal point from the center is positive to the left and up. USD's is the offset of the
+    # sensor from the optical axis, positive to the right and up.
     out.CreateHorizontalApertureOffsetAttr(float(right) * scale)
     out.CreateVerticalApertureOffsetAttr(-float(up) * stretch)
     out.CreateClippingRangeAttr(Gf.Vec2f(*_CLIPPING))

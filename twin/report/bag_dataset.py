@@ -1,7 +1,7 @@
-"""Robots' recordings (bags), of drives by a policy or by hand, as a LeRobot dataset.
+"""Converts a robot's ROS bags, of drives by a policy or by hand, to a LeRobot dataset.
 
 A frame has the newest picture, as a policy would see it; speed and yaw rate from the poses before it; and the mean of
-the commands until the next frame. Rewards and outcome come from the poses, by the twin's rules. `drive_dataset.py`
+the commands until the next frame. Rewards and outcome follow from the poses by the twin's rules. `drive_dataset.py`
 describes the format.
 """
 
@@ -30,7 +30,7 @@ from twin.types import Array, Image
 from twin_policy import Rectifier
 
 _SPEED_SPAN = 0.2  # [s] before an instant, over which speed is measured; later poses would show later commands
-_MAX_GAP = 0.5  # [s] longest time without a picture, and time for which a command is in force (ROS 2)
+_MAX_GAP = 0.5  # [s] longest time without a picture; also the time after which the robot stops without a command
 
 
 def write_bag_dataset(
@@ -61,7 +61,7 @@ def write_bag_dataset(
         InputError: scene, policy or a bag is unusable, `out` exists, or pyarrow is not installed.
     """
     if cause and len(bags) > 1:
-        raise InputError(f"--cause {cause} is of one bag; there are {len(bags)}")
+        raise InputError(f"--cause {cause} applies to one bag; there are {len(bags)}")
     require_pyarrow()
     require_absent(out)
     scene = load_scene(root)
@@ -129,8 +129,8 @@ def _motion(recording: TrialRecording, stamps: NDArray[np.int64]) -> Array:
 def _actions(recording: TrialRecording, stamps: NDArray[np.int64], period: float) -> Array:
     """Action in the step after each instant, v [m/s] and ω [rad/s], shape (k, 2); the last one is zero.
 
-    An action is the mean of the commands in the step. Without commands it is the last earlier one, or zero if that is
-    older than `_MAX_GAP`, since the robot has then stopped.
+    An action is the mean of the commands in the step. Without commands it is the last earlier command, or zero if that
+    is older than `_MAX_GAP`, since the robot has then stopped.
     """
     actions = np.zeros((len(stamps), 2))
     ends = np.searchsorted(recording.command_times, stamps + round(period * 1e9))

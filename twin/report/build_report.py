@@ -1,7 +1,8 @@
 """Writes `report.html`: what a build did, how good the result is, and how to improve it.
 
 The page is self-contained except for the review video, a file beside it. Pictures come from the stage folders. Figures
-show data from these folders and from the report. The text comes from `build_sections.py`.
+show data from these folders and from the report. The text comes from `build_sections.py` and
+`build_topics.py`.
 """
 
 import shlex
@@ -24,7 +25,7 @@ from twin.scene import SceneDir, stage_result
 
 _MAX_REPROJECTION = 4.0  # [px] right end of the histogram of reprojection errors
 _MAX_TRACK_LENGTH = 30.0  # [frames] right end of the histogram of track lengths
-_EXCLUDED = "Frames of each lighting: red pixels seem to show what moved or left, and were not used."
+_EXCLUDED = "Frames of each lighting. Red pixels were not used: they seem to show things that moved or went away."
 
 
 def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
@@ -97,7 +98,7 @@ def _field_charts(report: dict[str, Any]) -> list[Chart]:
     if isinstance(curve, list) and len(curve) > 1 and all(isinstance(row, list) and len(row) == 2 for row in curve):
         steps, values = zip(*curve, strict=True)
         drawn = figures.curve_chart({"": (steps, values)}, "training step", "PSNR on training pixels [dB]")
-        out.append(Chart("How training went", figures.svg(drawn), "field"))
+        out.append(Chart("PSNR during training", figures.svg(drawn), "field"))
     return out
 
 
@@ -109,11 +110,11 @@ def _drive_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     if isinstance(trace, dict) and len(trace.get("progress_m") or []) > 1:
         limit, at = _half_width(report), trace["progress_m"]
         off, speed = {"": (at, trace["cross_track_m"])}, {"": (at, trace["speed_m_s"])}
-        drawn = figures.curve_chart(off, along_route, "off the route [m], left is positive", limit)
-        title = "How far off the route it drove" + ("" if limit is None else "; dashed: the corridor")
+        drawn = figures.curve_chart(off, along_route, "cross-track [m], left is positive", limit)
+        title = "Cross-track error of the drive" + ("" if limit is None else "; dashed: the corridor")
         out.append(Chart(title, figures.svg(drawn), "review"))
         drawn = figures.curve_chart(speed, along_route, "speed [m/s]", lowest=0.0)
-        out.append(Chart("How fast it drove", figures.svg(drawn), "review"))
+        out.append(Chart("Speed of the drive", figures.svg(drawn), "review"))
     along = pick(report, "seen_touched.along")
     if isinstance(along, dict) and len(along.get("station_m") or []) > 1:
         keys = {"largest visual-only": "leak_m", "largest collision-only": "ghost_m", "ground, median": "ground_m"}
@@ -213,7 +214,7 @@ def _kicker(report: dict[str, Any]) -> str:
 
 
 def _pictures(scene: SceneDir) -> list[Picture]:
-    """The pictures that the review stage saved for the page, and that of the pixels that training left out."""
+    """The pictures that the review stage saved for the page, and one of the pixels that training left out."""
     folder, pictures = scene.stage("review"), []
     if (folder / "review.json").exists():
         stored = read_json(folder / "review.json").get("pictures", [])
@@ -248,12 +249,12 @@ def _next_steps(scene: SceneDir, report: dict[str, Any]) -> list[tuple[str, list
     first = "Watch the video and look at the pictures above: is this the place that you filmed?"
     if wrong:
         first = (
-            f"Look at the {'caution' if wrong == 1 else f'{wrong} cautions'} above. Change what helps, in scene.toml "
-            "or in the films, and build again; only what depends on the change is computed again:"
+            f"Look at the {'caution' if wrong == 1 else f'{wrong} cautions'} above. Change scene.toml or the films as "
+            "proposed there, and build again; only the stages that depend on the change run again:"
         )
     out = [(first, [build] if wrong else [])]
-    drive = " and drive the robot there" if scene.has_route else ""
-    look = f"Look around in the browser, in any lighting,{drive} (needs the extra “view”: pip install 'twin[view]'):"
+    drive = ", and drive the robot there" if scene.has_route else ""
+    look = f"Look around in the browser, in any lighting{drive} (needs the extra “view”: pip install 'twin[view]'):"
     out.append((look, [command("view", root)]))
     if scene.has_route:
         shown = shlex.join(["python", "-m", "mujoco.viewer", f"--mjcf={scene.stage('mjcf') / SCENE_XML}"])
@@ -270,7 +271,7 @@ def _next_steps(scene: SceneDir, report: dict[str, Any]) -> list[tuple[str, list
         (align, [command("align", root, "drive.csv"), build]),
         (f"Train a policy on the task “{task}”:", [command("train", root, "--task", task, "--run", "first")]),
         (
-            "Validate it: how often it reaches the goal in lights that it was not trained in:",
+            "Validate the policy: measure how often it reaches the goal in lightings that it was not trained in:",
             [command("validate", root, "--task", task, "--policy", "first", "--films")],
         ),
     ]

@@ -24,11 +24,11 @@ from twin.report.html import (
 )
 from twin.report.section_facts import as_number, cautions_above, facts_of
 
-_MIN_REGISTERED = 0.9  # a caution is given if a smaller share of frames was placed
+_MIN_REGISTERED = 0.9  # a caution is given if fewer of the frames have a camera pose
 _LARGE_SCALE_UNCERTAINTY = 0.03  # [relative] a caution is given if it is larger
 _LOW_PSNR = 18.0  # [dB]
 _FEW_HELD_OUT = 3  # a caution is given if a lighting has fewer held-out frames
-_LOW_LIGHTING_AGREEMENT = 0.7  # [share of places] 0.5 is chance
+_LOW_LIGHTING_AGREEMENT = 0.7  # fraction of places, see `cross_lighting_facts`; 0.5 is chance
 
 _SCALE_SOURCES = {
     "camera_height": "the camera’s height above the ground",
@@ -104,20 +104,20 @@ def cameras_section(report: dict[str, Any]) -> Section:
     track = _first_present(cameras, "mean_track_length", "track_length")
     focal = _focal_text(_first_present(cameras, "focal_px", "focal"))
     facts = [
-        Fact("frames placed", placed, "frames that the reconstruction could use"),
+        Fact("frames placed", placed, "frames whose camera pose was estimated"),
         *facts_of(
             report,
             (
                 "cameras.reprojection_error_px",
                 "reprojection error",
                 "{:.2f} px",
-                "distance of points from their observations",
+                "mean distance of projected points from their observations",
             ),
             ("cameras.points", "points", "{:,}", "triangulated"),
         ),
         Fact("track length", number(track, "{:.1f} frames"), "frames that observe a point"),
         Fact("focal length", focal, "given, or estimated by the reconstruction"),
-        Fact("method", str(cameras.get("mapper") or NOT_MEASURED), "global; incremental if that fails"),
+        Fact("method", str(cameras.get("mapper") or NOT_MEASURED), "global, or incremental if that fails"),
     ]
     done = "Structure from motion estimated the pose of each frame from points that several frames share."
     return Section("cameras", "Cameras", done, facts, cautions, verdict=verdict)
@@ -175,7 +175,7 @@ def metric_section(report: dict[str, Any]) -> Section:
     if source:
         source_text = " and ".join(_SCALE_SOURCES.get(one, one) for one in str(source).split(" + "))
         sure = "" if uncertainty is None else f", with an uncertainty of about {uncertainty:.1%}"
-        verdict = Verdict(f"Its scale comes from {source_text}{sure}.", "good")
+        verdict = Verdict(f"The scale comes from {source_text}{sure}.", "good")
     gravity = _first_present(metric, "gravity_source", "gravity")
     facts = [
         Fact("scale from", source_text, "as given in scene.toml"),
@@ -186,15 +186,15 @@ def metric_section(report: dict[str, Any]) -> Section:
             report,
             ("metric.gravity_uncertainty_deg", "tilt uncertainty", "{:.2f}°", "one standard deviation"),
             ("metric.path_length_m", "filmed path", "{:.1f} m", "of the longest film"),
-            ("metric.camera_height_median_m", "camera height", "{:.2f} m", "median, above the estimated floor"),
+            ("metric.camera_height_median_m", "camera height", "{:.2f} m", "median, above the ground"),
         ),
     ]
-    done = "The reconstruction was aligned with gravity, placed on the floor, and scaled to meters."
+    done = "The reconstruction was aligned with gravity, placed on the ground, and scaled to meters."
     return Section("metric", "Scale and gravity", done, facts, cautions, verdict=verdict)
 
 
 def _transient_facts(field: dict[str, Any]) -> list[Fact]:
-    """Facts about what was left out: movers, and objects that stand in the films of some lightings only."""
+    """Facts about what was left out: moving things, and objects that only some lightings' films show."""
     share, objects = pick(field, "transients.moving_share"), pick(field, "transients.objects") or []
     if share is None:
         return []
@@ -202,13 +202,13 @@ def _transient_facts(field: dict[str, Any]) -> list[Fact]:
         Fact(
             "moving things",
             number(share, "{:.1%}"),
-            "of the training pixels look like it and were left out; 1% is common where nothing moved",
+            "of the training pixels seem to show them and were left out; 1% is common if nothing moved",
         )
     ]
     for k, one in enumerate(objects, 1):
         size, (x, y, _) = sorted(one["size"], reverse=True), one["center"]
         text = f"{size[0]:.1f} m long, at x = {x:.1f}, y = {y:.1f} m"
-        meaning = f"stands in {' and '.join(one['present'])}, not in {' or '.join(one['absent'])}; left out"
+        meaning = f"filmed in {' and '.join(one['present'])}, absent in {' or '.join(one['absent'])}; left out"
         facts.append(Fact(f"removed object {k}", text, meaning))
     return facts
 
@@ -237,14 +237,14 @@ def field_section(report: dict[str, Any]) -> Section:
     small, lower = (numbers(field.get(key)) for key in ("psnr_small", "psnr_small_lower"))
     for name, value in small.items():
         text = number(value, "{:.1f} dB PSNR") + (f", {lower[name]:.1f} dB in the lower half" if name in lower else "")
-        facts.append(Fact(f"{name}, at 160×90", text, "as policies see it"))
+        facts.append(Fact(f"{name}, at 160×90", text, "the image size of policies"))
     for name, value in numbers(field.get("baking_gain")).items():
-        meaning = "effect of baking and detail on the PSNR of the same frames, unfitted"
+        meaning = "change of the PSNR by baking and added detail, without fitting"
         facts.append(Fact(f"{name}, baked", number(value, "{:+.1f} dB"), meaning))
     swapped, more = cross_lighting_facts(report)
     done = (
         "A NeRF models the appearance of every point from every direction, in each lighting. It is evaluated on "
-        "held-out frames: only the appearance is fitted on one half of such a frame, and the other half is scored. "
+        "held-out frames: the appearance embedding is fitted to one half of a frame, and the other half is scored. "
         "Images on this page are rendered without fitting. Above about 20 dB a view is easy to recognize; above 30 dB "
         "it is hard to distinguish from the film."
     )
@@ -257,22 +257,27 @@ def field_section(report: dict[str, Any]) -> Section:
 
 
 def cross_lighting_facts(report: dict[str, Any]) -> tuple[list[Fact], list[Caution]]:
-    """Facts and cautions on places that are rendered in a lighting without film of them (`twin.nerf.evaluate`)."""
+    """Facts and cautions about filmed places that are rendered in another lighting (`twin.nerf.evaluate`)."""
     cross = pick(report, "field.cross_lighting") or {}
     follows, own, shown = (numbers(cross.get(key)) for key in ("colour_follows", "to_filmed_rms", "to_shown_rms"))
     facts, cautions = [], []
     for name, share in follows.items():
         rms = f"{number(shown.get(name), '{:.0%}')} to this film, {number(own.get(name), '{:.0%}')} to their own"
         meaning = (
-            "of the places filmed in another lighting look like the film of this lighting when rendered in it. RMS "
-            f"color error: {rms}"
+            "of the places filmed in other lightings, rendered in this one, have a mean color closer to its film than "
+            f"to their own. RMS color error: {rms}"
         )
         facts.append(Fact(f"{name}, swapped in", f"{share:.0%}", meaning))
         if share < _LOW_LIGHTING_AGREEMENT:
             what = f"Only {share:.0%} of the places filmed in other light resemble “{name}” when rendered in it."
             cure = "film every light along the same path; lights that look very similar reach about 50% at best."
             cautions.append(Caution(what, cure))
-    moves = ("field.cross_lighting.depth_moves_m", "depth, light swapped", "{:.3f} m", "largest change; zero by design")
+    moves = (
+        "field.cross_lighting.depth_moves_m",
+        "depth",
+        "{:.3f} m",
+        "largest change between lightings; zero by design",
+    )
     what = "Depth moves by up to {:.3f} m with the light."
     cautions += cautions_above(report, (moves[0], 1e-3, what, "this is a bug; please report it."))
     return facts + (facts_of(report, moves) if follows else []), cautions
@@ -316,7 +321,7 @@ def mesh_section(report: dict[str, Any]) -> Section:
         ("mesh.ground.coverage", "ground measured", "{:.0%}", "the rest of its area was interpolated"),
         ("mesh.ground.corridor_coverage", "along the route", "{:.0%}", "of the ground was measured"),
         ("mesh.ground.route_slope_rms", "road’s slope", "{:.1%}", "root mean square, along the route"),
-        ("mesh.max_protrusion_m", "parts stick out", "{:.2f} m", "of the surface, at most"),
+        ("mesh.max_protrusion_m", "parts stick out", "{:.2f} m", "of the extracted surface, at most"),
         ("mesh.parts_left_out", "left out", "{}", "parts beyond what mesh.max_parts allows"),
     )
     done = (
@@ -327,7 +332,7 @@ def mesh_section(report: dict[str, Any]) -> Section:
 
 
 def _route_choice(report: dict[str, Any]) -> str:
-    """Source of the route in words: the passes that it follows, way points, or the filmed path."""
+    """Source of the route in words: filmed passes (`twin.geometry.passes`), way points, or the filmed path."""
     route = pick(report, "mesh.route")
     if not isinstance(route, dict) or not route.get("passes"):
         return "the filmed path"
@@ -340,7 +345,7 @@ def _route_choice(report: dict[str, Any]) -> str:
 def mjcf_section(report: dict[str, Any]) -> Section:
     routeless = pick(report, "mjcf.has_route") is False
     done = "Ground, parts, lights and a Husky at the start of the route, as a folder that MuJoCo loads: "
-    route = [Fact("route", "none", "the filmed path")]
+    route = [Fact("route", "none", "no line to drive along")]
     if routeless:
         done = "Ground, parts and lights as a folder that MuJoCo loads, without a robot because there is no route: "
     else:
@@ -382,7 +387,7 @@ def review_section(report: dict[str, Any]) -> Section:
                 "these are solid parts in or beside the corridor; if nothing is there in reality, mask what moved "
                 "while filming, or raise mjcf.corridor_margin."
             )
-            cautions.append(Caution(f"It touched {join_names(touched, 8)}.", cure))
+            cautions.append(Caution(f"The robot touched {join_names(touched, 8)}.", cure))
         parts = NOT_MEASURED if touched is None else join_names(touched)
         trust = "mean estimated reliability of pictures rendered in the corridor, 0 (poor) to 1 (like the film)"
         facts = [
@@ -390,10 +395,10 @@ def review_section(report: dict[str, Any]) -> Section:
             Fact("touched", parts, "besides ground"),
             *facts_of(
                 report,
-                ("review.follower.max_cross_track_m", "farthest off the route", "{:.2f} m", "cross-track"),
+                ("review.follower.max_cross_track_m", "farthest off the route", "{:.2f} m", "cross-track error"),
                 ("review.follower.distance_m", "driven", "{:.1f} m", duration(follower.get("seconds"))),
                 ("review.follower.turn_deg", "turned", "{:+.0f}°", "right is negative"),
-                ("review.trust.mean", "trust in its pictures", "{:.2f}", trust),
+                ("review.trust.mean", "trust in the pictures", "{:.2f}", trust),
             ),
         ]
     frames = number(pick(report, "review.frames"), "{} frames")
@@ -401,7 +406,7 @@ def review_section(report: dict[str, Any]) -> Section:
     facts += facts_of(
         report, ("review.render_seconds_per_frame", "rendering", "{:.2f} s", "per NeRF view in the video")
     )
-    done = "The video above: the field beside the real frames, the changing light, and the Husky on the route."
+    done = "The video above shows real and rendered frames, the changing light, and the Husky on the route."
     reason = str(pick(report, "review.not_applicable") or "")
     return Section("review", "Review", done, facts, cautions, reason, follower_verdict(report))
 

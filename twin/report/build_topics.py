@@ -15,8 +15,8 @@ def geometry_section(report: dict[str, Any]) -> Section:
     name, title = "seen_touched", "Visual and collision geometry"
     found = pick(report, name)
     if not isinstance(found, dict):
-        return Section(name, title, "", not_applicable="nothing was driven here, so there are no views to compare")
-    visible = "visible above the ground, without collision geometry"
+        return Section(name, title, "", not_applicable="no robot was driven, so there are no views to compare")
+    visible = "height of visible geometry above the ground"
     twice = "where no film shows the corridor from two directions; not part of the previous number"
     within = f"median within {MAX_DEPTH:g} m, ground and parts"
     facts = facts_of(
@@ -40,7 +40,7 @@ def geometry_section(report: dict[str, Any]) -> Section:
             "corridor_ghost_m",
             "largest collision-only in the corridor",
             "{:.3f} m",
-            "collision geometry that is not visible",
+            "distance by which visible geometry lies behind it",
         ),
         ("unfilmed_ghost_m", "the same, filmed from one direction", "{:.3f} m", twice),
         (
@@ -49,12 +49,12 @@ def geometry_section(report: dict[str, Any]) -> Section:
             "{:.3f} m",
             "median distance to the nearest surface",
         ),
-        ("leak_share", "visual-only", "{:.1%}", f"of visible obstacles, by more than {LARGE_ERROR:g} m"),
+        ("leak_share", "visual-only", "{:.1%}", f"of obstacle points, over {LARGE_ERROR:g} m from collision geometry"),
         (
             "ghost_share",
             "collision-only",
             "{:.1%}",
-            f"of the parts in view, by more than {LARGE_ERROR:g} m",
+            f"of points on parts, over {LARGE_ERROR:g} m from visible geometry",
         ),
         ("views", "views", "{}", "of the robot’s camera, along its drive"),
     )
@@ -95,7 +95,7 @@ def truth_section(report: dict[str, Any]) -> Section:
             "compare SCENE)"
         )
         return Section(name, title, "", not_applicable=reason)
-    kinds = {"ground": "ground", "obstacle": "obstacles up to full height", "foliage": "leaves"}
+    kinds = {"ground": "ground", "obstacle": "obstacles of any height", "foliage": "leaves"}
     shares = {kind: truth.get(f"mesh_completeness_10cm_{kind}") for kind in kinds}
     complete = [f"{number(share, '{:.0%}')} of {kinds[kind]}" for kind, share in shares.items() if share is not None]
     by_kind = join_names(complete) if complete else "completeness of the mesh"
@@ -113,12 +113,17 @@ def truth_section(report: dict[str, Any]) -> Section:
         ("scale_error", "scale", "{:+.2%}", "the twin’s meter compared with the true one"),
         ("tilt_deg", "gravity", "{:.2f}°", "between the twin’s vertical and the true one"),
         ("ground_median_m", "ground height", "{:.3f} m", "median error inside the corridor"),
-        ("ground_p95_m", "ground height, worst places", "{:.3f} m", "95 of 100 places are better"),
+        ("ground_p95_m", "the same, 95th percentile", "{:.3f} m", "error inside the corridor"),
         ("obstacle_accuracy_m", "solid parts to true surface", "{:.3f} m", "median: accuracy of the parts"),
         ("obstacle_completeness_m", "true surface to solid parts", "{:.3f} m", "median: completeness of the parts"),
         ("mesh_accuracy_median_m", "visual mesh to true surface", "{:.3f} m", "median: accuracy of the mesh"),
         ("mesh_accuracy_mean_m", "the same, mean", "{:.3f} m", "errors above 1 m count as 1 m"),
-        ("mesh_completeness_5cm", "true surface within 5 cm of the mesh", "{:.0%}", "of what the cameras saw nearby"),
+        (
+            "mesh_completeness_5cm",
+            "true surface within 5 cm of the mesh",
+            "{:.0%}",
+            "of that seen within 10 m of the route",
+        ),
         ("mesh_completeness_10cm", "true surface within 10 cm of the mesh", "{:.0%}", by_kind),
         ("mesh_chamfer_m", "visual mesh, Chamfer distance", "{:.3f} m", "mean of both directions, each up to 1 m"),
         ("corridor_intrusions", "parts inside the true corridor", "{}", "the corridor must be free"),
@@ -141,8 +146,8 @@ def truth_section(report: dict[str, Any]) -> Section:
     off, ground = as_number(truth.get("ate_m")), as_number(truth.get("ground_median_m"))
     verdict = None
     if off is not None:
-        also = "" if ground is None else f" and its ground by {100 * ground:.1f} cm"
-        verdict = Verdict(f"Compared with ground truth, its cameras are off by {100 * off:.1f} cm{also}.", "good")
+        also = "" if ground is None else f" and the ground by {100 * ground:.1f} cm (median)"
+        verdict = Verdict(f"Compared with ground truth, the cameras are off by {100 * off:.1f} cm (rms){also}.", "good")
     done = "This place was generated, so its ground truth is known. Only this comparison uses it; the build does not."
     return Section(name, title, done, facts, cautions, verdict=verdict)
 

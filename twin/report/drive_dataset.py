@@ -165,7 +165,7 @@ class DriveDataset:
         return {CAMERA: picture, **columns}
 
     def finish(self, robot: str = "husky") -> None:
-        """Writes the tables. At least one drive must have been added."""
+        """Writes the tables; `add` must have been called at least once."""
         import pyarrow as pa
         from pyarrow import parquet
 
@@ -266,7 +266,7 @@ def _merged(stats: list[dict[str, Array]]) -> dict[str, Array]:
 
 
 def _task_table(tasks: list[str]) -> "pyarrow.Table":
-    """Table of tasks. LeRobot reads it by pandas; the metadata make the text of the task the index."""
+    """Table of tasks. LeRobot reads it with pandas; the metadata make the text of the task the index."""
     import pyarrow as pa
 
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})

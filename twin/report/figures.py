@@ -25,7 +25,7 @@ from twin.config import RANDOMIZED, Condition
 from twin.geometry.passes import FilmedPass
 from twin.types import Array
 
-# Placeholder colors that occur nowhere else in a figure; `svg` replaces them by the page's CSS variables.
+# Placeholder colors that occur nowhere else in a figure; `svg` replaces them with the page's CSS variables.
 INK, MUTED, LINE, CARD = "#0a0b01", "#0a0b02", "#0a0b03", "#0a0b04"
 SERIES = ("#0a0b11", "#0a0b12", "#0a0b13", "#0a0b14", "#0a0b15", "#0a0b16")
 MARKERS = ("o", "s", "D", "^", "v", "P")
@@ -36,7 +36,7 @@ _VARIABLES |= {color: f"--c{i + 1}" for i, color in enumerate(SERIES)}
 
 _WIDTH = 4.8  # [in] if a figure of this width is scaled to a phone's screen, 8.5 pt text is still legible
 _RASTER_DPI = 200
-_MAX_POINTS = 20_000  # most points drawn in a map
+_MAX_POINTS = 20_000  # largest number of points drawn in a map
 _LEGEND_LETTERS = 55  # letters per row of a legend; a marker counts as four letters
 _STYLE: dict[str, Any] = {
     "font.size": 8.5,
@@ -151,7 +151,7 @@ def place_map(
     """Map [m] of the sparse points, the cameras by source (held-out ones hollow), and the route with its corridor.
 
     Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (m, 3), `route` (k, 2).
-    If a source has several passes, all passes are drawn as lines with their names.
+    If a source has several passes (`twin.geometry.passes`), all passes are drawn as lines with their names.
     """
     low, high = map_bounds(positions[:, :2] if route is None else np.concatenate([positions[:, :2], route]))
     figure, axes = _map_axes(low, high)
@@ -211,13 +211,13 @@ def ground_map(ground: Ground, path: Array, route: Array | None, half_width: flo
 
 
 def _draw_passes(axes: Axes, passes: Sequence[FilmedPass]) -> None:
-    """Draws the passes with their names if a source has several. A cross marks a pass that ends before its film."""
+    """Draws the passes with their names if a source has several. A cross marks an end that is not the film's end."""
     if len(passes) == len({one.source for one in passes}):
         return
     for k, one in enumerate(passes):
         color = SERIES[k % len(SERIES)]
         axes.plot(*one.path.T, color=color, lw=0.9, ls=(0, (4, 2)), zorder=3)
-        # Passes may coincide, so each name is at another share of its pass.
+        # Passes may coincide, so each name is at another fraction of its pass.
         at = one.path[len(one.path) * (k + 1) // (len(passes) + 1)]
         box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
         axes.annotate(
@@ -370,7 +370,7 @@ def percent_texts(rate: Array) -> NDArray[np.str_]:
 
 
 def difference_texts(difference: Array, certain: Array) -> NDArray[np.str_]:
-    """Formats differences as signed whole numbers, in parentheses where `certain` (same shape) is 0."""
+    """Formats differences as signed whole numbers. Where `certain` (same shape) is 0, they are in parentheses."""
     texts = np.array([[f"{each:+.0f}".replace("-", "−") if each else "0" for each in row] for row in difference])
     return np.where(certain == 0.0, np.char.add(np.char.add("(", texts), ")"), texts)
 

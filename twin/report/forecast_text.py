@@ -18,14 +18,14 @@ from twin.evaluation.trials import csv_text
 from twin.report.html import Caution, Verdict
 
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
-"""Rank correlations from which the verdict is that the twin ranks, or roughly ranks, policies as the road does."""
-SMALL_REGRET = 0.05
-_SMALL_GAP = 0.1  # if the order is reliable only for larger differences of twin scores, the verdict is not good
+"""Lowest rank correlations for the verdict that the twin ranks, or roughly ranks, policies as the road does."""
+SMALL_REGRET = 0.05  # up to this regret, the verdict is good
+_SMALL_GAP = 0.1  # if the order is reliable only for larger differences of rates in the twin, the verdict is not good
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
     ("pearson", "Pearson", "linear correlation of the rates: 1 if they lie on a rising straight line"),
-    ("mmrv", "MMRV", "mean maximum rank violation: the real success lost by each policy’s worst swap; 0 is best"),
+    ("mmrv", "MMRV", "mean maximum rank violation: real success lost by a policy’s worst swap, on average; 0 is best"),
     ("winner_agreement", "winner agrees", "1 if the twin’s best policy is also the best on the road, else 0"),
     ("winner_regret", "regret", "real success lost by choosing the twin’s best policy"),
     ("bias", "road minus twin", "mean over the policies; below 0 the twin is too optimistic"),
@@ -44,7 +44,7 @@ STATISTICS = (
     (
         "mean_real",
         "mean on the road",
-        "of policies such as these, with or without real trials (prediction-powered estimate)",
+        "mean real rate of policies like these, driven or not (prediction-powered estimate)",
     ),
 )
 """Name of a field of `Agreement`, its short name on the page, and its meaning."""
@@ -118,7 +118,7 @@ def verdicts(forecast: Forecast) -> list[Verdict]:
 
 
 def believable(group: Agreement) -> Verdict:
-    """Verdict on the smallest difference of two policies' twin scores from which the road confirms their order."""
+    """Verdict on the smallest difference of two policies' rates in the twin at which the road confirms their order."""
     pairs = [(it.low, it.pairs, it.right) for it in group.ordered]
     many, days = _count(group.trainings, "training"), _count(group.days, "day")
     where = f"measured on {days} and {many}"
@@ -192,7 +192,7 @@ def _bias(group: Agreement) -> Verdict:
 
 
 def _skill(group: Agreement) -> list[Verdict]:
-    """Verdict on the twin's prediction of single days against the mean of other trainings; empty without scores."""
+    """Verdict on how well the twin predicts single days, compared with the mean of other trainings, if scored."""
     gains = {it.predictor: it.gain for it in group.scores}
     gain = gains.get(OTHERS)
     if gain is None or gain.value is None:
@@ -236,7 +236,7 @@ def limitations(forecast: Forecast) -> list[Caution]:
         for what in group.missing
     ]
     if not forecast.real_trials:
-        what = "Whether the road ranks these policies as the twin does is unknown, as is the error of the twin’s rates."
+        what = "It is unknown how well the twin ranks these policies, and how large the error of its rates is."
         out.append(Caution(what, _TRIALS_NEEDED))
     on_road = {p.policy for p in forecast.pairs}
     days = {p.lighting for p in forecast.pairs}
@@ -265,20 +265,20 @@ def limitations(forecast: Forecast) -> list[Caution]:
         usual = max(sets, key=sets.count)
         if uneven := [c.policy for c, under in zip(mine, sets, strict=True) if under != usual]:
             what = f"On {task} not all policies were validated under the same lightings ({join_names(uneven)} differ)."
-            cure = "validate all of them under the same ones; otherwise the ranking mixes policy and light."
+            cure = "validate all under the same lightings; else the ranking mixes effects of policy and light."
             out.append(Caution(what, cure))
         driven = {
             c.policy: {p.lighting for p in forecast.pairs if (p.policy, p.task) == (c.policy, task)} for c in mine
         }
         if len({frozenset(under) for under in driven.values() if under}) > 1:
             what = f"On {task} not all policies were driven on the road under the same lightings."
-            cure = "drive all of them under the same ones; otherwise the rates mix policy and light."
+            cure = "drive all under the same lightings; else the rates mix effects of policy and light."
             out.append(Caution(what, cure))
     what = (
-        "The twin has no other traffic and no wet ground. Of the weather it has only haze, sun and shadows. It has no "
-        "change since the films."
+        "The twin has no other traffic and no wet ground. Of the weather it has only haze, sun and shadows. Changes "
+        "since the films are missing, too."
     )
-    return [*out, Caution(what, "only real trials measure it; spread them over several days.")]
+    return [*out, Caution(what, "only real trials measure these effects; spread them over several days.")]
 
 
 def next_trials(forecast: Forecast) -> list[str]:
@@ -309,7 +309,7 @@ def next_trials(forecast: Forecast) -> list[str]:
 
 
 def allocation_text(allocation: TrialAllocation) -> str:
-    """Text with the numbers of further real trials that find the best policy, and the order of all policies."""
+    """States how many further real trials find the best policy, and how many find the order of all policies."""
     if allocation.policies < 2:
         return f"{allocation.task}: one policy; there is nothing to rank."
 

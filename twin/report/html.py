@@ -71,7 +71,7 @@ class Section:
 
     @property
     def headline(self) -> Verdict | None:
-        """The verdict. If there is none: the title if there are cautions, else None.
+        """The verdict; without one, the title if there are cautions, else None.
 
         If there are cautions, the mood is "mixed", or "bad" if the verdict's mood is "bad".
         """
@@ -109,7 +109,7 @@ def duration(seconds: Any) -> str:
 def flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:
     """Lists the numbers and words of a JSON value with their dotted paths.
 
-    A long or nested list is represented by its length.
+    A long or nested list is replaced by its length.
     """
     if isinstance(value, dict):
         return [
@@ -136,7 +136,7 @@ def numbers(value: Any) -> dict[str, float]:
 
 
 def follower_verdict(report: dict[str, Any]) -> Verdict:
-    """Outcome of the scripted drive in one sentence."""
+    """Outcome of the drive by the scripted driver in one sentence."""
     follower = pick(report, "review.follower")
     if not isinstance(follower, dict):
         reason = pick(report, "review.not_applicable") or "this build has no drive"

@@ -86,7 +86,8 @@ def card(policy: Policy, folder: Path, cells: Sequence[Cell], known: Sequence[Ca
             "## Use",
             "",
             f"`twin film SCENE --policy {policy.name}` films a drive, `twin validate SCENE --policy {policy.name}` "
-            "measures it. `policy.onnx` runs on the robot, by `twin_policy` of the same project or any ONNX runtime.",
+            "measures success. `policy.onnx` runs on the robot, with `twin_policy` of the same project or with any "
+            "ONNX runtime.",
             "",
             "## Limits",
             "",

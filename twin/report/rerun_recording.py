@@ -1,4 +1,4 @@
-"""Writes a drive as a recording for Rerun (rerun.io): pictures, poses, commands, trust and rewards on one timeline [s].
+"""Writes a drive as a recording for Rerun (rerun.io), with one timeline [s]:
 
 world/route, world/corridor, world/goal   the route and the corridor's edges as lines, the goal as a point
 world/driven                              the robot's path so far
@@ -7,7 +7,8 @@ world/robot/camera                        the front camera with its pictures
 world/obstacles                           positions of the obstacles
 speed/wanted, yaw_rate/wanted             speed and yaw rate that the driver commands
 speed/driven, yaw_rate/driven             speed and yaw rate of the robot
-cross_track, progress, trust, reward      one curve each
+cross_track, progress                     distance from the route, and along it [m]
+trust, reward                             trust in the picture, 0 to 1; reward per step
 events                                    lighting, randomization, and how the drive ended
 """
 
@@ -148,7 +149,7 @@ def _blueprint() -> "rerun.blueprint.Blueprint":
         rrb.TimeSeriesView(origin="speed", name="Speed [m/s]"),
         rrb.TimeSeriesView(origin="yaw_rate", name="Yaw rate [rad/s]"),
         rrb.TimeSeriesView(contents=["trust", "reward"], name="Trust and reward"),
-        rrb.TimeSeriesView(contents=["cross_track"], name="Distance from the route [m]"),
+        rrb.TimeSeriesView(contents=["cross_track"], name="Cross-track error [m]"),
     ]
     seen = rrb.Spatial2DView(origin="world/robot/camera", name="What the robot sees")
     place = rrb.Spatial3DView(origin="world", name="Place")

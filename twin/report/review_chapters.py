@@ -1,6 +1,6 @@
 """Chapters of the review video: comparison of real and rendered frames, changing light, and the drive.
 
-All chapters use a `Studio`. It renders the field, counts renders, and saves pictures for the build's page.
+All chapters use a `Studio`. *The page* is the build report, `report.html`.
 """
 
 import math
@@ -58,13 +58,13 @@ from twin.types import Array, Image
 
 # ---- studio
 
-_PICTURE_WIDTH = 1000  # [px] greatest width of pictures for the build's page
-_PICTURE_QUALITY = 82  # of their JPEG files
+_PICTURE_WIDTH = 1000  # [px] greatest width of pictures for the page
+_PICTURE_QUALITY = 82  # JPEG quality of these pictures
 
 
 @dataclass
 class Studio:
-    """Renders views of the field, counts renders, and saves pictures for the build's page."""
+    """Renders views of the radiance field, counts renders, and saves pictures for the page."""
 
     name: str
     """Name of the scene."""
@@ -102,7 +102,7 @@ class Studio:
         return rendering
 
     def render_frame(self, i: int, lighting: str | None = None, width: int | None = None) -> Rendering:
-        """Renders the field at the pose of frame i, by default in that frame's own appearance; see `render`."""
+        """Renders the field at the pose of frame i, by default with its `appearance_of_frame`; see `render`."""
         cameras = self.cameras
         size = (int(cameras.sizes[i, 0]), int(cameras.sizes[i, 1]))
         light = lighting or appearance_of_frame(cameras, i)
@@ -148,7 +148,7 @@ def evenly_spaced(indices: Sequence[int] | NDArray, count: int) -> list[int]:
 
 
 def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
-    """At most `count` frames of a lighting's longest source, in order. Half are held-out frames if there are enough."""
+    """At most `count` frames of a lighting's longest source, in order. Half are held-out frames, if enough exist."""
     of_lighting = [i for i, name in enumerate(cameras.lightings) if name == lighting]
     sources = [cameras.sources[i] for i in of_lighting]
     if not sources:
@@ -189,10 +189,10 @@ MAX_ERROR = 0.3  # [share of full brightness] end of the color scale of errors
 _DEPTH_TICKS = (2.0, 5.0, 10.0, 25.0)  # [m] labels between the ends of the depth scale
 COMPARISON_STRIP = (0.3, 0.42, 0.28)  # shares of the strip: depth, map, facts
 LIGHTING_STRIP = (0.62, 0.38)  # shares of the strip: slider, map
-_CARD_SECONDS = 2.5
-_COMPARISON_SECONDS = 0.6
+_CARD_SECONDS = 2.5  # for which a title is shown
+_COMPARISON_SECONDS = 0.6  # per compared frame
 _HOLD_SECONDS = 0.8  # [s] for which a filmed lighting is shown without interpolation
-_ROW_HEIGHT = 240  # [px] height of the page's row of lightings
+_ROW_HEIGHT = 240  # [px] height of the picture of all lightings
 
 
 def write_title_card(studio: Studio, title: str, lines: list[str], seconds: float = _CARD_SECONDS) -> None:
@@ -200,7 +200,7 @@ def write_title_card(studio: Studio, title: str, lines: list[str], seconds: floa
 
 
 def comparison_frames(studio: Studio, budget: int) -> dict[str, list[int]]:
-    """Lighting → its frames in chapter 1. Of its share of the `budget`, one render is reserved for the page."""
+    """Lighting → its frames in chapter 1. Lightings share the `budget` of renders; one of each is for the page."""
     share = max(1, budget // max(1, len(studio.field.lightings)) - 1)
     return {name: frames_to_compare(studio.cameras, name, share) for name in studio.field.lightings}
 
@@ -230,7 +230,7 @@ def write_comparison_chapter(studio: Studio, map_view: MapView, chosen: dict[str
                 row, score = comparison_row(studio, i)
                 caption = (
                     f"{lighting}: real frame, render at the same pose ({score:.1f} dB PSNR), depth, and error. "
-                    "From the middle of the film, held out from training."
+                    "The frame is from the middle of the film and was not used for training."
                 )
                 studio.save_picture(f"compare_{number}", "field", caption, row, row.shape[1])
             progress.update()
@@ -322,7 +322,7 @@ def map_with_pose(map_view: MapView, pose: NDArray[np.float64], dots: NDArray[np
 
 
 def lighting_steps(lightings: int, budget: int) -> int:
-    """Number of views per transition between two lightings, at least 2. One view of `budget` is the final one."""
+    """Number of views per transition between two lightings, at least 2; `budget` also covers one final view."""
     return max(2, (budget - 1) // max(1, lightings - 1))
 
 
@@ -339,7 +339,7 @@ def write_lighting_chapter(studio: Studio, map_view: MapView, budget: int, progr
         [
             f"One pose rendered from {lightings[0]} to {lightings[-1]}. The geometry is constant; only the appearance "
             "embedding changes.",
-            "Right: the real frame nearest to this pose in the prevailing light.",
+            "Right: the nearest real frame, in the lighting that has more weight.",
         ],
     )
     nearest = {name: nearest_frame(cameras, i, name) for name in lightings}
@@ -384,7 +384,7 @@ T = TypeVar("T")
 
 DRIVE_STRIP = (0.62, 0.38)  # shares of the strip: map, facts
 _MAX_DRIVE_SECONDS = 14.0  # [s] in the video; longer drives are sped up
-_CROSSFADE_SHARE = 0.25  # over this last share of its route segment, a lighting blends into the next one
+_CROSSFADE_SHARE = 0.25  # fraction of a lighting's route segment, at its end, in which it blends into the next
 _CONTROL_RATE = 10  # control steps per second of a RecordedDrive
 
 
@@ -398,7 +398,7 @@ def smoothed_speed(drive: RecordedDrive) -> Array:
 
 
 def lighting_at(lightings: tuple[str, ...], share: float) -> tuple[str, str]:
-    """Name (for the field) and label of the lighting at a share of the route. Lightings get equal segments."""
+    """Name (for the field) and label of the lighting at a fraction of the route; lightings get equal segments."""
     index = min(int(share * len(lightings)), len(lightings) - 1)
     within = share * len(lightings) - index
     if index == len(lightings) - 1 or within <= 1.0 - _CROSSFADE_SHARE:
@@ -409,7 +409,7 @@ def lighting_at(lightings: tuple[str, ...], share: float) -> tuple[str, str]:
 
 
 def frame_timing(drive: RecordedDrive, fps: int) -> tuple[int, int]:
-    """Returns control steps and video frames per picture, such that the video takes `_MAX_DRIVE_SECONDS` at most."""
+    """Returns control steps and video frames per picture, so that the drive takes `_MAX_DRIVE_SECONDS` at most."""
     speedup = max(1.0, float(drive.times[-1]) / _MAX_DRIVE_SECONDS)
     every = max(1, math.ceil(speedup * _CONTROL_RATE / fps - 1e-9))
     return every, max(1, int(fps * every / (_CONTROL_RATE * speedup) + 1e-9))
@@ -441,9 +441,9 @@ def write_drive_chapter(
         studio,
         "3  The Husky drives",
         [
-            f"A scripted driver without camera follows the {arc_lengths(world.route)[-1]:.1f} m route in MuJoCo, which "
-            "shows that the route is drivable.",
-            "Left: the radiance field at the robot’s camera. Right: the physics, with solid parts. "
+            f"A scripted driver without camera follows the {arc_lengths(world.route)[-1]:.1f} m route in MuJoCo, to "
+            "test whether the route is drivable.",
+            "Left: the radiance field, from the robot’s camera. Right: the physics, with solid parts. "
             + (f"{shown_speed:.3g}× speed." if shown_speed > 1.01 else ""),
         ],
     )

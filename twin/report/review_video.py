@@ -1,7 +1,7 @@
 """Stage `review`: the review video, metrics of a scripted drive, and pictures for the report page.
 
 The video has up to three chapters. The first compares real and rendered frames. The second, if there are several
-lightings, shows changing light. The third, if there is a route, shows a scripted follower that drives the Husky.
+lightings, shows changing light. The third, if there is a route, shows a scripted driver that drives the Husky along it.
 """
 
 import queue
@@ -72,9 +72,9 @@ Shot = tuple[Array | None, Array]
 """The robot's configuration (MuJoCo's qpos; None for the initial one), and a camera pose (OpenCV axes)."""
 
 _RENDER_SHARES = (0.25, 0.2, 0.55)  # shares of `review.renders` for the chapters
-_PREFETCH_BYTES = 64 * 2**20  # [bytes] most memory of prefetched MuJoCo pictures
+_PREFETCH_BYTES = 64 * 2**20  # [bytes] largest memory of prefetched MuJoCo pictures
 _GAP_ROWS = 3  # number of views whose gap between visual and collision geometry is on the page
-_CRF = 24  # about 5 MB for the demo's video
+_CRF = 24  # quality of x264; gives about 5 MB for the demo's video
 _MOOD_COLORS = {"good": GREEN, "mixed": AMBER, "bad": RED, "plain": AMBER}
 
 
@@ -96,7 +96,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
 
 def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: RenderableField) -> dict[str, Any]:
-    """Does the work of `run` with any field, not only the baked one."""
+    """Same as `run`, with any field instead of the baked one of the scene."""
     cameras = Cameras.load(scene.stage("metric"))
     world = World.load(scene.stage("mjcf")) if config.mjcf.route and scene.has_route else None
     drive = follow_route(world, HuskyPhysics(world.model(), world.robot), config.review.speed) if world else None
@@ -113,7 +113,7 @@ def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: R
         if world:
             along = trust_grid(field, cameras, world)
             metrics["trust"] = trust_metrics(*along)
-            caption = "trust in views of the robot's camera: high near filmed poses, if the field is opaque on the road"
+            caption = "trust in views of the robot's camera: high near filmed poses where the road has no holes"
             studio.save_picture("trust", "review", caption, trust_picture(*along))
         verdict = follower_verdict(
             {"review": metrics, "mjcf": {"route_length_m": float(arc_lengths(world.route)[-1]) if world else None}}
@@ -150,7 +150,7 @@ def _write_chapters(
     strip, panel = studio.layout.strip, studio.layout.panel
     views, model = _scene_shots(studio, scene, world)
     behind = chase_shots(drive, frame_timing(drive, studio.fps)[0]) if drive else []
-    # Warp compiles kernels at first use. The field's are compiled here, before the second thread compiles the scene's.
+    # Warp compiles kernels at first use. This compiles the field's, before the second thread compiles the renderer's.
     field.render(cameras.select(np.array([0])), field.lightings[0], (16, 8))
     total = sum(map(len, chosen.values())) + len(rendered_instants(behind, drives))
     total += lighting_steps(len(field.lightings), turns) * (len(field.lightings) - 1) + 1 if turns else 0
@@ -171,7 +171,7 @@ def _write_chapters(
         if world and drive:
             write_drive_chapter(studio, map_in(strip(*DRIVE_STRIP)[0]), world, drive, pictures, drives, progress)
         else:
-            write_title_card(studio, "No drive", [f"Nothing is driven here: {no_drive_reason(config)}."])
+            write_title_card(studio, "No drive", [f"No robot is driven: {no_drive_reason(config)}."])
 
 
 def _compare_geometry(studio: Studio, scene: SceneDir, world: World, drive: RecordedDrive) -> dict[str, Any] | None:
@@ -221,7 +221,7 @@ def _save_capture_pictures(studio: Studio) -> None:
 
 # ---- numbers of the drive
 
-_TRACE_SAMPLES = 200  # most samples in a drive's trace
+_TRACE_SAMPLES = 200  # largest number of samples in a drive's trace
 
 
 def drive_metrics(drive: RecordedDrive) -> dict[str, Any]:
@@ -250,7 +250,7 @@ def drive_trace(drive: RecordedDrive) -> dict[str, list[float]]:
 
 
 _OVERVIEW_BEHIND, _OVERVIEW_ABOVE, _OVERVIEW_AHEAD = 9.0, 7.0, 10.0  # [m] camera: behind, above; target: ahead
-_OVERVIEW_POSITIONS = (0.0, 0.45)  # places of the overviews, as shares of the route's length
+_OVERVIEW_POSITIONS = (0.0, 0.45)  # places of the overviews, as fractions of the route's length
 
 
 def overview_pose(route: Array, s: float) -> Array:
@@ -300,12 +300,12 @@ _OFFSETS = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # [half widths of 
 _TRUST_SIZE = (80, 45)  # [px] of the rendered views
 _BATCH = 32
 _LOW_TRUST = 0.5  # views below this count as untrusted
-_CELL = (18, 16)  # [px] width of a cell if there are 40 columns; its height
+_CELL = (18, 16)  # [px] width (for 40 columns) and height of a cell
 _MARGIN_ROWS, _MARGIN_RIGHT = 26, 40  # [px] above and below; at the right, for the last label
 
 
 def trust_grid(field: RenderableField, cameras: Cameras, world: World) -> tuple[Array, Array, Array]:
-    """Estimates the trust in views of the front camera on and beside the route, with headings along the route.
+    """Estimates the trust (`twin.env.trust`) in views of the front camera, on and beside the route, looking along it.
 
     Returns:
         Arc lengths [m], shape (k,); lateral offsets, left positive [m], shape (m,); trust in [0, 1], shape (m, k).
@@ -339,7 +339,7 @@ def trust_metrics(s: Array, offsets: Array, trust: Array) -> dict[str, Any]:
 
 
 def trust_picture(s: Array, offsets: Array, trust: Array) -> Image:
-    """Draws the trust grid. Arc length increases to the right; the route's left is at the top; high trust is bright."""
+    """Draws the result of `trust_grid`: arc length to the right, the route's left at the top, high trust bright."""
     wide, high = max(2, _CELL[0] * 40 // max(len(s), 1)), _CELL[1]
     body = cv2.resize(
         colored("viridis", trust[::-1]), (wide * len(s), high * len(offsets)), interpolation=cv2.INTER_NEAREST

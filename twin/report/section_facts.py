@@ -7,7 +7,7 @@ from twin.report.html import Caution, Fact, number, pick
 Row = tuple[str, str, str, str]
 """Path of a number in the report, its name, its format, and its meaning."""
 Limit = tuple[str, float, str, str]
-"""Path of a number in the report, its limit, and the caution and its cure if the magnitude exceeds the limit."""
+"""Path of a number in the report, the limit of its magnitude, and the caution and its cure above the limit."""
 
 
 def facts_of(report: dict[str, Any], *rows: Row) -> list[Fact]:

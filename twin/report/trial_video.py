@@ -1,6 +1,6 @@
-"""Video of a trial on the road, with a map, curves and the outcome.
+"""Video of a trial on the road: the robot's picture beside the twin's from the same pose, map, curves and outcome.
 
-The robot's picture is shown beside the twin's picture from the same pose.
+*Replay*: the drive of the simulated robot by the recorded commands (`twin.evaluation.trial_judge`).
 """
 
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ def write_trial_video(
     Args:
         path: The mp4.
         trial: The judged trial.
-        replayed: Poses (x, y, yaw) of the twin's robot under the trial's commands, at the trial's times, shape (k, 3).
+        replayed: Poses (x, y, yaw) of the twin's replay at the trial's times, shape (k, 3).
         pictures: n pictures of the robot's camera as the policy saw them, each uint8, shape (h, w, 3).
         times: Times of the pictures since the trial's start [s], shape (n,).
         views: The twin's pictures from the same poses.
@@ -68,7 +68,7 @@ def write_trial_video(
     s = np.append(np.arange(segment[0], segment[1], 0.25), segment[1])
     map_view = MapView.draw(boxes[0][2:], point_at(world.route[:, :2], s), *ground_and_parts, half_width)
     apart = np.linalg.norm(trial.poses[:, :2] - replayed[:, :2], axis=1)
-    curves = [("off the route [m]", trial.cross_track, ACCENT), ("twin's replay off [m]", apart, GREEN)]
+    curves = [("off the route [m]", trial.cross_track, ACCENT), ("off the twin's replay [m]", apart, GREEN)]
     with VideoWriter(path, layout.size, fps, _CRF) as writer, bar("video", len(times), "frame") as progress:
         for i, time in enumerate(times):
             k = int(np.clip(np.searchsorted(trial.times, time + 1e-6) - 1, 0, len(trial.times) - 1))

@@ -56,7 +56,7 @@ TRUSTED = 0.8
 """An episode is counted separately if the mean trust in its pictures is lower."""
 FAILURES = {
     "collision": ("hit something", "touched anything solid except the ground"),
-    "out_of_bounds": ("left the corridor", "its center was more than half the corridor’s width off the route"),
+    "out_of_bounds": ("left the corridor", "the robot’s center was over half the corridor’s width off the route"),
     "timeout": ("ran out of time", "did not reach the goal within the time limit"),
     "rollover": ("rolled over", "tipped onto its side"),
     "stuck": ("got stuck", "stood still too long"),
@@ -156,7 +156,7 @@ def lighting_text(lighting: str) -> str:
 
 
 def training_text(trained: dict[str, Any]) -> str:
-    """Describes the episodes of a training's result, and the training; see `training_summaries`."""
+    """Describes a training and the episodes that measured its result; see `training_summaries`."""
     test = trained["test"]
     if test:
         episodes = f"final test, n = {test['trials']}" + (f", light {test['condition']}" if test["condition"] else "")
@@ -164,7 +164,7 @@ def training_text(trained: dict[str, Any]) -> str:
         since = f"ending from step {trained['first_step']:,} on"
         episodes = f"last training episodes from the task’s start, n = {trained['trials']}, {since}"
     light = "in varying light" if trained["lighting"] in (TRAINING, ANY) else f"in the light {trained['lighting']}"
-    light = "from MuJoCo’s picture of the mesh" if trained["observe"] == "simulator" else light
+    light = "from MuJoCo’s pictures of the mesh" if trained["observe"] == "simulator" else light
     return f"{episodes}; trained on {trained['task']}, {light}, for {trained['step']:,} steps"
 
 
@@ -181,11 +181,11 @@ def p_value_text(p: float) -> str:
 
 
 def verdicts(results: dict[str, Any]) -> list[Verdict]:
-    """The headlines: each task's best policy and its worst lighting, and the number of untrusted episodes."""
+    """The headlines: each task's best policy and its worst lighting, and the number of episodes with low trust."""
     out = [_task_verdict(task, [c for c in results["cells"] if c["task"] == task]) for task in tasks(results)]
     low, of = (sum(c[k]["trials"] for c in results["cells"]) for k in ("low_trust", "trusted"))
     if low:
-        text = f"In {low} of {low + of} episodes the pictures are not trusted; these are counted separately below."
+        text = f"In {low} of {low + of} episodes the pictures have low trust; these are counted separately below."
         out.append(Verdict(text, "mixed"))
     return out
 
@@ -260,7 +260,7 @@ def summary_lines(results: dict[str, Any]) -> list[str]:
         trusted, low = c["trusted"], c["low_trust"]
         if low["trials"]:
             counts = [f"{rate['successes']}/{rate['trials']}" for rate in (trusted, low)]
-            out.append(f"{'':{wide}}  trusted pictures {counts[0]}, others {counts[1]}")
+            out.append(f"{'':{wide}}  with trusted pictures {counts[0]}, with others {counts[1]}")
     for p in results["pairs"]:
         out.append(
             f"{p['a']} against {p['b']}, {p['task']}, the same {p['episodes']} episodes: only the first succeeded in "
@@ -355,7 +355,7 @@ def training_figure(steps: NDArray[np.int64], success: NDArray[np.int64], saved:
 
 
 def failure_map(path: Path, trials: Sequence[Trial], world: World, segment: tuple[float, float]) -> None:
-    """Writes a picture to `path`: the places on the route at which failed episodes of a task ended.
+    """Draws the places on the route at which failed episodes of a task ended, and writes the picture to `path`.
 
     `segment` contains the arc lengths of the task's start and end on the route [m].
     """
@@ -383,7 +383,7 @@ def failure_map(path: Path, trials: Sequence[Trial], world: World, segment: tupl
             total += count
     at = point_at(line, edges[:-1] + _BIN / 2)[total > 0]
     above.scatter(*at.T, s=30.0 * total[total > 0], color="#c0392b", alpha=0.6, linewidths=0)
-    title = f"{total.sum():.0f} of {len(trials)} episodes failed; the more fail at a place, the larger its dot"
+    title = f"{total.sum():.0f} of {len(trials)} episodes failed; area of a dot: number of failures there"
     above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title)
     along.set(xlabel="distance along the task [m]", ylabel="failed episodes", xlim=(0.0, edges[-1]))
     along.yaxis.get_major_locator().set_params(integer=True)

@@ -1,15 +1,16 @@
 """Compares the visual geometry (radiance field) with the collision geometry along a drive of the robot's camera.
 
 *Gap*: z-depth of the collision geometry minus that of the field, along a pixel's ray. *Visual-only* geometry ("leak" in
-the report's keys) is visible but cannot be collided with. *Collision-only* geometry ("ghost") can be collided with but
-is not visible. Differences are measured in three ways:
+the report's keys) is visible but has no collision geometry. *Collision-only* geometry ("ghost") has collision geometry
+but is not visible. Differences are measured in three ways:
 
 - on the ground: as heights, since a centimeter of height is decimeters along a ray at a low angle
 - on obstacles: as distances to the nearest surface of the other geometry
-- in the corridor: visual-only geometry by its height above the collision ground, collision-only parts by their gap
+- in the corridor: visual-only geometry by its height above the collision ground, collision-only parts by their gap,
+  collision-only ground by the height above what is visible
 
 Frames are matched within a film, so the field's depth is determined only where one film shows a place from two
-directions. At other places (mainly just ahead of a drive's first frame) the depth may differ from build to build.
+directions. At other places (mainly just ahead of a film's first frame) the depth may differ from build to build.
 Collision-only geometry at such places is reported separately, as `unfilmed_ghost_m`.
 """
 
@@ -42,9 +43,9 @@ from twin.report.video_layout import (
 from twin.runtime import track
 from twin.types import Array, Image
 
-VIEW_SPACING = 2.0  # [m] that the robot drives between two views
-MAX_DEPTH = 10.0  # [m] maximum compared depth
-LARGE_ERROR = 0.2  # [m] larger differences are counted or get a caution
+VIEW_SPACING = 2.0  # [m] of the drive between two views
+MAX_DEPTH = 10.0  # [m] pixels with a larger depth are not compared
+LARGE_ERROR = 0.2  # [m] larger differences count in the `_share` figures or get a caution
 
 _MIN_OPACITY = 0.5  # pixels of lower opacity count as empty
 _THINNING_CELL = 0.05  # [m]; point clouds are thinned to one point per cell
@@ -56,14 +57,14 @@ _MIN_PARALLAX = 1.0  # [°] two views determine a point's depth if their directi
 
 @dataclass(frozen=True)
 class GeometryViews:
-    """n views of both geometries. Depths (n, height, width) are z-depths [m], or FAR where a ray hits nothing."""
+    """n views of both geometries. Depths (n, height, width) are z-depths [m]; FAR where a ray hits nothing."""
 
     camera_to_world: Array
     """Shape (n, 4, 4)."""
     visual_depth: Array
     collision_depth: Array
     is_ground: NDArray[np.bool_]
-    """Mask (n, height, width) of the pixels whose ray hits the ground first, among the collision geometry."""
+    """Mask (n, height, width) of the pixels whose ray hits the collision ground before any part."""
     rgb: NDArray[np.float32]
     """Colors of the field, shape (n, height, width, 3)."""
 
@@ -155,7 +156,7 @@ def compare_geometry(
     # Size of collision-only geometry: the height difference on the ground, the gap on a part.
     depth_below = np.where(np.isfinite(height), -np.minimum(height, 0.0), FAR)
     behind = np.where(views.visual_depth > views.collision_depth, np.where(views.is_ground, depth_below, gap), 0.0)
-    behind = np.minimum(behind, MAX_DEPTH)  # where nothing at all is visible, the gap has no meaning
+    behind = np.minimum(behind, MAX_DEPTH)  # where nothing is visible, the gap would be almost FAR
     filmed = _depth_determined(cameras, collision, hit)
     visual_only, collision_only = np.where(inside, height, 0.0), np.where(hit & filmed, behind, 0.0)
     out["corridor_leak_m"], out["corridor_ghost_m"] = float(max(visual_only.max(), 0.0)), float(collision_only.max())
@@ -200,8 +201,8 @@ def _in_corridor(world: World, points: Array, among: NDArray[np.bool_]) -> tuple
 def _depth_determined(cameras: Cameras, points: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mask of the points (..., 3) in `among` that one film shows from directions at least `_MIN_PARALLAX` apart.
 
-    Only training frames count. Each is compared with the film's first frame that shows the point. Occlusions and image
-    masks are ignored.
+    Only training frames count. Directions are compared with that of the film's first frame that shows the point.
+    Occlusions and image masks are ignored.
     """
     selected = points[among]
     found = np.zeros(len(selected), bool)
@@ -241,7 +242,7 @@ def _quantile(values: Array, share: float) -> float | None:
 
 
 def _by_bin(edges: Array, station: Array, values: Array, reduce: Callable[[Array], Any], empty: float | None) -> list:
-    """Reduces values at stations [m] to one value per bin of the route. A bin without values gets `empty`."""
+    """Reduces values at stations [m] to one value per bin (in `edges`) of the route; without values, to `empty`."""
     which = np.clip(np.digitize(station, edges) - 1, 0, len(edges) - 2)
     found = [values[which == k] for k in range(len(edges) - 1)]
     return [round(float(reduce(v)), 4) if len(v) else empty for v in found]
@@ -249,12 +250,12 @@ def _by_bin(edges: Array, station: Array, values: Array, reduce: Callable[[Array
 
 # ---- picture
 
-_MAX_GAP = 0.3  # [m] at the ends of the color scale
+_MAX_GAP = 0.3  # [m] |gap| at the ends of the color scale
 _PANEL_WIDTH = 320  # [px] width of a panel
 
 
 def gap_row(views: GeometryViews, k: int) -> Image:
-    """Panels of view k in a row: field, visual depth, collision depth, and gap."""
+    """Panels of view k in a row: rendered field, visual depth, collision depth, and gap."""
     visual, collision = views.visual_depth[k], views.collision_depth[k]
     size = (_PANEL_WIDTH, round(_PANEL_WIDTH * visual.shape[0] / visual.shape[1]))
     near = (visual < MAX_DEPTH) & (collision < MAX_DEPTH)
@@ -268,6 +269,6 @@ def gap_row(views: GeometryViews, k: int) -> Image:
         titled_panel(fit(views.rgb[k], size), "field", "", caption_line(_PANEL_WIDTH, "as a policy sees it")),
         titled_panel(fit(depth_colors(visual), size), "visual", "depth", caption_line(_PANEL_WIDTH, "bright is near")),
         titled_panel(fit(depth_colors(collision), size), "collision", "depth", solid),
-        titled_panel(fit(colors, size), "gap", f"up to {MAX_DEPTH:g} m", scale),
+        titled_panel(fit(colors, size), "gap", f"within {MAX_DEPTH:g} m", scale),
     ]
     return panel_row(panels)

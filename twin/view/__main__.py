@@ -4,8 +4,8 @@
     python -m twin.view scenes/demo --policy first --task straight
     python -m twin.view scenes/demo --path scenes/demo/paths/path.json --out film.mp4
 
-The page needs no GPU and no network. It is served to this machine alone unless `--host` names another address; then the
-printed address has a token that the browser needs.
+No GPU and no network are required. The page is served to this machine alone unless `--host` names another address; the
+printed address then has a token that the browser needs.
 """
 
 import argparse
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from twin.learn.policy import Policy
     from twin.view.page import Page
 
-_HEAD_START = 6.0  # [s] given to the first picture, before the robot is loaded
-_MIN_SIDE, _MAX_SIDE, _MAX_FPS = 16, 4096, 120
+_HEAD_START = 6.0  # [s] longest wait for the first picture before the robot is loaded
+_MIN_SIDE, _MAX_SIDE, _MAX_FPS = 16, 4096, 120  # of a film: sides [px], frames per second
 
 
 def command(given: argparse.Namespace) -> None:
-    """Runs the verb with the options parsed by `twin.commands`."""
+    """Runs `twin view` with the options parsed by `twin.commands`."""
     twin = load_scene(given.scene)
     if (given.path is None) != (given.out is None):
-        raise InputError("--path and --out belong together: --path path.json --out film.mp4")
+        raise InputError("--path and --out belong together; give both, such as --path path.json --out film.mp4")
     if given.path is not None:
         film_path(twin, given.path, given.out, given.size, given.fps, given.quiet)
     else:
@@ -46,7 +46,7 @@ def film_path(twin: Twin, path: Path, out: Path, size: str, fps: int, quiet: boo
     """Renders a camera path to an mp4.
 
     Raises:
-        InputError: the scene is not built, or a bad path, size, number of frames per second or output.
+        InputError: the scene is not built, or `path`, `size`, `fps` or `out` is not valid.
     """
     width, height = parse_size(size)
     if not 1 <= fps <= _MAX_FPS:
@@ -78,7 +78,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def serve(twin: Twin, given: argparse.Namespace) -> None:
-    """Serves the page until it is stopped by a signal."""
+    """Serves the page until a signal stops the program."""
     if not 0 <= given.port <= 65535:
         raise InputError(f"--port {given.port}: expected 0 to 65535")
 
@@ -109,7 +109,7 @@ def open_page(
     `announce` is called with the page's address as soon as a browser can open it, before the field is loaded.
 
     Raises:
-        InputError: viser is missing, the scene has no field, or an unknown lighting or unusable address.
+        InputError: viser is missing, the scene has no field, or the lighting or the address is not valid.
     """
     try:
         import viser  # noqa: F401
@@ -136,7 +136,7 @@ def open_page(
 
 
 def _check_driver(twin: Twin, given: argparse.Namespace) -> "Policy | None":
-    """The policy given by `--policy`, if any. Raises InputError: an unknown policy or task, or a negative seed."""
+    """The policy given by `--policy`, if any. Raises InputError: the policy, task or seed is not valid."""
     if given.seed < 0:
         raise InputError(f"--seed {given.seed}: expected 0 or more")
     if given.task is not None:
@@ -155,7 +155,7 @@ def load_driving(page: "Page", task: str | None = None, policy: "Policy | None" 
     """Adds the robot to an open page; if the scene cannot be driven, the page shows why.
 
     Raises:
-        InputError: a policy or task was asked for and cannot be driven.
+        InputError: a policy or task is given, but cannot be driven.
     """
     try:
         from twin.view.driving import Driving

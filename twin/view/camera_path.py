@@ -72,7 +72,7 @@ class CameraPath:
         knots = np.array([view.time for view in self.views]) - self.views[0].time
         poses = np.array([view.camera_to_world for view in self.views])
         t = np.clip(times, 0.0, knots[-1])
-        # A cubic spline overshoots where the camera stands still; then, or with two views only, it is a monotone one.
+        # A cubic spline overshoots where the camera stands still. In this case, and for two views, PCHIP is used.
         still = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).min() < 1e-6
         curve = PchipInterpolator if still or len(knots) == 2 else CubicSpline
         out = np.tile(np.eye(4), (len(t), 1, 1))
@@ -107,7 +107,7 @@ class CameraPath:
 
 
 def mixed_lighting(one: EpisodeLighting, other: EpisodeLighting, share: float) -> EpisodeLighting:
-    """The lighting `share` of the way from one to another, both constant."""
+    """The lighting `share` of the way from one to another; neither changes with time."""
     if share <= 0.0 or one is other:
         return one
     if share >= 1.0:
@@ -123,7 +123,7 @@ def named_lighting(field: BakedField, name: str) -> EpisodeLighting:
 
 
 def _view_row(view: KeyView) -> dict[str, Any]:
-    # The name of a sampled lighting has a blank; names and mixtures of the field's lightings have none.
+    # Only the name of a sampled lighting has a blank. The field does not know it, so its embedding is stored.
     named = None if " " in view.lighting.name else view.lighting.name
     return {
         "time": view.time,
@@ -144,7 +144,9 @@ def _parse_view(row: Any, number: int, field: BakedField) -> KeyView:
         raise ValueError(f"view {number}: the upper left 3×3 of camera_to_world is no rotation")
     time, fov = float(row["time"]), float(row.get("fov", 60.0))
     if not np.isfinite(time) or not _MIN_FOV <= fov <= _MAX_FOV:
-        raise ValueError(f"view {number}: time {time}, fov {fov}; expected an angle from {_MIN_FOV:g} to {_MAX_FOV:g}°")
+        raise ValueError(
+            f"view {number}: time {time}, fov {fov}; expected a finite time, and fov from {_MIN_FOV:g} to {_MAX_FOV:g}°"
+        )
     given = row.get("lighting", field.lightings[0])
     if isinstance(given, str):
         return KeyView(time, pose, fov, named_lighting(field, given))
@@ -156,7 +158,7 @@ def _parse_view(row: Any, number: int, field: BakedField) -> KeyView:
 
 
 def path_frames(path: CameraPath, fps: int) -> Array:
-    """Times after the start of a film's frames [s], shape (k,)."""
+    """Times of a film's frames after the path's start [s], shape (k,)."""
     return np.arange(round(path.duration * fps) + 1) / fps
 
 
@@ -176,7 +178,7 @@ def write_path_film(
         picture: Renders the scene; robot and obstacles are left out.
         size: Width, height [px]; even.
         fps: Frames per second.
-        on_frame: Called with the numbers of written and of all frames; if it raises, no file is left.
+        on_frame: Called with the numbers of frames written and in total; if it raises, nothing is written.
     """
     views = path.at(path_frames(path, fps))
     with VideoWriter(out, size, fps, _CRF) as writer:
@@ -194,7 +196,7 @@ def path_image(
 
 
 def spaced_times(views: Sequence[Array], speed: float, least: float) -> list[float]:
-    """Times at which a camera passes poses (4, 4) at a speed [m/s], with at least `least` [s] between two of them."""
+    """Times at which a camera passes poses (4, 4) at a speed [m/s], with at least `least` [s] between neighbors."""
     points = np.array(views)[:, :3, 3]
     steps = np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1) / speed, least)
     return np.concatenate([[0.0], np.cumsum(steps)]).round(3).tolist()

@@ -1,4 +1,4 @@
-"""The page's controls that drive the robot and place obstacles, with facts of the drive."""
+"""The page's controls that drive the robot and place obstacles, and its display of the drive's state."""
 
 import time
 from collections import deque
@@ -42,7 +42,9 @@ class DrivePanel:
             self._behind = gui.add_checkbox("follow the robot", True)
             self._facts = gui.add_markdown("")
             self._robot_image = gui.add_image(np.zeros((180, 320, 3), np.uint8), label="the robot's picture")
-            self._plot = gui.add_image(_plot([]), label="torque at the wheels [N m], last 10 s", format="png")
+            self._plot = gui.add_image(
+                _plot([]), label="torque at the wheels [N m], last 100 control steps", format="png"
+            )
         with folders[1]:
             self._kind = gui.add_dropdown("kind", OBSTACLE_KINDS)
             add = gui.add_button("Add in front of the camera", icon=viser.Icon.PLUS)
@@ -76,11 +78,11 @@ class DrivePanel:
         self._run_button.label = "Stop" if running else "Start driving"
         self._run_button.icon = viser.Icon.PLAYER_STOP if running else viser.Icon.PLAYER_PLAY
         if by_keys:
-            text = "W ahead, S back, A and D turn. Click the picture if the keys do nothing."
+            text = "W ahead, S back, A and D turn. If the keys do nothing, click the picture."
             self._viewer.notify("W A S D", text, seconds=6.0)
 
     def drove(self, facts: DriveFacts) -> None:
-        """Shows the drive after a control step; called from the driving thread."""
+        """Shows the state of the drive after a control step or a reset; called on several threads."""
         driving = self._driving
         if self._torques and facts.time < self._torques[-1][0]:  # a new drive
             self._torques.clear()
@@ -108,7 +110,7 @@ class DrivePanel:
         kind = self._kind.value
         name = self._driving.obstacles.free(kind)
         if name is None:
-            raise InputError(f"all obstacles of the kind {kind} stand already; remove some")
+            raise InputError(f"all obstacles of the kind {kind} are in the scene already; press Remove all")
         if event.client is None:
             return
         pose = camera_pose_of(event.client)
@@ -166,12 +168,12 @@ class DrivePanel:
     def _show_obstacle_text(self) -> None:
         text = self._driving.obstacles.toml()
         note = "Drag an obstacle by its arrows, turn it by its ring."
-        keep = f" To keep them, copy into `scene.toml`:\n```toml\n{text}\n```" if text else ""
+        keep = f" To keep them, copy this into `scene.toml`:\n```toml\n{text}\n```" if text else ""
         self._obstacle_text.content = note + keep
 
 
 def _plot(torques: Iterable[tuple[float, float, float]]) -> Image:
-    """Curves of the torques (time [s], left, right [N m]) of the last control steps."""
+    """Plots torques of the last control steps, given as (time [s], left, right [N m])."""
     width, height = _PLOT_SIZE
     canvas = np.zeros((height, width, 3), np.uint8)
     times, left, right = np.array(list(torques) or [(0.0, 0.0, 0.0)]).T
@@ -181,16 +183,16 @@ def _plot(torques: Iterable[tuple[float, float, float]]) -> Image:
 
 
 def drive_table(facts: DriveFacts) -> str:
-    """The facts of a drive as a Markdown table."""
+    """The state of a drive as a Markdown table."""
     (v, yaw), (left, right), (amps_left, amps_right) = facts.command, facts.torque, facts.current
     rows = [
         ("time", f"{facts.time:.1f} s, {facts.rate:.1f}× real time"),
         ("command", f"{v:+.2f} m/s, {yaw:+.2f} rad/s"),
-        ("driven", f"{facts.speed:+.2f} m/s, {facts.yaw_rate:+.2f} rad/s"),
+        ("actual", f"{facts.speed:+.2f} m/s, {facts.yaw_rate:+.2f} rad/s"),
         ("torque left, right", f"{left:+.1f}, {right:+.1f} N m"),
         ("current left, right", f"{amps_left:+.1f}, {amps_right:+.1f} A"),
-        ("along, off the route", f"{facts.progress:.1f} m, {facts.cross_track:+.2f} m"),
-        ("trust in the picture", f"{facts.trust:.2f}"),
-        ("touches", join_names(facts.touched, 2) if facts.touched else "nothing"),
+        ("progress, cross-track error", f"{facts.progress:.1f} m, {facts.cross_track:+.2f} m"),
+        ("trust, 0 to 1", f"{facts.trust:.2f}"),
+        ("contacts", join_names(facts.touched, 2) if facts.touched else "none"),
     ]
     return "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows)

@@ -1,8 +1,8 @@
-"""Driving in the page: the Husky in the scene's own environment, stepped in real time by keys, a policy or a script.
+"""Driving in the page: the Husky in the scene's simulation, driven in real time by keys, a policy or a script.
 
-Two environments share one set of obstacles, which may be added, moved and removed at any time. Driven by keys, the
-robot may reverse and go anywhere, and contacts are only reported. A policy or the scripted driver drives a *task* of
-the scene, which ends as it does in `twin validate`.
+There is one environment for keys and one for a *task* of the scene. They share their obstacles, which may be added,
+moved and removed at any time. With keys, the robot may reverse and go anywhere, and contacts are only reported. A
+policy or the scripted driver drives the task, which ends as it does in `twin validate`.
 """
 
 import copy
@@ -34,7 +34,7 @@ from twin.view.scene_picture import ObjectState
 KEYS_DRIVER, SCRIPTED_DRIVER = "keys W A S D", "scripted driver"
 
 _PER_KIND = 4  # obstacles of each kind that may be added to those of scene.toml
-_REACH = 25.0  # [m] beside the route; within it, solid parts stop a robot that is driven by keys
+_REACH = 25.0  # [m] from the route, up to which solid parts block a robot that is driven by keys
 _LONG = 1e6  # [s] time limit of a drive by keys
 _MAX_LAG = 0.5  # [s] largest lag behind real time that is caught up; the rest is dropped
 _POSE_STEPS = 12  # iterations of `station_and_lateral`
@@ -52,7 +52,7 @@ class LoadedTwin(Twin):
 
 @dataclass(frozen=True)
 class DriveFacts:
-    """State of the drive after a control step: speed [m/s], yaw rate [rad/s], cross-track and progress [m]."""
+    """State of the drive: speed [m/s], yaw rate [rad/s], cross-track error and progress [m], trust in [0, 1]."""
 
     time: float
     """[s]"""
@@ -68,7 +68,7 @@ class DriveFacts:
     torque: Array
     """Motor torque of the left and right side at the wheels [N m]."""
     current: Array
-    """[A], shape (2,)."""
+    """Motor current of each side [A]."""
     cross_track: float
     progress: float
     trust: float
@@ -76,14 +76,14 @@ class DriveFacts:
     cause: str
     """Cause of the episode's end; empty while it goes on."""
     rate: float
-    """Simulated time over real time, averaged over the last steps."""
+    """Ratio of simulated to real time, averaged over the last steps."""
 
 
 class PlacedObstacles(EpisodeObstacles):
-    """The obstacles that now stand in the scene, taken from a pool with several of each kind."""
+    """The obstacles that stand in the scene at present, taken from a pool with several of each kind."""
 
     def __init__(self, world: World, segment: RouteSegment, given: tuple[ObstacleConfig, ...]) -> None:
-        """`given` are those of scene.toml, which stand from the beginning."""
+        """`given`: obstacles of scene.toml, which stand from the beginning."""
         super().__init__((), world, segment)
         self._world = world
         named = tuple(replace(one, name=one.name or f"{one.kind}_{k}") for k, one in enumerate(given))
@@ -100,7 +100,7 @@ class PlacedObstacles(EpisodeObstacles):
         return tuple(self.standing.values())
 
     def free(self, kind: str) -> str | None:
-        """Name of an obstacle of a kind that does not stand in the scene; None if all of them do."""
+        """Name of an obstacle of this kind that is not in the scene yet; None if all are."""
         return next((one.name for one in self._pool if one.kind == kind and one.name not in self.standing), None)
 
     def put(self, name: str, x: float, y: float, yaw: float) -> None:
@@ -130,7 +130,7 @@ class PlacedObstacles(EpisodeObstacles):
 
 
 def station_and_lateral(route: Array, xy: Array) -> tuple[float, float]:
-    """Station and lateral [m] of a point (2,), such that `obstacle_pose` gives the point; see `twin.env.obstacles`."""
+    """Station and lateral [m] for which `obstacle_pose` in `twin.env.obstacles` returns the point `xy` (2,)."""
     length = float(arc_lengths(route)[-1])
     foot, cross = nearest_on_route(route[:, :2], xy)
     station, lateral = float(foot), float(cross)
@@ -156,7 +156,7 @@ class FreeDrive(DriveTask):
 
 
 class KeyDriver:
-    """Drives by the held keys: W and S ahead and back, A and D to the left and right."""
+    """Drives by the held keys: W ahead, S back, A turns left, D turns right."""
 
     def __init__(self, held: Callable[[], frozenset[str]]) -> None:
         self._held = held
@@ -183,12 +183,12 @@ class Driving:
         """
         Args:
             twin: A built scene with a route.
-            field: Its field.
+            field: The scene's radiance field.
             task: The task that a policy or the scripted driver drives.
             policy: A `twin.learn.policy.Policy`, or None.
             lighting: Lighting of the robot's pictures.
             held: Returns the held keys.
-            on_step: Called after every control step and reset, from the stepping thread.
+            on_step: Called after every control step, on the stepping thread, and after every reset, on any thread.
             seed: Seed of the task's episodes.
 
         Raises:
@@ -291,7 +291,7 @@ class Driving:
             return ObjectState.of(self.environment.physics.data.ptr)
 
     def update_obstacles(self) -> None:
-        """Applies a change of `obstacles` to the drive."""
+        """Applies changes of `obstacles` to the simulation."""
         with self._lock:
             environment = self.environment
             task, data = environment.task, environment.physics.data.ptr

@@ -1,4 +1,4 @@
-"""The page's controls that compare the twin with a filmed frame, seen from the same place."""
+"""The page's controls that compare a filmed frame with the twin's picture from the same camera pose."""
 
 import time
 from functools import lru_cache
@@ -14,8 +14,8 @@ from twin.view.lighting_panel import LightingPanel
 from twin.view.picture_loop import FilmedFrame
 from twin.view.viewer import FOV, MOVED, Viewer, camera_pose_of
 
-_TURNED = 0.02  # change of the view direction; a larger one, or a movement of more than MOVED, ends the comparison
-_ECHO_TIME = 1.0  # [s] within which a page reports a camera pose that the server has set
+_TURNED = 0.02  # [rad] a larger turn of a page's camera, or a movement by more than MOVED, ends the comparison
+_ECHO_TIME = 1.0  # [s] after the server sets a camera pose, in which movements that a page reports are ignored
 _FRAME_CACHE = 4
 
 
@@ -30,7 +30,7 @@ class FilmPanel:
         self._share, self._placed = 0.5, 0.0
         self._read_frame = lru_cache(_FRAME_CACHE)(lambda i: read_image(self._cameras.image_path(i)))
         gui = viewer.server.gui
-        gui.add_markdown("Move the dividing line between a filmed frame and the twin, seen from the same place.")
+        gui.add_markdown("Compares a filmed frame with the twin from the same pose; move the line between them.")
         self._compare: Any = gui.add_checkbox("compare", False)
         sources = list(dict.fromkeys(self._cameras.sources))
         self._source: Any = gui.add_dropdown("film", sources)
@@ -54,7 +54,7 @@ class FilmPanel:
         return FilmedFrame(self._read_frame(index), pose, intrinsics, self._share)
 
     def moved(self, client: viser.ClientHandle) -> None:
-        """Ends the comparison if a page's camera has left the frame's."""
+        """Ends the comparison if a page's camera has moved away from the frame's camera."""
         if self.index is not None and time.monotonic() - self._placed > _ECHO_TIME:
             pose = self._cameras.camera_to_world[self.index]
             axis = camera_pose_of(client)[:3, 2]
@@ -94,7 +94,7 @@ class FilmPanel:
         self._read_frame(index)  # raises here if the frame cannot be read
         self.index, self._placed = index, time.monotonic()
         self._viewer.stop_following()
-        used = "held out: the field never saw it" if cameras.held_out[index] else "one that the field learned from"
+        used = "not used to train the field" if cameras.held_out[index] else "used to train the field"
         self._note.content = f"`{cameras.names[index]}`, {used}"
         pose, focal = cameras.camera_to_world[index], cameras.intrinsics[index, 1]
         fov = float(2.0 * np.arctan(cameras.sizes[index, 1] / 2.0 / focal))

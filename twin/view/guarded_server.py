@@ -3,11 +3,11 @@
 viser has no access control and no key events. All its traffic, both plain requests and WebSocket handshakes, passes one
 hook of the `websockets` library. `open_server` wraps this hook while viser opens its port:
 
-*Host and origin.* If the server is bound to this machine alone, it answers requests for a loopback name only, so that
-no other site can point its name here (DNS rebinding). A handshake must come from the server's own page.
+*Host and origin.* If the server is bound to this machine alone, it answers only requests for a loopback name, so that
+sites whose names point here cannot read it (DNS rebinding). A handshake must come from the server's own page.
 *Token.* If the server is bound to any other address, each request needs the token: the first one in its address, later
 ones as a cookie. Without TLS both can be read on the network.
-*Script.* The page gets `page.js`, which reports held keys to the socket `/keys` and hands dropped photos to the page.
+*Script.* The page contains `page.js`, which reports held keys to the socket `/keys` and uploads dropped photos.
 """
 
 import asyncio
@@ -43,7 +43,7 @@ KEYS = "wasd"
 _KEYS_PATH = "/keys"
 _HELD_TIME = 0.35  # [s] for which a report of held keys is valid; the page repeats it every 0.1 s
 _MAX_REPORT = 200  # characters
-_STOP_TIME = 3.0  # [s]
+_STOP_TIME = 3.0  # [s] longest wait for a thread of the server to end
 _PORTS = 50  # number of ports to try, from the given one on
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 
@@ -79,7 +79,7 @@ class Gate:
         self._token, self._cookie = token, f"twin_{port}"
 
     def refusal(self, request: Request) -> Response | None:
-        """The answer to a request that is refused; None if the request is allowed."""
+        """A refusal, or the redirect that stores the token as a cookie; None if the request is allowed."""
         host, origin = _header(request, "Host"), _header(request, "Origin")
         if self._token is None and (host is None or _hostname(host) not in _LOOPBACK_NAMES):
             return _plain(http.HTTPStatus.FORBIDDEN, "this page is for this machine only; see twin view --host\n")

@@ -1,4 +1,4 @@
-"""Layers of the page: geometry of the scene that the browser draws over the picture, each sent when first shown."""
+"""Layers: geometry of the scene that the browser draws over the picture. Each is sent when it is first shown."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,9 +29,9 @@ PALETTE = ((255, 183, 77), (100, 181, 246), (186, 104, 200), (129, 199, 132), (2
 """Colors of the filmed lightings, in their order."""
 
 _UP = np.array([0.0, 0.0, 0.04])  # [m] lift of lines and areas, so that the ground does not hide them
-_GROUND_CELL, _GROUND_FACES = 0.25, 40_000
-_FRUSTUM_DEPTH = 0.2  # [m]
-_CLICK_ANGLE = 0.5  # [°] largest angle between a click and the frustum that it hits
+_GROUND_CELL, _GROUND_FACES = 0.25, 40_000  # [m] smallest width of faces, and their largest number
+_FRUSTUM_DEPTH = 0.2  # [m] size of a drawn camera
+_CLICK_ANGLE = 0.5  # [°] largest angle between the ray of a click and the camera that it selects
 _GAMMA = 2.2
 _TRUST_STEP = 0.4  # [m] between points of the trust map
 _NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
@@ -68,7 +68,7 @@ def scene_layers(scene: viser.SceneApi, twin: Twin, field: BakedField) -> list[L
     if _has(twin, "mesh"):
         mesh = twin.scene.stage("mesh")
         out += [
-            Layer("mesh", "what other programs get: the visual mesh", lambda path: [_visual_mesh(scene, path, twin)]),
+            Layer("mesh", "the filmed surface, as twin exports it", lambda path: [_visual_mesh(scene, path, twin)]),
             Layer("ground", "the height field that the wheels roll on", lambda path: [_ground(scene, path, twin)]),
         ]
         if (mesh / "parts.npz").exists():
@@ -81,7 +81,7 @@ def scene_layers(scene: viser.SceneApi, twin: Twin, field: BakedField) -> list[L
             Layer("corridor", "where the robot may drive", lambda path: [_corridor(scene, path, world)]),
             Layer(
                 "trust map",
-                "how far the robot's pictures can be trusted: dark is far from the film, or full of holes",
+                "reliability of the robot's pictures: dark far from all filmed cameras, or where the field has holes",
                 lambda path: [_trust_map(scene, path, twin, world, cameras, field)],
             ),
         ]
@@ -97,7 +97,7 @@ def _has(twin: Twin, stage: str) -> bool:
 
 
 def _frustums(scene: viser.SceneApi, path: str, cameras: Cameras) -> list[viser.SceneNodeHandle]:
-    """The filmed cameras as lines, in a color per lighting: one node per lighting, as hundreds of nodes are slow."""
+    """Draws the filmed cameras as lines, with one color and one node per lighting, as hundreds of nodes are slow."""
     out: list[viser.SceneNodeHandle] = []
     for number, lighting in enumerate(dict.fromkeys(cameras.lightings)):
         segments = []
@@ -116,7 +116,7 @@ def _frustums(scene: viser.SceneApi, path: str, cameras: Cameras) -> list[viser.
 
 
 def clicked_frame(cameras: Cameras, origin: Array, direction: Array) -> int | None:
-    """Index of the frame whose camera is nearest to a ray, in angle; None if the ray passes near none."""
+    """Index of the frame whose camera has the smallest angle to a click's ray; None if it exceeds `_CLICK_ANGLE`."""
     ahead = cameras.positions - origin
     distance = np.linalg.norm(ahead, axis=1)
     along = ahead @ (direction / np.linalg.norm(direction))

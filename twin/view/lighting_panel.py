@@ -32,9 +32,9 @@ class LightingPanel:
         with self._folder:
             # viser's type of a handle declares no setter of `value`.
             self._slider: Any = self._add_slider(0.0)
-            button = gui.add_button("Sample a lighting", hint="one that nobody filmed but could have", order=10.0)
+            button = gui.add_button("Sample a lighting", hint="a plausible lighting that was never filmed", order=10.0)
             viewer.on_click(button, lambda event: self._sample())
-            self._name = gui.add_text("Name", "", hint="of the lighting that a photo adds", order=11.0)
+            self._name = gui.add_text("Name", "", hint="name for the lighting that a photo adds", order=11.0)
             upload = gui.add_upload_button(
                 "Relight by a photo",
                 mime_type="image/*",
@@ -46,7 +46,7 @@ class LightingPanel:
             upload.on_upload(lambda event: self._photo_given(upload.value.name, upload.value.content))
 
     def _add_slider(self, value: float) -> viser.GuiInputHandle[float]:
-        """A slider through the field's lightings; between two of them it mixes them."""
+        """A slider through the field's lightings; it blends between neighbors."""
         names = self._field.lightings
         slider = self._viewer.server.gui.add_slider(
             "lighting",
@@ -56,7 +56,7 @@ class LightingPanel:
             value,
             marks=tuple((float(k), name) for k, name in enumerate(names)),
             disabled=len(names) < 2,
-            hint="from one lighting to the next",
+            hint="blends from each lighting to the next",
             order=0.0,
         )
         self._viewer.on_update(slider, self._slid)
@@ -82,12 +82,12 @@ class LightingPanel:
             lighting = self._name.value.strip() or "".join(c if c.isalnum() else "_" for c in Path(name).stem)
             check_name(lighting, "name")
             self._upload.disabled = True
-            text = f"{name}: finding where it was taken, then fitting its light: about a minute."
+            text = f"{name}: finding its camera pose and fitting its lighting; this takes about a minute."
             self._viewer.notify("Relighting", text)
             self._viewer.submit(self._relight, lighting, Path(name).suffix, content)
 
     def _relight(self, name: str, suffix: str, content: bytes) -> None:
-        """Adds a photo's lighting by `twin relight`, in a process of its own: it needs much memory for a minute."""
+        """Adds a photo's lighting by `twin relight` in another process, which frees its large memory when it ends."""
         root = str(self._viewer.twin.scene.root)
         try:
             with tempfile.TemporaryDirectory(prefix="twin-") as folder:
@@ -110,7 +110,7 @@ class LightingPanel:
             self._upload.disabled = False
 
     def _reload(self) -> None:
-        """Reads the lightings of photos again."""
+        """Reloads the lightings that photos have added to the scene."""
         names = self._field.lightings_by_name.filmed()
         self._field.lightings_by_name = names
         self._field.add_lightings(*added_lightings(self._viewer.twin.scene, names.vectors.shape[1]))

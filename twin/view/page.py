@@ -1,4 +1,4 @@
-"""The page of `twin view`: its tabs Look, Drive, Film and Path, and the picture under their settings."""
+"""The page of `twin view`: its tabs Look, Drive, Film and Path, and the content of its picture."""
 
 from typing import Any
 
@@ -85,6 +85,6 @@ class Page:
         self._drive_note.content = why
 
     def drove(self, facts: DriveFacts) -> None:
-        """Shows the drive after a control step; called from the driving thread."""
+        """Shows the state of the drive after a control step or a reset; called on several threads."""
         if self._drive is not None:
             self._drive.drove(facts)

@@ -17,7 +17,7 @@ from twin.view.layers import wxyz_of
 from twin.view.viewer import Viewer, camera_pose_of
 
 _FILM_SIZE, _FILM_FPS = (1280, 720), 30  # width, height [px] and frames per second
-_SPEED, _MIN_STEP = 1.5, 1.0  # [m/s] along a path, [s] between two key views
+_SPEED, _MIN_STEP = 1.5, 1.0  # [m/s] default along a path; [s] shortest time between two key views
 _COLOR = (255, 64, 129)
 
 
@@ -92,14 +92,14 @@ class PathPanel:
             segments = np.stack([points[:-1], points[1:]], 1)
             self.nodes.append(scene.add_line_segments("/path/line", segments, _COLOR, thickness=0.03))
         views = "view" if len(self._keys) == 1 else "views"
-        self._note.content = f"{len(self._keys)} {views}, {length:.1f} s. Each keeps its lighting."
+        self._note.content = f"{len(self._keys)} {views}, {length:.1f} s. Each view keeps its lighting."
         self._viewer.loop.touch()
 
     def _save(self) -> None:
         path, file = self._path(), self._file()
         file.parent.mkdir(exist_ok=True)
         path.save(file)
-        text = f"{file}; twin view {self._root} --path {file} --out film.mp4"
+        text = f"{file}; to film it: twin view {self._root} --path {file} --out film.mp4"
         self._viewer.notify("Path saved", text, "green")
 
     def _load(self) -> None:
@@ -108,7 +108,7 @@ class PathPanel:
         self._show()
 
     def _fly(self, event: viser.GuiEvent) -> None:
-        """Moves the page's camera along the path in real time."""
+        """Moves the camera of the user's page along the path in real time."""
         client, path = event.client, self._path()
         if client is not None:
             threading.Thread(target=self._fly_along, args=(client, path), daemon=True).start()

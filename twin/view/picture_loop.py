@@ -18,13 +18,13 @@ from twin.types import Array, Image
 from twin.view.scene_picture import FreeCamera, ObjectState, ScenePicture
 
 COARSE_AREA, FINE_AREA = 320 * 180, 1280 * 720
-"""Most pixels of a coarse and of a fine picture; a page with fewer pixels has pictures of its own size."""
+"""Maximum numbers of pixels of a coarse and a fine picture; a smaller page has pictures of its own size."""
 
 _REST = 0.12  # [s] without a change, after which the fine picture is rendered
 _MIN_PERIOD = 0.045  # [s] between two coarse pictures of a page; the browser needs CPU time, too
 _COARSE_QUALITY, _FINE_QUALITY = 80, 92
-_DEPTH_MARGIN, _DEPTH_SHARE = 0.06, 0.01  # [m], fraction of depth: layers at most this far behind the field are shown
-_MAX_DEPTH = 160.0  # [m] that viser can transmit; beyond it, layers are drawn over the picture
+_DEPTH_MARGIN, _DEPTH_SHARE = 0.06, 0.01  # layers are drawn up to [m] + fraction of depth behind the picture's surface
+_MAX_DEPTH = 160.0  # [m] about the largest depth that viser can transmit; the picture hides layers beyond it
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class FilmedFrame:
     intrinsics: Array
     """fx, fy, cx, cy [px] at the image's size."""
     share: float
-    """Share of the page's width that shows the film."""
+    """Position of the dividing line, as a fraction of the page's width from the left."""
 
 
 @dataclass(frozen=True)
@@ -162,9 +162,9 @@ class PictureLoop:
 
 
 def picture_size(page: tuple[int, int], area: int) -> tuple[int, int] | None:
-    """Even width and height [px] of a picture with a page's shape and at most `area` pixels; None for a tiny page.
+    """Even width and height [px] of a picture with a page's aspect ratio and about `area` pixels at most.
 
-    A small page has pictures of its own size.
+    A small page has pictures of its own size. None: the page is too small for a picture.
     """
     width, height = page
     if min(width, height) < 8:
@@ -175,7 +175,7 @@ def picture_size(page: tuple[int, int], area: int) -> tuple[int, int] | None:
 
 
 def film_camera(film: FilmedFrame, size: tuple[int, int]) -> FreeCamera:
-    """The frame's camera for a picture of a size, in whose middle the frame is as large as fits."""
+    """The frame's camera, for a picture of this size in whose middle the frame is as large as possible."""
     height, width = film.image.shape[:2]
     scale = min(size[0] / width, size[1] / height)
     offset = (np.array(size) - scale * np.array([width, height])) / 2.0

@@ -1,4 +1,4 @@
-"""Pictures of a scene from a free camera: the field under a lighting, with the robot and obstacles in it.
+"""Pictures of a scene from a free camera: the radiance field under a lighting, with the robot and obstacles in it.
 
 Without `add_objects`, only the field is rendered. After it, `twin.env.compositor` also draws robot and obstacles in
 each picture for which an `ObjectState` with their positions is given.
@@ -89,7 +89,7 @@ class ScenePicture:
             self._compositors.clear()
 
     def render(self, camera: FreeCamera, lighting: EpisodeLighting, objects: ObjectState | None = None) -> Rendering:
-        """Renders one picture, with the lighting's fog; for `objects`, the principal point must be the center."""
+        """Renders one picture, with the lighting's fog; `objects` need a principal point in the image center."""
         with self._lock:
             if objects is None or self._model is None:
                 view = Viewpoints.of(camera.camera_to_world, camera.intrinsics, camera.size)

@@ -1,7 +1,7 @@
-"""The open pages of `twin view`: their cameras, the lighting and robot that all of them show, notices, and jobs.
+"""The open pages of `twin view`: their cameras, shared lighting and robot, notices, and background jobs.
 
-All pages of a server show the same lighting, layers, robot and obstacles; each has its own camera. Callbacks of viser
-run on many threads: each holds the viewer's lock, and an `InputError` within one is shown as a notice.
+All pages of a server show the same lighting, layers, robot and obstacles; each has its own camera. viser runs callbacks
+on many threads. Callbacks of controls hold the viewer's lock; an `InputError` in one of them is shown as a notice.
 """
 
 import threading
@@ -28,11 +28,11 @@ from twin.view.scene_picture import ScenePicture
 FOV = float(np.deg2rad(60.0))
 """Vertical angle of view of a new page's camera [rad]."""
 MOVED = 0.03
-"""[m]; a camera that is farther than this from a pose has left it."""
+"""[m]; a camera that is closer than this to a pose counts as being there."""
 
 
 class Viewer:
-    """The pages of one server, without their controls."""
+    """The pages of one server; other classes add their controls."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class Viewer:
         self._status.content = f"**{self.twin.scene.root.resolve().name}** in *{self.lighting.name}*"
 
     def set_lighting(self, lighting: EpisodeLighting) -> None:
-        """Shows another lighting on all pages and to the robot."""
+        """Changes the lighting of all pages and of the robot's pictures."""
         self.lighting = lighting
         self._show_status()
         self.loop.touch()
@@ -83,7 +83,7 @@ class Viewer:
 
         def connected(client: viser.ClientHandle) -> None:
             client.camera.on_update(lambda _: moved(client))
-            # A page may have been open before its initial camera was known.
+            # A page that connects early does not know the initial camera yet.
             if np.linalg.norm(client.camera.position - self._first[:3, 3]) > MOVED:
                 self.place(client, self._first, FOV)
             self.loop.add(client)
@@ -108,7 +108,7 @@ class Viewer:
         self.loop.touch(client)
 
     def follow(self, base_to_world: Array) -> None:
-        """Moves the cameras of all pages behind the robot, smoothly since the last `stop_following`."""
+        """Moves the cameras of all pages behind the robot, with smoothing, which `stop_following` resets."""
         if self._chase is None:
             self._chase = ChaseCamera(base_to_world)
         pose = self._chase.follow(base_to_world)
@@ -149,7 +149,7 @@ class Viewer:
             client.add_notification(title, body, auto_close_seconds=seconds, color=color)
 
     def submit(self, job: Callable[..., None], *given: Any) -> None:
-        """Runs a job after all earlier ones; the traceback of an unexpected error is printed."""
+        """Runs a job in the background, after all earlier ones; prints the traceback of an unexpected error."""
         self._jobs.submit(job, *given).add_done_callback(lambda future: future.cancelled() or future.result())
 
     def close(self) -> None:
