@@ -154,6 +154,33 @@ def _place(forecast, tmp_path, run, name="a"):
     return forecast.command.PlaceRun(protocol, 100, tmp_path / name, tmp_path / f"results_{name}", run, 1)
 
 
+def test_a_place_that_cannot_be_built_is_recorded_as_failed_and_not_run_again(forecast, tmp_path, capsys):
+    protocol = forecast.protocol.read_protocol()
+    run = StandIn(forecast)
+    run.must = lambda *arguments, cores=1: _fails_at(run, "twin.build", arguments)
+    place = forecast.command.PlaceRun(protocol, 100, tmp_path / "work", tmp_path / "results", run, 1)
+    with pytest.raises(InputError, match="no reconstructed point"):
+        forecast.command.run_place(place, None)
+    failure = {"step": "build", "message": "no reconstructed point"}
+    assert read_json(tmp_path / "results" / "version_1" / "place_100" / "failure.json") == failure
+    forecast.command.run_place(place, None)
+    assert run.calls == ["film"]
+    found = forecast.place_scores.score(protocol, tmp_path / "results")
+    assert found["places"]["100"] == "failed: build: no reconstructed point"
+    assert "failed: build: no reconstructed point" in forecast.place_scores.tables(protocol, found)
+
+
+def _fails_at(run, command, arguments):
+    if arguments[0] == command:
+        raise InputError("no reconstructed point")
+    assert run(*arguments) == 0
+
+
+def test_the_message_of_a_failed_command_is_kept(forecast, tmp_path):
+    with pytest.raises(InputError, match=r"twin\.build ended with exit status 2: no scene.toml at"):
+        forecast.command.Commands(5.0).must("twin.build", tmp_path / "nothing")
+
+
 def test_policies_are_frozen_before_anything_drives_and_a_repeat_changes_nothing(forecast, filmed, tmp_path):
     run = StandIn(forecast)
     one = _place(forecast, tmp_path, run)

@@ -1,10 +1,14 @@
 """The pairs of frames that are matched, and the outliers of a path."""
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from twin.capture.matching import (
     SEQUENCE_STEPS,
+    Matcher,
     expanded_pairs,
     frame_signatures,
     near_pairs,
@@ -115,3 +119,20 @@ def test_photos_in_no_order_have_no_outliers() -> None:
     path = _turning_path()
     assert not path_outliers(path[np.random.default_rng(0).permutation(50)], 0.3).any()
     assert not path_outliers(path[:4], 0.3).any()
+
+
+def test_sources_are_linked_by_many_verified_pairs_and_not_by_a_few() -> None:
+    """Films in opposite directions have some verified pairs by chance, with few matches."""
+    source = np.repeat([0, 1, 2], 20)
+    sources = tuple(SimpleNamespace(lighting=one) for one in ("day", "day", "night"))
+    tried = {(i, j) for i in range(60) for j in range(i + 1, 60) if source[i] != source[j]}
+    chance = {(i, 20 + i): 18 for i in range(15)} | {(i, 40 + i): 30 for i in range(3)}
+    verified = chance | {(20 + i, 40 + i): 60 for i in range(8)}
+    matcher = Matcher(
+        Path(), Path(), None, SimpleNamespace(source_index=source, sources=sources), source, 1, 0, tried, source
+    )
+    matcher.verified = lambda: verified  # type: ignore[method-assign]
+    first, second = matcher.linked_groups()
+    assert set(source[first]) == {1, 2} and set(source[second]) == {0}
+    verified |= {(i, 20 + j): 16 for i in range(20) for j in range(11)}  # more than half of the pairs
+    assert len(matcher.linked_groups()) == 1

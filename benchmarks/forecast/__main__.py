@@ -15,8 +15,8 @@
 - drive: drives every policy in the simulated reality, on each day, on the task that the twin exported.
 
 WORK holds the scenes (1 GB a place). After a kill, or at the end of `--minutes`, the same command continues. A place of
-60 m takes about two hours on two cores. No recorded row is removed. If a command fails, its place remains unfinished,
-and the next place begins.
+60 m takes about two hours on two cores. No recorded row is removed. A place that cannot be filmed, built or trained is
+recorded as failed, and the next place begins.
 """
 
 import argparse
@@ -24,13 +24,14 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from place_record import EPISODES, HELD_OUT_CONDITION, PLACE, TRIALS, by_photo, freeze, keep
+from place_record import EPISODES, FAILURE, HELD_OUT_CONDITION, PLACE, TRIALS, by_photo, freeze, keep
 from place_scores import score, tables
 from protocol import PROTOCOL, Protocol, read_protocol
 
@@ -57,6 +58,7 @@ class Commands:
     def __init__(self, minutes: float) -> None:
         self._end = time.monotonic() + 60.0 * min(minutes, 1e6)
         self._running: set[subprocess.Popen] = set()
+        self._message = ""
 
     def stop(self, *_: object) -> None:
         """Signal handler: moves the deadline to now, and ends running commands."""
@@ -70,17 +72,32 @@ class Commands:
             raise TimeIsUp
         print("+", " ".join(map(str, arguments)), flush=True)
         environment = {**os.environ, "OMP_NUM_THREADS": str(cores)}
-        process = subprocess.Popen([sys.executable, "-m", *map(str, arguments)], env=environment)
+        command = [sys.executable, "-m", *map(str, arguments)]
+        process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
         self._running.add(process)
+        copy = threading.Thread(target=self._copy_messages, args=(process,))
+        copy.start()
         try:
             status = process.wait(max(0.0, self._end - time.monotonic()))
         except subprocess.TimeoutExpired:
             status = None
         finally:
             self._end_of(process)
+            copy.join()
         if status is None or self._end == 0.0:
             raise TimeIsUp
         return status
+
+    def _copy_messages(self, process: subprocess.Popen) -> None:
+        """Copies a command's standard error, and remembers its last error message."""
+        assert process.stderr
+        tail = b""
+        while data := os.read(process.stderr.fileno(), 65536):
+            sys.stderr.buffer.write(data)
+            sys.stderr.buffer.flush()
+            tail = (tail + data)[-4096:]
+        errors = [line for line in tail.decode(errors="replace").splitlines() if line.startswith("error: ")]
+        self._message = errors[-1].removeprefix("error: ") if errors else "see its messages above"
 
     def _end_of(self, process: subprocess.Popen) -> None:
         """Ends a command that still runs, and lets it save its state."""
@@ -97,7 +114,7 @@ class Commands:
         """Runs a command. Raises InputError if it fails."""
         status = self(*arguments, cores=cores)
         if status:
-            raise InputError(f"{' '.join(map(str, arguments))}: exit status {status}; see its message above")
+            raise InputError(f"{arguments[0]} ended with exit status {status}: {self._message}")
 
 
 class PlaceRun:
@@ -215,11 +232,21 @@ class PlaceRun:
 
 
 def run_place(one: PlaceRun, ray: str | None) -> None:
-    """Runs all steps of a place. Writes the record even if a step fails or the time is up."""
+    """Runs all steps of a place. Writes the record even if a step fails or the time is up.
+
+    A place that cannot be filmed, built or trained is recorded as such, and not run again.
+    """
+    if (one.record / FAILURE).exists():
+        return
     steps: Sequence[Callable[[], None]] = (one.film, one.build, one.photos, one.train)
     try:
         for step in steps:
-            step()
+            try:
+                step()
+            except InputError as error:
+                one.record.mkdir(parents=True, exist_ok=True)
+                write_json(one.record / FAILURE, {"step": step.__name__, "message": str(error)})
+                raise
         one.validate(ray)
         one.drive()
     finally:

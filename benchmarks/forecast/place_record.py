@@ -22,7 +22,8 @@ from twin.evaluation.trials import EPISODE_COLUMNS, Trial, csv_text, read_trials
 from twin.files import digest_file, read_json, write_bytes, write_json
 from twin.types import Array
 
-EPISODES, TRIALS, POLICIES, PLACE = "episodes.csv.gz", "trials.csv.gz", "policies.json", "place.json"
+EPISODES, TRIALS = "episodes.csv.gz", "trials.csv.gz"
+POLICIES, PLACE, FAILURE = "policies.json", "place.json", "failure.json"
 HELD_OUT_CONDITION = str(Condition(HELD_OUT, True))
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from place_record import POLICIES, PlaceRecord, read_place
+from place_record import FAILURE, POLICIES, PlaceRecord, read_place
 from protocol import Protocol
 
 from twin.evaluation.jackknife import STATISTICS, PairedCells, Statistic, mean_difference_interval, place_interval
@@ -31,6 +31,7 @@ from twin.evaluation.probability_scores import (
     twin_probabilities,
 )
 from twin.evaluation.statistics import UndefinedStatistic, rate_over_days, winner
+from twin.files import read_json
 from twin.types import Array
 
 TWIN, HELD_OUT, SETUP = "twin, by a photo of each day", "twin, held-out lightings", "same setup at other places"
@@ -69,6 +70,9 @@ def score(protocol: Protocol, results: Path) -> dict[str, Any]:
 def _state(folder: Path, record: PlaceRecord | None) -> str:
     if record:
         return "complete"
+    if (folder / FAILURE).exists():
+        failure = read_json(folder / FAILURE)
+        return f"failed: {failure['step']}: {failure['message']}"
     return "trained" if (folder / POLICIES).exists() else "not begun" if not folder.exists() else "begun"
 
 

@@ -9,12 +9,14 @@ image. A camera is *known* (a given, fixed calibration), has a focal length *pri
 
 import itertools
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from twin.capture.camera_models import Lens
 from twin.capture.capture_data import Capture, SourceInfo
@@ -25,8 +27,14 @@ from twin.types import Array
 
 Pair = tuple[int, int]
 
-SEQUENCE_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-"""Distances [frames] of sequence pairs within a source: short ones for neighbors, long ones against drift."""
+SEQUENCE_STEPS = (1, 2, 3, 4, 6, 8, 12)
+"""Distances [frames] of sequence pairs within a source: short ones for neighbors, long ones against drift.
+
+Frames that are farther apart mostly match by what is infinitely far, which misleads global mapping.
+"""
+PROBE_INLIERS = 25
+"""Verified matches with which a pair counts as evidence of a common view; fewer than 20 occur by chance."""
+_LINKING_PAIRS, _LINKING_FRACTION = 8, 0.5  # pairs with such evidence, or fraction of verified pairs, link two sources
 _WORDS = 32  # visual words of the VLAD descriptor
 _SAMPLES_PER_FRAME = 150
 _PROBES_PER_SOURCE = 20
@@ -199,6 +207,7 @@ class Matcher:
     threads: int
     seed: int
     tried: set[Pair]
+    frames: NDArray[np.int64]  # indices of the frames that are to be reconstructed
 
     def frame_of(self) -> dict[int, int]:
         """Database id → frame index."""
@@ -265,6 +274,42 @@ class Matcher:
         pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
         return {ordered_pair(frame_of[a], frame_of[b]): n for (a, b), n in zip(pairs, counts, strict=True) if n > 0}
 
+    def linked_groups(self) -> list[NDArray[np.int64]]:
+        """Groups of frames (k,) whose sources are linked; the group with most lightings and frames is the first.
+
+        Two sources are linked if many of their pairs are verified. A few pairs are verified by chance even if two films
+        have no view in common, since they go in opposite directions.
+        """
+        source, count = self.capture.source_index, len(self.capture.sources)
+        lightings = [one.lighting for one in self.capture.sources]
+        strong, verified, tried = (np.zeros((count, count)) for _ in range(3))
+        for i, j in self.tried:
+            tried[source[i], source[j]] += 1
+        for (i, j), inliers in self.verified().items():
+            verified[source[i], source[j]] += 1
+            strong[source[i], source[j]] += inliers >= PROBE_INLIERS
+        frames = np.bincount(source, minlength=count)
+        enough = np.minimum(_LINKING_PAIRS, np.minimum(frames, frames[:, None]) / 2)
+        linked = (strong >= enough) | (verified > _LINKING_FRACTION * np.maximum(tried, 1))
+        group = connected_components(csr_matrix(linked & (tried > 0)), directed=False)[1]
+        groups = [np.flatnonzero(group[source] == k) for k in range(int(group.max()) + 1)]
+        return sorted(groups, key=lambda one: (-len({lightings[s] for s in source[one]}), -len(one), int(one[0])))
+
+    def restricted(self, frames: NDArray[np.int64], folder: Path) -> "Matcher":
+        """A matcher of some of the frames, with its own database in a folder."""
+        inside = set(frames.tolist())
+        others = [pair for pair in self.verified() if not inside.issuperset(pair)]
+        return replace(self, database=self.copied_without(others, folder), tried=set(self.tried), frames=frames)
+
+    def copied_without(self, pairs: list[Pair], folder: Path) -> Path:
+        """A copy of the database, in a folder, in which some pairs are not verified."""
+        path = folder / self.database.name
+        shutil.copyfile(self.database, path)
+        with pycolmap.Database.open(path) as database:
+            for i, j in pairs:
+                database.delete_two_view_geometry(int(self.image_ids[i]), int(self.image_ids[j]))
+        return path
+
 
 def open_database(capture: Capture, stage: Path, work: Path, free_focal: bool, threads: int, seed: int) -> Matcher:
     """Creates a database in `work` with the frames and cameras of a capture, whose stage folder is `stage`.
@@ -295,7 +340,17 @@ def open_database(capture: Capture, stage: Path, work: Path, free_focal: bool, t
                     done.add(image.camera_id)
                     intrinsics = None if given is None else given[i]
                     database.update_camera(_camera(source, image.camera_id, free_focal, intrinsics))
-    return Matcher(path, images, _mask_folder(capture, stage, work), capture, image_ids, threads, seed, set())
+    return Matcher(
+        path,
+        images,
+        _mask_folder(capture, stage, work),
+        capture,
+        image_ids,
+        threads,
+        seed,
+        set(),
+        np.arange(len(capture.names)),
+    )
 
 
 def _camera(source: SourceInfo, camera_id: int, free_focal: bool, intrinsics: Array | None) -> pycolmap.Camera:

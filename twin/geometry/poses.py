@@ -30,6 +30,10 @@ class Similarity:
         out[..., :3, 3] = self.points(out[..., :3, 3])
         return out
 
+    def __matmul__(self, first: "Similarity") -> "Similarity":
+        """Applies `first`, then this similarity."""
+        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.points(first.translation))
+
     def inverse(self) -> "Similarity":
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)

@@ -1,0 +1,294 @@
+"""Joins two reconstructions of one road by matching the ground as it looks from above.
+
+Films in opposite directions have no view in common, so their frames do not match, and COLMAP reconstructs them
+separately. From above, however, the ground has the same texture in both. Each reconstruction is a *part*. For each part
+a *ground picture* is composed of its frames: a map of the ground, with a pixel size of 2 % of the camera's height above
+the road. SIFT features of both pictures are matched. A match belongs to a pixel of a frame in each part, and so to a
+ray in each part. The similarity between the parts makes both rays of a match meet at the ground.
+
+*Level frame* of a part: z up, unit = height of the camera above the road. Lengths in this file are in this unit.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from twin.capture.gravity import up_from_ground
+from twin.geometry.poses import Similarity, inverse_pose
+from twin.types import Array
+
+_PIXEL = 0.02  # side of a ground picture's pixel
+_NEAR, _FAR, _ASIDE = (
+    1.0,
+    5.0,
+    3.5,
+)  # extent of the ground that is taken from a frame: ahead of the camera, to each side
+_MAX_PIXELS = 6e7  # limit of a ground picture
+_FEATURES = 20_000  # most SIFT features of a ground picture
+_CONTRAST = 0.015  # SIFT's threshold; asphalt has little contrast
+_RATIO = 0.85  # largest distance of the best match, relative to the second best one
+_TOLERANCE = 0.35  # largest error of a match under a similarity of the maps; relief displaces the two views oppositely
+_MIN_MATCHES = 25  # fewer matches under one similarity occur by chance
+_MAX_SCALE = 1.3  # largest ratio of the two camera heights
+_RAY_SIGMA, _HEIGHT_SIGMA = 0.02, 0.01  # standard deviations: distance of two rays; height of the road below a camera
+_AROUND, _MIN_AROUND = 1.5, 4  # radius and least number of the road points that give the height of a ground point
+_OUTLIER = 3.0  # [standard deviations] scale of the robust loss
+
+
+@dataclass(frozen=True)
+class Part:
+    """A reconstruction of n frames."""
+
+    frames: NDArray[np.int64]
+    """Indices of the frames in the capture, shape (n,)."""
+    camera_to_world: Array
+    """Poses in the reconstruction's frame and unit, shape (n, 4, 4)."""
+    points: Array
+    """Sparse points, shape (m, 3)."""
+    cameras: list[pycolmap.Camera]
+    """Camera of each frame, with distortion."""
+    lightings: list[str]
+    """Lighting of each frame."""
+
+
+@dataclass(frozen=True)
+class _GroundPicture:
+    """Map of the ground of the frames of one lighting."""
+
+    gray: NDArray[np.uint8]
+    """Shape (rows, columns); x grows with the column and y with the row."""
+    owner: NDArray[np.int32]
+    """Frame of each pixel, as an index into the part's frames; −1: not seen."""
+    origin: Array
+    """x, y of the corner of the first pixel, shape (2,)."""
+
+
+@dataclass(frozen=True)
+class _Match:
+    """k matches between the ground pictures of two parts."""
+
+    xy_a: Array
+    """Points x, y in the first picture, shape (k, 2)."""
+    xy_b: Array
+    rays_a: Array
+    """Rays of the first part, see `_rays`, shape (k, 6)."""
+    rays_b: Array
+
+
+def join(a: Part, b: Part, read_gray: Callable[[int], NDArray[np.uint8]]) -> Similarity | None:
+    """The similarity from the frame of part b to that of part a; None if their grounds do not match.
+
+    Args:
+        a: A part.
+        b: Another part.
+        read_gray: Reads the picture of a frame, given its index in the capture; uint8, shape (h, w).
+    """
+    levels = _level_frame(a), _level_frame(b)
+    if levels[0] is None or levels[1] is None:
+        return None
+    (level_a, road_a), (level_b, road_b) = levels[0], levels[1]
+    poses_a, poses_b = level_a.poses(a.camera_to_world), level_b.poses(b.camera_to_world)
+    common = set(a.lightings) & set(b.lightings)
+    pairs = [(one, one) for one in common] or [(one, two) for one in set(a.lightings) for two in set(b.lightings)]
+    found: list[_Match] = []
+    for one, two in sorted(pairs):
+        picture_a = _ground_picture(a, poses_a, one, read_gray)
+        picture_b = _ground_picture(b, poses_b, two, read_gray)
+        if picture_a and picture_b:
+            xy_a, xy_b = _matches(picture_a, picture_b)
+            rays = _rays(picture_a, xy_a, poses_a, road_a), _rays(picture_b, xy_b, poses_b, road_b)
+            found.append(_Match(xy_a, xy_b, *rays))
+    fits = [_planar_similarity(one.xy_b, one.xy_a) for one in found]
+    count, planar = max(fits, key=lambda fit: fit[0], default=(0, np.eye(3)))
+    if count < _MIN_MATCHES:
+        return None
+    inliers = [
+        np.linalg.norm(one.xy_b @ planar[:2, :2].T + planar[:2, 2] - one.xy_a, axis=1) < _TOLERANCE for one in found
+    ]
+    rays_a = np.concatenate([one.rays_a[near] for one, near in zip(found, inliers, strict=True)])
+    rays_b = np.concatenate([one.rays_b[near] for one, near in zip(found, inliers, strict=True)])
+    return level_a.inverse() @ _meeting_similarity(rays_a, rays_b, planar) @ level_b
+
+
+def _level_frame(part: Part) -> tuple[Similarity, Array] | None:
+    """The similarity to the part's level frame, and its road points (k, 3) there; None if it has no road."""
+    gravity, road = up_from_ground(part.camera_to_world, part.points)
+    if road is None:
+        return None
+    up = gravity.direction
+    x_axis = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    x_axis /= np.linalg.norm(x_axis)
+    rotation = np.stack([x_axis, np.cross(up, x_axis), up])
+    level = Similarity(1.0 / road.drop, rotation, np.zeros(3))
+    return level, level.points(part.points[road.points])
+
+
+def _slopes(poses: Array) -> Array:
+    """Slope of the path in the viewing direction at each frame, shape (n,); poses (n, 4, 4) in the level frame."""
+    centers, forward = poses[:, :3, 3], poses[:, :3, 2]
+    out = np.zeros(len(poses))
+    for k in range(len(poses)):
+        ahead = forward[k, :2] / max(float(np.linalg.norm(forward[k, :2])), 1e-9)
+        offset = centers - centers[k]
+        along = offset[:, :2] @ ahead
+        near = (np.abs(along) < _FAR) & (np.linalg.norm(offset[:, :2], axis=1) < _FAR)
+        if np.ptp(along[near]) > 1.0:
+            out[k] = np.polyfit(along[near], offset[near, 2], 1)[0]
+    return out
+
+
+def _ground_picture(
+    part: Part, poses: Array, lighting: str, read_gray: Callable[[int], NDArray[np.uint8]]
+) -> _GroundPicture | None:
+    """The ground as the frames of a lighting show it; None without such frames, or if the ground is too large."""
+    chosen = [k for k, one in enumerate(part.lightings) if one == lighting]
+    if not chosen:
+        return None
+    centers = poses[chosen, :2, 3]
+    low, high = centers.min(0) - _FAR - _ASIDE, centers.max(0) + _FAR + _ASIDE
+    columns, rows = np.ceil((high - low) / _PIXEL).astype(int).tolist()
+    if rows * columns > _MAX_PIXELS:
+        return None
+    slopes = _slopes(poses)
+    gray = np.zeros((rows, columns), np.uint8)
+    owner = np.full((rows, columns), -1, np.int32)
+    nearest = np.full((rows, columns), np.inf, np.float32)
+    for k in chosen:
+        center, forward = poses[k, :3, 3], poses[k, :2, 2]
+        ahead = forward / max(float(np.linalg.norm(forward)), 1e-9)
+        corners = center[:2] + np.array(
+            [
+                [x * ahead[0] - y * ahead[1], x * ahead[1] + y * ahead[0]]
+                for x in (_NEAR, _FAR)
+                for y in (-_ASIDE, _ASIDE)
+            ]
+        )
+        c0, r0 = np.floor((corners.min(0) - low) / _PIXEL).astype(int)
+        c1, r1 = np.ceil((corners.max(0) - low) / _PIXEL).astype(int)
+        x, y = np.meshgrid(low[0] + (np.arange(c0, c1) + 0.5) * _PIXEL, low[1] + (np.arange(r0, r1) + 0.5) * _PIXEL)
+        offset = np.stack([x - center[0], y - center[1]], -1)
+        along, aside = offset @ ahead, offset @ np.array([-ahead[1], ahead[0]])
+        window = slice(r0, r1), slice(c0, c1)
+        take = (along > _NEAR) & (along < _FAR) & (np.abs(aside) < _ASIDE) & (along < nearest[window])
+        ground = np.stack([x, y, center[2] - 1.0 + slopes[k] * along], -1)
+        camera = part.cameras[k]
+        pixels = np.full((*x.shape, 2), -1.0)
+        pixels[take] = _project(ground[take], poses[k], camera)
+        take &= (pixels > 0.0).all(-1) & (pixels < np.array([camera.width, camera.height]) - 1.0).all(-1)
+        column, row = (pixels.astype(np.float32) - np.float32(0.5)).transpose(2, 0, 1)
+        values = cv2.remap(read_gray(int(part.frames[k])), column, row, cv2.INTER_LINEAR)
+        gray[window][take] = values[take]
+        owner[window][take] = k
+        nearest[window][take] = along[take]
+    return _GroundPicture(gray, owner, low)
+
+
+def _project(points: Array, pose: Array, camera: pycolmap.Camera) -> Array:
+    """Pixels (k, 2) of points (k, 3) in front of a camera with distortion; nan behind it."""
+    local = points @ inverse_pose(pose)[:3, :3].T + inverse_pose(pose)[:3, 3]
+    out = np.full((len(points), 2), np.nan)
+    front = local[:, 2] > 0.05
+    if front.any():
+        out[front] = np.asarray(camera.img_from_cam(local[front])).reshape(-1, 2)
+    return np.nan_to_num(out, nan=-1.0)
+
+
+def _matches(a: _GroundPicture, b: _GroundPicture) -> tuple[Array, Array]:
+    """Points x, y of mutual matches between the features of two ground pictures, shapes (k, 2)."""
+    sift = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=_CONTRAST)
+    found = []
+    for picture in (a, b):
+        mask = cv2.erode((picture.owner >= 0).astype(np.uint8), np.ones((9, 9), np.uint8))
+        keys, descriptors = sift.detectAndCompute(picture.gray, mask)
+        xy = np.array([key.pt for key in keys], np.float64).reshape(-1, 2)
+        found.append((picture.origin + (xy + 0.5) * _PIXEL, descriptors))
+    (xy_a, descriptors_a), (xy_b, descriptors_b) = found
+    if descriptors_a is None or descriptors_b is None or min(len(xy_a), len(xy_b)) < 2:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    forth = {
+        m.queryIdx: m.trainIdx
+        for m, n in matcher.knnMatch(descriptors_a, descriptors_b, k=2)
+        if m.distance < _RATIO * n.distance
+    }
+    back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(descriptors_b, descriptors_a, k=1)}
+    mutual = np.array([(i, j) for i, j in forth.items() if back[j] == i], np.int64).reshape(-1, 2)
+    return xy_a[mutual[:, 0]], xy_b[mutual[:, 1]]
+
+
+def _planar_similarity(source: Array, target: Array) -> tuple[int, Array]:
+    """Number of points that one similarity of the plane maps within `_TOLERANCE`, and its matrix (3, 3)."""
+    if len(source) < 3:
+        return 0, np.eye(3)
+    matrix, inliers = cv2.estimateAffinePartial2D(
+        source, target, ransacReprojThreshold=_TOLERANCE, maxIters=20_000, confidence=0.9999
+    )
+    if matrix is None:
+        return 0, np.eye(3)
+    scale = float(np.hypot(matrix[0, 0], matrix[1, 0]))
+    plausible = 1.0 / _MAX_SCALE < scale < _MAX_SCALE
+    return int(inliers.sum()) if plausible else 0, np.vstack([matrix, [0.0, 0.0, 1.0]])
+
+
+def _rays(picture: _GroundPicture, xy: Array, poses: Array, road: Array) -> Array:
+    """Rays to points (k, 2) of a ground picture: center of the frame's camera, and the ground point; shape (k, 6).
+
+    The height of a ground point is that of the road points (m, 3) around it, if there are enough of them.
+    """
+    column, row = np.floor((xy - picture.origin) / _PIXEL).astype(int).T
+    frame = picture.owner[row, column]
+    center = poses[frame, :3, 3]
+    forward = poses[frame, :2, 2] / np.linalg.norm(poses[frame, :2, 2], axis=1, keepdims=True)
+    along = ((xy - center[:, :2]) * forward).sum(1)
+    drawn = center[:, 2] - 1.0 + _slopes(poses)[frame] * along  # the height with which the picture was composed
+    height = drawn.copy()
+    for k, near in enumerate(cKDTree(road[:, :2]).query_ball_point(xy, _AROUND)):
+        if len(near) >= _MIN_AROUND:
+            height[k] = np.median(road[near, 2])
+    # The ray stays the same: its point moves to the other height.
+    direction = np.column_stack([xy, drawn]) - center
+    return np.concatenate([center, center + direction * ((height - center[:, 2]) / direction[:, 2])[:, None]], 1)
+
+
+def _meeting_similarity(a: Array, b: Array, planar: Array) -> Similarity:
+    """The similarity from b to a under which the rays (k, 6) of each match meet at the road of both parts.
+
+    `planar` (3, 3) is the first estimate. Opposite rays meet at any displacement along the road, at different heights,
+    so the heights of the meeting points determine this displacement.
+    """
+    scale = float(np.hypot(planar[0, 0], planar[1, 0]))
+    turn = float(np.arctan2(planar[1, 0], planar[0, 0]))
+    lift = float(np.median(a[:, 5] - scale * b[:, 5]))
+    middle = np.array([*(b[:, 3:5] @ planar[:2, :2].T + planar[:2, 2]).mean(0), 0.0])
+
+    def similarity(x: Array) -> Similarity:
+        """From log scale, rotation vector (tilt, turn) and translation; the tilt turns about the middle of the road."""
+        tilt = Rotation.from_rotvec([x[1], x[2], 0.0]).as_matrix()
+        rotation = tilt @ Rotation.from_rotvec([0.0, 0.0, x[3]]).as_matrix()
+        return Similarity(float(np.exp(x[0])), rotation, tilt @ (x[4:] - middle) + middle)
+
+    def residuals(x: Array) -> Array:
+        there = similarity(x)
+        eye_a, eye_b = a[:, :3], there.points(b[:, :3])
+        ray_a, ray_b = a[:, 3:] - eye_a, there.points(b[:, 3:]) - eye_b
+        gap = eye_b - eye_a
+        normal = np.cross(ray_a, ray_b)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        # The points where the rays are closest are eye_a + s ray_a and eye_b + t ray_b; s = t = 1 on the road.
+        aa, bb, ab = (ray_a**2).sum(1), (ray_b**2).sum(1), (ray_a * ray_b).sum(1)
+        ga, gb = (gap * ray_a).sum(1), (gap * ray_b).sum(1)
+        sine = np.maximum(aa * bb - ab**2, 1e-9)
+        s, t = (ga * bb - gb * ab) / sine, (ga * ab - gb * aa) / sine
+        apart = (gap * normal).sum(1)
+        above_a, above_b = (s - 1.0) * ray_a[:, 2], (t - 1.0) * ray_b[:, 2]
+        return np.concatenate([apart / _RAY_SIGMA, above_a / _HEIGHT_SIGMA, above_b / _HEIGHT_SIGMA])
+
+    start = np.array([np.log(scale), 0.0, 0.0, turn, planar[0, 2], planar[1, 2], lift])
+    return similarity(least_squares(residuals, start, loss="soft_l1", f_scale=_OUTLIER).x)

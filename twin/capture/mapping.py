@@ -1,0 +1,280 @@
+"""Maps the frames of linked films with COLMAP, and keeps the part of the result that holds together.
+
+A *model* is a COLMAP reconstruction. Global mapping (Pan et al. 2024) is tried first, since the incremental mapper gets
+stuck on forward motion. Global mapping sometimes tears a film apart, for example if distant frames match by the same
+skyline. The pieces of a torn model share no points, so it is recognized, and other attempts follow. Frames off the path
+of their neighbors are removed and registered once more against all others, and left out if they are again off the path.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from twin.capture.camera_models import camera_to_world
+from twin.capture.matching import SEQUENCE_STEPS, Matcher, near_pairs
+from twin.capture.worker import send_message
+from twin.errors import InputError
+from twin.geometry.passes import path_outliers
+from twin.types import Array
+
+MIN_FRAMES = 3
+"""Least number of frames of a reconstruction."""
+_NEAR_STEPS = 3.0  # [median steps between frames] largest distance between the two cameras of a near pair
+_NEAR_PAIRS = 4  # largest number of near pairs per frame
+# The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
+_REMAPPING_FRACTION = 0.05
+_SHARED_POINTS = 15  # points in common that connect two frames of a model
+_COHERENT_FRACTION = 0.95  # of a model's frames; a model with a smaller connected part is torn
+_TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
+_MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
+_MIN_ANGLE = 0.5  # [°] smallest angle between two rays to a point
+_LOSS_SCALE = 0.5  # [px] scale of the Cauchy loss in the last bundle adjustment
+_REFINEMENTS = 30  # largest number of iterations of the last bundle adjustment
+
+
+def reconstruct(matcher: Matcher, job: dict[str, Any], work: Path, summary: dict[str, Any]) -> pycolmap.Reconstruction:
+    """Reconstructs the frames of a matcher, of which at least two pairs are verified.
+
+    Args:
+        matcher: Its matches are complete but for near pairs, which are added.
+        job: Settings of the stage, see `sfm.solve_mapping`.
+        work: Folder for COLMAP's files.
+        summary: Gets the mapper's name and the numbers of near pairs and of frames left out.
+
+    Raises:
+        InputError: no frame could be registered.
+    """
+    mapper = Mapper(matcher, job, work)
+    model = mapper.best(summary)
+    before = len(matcher.verified())
+    frames, poses = registered_poses(model, matcher)
+    near = near_pairs(poses, frames, matcher.tried, _NEAR_STEPS * median_step(poses, frames, matcher), _NEAR_PAIRS)
+    summary["near_pairs"] += len(near)
+    if near:
+        matcher.match(near, "near pairs")
+        fresh = len(matcher.verified()) - before
+        if fresh > _REMAPPING_FRACTION * before:
+            send_message(say=f"  {fresh} new verified pairs: reconstructing again")
+            again = mapper.best(summary)
+            model = again if again.num_reg_images() >= model.num_reg_images() else model
+    model = mapper.without_outliers(model, job["max_outlier"], summary)
+    send_message(bar="refinement", total=1)
+    mapper.refine(model)
+    send_message(step=1)
+    return model
+
+
+def coherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> set[int]:
+    """Frames of the largest part of a model whose frames are connected by at least 15 common points each."""
+    frame_of = matcher.frame_of()
+    seen = [
+        (frame_of[element.image_id], k)
+        for k, point in enumerate(model.points3D.values())
+        for element in point.track.elements
+    ]
+    if not seen:
+        return set()
+    frame, point = np.unique(np.array(seen), axis=0).T
+    total = len(matcher.capture.names)
+    views = csr_matrix((np.ones(len(frame), np.int32), (frame, point)), shape=(total, int(point.max()) + 1))
+    shared = views @ views.T >= _SHARED_POINTS
+    part = connected_components(shared, directed=False)[1]
+    return set(np.flatnonzero(part == np.bincount(part).argmax()).tolist())
+
+
+class Mapper:
+    """COLMAP's mappers on one database. The cameras of calibrated sources stay constant."""
+
+    def __init__(self, matcher: Matcher, job: dict[str, Any], work: Path) -> None:
+        self._matcher, self._work = matcher, work
+        self._kind, self._min_registered = job["mapper"], job["min_registered"]
+        capture = matcher.capture
+        with pycolmap.Database.open(matcher.database) as database:
+            self._cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+            camera_of = {image.image_id: image.camera_id for image in database.read_all_images()}
+        fixed = [source.calibrated and not job["free_focal"] for source in capture.sources]
+        images = zip(matcher.image_ids, capture.source_index, strict=True)
+        self._fixed = {camera_of[int(image)] for image, s in images if fixed[int(s)]}
+
+    def best(self, summary: dict[str, Any]) -> pycolmap.Reconstruction:
+        """The largest coherent model of a few attempts; the other frames are deregistered.
+
+        Raises:
+            InputError: no attempt gave a model.
+        """
+        matcher, needed = self._matcher, self._min_registered * len(self._matcher.frames)
+        best: pycolmap.Reconstruction | None = None
+        kept: set[int] = set()
+        for name, attempt in self._attempts():
+            if best is not None and name == "incremental" and len(kept) >= needed:
+                break  # slow, and rarely better than a torn model of global mapping
+            model = attempt()
+            if model is None:
+                continue
+            coherent = coherent_frames(model, matcher)
+            if best is None or len(coherent) > len(kept):
+                best, kept, summary["mapper"] = model, coherent, name
+            if len(kept) >= max(needed, _COHERENT_FRACTION * best.num_reg_images()):
+                break
+        if best is None:
+            raise InputError(
+                f"registered 0 of {len(matcher.frames)} frames; film slower, sideways rather than only forward, with "
+                "texture in view"
+            )
+        if kept:
+            _deregister(best, matcher, sorted(set(registered_poses(best, matcher)[0].tolist()) - kept))
+        return best
+
+    def _attempts(self) -> Iterator[tuple[str, Callable[[], pycolmap.Reconstruction | None]]]:
+        if self._kind in ("auto", "global"):
+            yield "global", lambda: self._global(self._matcher.database)
+            yield "global, without loops", lambda: self._global(self._without_loops())
+        if self._kind in ("auto", "incremental"):
+            yield "incremental", self._incremental
+
+    def _without_loops(self) -> Path:
+        """A copy of the database without pairs of frames that are far from each other in the same film."""
+        matcher = self._matcher
+        source = matcher.capture.source_index
+        far = [(i, j) for i, j in matcher.verified() if source[i] == source[j] and abs(i - j) > SEQUENCE_STEPS[-1]]
+        return matcher.copied_without(far, fresh_folder(self._work, "no_loops"))
+
+    def _global(self, database: Path) -> pycolmap.Reconstruction | None:
+        matcher = self._matcher
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads, options.random_seed = matcher.threads, matcher.seed
+        bundle = options.mapper.bundle_adjustment
+        bundle.ceres.use_gpu = False
+        options.mapper.global_positioning.use_gpu = False
+        options.mapper.track_required_tracks_per_view = _TRACKS_PER_VIEW
+        if self._fixed == set(self._cameras):
+            bundle.refine_focal_length = bundle.refine_extra_params = False
+        send_message(bar="mapping", total=0)
+        folder = fresh_folder(self._work, "global")
+        model = _largest(pycolmap.global_mapping(database, matcher.images, folder, options))
+        if model is not None and self._fixed and self._fixed != set(self._cameras):
+            self.refine(model)
+        return model
+
+    def _incremental(self) -> pycolmap.Reconstruction | None:
+        matcher = self._matcher
+        options = self._incremental_options()
+        options.min_model_size = MIN_FRAMES
+        send_message(bar="incremental mapping", total=len(matcher.frames))
+        models = pycolmap.incremental_mapping(
+            matcher.database,
+            matcher.images,
+            fresh_folder(self._work, "incremental"),
+            options,
+            next_image_callback=lambda: send_message(step=1),
+        )
+        return _largest(models)
+
+    def _incremental_options(self) -> pycolmap.IncrementalPipelineOptions:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads, options.random_seed = self._matcher.threads, self._matcher.seed
+        options.constant_cameras = self._fixed
+        options.mapper.constant_cameras = self._fixed
+        return options
+
+    def refine(self, model: pycolmap.Reconstruction) -> None:
+        """Runs a last bundle adjustment, with a more robust loss than COLMAP's: dark frames have many bad observations.
+
+        The known cameras are reset to their given calibration and kept constant.
+        """
+        pycolmap.ObservationManager(model).filter_all_points3D(_MAX_ERROR, _MIN_ANGLE)
+        fixed = [camera_id for camera_id in self._fixed if camera_id in model.cameras]
+        for camera_id in fixed:
+            model.cameras[camera_id].params = self._cameras[camera_id].params.tolist()
+        config = pycolmap.BundleAdjustmentConfig()
+        for image in model.images.values():
+            if image.has_pose:
+                config.add_image(image.image_id)
+        for camera_id in fixed:
+            config.set_constant_cam_intrinsics(camera_id)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        options = pycolmap.BundleAdjustmentOptions()
+        options.ceres.solver_options.max_num_iterations = _REFINEMENTS
+        options.ceres.solver_options.num_threads = self._matcher.threads
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = _LOSS_SCALE
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+        model.update_point_3d_errors()
+
+    def without_outliers(
+        self, model: pycolmap.Reconstruction, limit: float, summary: dict[str, Any]
+    ) -> pycolmap.Reconstruction:
+        """Registers the missing frames and those off the path again; removes the frames that are then off the path."""
+        matcher = self._matcher
+        names = matcher.capture.names
+        off = _off_path_frames(model, matcher, limit)
+        if not off and model.num_reg_images() == len(matcher.frames):
+            return model
+        _deregister(model, matcher, off)
+        model = self._register_missing(model)
+        off_again = _off_path_frames(model, matcher, limit)
+        _deregister(model, matcher, off_again)
+        dropped = set(off) - set(registered_poses(model, matcher)[0].tolist()) | set(off_again)
+        summary["outliers"] += sorted(names[i] for i in dropped)
+        summary["registered_anew"] += sorted(names[i] for i in set(off) - dropped)
+        return model
+
+    def _register_missing(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        source, target = fresh_folder(self._work, "kept"), fresh_folder(self._work, "anew")
+        model.write(source)
+        options = self._incremental_options()
+        options.fix_existing_frames = True
+        options.mapper.fix_existing_frames = True
+        options.multiple_models = False
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        matcher = self._matcher
+        again = _largest(pycolmap.incremental_mapping(matcher.database, matcher.images, target, options, source))
+        return model if again is None else again
+
+
+def _largest(models: dict[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+
+
+def fresh_folder(work: Path, name: str) -> Path:
+    folder = work / name
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
+
+
+def _off_path_frames(model: pycolmap.Reconstruction, matcher: Matcher, limit: float) -> list[int]:
+    frames, poses = registered_poses(model, matcher)
+    source = matcher.capture.source_index[frames]
+    off: list[int] = []
+    for s in np.unique(source):
+        off += frames[source == s][path_outliers(poses[source == s], limit)].tolist()
+    return off
+
+
+def _deregister(model: pycolmap.Reconstruction, matcher: Matcher, frames: list[int]) -> None:
+    for i in frames:
+        model.deregister_frame(model.images[int(matcher.image_ids[i])].frame_id)
+
+
+def registered_poses(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArray[np.int64], Array]:
+    """Sorted indices of the registered frames (n,), and their camera_to_world (n, 4, 4)."""
+    frame_of = matcher.frame_of()
+    registered = [image for image in model.images.values() if image.has_pose]
+    poses = {frame_of[image.image_id]: camera_to_world(image.cam_from_world()) for image in registered}
+    frames = np.array(sorted(poses), np.int64)
+    return frames, np.array([poses[i] for i in frames]).reshape(-1, 4, 4)
+
+
+def median_step(poses: Array, frames: NDArray[np.int64], matcher: Matcher) -> float:
+    """Median distance between successive frames (n,) of the same source, given their poses (n, 4, 4)."""
+    source = matcher.capture.source_index[frames]
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[np.diff(source) == 0]
+    return float(np.median(steps)) if len(steps) else 0.0
