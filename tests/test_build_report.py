@@ -245,6 +245,7 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("cameras", "cameras.registered", 100, "60 of 160 frames could not be placed"),
     ("cameras", "cameras.reprojection_error_px", 2.5, "2.50 px"),
     ("cameras", "cameras.outliers", ["day/000001"], "day/000001"),
+    ("cameras", "cameras.apart", ["day_back"], "day_back"),
     ("cameras", "cameras.note", "the given poses did not fit", "The given poses did not fit."),
     ("metric", "metric.scale_uncertainty", 0.1, "10.0%"),
     ("metric", "metric.scale_disagreement", 4.2, "4.2 standard deviations"),

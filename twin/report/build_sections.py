@@ -98,6 +98,11 @@ def cameras_section(report: dict[str, Any]) -> Section:
         what = f"{len(outliers)} frame(s) were outliers of their path and were dropped: {join_names(outliers, 6)}."
         cure = "a few are normal near large moving or featureless objects; mask these if there are many."
         cautions.append(Caution(what, cure))
+    apart = cameras.get("apart")
+    if isinstance(apart, list) and apart:
+        what = f"Film(s) that match the others neither by views nor by the ground were left out: {join_names(apart, 6)}."
+        cure = "remove them, or film again along the same path, with the road in view."
+        cautions.append(Caution(what, cure))
     if note := cameras.get("note"):
         cure = "check the given poses, or let twin estimate them from the images."
         cautions.append(Caution(f"{str(note).rstrip('.').capitalize()}.", cure))
@@ -119,6 +124,10 @@ def cameras_section(report: dict[str, Any]) -> Section:
         Fact("focal length", focal, "given, or estimated by the reconstruction"),
         Fact("method", str(cameras.get("mapper") or NOT_MEASURED), "global, or incremental if that fails"),
     ]
+    joined = cameras.get("joined")
+    if isinstance(joined, list) and joined:
+        meaning = "films in the opposite direction: reconstructed separately, and placed by the ground seen from above"
+        facts.append(Fact("joined by the ground", join_names(joined, 6), meaning))
     done = "Structure from motion estimated the pose of each frame from points that several frames share."
     return Section("cameras", "Cameras", done, facts, cautions, verdict=verdict)
 
