@@ -41,6 +41,9 @@ _RAY_SIGMA, _HEIGHT_SIGMA = 0.02, 0.01  # standard deviations: distance of two r
 _AROUND, _MIN_AROUND = 1.5, 4  # radius and least number of the road points that give the height of a ground point
 _OUTLIER = 3.0  # [standard deviations] scale of the robust loss
 
+FrameReader = Callable[[int], tuple[NDArray[np.uint8], NDArray[np.uint8] | None]]
+"""Reads a frame by its index in the capture: gray picture (h, w), and mask (h, w) or None; 0 = ignore."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -82,13 +85,13 @@ class _Match:
     rays_b: Array
 
 
-def join(a: Part, b: Part, read_gray: Callable[[int], NDArray[np.uint8]]) -> Similarity | None:
+def join(a: Part, b: Part, read_frame: FrameReader) -> Similarity | None:
     """The similarity from the frame of part b to that of part a; None if their grounds do not match.
 
     Args:
         a: A part.
         b: Another part.
-        read_gray: Reads the picture of a frame, given its index in the capture; uint8, shape (h, w).
+        read_frame: See `FrameReader`.
     """
     levels = _level_frame(a), _level_frame(b)
     if levels[0] is None or levels[1] is None:
@@ -99,8 +102,8 @@ def join(a: Part, b: Part, read_gray: Callable[[int], NDArray[np.uint8]]) -> Sim
     pairs = [(one, one) for one in common] or [(one, two) for one in set(a.lightings) for two in set(b.lightings)]
     found: list[_Match] = []
     for one, two in sorted(pairs):
-        picture_a = _ground_picture(a, poses_a, one, read_gray)
-        picture_b = _ground_picture(b, poses_b, two, read_gray)
+        picture_a = _ground_picture(a, poses_a, one, read_frame)
+        picture_b = _ground_picture(b, poses_b, two, read_frame)
         if picture_a and picture_b:
             xy_a, xy_b = _matches(picture_a, picture_b)
             rays = _rays(picture_a, xy_a, poses_a, road_a), _rays(picture_b, xy_b, poses_b, road_b)
@@ -144,9 +147,7 @@ def _slopes(poses: Array) -> Array:
     return out
 
 
-def _ground_picture(
-    part: Part, poses: Array, lighting: str, read_gray: Callable[[int], NDArray[np.uint8]]
-) -> _GroundPicture | None:
+def _ground_picture(part: Part, poses: Array, lighting: str, read_frame: FrameReader) -> _GroundPicture | None:
     """The ground as the frames of a lighting show it; None without such frames, or if the ground is too large."""
     chosen = [k for k, one in enumerate(part.lightings) if one == lighting]
     if not chosen:
@@ -183,7 +184,10 @@ def _ground_picture(
         pixels[take] = _project(ground[take], poses[k], camera)
         take &= (pixels > 0.0).all(-1) & (pixels < np.array([camera.width, camera.height]) - 1.0).all(-1)
         column, row = (pixels.astype(np.float32) - np.float32(0.5)).transpose(2, 0, 1)
-        values = cv2.remap(read_gray(int(part.frames[k])), column, row, cv2.INTER_LINEAR)
+        picture, valid = read_frame(int(part.frames[k]))
+        values = cv2.remap(picture, column, row, cv2.INTER_LINEAR)
+        if valid is not None:
+            take &= cv2.remap(valid, column, row, cv2.INTER_NEAREST) > 0
         gray[window][take] = values[take]
         owner[window][take] = k
         nearest[window][take] = along[take]

@@ -36,7 +36,7 @@ from twin.config import CamerasConfig, SceneConfig
 from twin.errors import InputError
 from twin.files import read_json, write_json
 from twin.geometry.cameras import Cameras, SparsePoints
-from twin.geometry.images import read_image
+from twin.geometry.images import decode_image
 from twin.geometry.poses import inverse_pose
 from twin.scene import SceneDir
 from twin.types import Array
@@ -290,11 +290,12 @@ def _join(first: tuple[Matcher, pycolmap.Reconstruction], other: tuple[Matcher, 
     """Transforms the other model to the frame of the first; returns False if their grounds do not match."""
     matcher = first[0]
 
-    def read_gray(frame: int) -> NDArray[np.uint8]:
-        path = matcher.images / f"{matcher.capture.names[frame]}.png"
-        return np.asarray(cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY), np.uint8)
+    def read_frame(frame: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+        name = f"{matcher.capture.names[frame]}.png"
+        mask = decode_image(matcher.masks / f"{name}.png", cv2.IMREAD_GRAYSCALE) if matcher.masks else None
+        return decode_image(matcher.images / name, cv2.IMREAD_GRAYSCALE), mask
 
-    similarity = join(_part(*first), _part(*other), read_gray)
+    similarity = join(_part(*first), _part(*other), read_frame)
     if similarity is None:
         return False
     rotation = pycolmap.Rotation3d(similarity.rotation)

@@ -100,7 +100,9 @@ def cameras_section(report: dict[str, Any]) -> Section:
         cautions.append(Caution(what, cure))
     apart = cameras.get("apart")
     if isinstance(apart, list) and apart:
-        what = f"Film(s) that match the others neither by views nor by the ground were left out: {join_names(apart, 6)}."
+        what = (
+            f"Film(s) that match the others neither by views nor by the ground were left out: {join_names(apart, 6)}."
+        )
         cure = "remove them, or film again along the same path, with the road in view."
         cautions.append(Caution(what, cure))
     if note := cameras.get("note"):
