@@ -326,7 +326,7 @@ def test_damaged_files_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert new_main([str(tmp_path / "scene"), str(file)]) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
     refused(
-        tmp_path, SourceConfig(path=bag.name, topic="/none"), r"no pictures on topic /none; there are .* /camera/image"
+        tmp_path, SourceConfig(path=bag.name, topic="/none"), r"no pictures on topic /none; expected one of .*/camera/image"
     )
     (tmp_path / "bare").mkdir()
     (tmp_path / "bare/drive_0.mcap").write_bytes(good)
