@@ -85,10 +85,6 @@ class Chromium:
         target = next(t["targetId"] for t in answer["result"]["targetInfos"] if t["type"] == "page")
         return connect(f"ws://127.0.0.1:{port}/devtools/page/{target}", max_size=None)
 
-    @property
-    def process_id(self) -> int:
-        return self._process.pid
-
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Calls a method of the protocol and returns its result."""
         number = next(self._ids)

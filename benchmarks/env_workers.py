@@ -25,7 +25,7 @@ def standard_tasks(scene: Path) -> list[str]:
     return [name for name in STANDARD_TASKS if name in there] or ["route"]
 
 
-def one_obstacle(scene: Path) -> dict[str, Any]:
+def one_obstacle() -> dict[str, Any]:
     """Options of an environment with a cone that stays in view for the first 20 m."""
     from twin.config import ObstacleConfig
 
@@ -42,11 +42,11 @@ def single(scene: Path, runs: int) -> dict[str, Any]:
     from twin.env.drivers import RouteDriver
 
     begin = time.perf_counter()
-    environment, drive = twin.load(scene, standard_tasks(scene)[-1], 0, **one_obstacle(scene)), RouteDriver()
+    environment, drive = twin.load(scene, standard_tasks(scene)[-1], 0, **one_obstacle()), RouteDriver()
     environment.reset()
     out: dict[str, Any] = {"single.load_s": time.perf_counter() - begin}
     renderer, reason = software_gl(scene)
-    plain = twin.load(scene, standard_tasks(scene)[-1], 0, **one_obstacle(scene), pixels=False)
+    plain = twin.load(scene, standard_tasks(scene)[-1], 0, **one_obstacle(), pixels=False)
     own, theirs = [], []
     for _ in range(runs):
         own.append(_pace(environment, drive, lambda: None))
@@ -148,7 +148,7 @@ def physics(scene: Path, runs: int) -> dict[str, Any]:
     import twin
     from twin.env.drivers import RouteDriver
 
-    environment = twin.load(scene, standard_tasks(scene)[-1], 0, **one_obstacle(scene), pixels=False)
+    environment = twin.load(scene, standard_tasks(scene)[-1], 0, **one_obstacle(), pixels=False)
     return {"physics.steps_per_s": max(_pace(environment, RouteDriver(), lambda: None)[0] for _ in range(2 * runs))}
 
 
@@ -275,7 +275,7 @@ def trust(scene: Path) -> dict[str, Any]:
 def _vector_env(scene: Path, count: int, processes: int | None = None, **options: Any) -> Any:
     from twin.env.vector_env import make_vector_env
 
-    options = one_obstacle(scene) | options
+    options = one_obstacle() | options
     return make_vector_env(scene, standard_tasks(scene)[-1], options, list(range(count)), processes)
 
 

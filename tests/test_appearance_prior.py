@@ -118,5 +118,5 @@ def test_sampling_fails_with_a_reason(monkeypatch):
 def test_error_without_probes_names_the_baked_field():
     mine = lightings(DAY_AND_DUSK)
     bare = Lightings(mine.names, mine.vectors, mine.frames, mine.frame_vectors)
-    with pytest.raises(InputError, match="baked field"):
+    with pytest.raises(InputError, match="use the baked one"):
         bare.sample(np.random.default_rng(0))

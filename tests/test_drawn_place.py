@@ -48,7 +48,7 @@ def test_descriptions_are_within_their_ranges():
         for start, length in tasks(spec.line).values():
             assert start >= 0.0 and start + length <= 0.97 * spec.line.length
     assert settings == set(SETTINGS)
-    with pytest.raises(InputError, match="from 1 on"):
+    with pytest.raises(InputError, match="place 0: expected 1 or more"):
         draw(0)
 
 

@@ -174,7 +174,7 @@ def test_a_baked_texture_shows_what_the_views_show() -> None:
 
 def test_tiles_do_not_overlap() -> None:
     side = np.random.default_rng(0).integers(2, 60, 500)
-    side, x, y, width = gltf.pack_tiles(side)
+    x, y, width = gltf.pack_tiles(side)
     used = np.zeros(((y + side).max(), width), int)
     for n, left, top in zip(side, x, y, strict=True):
         used[top : top + n, left : left + n] += 1

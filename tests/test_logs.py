@@ -30,7 +30,7 @@ BAD = {
         r"time goes from 2\.450 to 0\.000 s at row 51; expected it to increase",
     ),
     "yaw in degrees": (lambda t: _bad(t, yaw=np.degrees(t["yaw"])), r"yaw looks like degrees; multiply it by π/180"),
-    "yaw too small": (lambda t: _bad(t, yaw=np.radians(t["yaw"])), r"yaw looks π/180 times too small"),
+    "yaw too small": (lambda t: _bad(t, yaw=np.radians(t["yaw"])), r"yaw looks 180/π times too small"),
     "wheels in degrees": (
         lambda t: _bad(t, **{n: np.degrees(t[n]) for n in logs.WHEEL_SPEEDS}),
         r"wheel speeds look like °/s; multiply them by π/180",

@@ -179,6 +179,19 @@ def test_drive_films_a_pack_by_its_name(packed, tmp_path, monkeypatch, capsys):
     assert "no nowhere.twin here or in scenes/" in capsys.readouterr().err
 
 
+def test_drive_says_what_is_wrong_with_a_pack_that_is_there(packed, tmp_path, monkeypatch, capsys):
+    (tmp_path / "cut.twin").write_bytes(packed.read_bytes()[:-4000])
+    rewritten(packed, tmp_path / "sent.twin", add("policies/a.zip"))
+    monkeypatch.chdir(tmp_path)
+    for name, words in (
+        ("cut", "expected a pack, as twin pack"),
+        ("sent", "if you trust its sender, twin unpack --trust"),
+    ):
+        assert main(["drive", name]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{name}.twin" in line and words in line and "no folder" not in line
+
+
 def test_verbs_that_add_results_ask_for_a_folder(packed, capsys):
     for arguments in (["validate", str(packed), "--policy", "ahead"], ["train", str(packed), "--run", "x"]):
         assert main(arguments) == 2
@@ -317,7 +330,7 @@ HOSTILE = {
     "include": (edit(XML, lambda b: b.replace(b"<asset>", b'<include file="/a"/><asset>', 1)), "names a file"),
     "path": (edit(XML, lambda b: b.replace(b'meshdir="assets"', b'meshdir="/etc"', 1)), "names a file"),
     "config": (edit("scene.toml", lambda b: b + b"surprise = 1\n"), "surprise"),
-    "untrusted": (add("policies/a.zip"), "if you trust its sender, add --trust"),
+    "untrusted": (add("policies/a.zip"), "if you trust its sender, twin unpack --trust"),
 }  # fmt: skip
 
 

@@ -97,7 +97,7 @@ def test_poses_are_used_only_if_every_source_has_them(tmp_path: Path, capsys: py
     capture, metrics, _ = captured(tmp_path, [SourceConfig(path="posed"), SourceConfig(path="film.mp4")], frames=6)
     assert capture.camera_to_world is None and capture.intrinsics is None and not metrics["posed"]
     assert capture.sources[0].calibrated  # its lens is still known
-    assert "film brings none" in capsys.readouterr().err
+    assert "film has none" in capsys.readouterr().err
 
 
 def test_photo_times_need_a_clock_that_rises() -> None:

@@ -298,7 +298,7 @@ def test_a_dying_worker_is_an_error_with_a_cure(
     fake.write_text(f"#!/bin/sh\necho 'Check failed: something' >&2\nkill -{signal} $$\n")
     fake.chmod(0o755)
     monkeypatch.setattr(worker.sys, "executable", str(fake))
-    with pytest.raises(InputError, match=rf"SIG{signal}.*Check failed: something.*; {cure}") as error:
+    with pytest.raises(InputError, match=rf"ended by SIG{signal} \(Check failed: something\); {cure}") as error:
         worker.run_worker(sfm.solve_mapping, {}, tmp_path)
     assert "\n" not in str(error.value)
 

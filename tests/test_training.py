@@ -196,7 +196,7 @@ def test_a_changed_road_is_another_run(scene, tmp_path):
     text = toml.read_text()
     try:
         toml.write_text(text + '\n[[obstacle]]\nkind = "cone"\nstation = 2.0\n')
-        with pytest.raises(InputError, match="obstacles changed"):
+        with pytest.raises(InputError, match="obstacles were changed"):
             run(built, tmp_path, replace(SHORT, steps=16))
     finally:
         toml.write_text(text)

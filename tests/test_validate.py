@@ -68,7 +68,7 @@ def test_an_episode_equals_that_of_a_single_environment(scene):
     environment = twin.load(scene, "ahead", 5, lighting="day", **policy.options())
     episode = record_episode(environment, PolicyDriver(policy))
     assert (driven.cause, driven.steps) == (episode.cause, len(episode.times) - 1)
-    assert driven.progress == episode.progress[-1]  # to the last bit, which can decide whether a robot hits the kerb
+    assert driven.progress == episode.progress[-1]  # to the last bit, which can decide whether a robot hits the curb
     assert driven.trust == pytest.approx(episode.trust[:-1].mean(), abs=1e-9)
 
 

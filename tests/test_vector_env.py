@@ -105,7 +105,7 @@ def test_input_errors_pass_to_the_parent(scene):
 def test_a_process_that_dies_is_an_error_with_a_cure(spread):
     spread.begin(range(3))
     os.kill(spread._children[1].process.pid, signal.SIGKILL)
-    with pytest.raises(InputError, match=r"exit status -9.*fewer processes"):
+    with pytest.raises(InputError, match=r"exit status -9.*use fewer"):
         spread.step(np.zeros((3, spread.action_size)))
     with pytest.raises(InputError, match="make a new one"):
         spread.begin(range(3))

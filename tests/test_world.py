@@ -205,7 +205,7 @@ def test_a_route_that_is_too_short_is_refused(tmp_path):
     np.savez(scene.stage("mesh") / "route.npz", xy=xy, z=tiny_ground().at(xy))
     out = scene.stage("mjcf")
     out.mkdir()
-    with pytest.raises(InputError, match=r"has 0\.75 m"):
+    with pytest.raises(InputError, match=r"is 0\.75 m long"):
         run(scene, tiny_config(), out)
 
 

@@ -110,7 +110,7 @@ def build(
             stamps[stage.name] = stamp
             if stage.name == until:
                 break
-        report = _report(scene, config, stamps, skipped)
+        report = _report(config, stamps, skipped)
         publish(scene, report)
     return report
 
@@ -230,7 +230,7 @@ def _run(stage: Stage, scene: SceneDir, config: SceneConfig, depends: dict[str, 
     return stamp
 
 
-def _report(scene: SceneDir, config: SceneConfig, stamps: dict[str, Stamp], skipped: dict[str, bool]) -> dict[str, Any]:
+def _report(config: SceneConfig, stamps: dict[str, Stamp], skipped: dict[str, bool]) -> dict[str, Any]:
     report: dict[str, Any] = {
         "scene": config.name,
         "seed": config.seed,

@@ -56,7 +56,7 @@ class HelpFormatter(argparse.HelpFormatter):
 
     def _get_help_string(self, action: argparse.Action) -> str:
         text, value = action.help or "", action.default
-        if value is None or isinstance(value, bool) or value in ([], argparse.SUPPRESS) or "default" in text:
+        if value is None or isinstance(value, bool) or value in ("", [], argparse.SUPPRESS) or "default" in text:
             return text
         return f"{text} (default: {' '.join(value) if isinstance(value, list) else value})"
 

@@ -445,7 +445,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
             type=int,
             default=0,
             metavar="NUMBER",
-            help="0: the demo's street; from 1: random places (1 to 49 are for development)",
+            help="0: the demo's street; from 1: sampled places (1 to 49 are for development)",
         )
 
     def robot(command: argparse.ArgumentParser, camera: bool = True) -> None:
@@ -465,7 +465,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument("--out", type=Path, required=True, help="scene folder to write")
     place(command)
     command.add_argument(
-        "--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; for a random place, its own"
+        "--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; for a sampled place, its own"
     )
     command.add_argument("--tiny", action="store_true", help="only 12 m in 320x180 px under two lightings, for tests")
     command.add_argument(
@@ -480,7 +480,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--task",
         required=True,
-        help="{straight,right_turn}; a random place names its own; or a .json of twin export --task-file",
+        help="{straight,right_turn}; a sampled place names its own; or a .json of twin export --task-file",
     )
     command.add_argument("--scene", type=Path, help="the built scene from which the .json was exported")
     robot(command)
@@ -507,7 +507,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command = add("bag", "a ROS 2 bag of one trial of the place's Husky, for twin trial")
     command.add_argument("--out", type=Path, required=True, help="folder of the bag")
     command.add_argument("--policy", type=Path, help="policy folder; default: the robot follows the route")
-    command.add_argument("--task", default="straight", help="{straight,right_turn}; a random place names its own")
+    command.add_argument("--task", default="straight", help="{straight,right_turn}; a sampled place names its own")
     one_weather(command)
     command.add_argument("--seed", type=int, default=0, help="seed of start, camera and noise")
     robot(command)

@@ -18,7 +18,7 @@ from twin.errors import InputError
 from twin.film import film, film_options, summary
 from twin.learn.policy import JSON, find_policy, load_policy
 from twin.loading import Twin, load_scene
-from twin.unpack import SUFFIX, packed_policies
+from twin.unpack import SUFFIX, find_pack, packed_policies
 
 
 def chosen_policy(twin: Twin, name: str | None) -> str | None:
@@ -41,16 +41,11 @@ def chosen_task(twin: Twin, name: str | None, policy: str | None, trust: bool) -
 
 def command(given: argparse.Namespace) -> None:
     """Runs `twin drive` with the options parsed by `twin.commands`."""
-    if not given.scene.exists() and len(given.scene.parts) == 1:
+    if len(given.scene.parts) == 1 and not given.scene.exists() and find_pack(given.scene) is None:
         named = f"{given.scene.name.removesuffix(SUFFIX)}{SUFFIX}"
-        cure = f"no folder, and no {named} here or in scenes/"
-        try:
-            twin = load_scene(given.scene)
-        except InputError:
-            more = "; download scenes/demo.twin from twin's repository" if named == f"demo{SUFFIX}" else ""
-            raise InputError(f"{given.scene}: {cure}{more}") from None
-    else:
-        twin = load_scene(given.scene)
+        more = "; download scenes/demo.twin from twin's repository" if named == f"demo{SUFFIX}" else ""
+        raise InputError(f"{given.scene}: no folder, and no {named} here or in scenes/{more}")
+    twin = load_scene(given.scene)
     policy = chosen_policy(twin, given.policy)
     task = chosen_task(twin, given.task, policy, given.trust)
     if given.view:

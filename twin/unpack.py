@@ -148,7 +148,7 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
     zips = [name for name in manifest["files"] if name.endswith(".zip")]
     if zips and not trust:
         raise InputError(
-            f"{path} has {zips[0]}, which may run code when it is loaded; if you trust its sender, add --trust"
+            f"{path} has {zips[0]}, which may run code when it is loaded; if you trust its sender, twin unpack --trust"
         )
     if exists(folder) and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder} exists; give a folder that does not")

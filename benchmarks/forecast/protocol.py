@@ -9,8 +9,6 @@ from twin.errors import InputError
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 
 PROTOCOL = Path(__file__).with_name("protocol.toml")
-FIRST_TEST_PLACE = 100
-"""Places below this number were examined during development."""
 _FIRST_LIGHTING = "{first}"
 
 

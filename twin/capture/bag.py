@@ -175,14 +175,13 @@ def picture_topics(connections: Iterable[Any]) -> list[str]:
 
 def choose_pictures(connections: Sequence[Any], path: Path, topic: str = "") -> str:
     """The topic of the pictures: the given one, or the one with most messages. Raises InputError if there is none."""
-    if topic:
-        if topic not in messages_by_topic(connections, (RAW, COMPRESSED)):
-            have = join_names(picture_topics(connections), most=12)
-            raise InputError(f"{path}: no pictures on topic {topic}; expected one of {have}")
+    if topic in messages_by_topic(connections, (RAW, COMPRESSED)):
         return topic
     found = picture_topics(connections)
     if not found:
         raise InputError(f"{path}: no topic with pictures among {topic_names(connections)}; record the front camera")
+    if topic:
+        raise InputError(f"{path}: no pictures on topic {topic}; expected one of {join_names(found, most=12)}")
     return found[0]
 
 

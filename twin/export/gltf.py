@@ -77,7 +77,8 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
         InputError: no view shows the mesh.
     """
     corner, order = _turned(vertices[faces])
-    side, x, y, size = pack_tiles(_tile_sides(corner, views))
+    side = _tile_sides(corner, views)
+    x, y, size = pack_tiles(side)
     height = int((y + side).max())
     texture = np.zeros((height, size, 3), np.uint8)
     u_axis, v_axis = ((corner[:, k] - corner[:, 0]) / (side - 1)[:, None] for k in (1, 2))
@@ -136,8 +137,8 @@ def _tile_sides(corner: Array, views: Views) -> NDArray[np.int64]:
         texel *= _COARSER
 
 
-def pack_tiles(side: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray, int]:
-    """Places square tiles in rows, the largest first; returns their sides, left and top edges, and the width [px]."""
+def pack_tiles(side: NDArray[np.int64]) -> tuple[NDArray, NDArray, int]:
+    """Places square tiles in rows, the largest first; returns their left and top edges, and the total width [px]."""
     width = max(_SIDE if (side**2).sum() > _SIDE**2 / 4 else _SIDE // 2, int(side.max()))
     x, y = np.empty_like(side), np.empty_like(side)
     left = top = 0
@@ -148,7 +149,7 @@ def pack_tiles(side: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray, int]
             left, top, row = 0, top + row, n
         x[k], y[k] = left, top
         left += n
-    return side, x, y, width
+    return x, y, width
 
 
 @wp.kernel

@@ -302,7 +302,7 @@ def _from_zip(path: Path) -> Policy:
     try:
         from stable_baselines3 import SAC
     except ImportError:
-        raise InputError(f"{path}: needs stable-baselines3; pip install '.[learn]'") from None
+        raise InputError(f"{path}: needs stable-baselines3; pip install 'twin[learn]'") from None
     try:
         model = SAC.load(path, device="cpu")
     except Exception as error:  # damaged zips and pickles raise many kinds of errors

@@ -8,7 +8,7 @@ import numpy as np
 
 from twin.reality import SEED, primitives
 from twin.reality import centerline as roads
-from twin.reality.campus_textures import BUILDINGS, campus_textures
+from twin.reality.campus_textures import BUILDINGS, WET_TEXTURES, campus_textures
 from twin.reality.centerline import END, PAVEMENT_WIDTH, ROAD_HALF_WIDTH, START, VERGE_WIDTH, RoadLine
 from twin.reality.houses import add_block
 from twin.reality.lighting import LIGHTINGS, sky_cube_map
@@ -147,7 +147,7 @@ _LAYOUT = GroundLayout(
     },
     land=LAND_RANGE,
     field=((-8.0, -58.0), (60.0, 22.0)),
-    wet=("road", "kerb", "verge_left", "verge_right", "land"),
+    wet=WET_TEXTURES,
 )
 
 

@@ -146,11 +146,6 @@ def _filmed_line(number: int) -> Array:
     return true_route(FilmingPlan.of(draw(number)) if number else None, place.route)[:, :2]
 
 
-def task_names(number: int) -> tuple[str, ...]:
-    """Names of the tasks of a place."""
-    return tuple(tasks(draw(number).line) if number else CAMPUS_TASKS)
-
-
 def task_of_place(
     number: int, name: str, speed: float = 1.0, yaw_rate: float = 1.0, control_timestep: float = 0.1
 ) -> RoadTask:

@@ -129,11 +129,6 @@ class Truth:
         """The lighting of a film by its source name."""
         return self.lightings.get(film, film)
 
-    def path(self, step: float = 0.25) -> Array:
-        """The filmed segment of the center line on the ground [m], shape (m, 3)."""
-        xy = self.route.at(np.arange(self.start, self.start + self.length + step / 2, step))
-        return np.concatenate([xy, self.ground_height(xy)[:, None]], 1)
-
     def poses(self, source: str, times: Array) -> Array:
         """Interpolated camera_to_world of one source at times within its film [s], shapes (n,) → (n, 4, 4)."""
         film = self.films[source]

@@ -192,7 +192,8 @@ LIGHTING_STRIP = (0.62, 0.38)  # shares of the strip: slider, map
 _CARD_SECONDS = 2.5  # for which a title is shown
 _COMPARISON_SECONDS = 0.6  # per compared frame
 _HOLD_SECONDS = 0.8  # [s] for which a filmed lighting is shown without interpolation
-_ROW_HEIGHT = 240  # [px] height of the picture of all lightings
+_ROW_HEIGHT = 240  # [px] height of the picture of lightings
+_MAX_STILLS = 4  # largest number of lightings in it
 
 
 def write_title_card(studio: Studio, title: str, lines: list[str], seconds: float = _CARD_SECONDS) -> None:
@@ -366,11 +367,13 @@ def write_lighting_chapter(studio: Studio, map_view: MapView, budget: int, progr
             if pure:
                 stills.append(rgb)
             progress.update()
+    names = lightings[:_MAX_STILLS]
+    which = "every filmed lighting" if len(names) == len(lightings) else f"{len(names)} of {len(lightings)} lightings"
     studio.save_picture(
         "lightings",
         "field",
-        f"one pose in every filmed lighting: {', '.join(lightings)}",
-        side_by_side(stills[:4], _ROW_HEIGHT),
+        f"one pose in {which}: {', '.join(names)}",
+        side_by_side(stills[: len(names)], _ROW_HEIGHT),
     )
 
 

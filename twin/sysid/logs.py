@@ -474,7 +474,7 @@ def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, 
     turning = np.maximum(np.abs(half), rate * TRACK / 2) > _MOVING
     cures = {
         1 / _DEGREE: "yaw looks like degrees; multiply it by π/180",
-        _DEGREE: "yaw looks π/180 times too small; divide it by π/180",
+        _DEGREE: "yaw looks 180/π times too small; divide it by π/180",
     }
     ratio = _median(rate[turning] * TRACK / 2 / np.abs(half[turning]))
     yield ratio, (0.1, 1.3), "the robot turns {:.3g} times as fast as its wheels would have it without slip", cures
@@ -490,7 +490,7 @@ def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, 
         use = (np.abs(measured[:, i]) > 0.5 * _MOVING) & (np.abs(commanded[:, i]) > 0)
         cures = {
             _DEGREE: f"{name} looks like degrees; multiply by π/180",
-            1 / _DEGREE: f"{name} looks π/180 times too small; divide by π/180",
+            1 / _DEGREE: f"{name} looks 180/π times too small; divide by π/180",
         }
         ratio = _median(np.abs(measured[use, i] / commanded[use, i]))
         yield ratio, (0.1, 6.0), f"the wheels turn {{:.3g}} times as fast as {name} requires", cures

@@ -89,7 +89,7 @@ def _plot_wheels(windows: Windows, fitted: Prediction) -> plt.Figure:
         axis.set(title=f"window {i}", xlabel="time [s]")
     axes[0, 0].set_ylabel("wheel speed [rad/s]")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    figure.suptitle("Wheel speeds in held-out windows in which they change much")
+    figure.suptitle("Wheel speeds in held-out windows with large changes")
     return figure
 
 

@@ -72,8 +72,8 @@ class PictureLoop:
         self._pages: dict[int, _Page] = {}
         self._wake, self._lock = threading.Event(), threading.Lock()
         self._closed = False
-        self.coarse = self.fine = 0
-        """Numbers of pictures sent."""
+        self.fine = 0
+        """Number of fine pictures sent."""
         self.has_shown = threading.Event()
         """Set once a fine picture was sent."""
         self._thread = threading.Thread(target=self._run, daemon=True, name="pictures")
@@ -157,8 +157,6 @@ class PictureLoop:
         if fine:
             self.fine += 1
             self.has_shown.set()
-        else:
-            self.coarse += 1
 
 
 def picture_size(page: tuple[int, int], area: int) -> tuple[int, int] | None:
