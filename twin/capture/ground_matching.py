@@ -24,21 +24,24 @@ from twin.capture.gravity import up_from_ground
 from twin.geometry.poses import Similarity, inverse_pose
 from twin.types import Array
 
-_PIXEL = 0.02  # side of a ground picture's pixel
+_PIXEL, _MAX_PIXEL = 0.02, 0.05  # side of a ground picture's pixel; it is larger on a long road
 _NEAR, _FAR, _ASIDE = (
     1.0,
     5.0,
     3.5,
 )  # extent of the ground that is taken from a frame: ahead of the camera, to each side
-_MAX_PIXELS = 6e7  # limit of a ground picture
+_MAX_PIXELS = 1.2e7  # of a ground picture; SIFT takes 0.24 GB per million pixels
 _FEATURES = 20_000  # most SIFT features of a ground picture
 _CONTRAST = 0.015  # SIFT's threshold; asphalt has little contrast
 _RATIO = 0.85  # largest distance of the best match, relative to the second best one
 _TOLERANCE = 0.35  # largest error of a match under a similarity of the maps; relief displaces the two views oppositely
 _MIN_MATCHES = 25  # fewer matches under one similarity occur by chance
+_MIN_EXTENT = 5.0  # least extent of the matches; one manhole cover looks like another
+_STEEPEST = 0.5  # ground that seems to rise or fall by more than this within a frame is left out
 _MAX_SCALE = 1.3  # largest ratio of the two camera heights
 _RAY_SIGMA, _HEIGHT_SIGMA = 0.02, 0.01  # standard deviations: distance of two rays; height of the road below a camera
 _AROUND, _MIN_AROUND = 1.5, 4  # radius and least number of the road points that give the height of a ground point
+_SAME_RAY = 1e-3  # [focal lengths] error of a ray that is projected and unprojected
 _OUTLIER = 3.0  # [standard deviations] scale of the robust loss
 
 FrameReader = Callable[[int], tuple[NDArray[np.uint8], NDArray[np.uint8] | None]]
@@ -71,6 +74,8 @@ class _GroundPicture:
     """Frame of each pixel, as an index into the part's frames; −1: not seen."""
     origin: Array
     """x, y of the corner of the first pixel, shape (2,)."""
+    pixel: float
+    """Side of a pixel."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +120,9 @@ def join(a: Part, b: Part, read_frame: FrameReader) -> Similarity | None:
     inliers = [
         np.linalg.norm(one.xy_b @ planar[:2, :2].T + planar[:2, 2] - one.xy_a, axis=1) < _TOLERANCE for one in found
     ]
+    spread = np.concatenate([one.xy_a[near] for one, near in zip(found, inliers, strict=True)])
+    if max(np.ptp(spread, axis=0)) < _MIN_EXTENT:
+        return None
     rays_a = np.concatenate([one.rays_a[near] for one, near in zip(found, inliers, strict=True)])
     rays_b = np.concatenate([one.rays_b[near] for one, near in zip(found, inliers, strict=True)])
     return level_a.inverse() @ _meeting_similarity(rays_a, rays_b, planar) @ level_b
@@ -126,7 +134,13 @@ def _level_frame(part: Part) -> tuple[Similarity, Array] | None:
     if road is None:
         return None
     up = gravity.direction
-    x_axis = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    # x along the road makes the ground picture of a straight road narrow.
+    centers = part.camera_to_world[:, :3, 3] - part.camera_to_world[:, :3, 3].mean(0)
+    flat = centers - np.outer(centers @ up, up)
+    x_axis = np.linalg.svd(flat, full_matrices=False)[2][0]
+    x_axis = x_axis - (x_axis @ up) * up
+    if np.linalg.norm(x_axis) < 0.5:
+        return None
     x_axis /= np.linalg.norm(x_axis)
     rotation = np.stack([x_axis, np.cross(up, x_axis), up])
     level = Similarity(1.0 / road.drop, rotation, np.zeros(3))
@@ -154,9 +168,10 @@ def _ground_picture(part: Part, poses: Array, lighting: str, read_frame: FrameRe
         return None
     centers = poses[chosen, :2, 3]
     low, high = centers.min(0) - _FAR - _ASIDE, centers.max(0) + _FAR + _ASIDE
-    columns, rows = np.ceil((high - low) / _PIXEL).astype(int).tolist()
-    if rows * columns > _MAX_PIXELS:
+    pixel = max(_PIXEL, float(np.sqrt(np.prod(high - low) / _MAX_PIXELS)))
+    if pixel > _MAX_PIXEL:
         return None
+    columns, rows = np.ceil((high - low) / pixel).astype(int).tolist()
     slopes = _slopes(poses)
     gray = np.zeros((rows, columns), np.uint8)
     owner = np.full((rows, columns), -1, np.int32)
@@ -171,14 +186,21 @@ def _ground_picture(part: Part, poses: Array, lighting: str, read_frame: FrameRe
                 for y in (-_ASIDE, _ASIDE)
             ]
         )
-        c0, r0 = np.floor((corners.min(0) - low) / _PIXEL).astype(int)
-        c1, r1 = np.ceil((corners.max(0) - low) / _PIXEL).astype(int)
-        x, y = np.meshgrid(low[0] + (np.arange(c0, c1) + 0.5) * _PIXEL, low[1] + (np.arange(r0, r1) + 0.5) * _PIXEL)
+        c0, r0 = np.floor((corners.min(0) - low) / pixel).astype(int)
+        c1, r1 = np.ceil((corners.max(0) - low) / pixel).astype(int)
+        x, y = np.meshgrid(low[0] + (np.arange(c0, c1) + 0.5) * pixel, low[1] + (np.arange(r0, r1) + 0.5) * pixel)
         offset = np.stack([x - center[0], y - center[1]], -1)
         along, aside = offset @ ahead, offset @ np.array([-ahead[1], ahead[0]])
         window = slice(r0, r1), slice(c0, c1)
-        take = (along > _NEAR) & (along < _FAR) & (np.abs(aside) < _ASIDE) & (along < nearest[window])
-        ground = np.stack([x, y, center[2] - 1.0 + slopes[k] * along], -1)
+        rise = slopes[k] * along
+        take = (
+            (np.abs(rise) < _STEEPEST)
+            & (along > _NEAR)
+            & (along < _FAR)
+            & (np.abs(aside) < _ASIDE)
+            & (along < nearest[window])
+        )
+        ground = np.stack([x, y, center[2] - 1.0 + rise], -1)
         camera = part.cameras[k]
         pixels = np.full((*x.shape, 2), -1.0)
         pixels[take] = _project(ground[take], poses[k], camera)
@@ -191,17 +213,23 @@ def _ground_picture(part: Part, poses: Array, lighting: str, read_frame: FrameRe
         gray[window][take] = values[take]
         owner[window][take] = k
         nearest[window][take] = along[take]
-    return _GroundPicture(gray, owner, low)
+    return _GroundPicture(gray, owner, low, pixel)
 
 
 def _project(points: Array, pose: Array, camera: pycolmap.Camera) -> Array:
-    """Pixels (k, 2) of points (k, 3) in front of a camera with distortion; nan behind it."""
-    local = points @ inverse_pose(pose)[:3, :3].T + inverse_pose(pose)[:3, 3]
-    out = np.full((len(points), 2), np.nan)
-    front = local[:, 2] > 0.05
-    if front.any():
-        out[front] = np.asarray(camera.img_from_cam(local[front])).reshape(-1, 2)
-    return np.nan_to_num(out, nan=-1.0)
+    """Pixels (k, 2) of points (k, 3) under a camera with distortion; −1 for points that it does not see."""
+    to_camera = inverse_pose(pose)
+    local = points @ to_camera[:3, :3].T + to_camera[:3, 3]
+    out = np.full((len(points), 2), -1.0)
+    front = np.flatnonzero(local[:, 2] > 0.05)
+    if not len(front):
+        return out
+    pixels = np.asarray(camera.img_from_cam(local[front])).reshape(-1, 2)
+    # Far outside the picture, a distortion model may map rays back into it; the way back gives another ray then.
+    rays = np.asarray(camera.cam_from_img(pixels)).reshape(-1, 2)
+    same = np.abs(rays - local[front, :2] / local[front, 2:]).max(1) < _SAME_RAY
+    out[front[same]] = pixels[same]
+    return out
 
 
 def _matches(a: _GroundPicture, b: _GroundPicture) -> tuple[Array, Array]:
@@ -212,7 +240,7 @@ def _matches(a: _GroundPicture, b: _GroundPicture) -> tuple[Array, Array]:
         mask = cv2.erode((picture.owner >= 0).astype(np.uint8), np.ones((9, 9), np.uint8))
         keys, descriptors = sift.detectAndCompute(picture.gray, mask)
         xy = np.array([key.pt for key in keys], np.float64).reshape(-1, 2)
-        found.append((picture.origin + (xy + 0.5) * _PIXEL, descriptors))
+        found.append((picture.origin + (xy + 0.5) * picture.pixel, descriptors))
     (xy_a, descriptors_a), (xy_b, descriptors_b) = found
     if descriptors_a is None or descriptors_b is None or min(len(xy_a), len(xy_b)) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
@@ -246,7 +274,7 @@ def _rays(picture: _GroundPicture, xy: Array, poses: Array, road: Array) -> Arra
 
     The height of a ground point is that of the road points (m, 3) around it, if there are enough of them.
     """
-    column, row = np.floor((xy - picture.origin) / _PIXEL).astype(int).T
+    column, row = np.floor((xy - picture.origin) / picture.pixel).astype(int).T
     frame = picture.owner[row, column]
     center = poses[frame, :3, 3]
     forward = poses[frame, :2, 2] / np.linalg.norm(poses[frame, :2, 2], axis=1, keepdims=True)

@@ -18,7 +18,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from twin.capture.camera_models import camera_to_world
-from twin.capture.matching import SEQUENCE_STEPS, Matcher, near_pairs
+from twin.capture.matching import SEQUENCE_STEPS, Matcher, Pair, near_pairs
 from twin.capture.worker import send_message
 from twin.errors import InputError
 from twin.geometry.passes import path_outliers
@@ -72,21 +72,20 @@ def reconstruct(matcher: Matcher, job: dict[str, Any], work: Path, summary: dict
 
 
 def coherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> set[int]:
-    """Frames of the largest part of a model whose frames are connected by at least 15 common points each."""
-    frame_of = matcher.frame_of()
+    """Registered frames of the largest part of a model in which frames are connected by 15 common points or more."""
+    frames = registered_poses(model, matcher)[0]
+    row = {int(matcher.image_ids[i]): k for k, i in enumerate(frames)}
     seen = [
-        (frame_of[element.image_id], k)
+        (row[element.image_id], k)
         for k, point in enumerate(model.points3D.values())
         for element in point.track.elements
     ]
     if not seen:
         return set()
     frame, point = np.unique(np.array(seen), axis=0).T
-    total = len(matcher.capture.names)
-    views = csr_matrix((np.ones(len(frame), np.int32), (frame, point)), shape=(total, int(point.max()) + 1))
-    shared = views @ views.T >= _SHARED_POINTS
-    part = connected_components(shared, directed=False)[1]
-    return set(np.flatnonzero(part == np.bincount(part).argmax()).tolist())
+    views = csr_matrix((np.ones(len(frame), np.int32), (frame, point)), shape=(len(frames), int(point.max()) + 1))
+    part = connected_components(views @ views.T >= _SHARED_POINTS, directed=False)[1]
+    return set(frames[part == np.bincount(part).argmax()].tolist())
 
 
 class Mapper:
@@ -128,23 +127,26 @@ class Mapper:
                 f"registered 0 of {len(matcher.frames)} frames; film slower, sideways rather than only forward, with "
                 "texture in view"
             )
-        if kept:
+        if len(kept) >= MIN_FRAMES:  # otherwise the frames have too few points to tell
             _deregister(best, matcher, sorted(set(registered_poses(best, matcher)[0].tolist()) - kept))
         return best
 
     def _attempts(self) -> Iterator[tuple[str, Callable[[], pycolmap.Reconstruction | None]]]:
         if self._kind in ("auto", "global"):
             yield "global", lambda: self._global(self._matcher.database)
-            yield "global, without loops", lambda: self._global(self._without_loops())
+            if far := self._loops():
+                yield "global, without loops", lambda: self._global(self._without(far))
         if self._kind in ("auto", "incremental"):
             yield "incremental", self._incremental
 
-    def _without_loops(self) -> Path:
-        """A copy of the database without pairs of frames that are far from each other in the same film."""
-        matcher = self._matcher
-        source = matcher.capture.source_index
-        far = [(i, j) for i, j in matcher.verified() if source[i] == source[j] and abs(i - j) > SEQUENCE_STEPS[-1]]
-        return matcher.copied_without(far, fresh_folder(self._work, "no_loops"))
+    def _loops(self) -> list[Pair]:
+        """Verified pairs of frames that are far from each other in the same film."""
+        source = self._matcher.capture.source_index
+        pairs = self._matcher.verified()
+        return [(i, j) for i, j in pairs if source[i] == source[j] and abs(i - j) > SEQUENCE_STEPS[-1]]
+
+    def _without(self, pairs: list[Pair]) -> Path:
+        return self._matcher.copied_without(pairs, fresh_folder(self._work, "fewer_pairs"))
 
     def _global(self, database: Path) -> pycolmap.Reconstruction | None:
         matcher = self._matcher

@@ -275,13 +275,12 @@ class Matcher:
         return {ordered_pair(frame_of[a], frame_of[b]): n for (a, b), n in zip(pairs, counts, strict=True) if n > 0}
 
     def linked_groups(self) -> list[NDArray[np.int64]]:
-        """Groups of frames (k,) whose sources are linked; the group with most lightings and frames is the first.
+        """Groups of frames (k,) whose sources are linked, the largest first.
 
         Two sources are linked if many of their pairs are verified. A few pairs are verified by chance even if two films
         have no view in common, since they go in opposite directions.
         """
         source, count = self.capture.source_index, len(self.capture.sources)
-        lightings = [one.lighting for one in self.capture.sources]
         strong, verified, tried = (np.zeros((count, count)) for _ in range(3))
         for i, j in self.tried:
             tried[source[i], source[j]] += 1
@@ -293,7 +292,7 @@ class Matcher:
         linked = (strong >= enough) | (verified > _LINKING_FRACTION * np.maximum(tried, 1))
         group = connected_components(csr_matrix(linked & (tried > 0)), directed=False)[1]
         groups = [np.flatnonzero(group[source] == k) for k in range(int(group.max()) + 1)]
-        return sorted(groups, key=lambda one: (-len({lightings[s] for s in source[one]}), -len(one), int(one[0])))
+        return sorted(groups, key=lambda one: (-len(one), int(one[0])))
 
     def restricted(self, frames: NDArray[np.int64], folder: Path) -> "Matcher":
         """A matcher of some of the frames, with its own database in a folder."""

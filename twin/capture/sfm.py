@@ -44,6 +44,7 @@ from twin.types import Array
 _MAX_THREADS = 16
 # [px] Points with a larger reprojection error are left out, such as those that bundle adjustment moved behind a camera.
 _MAX_POINT_ERROR = 20.0
+_TOGETHER_FRACTION = 0.8  # of the frames of each group, for one model of two weakly linked groups
 _POSED_PAIRS = 10  # largest number of pairs per frame if poses are given
 
 
@@ -158,7 +159,11 @@ def _metrics(capture: Capture, cameras: Cameras, points: SparsePoints, summary: 
         # Weighted by the number of observations, as in COLMAP.
         "reprojection_error_px": float(np.average(points.error, weights=counts)) if len(points) else None,
         "mean_track_length": float(counts.mean()) if len(points) else None,
-        "focal_px": {name: round(float(np.median(cameras.intrinsics[of_source == name, :2])), 3) for name in names},
+        "focal_px": {
+            name: round(float(np.median(cameras.intrinsics[of_source == name, :2])), 3)
+            for name in names
+            if name in cameras.sources
+        },
         **{name: summary[name] for name in copied},
         "note": None if len(points) else "no point was triangulated under the given poses",
     }
@@ -174,7 +179,7 @@ def solve_mapping(job: dict[str, Any], work: Path) -> None:
     pycolmap.set_random_seed(job["seed"])
     matcher = open_database(capture, stage, work, job["free_focal"], job["threads"], job["seed"])
     matcher.extract(job["features"], job["max_feature_size"])
-    summary: dict[str, Any] = {"near_pairs": 0, "outliers": [], "registered_anew": [], "joined": [], "apart": []}
+    summary: dict[str, Any] = {"near_pairs": 0, "outliers": [], "registered_anew": [], "joined": []}
     if capture.camera_to_world is not None:
         summary["mapper"] = "given poses"
         solved = [(matcher, _triangulate(matcher, capture.camera_to_world, work))]
@@ -191,7 +196,10 @@ def solve_mapping(job: dict[str, Any], work: Path) -> None:
     for name in ("frames", "camera_to_world"):
         arrays[name] = arrays[name][order]
     np.savez(work / "result.npz", **arrays)
-    summary |= {"pairs": len(matcher.tried), "verified_pairs": sum(len(one.verified()) for one, _ in solved)}
+    summary["pairs"] = len(set().union(matcher.tried, *(one.tried for one, _ in solved)))
+    summary["verified_pairs"] = sum(len(one.verified()) for one, _ in solved)
+    missing = set(range(len(capture.sources))) - set(capture.source_index[arrays["frames"]].tolist())
+    summary["apart"] = [capture.sources[s].name for s in sorted(missing)]
     write_json(work / "result.json", summary | {"cameras": [vars(lenses[k]) for k in order]})
 
 
@@ -262,24 +270,40 @@ def _reconstruct(
     if len(groups) == 1:
         return [(matcher, reconstruct(matcher, job, work, summary))]
     solved: list[tuple[Matcher, pycolmap.Reconstruction]] = []
+    first: InputError | None = None
     for k, frames in enumerate(groups):
-        names = _source_names(capture, frames)
-        send_message(say=f"  films {', '.join(names)}: no common view with the others")
-        folder = fresh_folder(work, f"group_{k}")
-        own = matcher.restricted(frames, folder)
+        send_message(say=f"  films that share views: {', '.join(_source_names(capture, frames))}")
         try:
-            model = reconstruct(own, job, folder, summary)
-        except InputError:
-            if not solved:
-                raise
-            summary["apart"] += names
-            continue
-        if solved and not _join(solved[0], (own, model)):
-            summary["apart"] += names
-            continue
-        summary["joined"] += names if solved else []
-        solved.append((own, model))
+            own = _reconstructed(matcher, frames, job, fresh_folder(work, f"group_{k}"), summary)
+            if not solved or any(_join(one, own) for one in solved):
+                solved.append(own)
+                continue
+            both = np.sort(np.concatenate([solved[0][0].frames, frames]))
+            together = _reconstructed(matcher, both, job, fresh_folder(work, f"with_{k}"), summary)
+            if len(solved) == 1 and _registers(together, frames) and _registers(together, solved[0][0].frames):
+                solved = [together]
+        except InputError as error:
+            first = first or error
+    if not solved:
+        assert first is not None
+        raise first
+    summary["joined"] = [name for one, _ in solved[1:] for name in _source_names(capture, one.frames)]
     return solved
+
+
+def _reconstructed(
+    matcher: Matcher, frames: NDArray[np.int64], job: dict[str, Any], work: Path, summary: dict[str, Any]
+) -> tuple[Matcher, pycolmap.Reconstruction]:
+    """The model of some frames with its own matcher. Raises InputError: too few frames or pairs."""
+    own = matcher.restricted(frames, work)
+    if len(frames) < MIN_FRAMES or len(own.verified()) < 2:
+        raise InputError(f"{len(frames)} frames share no view with others; film slower, or with more overlap")
+    return own, reconstruct(own, job, work, summary)
+
+
+def _registers(solved: tuple[Matcher, pycolmap.Reconstruction], frames: NDArray[np.int64]) -> bool:
+    """True if a model has most of the frames."""
+    return bool(np.isin(frames, registered_poses(solved[1], solved[0])[0]).mean() > _TOGETHER_FRACTION)
 
 
 def _source_names(capture: Capture, frames: NDArray[np.int64]) -> list[str]:

@@ -112,7 +112,7 @@ class RealTest:
         task: RoadTask,
         setup: Setup | None = None,
         size: tuple[int, int] = (160, 90),
-        renderer_of: Callable[[str, tuple[float, ...], tuple[int, int], int], PlaceRenderer] = rasterizer,
+        renderer_of: Callable[[str, tuple[float, ...], tuple[int, int], int], PlaceRenderer] | None = None,
     ) -> None:
         """
         Args:
@@ -125,7 +125,8 @@ class RealTest:
         Raises:
             InputError: no such place, robot or camera.
         """
-        self.task, self.setup, self.size, self._renderer_of = task, setup or Setup(), size, renderer_of
+        self.task, self.setup, self.size = task, setup or Setup(), size
+        self._renderer_of = renderer_of or rasterizer
         self.robot = RealRobot(draw_robot(self.setup.robot), place_on_test_day(self.setup.place))
         self.camera = draw_camera(self.setup.camera)
         self.judge = RealJudge(task)
