@@ -164,7 +164,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
 
 def _check(config: SceneConfig, folder: str) -> None:
     """Raises InputError for invalid settings, so that no stage fails on them during the build."""
-    _require(config.source, "no [[source]] given; add one per film, with path = and lighting =")
+    _require(config.source, "no [[source]] given; add one per film, with `path` and `lighting`")
     for source in config.source:
         _check_source(source)
     _check_choice(config.cameras.mapper, MAPPERS, "cameras.mapper")

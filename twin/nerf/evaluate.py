@@ -28,7 +28,7 @@ from twin.types import Array
 
 _FIT_RAYS = 4000  # rays of half an image that a fit uses, evenly spaced
 _MAX_FRAMES = 6  # held-out frames scored per lighting, evenly spaced
-_SMALL_WIDTH = 160  # [px] of the images that policies see
+_SMALL_WIDTH = 160  # [px] width of the images that policies see
 _SSIM_WINDOW = 11  # [px]
 _ROW_STEP = 8  # step between the image rows on which the trained and the baked field are compared
 

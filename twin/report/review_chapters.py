@@ -189,8 +189,8 @@ MAX_ERROR = 0.3  # [share of full brightness] end of the color scale of errors
 _DEPTH_TICKS = (2.0, 5.0, 10.0, 25.0)  # [m] labels between the ends of the depth scale
 COMPARISON_STRIP = (0.3, 0.42, 0.28)  # shares of the strip: depth, map, facts
 LIGHTING_STRIP = (0.62, 0.38)  # shares of the strip: slider, map
-_CARD_SECONDS = 2.5  # for which a title is shown
-_COMPARISON_SECONDS = 0.6  # per compared frame
+_CARD_SECONDS = 2.5  # [s] for which a title is shown
+_COMPARISON_SECONDS = 0.6  # [s] for which a compared frame is shown
 _HOLD_SECONDS = 0.8  # [s] for which a filmed lighting is shown without interpolation
 _ROW_HEIGHT = 240  # [px] height of the picture of all lightings
 
@@ -484,7 +484,9 @@ def write_drive_chapter(
     studio.save_picture(
         "drive_camera", "review", "views of the robot’s camera along the route", side_by_side(camera_stills, 200)
     )
-    studio.save_picture("drive_chase", "review", "the same moments in the physics", side_by_side(chase_stills, 200))
+    studio.save_picture(
+        "drive_chase", "review", "the same moments from behind the robot", side_by_side(chase_stills, 200)
+    )
 
 
 def _drive_facts(

@@ -172,7 +172,7 @@ def simulate_windows(
         targets: Servo targets, left and right [rad/s], `CONTROL_STEP` [s] apart, shape (n, steps, 2).
         before: Wheel speeds up to time zero, left and right [rad/s], `PERIOD` [s] apart, (n, ≥ LEAD_SAMPLES + 2, 2).
         slope: Gravity along x and y in the robot's frame at the start of `before` [m/s²], shape (n, 2).
-        timestep: [s], a whole fraction of `PERIOD`; None: the scene's.
+        timestep: [s], a whole fraction of `PERIOD`; None: the time step of scenes.
     """
     model = plane_model(params, timestep)
     step = model.opt.timestep

@@ -50,7 +50,7 @@ _MIN_CONE_STEP = 0.5  # least step of the cone march [cells]
 _ACROSS = 2 * CORNERS * HALF_CORNERS  # density bytes from one sample to the next along x
 _NEXT_Y = 8 * HALF_CORNERS  # density bits from one sample to the next along y
 _X = CORNERS * CORNERS  # rows of features from one sample to the next along x
-_Z = 1  # the same along z
+_Z = 1  # rows of features from one sample to the next along z
 
 
 @wp.struct
