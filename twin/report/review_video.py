@@ -150,8 +150,8 @@ def _write_chapters(
     strip, panel = studio.layout.strip, studio.layout.panel
     views, model = _scene_shots(studio, scene, world)
     behind = chase_shots(drive, frame_timing(drive, studio.fps)[0]) if drive else []
-    # Warp compiles kernels at first use. The field's are compiled here, before the second thread compiles
-    # those of the renderer.
+    # Warp compiles kernels at first use. The field's are compiled here, before the second thread compiles those of
+    # the renderer.
     field.render(cameras.select(np.array([0])), field.lightings[0], (16, 8))
     total = sum(map(len, chosen.values())) + len(rendered_instants(behind, drives))
     total += lighting_steps(len(field.lightings), turns) * (len(field.lightings) - 1) + 1 if turns else 0
