@@ -1,4 +1,4 @@
-"""Benchmark of the environment: speed, memory, scripted drivers, exploits, endurance, trust, obstacles, GPU.
+"""Benchmark of the environment: speed, memory, scripted drivers, exploits, endurance, trust score, obstacles, GPU.
 
     python benchmarks/env.py --scene BUILT_SCENE [--only SECTION ...] [--json FILE]
 

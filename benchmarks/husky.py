@@ -34,10 +34,10 @@ _SPEED = (4.0, 4.5)  # [rad/s] of the left and right wheels: a gentle bend at 0.
 
 
 def steps_per_second(model: mujoco.MjModel) -> float:
-    """Calls of `mj_step` per second on one core, over one drive of 10 s.
+    """Simulation steps per second on one core, over one drive of 10 s.
 
-    The drive is timed in pieces of 0.2 s, one call each. For each piece the fastest repeat counts, which reduces the
-    effect of other load on the machine.
+    The drive is timed in pieces of 0.2 s; one call of `mj_step` runs the 100 steps of a piece. For each piece the
+    fastest repeat counts, which reduces the effect of other load on the machine.
     """
     seconds = np.full(_PIECES, np.inf)
     for _ in range(_REPEATS):
@@ -87,7 +87,8 @@ def line(row: Row) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, help="a built scene")
-    parser.add_argument("--only", nargs="+", metavar="ID", help="row ids such as B6, controls or speed")
+    kinds = "row ids such as B6; `controls` for the negative controls; `speed` for the simulation speed"
+    parser.add_argument("--only", nargs="+", metavar="ID", help=kinds)
     add_record_options(parser)
     arguments = parser.parse_args()
 

@@ -38,7 +38,7 @@ from twin.runtime import track
 
 _LIGHTINGS = ("sun", "overcast", "night")
 _EVERY = 12  # one in this many frames of the film is compared
-_LOWER = 0.6  # [m] height of the film's camera above the robot's
+_LOWER = 0.6  # [m] by which the robot's camera is lower than the film's camera
 
 
 def pictures(folder: Path | None) -> Iterator[tuple[str, float]]:

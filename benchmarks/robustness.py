@@ -83,8 +83,10 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
         if (k + 1) % max(1, rounds // 50) == 0:
             gc.collect()
             sizes.append(process.memory_info().rss)
-            tqdm.tqdm.write(f"{(k + 1) * _ENVS} steps, {sizes[-1] / 2**20:.1f} MiB, {bad} rounds not finite")
-    settled = sizes[len(sizes) // 5]  # every kind of obstacle has been in view by then
+            unsound = f"{bad} rounds (one step of all environments) with a reward or state that is not finite"
+            tqdm.tqdm.write(f"{(k + 1) * _ENVS} steps, {sizes[-1] / 2**20:.1f} MiB, {unsound}")
+    # After a fifth of the run, each kind of obstacle has been rendered, which allocates memory the first time.
+    settled = sizes[len(sizes) // 5]
     return {
         "steps": rounds * _ENVS,
         "episodes": episodes,

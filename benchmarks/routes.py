@@ -50,7 +50,7 @@ class Filming:
     kind: str
     cameras: Cameras
     lines: tuple[Array, ...]
-    """True lines (m, 2) [m]; those across a permitted gap are included."""
+    """True lines (m, 2) [m]; if the film has a gap, also the line across it, since a route may cross it."""
     longest: float
     """Length of the longest path filmed without interruption [m], without turning maneuvers."""
 

@@ -209,7 +209,8 @@ def test_the_page_shows_the_numbers_of_the_tables(tmp_path):
     text = page(tmp_path, said, curve).text
     for cell in [*said["cells"], *worst]:
         assert rate_text(cell) in text and failure_text(cell) in text
-    assert rate_text(trained["a"]) in text and "from the task’s start, n = 100, ending from step 20 on" in text
+    assert rate_text(trained["a"]) in text
+    assert "the last 100 training episodes that began at the task’s start (the first of them ended at step 20)" in text
     assert "trained on ahead, in varying light, for 300 steps" in text
     tested = {"a": trained["a"] | {"test": {"step": 300, "condition": "held-out"} | rate_summary(37, 40)}}
     shown = page(tmp_path, told(trials, training=tested)).text

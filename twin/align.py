@@ -57,7 +57,7 @@ def align_to_log(
     Args:
         target: Folder of a scene, a `robot.toml`, or `PUBLISHED_ROBOT`.
         log: See `twin.sysid.logs`.
-        out: Folder for the results; by default the scene's.
+        out: Folder for the results; by default that of the scene or the `robot.toml`.
         use_slope: Accounts for the ground's slope, which is estimated from the log's accelerations (if it has any).
 
     Raises:

@@ -87,7 +87,7 @@ twin new SCENE VIDEO... writes such a folder.
         "--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="stage to run again"
     )
     parser.add_argument(
-        "--quality", choices=tuple(QUALITIES), help="of the radiance field; default: scene.toml's, or standard"
+        "--quality", choices=tuple(QUALITIES), help="of the radiance field; default: as in scene.toml, or standard"
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="override scene.toml, as in nerf.steps=4000"
@@ -138,7 +138,7 @@ def _align(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, help="a .csv, an .npz, a bag, or a film")
     parser.add_argument("--camera", action="store_true", help="fit the camera's pose to the bag's pictures")
     parser.add_argument("--topic", help="topic of these pictures; default: that with the most pictures")
-    parser.add_argument("--out", type=Path, help="folder for robot.toml and alignment/; default: the scene's")
+    parser.add_argument("--out", type=Path, help="folder for robot.toml and alignment/; default: that of the scene")
     parser.add_argument("--level", action="store_true", help="assume level ground and ignore the log's IMU")
     parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
 

@@ -164,7 +164,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
 
 def _check(config: SceneConfig, folder: str) -> None:
     """Raises InputError for invalid settings, so that no stage fails on them during the build."""
-    _require(config.source, "no [[source]] given; add one per film, with path = and lighting =")
+    _require(config.source, "no [[source]] given; add one per film, with `path` and `lighting`")
     for source in config.source:
         _check_source(source)
     _check_choice(config.cameras.mapper, MAPPERS, "cameras.mapper")
@@ -337,5 +337,5 @@ def _check_obstacles(obstacles: tuple[ObstacleConfig, ...]) -> None:
         _require(sides, f"[[obstacle]] size = {size}; expected length, width, height > 0 [m]")
         _require(all(0.0 <= c <= 1.0 for c in color), f"[[obstacle]] color = {color}; expected values from 0 to 1")
         moves = one.speed > 0.0 or not one.to
-        _require(moves, f"[[obstacle]] speed = {one.speed}; expected more than 0, since it moves")
+        _require(moves, f"[[obstacle]] speed = {one.speed}; expected more than 0, since `to` makes it move")
     _check_unique([one.name or f"{one.kind}_{k}" for k, one in enumerate(obstacles)], "[[obstacle]]")

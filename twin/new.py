@@ -220,7 +220,7 @@ def _taken(bag: BagContents) -> str:
     ]
     if bag.other_pictures:
         others = join_names(bag.other_pictures)
-        lines.append(f"  other pictures: {others}; choose by --topic, or topic = in scene.toml")
+        lines.append(f"  other pictures: {others}; choose by --topic, or by `topic` in scene.toml")
     if "fixes" in bag.topics:
         lines.append(
             f"  GPS: {bag.topics['fixes']}, {np.isfinite(bag.fixes[:, :2]).all(1).sum()} fixes, "

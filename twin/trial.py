@@ -66,7 +66,7 @@ def record_trial(
         policy_name: The policy that drove: a run's name, or a source of `twin.learn.policy.load_policy`.
         task: See `twin.load`.
         lighting: Name of the day or light in `real.csv`.
-        out: `real.csv`; by default the scene's.
+        out: Path of `real.csv`; by default in the scene's folder.
         twin_lighting: The lighting of the twin that the trial is counted under, by default `lighting`. Pictures are
             compared with it or, if the field has none of that name, with the lighting that matches them best.
         cause: The cause of the recording's end, as stated by the operator.

@@ -206,7 +206,7 @@ def _write_films(root: Path, folder: Path, source: str, trust: bool, trials: Seq
             if (episode.cause, len(episode.times) - 1) != (trial.cause, trial.steps):
                 path.unlink()
                 raise InputError(
-                    f"{trial.policy}, {trial.task}, {trial.lighting}, seed {trial.seed}: driven again for its film it "
+                    f"{trial.policy}, {trial.task}, {trial.lighting}, seed {trial.seed}: driven again for its film, it "
                     f"ends by {episode.cause} after {len(episode.times) - 1} steps; expected {trial.cause} after "
                     f"{trial.steps}, as in {folder / 'episodes.csv'}: the policy's code changed, or another kind of "
                     f"machine drove it; move {folder} away to validate again"

@@ -15,7 +15,7 @@ from twin.nerf.rendering import RenderableField
 _TEXEL = 0.025  # [m] side of a texel
 _BEST_DISTANCE = 3.5  # [m] horizontal, from the lens to a texel; nearer texels are seldom in the image
 _MAX_DISTANCE = 12.0  # [m]; farther ground keeps its mean color
-_WIDTH = 640  # [px] of the renderings
+_WIDTH = 640  # [px] width of the renderings
 _MAX_TEXELS = 12_000_000
 _DEPTH_TOLERANCE = 0.15  # a texel is visible if its depth differs from the rendered one by a smaller fraction
 

@@ -19,7 +19,7 @@ from twin.types import Array
 
 _VIEWS, _WIDTH = 40, 96  # number of rendered poses, and their width [px]
 _REACH = 45.0  # [m] greatest depth
-_MAX_DEPTH_RATIO = 1.15  # between the corners of a triangle; with a larger ratio, it connects different surfaces
+_MAX_DEPTH_RATIO = 1.15  # between the depths of a triangle's corners; with a larger one, it connects different surfaces
 _LEAST_HEIGHT = 1.0  # [m] lowest height above the ground outside the mesh's box
 _OVERLAP = 0.5  # [m] by which the triangles begin below the top of the mesh's box, and within its sides
 

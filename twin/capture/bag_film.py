@@ -214,8 +214,9 @@ def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], N
     if late.sum() > max(1.0, _MAX_UNORDERED * len(times)):
         back = float((latest[:-1] - times[1:]).max() * 1e-9)
         raise InputError(
-            f"{where}: {late.sum()} of {len(times)} pictures have stamps that are not later than an earlier one, by "
-            f"up to {back:.3f} s; expected increasing stamps: give the topic of one camera, and record with one clock"
+            f"{where}: {late.sum()} of {len(times)} pictures have stamps that are not later than that of a picture "
+            f"before them in the bag, but up to {back:.3f} s earlier; expected increasing stamps: give the topic of "
+            "one camera, and record with one clock"
         )
     position = np.flatnonzero(~late)
     return position, times[position]
@@ -321,7 +322,7 @@ def lens_of(info: Any, rectified: bool, where: str) -> Lens:
     try:
         camera = Camera.from_info(info, rectified)
     except PictureError as error:
-        raise InputError(f"{where}: {error}; give camera = under this [[source]]") from None
+        raise InputError(f"{where}: {error}; add `camera = ...` under this [[source]] of scene.toml") from None
     width, height = camera.size
     d = (*camera.distortion, *(0.0,) * (8 - len(camera.distortion)))
     if not any(d):
@@ -349,7 +350,7 @@ def _lens(info: Any, topics: dict[str, str], frame: str, size: tuple[int, int], 
     if not same_aspect((lens.width, lens.height), size):
         raise InputError(
             f"{path}: {topic} is for {lens.width}x{lens.height}, but the pictures are {size[0]}x{size[1]}; expected "
-            "the same aspect ratio: give camera = under this [[source]]"
+            "the same aspect ratio: add `camera = ...` under this [[source]] of scene.toml"
         )
     return lens, f"{topic}: {info.distortion_model or 'no distortion'}"
 

@@ -212,7 +212,7 @@ def read_colmap(folder: Path, images: Path | None = None) -> ImageSet:
     if root is None:
         raise InputError(
             f"{model}: none of its {len(posed)} images (such as {posed[0][0]}) found in {roots[0]}; "
-            "set images = in scene.toml"
+            "set `images` in scene.toml to their folder"
         )
     found = [(root / name, lens, pose) for name, lens, pose in posed if is_file(root / name)]
     return ImageSet(
@@ -264,7 +264,7 @@ def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageS
     if not entries:
         raise InputError(
             f"{path}: none of its {len(frames)} images (such as {frames[0]['file_path']}) found; "
-            "set images = in scene.toml"
+            "set `images` in scene.toml to their folder"
         )
     files = sorted(entries, key=lambda file: natural_key(str(file)))
     masks = tuple(entries[file][2] for file in files)

@@ -82,7 +82,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
 def detect_kind(path: Path) -> str:
     """Detects a source's kind, one of `twin.config.KINDS`, from its files. Raises InputError if it has none."""
-    folder = is_folder(path, "check path = in scene.toml (it is relative to the scene folder)")
+    folder = is_folder(path, "check `path` in scene.toml (it is relative to the scene folder)")
     if is_bag(path):
         return "bag"
     if not folder:
@@ -166,7 +166,7 @@ def _read_source(
     task = SourceTask(path, name, lighting, kind, source, config, masks, writer)
     images = root / source.images if source.images else None
     if images:
-        require_folder(images, "check images = in scene.toml, a folder")
+        require_folder(images, "check `images` in scene.toml; expected a folder")
     if kind == "video":
         return _read_video(task, None)
     if kind == "bag":

@@ -34,12 +34,14 @@ Frames that are farther apart mostly match by what is infinitely far, which misl
 """
 PROBE_INLIERS = 25
 """Verified matches with which a pair counts as evidence of a common view; fewer than 20 occur by chance."""
-_LINKING_PAIRS, _LINKING_FRACTION = 8, 0.5  # pairs with such evidence, or fraction of verified pairs, link two sources
+# Two sources are linked if they have at least this number of pairs with such evidence (fewer if a source is short), or
+# if more than this fraction of their tried pairs is verified.
+_LINKING_PAIRS, _LINKING_FRACTION = 8, 0.5
 _WORDS = 32  # visual words of the VLAD descriptor
 _SAMPLES_PER_FRAME = 150
 _PROBES_PER_SOURCE = 20
 _CROSS_OFFSETS: tuple[int, ...] = (-2, -1, 0, 1, 2)  # [frames] around the expected counterpart of a frame
-_BLIND_OFFSETS: tuple[int, ...] = (-3, -2, -1, 0, 1, 2, 3)  # [frames] the same without anchors
+_BLIND_OFFSETS: tuple[int, ...] = (-3, -2, -1, 0, 1, 2, 3)  # [frames] the same if no counterpart is known
 _CHUNK_FRAMES = 16
 _CHUNK_PAIRS = 100
 _MIN_FEATURES = 50  # smallest accepted median number of features per frame
@@ -277,8 +279,8 @@ class Matcher:
     def linked_groups(self) -> list[NDArray[np.int64]]:
         """Groups of frames (k,) whose sources are linked, the largest first.
 
-        Two sources are linked if many of their pairs are verified. A few pairs are verified by chance even if two films
-        have no view in common, since they go in opposite directions.
+        Two sources are linked if many of their pairs are verified. A few are not enough: films that go in opposite
+        directions have no view in common, but a few of their pairs are verified by chance.
         """
         source, count = self.capture.source_index, len(self.capture.sources)
         strong, verified, tried = (np.zeros((count, count)) for _ in range(3))

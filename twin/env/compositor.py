@@ -34,7 +34,7 @@ from twin.warp_runtime import wp
 # ---- objects
 
 _NEAR_PLANE = 0.02  # [m] geoms whose z-depth is smaller than this everywhere are not drawn
-_SMALL_MASK = 800  # [px] if objects may cover at most this many, each gets four rays: finding edges would take longer
+_SMALL_MASK = 800  # [px] up to this size of the area that objects may cover, all pixels get four rays, which is faster
 _SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] offsets of a pixel's four rays
 
 

@@ -74,7 +74,7 @@ class Options:
     yaw_rate: float = 1.0
     """Largest yaw rate to either side [rad/s]."""
     half_width: float | None = None
-    """Half width of the corridor [m]; None: the scene's."""
+    """Half width of the corridor [m]; None: that of the scene."""
     time_limit: float | None = None
     """Time limit [s]; None: twice the time that the route segment takes at `speed`."""
     start_offset: float = 0.3

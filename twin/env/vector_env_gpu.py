@@ -1,8 +1,8 @@
 """Vector environment on a GPU: `mujoco_warp` steps all environments at once.
 
 The host starts episodes one by one. After each step, reward and termination are computed for all environments together.
-Images that show only the field stay on the device (`GpuPixelObserver`). Tests run this code on the CPU, where it is
-slower than MuJoCo.
+Images of the radiance field alone, without obstacles, weather or camera noise, stay on the device (`GpuPixelObserver`).
+Tests run this code on the CPU, where it is slower than MuJoCo.
 """
 
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
@@ -68,7 +68,7 @@ def _record_positions(
     qpos: wp.array2d(dtype=float),
     history: wp.array3d(dtype=float),
 ):
-    """Records positions; each substep overwrites its segment's record, so that the record is of the segment's end."""
+    """Records positions at the end of each segment (see `SubstepSchedules`); its last substep overwrites the others."""
     env, i = wp.tid()
     history[segment[k, env], env, i] = qpos[env, i]
 
@@ -120,7 +120,7 @@ class GpuSimulation:
         self._moving = np.zeros(n, bool)  # True for environments in which an obstacle moves
         mocap = [np.stack([getattr(env.robot.data, name) for env in envs]) for name in ("mocap_pos", "mocap_quat")]
         self._mocap = [np.tile(values, (max_segments, 1, 1, 1)) for values in mocap]  # poses at the end of each segment
-        # Snapshots of the last contact checks, the newest last; they give the delayed camera poses.
+        # The state at the last contact checks, the newest last; delayed camera poses are interpolated from it.
         latency = self._params.camera_latency
         kept = max_segments * (int(np.ceil(latency / period)) + 2) if latency else 0
         self._snapshot_times = np.full((kept, n), np.inf)

@@ -29,8 +29,8 @@ VIEWS, WIDTH, FAR = 96, 640, 100.0
 """Number of views that the texture is baked from, their width [px], and the z-depth where background starts [m]."""
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 _SIDE = 4096  # [px] largest width of the texture; every viewer supports this size
-_MIN_TEXEL = 0.01  # [m] side on the face
-_MAX_TILE = 256  # [px] side
+_MIN_TEXEL = 0.01  # [m] least side of a texel on its face
+_MAX_TILE = 256  # [px] greatest side of a face's tile
 _COARSER = 1.1  # factor by which texels grow until all tiles fit
 _DEPTH_TOLERANCE = 0.03  # a vertex is visible up to this relative difference from the rendered depth
 # Larger for texels: the mesh is smoother than the field, so a face may lie before or behind the surface in a view.
@@ -100,7 +100,8 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
         total = np.stack([np.bincount(own[seen] - start, rgb[seen, c], stop - start) for c in range(3)], 1)
         with np.errstate(invalid="ignore"):
             means[start:stop] = total / n[:, None]
-        # Texels that no view shows get the mean color of their face; faces that no view shows get the nearest face's.
+        # Texels that no view shows get the mean color of their face; faces that no view shows get
+        # the color of the nearest face.
         rgb[~seen] = np.nan_to_num(means[own[~seen]], nan=-1.0)
         texture[y[own] + j, x[own] + i] = np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
         start = stop

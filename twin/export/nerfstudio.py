@@ -1,7 +1,7 @@
 """nerfstudio data set of a built scene: images, cameras and sparse points, for training fields or splats elsewhere.
 
     DIR/transforms.json                every frame
-    DIR/transforms_<lighting>.json     frames of one lighting, for `ns-train ... --data FILE`, if there are several
+    DIR/transforms_<lighting>.json     frames of one lighting, if the scene has several, for `ns-train METHOD --data`
     DIR/images/..., DIR/masks/...      undistorted frames; masks, if any frame has one: 0 = ignore
     DIR/points.ply                     sparse points, from which splatfacto starts
 

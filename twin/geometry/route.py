@@ -1,8 +1,8 @@
 """The route: the line that the robot drives, chosen from the filmed passes.
 
-By default it is the longest line of a pass and the passes of the same lighting that continue it; `[route]` in
-scene.toml chooses passes, their direction, or way points. *Station* [m] is the arc length along the route. The
-*corridor* is the area within a half width of the route; it is free, since the camera passed through it.
+By default, passes of the same lighting that continue each other are joined, and the longest line so formed is the
+route; `[route]` in scene.toml chooses passes, their direction, or way points. *Station* [m] is the arc length along the
+route. The *corridor* is the area within a half width of the route; it is free, since the camera passed through it.
 """
 
 from dataclasses import dataclass
@@ -90,7 +90,7 @@ def _named(name: str, passes: list[FilmedPass]) -> FilmedPass:
 
 
 def _longest_line(passes: list[FilmedPass], max_gap: float) -> tuple[Array, tuple[str, ...]]:
-    """The longest line of a pass and others of its lighting that continue it, and the names of these passes."""
+    """The longest line of joined passes of one lighting that continue each other, and the names of these passes."""
     lines = []
     for start in passes:
         line, names = start.path, [start.name]

@@ -127,7 +127,8 @@ def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[lis
     count = min(processes, max(1, len(chunks)))
     pool = ProcessPoolExecutor(count, get_context("spawn"), _init_worker, (os.getpid(),))
     try:
-        with signals_held():  # workers start here; this process handles a terminal's signals
+        # Workers start with signals blocked: Ctrl+C cannot end one before it ignores signals. This process handles it.
+        with signals_held():
             driven = pool.map(run_chunk, chunks)
         yield from driven
     except BrokenProcessPool:

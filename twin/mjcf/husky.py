@@ -142,8 +142,8 @@ def check(model: mujoco.MjModel) -> list[WrongOption]:
 COSTS = {
     "cone": "a pyramidal cone turns with 23 % too little torque, and creeps down a slope at 9 cm/s",
     "impratio": "at 1, a parked robot creeps down a slope ten times faster, at 7 mm/s",
-    "integrator": "with Euler and RK4 the wheels hop (3 m/s² at the camera), at three times the motor torque",
-    "timestep": "at 10 ms the wheels hop (10 m/s²), at three times the motor torque, and the robot turns 26 % slower",
+    "integrator": "with Euler or RK4 the wheels hop (3 m/s² at the camera), and turning takes three times the torque",
+    "timestep": "at 10 ms the wheels hop (10 m/s²), and the robot turns 26 % slower, with three times the torque",
     "iterations": "with 1, a parked robot creeps down a slope at 15 cm/s",
     "tolerance": "at 1e-2, a parked robot creeps down a slope at 9 mm/s",
     "contact": "with MuJoCo's default contacts the wheels hop (14 m/s²), and the robot turns 28 % slower",
@@ -473,7 +473,8 @@ def _mast(base: mujoco.MjsBody, camera: tuple[float, float, float]) -> None:
 def camera_mount_geoms(model: mujoco.MjModel, camera: int) -> NDArray[np.int64]:
     """Geoms to leave out of a camera's images: the housing, lenses and bracket on the camera's body, shape (k,).
 
-    Randomization and latency move the camera but not these geoms, so they could block its view.
+    Randomization shifts the camera, and a delayed picture is rendered from an earlier pose, but these geoms stay where
+    they are, so they could block the view.
     """
     own = np.flatnonzero(model.geom_bodyid == model.cam_bodyid[camera])
     return own[[model.geom(int(i)).name.startswith(_CAMERA_PREFIX) for i in own]]

@@ -28,7 +28,7 @@ from twin.types import Array
 
 _FIT_RAYS = 4000  # rays of half an image that a fit uses, evenly spaced
 _MAX_FRAMES = 6  # held-out frames scored per lighting, evenly spaced
-_SMALL_WIDTH = 160  # [px] of the images that policies see
+_SMALL_WIDTH = 160  # [px] width of the images that policies see
 _SSIM_WINDOW = 11  # [px]
 _ROW_STEP = 8  # step between the image rows on which the trained and the baked field are compared
 
@@ -175,9 +175,10 @@ def cross_lighting(
     * `filmed_colour[i]`: mean color of the film at the poses of lighting i.
     * `mean_colour[i][j]`: mean color of the poses of lighting i, rendered under j.
     * `to_shown_rms[j]`: rms distance between `filmed_colour[j]` and the poses of other lightings, rendered under j.
-    * `to_filmed_rms[j]`: rms distance between these images and `filmed_colour` of the lighting of their own frame.
-    * `colour_follows[j]`: share of these images that are closer to the nearest frame filmed under j than to their own
-      filmed frame; a tie counts one half. 1: the lighting decides the color; 0: the pose decides it.
+    * `to_filmed_rms[j]`: rms distance between the same renderings and `filmed_colour[i]`, where i is the lighting under
+      which each pose was filmed.
+    * `colour_follows[j]`: share of the same renderings that are closer to the nearest frame filmed under j than to the
+      frame filmed at their pose; a tie counts one half. 1: the lighting decides the color; 0: the pose decides it.
     * `follows_by_pair[i][j]`: the same for the poses of lighting i alone.
     * `depth_moves_m`: greatest change of any pixel's depth between two lightings [m], 0 by construction.
     """

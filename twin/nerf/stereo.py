@@ -29,7 +29,7 @@ _WINDOW_SPACING = 240  # a frame's longer side is this many times the spacing of
 _MAX_COST = 0.5  # greatest 1 − NCC of a used cell
 _TOLERANCE = 0.04  # relative difference of inverse depth within which two frames agree
 _MIN_PARALLAX = 0.3  # [px] least shift in a voting source if inverse depth changes by the tolerance
-_MIN_VOTES = 2  # sources that must agree; one, if a frame has one
+_MIN_VOTES = 2  # sources that must agree; 1 suffices if a frame has only one source
 _MIN_POINTS = 20  # least number of sparse points from which a frame's depth range is estimated
 
 

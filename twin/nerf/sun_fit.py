@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 SEARCH_TEXEL = 0.5
 """[m] side of the texels of a search's shadow maps."""
 _ELEVATIONS = (8.0, 18.0, 32.0, 50.0)  # [°] elevations of the first directions
-_AZIMUTH_STEP = 22.5  # [°] step of their azimuths
-_ELEVATION_RANGE = (3.0, 80.0)  # [°] of a search
+_AZIMUTH_STEP = 22.5  # [°] step of the azimuths of the first directions
+_ELEVATION_RANGE = (3.0, 80.0)  # [°] range of elevations in a search
 _REFINEMENTS = (9.0, 5.0, 2.5)  # [°] steps of the further searches around the best directions
 _STARTS = 2  # number of first directions around which the search goes on
 _BASES = 2  # number of bases for which the search goes on, besides that of the embedding fitted without a sun

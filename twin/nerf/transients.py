@@ -240,14 +240,14 @@ def cleaned(strong: NDArray[np.bool_], weak: NDArray[np.bool_]) -> NDArray[np.bo
 _VOXEL = 0.25  # [m] side
 _REACH = 18.0  # [m] from the camera, within which stereo is accurate enough
 _BEHIND = (0.5, 0.08)  # least distance of a surface behind an empty voxel: greater of [m] and [share of the depth]
-_AT = (0.3, 0.04)  # greatest distance of a surface from an occupied voxel; the same units
+_AT = (0.3, 0.04)  # greatest distance of a surface from an occupied voxel: greater of [m] and [share of the depth]
 _MIN_KNOWN = 3  # least number of known depths among a voxel's cell and its eight neighbors, to find the voxel empty
 _MIN_FRAMES = 3  # least number of frames to find a voxel occupied, or empty
 _MIN_VOXELS = 24  # smaller objects are left alone: noise of stereo looks like them
 _HIDDEN = 0.7  # [m] an object is hidden by surfaces that are nearer than its nearest voxel by more than this
 _NEAR_PLANE = 0.3  # [m] z-depth from which an object's outline is drawn
 _SHADOW_REACH = 2.5  # [m] dark ground at most this far from an object is taken to be in its shadow
-_SHADOW_DARKNESS = 0.8  # greatest brightness of such ground, as a share of the median brightness farther away
+_SHADOW_DARKNESS = 0.8  # greatest brightness of ground in a shadow, as a share of the median brightness farther away
 _MIN_AROUND = 20  # least number of cells with ground farther away, to find a shadow
 _STEREO_CELLS = 160  # cells along a frame's longer side in which stereo depths are looked up
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])

@@ -176,7 +176,7 @@ def task_for(policy: Policy, task: str | RoadTask, place: int) -> RoadTask:
     """The given task, or the place's task of that name, for a policy's speed limits and control step.
 
     Raises:
-        InputError: no such task, or one with another control step than the policy's.
+        InputError: no such task, or one whose control step is not that of the policy.
     """
     c = policy.control
     if isinstance(task, str):

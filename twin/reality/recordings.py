@@ -27,7 +27,7 @@ from twin.reality.trial_place import place_on_test_day, shadow_range
 from twin.runtime import track
 from twin.types import Array
 
-LIGHTING = "overcast"  # of the film, if the place has this lighting
+LIGHTING = "overcast"  # lighting of the film, if the place has it
 
 _STATIONS = (4.0, 30.0)  # [m] start and end of the film
 _SPEED = 0.6  # [m/s]

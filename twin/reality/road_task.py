@@ -1,8 +1,8 @@
 """The task of a trial, as numbers: a line on the road, the corridor's width, start, goal and limits.
 
 The twin writes a task as JSON (`twin export SCENE --task NAME --task-file FILE`); `read_task` reads it and transforms
-it from the scene's frame into the true one. Without a twin, `task_of_place` gives a place's tasks on its filmed path,
-with the default rules. *Station*: arc length along the line [m].
+it from the scene's frame into that of the generated world (the *true frame*). Without a twin, `task_of_place` gives a
+place's tasks on its filmed path, with the default rules. *Station*: arc length along the line [m].
 """
 
 from dataclasses import dataclass

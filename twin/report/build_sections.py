@@ -297,7 +297,7 @@ def cross_lighting_facts(report: dict[str, Any]) -> tuple[list[Fact], list[Cauti
 def mesh_section(report: dict[str, Any]) -> Section:
     cautions = []
     if pick(report, "mesh.parts") == 0:
-        cure = "if there are obstacles, film them from closer, raise nerf.steps or lower mesh.obstacle_height."
+        cure = "if there are obstacles, film closer to them, raise nerf.steps or lower mesh.obstacle_height."
         cautions.append(Caution("Nothing solid was found apart from the ground.", cure))
     cautions += cautions_above(
         report,

@@ -42,7 +42,7 @@ def geometry_section(report: dict[str, Any]) -> Section:
             "{:.3f} m",
             "distance by which visible geometry lies behind it",
         ),
-        ("unfilmed_ghost_m", "the same, filmed from one direction", "{:.3f} m", twice),
+        ("unfilmed_ghost_m", "largest collision-only, filmed from one direction", "{:.3f} m", twice),
         (
             "standing_median_m",
             "visible obstacles to collision geometry",

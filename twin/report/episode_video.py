@@ -92,7 +92,7 @@ def write_episode_video(
             paste(canvas, observations[i], layout.left)
             paste(canvas, camera.render(episode.qpos[i], poses[i], time), layout.right)
             draw_label(canvas, "the robot’s camera", layout.left, size=layout.text, bold=True)
-            draw_label(canvas, "physics, with solid parts", layout.right, size=layout.text, bold=True)
+            draw_label(canvas, "MuJoCo scene, solid parts outlined", layout.right, size=layout.text, bold=True)
             obstacle_positions = [obstacle_pose(one, world.route, time)[:2] for one in episode.obstacles]
             base = episode.base_to_world[i]
             trail = episode.base_to_world[: i + 1, :2, 3]

@@ -189,8 +189,8 @@ MAX_ERROR = 0.3  # [share of full brightness] end of the color scale of errors
 _DEPTH_TICKS = (2.0, 5.0, 10.0, 25.0)  # [m] labels between the ends of the depth scale
 COMPARISON_STRIP = (0.3, 0.42, 0.28)  # shares of the strip: depth, map, facts
 LIGHTING_STRIP = (0.62, 0.38)  # shares of the strip: slider, map
-_CARD_SECONDS = 2.5  # for which a title is shown
-_COMPARISON_SECONDS = 0.6  # per compared frame
+_CARD_SECONDS = 2.5  # [s] for which a title is shown
+_COMPARISON_SECONDS = 0.6  # [s] for which a compared frame is shown
 _HOLD_SECONDS = 0.8  # [s] for which a filmed lighting is shown without interpolation
 _ROW_HEIGHT = 240  # [px] height of the picture of lightings
 _MAX_STILLS = 4  # largest number of lightings in it
@@ -201,7 +201,10 @@ def write_title_card(studio: Studio, title: str, lines: list[str], seconds: floa
 
 
 def comparison_frames(studio: Studio, budget: int) -> dict[str, list[int]]:
-    """Lighting → its frames in chapter 1. Lightings share the `budget` of renders; one of each is for the page."""
+    """Lighting → its frames in chapter 1.
+
+    The lightings share the `budget` of renders equally; one render of each lighting is kept for the page.
+    """
     share = max(1, budget // max(1, len(studio.field.lightings)) - 1)
     return {name: frames_to_compare(studio.cameras, name, share) for name in studio.field.lightings}
 
@@ -295,7 +298,7 @@ def comparison_row(studio: Studio, i: int) -> tuple[Image, float]:
     errors = error_colors(np.linspace(0, MAX_ERROR, bar)[None])
     errors = scale_bar(width, errors, [*ticks, (1.0, f"{100 * MAX_ERROR:.0f} %+")])
     unseen = caption_line(width, *(("held out", AMBER) if cameras.held_out[i] else ("trained on", MUTED)))
-    own = caption_line(width, "trained appearance, not fitted")
+    own = caption_line(width, "light not fitted to this frame")
     panels = [
         titled_panel(fit(studio.real_frame(i), (width, height)), "real", cameras.names[i], unseen),
         titled_panel(to_uint8(rgb), "rendered", f"{score:.1f} dB PSNR", own),
@@ -434,7 +437,8 @@ def write_drive_chapter(
 ) -> None:
     """Chapter 3: the drive, seen by the robot's camera and from behind the robot.
 
-    `chase` contains one picture per shot of `chase_shots`. At most `budget` views of the field are rendered.
+    `chase` gives the pictures from behind the robot, one per shown instant (see `review_video.chase_shots`). At most
+    `budget` views of the field are rendered.
     """
     layout = studio.layout
     every, hold = frame_timing(drive, studio.fps)
@@ -446,8 +450,8 @@ def write_drive_chapter(
         [
             f"A scripted driver without camera follows the {arc_lengths(world.route)[-1]:.1f} m route in MuJoCo, to "
             "test whether the route is drivable.",
-            "Left: the radiance field, from the robot’s camera. Right: the physics, with solid parts. "
-            + (f"{shown_speed:.3g}× speed." if shown_speed > 1.01 else ""),
+            "Left: the radiance field, from the robot’s camera. Right: the MuJoCo scene from behind the robot, "
+            "with its solid parts outlined. " + (f"{shown_speed:.3g}× speed." if shown_speed > 1.01 else ""),
         ],
     )
     rendered = set(rendered_instants(instants, budget))
@@ -466,7 +470,7 @@ def write_drive_chapter(
         paste(canvas, rgb, layout.left)
         paste(canvas, from_behind, layout.right)
         draw_label(canvas, f"robot camera: {label}", layout.left, size=layout.text, bold=True)
-        draw_label(canvas, "physics, with solid parts", layout.right, size=layout.text, bold=True)
+        draw_label(canvas, "MuJoCo scene, solid parts outlined", layout.right, size=layout.text, bold=True)
         left, right = layout.strip(*DRIVE_STRIP)
         base = drive.base_to_world[i]
         trail = drive.base_to_world[: i + 1, :2, 3]
@@ -483,7 +487,9 @@ def write_drive_chapter(
     studio.save_picture(
         "drive_camera", "review", "views of the robot’s camera along the route", side_by_side(camera_stills, 200)
     )
-    studio.save_picture("drive_chase", "review", "the same moments in the physics", side_by_side(chase_stills, 200))
+    studio.save_picture(
+        "drive_chase", "review", "the same moments from behind the robot", side_by_side(chase_stills, 200)
+    )
 
 
 def _drive_facts(

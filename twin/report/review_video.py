@@ -150,7 +150,8 @@ def _write_chapters(
     strip, panel = studio.layout.strip, studio.layout.panel
     views, model = _scene_shots(studio, scene, world)
     behind = chase_shots(drive, frame_timing(drive, studio.fps)[0]) if drive else []
-    # Warp compiles kernels at first use. This compiles the field's, before the second thread compiles the renderer's.
+    # Warp compiles kernels at first use. The field's are compiled here, before the second thread compiles those of
+    # the renderer.
     field.render(cameras.select(np.array([0])), field.lightings[0], (16, 8))
     total = sum(map(len, chosen.values())) + len(rendered_instants(behind, drives))
     total += lighting_steps(len(field.lightings), turns) * (len(field.lightings) - 1) + 1 if turns else 0
@@ -166,7 +167,7 @@ def _write_chapters(
             write_lighting_chapter(studio, map_in(strip(*LIGHTING_STRIP)[1]), turns, progress)
         pictures = iter(ahead)
         for number, picture in enumerate(islice(pictures, len(views))):
-            caption = ("the MuJoCo scene with solid parts", "further along the route")[number]
+            caption = ("the MuJoCo scene with its solid parts outlined", "further along the route")[number]
             studio.save_picture(f"scene_{number}", "mjcf", caption, picture)
         if world and drive:
             write_drive_chapter(studio, map_in(strip(*DRIVE_STRIP)[0]), world, drive, pictures, drives, progress)

@@ -68,7 +68,7 @@ def write_trial_video(
     s = np.append(np.arange(segment[0], segment[1], 0.25), segment[1])
     map_view = MapView.draw(boxes[0][2:], point_at(world.route[:, :2], s), *ground_and_parts, half_width)
     apart = np.linalg.norm(trial.poses[:, :2] - replayed[:, :2], axis=1)
-    curves = [("off the route [m]", trial.cross_track, ACCENT), ("off the twin's replay [m]", apart, GREEN)]
+    curves = [("cross-track error [m]", trial.cross_track, ACCENT), ("distance to the twin's replay [m]", apart, GREEN)]
     with VideoWriter(path, layout.size, fps, _CRF) as writer, bar("video", len(times), "frame") as progress:
         for i, time in enumerate(times):
             k = int(np.clip(np.searchsorted(trial.times, time + 1e-6) - 1, 0, len(trial.times) - 1))

@@ -56,7 +56,7 @@ TRUSTED = 0.8
 """An episode is counted separately if the mean trust in its pictures is lower."""
 FAILURES = {
     "collision": ("hit something", "touched anything solid except the ground"),
-    "out_of_bounds": ("left the corridor", "the robot’s center was over half the corridor’s width off the route"),
+    "out_of_bounds": ("left the corridor", "the robot’s center was farther from the route than the corridor’s edge"),
     "timeout": ("ran out of time", "did not reach the goal within the time limit"),
     "rollover": ("rolled over", "tipped onto its side"),
     "stuck": ("got stuck", "stood still too long"),
@@ -145,7 +145,7 @@ def lighting_text(lighting: str) -> str:
         return (
             f"{lighting_text(condition.lighting)}. Each episode also has its own sun, shadows, "
             "objects beside the corridor, and values of the robot parameters that were not identified; the haze varies "
-            "too, unless a photo determines it"
+            "too, unless the lighting was fitted to a photo, which then determines the haze"
         )
     if lighting.startswith("drawn_"):
         return f"light number {lighting[6:]} of those sampled in the search"
@@ -161,8 +161,8 @@ def training_text(trained: dict[str, Any]) -> str:
     if test:
         episodes = f"final test, n = {test['trials']}" + (f", light {test['condition']}" if test["condition"] else "")
     else:
-        since = f"ending from step {trained['first_step']:,} on"
-        episodes = f"last training episodes from the task’s start, n = {trained['trials']}, {since}"
+        since = f"the first of them ended at step {trained['first_step']:,}"
+        episodes = f"the last {trained['trials']} training episodes that began at the task’s start ({since})"
     light = "in varying light" if trained["lighting"] in (TRAINING, ANY) else f"in the light {trained['lighting']}"
     light = "from MuJoCo’s pictures of the mesh" if trained["observe"] == "simulator" else light
     return f"{episodes}; trained on {trained['task']}, {light}, for {trained['step']:,} steps"

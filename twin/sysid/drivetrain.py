@@ -18,7 +18,7 @@ from twin.sysid.estimation import Fit, Kinds, Parameter, fit_parameters, negativ
 from twin.sysid.logs import PERIOD, SAMPLES, Windows
 from twin.types import Array
 
-CONTROL_STEP = 0.01  # [s] of the simulation
+CONTROL_STEP = 0.01  # [s] between two servo targets
 EXTRA_SAMPLES = 5  # samples after a window's end, for poses measured after it
 
 _HISTORY = 20  # samples of the previous window from which delayed commands are taken

@@ -36,7 +36,7 @@ DEGREES_OF_FREEDOM = 3.0  # fits of ν to the public DRIVE log gave 2.6 to 3.2
 
 _MIN_SCALE = 1e-3  # [m], [rad] or [rad/s] smallest σ; logs are not more accurate
 _ROUNDS, _SETTLED = 10, 0.05  # limit of alternations of scales and model; relative change of converged scales
-_ITERATIONS, _CLOSE = 500, 1e-4  # the same for expectation maximization
+_ITERATIONS, _CLOSE = 500, 1e-4  # limit of steps of expectation maximization; relative change of a scale that ends them
 
 
 def residual_scale(residuals: Array, kinds: Kinds) -> Array:

@@ -30,7 +30,7 @@ _ROUNDS = 5  # number of fits
 
 @dataclass(frozen=True)
 class FrameFit:
-    """Rotation and shift from a recording's frame to the scene's, and how well they fit."""
+    """Rotation and shift from a recording's frame to that of the scene, and how well they fit."""
 
     yaw: float
     """[rad]"""

@@ -45,8 +45,10 @@ ACCELERATION = ("acceleration_x", "acceleration_y")
 
 _MAX_GAP = 0.5  # [s] largest gap between two rows of a table; windows with a longer gap are left out
 _MIN_INTERVAL = 5e-4  # [s] least median interval between rows; a shorter one means that time is not in seconds
-_FAST = 1.75  # [samples] if the pose sensor's period is shorter, times of appearance are used: `measurement_times`
-_JITTER = 4  # largest number of samples from measurement to appearance of a pose, apart from the common delay
+_FAST = 1.75  # [samples] if the pose sensor's period is shorter, poses count as measured when they appear
+# [samples] A window contradicts the period if a pose appears further than this from its estimated measurement time; the
+# delay that all poses share is not counted.
+_JITTER = 4
 _UNSTEADY = 0.1  # if a larger fraction of windows contradicts the period, the sensor counts as aperiodic
 _DROPOUT = 30  # [samples] windows without a fresh pose for longer are left out if the wheels turn
 _TURNING = 0.5  # [rad/s] mean of both sides' wheel speeds above which the wheels count as turning
@@ -64,9 +66,9 @@ def measurement_times(fresh: NDArray[np.bool_]) -> Array:
 
     A pose sensor measures at a steady rate, but its poses reach the log with varying delay: between fresh poses that
     appear 0.05 s apart, a robot moves as far as between those that appear 0.15 s apart. (In turning windows of DRIVE's
-    log, yaw is smooth to 0.3° as a function of the fresh pose's number, but only to 0.7° as one of its time of
-    appearance.) So the n-th fresh pose counts as measured n periods after the first. Lost poses are counted, too: if a
-    pose and all later ones are late by more than half a period, poses before it were lost.
+    log, yaw is smooth to 0.3° as a function of the number of the fresh pose, but only to 0.7° as a function of the
+    time at which the pose appears.) So the n-th fresh pose counts as measured n periods after the first. Lost poses are
+    counted, too: if a pose and all later ones are late by more than half a period, poses before it were lost.
 
     Times of appearance are used instead for windows that contradict the period by more than `_JITTER`, and for the
     whole log if many windows do so or if the sensor is fast.
@@ -241,7 +243,7 @@ def read_npz(path: Path) -> dict[str, Array]:
 
 
 def cut_windows(columns: dict[str, Array], where: str) -> Windows:
-    """Cuts a table into windows; a sample has the values of the newest row at its instant.
+    """Cuts a table into windows; a sample has the values of the last row that is not later than the sample.
 
     Args:
         columns: Columns by name, shape (rows,) each; see the module's head.
@@ -293,7 +295,7 @@ def cut_windows(columns: dict[str, Array], where: str) -> Windows:
 
 
 def _informative(windows: Windows, where: str) -> Windows:
-    """Leaves out windows that lose poses while the wheels turn, and windows in which the robot stands as commanded.
+    """Leaves out windows that lose poses while the wheels turn, and windows in which the robot stands still on command.
 
     Raises InputError: poses are lost in more than half of the windows in which the wheels turn.
     """
@@ -376,7 +378,9 @@ def _published_windows(columns: dict[str, Array], where: str) -> Windows:
 
 
 def resample_poses(poses: Array, late: Array, before: int) -> Array:
-    """Poses every `PERIOD` [s] since the first one was measured, relative to it, shape (n, k + MAX_POSE_AGE + 1, 3).
+    """Interpolates predicted poses from the time when a window's first pose was measured, `PERIOD` [s] apart.
+
+    The result is relative to its first pose, shape (n, SAMPLES + MAX_POSE_AGE + 1, 3).
 
     Args:
         poses: `PERIOD` [s] apart, shape (n, m, 3); extrapolated linearly beyond the last one.

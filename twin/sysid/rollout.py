@@ -44,7 +44,9 @@ class SlopeModel:
     """Standard deviation of a window's reading [m/s²]."""
 
 
-_PRIOR, _PRIOR_STD = SlopeModel(0.25, 5.0, 0.25), 1.0  # median (a slope of 1.5°); std of the logarithms
+# Log-normal prior of the three statistics: their medians (0.25 m/s² is a slope of 1.5°), and the standard deviation of
+# their logarithms.
+_PRIOR, _PRIOR_STD = SlopeModel(0.25, 5.0, 0.25), 1.0
 _RANGE = 1e-3, 1e3  # bounds of each statistic; they keep the fit finite if the readings have no noise
 
 
@@ -127,7 +129,8 @@ def smooth_slopes(
 
 MAX_POSE_LAG, MAX_POSE_LEAD = 4, 3  # samples by which poses may be behind and ahead of the wheel speeds
 LEAD_SAMPLES = MAX_POSE_LAG + MAX_POSE_AGE  # samples before time zero in the result
-COARSE_TIMESTEP = 0.005  # [s] for the start of a fit; after 2 s, up to 1 cm and 0.8° off the poses at the scene's
+# [s] For the start of a fit; after 2 s, poses differ by up to 1 cm and 0.8° from those with the scene's time step.
+COARSE_TIMESTEP = 0.005
 
 _SETTLE = 1.0  # [s] at rest before a simulation
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -169,7 +172,7 @@ def simulate_windows(
         targets: Servo targets, left and right [rad/s], `CONTROL_STEP` [s] apart, shape (n, steps, 2).
         before: Wheel speeds up to time zero, left and right [rad/s], `PERIOD` [s] apart, (n, ≥ LEAD_SAMPLES + 2, 2).
         slope: Gravity along x and y in the robot's frame at the start of `before` [m/s²], shape (n, 2).
-        timestep: [s], a whole fraction of `PERIOD`; None: the scene's.
+        timestep: [s], a whole fraction of `PERIOD`; None: the time step of scenes.
     """
     model = plane_model(params, timestep)
     step = model.opt.timestep
@@ -217,7 +220,12 @@ def _initial_states(model: mujoco.MjModel, params: HuskyParams, start: Array) ->
     for i, sides in enumerate(start):
         rolling = sides * params.wheel_radius
         data.qvel[0] = rolling.mean()
-        data.qvel[5] = (rolling[1] - rolling[0]) / 2  # 0.29 (TRACK / 2) times the yaw rate of a differential drive
+        # Half the speed difference [m/s] is taken as yaw rate [rad/s], without division by a track: about half of the
+        # rate to which the robot settles. It is only the start, 0.8 s before the result's first pose, and it stays,
+        # since published fits were made with it. In turns at constant wheel speeds, a start at about the settled rate
+        # changes poses by at most 1.2 mm and 0.02° (after time zero, 0.03 mm) with a friction of 0.3 or more, but by up
+        # to 3 cm and 1.1° with 0.05, the lower bound of a fit.
+        data.qvel[5] = (rolling[1] - rolling[0]) / 2
         data.qvel[joints] = np.tile(sides, 2)
         if model.na:
             data.act[:] = sides

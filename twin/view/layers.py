@@ -81,7 +81,7 @@ def scene_layers(scene: viser.SceneApi, twin: Twin, field: BakedField) -> list[L
             Layer("corridor", "where the robot may drive", lambda path: [_corridor(scene, path, world)]),
             Layer(
                 "trust map",
-                "reliability of the robot's pictures: dark far from all filmed cameras, or where the field has holes",
+                "dark where the robot's pictures are unreliable: far from filmed cameras, or at holes in the field",
                 lambda path: [_trust_map(scene, path, twin, world, cameras, field)],
             ),
         ]

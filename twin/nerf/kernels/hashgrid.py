@@ -2,7 +2,8 @@
 
 *Grid position*: see `kernels/space.py`. *Level*: one of several grids of vertices, from coarse to fine. *Table*:
 features of all levels, equally many rows each, `FEATURES` floats per row. A level with no more vertices than rows is
-stored densely, others are hashed. The backward pass is launched level by level: so a CPU sums in fixed order.
+stored densely, others are hashed. The trainer launches the backward pass once per level, so that a CPU adds the
+sums of each level in a fixed order.
 """
 
 # Warp evaluates annotations, so they contain calls, which mypy does not accept.
@@ -107,7 +108,8 @@ def encode_backward(
     k, i = wp.tid()
     level = first_level + k
     g = features_grad[i, level]
-    if wp.dot(g, g) == 0.0:  # as behind an opaque sample; small gradients count, as Adam normalizes them
+    # Zero gradients occur, for example, behind an opaque sample. Small ones count, because Adam normalizes them.
+    if wp.dot(g, g) == 0.0:
         return
     cell = cell_at(positions[i], levels.cells[level])
     for n in range(8):

@@ -50,7 +50,7 @@ _MIN_CONE_STEP = 0.5  # least step of the cone march [cells]
 _ACROSS = 2 * CORNERS * HALF_CORNERS  # density bytes from one sample to the next along x
 _NEXT_Y = 8 * HALF_CORNERS  # density bits from one sample to the next along y
 _X = CORNERS * CORNERS  # rows of features from one sample to the next along x
-_Z = 1  # the same along z
+_Z = 1  # rows of features from one sample to the next along z
 
 
 @wp.struct
@@ -229,7 +229,7 @@ def unit_ray(k: wp.vec4f, u: wp.float32, v: wp.float32) -> wp.vec3f:
 
 @wp.kernel(enable_backward=False)
 def cone_march(bricks: Bricks, image: ImageBuffers, first: wp.int32, start: wp.array2d(dtype=wp.float32)):
-    """Cone march: finds distances [m] up to which space is empty in the tiles from `first` on of every camera.
+    """Cone march: finds the distance [m] up to which space is empty, per camera and tile, from tile `first` on.
 
     The unit directions of a tile's rays differ from that of its axis by at most a chord α. So at distance t, the rays
     lie in a ball of radius α·t around a point of the axis.
@@ -277,7 +277,8 @@ def march_kernel(lanes: int) -> Any:
     """Builds the marching kernel for packets of `lanes` rays, 1, 8 or 16.
 
     It is launched over cameras and packets, `TILE`² / lanes of them per tile. It writes opacity and composited
-    features (cameras, CHANNELS, pixels), and the z-depth [m] at which half the light is blocked (−1 if less is).
+    features (cameras, CHANNELS, pixels), and the z-depth [m] at which half the light is blocked (−1 if less
+    than half is blocked).
     """
     Floats = wp.types.vector(length=lanes, dtype=wp.float32)
     Ints = wp.types.vector(length=lanes, dtype=wp.int32)

@@ -347,7 +347,7 @@ def sum_levels(
 ):
     """Adds to every texel the coarser levels at its node, so that rendering interpolates one level instead of all.
 
-    Both give the same, as a level's nodes are nodes of all finer levels.
+    Both give the same sum, since a level's nodes are nodes of all finer levels.
     """
     row = wp.tid()
     tile = tiles[row // TEXELS]
