@@ -157,7 +157,7 @@ def _place(forecast, tmp_path, run, name="a"):
 def test_a_place_that_cannot_be_built_is_recorded_as_failed_and_not_run_again(forecast, tmp_path, capsys):
     protocol = forecast.protocol.read_protocol()
     run = StandIn(forecast)
-    run.must = lambda *arguments, cores=1: _fails_at(run, "twin.build", arguments)
+    run.must = lambda *arguments, cores=1: _fails_at(run, "twin.build", arguments, forecast.command.Refused)
     place = forecast.command.PlaceRun(protocol, 100, tmp_path / "work", tmp_path / "results", run, 1)
     with pytest.raises(InputError, match="no reconstructed point"):
         forecast.command.run_place(place, None)
@@ -170,14 +170,25 @@ def test_a_place_that_cannot_be_built_is_recorded_as_failed_and_not_run_again(fo
     assert "failed: build: no reconstructed point" in forecast.place_scores.tables(protocol, found)
 
 
-def _fails_at(run, command, arguments):
+def _fails_at(run, command, arguments, kind):
     if arguments[0] == command:
-        raise InputError("no reconstructed point")
+        raise kind("no reconstructed point")
     assert run(*arguments) == 0
 
 
+def test_a_command_that_is_killed_leaves_the_place_unfinished(forecast, tmp_path):
+    run = StandIn(forecast)
+    run.must = lambda *arguments, cores=1: _fails_at(run, "twin.build", arguments, InputError)
+    place = forecast.command.PlaceRun(
+        forecast.protocol.read_protocol(), 100, tmp_path / "work", tmp_path / "results", run, 1
+    )
+    with pytest.raises(InputError):
+        forecast.command.run_place(place, None)
+    assert not place.record.exists()
+
+
 def test_the_message_of_a_failed_command_is_kept(forecast, tmp_path):
-    with pytest.raises(InputError, match=r"twin\.build ended with exit status 2: no scene.toml at"):
+    with pytest.raises(forecast.command.Refused, match=r"twin\.build ended with exit status 2: no scene.toml at"):
         forecast.command.Commands(5.0).must("twin.build", tmp_path / "nothing")
 
 

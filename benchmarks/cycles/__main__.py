@@ -14,7 +14,9 @@ numpy 1 and therefore cannot be installed beside `twin`.
 
 import argparse
 import sys
+import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import repeat
@@ -36,7 +38,7 @@ from twin.reality.trial_place import place_on_test_day
 
 sys.path.append(str(Path(__file__).parents[1]))
 sys.path.append(str(Path(__file__).parents[1] / "forecast"))
-from place_record import TRIALS, keep
+from place_record import TRIALS, freeze, keep
 from protocol import PROTOCOL, Protocol, read_protocol
 from record import add_record_options, save
 
@@ -93,23 +95,21 @@ def compare(place: int, own: list[Trial], repeated: list[Trial]) -> Agreement:
 class Repetition:
     """Repeats trials at one place with the pictures of Cycles."""
 
-    def __init__(self, scene: Path, record: Path, place: int, task: str, python: Path, samples: int) -> None:
+    def __init__(self, scene: Path, place: int, task: str, python: Path, samples: int) -> None:
         """
         Args:
             scene: The place's scene of the forecast experiment, with its policies and its task file.
-            record: Folder of the place's record.
             place: Number of place, robot and camera.
             task: Name of the task.
             python: Interpreter that can import `bpy`.
             samples: Paths per pixel.
         """
-        self.scene, self.record, self.place, self.python, self.samples = scene, record, place, python, samples
+        self.scene, self.place, self.python, self.samples = scene, place, python, samples
         self.task = scene_task(str(scene / f"{task}.json"), scene, place)
         self.setup = Setup(place, place, place)
 
-    def one_day(self, day: str, trials: list[Trial], end: float) -> list[Trial]:
-        """Repeats the trials of one day, until a time of `time.monotonic` [s]."""
-        out: list[Trial] = []
+    def one_day(self, day: str, trials: list[Trial], end: float, keep_trial: Callable[[Trial], None]) -> None:
+        """Repeats the trials of one day, until a time of `time.monotonic` [s]; each one is kept as it ends."""
         renderers: list[CyclesRenderer] = []
 
         def renderer_of(lighting: str, intrinsics: tuple[float, ...], size: tuple[int, int], number: int) -> Any:
@@ -125,12 +125,10 @@ class Repetition:
                     break
                 policy = load_policy_file(self.scene / "runs" / one.policy)
                 test = RealTest(task_for(policy, self.task, self.place), self.setup, policy.size, renderer_of)
-                out.append(test.run_trial(policy, day, one.seed))
-                print(*out[-1].row(), flush=True)
+                keep_trial(test.run_trial(policy, day, one.seed))
         finally:
             for renderer in renderers:
                 renderer.close()
-        return out
 
 
 def _repeat(protocol: Protocol, given: argparse.Namespace) -> None:
@@ -140,20 +138,27 @@ def _repeat(protocol: Protocol, given: argparse.Namespace) -> None:
         record = given.results / protocol.name / f"place_{place}"
         if not (record / TRIALS).exists():
             raise InputError(f"{record / TRIALS}: no such file; first run benchmarks/forecast at place {place}")
+        scene = given.work / protocol.name / f"place_{place}"
+        freeze(record, {setup: scene / "runs" / setup for setup in protocol.setups})  # the policies that were recorded
         chosen = drawn(read_trials(record / TRIALS), given.share, place)
         done = read_trials(record / REPEATED) if (record / REPEATED).exists() else []
         known = {_key(one) for one in done}
-        missing = [one for one in chosen if _key(one) not in known]
-        scene = given.work / protocol.name / f"place_{place}"
         place_on_test_day(place)  # fills its cache before threads ask for it
-        run = Repetition(scene, record, place, protocol.task, given.python, given.samples)
+        run = Repetition(scene, place, protocol.task, given.python, given.samples)
         days: dict[str, list[Trial]] = {}
-        for one in missing:
-            days.setdefault(one.lighting, []).append(one)
-        with ThreadPoolExecutor(given.jobs) as pool:
-            for new in pool.map(run.one_day, days, days.values(), repeat(end)):
-                done += new
+        for one in chosen:
+            if _key(one) not in known:
+                days.setdefault(one.lighting, []).append(one)
+        lock = threading.Lock()
+
+        def keep_trial(trial: Trial, record: Path = record, done: list[Trial] = done, lock: Any = lock) -> None:
+            with lock:
+                done.append(trial)
                 keep(record / REPEATED, done)
+                print(*trial.row(), flush=True)
+
+        with ThreadPoolExecutor(given.jobs) as pool:
+            list(pool.map(run.one_day, days, days.values(), repeat(end), repeat(keep_trial)))
 
 
 def _film(given: argparse.Namespace) -> None:
@@ -164,14 +169,16 @@ def _film(given: argparse.Namespace) -> None:
     def renderer_of(lighting: str, place: Any) -> CyclesRenderer:
         size = plan.width, plan.height
         light = place.lightings[lighting]
+        if running:
+            running[-1].close()  # the films of the lighting before are done
         running.append(CyclesRenderer(given.python, light, place, plan.intrinsics, size, given.samples, given.jobs))
         return running[-1]
 
     try:
         film(plan, given.out, given.place, renderer_of=renderer_of)
     finally:
-        for renderer in running:
-            renderer.close()
+        if running:
+            running[-1].close()
 
 
 def _tables(protocol: Protocol, results: Path) -> dict[str, Any]:

@@ -26,7 +26,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -52,13 +52,16 @@ class TimeIsUp(Exception):
     """The time given by `--minutes` is over, or a signal asked to stop."""
 
 
+class Refused(InputError):
+    """A command ended with exit status 2: its input is bad, so it would end like this again."""
+
+
 class Commands:
     """Runs `python -m twin.…` until a deadline."""
 
     def __init__(self, minutes: float) -> None:
         self._end = time.monotonic() + 60.0 * min(minutes, 1e6)
         self._running: set[subprocess.Popen] = set()
-        self._message = ""
 
     def stop(self, *_: object) -> None:
         """Signal handler: moves the deadline to now, and ends running commands."""
@@ -68,6 +71,22 @@ class Commands:
 
     def __call__(self, *arguments: str | Path, cores: int = 1) -> int:
         """Returns the exit status. Raises TimeIsUp at the deadline, after the command has saved its state."""
+        return self._run(arguments, cores)[0]
+
+    def must(self, *arguments: str | Path, cores: int = 1) -> None:
+        """Runs a command.
+
+        Raises:
+            Refused: it ended with exit status 2.
+            InputError: it failed in another way.
+        """
+        status, message = self._run(arguments, cores)
+        if status:
+            text = f"{arguments[0]} ended with exit status {status}: {message}"
+            raise Refused(text) if status == 2 else InputError(text)
+
+    def _run(self, arguments: Sequence[str | Path], cores: int) -> tuple[int, str]:
+        """Exit status and last error message of a command."""
         if time.monotonic() > self._end:
             raise TimeIsUp
         print("+", " ".join(map(str, arguments)), flush=True)
@@ -75,7 +94,8 @@ class Commands:
         command = [sys.executable, "-m", *map(str, arguments)]
         process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
         self._running.add(process)
-        copy = threading.Thread(target=self._copy_messages, args=(process,))
+        errors: list[str] = []
+        copy = threading.Thread(target=_copy_messages, args=(process, errors), daemon=True)
         copy.start()
         try:
             status = process.wait(max(0.0, self._end - time.monotonic()))
@@ -83,21 +103,10 @@ class Commands:
             status = None
         finally:
             self._end_of(process)
-            copy.join()
+            copy.join(_GRACE)
         if status is None or self._end == 0.0:
             raise TimeIsUp
-        return status
-
-    def _copy_messages(self, process: subprocess.Popen) -> None:
-        """Copies a command's standard error, and remembers its last error message."""
-        assert process.stderr
-        tail = b""
-        while data := os.read(process.stderr.fileno(), 65536):
-            sys.stderr.buffer.write(data)
-            sys.stderr.buffer.flush()
-            tail = (tail + data)[-4096:]
-        errors = [line for line in tail.decode(errors="replace").splitlines() if line.startswith("error: ")]
-        self._message = errors[-1].removeprefix("error: ") if errors else "see its messages above"
+        return status, errors[-1] if errors else "see its messages above"
 
     def _end_of(self, process: subprocess.Popen) -> None:
         """Ends a command that still runs, and lets it save its state."""
@@ -110,11 +119,18 @@ class Commands:
                 process.wait()
         self._running.discard(process)
 
-    def must(self, *arguments: str | Path, cores: int = 1) -> None:
-        """Runs a command. Raises InputError if it fails."""
-        status = self(*arguments, cores=cores)
-        if status:
-            raise InputError(f"{arguments[0]} ended with exit status {status}: {self._message}")
+
+def _copy_messages(process: subprocess.Popen, errors: list[str]) -> None:
+    """Copies a command's standard error, progress bars included, and appends its error messages to a list."""
+    assert process.stderr
+    tail = b""
+    with process.stderr as stream:
+        while data := os.read(stream.fileno(), 65536):
+            sys.stderr.buffer.write(data)
+            sys.stderr.buffer.flush()
+            tail = (tail + data)[-8192:]
+    lines = tail.decode(errors="replace").replace("\r", "\n").splitlines()
+    errors += [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
 
 
 class PlaceRun:
@@ -237,15 +253,16 @@ def run_place(one: PlaceRun, ray: str | None) -> None:
     A place that cannot be filmed, built or trained is recorded as such, and not run again.
     """
     if (one.record / FAILURE).exists():
+        print(f"place {one.place} has failed before; see {one.record / FAILURE}", flush=True)
         return
-    steps: Sequence[Callable[[], None]] = (one.film, one.build, one.photos, one.train)
     try:
-        for step in steps:
+        for step, final in ((one.film, True), (one.build, True), (one.photos, False), (one.train, True)):
             try:
                 step()
-            except InputError as error:
-                one.record.mkdir(parents=True, exist_ok=True)
-                write_json(one.record / FAILURE, {"step": step.__name__, "message": str(error)})
+            except Refused as error:
+                if final:
+                    one.record.mkdir(parents=True, exist_ok=True)
+                    write_json(one.record / FAILURE, {"step": step.__name__, "message": str(error)})
                 raise
         one.validate(ray)
         one.drive()
