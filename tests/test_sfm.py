@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import subprocess
 import sys
 import time
@@ -25,8 +26,8 @@ from twin.scene import SceneDir
 
 SIZE = (320, 240)
 INTRINSICS = np.array([260.0, 260.0, 160.0, 120.0])
-TURN_ROUND = np.diag([-1.0, -1.0, 1.0, 1.0]) + np.outer([6.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-"""Turns the drive of 6 m around, so that it ends at its start."""
+TURN_ROUND = np.diag([-1.0, -1.0, 1.0, 1.0]) + np.outer([12.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+"""Turns a drive of 12 m around, so that it ends at its start."""
 
 
 # --- a street to film -------------------------------------------------------------------------------------------------
@@ -58,9 +59,9 @@ def _render(pose: np.ndarray, textures: list[np.ndarray], brightness: float) -> 
     return np.repeat((255 * brightness * image).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def _drive(count: int, phase: float) -> np.ndarray:
-    """A slightly winding drive of 6 m at 1 m height, shape (count, 4, 4)."""
-    s = np.linspace(0.0, 1.0, count)
+def _drive(count: int, phase: float, length: float = 6.0) -> np.ndarray:
+    """A slightly winding drive at 1 m height, shape (count, 4, 4)."""
+    s = np.linspace(0.0, length / 6.0, count)
     eyes = np.stack([6 * s, 0.6 * np.sin(3 * s + phase), 1.0 + 0.05 * np.sin(9 * s)], 1)
     ahead = np.stack([6 * s + 4, 0.6 * np.sin(3 * s + phase + 0.6), 0.8 + 0 * s], 1)
     return np.array([look_at(e, a) for e, a in zip(eyes, ahead, strict=True)])
@@ -76,18 +77,19 @@ class Street:
 FILMS = (("bright", 12, 1.0), ("dim", 9, 0.5))
 
 
-def _film(root: Path, posed: bool = False, there_and_back: bool = False) -> Street:
-    """Two films of the street; one is dark, or goes in the opposite direction."""
+def _film(root: Path, posed: bool = False, there_and_back: bool = False, same_road: bool = True) -> Street:
+    """Two films of the street; one is dark, or goes in the opposite direction, on this road or on another one."""
     rng = np.random.default_rng(3)
     textures = [_texture(rng) for _ in range(4)]
     stage = SceneDir(root).stage("capture")
     names, index, times, truth = [], [], [], {}
     infos = []
-    films = (("out", 15, 1.0), ("back", 15, 1.0)) if there_and_back else FILMS
+    films = (("out", 25, 1.0), ("back", 25, 1.0)) if there_and_back else FILMS
     for s, (source, count, brightness) in enumerate(films):
-        poses = _drive(count, 0.1 * s)
+        poses = _drive(count, 0.1 * s, 12.0 if there_and_back else 6.0)
         if source == "back":
             poses = np.array([TURN_ROUND @ pose for pose in poses])
+            textures = textures if same_road else [_texture(rng) for _ in range(4)]
         for i, pose in enumerate(poses):
             names.append(f"{source}/{i:06d}")
             truth[names[-1]] = pose
@@ -159,10 +161,10 @@ def test_films_in_opposite_directions_are_joined_by_the_ground(tmp_path: Path) -
     metrics = _run(street, tmp_path / "out")
     cameras, points = Cameras.load(tmp_path / "out"), SparsePoints.load(tmp_path / "out")
     assert metrics["joined"] == ["back"] and metrics["apart"] == []
-    assert metrics["registered"] == len(cameras) == 30
+    assert metrics["registered"] == len(cameras) == 50
     true = np.array([street.truth[name] for name in cameras.names])
     fit = umeyama(cameras.positions, true[:, :3, 3])
-    assert np.linalg.norm(fit.points(cameras.positions) - true[:, :3, 3], axis=1).max() < 0.08  # [m] of 6 m
+    assert np.linalg.norm(fit.points(cameras.positions) - true[:, :3, 3], axis=1).max() < 0.08  # [m] of 12 m
     turned = fit.poses(cameras.camera_to_world)[:, :3, :3]
     assert (
         np.degrees(rotation_angle(np.swapaxes(turned, 1, 2) @ true[:, :3, :3])).max() < 2.0
@@ -173,15 +175,27 @@ def test_films_in_opposite_directions_are_joined_by_the_ground(tmp_path: Path) -
     assert (local[:, 2] > 0.0).all()
 
 
-def test_a_film_that_cannot_be_joined_is_left_out_if_its_lighting_has_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_film_of_another_road_is_left_out(tmp_path: Path) -> None:
+    """Its lighting is in another film, so the build goes on, and the metrics name it."""
+    street = _film(tmp_path / "s", there_and_back=True, same_road=False)
+    metrics = _run(street, tmp_path / "out")
+    assert metrics["joined"] == [] and metrics["apart"] == ["back"]
+    assert metrics["registered"] == 25 and metrics["registered_per_source"]["back"] == [0, 25]
+    json.dumps(metrics, allow_nan=False)
+    cameras = Cameras.load(tmp_path / "out")
+    assert set(cameras.sources) == {"out"}
+    true = np.array([street.truth[name] for name in cameras.names])
+    fit = umeyama(cameras.positions, true[:, :3, 3])
+    assert np.linalg.norm(fit.points(cameras.positions) - true[:, :3, 3], axis=1).max() < 0.03
+
+
+def test_a_lighting_without_any_placed_film_is_refused(tmp_path: Path) -> None:
     capture = Capture.load(_film(tmp_path / "s", there_and_back=True).scene.stage("capture"))
     frames = np.flatnonzero(capture.source_index == 0)
     sfm._check_registered(capture, frames, CamerasConfig())
     other = dataclasses.replace(capture.sources[1], lighting="night")
     capture = dataclasses.replace(capture, sources=(capture.sources[0], other))
-    with pytest.raises(InputError, match="source 'back': none of its 15 frames connects"):
+    with pytest.raises(InputError, match="source 'back': none of its 25 frames connects"):
         sfm._check_registered(capture, frames, CamerasConfig())
 
 
@@ -202,7 +216,7 @@ def test_a_torn_model_is_recognized(street: Street, tmp_path: Path) -> None:
                 track.add_element(frame + 1, k + (20 if len(piece) == 2 else 0))
             if len(piece):
                 model.add_point3D(np.zeros(3), track)
-    matcher = SimpleNamespace(frame_of=lambda: {k + 1: k for k in range(8)}, capture=capture)
+    matcher = SimpleNamespace(frame_of=lambda: {k + 1: k for k in range(8)}, image_ids=np.arange(1, 9), capture=capture)
     assert mapping.coherent_frames(model, matcher) == {0, 1, 2, 3, 4}
 
 

@@ -34,9 +34,9 @@ Frames that are farther apart mostly match by what is infinitely far, which misl
 """
 PROBE_INLIERS = 25
 """Verified matches with which a pair counts as evidence of a common view; fewer than 20 occur by chance."""
-# Two sources are linked if they have at least this number of pairs with such evidence (fewer if a source is short), or
-# if more than this fraction of their tried pairs is verified.
-_LINKING_PAIRS, _LINKING_FRACTION = 8, 0.5
+# Two sources are linked by 8 pairs with 40 verified matches each, or if half of their pairs are verified. Between films
+# in opposite directions, up to eight pairs with 25 to 37 matches were seen where house fronts repeat.
+_LINKING_PAIRS, _LINKING_INLIERS, _LINKING_FRACTION = 8, 40, 0.5
 _WORDS = 32  # visual words of the VLAD descriptor
 _SAMPLES_PER_FRAME = 150
 _PROBES_PER_SOURCE = 20
@@ -288,7 +288,7 @@ class Matcher:
             tried[source[i], source[j]] += 1
         for (i, j), inliers in self.verified().items():
             verified[source[i], source[j]] += 1
-            strong[source[i], source[j]] += inliers >= PROBE_INLIERS
+            strong[source[i], source[j]] += inliers >= _LINKING_INLIERS
         frames = np.bincount(source, minlength=count)
         enough = np.minimum(_LINKING_PAIRS, np.minimum(frames, frames[:, None]) / 2)
         linked = (strong >= enough) | (verified > _LINKING_FRACTION * np.maximum(tried, 1))

@@ -20,7 +20,7 @@ from twin import runtime
 from twin.capture.camera_models import Lens, lens_from_json, undistortion, write_pinhole_image
 from twin.capture.capture_data import Capture
 from twin.capture.ground_matching import Part, join
-from twin.capture.mapping import MIN_FRAMES, fresh_folder, reconstruct, registered_poses
+from twin.capture.mapping import MIN_FRAMES, coherent_frames, fresh_folder, reconstruct, registered_poses
 from twin.capture.matching import (
     PROBE_INLIERS,
     Matcher,
@@ -280,7 +280,7 @@ def _reconstruct(
                 continue
             both = np.sort(np.concatenate([solved[0][0].frames, frames]))
             together = _reconstructed(matcher, both, job, fresh_folder(work, f"with_{k}"), summary)
-            if len(solved) == 1 and _registers(together, frames) and _registers(together, solved[0][0].frames):
+            if len(solved) == 1 and all(_holds(together, one) for one in (frames, solved[0][0].frames)):
                 solved = [together]
         except InputError as error:
             first = first or error
@@ -301,9 +301,10 @@ def _reconstructed(
     return own, reconstruct(own, job, work, summary)
 
 
-def _registers(solved: tuple[Matcher, pycolmap.Reconstruction], frames: NDArray[np.int64]) -> bool:
-    """True if a model has most of the frames."""
-    return bool(np.isin(frames, registered_poses(solved[1], solved[0])[0]).mean() > _TOGETHER_FRACTION)
+def _holds(solved: tuple[Matcher, pycolmap.Reconstruction], frames: NDArray[np.int64]) -> bool:
+    """True if most of the frames are in the coherent part of a model."""
+    coherent = coherent_frames(solved[1], solved[0])
+    return len(coherent.intersection(frames.tolist())) > _TOGETHER_FRACTION * len(frames)
 
 
 def _source_names(capture: Capture, frames: NDArray[np.int64]) -> list[str]:
