@@ -25,11 +25,7 @@ from twin.geometry.poses import Similarity, inverse_pose
 from twin.types import Array
 
 _PIXEL, _MAX_PIXEL = 0.02, 0.05  # side of a ground picture's pixel; it is larger on a long road
-_NEAR, _FAR, _ASIDE = (
-    1.0,
-    5.0,
-    3.5,
-)  # extent of the ground that is taken from a frame: ahead of the camera, to each side
+_NEAR, _FAR, _ASIDE = 1.0, 5.0, 3.5  # the ground that is taken from a frame: range ahead; width to each side
 _MAX_PIXELS = 1.2e7  # of a ground picture; SIFT takes 0.24 GB per million pixels
 _FEATURES = 20_000  # most SIFT features of a ground picture
 _CONTRAST = 0.015  # SIFT's threshold; asphalt has little contrast
