@@ -5,7 +5,7 @@
 The robot turns on the spot at a commanded 1 rad/s, on a plane and on a flat road as the mesh stage reconstructs it.
 Prints yaw rate and motor torque, divided by those with the right options on the plane; motor power divided by the power
 that the contacts dissipate (1 if energy is conserved); vertical acceleration at the camera (jolt); and the speed of the
-robot when parked on a slope (creep). A run takes a minute.
+robot when parked on a slope (creep). A run takes 20 s.
 """
 
 import argparse

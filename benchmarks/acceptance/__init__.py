@@ -4,5 +4,5 @@
 compiled, which makes a wrong model. *Chi*: track ratio, the effective track divided by the geometric one. Letters of
 the row ids: A composition, B scrubbing on a plane, C static friction and stalling, D driving, E ground from the
 pipeline, P convex parts. Read chi together with B4 to B6: a hopping model can have a plausible chi, and a model with a
-pyramidal friction cone has the right chi with a torque 21 % too low.
+pyramidal friction cone has the right chi with a torque 23 % too low.
 """

@@ -67,7 +67,7 @@ def set_options(spec: mujoco.MjSpec, params: HuskyParams | None = None) -> None:
     spec.option.timestep = TIMESTEP
     # Euler and RK4 are unstable with a stiff speed servo; implicitfast adds the servo's damping to the mass matrix.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # The pyramidal friction cone gives the right track ratio, but a torque that is 21 % too low.
+    # The pyramidal friction cone gives the right track ratio, but a torque that is 23 % too low.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = params.slip_stiffness
     spec.option.viscosity = params.ground_viscosity
