@@ -31,6 +31,7 @@ _NEAR_PAIRS = 4  # largest number of near pairs per frame
 # The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
 _REMAPPING_FRACTION = 0.05
 _SHARED_POINTS = 15  # points in common that connect two frames of a model
+_MAX_STEPS = 60.0  # [median steps between frames] largest distance between two connected frames
 _COHERENT_FRACTION = 0.95  # a model is torn if its largest connected part has a smaller fraction of its frames
 _TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
@@ -72,8 +73,21 @@ def reconstruct(matcher: Matcher, job: dict[str, Any], work: Path, summary: dict
 
 
 def coherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> set[int]:
-    """Registered frames of the largest part of a model in which frames are connected by 15 common points or more."""
-    frames = registered_poses(model, matcher)[0]
+    """Registered frames of the largest connected part of a model, see `connections`."""
+    frames, connected = connections(model, matcher)
+    if not connected.nnz:
+        return set()
+    part = connected_components(connected, directed=False)[1]
+    return set(frames[part == np.bincount(part).argmax()].tolist())
+
+
+def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArray[np.int64], csr_matrix]:
+    """Registered frames (n,), and a matrix (n, n) that is True for connected pairs.
+
+    Two frames are connected if they share 15 points or more, and lie near each other: frames that were thrown far off
+    the path still share points that are even farther away.
+    """
+    frames, poses = registered_poses(model, matcher)
     row = {int(matcher.image_ids[i]): k for k, i in enumerate(frames)}
     seen = [
         (row[element.image_id], k)
@@ -81,11 +95,14 @@ def coherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> set[int
         for element in point.track.elements
     ]
     if not seen:
-        return set()
+        return frames, csr_matrix((len(frames), len(frames)), dtype=bool)
     frame, point = np.unique(np.array(seen), axis=0).T
     views = csr_matrix((np.ones(len(frame), np.int32), (frame, point)), shape=(len(frames), int(point.max()) + 1))
-    part = connected_components(views @ views.T >= _SHARED_POINTS, directed=False)[1]
-    return set(frames[part == np.bincount(part).argmax()].tolist())
+    shared = (views @ views.T >= _SHARED_POINTS).tocoo()
+    distance = np.linalg.norm(poses[shared.row, :3, 3] - poses[shared.col, :3, 3], axis=1)
+    near = distance <= _MAX_STEPS * median_step(poses, frames, matcher)
+    kept = shared.row[near], shared.col[near]
+    return frames, csr_matrix((np.ones(len(kept[0]), bool), kept), shape=(len(frames), len(frames)))
 
 
 class Mapper:

@@ -20,7 +20,14 @@ from twin import runtime
 from twin.capture.camera_models import Lens, lens_from_json, undistortion, write_pinhole_image
 from twin.capture.capture_data import Capture
 from twin.capture.ground_matching import Part, join
-from twin.capture.mapping import MIN_FRAMES, coherent_frames, fresh_folder, reconstruct, registered_poses
+from twin.capture.mapping import (
+    MIN_FRAMES,
+    coherent_frames,
+    connections,
+    fresh_folder,
+    reconstruct,
+    registered_poses,
+)
 from twin.capture.matching import (
     PROBE_INLIERS,
     Matcher,
@@ -44,7 +51,8 @@ from twin.types import Array
 _MAX_THREADS = 16
 # [px] Points with a larger reprojection error are left out, such as those that bundle adjustment moved behind a camera.
 _MAX_POINT_ERROR = 20.0
-_TOGETHER_FRACTION = 0.8  # of the frames of each group, for one model of two weakly linked groups
+# One model of two weakly linked groups: fraction of the frames of each, and connections between them.
+_TOGETHER_FRACTION, _TOGETHER_PAIRS = 0.8, 20
 _POSED_PAIRS = 10  # largest number of pairs per frame if poses are given
 
 
@@ -280,7 +288,7 @@ def _reconstruct(
                 continue
             both = np.sort(np.concatenate([solved[0][0].frames, frames]))
             together = _reconstructed(matcher, both, job, fresh_folder(work, f"with_{k}"), summary)
-            if len(solved) == 1 and all(_holds(together, one) for one in (frames, solved[0][0].frames)):
+            if len(solved) == 1 and _is_one(together, solved[0][0].frames, frames):
                 solved = [together]
         except InputError as error:
             first = first or error
@@ -301,10 +309,15 @@ def _reconstructed(
     return own, reconstruct(own, job, work, summary)
 
 
-def _holds(solved: tuple[Matcher, pycolmap.Reconstruction], frames: NDArray[np.int64]) -> bool:
-    """True if most of the frames are in the coherent part of a model."""
-    coherent = coherent_frames(solved[1], solved[0])
-    return len(coherent.intersection(frames.tolist())) > _TOGETHER_FRACTION * len(frames)
+def _is_one(solved: tuple[Matcher, pycolmap.Reconstruction], a: NDArray[np.int64], b: NDArray[np.int64]) -> bool:
+    """True if a model has most frames of two groups in its coherent part, and enough connections between the groups."""
+    matcher, model = solved
+    coherent = np.array(sorted(coherent_frames(model, matcher)))
+    if min(np.isin(one, coherent).mean() for one in (a, b)) < _TOGETHER_FRACTION:
+        return False
+    frames, connected = connections(model, matcher)
+    between = connected[np.isin(frames, a)][:, np.isin(frames, b)]
+    return bool(between.nnz >= min(_TOGETHER_PAIRS, len(a), len(b)))
 
 
 def _source_names(capture: Capture, frames: NDArray[np.int64]) -> list[str]:
