@@ -199,25 +199,39 @@ def test_a_lighting_without_any_placed_film_is_refused(tmp_path: Path) -> None:
         sfm._check_registered(capture, frames, CamerasConfig())
 
 
-def test_a_torn_model_is_recognized(street: Street, tmp_path: Path) -> None:
-    """Two pieces without common points are not coherent; the larger one is kept."""
+def _model(
+    street: Street, places: list[float], groups: list[tuple[int, ...]]
+) -> tuple[pycolmap.Reconstruction, object]:
+    """A model of frames at places x along a line, with one point for each group of frames; and its matcher."""
     model = pycolmap.Reconstruction()
-    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 260.0, *SIZE)
-    model.add_camera_with_trivial_rig(camera)
+    model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 260.0, *SIZE))
+    points = pycolmap.Point2DList([pycolmap.Point2D(np.array([float(k), 1.0])) for k in range(len(groups))])
+    for k, x in enumerate(places):
+        image = pycolmap.Image(f"{k}", points, 1, k + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-x, 0.0, 0.0])))
+    for k, group in enumerate(groups):
+        track = pycolmap.Track()
+        for frame in group:
+            track.add_element(frame + 1, k)
+        model.add_point3D(np.zeros(3), track)
     capture = Capture.load(street.scene.stage("capture"))
-    points = [pycolmap.Point2D(np.array([float(k), 1.0])) for k in range(40)]
-    for k in range(8):
-        image = pycolmap.Image(f"{k}", pycolmap.Point2DList(points), 1, k + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    for k in range(20):  # frames 0 to 4 share 20 points, frames 5 to 7 others, and 10 are common to 4 and 5
-        for piece in (range(5), range(5, 8), range(4, 6) if k < 10 else ()):
-            track = pycolmap.Track()
-            for frame in piece:
-                track.add_element(frame + 1, k + (20 if len(piece) == 2 else 0))
-            if len(piece):
-                model.add_point3D(np.zeros(3), track)
-    matcher = SimpleNamespace(frame_of=lambda: {k + 1: k for k in range(8)}, image_ids=np.arange(1, 9), capture=capture)
-    assert mapping.coherent_frames(model, matcher) == {0, 1, 2, 3, 4}
+    ids = {k + 1: k for k in range(len(places))}
+    return model, SimpleNamespace(frame_of=lambda: ids, image_ids=np.arange(1, len(places) + 1), capture=capture)
+
+
+def test_a_torn_model_is_recognized(street: Street) -> None:
+    """Two pieces with too few common points are not coherent; the larger one is kept."""
+    groups = [tuple(range(5))] * 20 + [(5, 6, 7)] * 20 + [(4, 5)] * 10
+    assert mapping.coherent_frames(*_model(street, [0.0, 1, 2, 3, 4, 5, 6, 7], groups)) == {0, 1, 2, 3, 4}
+    assert mapping.coherent_frames(*_model(street, [0.0, 1, 2, 3, 4, 5, 6, 7], [*groups, *[(4, 5)] * 5])) == set(
+        range(8)
+    )
+
+
+def test_a_frame_thrown_far_off_is_not_coherent_although_it_shares_points(street: Street) -> None:
+    groups = [tuple(range(8))] * 20
+    assert mapping.coherent_frames(*_model(street, [0.0, 1, 2, 3, 4, 5, 6, 1000], groups)) == set(range(7))
+    assert mapping.coherent_frames(*_model(street, [0.0, 1, 2, 3, 4, 5, 6, 16], groups)) == set(range(8))  # a gap
 
 
 def test_masked_parts_have_no_features(street: Street, tmp_path: Path) -> None:

@@ -100,7 +100,8 @@ def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArr
     views = csr_matrix((np.ones(len(frame), np.int32), (frame, point)), shape=(len(frames), int(point.max()) + 1))
     shared = (views @ views.T >= _SHARED_POINTS).tocoo()
     distance = np.linalg.norm(poses[shared.row, :3, 3] - poses[shared.col, :3, 3], axis=1)
-    near = distance <= _MAX_STEPS * median_step(poses, frames, matcher)
+    step = median_step(poses, frames, matcher)
+    near = distance <= (_MAX_STEPS * step if step else np.inf)  # no step: no source has two frames
     kept = shared.row[near], shared.col[near]
     return frames, csr_matrix((np.ones(len(kept[0]), bool), kept), shape=(len(frames), len(frames)))
 
