@@ -187,7 +187,7 @@ def solve_mapping(job: dict[str, Any], work: Path) -> None:
     pycolmap.set_random_seed(job["seed"])
     matcher = open_database(capture, stage, work, job["free_focal"], job["threads"], job["seed"])
     matcher.extract(job["features"], job["max_feature_size"])
-    summary: dict[str, Any] = {"near_pairs": 0, "outliers": [], "registered_anew": [], "joined": []}
+    summary = _new_summary()
     if capture.camera_to_world is not None:
         summary["mapper"] = "given poses"
         solved = [(matcher, _triangulate(matcher, capture.camera_to_world, work))]
@@ -278,35 +278,45 @@ def _reconstruct(
     if len(groups) == 1:
         return [(matcher, reconstruct(matcher, job, work, summary))]
     solved: list[tuple[Matcher, pycolmap.Reconstruction]] = []
+    found: list[dict[str, Any]] = []  # summaries of the models in `solved`
     first: InputError | None = None
     for k, frames in enumerate(groups):
         send_message(say=f"  films that share views: {', '.join(_source_names(capture, frames))}")
         try:
-            own = _reconstructed(matcher, frames, job, fresh_folder(work, f"group_{k}"), summary)
+            own, about = _reconstructed(matcher, frames, job, fresh_folder(work, f"group_{k}"))
             if not solved or any(_join(one, own) for one in solved):
                 solved.append(own)
+                found.append(about)
                 continue
             both = np.sort(np.concatenate([solved[0][0].frames, frames]))
-            together = _reconstructed(matcher, both, job, fresh_folder(work, f"with_{k}"), summary)
+            together, about = _reconstructed(matcher, both, job, fresh_folder(work, f"with_{k}"))
             if len(solved) == 1 and _is_one(together, solved[0][0].frames, frames):
-                solved = [together]
+                solved, found = [together], [about]
         except InputError as error:
             first = first or error
     if not solved:
         assert first is not None
         raise first
+    for name in ("near_pairs", "outliers", "registered_anew"):
+        summary[name] = sum((one[name] for one in found), summary[name])
+    summary["mapper"] = found[0]["mapper"]
     summary["joined"] = [name for one, _ in solved[1:] for name in _source_names(capture, one.frames)]
     return solved
 
 
 def _reconstructed(
-    matcher: Matcher, frames: NDArray[np.int64], job: dict[str, Any], work: Path, summary: dict[str, Any]
-) -> tuple[Matcher, pycolmap.Reconstruction]:
-    """The model of some frames with its own matcher. Raises InputError: too few frames or pairs."""
+    matcher: Matcher, frames: NDArray[np.int64], job: dict[str, Any], work: Path
+) -> tuple[tuple[Matcher, pycolmap.Reconstruction], dict[str, Any]]:
+    """The model of some frames with its own matcher, and its summary. Raises InputError: too few frames or pairs."""
     own = matcher.restricted(frames, work)
     if len(frames) < MIN_FRAMES or len(own.verified()) < 2:
         raise InputError(f"{len(frames)} frames share no view with others; film slower, or with more overlap")
-    return own, reconstruct(own, job, work, summary)
+    summary = _new_summary()
+    return (own, reconstruct(own, job, work, summary)), summary
+
+
+def _new_summary() -> dict[str, Any]:
+    return {"near_pairs": 0, "outliers": [], "registered_anew": [], "joined": []}
 
 
 def _is_one(solved: tuple[Matcher, pycolmap.Reconstruction], a: NDArray[np.int64], b: NDArray[np.int64]) -> bool:
