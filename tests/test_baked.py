@@ -10,7 +10,7 @@ from twin import runtime
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
-from twin.nerf.baked import BakedField
+from twin.nerf.baked import BakedField, BakedSection
 from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
 from twin.nerf.kernels import bricks
 from twin.nerf.lightings import Lightings
@@ -74,7 +74,14 @@ def baked(raw, layout: BrickLayout = LAYOUT) -> BakedField:
         **networks(),
     }
     names = Lightings(("day", "night"), np.eye(2, 4, dtype=np.float32), ("day/0",), np.ones((1, 4), np.float32))
-    return BakedField(layout, names, arrays | skip_distances(layout, arrays))
+    return baked_of_arrays(layout, names, arrays | skip_distances(layout, arrays))
+
+
+def baked_of_arrays(layout: BrickLayout, lightings: Lightings, arrays) -> BakedField:
+    """A baked field of one section from all its arrays, those of the networks included."""
+    shared = {name: array for name, array in arrays.items() if name.startswith(("network.", "probes."))}
+    section = {name: array for name, array in arrays.items() if name not in shared}
+    return BakedField([BakedSection(layout, section)], lightings, shared)
 
 
 def camera_at(eye=(-3.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)) -> np.ndarray:
@@ -118,13 +125,14 @@ def test_march_stops_at_given_depths(distance, opacity):
 
 def slow_march(field: BakedField, eye: np.ndarray, directions: np.ndarray, step: float) -> np.ndarray:
     """Opacity and features along rays (k, 3) by small equal steps through the near box, shape (k, 16)."""
-    near = brick_indices(field.layout, field.arrays["near"], field.arrays["far"])[0]
-    low, scale = field.arrays["low"].astype(float), field.arrays["step"].astype(float)
+    layout, arrays = field.sections[0].layout, field.sections[0].arrays
+    near = brick_indices(layout, arrays["near"], arrays["far"])[0]
+    low, scale = arrays["low"].astype(float), arrays["step"].astype(float)
     total, transmittance = np.zeros((len(directions), 16)), np.ones(len(directions))
-    for t in np.arange(field.layout.near_plane + step / 2, 12.0, step):
-        b = ((eye + directions * t - field.layout.centre) / field.layout.half + 1) / 2
+    for t in np.arange(layout.near_plane + step / 2, 12.0, step):
+        b = ((eye + directions * t - layout.centre) / layout.half + 1) / 2
         inside = ((b >= 0) & (b < 1)).all(1)
-        p = b.clip(0, 1 - 1e-9) * field.layout.near_shape
+        p = b.clip(0, 1 - 1e-9) * layout.near_shape
         slot = near[tuple(np.floor(p).astype(int).T)]
         c = (p - np.floor(p)) * bricks.CELLS
         cell = np.minimum(np.floor(c).astype(int), bricks.CELLS - 1)
@@ -132,9 +140,9 @@ def slow_march(field: BakedField, eye: np.ndarray, directions: np.ndarray, step:
         for corner in np.ndindex(2, 2, 2):
             x, y, z = (cell + corner).T
             weight = np.prod(np.where(np.array(corner) == 1, c - cell, 1 - (c - cell)), axis=1)
-            code = field.arrays["features"][slot, (x * bricks.CORNERS + y) * bricks.CORNERS + z]
+            code = arrays["features"][slot, (x * bricks.CORNERS + y) * bricks.CORNERS + z]
             value += weight[:, None] * (low + scale * code)
-        optical = np.where(inside, field.layout.density_unit * np.exp(value[:, 0]) * step, 0.0)
+        optical = np.where(inside, layout.density_unit * np.exp(value[:, 0]) * step, 0.0)
         weight = transmittance * -np.expm1(-optical)
         total += weight[:, None] * value
         transmittance *= np.exp(-optical)
@@ -165,7 +173,7 @@ def test_march_equals_the_reference():
 
 def test_skip_distances_never_pass_an_occupied_block():
     rng = np.random.default_rng(2)
-    sparse = dict(baked(wall(1.0, 11.0)).arrays)
+    sparse = dict(baked(wall(1.0, 11.0)).sections[0].arrays)
     sparse["features"] = np.zeros_like(sparse["features"])
     for _ in range(6):
         sparse["features"][rng.integers(len(sparse["near"])), rng.integers(729), 0] = 255
@@ -195,7 +203,7 @@ def test_image_does_not_depend_on_other_lightings_of_the_batch():
     head = networks(dim)
     head["network.head.0"][-dim:] = rng.normal(0, 0.1, (dim, 8))
     names = Lightings(("day",), np.zeros((1, dim), np.float32), (), np.zeros((0, dim), np.float32))
-    field = BakedField(LAYOUT, names, bare.arrays | head)
+    field = baked_of_arrays(LAYOUT, names, bare.sections[0].arrays | head)
     lights = rng.normal(0, 1, (16, 32)).astype(np.float32)
     for n in (2, 3, 8, 16):
         together = field.render(Viewpoints.of(np.tile(camera_at(), (n, 1, 1)), K, SIZE), lights[:n])
@@ -251,8 +259,8 @@ def test_random_lightings_are_equal_after_loading(tmp_path):
         bare.sample_lighting(np.random.default_rng(0))
     rng = np.random.default_rng(3)
     rays = rng.normal(size=(50, 15)).astype(np.float32), rng.normal(size=(50, 16)).astype(np.float32)
-    arrays = {**bare.arrays, "probes.features": rays[0], "probes.harmonics": rays[1]}
-    field = BakedField(LAYOUT, bare.lightings_by_name, arrays)
+    arrays = {**bare.sections[0].arrays, **bare.networks, "probes.features": rays[0], "probes.harmonics": rays[1]}
+    field = baked_of_arrays(LAYOUT, bare.lightings_by_name, arrays)
     field.save(tmp_path)
     again = BakedField.load(tmp_path)
     drawn = field.sample_lighting(np.random.default_rng(0))

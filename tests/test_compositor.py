@@ -106,7 +106,7 @@ def test_obstacle_behind_a_half_transparent_layer(box, raw):
     out = Compositor(model, field, SIZE, shaded=False).render([data], "day")
     front = field.render(view(data), "day", stop=np.full((1, SIZE[1], SIZE[0]), 3.5))
     middle = np.s_[0, SIZE[1] // 2, SIZE[0] // 2]
-    held = 1.0 - np.exp(-field.layout.density_unit * np.exp(raw) * 1.0)
+    held = 1.0 - np.exp(-field.sections[0].layout.density_unit * np.exp(raw) * 1.0)
     assert front.opacity[middle] == pytest.approx(held, abs=0.06)
     expected = front.opacity[middle] * front.rgb[middle] + (1.0 - front.opacity[middle]) * np.array(COLOR)
     assert np.abs(out.rgb[middle] - expected).max() < 0.01

@@ -10,7 +10,7 @@ from twin.errors import InputError
 from twin.geometry.cameras import SparsePoints, Viewpoints
 from twin.geometry.poses import look_at
 from twin.nerf.bake import bake
-from twin.nerf.baked import BakedField
+from twin.nerf.baked import BakedField, BakedSection
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.detail import fit_detail
 from twin.nerf.kernels import surface_detail as kernels
@@ -196,7 +196,7 @@ def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path):
     before = plain.render(view, "day")
     fields = []
     for _ in range(2):
-        fields.append(BakedField(plain.layout, plain.lightings_by_name, dict(plain.arrays)))
+        fields.append(plain.alone(0))
         facts = fit_detail(fields[-1], field.appearance, pixels, seed=0, passes=30.0)
         assert facts["pixels"] > 100 and facts["psnr_after"] > facts["psnr_before"] + 0.2
     after, again = (f.render(view, "day") for f in fields)
@@ -209,16 +209,17 @@ def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path):
     fields[0].save(tmp_path)
     assert np.array_equal(BakedField.load(tmp_path).render(view, "day").rgb, after.rgb)
     # A file that a kernel would read beyond its ends is refused.
-    texels, tiles = fields[0].arrays["detail.texels"], fields[0].arrays["detail.tiles"]
+    texels, tiles = fields[0].sections[0].arrays["detail.texels"], fields[0].sections[0].arrays["detail.tiles"]
     for name, value in (
         ("texels", texels[:-1]),
         ("tiles", tiles - 10**6),
         ("tiles", tiles + 10**6),
-        ("vertices", fields[0].arrays["detail.vertices"][:12]),
+        ("vertices", fields[0].sections[0].arrays["detail.vertices"][:12]),
         ("sides", np.zeros(3)),
         ("heights", np.zeros((2, 2, 2), np.float32)),
     ):
-        fields[1].arrays = fields[0].arrays | {f"detail.{name}": value}
+        section = BakedSection(fields[0].sections[0].layout, fields[0].sections[0].arrays | {f"detail.{name}": value})
+        fields[1].sections = (section,)
         fields[1].save(tmp_path)
         with pytest.raises(InputError, match="build the scene again"):
             BakedField.load(tmp_path)

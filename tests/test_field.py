@@ -19,7 +19,7 @@ from twin.nerf.buffers import (
     level_shapes,
     near_box_of_cameras,
 )
-from twin.nerf.field import RadianceField, untrained_field
+from twin.nerf.field import FieldSection, RadianceField, untrained_field
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid
 from twin.nerf.kernels.space import contract_points
@@ -35,13 +35,18 @@ def field() -> RadianceField:
     frames = ("day/000000", "day/000001", "night/000000")
     appearance = initial_appearance(("day", "night"), frames, np.array([0, 0, 1]), 32, seed=3)
     appearance.residuals.normal_(generator=torch.Generator().manual_seed(0))
-    return untrained_field(LAYOUT, appearance, seed=1, device="cpu")
+    return untrained_field([LAYOUT], appearance, seed=1, device="cpu")
 
 
-def random_samples(field: RadianceField, rays: int, samples: int, seed: int = 0) -> Workspace:
+@pytest.fixture
+def section(field) -> FieldSection:
+    return field.sections[0]
+
+
+def random_samples(section: FieldSection, rays: int, samples: int, seed: int = 0) -> Workspace:
     """A workspace with random but sorted samples and random network outputs."""
     rng = np.random.default_rng(seed)
-    ws = Workspace(field.layout, rays, samples, "cpu", training=True)
+    ws = Workspace(section.layout, rays, samples, "cpu", training=True)
     edges = np.sort(rng.uniform(0.5, 20.0, (rays, samples + 1)), 1)
     ws.edges.copy_(torch.from_numpy(edges))
     ws.distances.copy_(torch.from_numpy(edges[:, :-1] + rng.random((rays, samples)) * np.diff(edges)))
@@ -51,12 +56,12 @@ def random_samples(field: RadianceField, rays: int, samples: int, seed: int = 0)
     return ws
 
 
-def slow_encode(field: RadianceField, table: torch.Tensor, positions: torch.Tensor) -> torch.Tensor:
+def slow_encode(section: FieldSection, table: torch.Tensor, positions: torch.Tensor) -> torch.Tensor:
     """Trilinear hash features, differentiable, shape (n, levels · FEATURES)."""
-    cells = level_cells(field.layout.near_box, field.layout.levels, field.layout.growth)
-    shapes = level_shapes(cells, field.layout.log2_table)
+    cells = level_cells(section.layout.near_box, section.layout.levels, section.layout.growth)
+    shapes = level_shapes(cells, section.layout.log2_table)
     columns = []
-    for level in range(field.layout.levels):
+    for level in range(section.layout.levels):
         s = (positions.numpy() * cells[level]).astype(np.float32)
         base = np.floor(s).astype(np.int64)
         b = torch.from_numpy(s - base)
@@ -67,7 +72,7 @@ def slow_encode(field: RadianceField, table: torch.Tensor, positions: torch.Tens
             if dense:
                 index = x + nx * (y + ny * z)
             else:
-                index = (x ^ (y * 2654435761) ^ (z * 805459861)) & (2**field.layout.log2_table - 1)
+                index = (x ^ (y * 2654435761) ^ (z * 805459861)) & (2**section.layout.log2_table - 1)
             weight = torch.stack([b[:, k] if corner[k] else 1 - b[:, k] for k in range(3)], -1).prod(-1)
             total = total + weight[:, None] * table[level, torch.from_numpy(index)]
         columns.append(total)
@@ -79,22 +84,22 @@ def test_levels_include_dense_and_hashed_ones(field):
     assert set(shapes[:, 3]) == {0, 1}
 
 
-def test_encoding_and_its_gradient_equal_the_reference(field):
-    ws = random_samples(field, 20, 5)
-    field.query(ws, 0, 100)
-    table = field.table.clone().double().requires_grad_(True)
-    expected = slow_encode(field, table, ws.positions)
+def test_encoding_and_its_gradient_equal_the_reference(section):
+    ws = random_samples(section, 20, 5)
+    section.query(ws, 0, 100)
+    table = section.table.clone().double().requires_grad_(True)
+    expected = slow_encode(section, table, ws.positions)
     torch.testing.assert_close(ws.features.double(), expected.detach(), atol=1e-6, rtol=1e-4)
 
     gradient = torch.randn(expected.shape, generator=torch.Generator().manual_seed(2))
     expected.backward(gradient.double())
     ws.features_grad.copy_(gradient)
-    got = torch.zeros_like(field.table)
+    got = torch.zeros_like(section.table)
     for level in range(LAYOUT.levels):
         wp.launch(
             hashgrid.encode_backward,
             (1, 100),
-            [ws.w_positions, field.w_levels, level, ws.w_features_grad, wp.from_torch(got, dtype=hashgrid.Feature)],
+            [ws.w_positions, section.w_levels, level, ws.w_features_grad, wp.from_torch(got, dtype=hashgrid.Feature)],
             device="cpu",
         )
     torch.testing.assert_close(got.double(), table.grad, atol=1e-5, rtol=1e-4)
@@ -110,11 +115,11 @@ def slow_composite(raw: torch.Tensor, ws: Workspace, unit: float) -> tuple[torch
     return w, torch.cat([w.sum(1, keepdim=True), out[:, 1:]], 1), (w / ws.distances.double()).sum(1)
 
 
-def test_compositing_and_its_gradient_equal_the_reference(field):
+def test_compositing_and_its_gradient_equal_the_reference(section):
     rays, samples = 12, 7
-    ws = random_samples(field, rays, samples)
+    ws = random_samples(section, rays, samples)
     ws.targets[::2] = 6.0
-    field.composite(ws, 0, rays)
+    section.composite(ws, 0, rays)
     raw = ws.outputs.view(rays, samples, -1).double().requires_grad_(True)
     w, composited, inverse = slow_composite(raw, ws, LAYOUT.density_unit)
     torch.testing.assert_close(ws.composited.double(), composited.detach(), atol=1e-5, rtol=1e-4)
@@ -137,54 +142,54 @@ def test_compositing_and_its_gradient_equal_the_reference(field):
 
     ws.composited_grad.copy_(g)
     ws.inverse_grad.copy_(gi)
-    field.composite_backward(ws, 0, rays, distortion, depth, reach, offset)
+    section.composite_backward(ws, 0, rays, distortion, depth, reach, offset)
     torch.testing.assert_close(ws.outputs_grad.view_as(raw).double(), raw.grad, atol=2e-5, rtol=1e-3)
 
 
-def test_trunk_gradient_equals_autograd(field):
+def test_trunk_gradient_equals_autograd(section):
     generator = torch.Generator().manual_seed(4)
     features = torch.randn(50, 12, generator=generator)
-    weights = {k: v.clone().requires_grad_(True) for k, v in field.parameters.items() if k.startswith("trunk")}
+    weights = {k: v.clone().requires_grad_(True) for k, v in section.parameters.items() if k.startswith("trunk")}
     features_ = features.clone().requires_grad_(True)
     g = torch.randn(50, volume.CHANNELS, generator=generator)
     (torch.relu(features_ @ weights["trunk.0"]) @ weights["trunk.1"] * g).sum().backward()
 
     hidden, out, hidden_grad, features_grad = (torch.empty(50, n) for n in (16, volume.CHANNELS, 16, 12))
-    network.trunk(field.parameters, features, hidden, out)
-    first, second = network.trunk_backward(field.parameters, features, hidden, g, hidden_grad, features_grad)
+    network.trunk(section.parameters, features, hidden, out)
+    first, second = network.trunk_backward(section.parameters, features, hidden, g, hidden_grad, features_grad)
     torch.testing.assert_close(first, weights["trunk.0"].grad)
     torch.testing.assert_close(second, weights["trunk.1"].grad)
     torch.testing.assert_close(features_grad, features_.grad)
 
 
-def test_contraction_is_affine_in_the_near_box_and_bounded(field):
+def test_contraction_is_affine_in_the_near_box_and_bounded(section):
     points = np.array([[1.0, -2.0, 0.5], [9.0, -2.0, 0.5], [1.0 + 16.0, -2.0, 0.5], [1e9, -2.0, 0.5]], np.float32)
     out = wp.zeros(4, dtype=wp.vec3f, device="cpu")
     points = wp.array(points, dtype=wp.vec3f, device="cpu")
-    wp.launch(contract_points, 4, [points, field.contraction], [out], device="cpu")
+    wp.launch(contract_points, 4, [points, section.contraction], [out], device="cpu")
     # (2 − 1/2)/4 + 1/2 at two half sides; the horizon is mapped to the faces of the cube.
     np.testing.assert_allclose(out.numpy()[:, 0], [0.5, 0.75, 0.875, 1.0], atol=1e-5)
     np.testing.assert_allclose(out.numpy()[:, 1:], 0.5, atol=1e-6)
 
 
-def make_opaque_below(field: RadianceField, height: float) -> None:
+def make_opaque_below(section: FieldSection, height: float) -> None:
     """Makes everything below z = height [m] opaque for sampling."""
-    near, far = field.grids
-    low, high = field.bounds[:, 2]
+    near, far = section.grids
+    low, high = section.layout.near_box.bounds[:, 2]
     z = low + (np.arange(near.shape[2]) + 0.5) / near.shape[2] * (high - low)
     near[:] = torch.from_numpy(np.where(z < height, 0.99, 0.0).astype(np.float32))
     far.zero_()
 
 
-def test_samples_are_sorted_and_concentrate_at_the_surface(field):
-    make_opaque_below(field, 0.0)
-    ws = Workspace(field.layout, 64, 16, "cpu")
+def test_samples_are_sorted_and_concentrate_at_the_surface(section):
+    make_opaque_below(section, 0.0)
+    ws = Workspace(section.layout, 64, 16, "cpu")
     rng = np.random.default_rng(0)
     directions = np.stack([np.full(64, 0.6), rng.uniform(-0.3, 0.3, 64), np.full(64, -0.5)], -1)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     ws.origins[:] = torch.tensor([-2.0, -2.0, 1.5])
     ws.directions.copy_(torch.from_numpy(directions))
-    field.sample(ws, 0, 64, 0.05, seed=7)
+    section.sample(ws, 0, 64, 0.05, seed=7)
     edges, t = ws.edges.numpy(), ws.distances.numpy()
     assert (np.diff(edges, axis=1) > 0).all()
     assert (t >= edges[:, :-1]).all() and (t <= edges[:, 1:]).all()
@@ -194,15 +199,15 @@ def test_samples_are_sorted_and_concentrate_at_the_surface(field):
 
 
 @pytest.mark.parametrize("seed", [0, 3, 2147, 2148, 12345, 2**31 - 1])
-def test_samples_are_jittered_for_every_seed(field, seed):
+def test_samples_are_jittered_for_every_seed(section, seed):
     """Scene seeds as training and baking combine them with their step."""
-    make_opaque_below(field, 0.0)
-    ws = Workspace(field.layout, 64, 16, "cpu")
+    make_opaque_below(section, 0.0)
+    ws = Workspace(section.layout, 64, 16, "cpu")
     ws.origins[:] = torch.tensor([-2.0, -2.0, 1.5])
     ws.directions[:] = torch.tensor([0.6, 0.0, -0.8])
 
     def distances(step: int | None) -> np.ndarray:
-        field.sample(ws, 0, 64, 0.05, seed=None if step is None else seed * 1_000_003 + step)
+        section.sample(ws, 0, 64, 0.05, seed=None if step is None else seed * 1_000_003 + step)
         return ws.distances.numpy().copy()
 
     middles, one, again, other = distances(None), distances(5), distances(5), distances(6)
@@ -211,35 +216,35 @@ def test_samples_are_jittered_for_every_seed(field, seed):
     assert np.ptp(one, axis=0).max() > 0.1  # every ray has its own
 
 
-def test_samples_concentrate_at_a_known_distance(field):
-    ws = Workspace(field.layout, 8, 16, "cpu")
+def test_samples_concentrate_at_a_known_distance(section):
+    ws = Workspace(section.layout, 8, 16, "cpu")
     ws.origins[:] = torch.tensor([0.0, -2.0, 0.5])
     ws.directions[:] = torch.tensor([1.0, 0.0, 0.0])
     ws.targets[:4] = 5.0
-    field.sample(ws, 0, 8, 0.1, target_mass=0.5)
+    section.sample(ws, 0, 8, 0.1, target_mass=0.5)
     near = (np.abs(ws.distances.numpy() - 5.0) < 0.3).sum(1)
     assert (near[:4] >= 4).all() and (near[4:] <= 3).all()
 
 
-def make_ground(field: RadianceField, height: float) -> None:
+def make_ground(section: FieldSection, height: float) -> None:
     """A field that is opaque below z = height and empty above: feature 0 of the dense level is the depth below it."""
-    make_opaque_below(field, height)
-    cells = level_cells(field.layout.near_box, field.layout.levels, field.layout.growth)[0]
-    n = level_shapes(level_cells(field.layout.near_box, 3, 2.0), field.layout.log2_table)[0]
+    make_opaque_below(section, height)
+    cells = level_cells(section.layout.near_box, section.layout.levels, section.layout.growth)[0]
+    n = level_shapes(level_cells(section.layout.near_box, 3, 2.0), section.layout.log2_table)[0]
     vertex = np.arange(n[0] * n[1] * n[2]) // (n[0] * n[1])
-    z = field.layout.centre[2] + (vertex / cells[2] - 0.5) * 4.0 * field.layout.half[2]
-    field.table.zero_()
-    field.table[0, : len(z), 0] = torch.from_numpy(height - z)
-    field.table[0, : len(z), 1] = 1.0
+    z = section.layout.centre[2] + (vertex / cells[2] - 0.5) * 4.0 * section.layout.half[2]
+    section.table.zero_()
+    section.table[0, : len(z), 0] = torch.from_numpy(height - z)
+    section.table[0, : len(z), 1] = 1.0
     for name in ("trunk.0", "trunk.1"):
-        field.parameters[name].zero_()
-    field.parameters["trunk.0"][0, 0] = field.parameters["trunk.0"][1, 1] = 1.0
-    field.parameters["trunk.1"][0, 0] = 2000.0  # raw output: 2000 per meter of depth, from −12 on
-    field.parameters["trunk.1"][1, 0] = -12.0
+        section.parameters[name].zero_()
+    section.parameters["trunk.0"][0, 0] = section.parameters["trunk.0"][1, 1] = 1.0
+    section.parameters["trunk.1"][0, 0] = 2000.0  # raw output: 2000 per meter of depth, from −12 on
+    section.parameters["trunk.1"][1, 0] = -12.0
 
 
 def test_ground_renders_at_its_depth_and_sky_is_transparent(field):
-    make_ground(field, 0.0)
+    make_ground(field.sections[0], 0.0)
     pose = look_at(np.array([0.0, -2.0, 1.5]), np.array([4.0, -2.0, 0.0]))
     result = field.render(Viewpoints.of(pose[None], np.array([[20.0, 20.0, 16.0, 9.0]]), (32, 18)), "day")
     assert result.rgb.shape == (1, 18, 32, 3) and result.depth.shape == result.opacity.shape == (1, 18, 32)
@@ -248,7 +253,7 @@ def test_ground_renders_at_its_depth_and_sky_is_transparent(field):
     assert centre == pytest.approx(np.hypot(4.0, 1.5), rel=0.03)
     up = look_at(np.array([0.0, -2.0, 1.5]), np.array([1.0, -2.0, 4.0]))
     sky = field.render(Viewpoints.of(up[None], np.array([[20.0, 20.0, 16.0, 9.0]]), (32, 18)), "night")
-    density = field.density(np.array([[0.0, -2.0, 1.0], [0.0, -2.0, -0.3]]))
+    density = field.sections[0].density(np.array([[0.0, -2.0, 1.0], [0.0, -2.0, -0.3]]))
     assert density[0] < 1e-4 and density[1] > 100.0
     assert (sky.depth == FAR).all() and sky.opacity.max() < 0.05 and result.opacity.max() > 0.99
 
@@ -274,11 +279,11 @@ def test_save_and_load_are_the_identity(field, tmp_path):
     field.about = {"scene": "x"}
     field.save(tmp_path)
     loaded = RadianceField.load(tmp_path, "cpu")
-    assert loaded.layout == field.layout and loaded.about == field.about
+    assert loaded.sections[0].layout == field.sections[0].layout and loaded.about == field.about
     assert loaded.lightings == ("day", "night")
     np.testing.assert_array_equal(loaded.embedding("day"), field.embedding("day"))
     points = np.random.default_rng(0).normal(0.0, 5.0, (100, 3))
-    np.testing.assert_array_equal(loaded.density(points), field.density(points))
+    np.testing.assert_array_equal(loaded.sections[0].density(points), field.sections[0].density(points))
     pose = look_at(np.array([0.0, -2.0, 1.5]), np.array([4.0, -2.0, 0.0]))[None]
     k = np.array([[20.0, 20.0, 16.0, 9.0]])
     a, b = (f.render(Viewpoints.of(pose, k, (32, 18)), "night") for f in (field, loaded))
@@ -309,16 +314,16 @@ def test_near_box_contains_the_cameras_and_the_space_ahead():
     assert NearBox((0.0, 0.0, 0.0), (2.0, 3.0, 1.0)).scale == 3.0
 
 
-def test_pixel_rays_equal_unprojected_pixels(field):
+def test_pixel_rays_equal_unprojected_pixels(section):
     from twin.geometry.cameras import unproject
 
     pose = look_at(np.array([1.0, 2.0, 3.0]), np.array([4.0, -2.0, 0.0]))
     k = np.array([55.0, 50.0, 30.0, 20.0])
     cameras = CameraArrays(pose[None], k[None], "cpu")
-    ws = Workspace(field.layout, 2, 4, "cpu")
+    ws = Workspace(section.layout, 2, 4, "cpu")
     pixel = np.array([[3.5, 7.5], [60.0, 1.0]])
     ws.pixel.copy_(torch.from_numpy(pixel))
-    field.cast(ws, cameras, 0, 2)
+    section.cast(ws, cameras, 0, 2)
     local = unproject(pixel, k)
     expected = local @ pose[:3, :3].T
     np.testing.assert_allclose(ws.directions.numpy(), expected / np.linalg.norm(expected, axis=1)[:, None], atol=1e-6)

@@ -118,7 +118,7 @@ def ground_and_wall(p):
 
 def test_darker_lighting_has_less_irradiance():
     field = baked(ground_and_wall)
-    dim = dict(field.arrays)
+    dim = dict(field.networks)
     head = dim["network.head.0"].copy()
     bias = dim["network.head.2.bias"]
     # The second appearance number darkens everything by way of a unit that is otherwise unused.
@@ -129,7 +129,7 @@ def test_darker_lighting_has_less_irradiance():
     dim["network.head.2"] = out
     from twin.nerf.baked import BakedField
 
-    field = BakedField(field.layout, field.lightings_by_name, dim)
+    field = BakedField(field.sections, field.lightings_by_name, dim)
     found = IrradianceEstimator(field, ROUTE)
     day, night = found.estimate("day"), found.estimate("night")
     here = np.array([[0.0, 0.0]])

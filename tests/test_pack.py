@@ -80,7 +80,7 @@ def test_a_packed_scene_drives_as_the_built_one_bit_for_bit(root, packed, tmp_pa
 def test_replaced_samples_are_read_by_no_ray(root, packed, tmp_path):
     unpack.unpack(packed, tmp_path / "there")
     fields = [twin.load_scene(scene).field() for scene in (root, tmp_path / "there")]
-    assert (fields[0].arrays["features"] != fields[1].arrays["features"]).any()
+    assert (fields[0].sections[0].arrays["features"] != fields[1].sections[0].arrays["features"]).any()
     rng = np.random.default_rng(0)
     eyes = rng.uniform([-3, -8, 0.2], [12, 3, 2.5], (40, 3))
     poses = np.array([look_at(eye, eye + rng.normal(size=3)) for eye in eyes])

@@ -35,29 +35,29 @@ def test_correction_rotates_about_the_center_and_translates():
 def test_gradients_equal_finite_differences(cameras):
     """For Σ wᵢ·featureᵢ along rays at fixed sample distances, in the near box and outside."""
     trainer = Trainer(cameras, floor_points(cameras), REFINING, 0, "cpu")
-    ws, field, refinement = trainer.ws, trainer.field, trainer.refinement
+    ws, section, refinement = trainer.ws, trainer.field.sections[0], trainer.refinement
     assert refinement is not None
     rng = np.random.default_rng(0)
-    field.table.copy_(torch.as_tensor(rng.normal(size=field.table.shape)))
+    section.table.copy_(torch.as_tensor(rng.normal(size=section.table.shape)))
     ws.camera.copy_(torch.as_tensor(rng.integers(14, size=ws.rays)))
     ws.pixel.copy_(torch.as_tensor(rng.uniform(2, 22, (ws.rays, 2))))
     rows = ws.rays * ws.samples
     weights = torch.as_tensor(rng.normal(size=(rows, ws.features.shape[1])), dtype=torch.float32)
-    field.cast(ws, trainer.arrays, 0, ws.rays)
+    section.cast(ws, trainer.arrays, 0, ws.rays)
     ws.distances.copy_(torch.as_tensor(np.sort(rng.uniform(0.2, 6.0, ws.distances.shape), 1)))
-    centre, half = torch.tensor(field.layout.centre), torch.tensor(field.layout.half)
+    centre, half = torch.tensor(section.layout.centre), torch.tensor(section.layout.half)
 
     def value(origin: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
         """The sum per ray, shape (n,)."""
         meters = (origin[:, None] + ws.distances[..., None] * direction[:, None]).reshape(-1, 3).contiguous()
         points = wp.from_torch(meters, dtype=wp.vec3f)
-        wp.launch(space.contract_points, rows, [points, field.contraction], [ws.w_positions])
-        field.query(ws, 0, rows)
+        wp.launch(space.contract_points, rows, [points, section.contraction], [ws.w_positions])
+        section.query(ws, 0, rows)
         return (ws.features[:rows].double() * weights).sum(1).view(ws.rays, -1).sum(1)
 
     value(ws.origins, ws.directions)
     ws.features_grad[:rows].copy_(weights)
-    refinement.backward(field, 0, ws.rays)
+    refinement.backward(section, 0, ws.rays)
     meters = ws.origins[:, None] + ws.distances[..., None] * ws.directions[:, None]
     outside = (((meters - centre) / half).abs().amax(-1) > 1.0).sum()
     assert 50 < outside < rows - 50
@@ -132,7 +132,7 @@ def test_refinement_is_bit_equal(cameras):
             while not trainer.done:
                 trainer.step()
         assert trainer.refinement is not None
-        return trainer.refinement.rotation.detach(), trainer.field.table
+        return trainer.refinement.rotation.detach(), trainer.field.sections[0].table
 
     first, second = once(), once()
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True)) and first[0].abs().max() > 0.0

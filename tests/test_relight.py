@@ -30,7 +30,7 @@ def small_field(seed: int = 0) -> RadianceField:
     frames = tuple(f"day/{i:06d}" for i in range(4))
     appearance = initial_appearance(("day", "night"), frames, np.zeros(4, np.int64), 8, seed)
     layout = Layout((0.0, 0.0, 0.0), (8.0, 8.0, 4.0), 0.1, 4, 2.0, 10, 32, 8)
-    return untrained_field(layout, appearance, seed, "cpu")
+    return untrained_field([layout], appearance, seed, "cpu")
 
 
 @pytest.fixture(scope="module")

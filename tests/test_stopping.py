@@ -50,7 +50,7 @@ def _corridor(root: Path) -> Path:
     layout = Layout((0.0, 0.0, 0.0), (8.0, 8.0, 4.0), 0.1, 4, 2.0, 10, 32, 8)
     for stage in ("field", "mesh"):
         scene.stage(stage).mkdir()
-    untrained_field(layout, appearance, 0, "cpu").save(scene.stage("field"))
+    untrained_field([layout], appearance, 0, "cpu").save(scene.stage("field"))
     for stage in ("capture", "cameras", "metric", "field", "mesh"):
         write_stamp(scene.stage(stage), stage)
     return root

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from test_baked import LOW, STEP, networks, places
+from test_baked import LOW, STEP, baked_of_arrays, networks, places
 from tiny_world import tiny_config, tiny_ground, tiny_scene
 
 from twin.mjcf.scene_xml import run
@@ -83,4 +83,4 @@ def tiny_field(boxes) -> BakedField:
     vectors = np.eye(2, 4, dtype=np.float32)
     frames = np.repeat(vectors, 4, 0) + rng.normal(0, 0.1, (8, 4)).astype(np.float32)
     names = Lightings(("day", "night"), vectors, tuple(f"{n}/{k}" for n in ("day", "night") for k in range(4)), frames)
-    return BakedField(layout, names, arrays | skip_distances(layout, arrays), "cpu")
+    return baked_of_arrays(layout, names, arrays | skip_distances(layout, arrays))

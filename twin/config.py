@@ -243,6 +243,9 @@ class NerfConfig:
     appearance_dim: Annotated[int, Range(1, 1024)] = 32
     levels: Annotated[int, Range(1, 32)] = 8
     log2_table: Annotated[int, Range(1, 24)] = 18
+    section_length: Annotated[float, Range(0, 100_000)] = 65.0
+    """A longer road is divided into sections of about this length [m], each with `steps`, `max_bricks` and hash tables
+    of its own; 0 = one section."""
     near_half_extent: Annotated[float, Range(0, 100)] = 0.0
     """Half side of the near box, in which space is not contracted [m]; 0 = from the camera positions."""
     near_plane: Annotated[float, Range(0, 100)] = 0.3

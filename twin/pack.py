@@ -16,6 +16,7 @@ that number of values, which makes the pack smaller and changes the field.
 import argparse
 import csv
 import io
+import re
 import sys
 import zipfile
 from collections.abc import Sequence
@@ -35,7 +36,9 @@ from twin.errors import InputError
 from twin.files import atomic_path, digest_json, json_bytes, load_tensors, read_bytes, read_json, read_toml, toml_value
 from twin.learn.policy import JSON, ONNX, WEIGHTS, find_policy, load_policy
 from twin.loading import Twin, load_scene
+from twin.nerf.baked import section_file, stored_layouts
 from twin.nerf.brick_layout import BrickLayout, samples_read
+from twin.nerf.road import ROAD_FILE
 from twin.scene import STAGES, SceneDir, Stamp, package_versions, require_stage, stage_result
 
 LEVELS = 256
@@ -44,6 +47,7 @@ _ZERO = 128  # byte that stands for 0 in the detail; rounding gives values at mu
 _FINER = 4  # step of features / step of density; density is rounded less because it determines surfaces
 _VERTEX_STEP = 2  # step of the hash grid's vertices / step of features
 _PACKED = {"metric": ("cameras.json", "cameras.npz"), "field": ("baked.json", "baked.safetensors")}
+_IS_BAKED = re.compile(r"/baked(_\d+)?\.safetensors$")
 _MESH = ("ground.npz", "parts.npz", "visual.npz")
 _TEXT = """\
 A pack of {name}, made by twin {version}: a place to drive in, on MuJoCo, as `twin build` made it from films.
@@ -182,10 +186,11 @@ def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
         stamp = Stamp.verified(folder)
         results[stage] = stamp.result
         if stage == "field":
-            layout = BrickLayout(**_tuples(read_json(folder / "baked.json")["layout"]))
-            kept["baked.safetensors"] = to_bytes(
-                packed_field(layout, load_tensors(folder / "baked.safetensors"), levels)
-            )
+            for k, layout in enumerate(stored_layouts(read_json(folder / "baked.json"))):
+                name = section_file(k)
+                kept[name] = to_bytes(packed_field(layout, load_tensors(folder / name), levels))
+            if (folder / ROAD_FILE).exists():
+                kept[ROAD_FILE] = read_bytes(folder / ROAD_FILE)
             if levels < LEVELS:
                 results[stage] = digest_json([stamp.result, levels])
         sizes = {name: len(content) for name, content in kept.items()}
@@ -196,12 +201,8 @@ def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
     return results["field"]
 
 
-def _tuples(table: dict[str, Any]) -> dict[str, Any]:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
-
-
 def packed_field(layout: BrickLayout, arrays: dict[str, NDArray], levels: int = LEVELS) -> dict[str, NDArray]:
-    """The arrays of a baked field (see `BakedField`) for a pack.
+    """The arrays of a section (see `BakedSection`) for a pack.
 
     Samples that no ray reads become copies of the preceding sample, which compress to almost nothing. With `levels`
     below 256, densities and features are rounded.
@@ -228,7 +229,7 @@ def rounded(values: NDArray[np.uint8], step: float) -> NDArray[np.uint8]:
 
 
 def _write(out: Path, files: dict[str, bytes], head: dict[str, Any], trust: bool) -> dict[str, Any]:
-    coded = {name: unpack.DIFFERENCES if name.endswith("baked.safetensors") else unpack.PLAIN for name in files}
+    coded = {name: unpack.DIFFERENCES if _IS_BAKED.search(name) else unpack.PLAIN for name in files}
     facts = {
         name: {"bytes": len(content), "sha256": unpack.digest(content), "coding": coded[name]}
         for name, content in sorted(files.items())

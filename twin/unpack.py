@@ -55,7 +55,7 @@ _N = r"\w[\w.+-]{0,99}"  # a name in a path; it cannot begin with a dot, so ".."
 _PLACES = re.compile(
     rf"scene\.toml|robot\.toml|positions\.csv|lightings/{_N}\.json"
     rf"|build/{STAGES['metric']}/(cameras\.(json|npz)|stamp\.json)"
-    rf"|build/{STAGES['field']}/(baked\.(json|safetensors)|stamp\.json)"
+    rf"|build/{STAGES['field']}/(baked\.json|baked(_[1-9][0-9]{{0,3}})?\.safetensors|road\.safetensors|stamp\.json)"
     rf"|build/{STAGES['mesh']}/({_N}\.(npz|png)|stamp\.json)"
     rf"|build/{STAGES['mjcf']}/(scene\.xml|world\.json|stamp\.json|assets/{_N}\.(obj|png|bin))"
     rf"|runs/{_N}/(checkpoints/{_N}/)?policy\.(json|safetensors|onnx)|policies/{_N}\.(onnx|zip)"

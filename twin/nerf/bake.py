@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from twin.errors import InputError
 from twin.nerf import network
-from twin.nerf.baked import BakedField
+from twin.nerf.baked import BakedField, BakedSection
 from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
 from twin.nerf.buffers import CameraArrays, Workspace, in_batches, parallel, single_threaded_torch, warp_view
 from twin.nerf.dataset import TrainingPixels
-from twin.nerf.field import QUERY_POINTS, RadianceField
+from twin.nerf.field import QUERY_POINTS, FieldSection, RadianceField
 from twin.nerf.kernels import bricks as kernels
 from twin.nerf.kernels import composite as volume
 from twin.runtime import bar
@@ -52,40 +52,63 @@ def bake(
         pixels: The frames that the field was trained on.
         seed: Seed of the fine-tuning batches.
         steps: Fine-tuning steps, at least 1.
-        max_bricks: Cells grow until there are at most this many bricks (9,000 are 105 MB), or `_EXTRA_BRICKS` times as
-            many if cells would exceed `_LARGE_CELL`, as on a long road.
+        max_bricks: In each section, cells grow until there are at most this many bricks (9,000 are 105 MB), or
+            `_EXTRA_BRICKS` times as many if cells would exceed `_LARGE_CELL`, as in a long section.
 
     Raises:
         InputError: no training camera sees a surface in the field.
     """
     began = time.perf_counter()
-    near, far = _surface_positions(field, pixels)
+    sections, facts = [], []
+    for k, frames in enumerate(field.road.frames(pixels.cameras.positions)):
+        section, about = _bake_section(field, k, pixels.of_frames(frames), seed + k, steps, max_bricks)
+        sections.append(section)
+        facts.append(about)
+    networks = {
+        f"network.{k}": v.detach().cpu().numpy() for k, v in field.parameters.items() if not k.startswith("trunk")
+    }
+    networks |= _probes(field, pixels, seed)
+    baked = BakedField(sections, field.appearance.named(), networks, field.device, field.about, field.road)
+    return baked, {
+        "bricks_near": sum(one["bricks_near"] for one in facts),
+        "bricks_far": sum(one["bricks_far"] for one in facts),
+        "cell_m": max(one["cell_m"] for one in facts),
+        "bytes": baked.bytes,
+        "fine_tune_psnr": float(np.mean([one["fine_tune_psnr"] for one in facts])),
+        "seconds": time.perf_counter() - began,
+    }
+
+
+def _bake_section(
+    field: RadianceField, k: int, pixels: TrainingPixels, seed: int, steps: int, max_bricks: int
+) -> tuple[BakedSection, dict[str, Any]]:
+    """Bakes section k from the pixels that train it, see `bake`."""
+    section = field.sections[k]
+    near, far = _surface_positions(section, pixels)
     if not len(near) and not len(far):
         raise InputError(
             "no training camera sees anything in the trained field, so there is nothing to bake; raise nerf.steps; if "
             "nerf.near_plane or nerf.near_half_extent was changed, restore its default"
         )
-    layout, slots = _layout(field, near, far, max_bricks)
+    layout, slots = _layout(section, near, far, max_bricks)
     if layout.near_side.max() / kernels.CELLS > _LARGE_CELL:
-        layout, slots = _layout(field, near, far, round(_EXTRA_BRICKS * max_bricks))
-    values = _sample_bricks(field, layout, slots)
-    psnr = _FineTuner(field, pixels, layout, slots, values, steps, seed).run()
-    arrays = _quantized(values, slots, field, layout) | _probes(field, pixels, seed)
-    baked = BakedField(layout, field.appearance.named(), arrays, field.device, field.about)
-    return baked, {
+        layout, slots = _layout(section, near, far, round(_EXTRA_BRICKS * max_bricks))
+    values = _sample_bricks(section, layout, slots)
+    psnr = _FineTuner(field, section, pixels, layout, slots, values, steps, seed).run()
+    return BakedSection(layout, _quantized(values, slots, layout)), {
         "bricks_near": len(slots[0]),
         "bricks_far": len(slots[1]),
         "cell_m": float(layout.near_side.max()) / kernels.CELLS,
-        "bytes": baked.bytes,
         "fine_tune_psnr": psnr,
-        "seconds": time.perf_counter() - began,
     }
 
 
-def _surface_positions(field: RadianceField, pixels: TrainingPixels) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _surface_positions(
+    section: FieldSection, pixels: TrainingPixels
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Grid positions of surface samples seen by the training cameras, (a, 3) in the near box and (b, 3) outside."""
-    cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, field.device)
-    frames = np.unique(np.linspace(0, len(pixels.cameras) - 1, _VIEWS).round().astype(int))
+    cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, section.device)
+    frames = pixels.frames[np.unique(np.linspace(0, len(pixels.frames) - 1, _VIEWS).round().astype(int))]
     spots: list[tuple[NDArray, NDArray]] = [(np.zeros((0, 3), "f4"),) * 2] * len(frames)
 
     with bar("finding surfaces", len(spots), "view") as progress:
@@ -97,28 +120,28 @@ def _surface_positions(field: RadianceField, pixels: TrainingPixels) -> tuple[ND
             height = max(1, round(width * pixels.height[i] / pixels.width[i]))
             v, u = (np.mgrid[:height, :width] + 0.5) * (pixels.width[i] / width)
             n = width * height
-            with field.workspace(n, _SAMPLES) as ws:
+            with section.workspace(n, _SAMPLES) as ws:
                 ws.camera.fill_(i)
                 ws.pixel.copy_(torch.as_tensor(np.stack([u.ravel(), v.ravel()], -1).astype(np.float32)))
-                field.cast(ws, cameras, 0, n)
-                field.sample(ws, 0, n, 0.02)
-                field.query(ws, 0, n * _SAMPLES)
-                field.composite(ws, 0, n)
+                section.cast(ws, cameras, 0, n)
+                section.sample(ws, 0, n, 0.02)
+                section.query(ws, 0, n * _SAMPLES)
+                section.composite(ws, 0, n)
                 seen = ws.positions[: n * _SAMPLES][ws.weights.reshape(-1) > _MIN_WEIGHT].cpu().numpy()
             inside = ((seen >= 0.25) & (seen < 0.75)).all(1)
             spots[k] = seen[inside].copy(), seen[~inside].copy()
             progress.update()
 
         with single_threaded_torch():
-            parallel(find, range(len(spots)), field.device)
+            parallel(find, range(len(spots)), section.device)
     return np.concatenate([a for a, _ in spots]), np.concatenate([b for _, b in spots])
 
 
 def _layout(
-    field: RadianceField, near: NDArray, far: NDArray, max_bricks: int
+    section: FieldSection, near: NDArray, far: NDArray, max_bricks: int
 ) -> tuple[BrickLayout, tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """The finest layout with at most `max_bricks` bricks around surfaces, and the near and far bricks, each (s, 3)."""
-    half = np.array(field.layout.half)
+    half = np.array(section.layout.half)
     cell = _MIN_CELL
     while True:
         near_shape = np.maximum(np.ceil(2 * half / (cell * kernels.CELLS)), 1).astype(int)
@@ -133,7 +156,7 @@ def _layout(
         cell *= max(_COARSENING, (count / max_bricks) ** 0.4)
     shapes = [tuple(int(x) for x in shape) for shape in (near_shape, far_shape)]
     layout = BrickLayout(
-        *(field.layout.centre, field.layout.half, field.layout.near_plane, field.layout.density_unit),
+        *(section.layout.centre, section.layout.half, section.layout.near_plane, section.layout.density_unit),
         *shapes,  # type: ignore[arg-type]
     )
     return layout, slots
@@ -151,22 +174,22 @@ def _bricks_around(spots: NDArray, shape: NDArray) -> NDArray[np.int64]:
     return np.argwhere(marked)
 
 
-def _sample_bricks(field: RadianceField, layout: BrickLayout, slots: tuple[NDArray, NDArray]) -> torch.Tensor:
+def _sample_bricks(section: FieldSection, layout: BrickLayout, slots: tuple[NDArray, NDArray]) -> torch.Tensor:
     """Raw densities and features of the field at all brick samples, shape (s, 729, CHANNELS)."""
     grid = np.stack(np.meshgrid(*[np.arange(kernels.CORNERS)] * 3, indexing="ij"), -1).reshape(-1, 3) / kernels.CELLS
     near = (slots[0][:, None] + grid) / np.array(layout.near_shape) * 0.5 + 0.25
     far = (slots[1][:, None] + grid) / np.array(layout.far_shape)
     positions = np.concatenate([near.reshape(-1, 3), far.reshape(-1, 3)]).astype(np.float32).clip(0.0, 1.0 - 1e-6)
-    values = torch.empty(len(positions), volume.CHANNELS, device=field.device)
+    values = torch.empty(len(positions), volume.CHANNELS, device=section.device)
 
     def query(rows: slice) -> None:
         n = rows.stop - rows.start
-        with field.workspace(0, 1, QUERY_POINTS) as ws:
-            ws.positions[:n] = torch.as_tensor(positions[rows], device=field.device)
-            field.query(ws, 0, n)
+        with section.workspace(0, 1, QUERY_POINTS) as ws:
+            ws.positions[:n] = torch.as_tensor(positions[rows], device=section.device)
+            section.query(ws, 0, n)
             values[rows] = ws.outputs[:n]
 
-    in_batches(query, len(positions), QUERY_POINTS, field.device)
+    in_batches(query, len(positions), QUERY_POINTS, section.device)
     values[:, 0].clamp_(*_RAW_RANGE)
     return values.view(-1, kernels.SAMPLES, volume.CHANNELS)
 
@@ -177,6 +200,7 @@ class _FineTuner:
     def __init__(
         self,
         field: RadianceField,
+        section: FieldSection,
         pixels: TrainingPixels,
         layout: BrickLayout,
         slots: tuple[NDArray, NDArray],
@@ -184,7 +208,14 @@ class _FineTuner:
         steps: int,
         seed: int,
     ):
-        self.field, self.pixels, self.steps, self.values, self.seed = field, pixels, steps, values, seed
+        self.field, self.section, self.pixels, self.steps, self.values, self.seed = (
+            field,
+            section,
+            pixels,
+            steps,
+            values,
+            seed,
+        )
         device = field.device
         self.index: Any = kernels.BrickIndex()
         near, far = brick_indices(layout, *slots)
@@ -194,7 +225,7 @@ class _FineTuner:
         self.w_values, self.w_gradient = warp_view(values, volume.Channels), warp_view(self.gradient, volume.Channels)
         self.w_second = warp_view(self.second, wp.vec2f)
         self.rays = -(-_RAYS // _SHARDS) * _SHARDS
-        self.ws = Workspace(field.layout, self.rays, _SAMPLES, device, training=True)
+        self.ws = Workspace(section.layout, self.rays, _SAMPLES, device, training=True)
         self.cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, device)
 
     def run(self) -> float:
@@ -217,12 +248,12 @@ class _FineTuner:
         return float(-10 * np.log10(np.mean(errors[-max(1, self.steps // 10) :])))
 
     def _backward(self, shard: int, color: torch.Tensor, step: int) -> float:
-        f, ws = self.field, self.ws
+        f, s, ws = self.field, self.section, self.ws
         count = self.rays // _SHARDS
         start = shard * count
         rays, samples = slice(start, start + count), slice(start * _SAMPLES, (start + count) * _SAMPLES)
-        f.cast(ws, self.cameras, start, count)
-        f.sample(ws, start, count, 0.02, seed=self.seed * 1_000_003 + step)
+        s.cast(ws, self.cameras, start, count)
+        s.sample(ws, start, count, 0.02, seed=self.seed * 1_000_003 + step)
         wp.launch(
             kernels.interpolate,
             count * _SAMPLES,
@@ -230,7 +261,7 @@ class _FineTuner:
             [ws.w_outputs],
             device=f.device,
         )
-        f.composite(ws, start, count)
+        s.composite(ws, start, count)
         composited = ws.composited[rays].detach().requires_grad_(True)
         harmonics = network.spherical_harmonics(ws.directions[rays])
         features = network.ray_features(f.parameters, composited, harmonics)
@@ -241,7 +272,7 @@ class _FineTuner:
         with torch.no_grad():
             ws.composited_grad[rays] = gradient
             ws.inverse_grad[rays] = 0.0
-            f.composite_backward(ws, start, count)
+            s.composite_backward(ws, start, count)
         return float((error.detach() ** 2).mean())
 
     def _update(self, part: int, rate: float, step: int) -> None:
@@ -275,10 +306,8 @@ def _probes(field: RadianceField, pixels: TrainingPixels, seed: int) -> dict[str
     return {"probes.features": features.cpu().numpy(), "probes.harmonics": harmonics.cpu().numpy()}
 
 
-def _quantized(
-    values: torch.Tensor, slots: tuple[NDArray, NDArray], field: RadianceField, layout: BrickLayout
-) -> dict[str, NDArray]:
-    """The arrays of a `BakedField`, with values as bytes. Overwrites `values`."""
+def _quantized(values: torch.Tensor, slots: tuple[NDArray, NDArray], layout: BrickLayout) -> dict[str, NDArray]:
+    """The arrays of a `BakedSection`, with values as bytes. Overwrites `values`."""
     flat = values.view(-1, volume.CHANNELS)
     dense = torch.nonzero(flat[:, 0] > 0.0)[:, 0]
     some = flat[dense[:: max(1, len(dense) // 200_000)] if len(dense) else slice(None, None, 100)].cpu().numpy()
@@ -294,6 +323,4 @@ def _quantized(
         "low": low,
         "step": step,
     }
-    parameters = {k: v for k, v in field.parameters.items() if not k.startswith("trunk")}
-    arrays |= {f"network.{k}": v.detach().cpu().numpy() for k, v in parameters.items()}
     return arrays | skip_distances(layout, arrays)

@@ -2,15 +2,16 @@
 
 `kernels/bricks.py` defines the bricks, `brick_layout.py` their layout. The two per-ray networks, head and background
 (`network.py`), are stored beside them. A lighting is one vector, so one baked field renders the place under every
-lighting.
+lighting. A long road has several sections (`road.py`), which are read from disk when a camera first needs them.
 """
 
 import copy
 import itertools
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from twin.errors import InputError, short_repr
 from twin.files import check_shapes, load_tensors, read_json, require_text, wrap_read_errors, write_json
 from twin.geometry.cameras import PosedCameras, intrinsics_for_size
 from twin.nerf.appearance_prior import Probes
-from twin.nerf.brick_layout import BrickLayout, brick_indices, check_arrays, density_codes, stored_skips
+from twin.nerf.brick_layout import BrickLayout, brick_indices, check_arrays, check_networks, density_codes, stored_skips
 from twin.nerf.fog import Fog
 from twin.nerf.kernels import march as kernels
 from twin.nerf.kernels import surface_detail as detail_kernels
@@ -33,6 +34,7 @@ from twin.nerf.kernels.color_head import LANES as HEAD_LANES
 from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import Rendering
+from twin.nerf.road import Road, undivided_road
 from twin.nerf.sun import Sun, Sunlight
 from twin.nerf.surface_features import Detail, detail_grid
 from twin.runtime import available_cores, bar
@@ -40,46 +42,47 @@ from twin.types import Array32
 from twin.warp_runtime import wp
 
 _FORMAT = 2
-# Largest number of render targets that are kept, one per number of cameras and image size; the least recently used one
-# is dropped. A vector env renders either all its envs or those that reset, whose number varies.
+# Largest number of render targets that are kept per section, one per number of cameras and image size; the least
+# recently used one is dropped. A vector env renders either all its envs or those that reset, whose number varies.
 _MAX_TARGETS = 4
+_MAX_RESIDENT = 8  # sections that are kept in memory, about 150 MB each
 
 
-class BakedField:
-    """Density and color of a place under every lighting it was filmed in, ready to render."""
+class BakedSection:
+    """Bricks and detail of one section of the road, in memory or in a file that is read on demand."""
 
-    def __init__(
-        self,
-        layout: BrickLayout,
-        lightings: Lightings,
-        arrays: dict[str, NDArray],
-        device: str = "cpu",
-        about: dict[str, Any] | None = None,
-    ):
+    def __init__(self, layout: BrickLayout, arrays: dict[str, NDArray] | None = None, file: Path | None = None):
         """
         Args:
             layout: Sizes and bounds.
-            lightings: Appearance embeddings by name.
             arrays: `near` and `far` (the stored bricks in their grids, (s, 3)), `features` (s, 729, CHANNELS) bytes,
                 near bricks first, `low` and `step` (CHANNELS,) of the quantization, `near_leap` and `far_leap` (see
-                `brick_layout.skip_distances`), `network.*`, and for random lightings `probes.*` (see
-                `appearance_prior.Probes`).
-            device: `cpu` or `cuda`.
-            about: JSON-able metadata stored with the field.
+                `brick_layout.skip_distances`), and those of `Detail.arrays`.
+            file: A file with these arrays, if they are not given.
         """
-        self.layout, self.lightings_by_name, self.about, self.device = layout, lightings, about or {}, device
-        self.arrays = arrays
-        p = self.network
-        if "probes.features" in arrays:
-            probes = Probes(arrays["probes.features"], arrays["probes.harmonics"], p)
-            self.lightings_by_name = replace(lightings, probes=probes)
+        self.layout, self._arrays, self._file = layout, arrays, file
+
+    @property
+    def arrays(self) -> dict[str, NDArray]:
+        """The arrays. Raises InputError if the file is damaged."""
+        if self._arrays is not None:
+            return self._arrays
+        assert self._file is not None
+        arrays = load_tensors(self._file)
+        with wrap_read_errors(self._file, "build the scene again"):
+            check_arrays(self.layout, arrays)
+            Detail.of_arrays(arrays)
+        return arrays
+
+
+class _SectionOnDevice:
+    """Bricks and detail as the kernels read them."""
+
+    def __init__(self, section: BakedSection, device: str):
+        layout, arrays = section.layout, section.arrays
 
         def on_device(array: NDArray, dtype: Any) -> Any:
-            if device == "cpu":  # NumPy allocates large arrays on huge pages, where random reads cost less
-                own = np.empty(array.shape, array.dtype)
-                own[...] = array
-                return wp.array(own, dtype=dtype, device=device, copy=False)
-            return wp.array(np.ascontiguousarray(array), dtype=dtype, device=device)
+            return _on_device(array, dtype, device)
 
         b: Any = Bricks()
         near_index, far_index = brick_indices(layout, arrays["near"], arrays["far"])
@@ -96,10 +99,64 @@ class BakedField:
         b.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
         b.near_cell, b.far_cell = layout.near_cell, layout.far_cell
         b.unit, b.near_plane = layout.density_unit, layout.near_plane
-        self._bricks = b
+        self.bricks = b
+        detail = Detail.of_arrays(arrays)
+        stored: Any = detail_kernels.DetailBytes()
+        stored.texels = wp.array(detail.texels, dtype=Bytes, device=device)
+        stored.vertices = wp.array(detail.vertices, dtype=Bytes, device=device)
+        stored.texel_step, stored.vertex_step = (
+            Channels(*step.tolist()) for step in (detail.texel_step, detail.vertex_step)
+        )
+        self.detail = detail_grid(detail, device), stored
+        self.has_detail = bool(len(detail.tiles) or len(detail.vertices))
+
+
+def _on_device(array: NDArray, dtype: Any, device: str) -> Any:
+    """A copy of an array on a device."""
+    if device == "cpu":  # NumPy allocates large arrays on huge pages, where random reads cost less
+        own = np.empty(array.shape, array.dtype)
+        own[...] = array
+        return wp.array(own, dtype=dtype, device=device, copy=False)
+    return wp.array(np.ascontiguousarray(array), dtype=dtype, device=device)
+
+
+class BakedField:
+    """Density and color of a place under every lighting it was filmed in, ready to render."""
+
+    def __init__(
+        self,
+        sections: Sequence[BakedSection],
+        lightings: Lightings,
+        networks: dict[str, NDArray],
+        device: str = "cpu",
+        about: dict[str, Any] | None = None,
+        road: Road | None = None,
+    ):
+        """
+        Args:
+            sections: Sections in the order of `road`.
+            lightings: Appearance embeddings by name.
+            networks: `network.*`, and for random lightings `probes.*` (see `appearance_prior.Probes`).
+            device: `cpu` or `cuda`.
+            about: JSON-able metadata stored with the field.
+            road: Tells which sections render a camera; None: a road of one section.
+        """
+        self.sections, self.road = tuple(sections), road or undivided_road()
+        self.lightings_by_name, self.about, self.device = lightings, about or {}, device
+        self.networks = networks
+        p = self.network
+        if "probes.features" in networks:
+            probes = Probes(networks["probes.features"], networks["probes.harmonics"], p)
+            self.lightings_by_name = replace(lightings, probes=probes)
         self._lock = threading.Lock()
-        self._targets: dict[tuple[int, int, int, bool], _RenderTarget] = {}
-        self._set_detail(Detail.of_arrays(arrays))
+        self._targets: dict[tuple[int, int, int, int, bool], _RenderTarget] = {}
+        self._resident: OrderedDict[int, _SectionOnDevice] = OrderedDict()
+        self._resident_lock = threading.Lock()
+        if len(self.sections) == 1:
+            self._section(0)
+
+        def on_device(array: NDArray, dtype: Any) -> Any:
+            return _on_device(array, dtype, device)
 
         self._march = kernels.march_kernel(kernels.LANES[device])
         self._color_head, weights = color_head_kernel(
@@ -134,19 +191,23 @@ class BakedField:
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """Lowest and highest corner of the near box [m], shape (2, 3)."""
-        center, half = np.array(self.layout.centre), np.array(self.layout.half)
-        return np.stack([center - half, center + half])
+        """Lowest and highest corner of the near boxes [m], shape (2, 3)."""
+        center, half = (np.array([getattr(one.layout, name) for one in self.sections]) for name in ("centre", "half"))
+        return np.stack([(center - half).min(0), (center + half).max(0)])
 
     @property
     def network(self) -> dict[str, NDArray]:
         """Arrays of the color head and the background network, by name."""
-        return {k.removeprefix("network."): v for k, v in self.arrays.items() if k.startswith("network.")}
+        return {k.removeprefix("network."): v for k, v in self.networks.items() if k.startswith("network.")}
 
     @property
     def bytes(self) -> int:
         """Size of the stored arrays [bytes]."""
-        return sum(array.nbytes for array in self.arrays.values())
+        return sum(
+            array.nbytes
+            for arrays in (self.networks, *(one.arrays for one in self.sections))
+            for array in arrays.values()
+        )
 
     def embedding(self, lighting: str) -> Array32:
         """See `Lightings.embedding`."""
@@ -195,7 +256,8 @@ class BakedField:
             InputError: unknown lighting, or cameras of several sizes and no size given.
         """
         with self._lock:  # all callers share the render targets
-            return self._render(cameras, lighting, size, stop).result()
+            views = self._views(cameras, lighting, size, stop)
+            return self._rendered(views)[0]
 
     def render_on_device(
         self,
@@ -203,44 +265,50 @@ class BakedField:
         lighting: str | NDArray | Sequence[str | NDArray],
         consume: Callable[[Any, Any], None],
     ) -> None:
-        """Renders as `render` does and passes the result to `consume` without copying it to the host.
+        """Renders as `render` does and passes the result to `consume`.
 
         `consume` receives two Warp arrays on the field's device: colors (n, height · width) of vec3, and opacities
-        (n, height · width). Both are valid only until it returns.
+        (n, height · width). Both are valid only until it returns. They are not copied to the host, unless the cameras
+        are in several sections.
         """
         with self._lock:
-            target = self._render(cameras, lighting)
-            consume(target.rgb, target.opacity)
+            views = self._views(cameras, lighting)
+            parts = self._parts(views)
+            if len(parts) == 1:
+                target = self._render(parts[0][0], views)
+                return consume(target.rgb, target.opacity)
+            out, _ = self._rendered(views)
+            n = len(out.rgb)
+            consume(
+                wp.array(out.rgb.reshape(n, -1, 3), dtype=wp.vec3f, device=self.device),
+                wp.array(out.opacity.reshape(n, -1), dtype=wp.float32, device=self.device),
+            )
 
     def render_features(
         self, cameras: PosedCameras, lighting: str | NDArray, size: tuple[int, int] | None = None
     ) -> tuple[Rendering, Array32]:
-        """Renders as `render` does and also returns the composited features before the color head.
+        """Renders as `render` does, without blending of sections, and also returns the features before the color head.
 
         Returns:
             The rendering, and a copy of opacity (channel 0) and features, shape (n, CHANNELS, height, width).
         """
         with self._lock:
-            target = self._render(cameras, lighting, size)
-            n, height, width = target.shape
-            return target.result(), target.features.numpy().reshape(n, -1, height, width).copy()
+            out, features = self._rendered(self._views(cameras, lighting, size), features=True)
+            assert features is not None
+            return out, features
 
-    def set_detail(self, detail: Detail) -> None:
-        """Replaces the detail."""
+    def set_detail(self, section: int, detail: Detail) -> None:
+        """Replaces the detail of a section."""
         with self._lock:
-            self.arrays |= detail.arrays()
-            self._set_detail(detail)
+            old = self.sections[section]
+            new = BakedSection(old.layout, old.arrays | detail.arrays())
+            self.sections = (*self.sections[:section], new, *self.sections[section + 1 :])
+            self._resident.pop(section, None)
+            self._targets.clear()
 
-    def _set_detail(self, detail: Detail) -> None:
-        stored: Any = detail_kernels.DetailBytes()
-        stored.texels = wp.array(detail.texels, dtype=Bytes, device=self.device)
-        stored.vertices = wp.array(detail.vertices, dtype=Bytes, device=self.device)
-        stored.texel_step, stored.vertex_step = (
-            Channels(*step.tolist()) for step in (detail.texel_step, detail.vertex_step)
-        )
-        self._detail = detail_grid(detail, self.device), stored
-        self._has_detail = bool(len(detail.tiles) or len(detail.vertices))
-        self._targets.clear()
+    def alone(self, section: int) -> "BakedField":
+        """A field of one section, for all cameras."""
+        return BakedField([self.sections[section]], self.lightings_by_name, self.networks, self.device, self.about)
 
     def single_threaded(self) -> "BakedField":
         """A field on the same arrays with its own render targets and lock. It renders on the calling thread.
@@ -251,21 +319,72 @@ class BakedField:
         out._targets, out._lock, out._pool = {}, threading.Lock(), None
         return out
 
-    def _render(
+    def _views(
         self,
         cameras: PosedCameras,
         lighting: str | NDArray | Sequence[str | NDArray],
         size: tuple[int, int] | None = None,
         stop: NDArray | None = None,
-    ) -> "_RenderTarget":
-        intrinsics, (width, height) = intrinsics_for_size(cameras, size)
+    ) -> "_Views":
+        intrinsics, size = intrinsics_for_size(cameras, size)
         pose = np.asarray(cameras.camera_to_world, np.float64)
-        key = len(pose), width, height, stop is not None
-        target = self._targets.pop(key, None) or _RenderTarget(self, *key)
+        return _Views(pose, intrinsics, size, self.head_biases(lighting, len(pose)), stop)
+
+    def _parts(self, views: "_Views", blended: bool = True) -> list[tuple[int, NDArray[np.int64], NDArray[np.float64]]]:
+        """The needed sections; for each, the indices of the views that it renders and its shares of their pictures."""
+        n = len(views.pose)
+        if len(self.sections) == 1:
+            return [(0, np.arange(n), np.ones(n))]
+        first, second, share = self.road.blend(views.pose[:, :3, 3])
+        if not blended:
+            share = np.zeros(n)
+        out = []
+        for k in np.unique(np.concatenate([first, second[share > 0.0]])):
+            weight = np.where(first == k, 1.0 - share, np.where(second == k, share, 0.0))
+            rows = np.flatnonzero(weight)
+            out.append((int(k), rows, weight[rows]))
+        return out
+
+    def _rendered(self, views: "_Views", features: bool = False) -> tuple[Rendering, Array32 | None]:
+        """Renders views; with `features` each by its nearest section alone, else blended where two sections meet."""
+        parts = self._parts(views, blended=not features)
+        if len(parts) == 1:
+            target = self._render(parts[0][0], views)
+            return target.result(), target.composited() if features else None
+        n, (width, height) = len(views.pose), views.size
+        rgb, composited = np.zeros((n, height, width, 3), np.float32), None
+        depth, opacity = np.zeros((2, n, height, width), np.float32)
+        if features:
+            composited = np.zeros((n, CHANNELS, height, width), np.float32)
+        for k, rows, weight in parts:
+            target = self._render(k, views.subset(rows))
+            one, share = target.result(), weight.astype(np.float32)[:, None, None]
+            rgb[rows] += share[..., None] * one.rgb
+            opacity[rows] += share * one.opacity
+            depth[rows] = np.where(share >= 0.5, one.depth, depth[rows])
+            if composited is not None:
+                composited[rows] = target.composited()
+        return Rendering(rgb, depth, opacity), composited
+
+    def _section(self, k: int) -> _SectionOnDevice:
+        """Section k on the device; beyond `_MAX_RESIDENT` sections, the least recently used one is dropped."""
+        with self._resident_lock:
+            if k not in self._resident:
+                self._resident[k] = _SectionOnDevice(self.sections[k], self.device)
+            self._resident.move_to_end(k)
+            if len(self._resident) > _MAX_RESIDENT:
+                gone, _ = self._resident.popitem(last=False)
+                self._targets = {key: target for key, target in self._targets.items() if key[0] != gone}
+            return self._resident[k]
+
+    def _render(self, k: int, views: "_Views") -> "_RenderTarget":
+        """Renders views by section k alone."""
+        key = k, len(views.pose), *views.size, views.stop is not None
+        target = self._targets.pop(key, None) or _RenderTarget(self, self._section(k), *key[1:])
         self._targets[key] = target
-        while len(self._targets) > _MAX_TARGETS:
+        while len(self._targets) > _MAX_TARGETS * min(len(self.sections), _MAX_RESIDENT):
             del self._targets[next(iter(self._targets))]
-        target.set_cameras(pose, intrinsics, self.head_biases(lighting, len(pose)), stop)
+        target.set_cameras(views)
         if self._pool is None:
             for band in target.bands:
                 target.render_band(band)
@@ -289,15 +408,21 @@ class BakedField:
     # ---- files
 
     def save(self, folder: Path) -> None:
-        """Writes `baked.safetensors` and `baked.json`."""
+        """Writes `baked.json`, a file per section (`section_file`), and with several sections the road."""
         names = self.lightings_by_name
-        stored = {**self.arrays, "lightings.vectors": names.vectors, "lightings.frames": names.frame_vectors}
-        (folder / "baked.safetensors").write_bytes(to_bytes({k: np.ascontiguousarray(v) for k, v in stored.items()}))
+        shared = {**self.networks, "lightings.vectors": names.vectors, "lightings.frames": names.frame_vectors}
+        for k, section in enumerate(self.sections):
+            stored = section.arrays | (shared if k == 0 else {})
+            contiguous = {name: np.ascontiguousarray(array) for name, array in stored.items()}
+            (folder / section_file(k)).write_bytes(to_bytes(contiguous))
+        self.road.save(folder)
+        layouts = [asdict(section.layout) for section in self.sections]
         write_json(
             folder / "baked.json",
             {
                 "format": _FORMAT,
-                "layout": asdict(self.layout),
+                "layout": layouts[0],
+                **({"more_layouts": layouts[1:]} if layouts[1:] else {}),
                 "lightings": names.names,
                 "frames": names.frames,
                 "about": self.about,
@@ -306,7 +431,10 @@ class BakedField:
 
     @staticmethod
     def load(folder: Path, device: str = "cpu") -> "BakedField":
-        """Loads a baked field; raises InputError if it is missing, damaged or of another format."""
+        """Loads a baked field; raises InputError if it is missing, damaged or of another format.
+
+        Sections from the second on are read, and found damaged, only when a camera needs them.
+        """
         path = folder / "baked.json"
         if not path.exists():
             raise InputError(f"{folder}: contains no baked.json; build the scene (again)")
@@ -316,24 +444,65 @@ class BakedField:
                 raise InputError(
                     f"{path}: format {short_repr(head.get('format'))}, expected {_FORMAT}; build the scene again"
                 )
-            layout: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in head["layout"].items()}
-            bricks = BrickLayout(**layout)
+            layouts = stored_layouts(head)
             names, frames = tuple(map(require_text, head["lightings"])), tuple(map(require_text, head["frames"]))
             about = dict(head["about"])
-        arrays = load_tensors(folder / "baked.safetensors")
-        with wrap_read_errors(folder / "baked.safetensors", "build the scene again"):
+        arrays = load_tensors(folder / section_file(0))
+        with wrap_read_errors(folder / section_file(0), "build the scene again"):
             vectors, frame_vectors = arrays.pop("lightings.vectors"), arrays.pop("lightings.frames")
             dim = vectors.shape[1]
             shapes = {"lightings.vectors": (vectors, (len(names), dim), "f")}
             check_shapes(shapes | {"lightings.frames": (frame_vectors, (len(frames), dim), "f")})
-            check_arrays(bricks, arrays, dim)
-            return BakedField(bricks, Lightings(names, vectors, frames, frame_vectors), arrays, device, about)
+            networks = {name: arrays.pop(name) for name in list(arrays) if name.startswith(("network.", "probes."))}
+            check_arrays(layouts[0], arrays)
+            check_networks(networks, dim)
+            sections = [
+                BakedSection(layout, file=folder / section_file(k)) if k else BakedSection(layout, arrays)
+                for k, layout in enumerate(layouts)
+            ]
+            road = Road.load(folder, len(layouts))
+            lightings = Lightings(names, vectors, frames, frame_vectors)
+            return BakedField(sections, lightings, networks, device, about, road)
+
+
+def section_file(k: int) -> str:
+    """Name of the file with the arrays of section k; that of section 0 also has those that all sections share."""
+    return f"baked_{k}.safetensors" if k else "baked.safetensors"
+
+
+def stored_layouts(head: dict[str, Any]) -> list[BrickLayout]:
+    """Layouts of the sections in `baked.json`."""
+    layouts = []
+    for one in (head["layout"], *head.get("more_layouts", ())):
+        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in one.items()}
+        layouts.append(BrickLayout(**fields))
+    return layouts
+
+
+@dataclass(frozen=True)
+class _Views:
+    """n cameras to render."""
+
+    pose: NDArray[np.float64]
+    """Camera to world, shape (n, 4, 4)."""
+    intrinsics: NDArray[np.float64]
+    """Shape (n, 4)."""
+    size: tuple[int, int]
+    """Width, height [px]."""
+    bias: Array32
+    """See `BakedField.head_biases`."""
+    stop: NDArray | None
+    """See `BakedField.render`."""
+
+    def subset(self, rows: NDArray[np.int64]) -> "_Views":
+        stop = None if self.stop is None else self.stop[rows]
+        return _Views(self.pose[rows], self.intrinsics[rows], self.size, self.bias[rows], stop)
 
 
 class _RenderTarget:
     """Buffers for images of one size, and recorded launches that render them in horizontal bands, in parallel."""
 
-    def __init__(self, field: BakedField, n: int, width: int, height: int, stopped: bool):
+    def __init__(self, field: BakedField, section: _SectionOnDevice, n: int, width: int, height: int, stopped: bool):
         self.shape, device = (n, height, width), field.device
         across, down, pixels = -(-width // kernels.TILE), -(-height // kernels.TILE), width * height
 
@@ -362,20 +531,20 @@ class _RenderTarget:
             runs = -(-(bottom - top) // HEAD_LANES[device])
             self.launches.append(
                 [
-                    recorded(kernels.cone_march, (n, tiles), [field._bricks, image, first * across], [start]),
+                    recorded(kernels.cone_march, (n, tiles), [section.bricks, image, first * across], [start]),
                     recorded(
-                        *(field._march, (n, packets), [field._bricks, image, first * across, start]),
+                        *(field._march, (n, packets), [section.bricks, image, first * across, start]),
                         [self.features, self.depth],
                     ),
                     *(
                         [
                             recorded(
                                 *(detail_kernels.add_detail, (n, -(-(bottom - top) // detail_kernels.RUN))),
-                                [*field._detail, image, top, bottom, self.depth],
+                                [*section.detail, image, top, bottom, self.depth],
                                 [self.features],
                             )
                         ]
-                        if field._has_detail
+                        if section.has_detail
                         else []
                     ),
                     recorded(
@@ -385,14 +554,14 @@ class _RenderTarget:
                 ]
             )
 
-    def set_cameras(self, pose: NDArray, intrinsics: NDArray, bias: NDArray, stop: NDArray | None) -> None:
+    def set_cameras(self, views: _Views) -> None:
         image = self.image
-        image.rotation.assign(pose[:, :3, :3].astype(np.float32))
-        image.position.assign(pose[:, :3, 3].astype(np.float32))
-        image.intrinsics.assign(intrinsics.astype(np.float32))
-        self.bias.assign(np.ascontiguousarray(bias, np.float32).reshape(len(bias), -1, 8))
-        if stop is not None:
-            image.stop.assign(np.asarray(stop, np.float32).reshape(image.stop.shape))
+        image.rotation.assign(views.pose[:, :3, :3].astype(np.float32))
+        image.position.assign(views.pose[:, :3, 3].astype(np.float32))
+        image.intrinsics.assign(views.intrinsics.astype(np.float32))
+        self.bias.assign(np.ascontiguousarray(views.bias, np.float32).reshape(len(views.bias), -1, 8))
+        if views.stop is not None:
+            image.stop.assign(np.asarray(views.stop, np.float32).reshape(image.stop.shape))
 
     def render_band(self, band: int) -> None:
         for launch in self.launches[band]:
@@ -405,3 +574,8 @@ class _RenderTarget:
             self.depth.numpy().reshape(self.shape).copy(),
             self.opacity.numpy().reshape(self.shape).copy(),
         )
+
+    def composited(self) -> Array32:
+        """A copy of opacity (channel 0) and composited features, shape (n, CHANNELS, height, width)."""
+        n, height, width = self.shape
+        return self.features.numpy().reshape(n, -1, height, width).copy()

@@ -124,11 +124,10 @@ def samples_read(layout: BrickLayout, arrays: dict[str, NDArray]) -> NDArray[np.
     return read.reshape(len(read), -1)
 
 
-def check_arrays(layout: BrickLayout, arrays: dict[str, NDArray], dim: int) -> None:
-    """Raises ValueError if the arrays would make a kernel read outside of them."""
+def check_arrays(layout: BrickLayout, arrays: dict[str, NDArray]) -> None:
+    """Raises ValueError if the arrays of a section would make a kernel read outside of them."""
     near, far = arrays["near"], arrays["far"]
-    slots, hidden = len(near) + len(far), arrays["network.head.1"].shape[0]
-    background, inputs = arrays["network.backdrop.0"].shape[1], CHANNELS - 1 + HARMONICS + dim
+    slots = len(near) + len(far)
     shapes: dict[str, tuple[tuple[int, ...], str]] = {
         "near": ((len(near), 3), "i"),
         "far": ((len(far), 3), "i"),
@@ -137,20 +136,28 @@ def check_arrays(layout: BrickLayout, arrays: dict[str, NDArray], dim: int) -> N
         "step": ((CHANNELS,), "f"),
         "near_leap": (tuple(BLOCKS * n for n in layout.near_shape), "u"),
         "far_leap": (tuple(BLOCKS * n for n in layout.far_shape), "u"),
-        "network.head.0": ((inputs, hidden), "f"),
-        "network.head.0.bias": ((hidden,), "f"),
-        "network.head.1": ((hidden, hidden), "f"),
-        "network.head.1.bias": ((hidden,), "f"),
-        "network.head.2": ((hidden, 3), "f"),
-        "network.head.2.bias": ((3,), "f"),
-        "network.backdrop.0": ((HARMONICS, background), "f"),
-        "network.backdrop.0.bias": ((background,), "f"),
-        "network.backdrop.1": ((background, CHANNELS - 1), "f"),
     }
     check_shapes({name: (arrays[name], *expected) for name, expected in shapes.items()})
-    if hidden % 8 or not hidden:
-        raise ValueError(f"the head has {hidden} hidden units; expected a multiple of 8")
     for name, index, shape in (("near", near, layout.near_shape), ("far", far, layout.far_shape)):
         inside = not len(index) or (index.min() >= 0 and (index < np.array(shape)).all())
         if not inside or len(np.unique(np.ravel_multi_index(tuple(index.T), shape))) < len(index):
             raise ValueError(f"{name}: a brick is outside the grid of {shape} bricks or occurs twice")
+
+
+def check_networks(networks: dict[str, NDArray], dim: int) -> None:
+    """Raises ValueError if the networks do not fit together, or to embeddings of `dim` numbers."""
+    hidden, background = networks["network.head.1"].shape[0], networks["network.backdrop.0"].shape[1]
+    shapes = {
+        "network.head.0": (CHANNELS - 1 + HARMONICS + dim, hidden),
+        "network.head.0.bias": (hidden,),
+        "network.head.1": (hidden, hidden),
+        "network.head.1.bias": (hidden,),
+        "network.head.2": (hidden, 3),
+        "network.head.2.bias": (3,),
+        "network.backdrop.0": (HARMONICS, background),
+        "network.backdrop.0.bias": (background,),
+        "network.backdrop.1": (background, CHANNELS - 1),
+    }
+    check_shapes({name: (networks[name], shape, "f") for name, shape in shapes.items()})
+    if hidden % 8 or not hidden:
+        raise ValueError(f"the head has {hidden} hidden units; expected a multiple of 8")

@@ -5,6 +5,7 @@ kinds: sparse points in the frames in which they were matched, the ground under 
 camera height is constant), and stereo.
 """
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,6 +88,8 @@ class TrainingPixels:
         if self.unmasked_index is not None and not len(self.unmasked_index):
             raise InputError("every training pixel is masked; in a mask 0 = ignore, so are the masks inverted?")
         self.unmasked = unmasked
+        self.frames = np.arange(len(chosen))
+        """Indices of the frames from which `batch` samples, ascending; all frames, but see `of_frames`."""
         self.points = self._depths_of_points(points, chosen)
         self.path = self._depths_of_path(camera_height) if camera_height > 0.0 else join_depths([])
         self.stereo = join_depths([])  # set from `stereo.stereo_depths`
@@ -101,6 +104,26 @@ class TrainingPixels:
         self.unmasked = np.concatenate([new if new.any() else old for old, new in zip(parts, kept, strict=True)])
         self.unmasked_index = None if self.unmasked.all() else np.flatnonzero(self.unmasked)
         self.points, self.path, self.stereo = map(self._on_unmasked, (self.points, self.path, self.stereo))
+
+    def of_frames(self, frames: NDArray[np.int64]) -> "TrainingPixels":
+        """The same pixels and frame indices, but `batch` samples from the given frames only.
+
+        Raises InputError if these have no pixel to train on.
+        """
+        if np.array_equal(frames, self.frames):
+            return self
+        out = copy.copy(self)
+        out.frames = frames
+        if self.unmasked_index is not None:
+            inside = np.isin(np.arange(len(self.cameras)), frames)
+            out.unmasked_index = self.unmasked_index[np.repeat(inside, np.diff(self.start))[self.unmasked_index]]
+        for name in ("points", "path", "stereo"):
+            pool = getattr(self, name)
+            keep = np.isin(pool.frame, frames)
+            setattr(out, name, DepthSupervision(pool.frame[keep], pool.pixel[keep], pool.distance[keep]))
+        if not len(frames) or (out.unmasked_index is not None and not len(out.unmasked_index)):
+            raise InputError("a section of the road has no pixel to train on; set nerf.section_length = 0")
+        return out
 
     def _on_unmasked(self, depths: DepthSupervision) -> DepthSupervision:
         u, v = depths.pixel.astype(int).T
@@ -169,7 +192,10 @@ class TrainingPixels:
     def _random(self, rng: np.random.Generator, n: int) -> NDArray[np.int64]:
         """Random indices into `colors` of unmasked pixels."""
         if self.unmasked_index is None:
-            return rng.integers(len(self.colors), size=n)
+            ends = np.cumsum(self.start[self.frames + 1] - self.start[self.frames])
+            pick = rng.integers(ends[-1], size=n)
+            run = np.searchsorted(ends, pick, side="right")
+            return self.start[self.frames + 1][run] - ends[run] + pick
         return self.unmasked_index[rng.integers(len(self.unmasked_index), size=n)]
 
     def _place(self, flat: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:

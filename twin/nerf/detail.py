@@ -72,10 +72,27 @@ def fit_detail(
         seed: Seed of the order of pixels.
         passes: How often every usable training pixel is used.
     """
+    facts = []
+    for k, frames in enumerate(baked.road.frames(pixels.cameras.positions)):
+        detail, about = _section_detail(baked.alone(k), appearance, pixels.of_frames(frames), seed + k, passes)
+        if detail is not None:
+            baked.set_detail(k, detail)
+            facts.append(about)
+    if not facts:
+        return {"pixels": 0}
+    totals = {name: sum(one[name] for one in facts) for name in ("pixels", "tiles", "bytes")}
+    means = {name: round(float(np.mean([one[name] for one in facts])), 3) for name in ("psnr_before", "psnr_after")}
+    return totals | {"texel_m": max(one["texel_m"] for one in facts)} | means
+
+
+def _section_detail(
+    baked: BakedField, appearance: Appearance, pixels: TrainingPixels, seed: int, passes: float
+) -> tuple[Detail | None, dict[str, Any]]:
+    """Detail of a field of one section, or None if no pixel shows a near surface; and a summary."""
     ground = Detail.without_features(*_height_map(baked, pixels), _HEIGHT_CELL)
     seen = _surface_pixels(baked, pixels, ground, seed)
     if not len(seen.hits):
-        return {"pixels": 0}
+        return None, {}
     tiles, texel = _choose_tiles(seen.hits, ground.heights.shape)
     vertices = np.zeros((2**_LOG2_ROWS, 0), np.uint8)
     fitter = _DetailFitter(
@@ -83,13 +100,12 @@ def fit_detail(
     )
     before, after = fitter.run(max(1, round(passes * len(seen.hits) / _RAYS)))
     detail = fitter.quantized()
-    baked.set_detail(detail)
-    return {
+    return detail, {
         "pixels": len(seen.hits),
         "tiles": len(tiles),
         "texel_m": texel,
-        "psnr_before": round(before, 3),
-        "psnr_after": round(after, 3),
+        "psnr_before": before,
+        "psnr_after": after,
         "bytes": sum(array.nbytes for array in detail.arrays().values()),
     }
 
@@ -97,7 +113,7 @@ def fit_detail(
 def _height_map(baked: BakedField, pixels: TrainingPixels) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Heights of level surfaces (along x, along y) [m], and the lowest corner of their grid."""
     found = [np.zeros((0, 3))]
-    for i in range(len(pixels.cameras)):
+    for i in pixels.frames.tolist():
         width = min(_HEIGHT_VIEW, int(pixels.width[i]))
         height = max(2, round(width * int(pixels.height[i]) / int(pixels.width[i])))
         pose, k = pixels.cameras.camera_to_world[i], pixels.intrinsics[i] * (width / pixels.width[i])
@@ -136,10 +152,11 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
     """Unmasked training pixels that detail can change, in random order."""
     grid = detail_grid(ground, baked.device)
     rng = np.random.default_rng([seed, 7])
-    share = min(1.0, _MAX_HITS / max(1, int(0.7 * pixels.start[-1])))
+    total = int((pixels.width * pixels.height)[pixels.frames].sum())
+    share = min(1.0, _MAX_HITS / max(1, int(0.7 * total)))
     parts: list[list[NDArray[Any]]] = []
-    with bar("surface points", len(pixels.cameras), "frame") as progress:
-        for i in range(len(pixels.cameras)):
+    with bar("surface points", len(pixels.frames), "frame") as progress:
+        for i in pixels.frames.tolist():
             width, height = int(pixels.width[i]), int(pixels.height[i])
             pose, k = pixels.cameras.camera_to_world[i].astype(np.float32), pixels.intrinsics[i].astype(np.float32)
             shown, features = baked.render_features(

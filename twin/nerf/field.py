@@ -6,7 +6,7 @@ cameras; `kernels/space.py` defines the other terms.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -39,6 +39,7 @@ from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler, space
 from twin.nerf.kernels.color_head import HARMONICS
 from twin.nerf.rendering import FAR, Rendering
+from twin.nerf.road import Road, undivided_road
 from twin.warp_runtime import wp
 
 _FORMAT = 1
@@ -51,29 +52,32 @@ _RENDER_UNIFORM_WEIGHT = 0.02  # `floor` of `sampler.sample_rays` when rendering
 _MAX_SEED = 2**31 - 1  # kernels take 32-bit signed seeds
 
 
-class RadianceField:
-    """A radiance field on one device, trained or in training."""
+Traced = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+
+
+def _prefix(k: int) -> str:
+    """Prefix of the names of section k's tensors in `field.safetensors`."""
+    return f"{k}." if k else ""
+
+
+class FieldSection:
+    """Density and features of one section of the road (`road.py`): hash grid, opacity grids and trunk network."""
 
     def __init__(
         self,
         layout: Layout,
-        appearance: Appearance,
         table: torch.Tensor,
-        parameters: dict[str, torch.Tensor],
         grids: tuple[torch.Tensor, torch.Tensor],
-        about: dict[str, Any] | None = None,
+        parameters: dict[str, torch.Tensor],
     ):
         """
         Args:
             layout: Sizes and bounds.
-            appearance: Embeddings, on the device of the tensors.
             table: Hash tables, shape (levels, 2**log2_table, FEATURES).
-            parameters: Weights of the networks, see `network.initial_parameters`.
             grids: Near and far opacity grid, see `kernels/sampler.py`.
-            about: JSON-able metadata stored with the field.
+            parameters: Weights of the networks, which all sections share; see `network.initial_parameters`.
         """
-        self.layout, self.appearance, self.about = layout, appearance, about or {}
-        self.table, self.parameters, self.grids = table, parameters, grids
+        self.layout, self.table, self.grids, self.parameters = layout, table, grids, parameters
         self.device = "cpu" if table.device.type == "cpu" else "cuda"
         load_training_kernels(self.device)
         self.w_table = warp_view(table, hashgrid.Feature)
@@ -90,23 +94,6 @@ class RadianceField:
         self.contraction.center = wp.vec3f(*layout.centre)
         self.contraction.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
         self._spare: dict[tuple[int, int, int], list[Workspace]] = {}
-
-    @property
-    def lightings(self) -> tuple[str, ...]:
-        return self.appearance.lightings
-
-    @property
-    def bounds(self) -> NDArray[np.float64]:
-        """Lowest and highest corner of the near box [m], shape (2, 3)."""
-        return self.layout.near_box.bounds
-
-    def embedding(self, lighting: str) -> NDArray[np.float32]:
-        """See `Lightings.embedding`."""
-        return self.appearance.named().embedding(lighting)
-
-    def add_lightings(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> None:
-        """See `Lightings.added`."""
-        self.appearance = self.appearance.added(more, stale)
 
     # ---- passes of a batch, each on rays [start, start + count) of a workspace
 
@@ -185,7 +172,7 @@ class RadianceField:
             device=self.device,
         )
 
-    # ---- queries and rendering
+    # ---- queries
 
     def density(self, points: NDArray) -> NDArray[np.float32]:
         """Density [1/m] at points [m], shape (k, 3) → (k,)."""
@@ -213,35 +200,109 @@ class RadianceField:
         return result
 
     def trace(
-        self, cameras: CameraArrays, camera: NDArray, pixel: NDArray, samples: int = _RENDER_SAMPLES
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        self, cameras: CameraArrays, camera: NDArray, pixel: NDArray, samples: int, rays: NDArray[np.int64], out: Traced
+    ) -> None:
+        """Traces the rays with the indices `rays` and writes their results into `out`, see `RadianceField.trace`."""
+
+        def march(rows: slice) -> None:
+            index = rays[rows]
+            k = len(index)
+            with self.workspace(_RENDER_RAYS, samples) as ws:
+                ws.camera[:k] = torch.as_tensor(camera[index].astype(np.int32), device=self.device)
+                ws.pixel[:k] = torch.as_tensor(pixel[index].astype(np.float32), device=self.device)
+                self.cast(ws, cameras, 0, k)
+                self.sample(ws, 0, k, _RENDER_UNIFORM_WEIGHT)
+                self.query(ws, 0, k * samples)
+                self.composite(ws, 0, k)
+                at = torch.as_tensor(index, device=self.device)
+                features, harmonics, depth, opacity = out
+                harmonics[at] = network.spherical_harmonics(ws.directions[:k])
+                features[at] = network.ray_features(self.parameters, ws.composited[:k], harmonics[at])
+                median = ws.median_distance[:k]
+                depth[at] = torch.where(median > 0.0, median * ws.cosines[:k], FAR).clamp(max=FAR)
+                opacity[at] = ws.composited[:k, 0]
+
+        in_batches(march, len(rays), _RENDER_RAYS, self.device)
+
+    @contextmanager
+    def workspace(self, rays: int, samples: int, extra: int = 0) -> Iterator[Workspace]:
+        """Lends a spare or new workspace of this size.
+
+        Several threads may call this at the same time, since each dict and list operation is atomic.
+        """
+        spares = self._spare.setdefault((rays, samples, extra), [])
+        try:
+            ws = spares.pop()
+        except IndexError:
+            ws = Workspace(self.layout, rays, samples, self.device, extra)
+        yield ws
+        spares.append(ws)
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """The learned tensors by their names in `field.safetensors`, except the networks."""
+        return {"table": self.table, "grid.near": self.grids[0], "grid.far": self.grids[1]}
+
+
+class RadianceField:
+    """A radiance field on one device, trained or in training."""
+
+    def __init__(
+        self,
+        sections: Sequence[FieldSection],
+        road: Road,
+        appearance: Appearance,
+        parameters: dict[str, torch.Tensor],
+        about: dict[str, Any] | None = None,
+    ):
+        """
+        Args:
+            sections: Sections in the order of `road`.
+            road: Tells which section renders a camera.
+            appearance: Embeddings, on the device of the tensors.
+            parameters: Weights of the networks, see `network.initial_parameters`.
+            about: JSON-able metadata stored with the field.
+        """
+        self.sections, self.road = tuple(sections), road
+        self.appearance, self.parameters, self.about = appearance, parameters, about or {}
+        self.device = self.sections[0].device
+
+    @property
+    def lightings(self) -> tuple[str, ...]:
+        return self.appearance.lightings
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of the near boxes [m], shape (2, 3)."""
+        low, high = np.stack([section.layout.near_box.bounds for section in self.sections], 1)
+        return np.stack([low.min(0), high.max(0)])
+
+    def embedding(self, lighting: str) -> NDArray[np.float32]:
+        """See `Lightings.embedding`."""
+        return self.appearance.named().embedding(lighting)
+
+    def add_lightings(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> None:
+        """See `Lightings.added`."""
+        self.appearance = self.appearance.added(more, stale)
+
+    def trace(self, cameras: CameraArrays, camera: NDArray, pixel: NDArray, samples: int = _RENDER_SAMPLES) -> Traced:
         """Traces n rays, given by camera index (n,) and pixel (n, 2) [px]; the result does not depend on the lighting.
+
+        Every camera is rendered by its nearest section alone.
 
         Returns:
             Features (n, CHANNELS − 1), spherical harmonics of the directions (n, 16), z-depth [m] (n,), opacity (n,).
         """
         n = len(camera)
-        features = torch.empty(n, volume.CHANNELS - 1, device=self.device)
-        harmonics = torch.empty(n, HARMONICS, device=self.device)
-        depth, opacity = torch.empty(n, device=self.device), torch.empty(n, device=self.device)
-
-        def march(rows: slice) -> None:
-            k = rows.stop - rows.start
-            with self.workspace(_RENDER_RAYS, samples) as ws:
-                ws.camera[:k] = torch.as_tensor(camera[rows].astype(np.int32), device=self.device)
-                ws.pixel[:k] = torch.as_tensor(pixel[rows].astype(np.float32), device=self.device)
-                self.cast(ws, cameras, 0, k)
-                self.sample(ws, 0, k, _RENDER_UNIFORM_WEIGHT)
-                self.query(ws, 0, k * samples)
-                self.composite(ws, 0, k)
-                harmonics[rows] = network.spherical_harmonics(ws.directions[:k])
-                features[rows] = network.ray_features(self.parameters, ws.composited[:k], harmonics[rows])
-                median = ws.median_distance[:k]
-                depth[rows] = torch.where(median > 0.0, median * ws.cosines[:k], FAR).clamp(max=FAR)
-                opacity[rows] = ws.composited[:k, 0]
-
-        in_batches(march, n, _RENDER_RAYS, self.device)
-        return features, harmonics, depth, opacity
+        out = (
+            torch.empty(n, volume.CHANNELS - 1, device=self.device),
+            torch.empty(n, HARMONICS, device=self.device),
+            torch.empty(n, device=self.device),
+            torch.empty(n, device=self.device),
+        )
+        mine = self.road.nearest(cameras.position.numpy().astype(np.float64))[camera]
+        for k, section in enumerate(self.sections):
+            section.trace(cameras, camera, pixel, samples, np.flatnonzero(mine == k), out)
+        return out
 
     def color(self, features: torch.Tensor, harmonics: torch.Tensor, embedding: NDArray) -> NDArray[np.float32]:
         """Colors in [0, 1], shape (n, 3), of traced rays under one embedding (dim,)."""
@@ -269,34 +330,24 @@ class RadianceField:
             opacity.cpu().numpy().reshape(n, height, width),
         )
 
-    @contextmanager
-    def workspace(self, rays: int, samples: int, extra: int = 0) -> Iterator[Workspace]:
-        """Lends a spare or new workspace of this size.
-
-        Several threads may call this at the same time, since each dict and list operation is atomic.
-        """
-        spares = self._spare.setdefault((rays, samples, extra), [])
-        try:
-            ws = spares.pop()
-        except IndexError:
-            ws = Workspace(self.layout, rays, samples, self.device, extra)
-        yield ws
-        spares.append(ws)
-
     # ---- files
 
     def save(self, folder: Path) -> None:
         """Writes `field.safetensors` and `field.json`."""
-        tensors = {"table": self.table, "grid.near": self.grids[0], "grid.far": self.grids[1]}
+        tensors: dict[str, torch.Tensor] = {}
+        for k, section in enumerate(self.sections):
+            tensors |= {f"{_prefix(k)}{name}": tensor for name, tensor in section.tensors().items()}
         tensors |= {"appearance.vectors": self.appearance.vectors, "appearance.residuals": self.appearance.residuals}
         tensors |= {f"network.{name}": value for name, value in self.parameters.items()}
         stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
         (folder / "field.safetensors").write_bytes(to_bytes(stored))
+        self.road.save(folder)
         write_json(
             folder / "field.json",
             {
                 "format": _FORMAT,
-                "layout": asdict(self.layout),
+                "layout": asdict(self.sections[0].layout),
+                **({"more_layouts": [asdict(one.layout) for one in self.sections[1:]]} if self.sections[1:] else {}),
                 "lightings": self.appearance.lightings,
                 "frames": self.appearance.frames,
                 "frame_lighting": self.appearance.frame_lighting.tolist(),
@@ -320,7 +371,10 @@ class RadianceField:
                 raise InputError(
                     f"{path}: format {short_repr(head.get('format'))}, expected {_FORMAT}; build the scene again"
                 )
-            layout = Layout(**(head["layout"] | {key: tuple(head["layout"][key]) for key in ("centre", "half")}))
+            layouts = [
+                Layout(**(one | {key: tuple(one[key]) for key in ("centre", "half")}))
+                for one in (head["layout"], *head.get("more_layouts", ()))
+            ]
             names, frames = tuple(map(require_text, head["lightings"])), tuple(map(require_text, head["frames"]))
             frame_lighting, about = np.array(head["frame_lighting"], np.int64), dict(head["about"])
         path = regular_file(folder / "field.safetensors")
@@ -330,21 +384,37 @@ class RadianceField:
                 names, frames, frame_lighting, tensors["appearance.vectors"], tensors["appearance.residuals"]
             )
             parameters = {k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")}
-            grids = tensors["grid.near"], tensors["grid.far"]
-            return RadianceField(layout, appearance, tensors["table"], parameters, grids, about)
+            sections = [
+                FieldSection(
+                    layout,
+                    tensors[f"{_prefix(k)}table"],
+                    (tensors[f"{_prefix(k)}grid.near"], tensors[f"{_prefix(k)}grid.far"]),
+                    parameters,
+                )
+                for k, layout in enumerate(layouts)
+            ]
+        return RadianceField(sections, Road.load(folder, len(sections)), appearance, parameters, about)
 
 
-def untrained_field(layout: Layout, appearance: Appearance, seed: int, device: str) -> RadianceField:
-    """The field before its first training step; its density is low and almost uniform."""
+def untrained_field(
+    layouts: Sequence[Layout], appearance: Appearance, seed: int, device: str, road: Road | None = None
+) -> RadianceField:
+    """The field before its first training step; its density is low and almost uniform.
+
+    `layouts` has one layout per section of `road`; None is a road of one section.
+    """
     generator = torch.Generator().manual_seed(seed)
-    table = (torch.rand(layout.levels, 2**layout.log2_table, hashgrid.FEATURES, generator=generator) - 0.5) * 2e-2
-    parameters = network.initial_parameters(
-        layout.levels * hashgrid.FEATURES, layout.hidden, layout.appearance_dim, seed
-    )
-    near, far = (
-        torch.full(shape, -math.expm1(-layout.density_unit * cell), device=device)
-        for shape, cell in opacity_grid_sizes(layout.near_box)
-    )
+    first = layouts[0]
+    initial = network.initial_parameters(first.levels * hashgrid.FEATURES, first.hidden, first.appearance_dim, seed)
+    parameters = {name: value.to(device) for name, value in initial.items()}
+    sections = []
+    for layout in layouts:
+        table = (torch.rand(layout.levels, 2**layout.log2_table, hashgrid.FEATURES, generator=generator) - 0.5) * 2e-2
+        near, far = (
+            torch.full(shape, -math.expm1(-layout.density_unit * cell), device=device)
+            for shape, cell in opacity_grid_sizes(layout.near_box)
+        )
+        sections.append(FieldSection(layout, table.to(device), (near, far), parameters))
     moved = Appearance(
         appearance.lightings,
         appearance.frames,
@@ -352,5 +422,4 @@ def untrained_field(layout: Layout, appearance: Appearance, seed: int, device: s
         appearance.vectors.to(device),
         appearance.residuals.to(device),
     )
-    on_device = {name: value.to(device) for name, value in parameters.items()}
-    return RadianceField(layout, moved, table.to(device), on_device, (near, far))
+    return RadianceField(sections, road or undivided_road(), moved, parameters)

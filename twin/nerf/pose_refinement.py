@@ -15,7 +15,7 @@ import torch
 
 from twin.geometry.cameras import Cameras
 from twin.nerf.buffers import CameraArrays, Workspace, warp_view
-from twin.nerf.field import RadianceField
+from twin.nerf.field import FieldSection
 from twin.nerf.kernels import hashgrid, space
 from twin.types import Array
 from twin.warp_runtime import wp
@@ -51,28 +51,28 @@ class PoseRefinement:
         self._w_ray_positions_grad = warp_view(on_rays, wp.vec3f)
         self._w_ray_grad: list[Any] = [warp_view(part, wp.vec3f) for part in self._ray_grad]
 
-    def backward(self, field: RadianceField, start: int, count: int) -> None:
+    def backward(self, section: FieldSection, start: int, count: int) -> None:
         """Computes gradients of the rays [start, start + count) from the gradients of their samples' features."""
         ws = self._ws
         wp.launch(
             hashgrid.encode_positions_backward,
             count * ws.samples,
             [
-                *(ws.w_positions, field.w_table, field.w_levels, start * ws.samples),
+                *(ws.w_positions, section.w_table, section.w_levels, start * ws.samples),
                 ws.w_features_grad,
             ],
             [self._w_positions_grad],
-            device=field.device,
+            device=section.device,
         )
         wp.launch(
             space.rays_backward,
             count,
             [
-                *(ws.w_rays, ws.w_strata.distances, field.contraction, start),
+                *(ws.w_rays, ws.w_strata.distances, section.contraction, start),
                 self._w_ray_positions_grad,
             ],
             self._w_ray_grad,
-            device=field.device,
+            device=section.device,
         )
 
     def step(self, rate: float) -> None:

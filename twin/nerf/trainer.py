@@ -6,7 +6,7 @@ Each step also penalizes density at *free points*: random points near the camera
 
 import math
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -38,10 +38,11 @@ from twin.nerf.buffers import (
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.detail import fit_detail
 from twin.nerf.evaluate import cross_lighting, evaluate
-from twin.nerf.field import RadianceField, untrained_field
+from twin.nerf.field import FieldSection, RadianceField, untrained_field
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler
 from twin.nerf.pose_refinement import PoseRefinement
+from twin.nerf.road import divide_road
 from twin.nerf.stereo import stereo_depths
 from twin.nerf.transients import LeftObject, cell_centers, cell_size, left_objects, mover_masks, object_masks
 from twin.nerf.transients import picture as excluded_picture
@@ -132,27 +133,23 @@ class Trainer:
         train = self.pixels.cameras
         lightings = tuple(dict.fromkeys(train.lightings))
         frame_lighting = np.array([lightings.index(name) for name in train.lightings])
-        near_box = near_box_of_cameras(cameras.camera_to_world, config.near_half_extent)
-        layout = Layout(
-            near_box.center,
-            near_box.half,
-            near_plane=config.near_plane,
-            levels=config.levels,
-            growth=self._growth(near_box),
-            log2_table=config.log2_table,
-            hidden=_HIDDEN,
-            appearance_dim=config.appearance_dim,
-        )
+        self.road = divide_road(cameras.positions, config.section_length)
+        layouts = [self._layout(cameras.select(frames)) for frames in self.road.frames(cameras.positions)]
+        self.frames = self.road.frames(train.positions)
+        """Indices of the training frames of each section."""
+        self.parts = [self.pixels.of_frames(frames) for frames in self.frames]
+        """Pixels of each section."""
         appearance = initial_appearance(lightings, train.names, frame_lighting, config.appearance_dim, seed)
-        self.field = untrained_field(layout, appearance, seed, device)
+        self.field = untrained_field(layouts, appearance, seed, device, self.road)
         self.rng = np.random.default_rng([seed, 2])
         self.rays = -(-config.rays // _SHARDS) * _SHARDS
-        self.ws = Workspace(layout, self.rays, config.samples, device, _SHARDS * _FREE_POINTS, training=True)
-        self.free = free_segments(train, config.near_plane)
+        self.ws = Workspace(layouts[0], self.rays, config.samples, device, _SHARDS * _FREE_POINTS, training=True)
+        self.free = [free_segments(train.select(frames), config.near_plane) for frames in self.frames]
+        """Segments of each section, see `free_segments`."""
         self.refinement: PoseRefinement | None = None
         """Camera corrections; None without `nerf.refine_cameras`."""
         if config.refine_cameras:
-            near = self._near_distance(near_box)
+            near = self._near_distance(layouts[0].near_box)
             self.refinement = PoseRefinement(train.camera_to_world, self.pixels.intrinsics, near, self.ws)
             self.arrays = self.refinement.arrays
         else:
@@ -165,9 +162,27 @@ class Trainer:
                 tensor.requires_grad_(True)
         learned = list(self.torch_parameters.values())
         self.optimizer = torch.optim.Adam(learned, lr=_NETWORK_RATE, betas=(0.9, 0.99), eps=1e-12)
-        # The hash table's gradient, and Adam's first and second moment of it.
-        self.moments = [warp_view(torch.zeros_like(f.table), hashgrid.Feature) for _ in range(3)]
+        self.moments = [
+            [warp_view(torch.zeros_like(section.table), hashgrid.Feature) for _ in range(3)] for section in f.sections
+        ]
+        """For each section, the hash table's gradient, and Adam's first and second moment of it."""
+        self.steps = config.steps * self.road.count
+        """Number of steps; the sections take turns."""
         self.steps_done = 0
+
+    def _layout(self, cameras: Cameras) -> Layout:
+        """Layout of the section that is filmed by the cameras."""
+        config, near_box = self.config, near_box_of_cameras(cameras.camera_to_world, self.config.near_half_extent)
+        return Layout(
+            near_box.center,
+            near_box.half,
+            near_plane=config.near_plane,
+            levels=config.levels,
+            growth=self._growth(near_box),
+            log2_table=config.log2_table,
+            hidden=_HIDDEN,
+            appearance_dim=config.appearance_dim,
+        )
 
     def _growth(self, near_box: NearBox) -> float:
         """Factor between the cells per axis of consecutive hash levels: makes the finest cell `_CELL_PIXELS` wide."""
@@ -182,35 +197,38 @@ class Trainer:
 
     @property
     def done(self) -> bool:
-        return self.steps_done >= self.config.steps
+        return self.steps_done >= self.steps
 
     def rate(self) -> float:
         """Current learning rate, as a share of the initial one."""
         warm = min(1.0, (self.steps_done + 1) / _WARM_UP)
-        return warm * math.exp(math.log(_FINAL_RATE) * self.steps_done / self.config.steps)
+        return warm * math.exp(math.log(_FINAL_RATE) * self.steps_done / self.steps)
 
     def step(self) -> float:
         """Runs one training step and returns the mean squared error of its colors."""
-        if self.config.transients and self.steps_done == int(_MOVERS_SHARE * self.config.steps):
+        if self.config.transients and self.steps_done == int(_MOVERS_SHARE * self.steps):
             movers = mover_masks(self.pixels, self._cell_depths())
             self.moving = sum(float(mask.sum()) for mask in movers) / len(self.pixels.colors)
             self._exclude(movers)
         ws, device = self.ws, self.device
+        section = self.steps_done % self.road.count
         per_shard = self.rays // _SHARDS
         supervised = int(per_shard * self.config.sightings)
         triples = int(per_shard * _TRIPLE_SHARE) // 3
-        batch = self.pixels.batch(self.rng, _SHARDS, triples, per_shard - supervised - 3 * triples, supervised)
+        batch = self.parts[section].batch(self.rng, _SHARDS, triples, per_shard - supervised - 3 * triples, supervised)
         ws.camera.copy_(torch.from_numpy(batch.frame))
         ws.pixel.copy_(torch.from_numpy(batch.pixel))
         ws.targets.copy_(torch.from_numpy(batch.distance))
         color = torch.from_numpy(batch.color).to(device)
-        free = self._free_points(_SHARDS * _FREE_POINTS)
+        free = self._free_points(section, _SHARDS * _FREE_POINTS)
         if free is not None:
             ws.positions[self.rays * ws.samples :].copy_(free)
 
-        results = parallel(lambda shard: self._shard(shard, color, triples, free is not None), range(_SHARDS), device)
+        results = parallel(
+            lambda shard: self._shard(section, shard, color, triples, free is not None), range(_SHARDS), device
+        )
         rate = self.rate()
-        parallel(lambda task: self._update(task, rate), range(self.config.levels + 2), device)
+        parallel(lambda task: self._update(section, task, rate), range(self.config.levels + 2), device)
         for tensor, *gradients in zip(self.torch_parameters.values(), *(r[1] for r in results), strict=True):
             tensor.grad = torch.stack(gradients).sum(0) if len(gradients) > 1 else gradients[0]
         for group in self.optimizer.param_groups:
@@ -221,20 +239,22 @@ class Trainer:
         self.steps_done += 1
         return sum(r[0] for r in results) / _SHARDS
 
-    def _shard(self, shard: int, color: torch.Tensor, triples: int, free: bool) -> tuple[float, list[torch.Tensor]]:
+    def _shard(
+        self, section: int, shard: int, color: torch.Tensor, triples: int, free: bool
+    ) -> tuple[float, list[torch.Tensor]]:
         """Runs a shard; returns its mean squared error, and its gradients in the order of `torch_parameters`."""
-        f, ws = self.field, self.ws
+        f, s, ws = self.field, self.field.sections[section], self.ws
         count = self.rays // _SHARDS
         start = shard * count
         rays = slice(start, start + count)
         samples = slice(start * ws.samples, (start + count) * ws.samples)
         first_free = self.rays * ws.samples + shard * _FREE_POINTS
-        explore = max(0.0, 1.0 - self.steps_done / (_EXPLORATION_SHARE * self.config.steps + 1))
+        explore = max(0.0, 1.0 - self.steps_done / (_EXPLORATION_SHARE * self.steps + 1))
 
-        f.cast(ws, self.arrays, start, count)
-        f.sample(ws, start, count, 0.1 + explore, target_mass=0.3, seed=self.seed * 1_000_003 + self.steps_done)
-        f.query(ws, samples.start, samples.stop - samples.start)
-        f.composite(ws, start, count)
+        s.cast(ws, self.arrays, start, count)
+        s.sample(ws, start, count, 0.1 + explore, target_mass=0.3, seed=self.seed * 1_000_003 + self.steps_done)
+        s.query(ws, samples.start, samples.stop - samples.start)
+        s.composite(ws, start, count)
 
         composited = ws.composited[rays].detach().requires_grad_(True)
         frame = ws.camera[rays].long()
@@ -256,20 +276,20 @@ class Trainer:
             ws.composited_grad[rays] = gradients[0]
             if gradients[1] is not None:
                 ws.inverse_grad[rays] = gradients[1] / ws.cosines[rays]
-            f.composite_backward(
+            s.composite_backward(
                 *(ws, start, count, _DISTORTION / self.rays, _DEPTH / self.rays, _DEPTH_REACH),
-                _LOG_OFFSET * f.layout.near_box.scale,
+                _LOG_OFFSET * s.layout.near_box.scale,
             )
             first, second = self._trunk_backward(samples)
             if self._refines:
-                self.refinement.backward(f, start, count)  # type: ignore[union-attr]
+                self.refinement.backward(s, start, count)  # type: ignore[union-attr]
             if free:
-                more = self._free_backward(first_free)
+                more = self._free_backward(s, first_free)
                 first, second = first + more[0], second + more[1]
             wp.launch(
                 volume.sample_densities,
                 samples.stop - samples.start,
-                [ws.w_outputs, f.layout.density_unit, samples.start],
+                [ws.w_outputs, s.layout.density_unit, samples.start],
                 [ws.w_densities],
                 device=self.device,
             )
@@ -278,6 +298,7 @@ class Trainer:
     def _exclude(self, masks: list[NDArray[np.bool_]]) -> None:
         """Excludes marked pixels from training, in addition to earlier ones."""
         self.pixels.exclude(masks)
+        self.parts = [self.pixels.of_frames(frames) for frames in self.frames]
         before = self.excluded or [np.zeros_like(mask) for mask in masks]
         self.excluded = [one | other for one, other in zip(before, masks, strict=True)]
 
@@ -295,7 +316,7 @@ class Trainer:
     @property
     def _refines(self) -> bool:
         """True if this step refines cameras: not at first, while the field is less accurate than the cameras."""
-        return self.refinement is not None and self.steps_done >= _EXPLORATION_SHARE * self.config.steps
+        return self.refinement is not None and self.steps_done >= _EXPLORATION_SHARE * self.steps
 
     def _trunk_backward(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
         ws = self.ws
@@ -308,62 +329,63 @@ class Trainer:
             ws.features_grad[rows],
         )
 
-    def _free_backward(self, start: int) -> tuple[torch.Tensor, torch.Tensor]:
+    def _free_backward(self, section: FieldSection, start: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Gradients of the loss `_FREE` · mean(log(1 + σ·scale)) over free points of density σ.
 
         With respect to raw density, the gradient saturates at high density.
         """
-        f, ws = self.field, self.ws
-        f.query(ws, start, _FREE_POINTS)
+        ws, layout = self.ws, section.layout
+        section.query(ws, start, _FREE_POINTS)
         rows = slice(start, start + _FREE_POINTS)
-        density = torch.exp(ws.outputs[rows, 0].clamp(max=volume.RAW_LIMIT)) * f.layout.density_unit
-        depth = density * f.layout.near_box.scale
+        density = torch.exp(ws.outputs[rows, 0].clamp(max=volume.RAW_LIMIT)) * layout.density_unit
+        depth = density * layout.near_box.scale
         ws.outputs_grad[rows, 0] = _FREE / (_SHARDS * _FREE_POINTS) * depth / (1.0 + depth)
         return self._trunk_backward(rows)
 
-    def _update(self, task: int, rate: float) -> None:
+    def _update(self, section: int, task: int, rate: float) -> None:
         """Accumulates the gradient of hash level `task` and takes an Adam step on that level.
 
         The last two tasks instead update the opacity grids, each one half of the cells.
         """
-        f, ws = self.field, self.ws
+        s, ws, moments = self.field.sections[section], self.ws, self.moments[section]
         levels = self.config.levels
         if task >= levels:
             wp.launch(
                 sampler.update_grids,
                 self.rays * ws.samples,
                 [
-                    *(ws.w_positions, ws.w_densities, _RISE, _FALL, task - levels, 2, f.w_grids),
+                    *(ws.w_positions, ws.w_densities, _RISE, _FALL, task - levels, 2, s.w_grids),
                 ],
                 device=self.device,
             )
             return
-        t = self.steps_done + 1
+        t = self.steps_done // self.road.count + 1
         wp.launch(
             hashgrid.encode_backward,
             (1, ws.features.shape[0]),
-            [ws.w_positions, f.w_levels, task, ws.w_features_grad, self.moments[0]],
+            [ws.w_positions, s.w_levels, task, ws.w_features_grad, moments[0]],
             device=self.device,
         )
         wp.launch(
             hashgrid.adam_step,
-            (1, f.table.shape[1]),
+            (1, s.table.shape[1]),
             [
                 *(task, self.config.learning_rate * rate / (1.0 - 0.9**t), 1.0 / (1.0 - 0.99**t)),
-                *(f.w_table, *self.moments),
+                *(s.w_table, *moments),
             ],
             device=self.device,
         )
 
-    def _free_points(self, n: int) -> torch.Tensor | None:
-        """Grid positions of random free points, shape (n, 3); None without free segments."""
-        if not len(self.free):
+    def _free_points(self, section: int, n: int) -> torch.Tensor | None:
+        """Grid positions of random free points of a section, shape (n, 3); None without free segments."""
+        free = self.free[section]
+        if not len(free):
             return None
-        pick = self.free[self.rng.integers(len(self.free), size=n)]
+        pick = free[self.rng.integers(len(free), size=n)]
         offset = self.rng.normal(size=(n, 3))
         offset *= self.config.near_plane * self.rng.random((n, 1)) ** (1 / 3) / np.linalg.norm(offset, axis=1)[:, None]
         x = pick[:, 0] + (pick[:, 1] - pick[:, 0]) * self.rng.random((n, 1)) + offset
-        layout = self.field.layout
+        layout = self.field.sections[section].layout
         u = (x - np.array(layout.centre)) / np.array(layout.half)  # not contracted: the path is in the near box
         return torch.as_tensor((u * 0.25 + 0.5).clip(0.0, 1.0 - 1e-6).astype(np.float32), device=self.device)
 
@@ -406,7 +428,7 @@ def train_field(
     curve: list[list[float]] = []
     began = time.perf_counter()
     mean = 0.0
-    with bar("training", config.steps, "step") as progress, single_threaded_torch():
+    with bar("training", trainer.steps, "step") as progress, single_threaded_torch():
         while not trainer.done:
             error = trainer.step()
             if not math.isfinite(error):
@@ -424,11 +446,12 @@ def train_field(
     return (
         field,
         {
-            "steps": config.steps,
+            "steps": trainer.steps,
+            "sections": trainer.road.count,
             "seconds_train": round(seconds, 2),
-            "rays_per_second": round(config.steps * trainer.rays / seconds, 1),
+            "rays_per_second": round(trainer.steps * trainer.rays / seconds, 1),
             "train_psnr": curve[-1][1],
-            "parameters": int(field.table.numel() + in_torch),
+            "parameters": int(sum(section.table.numel() for section in field.sections) + in_torch),
             "sightings_points": len(trainer.pixels.points.frame),
             "sightings_path": len(trainer.pixels.path.frame),
             "stereo": trainer.stereo,
@@ -475,7 +498,9 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))
     height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
-    field, metrics, cameras, excluded = train_field(cameras, points, config.nerf, config.seed, height, device)
+    # A capture around an object has no road to divide.
+    nerf = config.nerf if config.mjcf.route else replace(config.nerf, section_length=0.0)
+    field, metrics, cameras, excluded = train_field(cameras, points, nerf, config.seed, height, device)
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
     if any(mask.any() for mask in excluded):
         pixels.exclude(excluded)

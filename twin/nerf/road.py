@@ -1,0 +1,140 @@
+"""Sections of a long road. Each has its own hash grid and bricks, so that the road's length does not coarsen them.
+
+A section is the part of the filmed path that is nearer to its center than to those of the other sections. A camera is
+rendered by the section that has the nearest filmed position. Close to a border it is rendered by both, and the pictures
+are blended, so that no step shows when a robot drives across.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save as to_bytes
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist, squareform
+
+from twin.files import check_shapes, load_tensors, wrap_read_errors
+from twin.types import Array
+
+ROAD_FILE = "road.safetensors"
+"""File of a road of several sections."""
+OVERLAP = 12.0
+"""Distance [m] from a section's own cameras up to which other cameras train it, too."""
+_SPACING = 5.0  # [m] the road's length is that of the shortest tree that connects filmed positions this far apart
+_ROUNDS = 100  # greatest number of rounds in which centers move
+_BLEND = 2.0  # [m] a picture is blended if the second section is farther than the first by less than this
+
+
+@dataclass(frozen=True)
+class Road:
+    """Filmed positions, and the section of each."""
+
+    points: Array
+    """[m], shape (m, 3)."""
+    section: NDArray[np.int64]
+    """Shape (m,), from 0 to `count` − 1, each of which occurs."""
+
+    def save(self, folder: Path) -> None:
+        """Writes `road.safetensors` if there are several sections."""
+        if self.count > 1:
+            arrays = {"points": self.points, "section": self.section}
+            (folder / ROAD_FILE).write_bytes(to_bytes({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
+
+    @staticmethod
+    def load(folder: Path, count: int) -> "Road":
+        """Reads the road of a field with `count` sections. Raises InputError for a file that does not fit."""
+        if count == 1:
+            return undivided_road()
+        path = folder / ROAD_FILE
+        arrays = load_tensors(path)
+        with wrap_read_errors(path, "build the scene again"):
+            points, section = arrays["points"], arrays["section"]
+            check_shapes({"points": (points, (len(points), 3), "f"), "section": (section, (len(points),), "i")})
+            if not np.array_equal(np.unique(section), np.arange(count)):
+                raise ValueError(f"the road does not have the sections 0 to {count - 1}")
+            return Road(points, section)
+
+    @property
+    def count(self) -> int:
+        """Number of sections."""
+        return int(self.section.max()) + 1
+
+    @cached_property
+    def _trees(self) -> list[Any]:
+        return [cKDTree(self.points[self.section == k]) for k in range(self.count)]
+
+    def distances(self, positions: Array) -> Array:
+        """Distance of positions (n, 3) [m] from the nearest filmed position of each section, shape (n, count)."""
+        return np.stack([tree.query(positions)[0] for tree in self._trees], 1)
+
+    def nearest(self, positions: Array) -> NDArray[np.int64]:
+        """The section that renders a camera at each of the positions (n, 3) [m], shape (n,)."""
+        return self.distances(positions).argmin(1)
+
+    def blend(self, positions: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+        """Sections to render cameras at positions (n, 3) [m].
+
+        Returns:
+            The nearest and the second nearest section, and the second one's share of the picture, from 0 to 0.5; each
+            of shape (n,).
+        """
+        distance = self.distances(positions)
+        first, second = np.argsort(distance, 1, kind="stable")[:, :2].T
+        rows = np.arange(len(distance))
+        farther = distance[rows, second] - distance[rows, first]
+        return first, second, np.maximum(0.0, 0.5 - 0.5 * farther / _BLEND)
+
+    def frames(self, positions: Array) -> list[NDArray[np.int64]]:
+        """For each section, the indices of those of the positions (n, 3) [m] whose cameras train it."""
+        if self.count == 1:
+            return [np.arange(len(positions))]
+        near = self.distances(positions) <= OVERLAP
+        return [np.flatnonzero(column) for column in near.T]
+
+
+def undivided_road() -> Road:
+    """A road of one section."""
+    return Road(np.zeros((1, 3)), np.zeros(1, np.int64))
+
+
+def divide_road(positions: Array, length: float) -> Road:
+    """Divides filmed positions (n, 3) [m] into sections of about the same `length` [m]; 0 = one section.
+
+    The centers are those of k-means, so bends, crossings and films in both directions need no special treatment.
+    """
+    anchors = _thinned(positions)
+    filmed = float(minimum_spanning_tree(squareform(pdist(anchors))).sum())
+    count = max(1, round(filmed / length)) if length > 0.0 else 1
+    centers = anchors[:1] if count == 1 else _centers(anchors, count)
+    section = cKDTree(centers).query(positions)[1]
+    return Road(positions, np.unique(section, return_inverse=True)[1])
+
+
+def _thinned(positions: Array) -> Array:
+    """Positions, in their order, that are at least `_SPACING` from all those kept before."""
+    left, kept = positions, []
+    while len(left):
+        kept.append(left[0])
+        left = left[np.linalg.norm(left - left[0], axis=1) >= _SPACING]
+    return np.array(kept)
+
+
+def _centers(points: Array, count: int) -> Array:
+    """Centers of k-means clusters of points (n, 3); starts with points that are far from each other."""
+    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
+    gap = np.full(len(points), np.inf)
+    for _ in range(count - 1):
+        gap = np.minimum(gap, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        chosen.append(int(gap.argmax()))
+    centers = points[chosen]
+    for _ in range(_ROUNDS):
+        nearest = cKDTree(centers).query(points)[1]
+        moved = np.array([points[nearest == k].mean(0) if (nearest == k).any() else centers[k] for k in range(count)])
+        if np.array_equal(moved, centers):
+            break
+        centers = moved
+    return centers
