@@ -185,7 +185,7 @@ def test_field_of_two_sections_learns_renders_and_survives_the_disk(tmp_path, mo
     monkeypatch.setattr(road_module, "OVERLAP", 2.0)
     cameras = make_cameras(tmp_path, 28)
     config = replace(
-        CONFIG, steps=80, rays=512, samples=12, levels=4, log2_table=12, section_length=7.0, transients=False
+        CONFIG, steps=80, rays=512, samples=12, levels=4, log2_table=12, section_length=5.0, transients=False
     )
     field, metrics, *_ = train_field(cameras, floor_points(cameras), config, camera_height=1.5, device="cpu")
     assert metrics["sections"] == field.road.count == 2 and metrics["steps"] == 160
@@ -214,7 +214,7 @@ def test_field_of_two_sections_learns_renders_and_survives_the_disk(tmp_path, mo
 def test_sections_train_on_their_own_frames(tmp_path, monkeypatch):
     monkeypatch.setattr(road_module, "OVERLAP", 1.0)
     cameras = make_cameras(tmp_path, 28)
-    trainer = Trainer(cameras, floor_points(cameras), replace(CONFIG, section_length=7.0), 0, "cpu", camera_height=1.5)
+    trainer = Trainer(cameras, floor_points(cameras), replace(CONFIG, section_length=5.0), 0, "cpu", camera_height=1.5)
     rng = np.random.default_rng(0)
     for part, frames in zip(trainer.parts, trainer.frames, strict=True):
         batch = part.batch(rng, 4, 5, 60, 20)

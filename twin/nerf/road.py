@@ -24,7 +24,10 @@ ROAD_FILE = "road.safetensors"
 """File of a road of several sections."""
 OVERLAP = 12.0
 """Distance [m] from a section's own cameras up to which other cameras train it, too."""
-_SPACING = 5.0  # [m] the road's length is that of the shortest tree that connects filmed positions this far apart
+# The road's length is that of the shortest tree that connects filmed positions this far apart [m], so that it does not
+# matter how often and in which lane the road was filmed.
+_LENGTH_SPACING = 5.0
+_CENTER_SPACING = 1.0  # [m] spacing of the filmed positions whose means are the centers
 _ROUNDS = 100  # greatest number of rounds in which centers move
 _BLEND = 2.0  # [m] a picture is blended if the second section is farther than the first by less than this
 
@@ -106,20 +109,19 @@ def divide_road(positions: Array, length: float) -> Road:
 
     The centers are those of k-means, so bends, crossings and films in both directions need no special treatment.
     """
-    anchors = _thinned(positions)
-    filmed = float(minimum_spanning_tree(squareform(pdist(anchors))).sum())
+    filmed = float(minimum_spanning_tree(squareform(pdist(_thinned(positions, _LENGTH_SPACING)))).sum())
     count = max(1, round(filmed / length)) if length > 0.0 else 1
-    centers = anchors[:1] if count == 1 else _centers(anchors, count)
+    centers = positions[:1] if count == 1 else _centers(_thinned(positions, _CENTER_SPACING), count)
     section = cKDTree(centers).query(positions)[1]
     return Road(positions, np.unique(section, return_inverse=True)[1])
 
 
-def _thinned(positions: Array) -> Array:
-    """Positions, in their order, that are at least `_SPACING` from all those kept before."""
+def _thinned(positions: Array, spacing: float) -> Array:
+    """Positions, in their order, that are at least `spacing` [m] from all those kept before."""
     left, kept = positions, []
     while len(left):
         kept.append(left[0])
-        left = left[np.linalg.norm(left - left[0], axis=1) >= _SPACING]
+        left = left[np.linalg.norm(left - left[0], axis=1) >= spacing]
     return np.array(kept)
 
 
