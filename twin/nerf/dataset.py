@@ -7,6 +7,7 @@ camera height is constant), and stereo.
 
 import copy
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,10 +85,10 @@ class TrainingPixels:
         self.start = np.concatenate([[0], np.cumsum(self.width * self.height)])
         self.colors = np.concatenate([image.reshape(-1, 3) for image in images])
         unmasked = np.concatenate([mask.ravel() for mask in masks])
-        self.unmasked_index = None if unmasked.all() else np.flatnonzero(unmasked)
-        if self.unmasked_index is not None and not len(self.unmasked_index):
+        if not unmasked.any():
             raise InputError("every training pixel is masked; in a mask 0 = ignore, so are the masks inverted?")
         self.unmasked = unmasked
+        """True for the pixels to train on, in the order of `colors`."""
         self.frames = np.arange(len(chosen))
         """Indices of the frames from which `batch` samples, ascending; all frames, but see `of_frames`."""
         self.points = self._depths_of_points(points, chosen)
@@ -102,7 +103,7 @@ class TrainingPixels:
         parts = np.split(self.unmasked, self.start[1:-1])
         kept = [part & ~mark.ravel() for part, mark in zip(parts, marked, strict=True)]
         self.unmasked = np.concatenate([new if new.any() else old for old, new in zip(parts, kept, strict=True)])
-        self.unmasked_index = None if self.unmasked.all() else np.flatnonzero(self.unmasked)
+        vars(self).pop("_index", None)
         self.points, self.path, self.stereo = map(self._on_unmasked, (self.points, self.path, self.stereo))
 
     def of_frames(self, frames: NDArray[np.int64]) -> "TrainingPixels":
@@ -114,14 +115,12 @@ class TrainingPixels:
             return self
         out = copy.copy(self)
         out.frames = frames
-        if self.unmasked_index is not None:
-            inside = np.isin(np.arange(len(self.cameras)), frames)
-            out.unmasked_index = self.unmasked_index[np.repeat(inside, np.diff(self.start))[self.unmasked_index]]
+        vars(out).pop("_index", None)
         for name in ("points", "path", "stereo"):
             pool = getattr(self, name)
             keep = np.isin(pool.frame, frames)
             setattr(out, name, DepthSupervision(pool.frame[keep], pool.pixel[keep], pool.distance[keep]))
-        if not len(frames) or (out.unmasked_index is not None and not len(out.unmasked_index)):
+        if not any(self.unmasked[self.start[i] : self.start[i + 1]].any() for i in frames):
             raise InputError("a section of the road has no pixel to train on; set nerf.section_length = 0")
         return out
 
@@ -191,12 +190,21 @@ class TrainingPixels:
 
     def _random(self, rng: np.random.Generator, n: int) -> NDArray[np.int64]:
         """Random indices into `colors` of unmasked pixels."""
-        if self.unmasked_index is None:
+        if self._index is None:
             ends = np.cumsum(self.start[self.frames + 1] - self.start[self.frames])
             pick = rng.integers(ends[-1], size=n)
             run = np.searchsorted(ends, pick, side="right")
             return self.start[self.frames + 1][run] - ends[run] + pick
-        return self.unmasked_index[rng.integers(len(self.unmasked_index), size=n)]
+        return self._index[rng.integers(len(self._index), size=n)].astype(np.int64)
+
+    @cached_property
+    def _index(self) -> NDArray[np.integer] | None:
+        """Indices of the unmasked pixels of `frames`; None if no pixel is masked."""
+        if self.unmasked.all():
+            return None
+        kind = np.int32 if len(self.unmasked) < 2**31 else np.int64  # on a long road this is the largest array
+        runs = [slice(self.start[i], self.start[i + 1]) for i in self.frames]
+        return np.concatenate([(np.flatnonzero(self.unmasked[run]) + run.start).astype(kind) for run in runs])
 
     def _place(self, flat: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
         """Frame, row and column of indices into `colors`."""
@@ -222,7 +230,7 @@ class TrainingPixels:
         inside = (column - abs(dx) >= 0) & (column + abs(dx) < w) & (row - dy >= 0) & (row + dy < h)
         shift = np.where(inside, dy * w + dx, 0)
         triple = np.stack([middle - shift, middle, middle + shift], 1)
-        if self.unmasked_index is not None:
+        if self._index is not None:
             triple = np.where(self.unmasked[triple].all(1, keepdims=True), triple, middle[:, None])
         return self._pixels(triple.ravel())
 

@@ -118,6 +118,10 @@ class Trainer:
     ):
         self.config, self.seed, self.device = config, seed, device
         self.pixels = TrainingPixels(cameras, points, config.max_width, camera_height)
+        train = self.pixels.cameras
+        self.road = divide_road(cameras.positions, config.section_length)
+        self.frames = self.road.frames(train.positions)
+        """Indices of the training frames of each section."""
         self.stereo: dict[str, Any] | None = None
         """Summary of the stereo depths; None without `nerf.stereo`."""
         if config.stereo:
@@ -130,13 +134,9 @@ class Trainer:
         # The field must never learn the colors of these objects: some lightings have no pixels that would correct them.
         if self.left:
             self._exclude(object_masks(self.pixels, self.left))
-        train = self.pixels.cameras
         lightings = tuple(dict.fromkeys(train.lightings))
         frame_lighting = np.array([lightings.index(name) for name in train.lightings])
-        self.road = divide_road(cameras.positions, config.section_length)
         layouts = [self._layout(cameras.select(frames)) for frames in self.road.frames(cameras.positions)]
-        self.frames = self.road.frames(train.positions)
-        """Indices of the training frames of each section."""
         self.parts = [self.pixels.of_frames(frames) for frames in self.frames]
         """Pixels of each section."""
         appearance = initial_appearance(lightings, train.names, frame_lighting, config.appearance_dim, seed)
