@@ -43,11 +43,15 @@ class DepthSupervision:
     """k known distances along rays."""
 
     frame: NDArray[np.int32]
-    """Index into the training frames, shape (k,)."""
+    """Index into the training frames, ascending, shape (k,)."""
     pixel: NDArray[np.float64]
     """(u, v) [px], shape (k, 2)."""
     distance: NDArray[np.float32]
     """[m], shape (k,)."""
+
+    def of_frame(self, i: int) -> slice:
+        """The rows of frame i."""
+        return slice(*np.searchsorted(self.frame, np.array([i, i + 1], self.frame.dtype)))
 
 
 def join_depths(parts: list[DepthSupervision]) -> DepthSupervision:

@@ -385,7 +385,7 @@ def _shadow(pixels: TrainingPixels, cells: Cells, i: int, one: LeftObject) -> ND
 def stereo_map(pixels: TrainingPixels, i: int, side: int) -> Array32:
     """Stereo's z-depths [m] in the cells of `side` pixels of training frame i, nan where unknown, (rows, columns)."""
     known = np.full((int(pixels.height[i]) // side, int(pixels.width[i]) // side), np.nan, np.float32)
-    own = pixels.stereo.frame == i
+    own = pixels.stereo.of_frame(i)
     pixel = pixels.stereo.pixel[own]
     z = pixels.stereo.distance[own] / np.linalg.norm(unproject(pixel, pixels.intrinsics[i]), axis=1)
     column, row = np.minimum((pixel // side).astype(int), [known.shape[1] - 1, known.shape[0] - 1]).T
@@ -395,13 +395,13 @@ def stereo_map(pixels: TrainingPixels, i: int, side: int) -> Array32:
 
 def _voxels(pixels: TrainingPixels) -> Array:
     """Centers [m] of the voxels that contain stereo points of enough frames near them, shape (n, 3)."""
-    near = pixels.stereo.distance < _REACH
-    frame, pixel = pixels.stereo.frame[near], pixels.stereo.pixel[near]
     keys = []
     for i in range(len(pixels.cameras)):
-        own = frame == i
-        rays = unproject(pixel[own], pixels.intrinsics[i])
-        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True) * pixels.stereo.distance[near][own, None]
+        own = pixels.stereo.of_frame(i)
+        distance = pixels.stereo.distance[own]
+        near = distance < _REACH
+        rays = unproject(pixels.stereo.pixel[own][near], pixels.intrinsics[i])
+        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True) * distance[near, None]
         pose = pixels.cameras.camera_to_world[i]
         keys.append(np.unique(np.floor((rays @ pose[:3, :3].T + pose[:3, 3]) / _VOXEL).astype(np.int64), axis=0))
     found, frames = np.unique(np.concatenate(keys), axis=0, return_counts=True)
