@@ -64,6 +64,21 @@ def test_sections_of_a_loop_are_arcs():
     assert changes == 6
 
 
+def test_frames_placed_far_off_the_road_do_not_divide_it():
+    positions = line(300.0)
+    wrong = positions + 0.0
+    wrong[[50, 200]] += [[3e7, 0.0, 1e6], [-400.0, 900.0, 0.0]]
+    road = divide_road(wrong, 65.0)
+    right = np.delete(np.arange(len(positions)), [50, 200])
+    spans = [np.ptp(positions[right][road.section[right] == k, 0]) for k in range(road.count)]
+    assert len(spans) == 5 and min(spans) > 50.0 and max(spans) < 70.0
+
+
+def test_section_has_enough_frames():
+    assert divide_road(line(300.0, 20.0), 65.0).count == 1
+    assert min(np.bincount(divide_road(line(300.0, 6.0), 65.0).section)) >= 10
+
+
 def test_training_frames_overlap():
     positions = line(130.0)
     road = divide_road(positions, 65.0)

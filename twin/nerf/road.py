@@ -26,8 +26,10 @@ OVERLAP = 12.0
 """Distance [m] from a section's own cameras up to which other cameras train it, too."""
 # The road's length is that of the shortest tree that connects filmed positions this far apart [m], so that it does not
 # matter how often and in which lane the road was filmed.
-_LENGTH_SPACING = 5.0
-_CENTER_SPACING = 1.0  # [m] spacing of the filmed positions whose means are the centers
+_ANCHOR_SPACING = 5.0
+_JUMP = 25.0  # [m] a longer step between such positions leads to a frame that was placed wrong, or to another film
+_CENTER_SPACING = 1.0  # [m] spacing of the filmed positions whose medians are the centers
+_MIN_FRAMES = 10  # least number of frames of a section
 _ROUNDS = 100  # greatest number of rounds in which centers move
 _BLEND = 2.0  # [m] a picture is blended if the second section is farther than the first by less than this
 
@@ -107,12 +109,19 @@ def undivided_road() -> Road:
 def divide_road(positions: Array, length: float) -> Road:
     """Divides filmed positions (n, 3) [m] into sections of about the same `length` [m]; 0 = one section.
 
-    The centers are those of k-means, so bends, crossings and films in both directions need no special treatment.
+    The centers are those of k-medians: bends, crossings and films in both directions need no special treatment, and
+    frames that were placed far off the road move no center.
     """
-    filmed = float(minimum_spanning_tree(squareform(pdist(_thinned(positions, _LENGTH_SPACING)))).sum())
-    count = max(1, round(filmed / length)) if length > 0.0 else 1
-    centers = positions[:1] if count == 1 else _centers(_thinned(positions, _CENTER_SPACING), count)
+    anchors = _thinned(positions, _ANCHOR_SPACING)
+    steps = minimum_spanning_tree(squareform(pdist(anchors))).data
+    filmed = float(steps[steps < _JUMP].sum())
+    count = min(round(filmed / length), len(positions) // _MIN_FRAMES) if length > 0.0 else 1
+    if count < 2:
+        return Road(positions, np.zeros(len(positions), np.int64))
+    centers = _centers(_far_apart(anchors, count), _thinned(positions, _CENTER_SPACING))
     section = cKDTree(centers).query(positions)[1]
+    enough = np.bincount(section, minlength=count) >= _MIN_FRAMES
+    section = cKDTree(centers[enough]).query(positions)[1]
     return Road(positions, np.unique(section, return_inverse=True)[1])
 
 
@@ -125,17 +134,23 @@ def _thinned(positions: Array, spacing: float) -> Array:
     return np.array(kept)
 
 
-def _centers(points: Array, count: int) -> Array:
-    """Centers of k-means clusters of points (n, 3); starts with points that are far from each other."""
-    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
+def _far_apart(points: Array, count: int) -> Array:
+    """Of those points (n, 3) that have another one nearby, `count` that are far from each other."""
+    points = points[cKDTree(points).query(points, k=2)[0][:, 1] < _JUMP]
+    chosen = [int(np.linalg.norm(points - np.median(points, 0), axis=1).argmax())]
     gap = np.full(len(points), np.inf)
     for _ in range(count - 1):
         gap = np.minimum(gap, np.linalg.norm(points - points[chosen[-1]], axis=1))
         chosen.append(int(gap.argmax()))
-    centers = points[chosen]
+    return points[chosen]
+
+
+def _centers(centers: Array, points: Array) -> Array:
+    """Centers of k-medians clusters of points (n, 3), from first centers (count, 3)."""
     for _ in range(_ROUNDS):
         nearest = cKDTree(centers).query(points)[1]
-        moved = np.array([points[nearest == k].mean(0) if (nearest == k).any() else centers[k] for k in range(count)])
+        own = [points[nearest == k] for k in range(len(centers))]
+        moved = np.array([np.median(part, 0) if len(part) else old for part, old in zip(own, centers, strict=True)])
         if np.array_equal(moved, centers):
             break
         centers = moved
