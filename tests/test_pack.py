@@ -23,9 +23,10 @@ from twin.drive import chosen_policy, chosen_task
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.poses import look_at
-from twin.nerf.baked import BakedField
+from twin.nerf.baked import BakedField, BakedSection
 from twin.nerf.fog import Fog
 from twin.nerf.lightings import AddedLighting
+from twin.nerf.road import Road
 from twin.pack import pack, rounded
 from twin.scene import SceneDir, stage_result, write_stamp
 from twin.unpack import decode_differences, encode_differences, open_scene
@@ -88,6 +89,34 @@ def test_replaced_samples_are_read_by_no_ray(root, packed, tmp_path):
     a, b = (field.render(views, "night") for field in fields)
     for name in ("rgb", "depth", "opacity"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_a_packed_long_road_has_all_its_sections(tmp_path):
+    root = tiny_twin(tmp_path / "place")
+    stage = SceneDir(root).stage("field")
+    field = BakedField.load(stage)
+    x = np.linspace(-3.0, 12.0, 40)
+    road = Road(np.stack([x, 0 * x, 0 * x + 1.0], 1), (x > 3.0).astype(np.int64))
+    sections = [field.sections[0], other_features(field.sections[0])]
+    BakedField(sections, field.lightings_by_name, field.networks, road=road).save(stage)
+    write_stamp(stage, "field")
+    out, _ = pack(root, tmp_path / "long.twin")
+    unpack.unpack(out, tmp_path / "there")
+    eyes = np.stack([[0.0, 3.0, 6.0], [0.0] * 3, [1.0] * 3], 1)
+    views = Viewpoints.of(
+        np.array([look_at(eye, eye + np.array([2.0, 0.3, -0.2])) for eye in eyes]), [60, 60, 40, 22], (80, 44)
+    )
+    a, b = (twin.load_scene(scene).field().render(views, "day").rgb for scene in (root, tmp_path / "there"))
+    np.testing.assert_array_equal(a, b)
+    changed = np.abs(a - field.render(views, "day").rgb).max((1, 2, 3))
+    assert changed[0] == 0.0 and changed[1:].min() > 0.01
+
+
+def other_features(section: BakedSection) -> BakedSection:
+    """The section with other features."""
+    features = section.arrays["features"].copy()
+    features[..., 1:] = 255 - features[..., 1:]
+    return BakedSection(section.layout, section.arrays | {"features": features})
 
 
 def test_fewer_levels_make_a_smaller_pack_of_another_field(root, packed, tmp_path):

@@ -380,7 +380,8 @@ class BakedField:
     def _render(self, k: int, views: "_Views") -> "_RenderTarget":
         """Renders views by section k alone."""
         key = k, len(views.pose), *views.size, views.stop is not None
-        target = self._targets.pop(key, None) or _RenderTarget(self, self._section(k), *key[1:])
+        section = self._section(k)
+        target = self._targets.pop(key, None) or _RenderTarget(self, section, *key[1:])
         self._targets[key] = target
         while len(self._targets) > _MAX_TARGETS * min(len(self.sections), _MAX_RESIDENT):
             del self._targets[next(iter(self._targets))]
