@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import align as align_benchmark
 import motor_currents
 import mujoco
 import numpy as np
@@ -58,6 +59,29 @@ def test_kinematics_begin_with_the_preceding_wheel_speeds():
     distance, angle = kinematics.end_errors(kinematics.predict(kinematics.NOMINAL, windows), windows)
     assert distance[1:].max() < 0.005
     assert angle[1:].max() < 0.2
+
+
+def test_icr_baseline_that_gets_the_slopes_slides_downhill():
+    """It is `benchmarks/align.py --last-third`'s; without drift it is the plain baseline."""
+    rng = np.random.default_rng(1)
+    windows = windows_of(rng.uniform(1.0, 4.0, (8, 1, 2)) + np.zeros((8, logs.SAMPLES, 2)), follows=np.arange(8) > 0)
+    slope, five = rng.normal(0.0, 0.5, (8, 2)), np.array([0.93, 0.97, 0.55, -0.62, -0.08])
+    plain = kinematics.predict(IcrModel(*five), windows)
+    np.testing.assert_allclose(
+        align_benchmark._sloped_poses(np.append(five, [0, 0]), windows, slope), plain, atol=1e-12
+    )
+    straight = windows_of(np.full((1, logs.SAMPLES, 2), 3.0))
+    level = kinematics.predict(kinematics.NOMINAL, straight)
+    left = align_benchmark._sloped_poses(
+        np.array([1, 1, TRACK / 2, -TRACK / 2, 0, 0, 0.2]), straight, np.array([[0.0, 0.5]])
+    )
+    assert (left - level)[0, logs.SAMPLES] == pytest.approx([0.0, 0.2 * 0.5 * logs.DURATION, 0.0], abs=1e-9)
+
+
+def test_last_third_of_the_groups_is_for_scoring():
+    groups = np.repeat([3, 5, 7, 8, 11, 12], 4)
+    windows = align_benchmark.cut_last_third(windows_of(np.ones((24, logs.SAMPLES, 2)), groups=groups))
+    assert np.array_equal(windows.fitting, groups <= 8) and len(np.unique(windows.groups)) == 6
 
 
 def test_commands_become_the_controllers_wheel_speeds():
