@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from twin import commands, runtime
-from twin.config import MetricConfig, RouteConfig, SceneConfig
+from twin.config import MetricConfig, NerfConfig, RouteConfig, SceneConfig
 from twin.config_file import load_config
 from twin.errors import InputError
 from twin.files import digest_file, digest_json, is_folder, is_link, remove, write_json
@@ -46,7 +46,7 @@ PIPELINE = (
     Stage("cameras", "twin.capture.sfm", 2, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
     Stage("field", "twin.nerf.trainer", 5, ("nerf", "mjcf.route"), ("cameras", "metric")),
-    Stage("mesh", "twin.assets.mesh", 4, ("mesh", "route", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
+    Stage("mesh", "twin.assets.mesh", 4, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.scene_xml", 4, ("mjcf", "robot"), ("metric", "mesh")),
     Stage(
         "review",
@@ -198,6 +198,10 @@ def _depends(stage: Stage, config: SceneConfig, inputs: dict[str, str], stamps: 
         del settings["metric"]["odometry"], settings["metric"]["odometry_tolerance"]
     if settings.get("route") == dataclasses.asdict(RouteConfig()):
         del settings["route"]
+    if "branch" in settings and not settings["branch"]:
+        del settings["branch"]
+    if settings.get("nerf", {}).get("section_length") == NerfConfig.section_length:
+        del settings["nerf"]["section_length"]
     for key in ("refine_cameras", "transients"):
         if not settings.get("nerf", {}).get(key, True):
             del settings["nerf"][key]

@@ -302,6 +302,13 @@ class RouteConfig:
 
 
 @dataclass(frozen=True)
+class BranchConfig(RouteConfig):
+    """Another route through the same place, such as a side road; its name is also that of a task, the whole branch."""
+
+    name: str = ""
+
+
+@dataclass(frozen=True)
 class MjcfConfig:
     """The MJCF scene."""
 
@@ -360,13 +367,17 @@ class ObstacleConfig:
     """Main color as red, green, blue, each from 0 to 1; by default the color of its kind."""
     size: tuple[float, ...] = ()
     """Length, width, height of a box [m]."""
+    route: str = ""
+    """Name of the [[branch]] along which it stands, and in whose tasks it occurs; by default the route."""
 
 
 @dataclass(frozen=True)
 class TaskConfig:
-    """A driving task on a segment of the route, in addition to those of `twin/env/route_segments.py`."""
+    """A driving task on a segment of a route, in addition to those of `twin/env/route_segments.py`."""
 
     name: str = ""
+    route: str = ""
+    """Name of the [[branch]] that the task drives along; by default the route."""
     start: float = 0.0
     """Arc length on the route at which the segment starts [m]."""
     length: float = 0.0
@@ -387,6 +398,7 @@ class SceneConfig:
     nerf: NerfConfig = field(default_factory=NerfConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     route: RouteConfig = field(default_factory=RouteConfig)
+    branch: tuple[BranchConfig, ...] = ()
     mjcf: MjcfConfig = field(default_factory=MjcfConfig)
     robot: HuskyParams = field(default_factory=HuskyParams)
     """Values of `scene.toml` override those of `robot.toml` beside it, which override the defaults."""

@@ -184,7 +184,8 @@ def _check(config: SceneConfig, folder: str) -> None:
         _check_range(source.camera_height, bounds, f"camera_height {what}")
         _check_segments(source.keep, f"keep {what}")
     _check_segments(config.capture.keep, "capture.keep")
-    _check_route(config.route)
+    _check_route(config.route, "route")
+    _check_branches(config)
     _check_obstacles(config.obstacle)
     _check_metric(config.metric)
     metric = config.metric
@@ -260,15 +261,32 @@ def _check_tasks(tasks: tuple[TaskConfig, ...]) -> None:
     _check_unique([task.name for task in tasks], "[[task]]")
 
 
-def _check_route(route: RouteConfig) -> None:
-    _require(not (route.passes and route.points), "[route] gives passes and points; give one of them")
+def _check_branches(config: SceneConfig) -> None:
+    for branch in config.branch:
+        _check_name(branch.name, "[[branch]] name")
+        what = f"[[branch]] {branch.name!r}"
+        _require(branch.passes or branch.points, f"{what} has neither passes nor points; give one of them")
+        _check_range(branch.max_gap, setting_ranges(RouteConfig)["max_gap"], f"{what} max_gap")
+        _check_route(branch, what)
+    names = [branch.name for branch in config.branch]
+    _check_unique(["route", *names], "routes")
+    for kind, entries in (("task", config.task), ("obstacle", config.obstacle)):
+        for one in entries:
+            if one.route:
+                _require(names, f"[[{kind}]] route = {one.route!r}, but there is no [[branch]]; define it")
+                _check_choice(one.route, names, f"[[{kind}]] route")
+    _require(not names or config.mjcf.route, "[[branch]] needs a route, but mjcf.route = false; remove one of them")
+
+
+def _check_route(route: RouteConfig, what: str) -> None:
+    _require(not (route.passes and route.points), f"{what} gives passes and points; give one of them")
     _require(
         len(route.points) != 1 and all(len(point) == 2 for point in route.points),
-        f"route.points = {short_repr([list(point) for point in route.points])}; expected two or more [x, y] [m], such "
+        f"{what}.points = {short_repr([list(point) for point in route.points])}; expected two or more [x, y] [m], such "
         "as [[0, 0], [12.5, 1.0]]",
     )
     twice = any(a == b for a, b in pairwise(route.points))
-    _require(not twice, "route.points names a point twice in a row; give each once")
+    _require(not twice, f"{what}.points names a point twice in a row; give each once")
 
 
 def _check_metric(metric: MetricConfig) -> None:
@@ -294,7 +312,11 @@ def _check_choice(value: str, choices: Iterable[str], what: str) -> None:
     if value not in names:
         lower = {name.lower(): name for name in names}
         near = difflib.get_close_matches(value.lower()[:MAX_NAME], list(lower), n=1)
-        hint = f"did you mean {lower[near[0]]!r}?" if near else f"expected {', '.join(names[:-1])} or {names[-1]}"
+        hint = (
+            f"did you mean {lower[near[0]]!r}?"
+            if near
+            else f"expected {' or '.join([', '.join(names[:-1]), *names[-1:]]).removeprefix(' or ')}"
+        )
         raise InputError(f"{what} = {value!r}; {hint}")
 
 

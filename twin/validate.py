@@ -332,7 +332,7 @@ def _draw_maps(twin: Twin, folder: Path, trials: Sequence[Trial]) -> None:
     for task in dict.fromkeys(t.task for t in trials):
         segment = find_task(task, world, config.task)
         mine = [t for t in trials if t.task == task]
-        failure_map(folder / f"failures_{task}.png", mine, world, (segment.start, segment.end))
+        failure_map(folder / f"failures_{task}.png", mine, world.along(segment.route), (segment.start, segment.end))
 
 
 def _key(trial: Trial) -> Key:

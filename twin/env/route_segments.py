@@ -2,6 +2,7 @@
 
 The *standard tasks* of DriveEnv-NeRF are `straight` (30 m) and `right_turn` (60 m): segments of the route with a given
 length and total turn. `[[task]]` entries of `scene.toml` define further tasks, and `route` is the whole route.
+A [[branch]] of `scene.toml`, another route through the place, is a task of its own.
 """
 
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ class RouteSegment:
     """Arc length of the start [m]."""
     length: float
     """[m]"""
+    route: str = ""
+    """Name of the branch (`World.branches`) of which it is a part; "" is the route."""
 
     @property
     def end(self) -> float:
@@ -83,14 +86,22 @@ def scene_tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[s
         long_enough = length >= (1.0 - _LENGTH_TOLERANCE) * standard.length
         if long_enough and (starts := _fitting_starts(world.route, standard, length)).size:
             found[name] = RouteSegment(name, float(starts[0]), length)
+    found |= {name: RouteSegment(name, 0.0, _length(world, name), name) for name in world.branches}
     for task in configured:
-        if task.start + task.length > total + 1e-6:
+        if task.route and task.route not in world.branches:
+            raise InputError(f"task {task.name!r}: the build has no branch {task.route!r}; build the scene again")
+        length = _length(world, task.route)
+        if task.start + task.length > length + 1e-6:
             raise InputError(
-                f"task {task.name!r}: from {task.start:g} m to {task.start + task.length:g} m, but the route is "
-                f"{total:.2f} m long; shorten the task in scene.toml"
+                f"task {task.name!r}: from {task.start:g} m to {task.start + task.length:g} m, but its route is "
+                f"{length:.2f} m long; shorten the task in scene.toml"
             )
-        found[task.name] = RouteSegment(task.name, task.start, task.length)
+        found[task.name] = RouteSegment(task.name, task.start, task.length, task.route)
     return found
+
+
+def _length(world: World, branch: str) -> float:
+    return float(arc_lengths(world.along(branch).route)[-1])
 
 
 def _fitting_starts(route: Array, standard: _StandardTask, length: float) -> Array:

@@ -19,7 +19,7 @@ from dm_env import specs
 from scipy.spatial import cKDTree
 
 from twin.assets.gaussians import read_ply
-from twin.config import HELD_OUT, TRAINING, Condition
+from twin.config import HELD_OUT, TRAINING, Condition, ObstacleConfig
 from twin.config_file import load_config
 from twin.env import episode_lighting
 from twin.env.compositor import Compositor, ObjectRenderer
@@ -73,7 +73,9 @@ class EnvFactory:
             parsed = dataclasses.replace(parsed, randomise=parsed.randomise.for_robot(world.robot))
         config = load_config(twin.scene.config_file)
         segment = find_task(task, world, config.task)
-        wanted = config.obstacle if isinstance(parsed.obstacles, str) else parsed.obstacles
+        world = world.along(segment.route)
+        here = tuple(one for one in config.obstacle if one.route == segment.route)
+        wanted = here if isinstance(parsed.obstacles, str) else parsed.obstacles
         beside = round(parsed.randomise.bystanders[1]) if parsed.randomise else 0
         half_width = parsed.half_width or world.half_width
         obstacles = EpisodeObstacles(wanted, dataclasses.replace(world, half_width=half_width), segment, beside)
@@ -136,7 +138,8 @@ def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
     Raises:
         InputError: see `EnvFactory.open`.
     """
-    world, config = twin.world(), load_config(twin.scene.config_file)
+    config = load_config(twin.scene.config_file)
+    segment = find_task(task, twin.world(), config.task)
     ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # of training and of evaluation
     randomization = {"version": VERSION, "ranges": ranges} if condition.randomised else {}
     photos = [
@@ -145,14 +148,20 @@ def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
     return digest_json(
         {
             "stages": [stage_result(twin.scene, factory) for factory in ("field", "mjcf")],
-            "stretch": dataclasses.asdict(find_task(task, world, config.task)),
-            "obstacles": [dataclasses.asdict(one) for one in config.obstacle],
+            "stretch": _without_route(segment),
+            "obstacles": [_without_route(one) for one in config.obstacle if one.route == segment.route],
             **({"randomise": randomization} if randomization else {}),
             **({"lights": episode_lighting.VERSION} if condition.lighting in (TRAINING, HELD_OUT) else {}),
             "photos": [digest_file(path) for path in photos],
             **({"untold": KNOWN_WEATHER_FRACTION} if photos and randomization else {}),
         }
     )
+
+
+def _without_route(one: RouteSegment | ObstacleConfig) -> dict[str, Any]:
+    """The fields; without `route` if it is empty, so that digests from before there were branches stay valid."""
+    fields = dataclasses.asdict(one)
+    return fields if fields["route"] else {name: value for name, value in fields.items() if name != "route"}
 
 
 class DriveEnvironment(control.Environment):

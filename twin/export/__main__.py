@@ -89,7 +89,7 @@ def export(
             raise InputError(f"{twin.scene.root}: has no route, so no tasks; set mjcf.route = true and build it again")
         world = twin.world()
         segment = find_task(task, world, load_config(twin.scene.config_file).task)
-        write_task(task_file, world, segment, Options())
+        write_task(task_file, world.along(segment.route), segment, Options())
         lines.append(f"{task_file}: {task}, {segment.length:.1f} m long, starts {segment.start:.1f} m along the route")
     if folders:
         cameras = twin.cameras()

@@ -11,12 +11,14 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
-from twin.config import RouteConfig
+from twin.config import BranchConfig, RouteConfig
 from twin.errors import InputError, short_repr
 from twin.geometry.cameras import Cameras
 from twin.geometry.passes import SPACING, FilmedPass, find_passes, path_directions, path_length, resample, smooth_line
 from twin.types import Array
 
+BRANCH = "branch."
+"""Prefix of the branches' names in `route.npz`, the file of the route."""
 _MIN_LENGTH = 2.0  # [m] least length of a route
 _AS_LONG = 0.98  # lines longer than this fraction of the longest count as equally long, so that noise does not decide
 _ASIDE = 0.6  # [m] largest lateral offset between a pass and its continuation; the joined line runs midway
@@ -38,6 +40,17 @@ class Route:
     """Names of these passes in driving order; empty if way points were given."""
     passes: tuple[FilmedPass, ...]
     """All filmed passes, chosen or not."""
+
+
+def filmed_branches(cameras: Cameras, branches: tuple[BranchConfig, ...]) -> dict[str, Array]:
+    """Lines of other routes through the place by name, as `Route.line`. Raises InputError as `filmed_route` does."""
+    lines = {}
+    for branch in branches:
+        try:
+            lines[branch.name] = filmed_route(cameras, branch).line
+        except InputError as error:
+            raise InputError(f"[[branch]] {branch.name!r}: {error}") from None
+    return lines
 
 
 def filmed_route(cameras: Cameras, config: RouteConfig | None = None) -> Route:

@@ -22,6 +22,7 @@ from twin.errors import InputError
 from twin.files import load_arrays
 from twin.geometry.cameras import Cameras
 from twin.geometry.images import read_image, write_image
+from twin.geometry.route import BRANCH
 from twin.mjcf import husky
 from twin.mjcf.world import (
     GROUND_GROUP,
@@ -91,7 +92,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     faces = _add_visual(spec, ground, mesh / "visual.npz", assets)
     _add_parts(spec, parts, assets)
 
-    route = _load_route(mesh / "route.npz") if config.mjcf.route else None
+    route, branches = _load_routes(mesh / "route.npz") if config.mjcf.route else (None, {})
     metrics: dict[str, Any] = {"parts": len(parts.vertices), "visual_faces": faces, "has_route": route is not None}
     if route is None:
         metrics |= {"route_length_m": None, "note": "no route: scene without a robot, corridor or goal"}
@@ -99,7 +100,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         camera = config.robot.camera(film_camera(Cameras.load(scene.stage("metric"))))
         spawn, initial_contacts = _add_robot(spec, ground, route, config.robot, camera)
         _add_route(spec, route, config.mjcf.half_width)
-        world = World(route, config.mjcf.half_width, spawn, out, camera, config.robot)
+        world = World(route, config.mjcf.half_width, spawn, out, camera, config.robot, branches=branches)
         world.save()
         metrics |= {
             "route_length_m": float(arc_lengths(route)[-1]),
@@ -115,12 +116,13 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     return metrics
 
 
-def _load_route(path: Path) -> Array | None:
-    """The route [m], shape (m, 3); None if the stage `mesh` wrote none."""
+def _load_routes(path: Path) -> tuple[Array | None, dict[str, Array]]:
+    """The route [m], shape (m, 3), and the branches by name; None and {} if the stage `mesh` wrote none."""
     if not path.exists():
-        return None
+        return None, {}
     data = load_arrays(path)
-    return np.concatenate([data["xy"], data["z"][:, None]], 1).astype(np.float64)
+    route = np.concatenate([data["xy"], data["z"][:, None]], 1).astype(np.float64)
+    return route, {key.removeprefix(BRANCH): line for key, line in data.items() if key.startswith(BRANCH)}
 
 
 def film_camera(cameras: Cameras) -> PixelCamera:

@@ -5,7 +5,7 @@ plane, 0 at its start. *Cross-track error*: distance from the route in the plane
 from the x axis, positive towards y. *Corridor*: the area within `half_width` of the route.
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import mujoco
@@ -42,6 +42,13 @@ class World:
     )
     """Names in the MJCF of the `body`, `camera`, `ground` and `keyframe`."""
 
+    branches: dict[str, Array] = field(default_factory=dict)
+    """Points of other routes through the place, as `route`, by name."""
+
+    def along(self, branch: str) -> "World":
+        """The world with a branch as its route; "" is the route itself. The robot's `spawn` stays where it is."""
+        return replace(self, route=self.branches[branch]) if branch else self
+
     @property
     def intrinsics(self) -> Array:
         """fx, fy, cx, cy [px] of the front camera at CAMERA_SIZE, shape (4,)."""
@@ -77,6 +84,7 @@ class World:
                 "robot": asdict(self.robot),
                 "names": self.names,
                 "model": SCENE_XML,
+                **({"branches": {k: v.tolist() for k, v in self.branches.items()}} if self.branches else {}),
             },
         )
 
@@ -96,9 +104,13 @@ class World:
                 robot=parse_table(HuskyParams, head["robot"], str(path)),
                 folder=folder,
                 names={require_text(key): require_text(name) for key, name in head["names"].items()},
+                branches={
+                    require_text(name): np.array(line, np.float64) for name, line in head.get("branches", {}).items()
+                },
             )
-            m = len(world.route)
-            check_shapes({"route": (world.route, (m, 3), "f")})
+            m = min(len(line) for line in (world.route, *world.branches.values()))
+            lines = {"route": world.route, **world.branches}
+            check_shapes({name: (line, (len(line), 3), "f") for name, line in lines.items()})
             if m < 2 or not world.half_width > 0.0 or min(fx, fy, width, height) <= 0:
                 raise ValueError(
                     f"{m} route points, half width {world.half_width} m, a camera of {width} × {height} px with focal "

@@ -194,11 +194,14 @@ class Driving:
         Raises:
             InputError: the scene cannot be driven, or has no such task.
         """
-        self.world, self._lighting, self._on_step, self._seed = twin.world(), lighting, on_step, seed
+        self._lighting, self._on_step, self._seed = lighting, on_step, seed
         shared = LoadedTwin(twin.scene, field.single_threaded())
         config = load_config(twin.scene.config_file)
         options: dict[str, Any] = {"lighting": field.lightings[0], "observe": "nerf"}
-        self.obstacles = PlacedObstacles(self.world, find_task(task, self.world, config.task), config.obstacle)
+        segment = find_task(task, twin.world(), config.task)
+        self.world = twin.world().along(segment.route)
+        standing = tuple(one for one in config.obstacle if one.route == segment.route)
+        self.obstacles = PlacedObstacles(self.world, segment, standing)
         common = {**options, "obstacles": self.obstacles.pool}
         free = {
             "half_width": max(_REACH, self.world.half_width),
@@ -208,7 +211,7 @@ class Driving:
             "speed": self.world.robot.max_speed,
             "yaw_rate": self.world.robot.max_yaw_rate,
         }
-        loose = EnvFactory.open(shared, "route", {**common, **free})
+        loose = EnvFactory.open(shared, segment.route or "route", {**common, **free})
         bound = EnvFactory.open(shared, task, {**common, **(policy.options() if policy else {})})
         by_keys, by_others = ("keys", loose, FreeDrive), ("task", bound, DriveTask)
         self._drivers: dict[str, tuple[Driver, tuple[str, EnvFactory, type[DriveTask]]]] = {

@@ -1,0 +1,112 @@
+"""Branches: other routes through the same place, by name."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_twin import tiny_twin
+from tiny_world import tiny_ground
+
+import twin
+from twin import runtime
+from twin.config import Condition
+from twin.config_file import load_config
+from twin.env import suite
+from twin.env.route_segments import scene_tasks
+from twin.env.suite import EnvFactory, fingerprint
+from twin.errors import InputError
+from twin.geometry.route import BRANCH
+from twin.mjcf.scene_xml import run
+from twin.mjcf.world import World, arc_lengths
+from twin.scene import SceneDir, write_stamp
+
+BRANCHED = """
+[[branch]]
+name = "side"
+points = [[1.0, 0.0], [9.0, 1.0]]
+[[task]]
+name = "side_gate"
+route = "side"
+start = 2.0
+length = 3.0
+[[obstacle]]
+kind = "cone"
+station = 4.0
+lateral = 0.6
+[[obstacle]]
+kind = "box"
+route = "side"
+station = 4.0
+lateral = -1.4
+"""
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    runtime.set_quiet(True)
+    yield
+    runtime.set_quiet(False)
+
+
+def side() -> np.ndarray:
+    """A line that leaves the tiny route to the left, shape (m, 3)."""
+    xy = np.stack([np.arange(1.0, 9.0, 0.25), np.linspace(0.0, 1.0, 32)], 1)
+    return np.column_stack([xy, tiny_ground().at(xy)])
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    root = tiny_twin(tmp_path_factory.mktemp("branches") / "place", more=BRANCHED)
+    scene = SceneDir(root)
+    mesh, mjcf = scene.stage("mesh"), scene.stage("mjcf")
+    with np.load(mesh / "route.npz") as stored:
+        np.savez(mesh / "route.npz", **stored, **{f"{BRANCH}side": side()})
+    run(scene, load_config(scene.config_file), mjcf)
+    for stage in (mesh, mjcf):
+        write_stamp(stage, stage.name.split("_")[1])
+    return root
+
+
+def test_branch_is_a_task_and_has_tasks(root):
+    world, config = World.load(SceneDir(root).stage("mjcf")), load_config(root / "scene.toml")
+    np.testing.assert_allclose(world.branches["side"], side())
+    assert world.along("") is world and np.array_equal(world.along("side").goal, side()[-1])
+    tasks = scene_tasks(world, config.task)
+    assert tasks["side"].route == tasks["side_gate"].route == "side" and tasks["ahead"].route == ""
+    assert tasks["side"].length == pytest.approx(arc_lengths(side())[-1])
+    too_long = config.task[-1].__class__("far", "side", 5.0, 5.0)
+    with pytest.raises(InputError, match=r"its route is 7\.8"):
+        scene_tasks(world, (too_long,))
+    with pytest.raises(InputError, match="has no branch 'north'; build the scene again"):
+        scene_tasks(world, (config.task[-1].__class__("far", "north", 0.0, 5.0),))
+
+
+def test_episode_drives_along_the_branch(root):
+    env = twin.load(root, "side_gate", seed=1, start_offset=0.0, start_heading=0.0)
+    env.reset()
+    start = env.physics.base_to_world[:2, 3]
+    assert np.linalg.norm(start - np.array([3.0, 0.25])) < 0.1
+    step = env.step([1.0, 0.0])
+    while not step.last():
+        step = env.step([1.0, 0.0])
+    info = env.task.info(env.physics)
+    assert info["cause"] == "goal" and abs(info["cross_track"]) < 0.2
+    assert env.physics.base_to_world[0, 3] > 5.0 and env.physics.base_to_world[1, 3] > 0.4
+
+
+def test_obstacles_stand_on_their_own_route(root):
+    kinds = {}
+    for task in ("ahead", "side"):
+        factory = EnvFactory.open(root, task, {"obstacles": "scene", "pixels": False})
+        kinds[task] = [one.kind for one in factory.obstacles.pool]
+    assert kinds == {"ahead": ["cone"], "side": ["box"]}
+
+
+def test_digests_of_episodes_on_the_route_do_not_depend_on_branches(root, tmp_path, monkeypatch):
+    """They are stored in validated results of builds from before there were branches."""
+    monkeypatch.setattr(suite, "stage_result", lambda scene, stage: stage)
+    cone = BRANCHED[BRANCHED.index("[[obstacle]]") : BRANCHED.rindex("[[obstacle]]")]
+    before = tiny_twin(tmp_path / "place", more=cone)
+    old, new = (fingerprint(twin.load_scene(place), "ahead", Condition("day")) for place in (before, root))
+    assert old == new
+    assert fingerprint(twin.load_scene(root), "side", Condition("day")) != new
