@@ -312,11 +312,8 @@ def _check_choice(value: str, choices: Iterable[str], what: str) -> None:
     if value not in names:
         lower = {name.lower(): name for name in names}
         near = difflib.get_close_matches(value.lower()[:MAX_NAME], list(lower), n=1)
-        hint = (
-            f"did you mean {lower[near[0]]!r}?"
-            if near
-            else f"expected {' or '.join([', '.join(names[:-1]), *names[-1:]]).removeprefix(' or ')}"
-        )
+        expected = " or ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+        hint = f"did you mean {lower[near[0]]!r}?" if near else f"expected {expected}"
         raise InputError(f"{what} = {value!r}; {hint}")
 
 
