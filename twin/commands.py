@@ -452,7 +452,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
             type=float,
             default=0.0,
             metavar="METERS",
-            help="lengthen a sampled place's road to this (20 to 2000; default: as sampled)",
+            help="lengthen a sampled place's road to this, 20 to 2000; 0: as sampled",
         )
 
     def robot(command: argparse.ArgumentParser, camera: bool = True) -> None:

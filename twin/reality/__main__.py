@@ -64,15 +64,15 @@ def film(
     plan: FilmingPlan,
     out: Path,
     number: int = 0,
-    length: float = 0.0,
     traffic: bool = False,
     renderer_of: Callable[[str, KnownPlace], PlaceRenderer] | None = None,
+    length: float = 0.0,
 ) -> Truth:
     """Films every pass of a plan under every lighting into the scene folder `out`, and saves the truth there.
 
-    `number` is that of the place, and `length` [m] as for `place_sampling.draw`; `plan` fits both. With `traffic`, walkers and cars move through every film, and the films of all lightings but the last show parked
+    With `traffic`, walkers and cars move through every film, and the films of all lightings but the last show parked
     cars. The truth contains none of them. `renderer_of` returns the renderer for a lighting and a place; the default is
-    `filming.Renderer`, the only one that shows moving traffic.
+    `filming.Renderer`, the only one that shows moving traffic. `length` [m] is that for `place_sampling.draw`.
 
     Raises:
         InputError: `out` is not empty and has no folder `truth`.
@@ -162,7 +162,7 @@ def command(options: argparse.Namespace) -> None:
             plan = _tiny(plan) if options.tiny else plan
         _check_lightings(options.lightings or [], plan.lightings if options.place else LIGHTINGS)
         plan = replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan
-        film(plan, options.out, options.place, options.length, options.traffic)
+        film(plan, options.out, options.place, options.traffic, length=options.length)
     elif options.command == "compare":
         scene = SceneDir(options.scene)
         figures = compare(scene)["figures"]
@@ -209,7 +209,7 @@ def scene_task(given: str, scene: Path | None, place: int, length: float = 0.0) 
     """Returns a task's name unchanged; reads a JSON file and transforms its task to the true frame.
 
     Raises:
-        InputError: no scene, a scene without truth, or one of another place.
+        InputError: no scene, a scene without truth, or one of another place or length.
     """
     if not given.endswith(".json"):
         return given
@@ -218,12 +218,13 @@ def scene_task(given: str, scene: Path | None, place: int, length: float = 0.0) 
     root = SceneDir(scene)
     if not (root.truth / "truth.npz").exists():
         raise InputError(f"{scene} has no truth; only scenes of `python -m twin.reality film` have one")
-    truth, cameras = Truth.load(root.truth), Cameras.load(require_stage(root, "metric"))
+    truth = Truth.load(root.truth)
     if truth.number != place:
         raise InputError(f"{scene} is a film of place {truth.number}; give --place {truth.number}")
     if place and truth.route.length != draw(place, length).line.length:
         cure = f"give --length {truth.road_length:g}" if truth.road_length else "leave --length out"
         raise InputError(f"{scene} has a road of {truth.route.length:g} m, this place another; {cure}")
+    cameras = Cameras.load(require_stage(root, "metric"))
     return read_task(Path(given), align_rigid(cameras.camera_to_world, matched_poses(truth, cameras)))
 
 

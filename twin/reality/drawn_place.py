@@ -190,9 +190,7 @@ def _add_side_roads(place: KnownPlace, road: DrawnRoad, stations: Array) -> None
         place.objects.append(PlaceObject(f"side_road_{k}", "ground", part, "side_road"))
 
 
-def _add_land(
-    place: KnownPlace, road: DrawnRoad, name: str, box: tuple[float, float, float, float]
-) -> None:
+def _add_land(place: KnownPlace, road: DrawnRoad, name: str, box: tuple[float, float, float, float]) -> None:
     """Adds land in an x and y range [m], lowered under road, verges and side roads."""
     section = road.section
     x0, x1, y0, y1 = box

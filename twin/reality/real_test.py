@@ -58,7 +58,7 @@ class Setup:
     robot: int = 0
     camera: int = 0
     length: float = 0.0
-    """[m], as for `place_sampling.draw`."""
+    """Length to which the place's road is lengthened [m], see `place_sampling.draw`."""
 
     def __post_init__(self) -> None:
         """Raises InputError: no such robot or camera."""
