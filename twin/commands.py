@@ -447,6 +447,13 @@ def _reality(parser: argparse.ArgumentParser) -> None:
             metavar="NUMBER",
             help="0: the demo's street; from 1: sampled places (1 to 49 are for development)",
         )
+        command.add_argument(
+            "--length",
+            type=float,
+            default=0.0,
+            metavar="METERS",
+            help="lengthen a sampled place's road to this, 20 to 2000; 0: as sampled",
+        )
 
     def robot(command: argparse.ArgumentParser, camera: bool = True) -> None:
         place(command)

@@ -1,6 +1,6 @@
 """`twin reality`: films a generated place whose truth is known, drives in it, and measures builds of it.
 
-    python -m twin.reality film [--place NUMBER] --out DIR
+    python -m twin.reality film [--place NUMBER [--length METERS]] --out DIR
     python -m twin.reality compare DIR
     python -m twin.reality drive --policy FILE... --task straight [--place N] [--robot N] [--camera N] --day 1 2
         --out results.csv
@@ -52,6 +52,9 @@ TINY = FilmingPlan(
 """A short film of the campus road, 12 m around the start of its turn, for tests."""
 
 
+_LENGTHS = (20.0, 2000.0)  # [m] range of `--length`
+
+
 def _tiny(plan: FilmingPlan) -> FilmingPlan:
     """The first 12 m of a plan in 320 × 180 px, under at most two lightings."""
     return replace(plan, lightings=plan.lightings[:2], length=12.0, width=320, height=180)
@@ -63,12 +66,13 @@ def film(
     number: int = 0,
     traffic: bool = False,
     renderer_of: Callable[[str, KnownPlace], PlaceRenderer] | None = None,
+    length: float = 0.0,
 ) -> Truth:
     """Films every pass of a plan under every lighting into the scene folder `out`, and saves the truth there.
 
     With `traffic`, walkers and cars move through every film, and the films of all lightings but the last show parked
     cars. The truth contains none of them. `renderer_of` returns the renderer for a lighting and a place; the default is
-    `filming.Renderer`, the only one that shows moving traffic.
+    `filming.Renderer`, the only one that shows moving traffic. `length` [m] is that for `place_sampling.draw`.
 
     Raises:
         InputError: `out` is not empty and has no folder `truth`.
@@ -76,7 +80,7 @@ def film(
     if out.is_dir() and any(out.iterdir()) and not (out / "truth").is_dir():
         raise InputError(f"{out} is not empty and has no truth/, so this command did not write it; give another --out")
     (out / "input").mkdir(parents=True, exist_ok=True)
-    place = build_number(number) if number else places.build()
+    place = build_number(number, length=length) if number else places.build()
     parked = parked_cars(place, plan.start, plan.length) if traffic else []
     films, lightings = {}, {}
     for lighting in plan.lightings:
@@ -102,14 +106,19 @@ def film(
         plan.camera_height,
     )
     truth.save(out / "truth")
-    write_text(out / "scene.toml", scene_toml(plan, out.resolve().name, draw(number) if number else None))
+    spec = draw(number, length) if number else None
+    write_text(out / "scene.toml", scene_toml(plan, out.resolve().name, spec, truth.road_length))
     return truth
 
 
-def scene_toml(plan: FilmingPlan, name: str, spec: PlaceSpec | None = None) -> str:
-    """The contents of `scene.toml`, as a user would write them; `spec` is None for the campus road."""
+def scene_toml(plan: FilmingPlan, name: str, spec: PlaceSpec | None = None, road_length: float = 0.0) -> str:
+    """The contents of `scene.toml`, as a user would write them; `spec` is None for the campus road.
+
+    `road_length` is `Truth.road_length` [m].
+    """
     fx, fy, cx, cy = (round(float(v), 4) for v in plan.intrinsics)
     place = f" --place {spec.number}" if spec else ""
+    place += f" --length {road_length:g}" if road_length else ""
     height = f"camera_height = {plan.camera_height}  # metres"
     if spec:
         height = f"camera_height = {spec.film.stated_height}  # metres, ± {spec.film.height_tolerance:.3f}"
@@ -141,21 +150,26 @@ def _check_lightings(names: list[str], among: Iterable[str]) -> None:
 
 def command(options: argparse.Namespace) -> None:
     """Runs the command in the options parsed by `twin.commands`."""
+    if getattr(options, "length", 0.0):
+        if not _LENGTHS[0] <= options.length <= _LENGTHS[1]:
+            raise InputError(f"--length {options.length:g}: expected {_LENGTHS[0]:g} to {_LENGTHS[1]:g} m")
+        if options.place == 0:
+            raise InputError("--length: the demo's street has its length; give a --place from 1 on")
     if options.command == "film":
         plan = TINY if options.tiny else FilmingPlan()
         if options.place:
-            plan = FilmingPlan.of(draw(options.place))
+            plan = FilmingPlan.of(draw(options.place, options.length))
             plan = _tiny(plan) if options.tiny else plan
         _check_lightings(options.lightings or [], plan.lightings if options.place else LIGHTINGS)
         plan = replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan
-        film(plan, options.out, options.place, options.traffic)
+        film(plan, options.out, options.place, options.traffic, length=options.length)
     elif options.command == "compare":
         scene = SceneDir(options.scene)
         figures = compare(scene)["figures"]
         publish(scene, load_scene(options.scene).report())
         print("\n".join(f"{name:<32} {value:.4g}" for name, value in figures.items() if value is not None))
     else:
-        _with_robot(options, Setup(options.place, options.robot, getattr(options, "camera", 0)))
+        _with_robot(options, Setup(options.place, options.robot, getattr(options, "camera", 0), options.length))
 
 
 def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
@@ -179,7 +193,7 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
             options.lightings = list(WEATHER)
         trials = real_test.run(
             options.policy,
-            scene_task(options.task, options.scene, setup.place),
+            scene_task(options.task, options.scene, setup.place, setup.length),
             [*(options.lightings or []), *days],
             options.trials,
             options.out,
@@ -191,11 +205,11 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
         print(setup)
 
 
-def scene_task(given: str, scene: Path | None, place: int) -> str | RoadTask:
+def scene_task(given: str, scene: Path | None, place: int, length: float = 0.0) -> str | RoadTask:
     """Returns a task's name unchanged; reads a JSON file and transforms its task to the true frame.
 
     Raises:
-        InputError: no scene, a scene without truth, or one of another place.
+        InputError: no scene, a scene without truth, or one of another place or length.
     """
     if not given.endswith(".json"):
         return given
@@ -204,9 +218,13 @@ def scene_task(given: str, scene: Path | None, place: int) -> str | RoadTask:
     root = SceneDir(scene)
     if not (root.truth / "truth.npz").exists():
         raise InputError(f"{scene} has no truth; only scenes of `python -m twin.reality film` have one")
-    truth, cameras = Truth.load(root.truth), Cameras.load(require_stage(root, "metric"))
+    truth = Truth.load(root.truth)
     if truth.number != place:
         raise InputError(f"{scene} is a film of place {truth.number}; give --place {truth.number}")
+    if place and truth.route.length != draw(place, length).line.length:
+        cure = f"give --length {truth.road_length:g}" if truth.road_length else "leave --length out"
+        raise InputError(f"{scene} has a road of {truth.route.length:g} m, this place another; {cure}")
+    cameras = Cameras.load(require_stage(root, "metric"))
     return read_task(Path(given), align_rigid(cameras.camera_to_world, matched_poses(truth, cameras)))
 
 

@@ -7,6 +7,7 @@ footprint.
 
 from collections.abc import Callable
 from functools import cache, partial
+from math import hypot
 
 import numpy as np
 
@@ -29,6 +30,9 @@ _LAND_STEP = 1.5  # [m] between vertices of the land
 _LAND_MARGIN = 48.0  # [m] width of the land around the road
 _FIELD_MARGIN = 14.0  # [m] from the driven line to the edges of `GroundLayout.field`
 _MIN_GAP = 0.35  # [m] between footprints
+_PART_LENGTH = 90.0  # [m] mean length of the parts of a long road; each part has textures of its own
+_TILE = 72.0  # [m] side of the square tiles of a long road's land, a multiple of `_LAND_STEP`
+_LONGEST_REACH = 113.0  # [m] longest reach, see `_reach`, of a road that was not lengthened
 
 
 def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
@@ -40,27 +44,32 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
     """
     road = DrawnRoad(spec)
     stations = np.arange(road.start, road.end + _STEP / 2, _STEP)
-    line = road.at(stations)
-    low, high = line.min(0), line.max(0)
+    parts = max(1, round((stations[-1] - stations[0]) / _PART_LENGTH))
+    ends = np.linspace(0, len(stations) - 1, parts + 1).round().astype(int).tolist()
     driven = road.at(np.linspace(0.0, spec.line.length, 200))
     corners = ((driven.min(0) - _FIELD_MARGIN).tolist(), (driven.max(0) + _FIELD_MARGIN).tolist())
     section = spec.section
     left, right = section.left + section.kerb_width, -section.right - section.kerb_width
+    across = {
+        "road": (section.left, -section.right),
+        "verge_left": (left + section.sides[0].width, left),
+        "verge_right": (right, right - section.sides[1].width),
+    }
+    names_of_parts = [f"_{k}" if k else "" for k in range(parts)]
+    lands = _lands(road.at(stations), tiled=parts > 1)
     layout = GroundLayout(
-        stations=(float(stations[0]), float(stations[-1])),
         bands={
-            "road": (section.left, -section.right),
-            "verge_left": (left + section.sides[0].width, left),
-            "verge_right": (right, right - section.sides[1].width),
+            f"{name}{part}": (float(stations[first]), float(stations[last]), *laterals)
+            for part, first, last in zip(names_of_parts, ends, ends[1:], strict=False)
+            for name, laterals in across.items()
         },
-        land=(
-            float(low[0] - _LAND_MARGIN),
-            float(high[0] + _LAND_MARGIN),
-            float(low[1] - _LAND_MARGIN),
-            float(high[1] + _LAND_MARGIN),
-        ),
+        lands=lands,
         field=((corners[0][0], corners[0][1]), (corners[1][0], corners[1][1])),
-        wet=("road", "kerb", "verge_left", "verge_right", "land", "side_road"),
+        wet=(
+            *(f"{name}{part}" for part in names_of_parts for name in ("road", "kerb", "verge_left", "verge_right")),
+            *lands,
+            "side_road",
+        ),
     )
     names: dict[str, tuple[House, str, Rgb, Rgb]] = {}
     place = KnownPlace(
@@ -73,7 +82,11 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
         seed=(SEED, 100, spec.number, 1000),
         atlas=Atlas(DRAWN_CELLS),
     )
-    _add_ground(place, road, stations)
+    for part, first, last in zip(names_of_parts, ends, ends[1:], strict=False):
+        _add_road(place, road, stations[first : last + 1], part)
+    _add_side_roads(place, road, stations)
+    for name, box in lands.items():
+        _add_land(place, road, name, box)
     site = Site(road)
     names.update(_add_houses(place, spec, site))
     _add_lamps(place, spec, site)
@@ -87,15 +100,30 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
 
 
 @cache
-def build_number(number: int, displaced: bool = False) -> KnownPlace:
-    """Builds the place with a number, 1 or more."""
-    return build(draw(number), displaced)
+def build_number(number: int, displaced: bool = False, length: float = 0.0) -> KnownPlace:
+    """Builds the place with a number, 1 or more; `length` [m] as for `draw`."""
+    return build(draw(number, length), displaced)
 
 
 # ---- ground
 
 
-def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
+def _lands(line: Array, tiled: bool) -> dict[str, tuple[float, float, float, float]]:
+    """Textures of the land and their x and y ranges [m]: one for all, or one per square tile near the line (n, 2)."""
+    (x0, y0), (x1, y1) = (line.min(0) - _LAND_MARGIN).tolist(), (line.max(0) + _LAND_MARGIN).tolist()
+    if not tiled:
+        return {"land": (x0, x1, y0, y1)}
+    out: dict[str, tuple[float, float, float, float]] = {}
+    for x in np.arange(x0, x1, _TILE).tolist():
+        for y in np.arange(y0, y1, _TILE).tolist():
+            away = np.abs(line - (x + 0.5 * _TILE, y + 0.5 * _TILE)) - 0.5 * _TILE
+            if np.hypot(*np.maximum(away, 0.0).T).min() < _LAND_MARGIN:
+                out[f"land_{len(out)}"] = (x, x + _TILE, y, y + _TILE)
+    return out
+
+
+def _add_road(place: KnownPlace, road: DrawnRoad, stations: Array, suffix: str) -> None:
+    """Adds road, curbs and verges along consecutive stations; `suffix` ends the names of objects and textures."""
     section = road.section
 
     def strip(name: str, texture: str, laterals: Array, lifts: Array | None = None, gaps: int = 0) -> None:
@@ -118,7 +146,7 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
             for mouth in road.mouths(gaps):
                 keep &= np.abs(middle - mouth.station) > 0.5 * mouth.width
             part = primitives.MeshPart(part.vertices, part.faces[keep], part.uv)
-        place.objects.append(PlaceObject(name, "ground", part, texture))
+        place.objects.append(PlaceObject(f"{name}{suffix}", "ground", part, f"{texture}{suffix}"))
 
     inner = 1e-6  # keeps the vertices at the road's edges on the road
     strip("road", "road", np.linspace(section.left - inner, -section.right + inner, 15))
@@ -141,6 +169,11 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
             strip(f"kerb_{name}", "kerb", laterals, lifts)
         across = sign * np.linspace(outer + inner, outer + side.width, 9)
         strip(f"verge_{name}", f"verge_{name}", np.sort(across)[::-1], gaps=sign)
+
+
+def _add_side_roads(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
+    """Adds side roads; `stations` are those of the vertices along the road."""
+    section = road.section
     for k, mouth in enumerate(road.line.mouths):
         edge = section.left if mouth.side > 0 else section.right
         reach = edge + section.kerb_width + np.arange(0.0, MOUTH_REACH, 0.5)
@@ -150,12 +183,17 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
         z = road.ground_height(xy) + 0.01
         u = (reach - reach[0]) / np.ptp(reach)
         v = (inside - inside[0]) / np.ptp(inside)
-        uv = np.stack(np.broadcast_arrays(0.03 + 0.3 * k + 0.25 * u[:, None], v[None]), -1)
+        uv = np.stack(np.broadcast_arrays(0.03 + 0.3 * (k % 3) + 0.25 * u[:, None], v[None]), -1)
         order = slice(None, None, -1) if mouth.side > 0 else slice(None)
         points = np.concatenate([xy, z[..., None]], -1)[order]
         part = primitives.grid(points, uv[order])
         place.objects.append(PlaceObject(f"side_road_{k}", "ground", part, "side_road"))
-    x0, x1, y0, y1 = place.layout.land
+
+
+def _add_land(place: KnownPlace, road: DrawnRoad, name: str, box: tuple[float, float, float, float]) -> None:
+    """Adds land in an x and y range [m], lowered under road, verges and side roads."""
+    section = road.section
+    x0, x1, y0, y1 = box
     x, y = np.meshgrid(np.arange(x0, x1 + 0.1, _LAND_STEP), np.arange(y1, y0 - 0.1, -_LAND_STEP))
     xy = np.stack([x, y], -1)
     station, lateral = road.project(xy)
@@ -168,7 +206,7 @@ def _add_ground(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
         sunk = np.where(near & (away < MOUTH_REACH), 0.3, sunk)
     points = np.concatenate([xy, (road.ground_height(xy) - sunk)[..., None]], -1)
     uv = np.clip(np.stack([(x - x0) / (x1 - x0), (y1 - y) / (y1 - y0)], -1), 0.0, 1.0)
-    place.objects.append(PlaceObject("land", "ground", primitives.grid(points, uv), "land"))
+    place.objects.append(PlaceObject(name, "ground", primitives.grid(points, uv), name))
 
 
 # ---- placement
@@ -182,7 +220,7 @@ class Site:
 
     def __init__(self, road: DrawnRoad) -> None:
         self._road = road
-        self._taken: list[tuple[Array, float, Array]] = []  # center, radius, corners
+        self._taken: list[tuple[float, float, float, Array]] = []  # x, y, radius, corners
 
     def take(
         self, center: Array, half: tuple[float, float], yaw: float, clear: float = CLEARANCE, gap: float = _MIN_GAP
@@ -200,10 +238,11 @@ class Site:
         if not self._off_road(center, half, yaw, clear):
             return False
         grown, radius = _corners(center, (half[0] + gap, half[1] + gap), yaw), float(np.hypot(*half)) + gap
-        for other, reach, outline in self._taken:
-            if np.hypot(*(center - other)) < radius + reach and _overlap(grown, outline):
+        x, y = center.tolist()
+        for other_x, other_y, reach, outline in self._taken:
+            if hypot(x - other_x, y - other_y) < radius + reach and _overlap(grown, outline):
                 return False
-        self._taken.append((center, float(np.hypot(*half)), corners))
+        self._taken.append((x, y, float(np.hypot(*half)), corners))
         return True
 
     def _off_road(self, center: Array, half: tuple[float, float], yaw: float, clear: float) -> bool:
@@ -263,6 +302,7 @@ def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tup
     first, last = _reach(spec)
     if houses.density <= 0.05:
         return out
+    most = max(16, int(0.14 * (last - first)))
     for side in (1, -1):
         station = first + float(rng.uniform(0.0, 12.0))
         while station < last + 10.0:
@@ -277,7 +317,7 @@ def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tup
             house = House(
                 _spot(place, station, side * away), yaw, width, depth, storeys, roof, houses.pitch, houses.window
             )
-            if len(out) < 16 and site.take(house.center, (width / 2 + 0.3, depth / 2 + 0.3), yaw, 0.6, 0.6):
+            if len(out) < most and site.take(house.center, (width / 2 + 0.3, depth / 2 + 0.3), yaw, 0.6, 0.6):
                 name = f"house_{len(out)}"
                 add_house(place, name, house, spec.lamps.lit_windows)
                 out[name] = (house, wall, color, tiles)
@@ -458,7 +498,8 @@ def _add_trees(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
             station = first + (k + float(rng.uniform(0.2, 0.8))) / max(1, count) * (last - first + 8.0)
             beyond = row + float(rng.normal(0.0, 0.15)) if trees.row else float(rng.gamma(2.0, 3.5)) + 0.8
             spots.append((station, side * (_edge(spec, side) + beyond)))
-    for _ in range(14 if spec.setting not in ("town", "works") else 5):  # farther away from the road
+    distant = 14 if spec.setting not in ("town", "works") else 5  # farther away from the road
+    for _ in range(round(distant * max(1.0, (last - first) / _LONGEST_REACH))):
         side = int(rng.choice([-1, 1]))
         spots.append((float(rng.uniform(first, last + 25.0)), side * float(rng.uniform(14.0, 38.0))))
     for k, at in enumerate(spots):

@@ -22,7 +22,8 @@ _LAND_SAMPLE = 2.0  # [m] between points of the line whose heights determine the
 _LAND_SMOOTHING = 3.0  # [m] length over which these heights are smoothed
 _DROP_LENGTH = 0.8  # [m] over which a curb drops beside a side road
 MOUTH_REACH = 26.0  # [m] from the road's edge to the end of a side road
-_CHUNK = 40_000  # points whose land height is computed together
+_CHUNK = 40_000  # most points whose land height is computed together
+_CHUNK_DISTANCES = 4_000_000  # most distances between points and line that are computed together
 
 
 class DrawnRoad:
@@ -170,13 +171,14 @@ class DrawnRoad:
         """Height of the open land [m], shape (n, 2) → (n,): a weighted mean of the line's heights, plus swells."""
         points, heights = self._land_samples
         out = np.empty(len(xy))
-        for first in range(0, len(xy), _CHUNK):
-            part = xy[first : first + _CHUNK]
+        chunk = min(_CHUNK, _CHUNK_DISTANCES // len(points))
+        for first in range(0, len(xy), chunk):
+            part = xy[first : first + chunk]
             distance2 = ((part[:, None] - points[None]) ** 2).sum(-1)
             weight = 1.0 / (distance2 + _LAND_SMOOTHING**2) ** 2
             swell = np.sin(part @ self._swells.T + self._swell_phases).sum(-1) / np.sqrt(2.0)
             nearness = 1.0 - np.exp(-distance2.min(1) / 30.0**2)
-            out[first : first + _CHUNK] = (weight @ heights) / weight.sum(1) + self.line.relief * nearness * swell
+            out[first : first + chunk] = (weight @ heights) / weight.sum(1) + self.line.relief * nearness * swell
         return out
 
     def ground_height(self, xy: ArrayLike) -> Array:

@@ -101,33 +101,46 @@ def _paint(
     def rng(*key: int) -> np.random.Generator:
         return stream(spec.number, "surface", *key)
 
-    first, last = layout.stations
-    length = last - first
-    zebras: tuple[float, ...] = ()
-    if "zebra" in surface.markings:
-        zebras = (float(rng(1).uniform(0.2, 0.8)) * spec.line.length - first,)
-    out = {"road": to_uint8(surfaces.road(rng(2), surface, section, length, _ROAD_PIXEL, zebras))}
-    for k, (name, side) in enumerate(zip(("verge_left", "verge_right"), section.sides, strict=True)):
-        shape = (max(8, round(side.width / _VERGE_PIXEL)), round(length / _VERGE_PIXEL))
-        image = surfaces.turf(rng(3, k), surface, shape, _VERGE_PIXEL, side.verge)
-        if side.pavement > 0.0:
-            paved = min(shape[0], round(side.pavement / _VERGE_PIXEL))
-            inner = slice(shape[0] - paved, None) if k == 0 else slice(0, paved)
-            image[inner] = surfaces.paving(rng(4, k), surface, (paved, shape[1]), _VERGE_PIXEL, side.paving)
-        out[name] = to_uint8(image)
-    if section.kerb_height > 0.0:
-        tone = float(rng(5).uniform(0.7, 1.25))
-        stones = (16, round(length / 0.02))
-        out["kerb"] = to_uint8(slabs(rng(6), stones, 0.02, (10.0, float(rng(5).uniform(0.5, 1.2)))) * tone)
+    def style(key: int) -> np.random.Generator | None:
+        """The generator of what the parts of a long road share; None for a road of one part."""
+        return stream(spec.number, "longer", key) if parts > 1 else None
+
+    out: dict[str, NDArray[np.uint8]] = {}
+    parts = sum(name.startswith("road") for name in layout.bands)
+    for n in range(parts):
+        part, more = (f"_{n}", (n,)) if n else ("", ())
+        first, last, *_ = layout.bands[f"road{part}"]
+        length = last - first
+        zebras: tuple[float, ...] = ()
+        if "zebra" in surface.markings:
+            share = float(rng(1, *more).uniform(0.2, 0.8))
+            zebras = (share * spec.line.length - first if parts == 1 else share * length,)
+        painted = surfaces.road(rng(2, *more), surface, section, length, _ROAD_PIXEL, zebras, style(1))
+        out[f"road{part}"] = to_uint8(painted)
+        for k, (name, side) in enumerate(zip(("verge_left", "verge_right"), section.sides, strict=True)):
+            shape = (max(8, round(side.width / _VERGE_PIXEL)), round(length / _VERGE_PIXEL))
+            image = surfaces.turf(rng(3, k, *more), surface, shape, _VERGE_PIXEL, side.verge)
+            if side.pavement > 0.0:
+                paved = (min(shape[0], round(side.pavement / _VERGE_PIXEL)), shape[1])
+                inner = slice(shape[0] - paved[0], None) if k == 0 else slice(0, paved[0])
+                image[inner] = surfaces.paving(
+                    rng(4, k, *more), surface, paved, _VERGE_PIXEL, side.paving, style(2 + k)
+                )
+            out[f"{name}{part}"] = to_uint8(image)
+        if section.kerb_height > 0.0:
+            tone = float(rng(5).uniform(0.7, 1.25))
+            stones = (16, round(length / 0.02))
+            kerb = slabs(rng(6, *more), stones, 0.02, (10.0, float(rng(5).uniform(0.5, 1.2)))) * tone
+            out[f"kerb{part}"] = to_uint8(kerb)
     if spec.line.mouths:
         plain = replace(surface, markings=(), strip=0.0)
         half = 0.5 * max(mouth.width for mouth in spec.line.mouths)
         across = replace(section, left=half, right=half, kerb_height=0.0)
         out["side_road"] = to_uint8(surfaces.road(rng(7), plain, across, MOUTH_REACH / 0.25, 0.02))
-    x0, x1, y0, y1 = layout.land
     kind = {"town": "grass", "works": "gravel", "field": "meadow", "forest": "earth"}.get(spec.setting, "grass")
-    shape = (round((y1 - y0) / _LAND_PIXEL), round((x1 - x0) / _LAND_PIXEL))
-    out["land"] = to_uint8(surfaces.land(rng(8), surface, shape, _LAND_PIXEL, kind))
+    for n, (name, (x0, x1, y0, y1)) in enumerate(layout.lands.items()):
+        shape = (round((y1 - y0) / _LAND_PIXEL), round((x1 - x0) / _LAND_PIXEL))
+        out[name] = to_uint8(surfaces.land(rng(8, *((n,) if n else ())), surface, shape, _LAND_PIXEL, kind))
     for k, (name, (house, wall, color, tiles)) in enumerate(houses.items()):
         size = (round((house.eaves + 0.5) / _WALL_PIXEL), round(2 * (house.width + house.depth) / _WALL_PIXEL))
         paint = stream(spec.number, "houses", 2, k)

@@ -6,6 +6,7 @@ has its own speed, lateral wander and shake, so that no two films share a viewpo
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import av
@@ -16,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
-from twin.reality import SEED, true_world
+from twin.geometry.mesh_rays import Surface
+from twin.reality import SEED, primitives, true_world
 from twin.reality.lighting import Lighting, apply_haze
 from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.place_spec import PassSpec, PlaceSpec
 from twin.reality.rasterizer import PlaceRenderer
+from twin.reality.stretches import StretchRenderer, is_long
 from twin.reality.traffic import Mover, movers
 from twin.runtime import track
 from twin.types import Array
@@ -244,15 +247,18 @@ def film_pass(
     light = place.lightings[lighting]
     gains = exposures(light, times)
     rng = np.random.default_rng([SEED, 13, sum(map(ord, name))])
-    render = renderer or Renderer(lighting, place, plan, movers(place, name, times, poses) if traffic else ())
+    moving = movers(place, name, times, poses) if traffic else []
+    make = partial(Renderer, lighting, plan=plan, movers=moving)
+    render = renderer or (StretchRenderer(place, make) if is_long(place) else make(place))
     steps = track(list(zip(times, poses, gains, strict=True)), f"film {name}", unit="frame")
     rays = unproject(pixel_grid(plan.width, plan.height), plan.intrinsics)
 
     def frame(time: float, pose: Array, gain: float) -> NDArray[np.uint8]:
-        if isinstance(render, Renderer) and traffic:
-            render.move_to(time)
+        here = render.at(pose) if isinstance(render, StretchRenderer) else render
+        if isinstance(here, Renderer) and moving:
+            here.move_to(time)
         ground = float(place.route.ground_height(pose[:2, 3]))
-        return sensor_image(rng, apply_haze(*render(pose), rays, pose, light, ground), light, gain)
+        return sensor_image(rng, apply_haze(*here(pose), rays, pose, light, ground), light, gain)
 
     write_video((frame(float(time), pose, float(gain)) for time, pose, gain in steps), plan, path)
     return times, poses
@@ -280,5 +286,12 @@ def depth_maps(
     part = 4 if plan.height % 4 == 0 else 3
     small = replace(plan, width=plan.width // part, height=plan.height // part, samples=1, oversize=1.0)
     frames = np.unique(np.linspace(0, len(poses) - 1, 10).round().astype(np.int64))
+    if is_long(place):
+        # A ray per pixel as in the renderer, but onto the whole place, which a renderer would hold in parts.
+        whole = primitives.join([one.part for one in place.objects])
+        surface = Surface(whole.vertices, whole.faces)
+        rays = unproject(pixel_grid(small.width, small.height), small.intrinsics).reshape(-1, 3)
+        maps = [surface.cast(np.tile(pose[:3, 3], (len(rays), 1)), rays @ pose[:3, :3].T) for pose in poses[frames]]
+        return frames, np.maximum(np.stack(maps), 0.0).reshape(-1, small.height, small.width).astype(np.float16)
     render = Renderer(lighting, place, small)
     return frames, np.stack([render(poses[k])[1] for k in frames]).astype(np.float16)

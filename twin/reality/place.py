@@ -139,13 +139,12 @@ LAND_STEP = 1.5  # [m] between vertices of the land
 
 _OUTER = ROAD_HALF_WIDTH + roads.KERB_WIDTH
 _LAYOUT = GroundLayout(
-    stations=(START, END),
     bands={
-        "road": (ROAD_HALF_WIDTH, -ROAD_HALF_WIDTH),
-        "verge_left": (_OUTER + VERGE_WIDTH, _OUTER),
-        "verge_right": (-_OUTER, -_OUTER - VERGE_WIDTH),
+        "road": (START, END, ROAD_HALF_WIDTH, -ROAD_HALF_WIDTH),
+        "verge_left": (START, END, _OUTER + VERGE_WIDTH, _OUTER),
+        "verge_right": (START, END, -_OUTER, -_OUTER - VERGE_WIDTH),
     },
-    land=LAND_RANGE,
+    lands={"land": LAND_RANGE},
     field=((-8.0, -58.0), (60.0, 22.0)),
     wet=WET_TEXTURES,
 )

@@ -72,13 +72,10 @@ class Atlas:
 class GroundLayout:
     """Extents of the ground textures of a place, and of the area around its driven line."""
 
-    stations: tuple[float, float]
-    """First and last station of the road mesh [m]."""
-    bands: Mapping[str, tuple[float, float]]
-    """Texture → lateral of its first and of its last row [m]. Rows run along the road: the station increases with
-    the column index."""
-    land: tuple[float, float, float, float]
-    """x and y range of the texture `land` [m]."""
+    bands: Mapping[str, tuple[float, float, float, float]]
+    """Texture → stations of its first and last column, laterals of its first and last row [m]."""
+    lands: Mapping[str, tuple[float, float, float, float]]
+    """Texture of the land → its x and y range [m]."""
     field: tuple[tuple[float, float], tuple[float, float]]
     """Lowest and highest (x, y) [m] of the area around the driven line. In randomly sampled places (number ≥ 1), the
     rasterizer casts shadows only in this area (`trial_place.shadow_range`)."""

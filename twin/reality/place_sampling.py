@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from twin.errors import InputError
-from twin.reality.line_sampling import sample_line
+from twin.reality.line_sampling import lengthen, sample_line
 from twin.reality.place_spec import (
     SETTINGS,
     BoundarySpec,
@@ -38,8 +38,11 @@ T = TypeVar("T")
 MAX_FRAMES = 420  # upper bound of the number of frames in all films of a place together
 
 
-def draw(number: int) -> PlaceSpec:
+def draw(number: int, length: float = 0.0) -> PlaceSpec:
     """The description of the place with a number, always the same.
+
+    If its line is shorter than `length` [m], it is lengthened to that. Section, materials, amounts and camera are then
+    those of the place, but what stands beside the road is placed anew.
 
     Raises:
         InputError: `number` < 1; place 0 has no `PlaceSpec`.
@@ -49,6 +52,9 @@ def draw(number: int) -> PlaceSpec:
     setting = _pick(stream(number, "setting"), dict(zip(SETTINGS, (3, 4, 4, 2, 2, 2, 3), strict=True)))
     section = _section(stream(number, "section"), setting)
     line = sample_line(stream(number, "line"), setting, section)
+    fitted = _fitted(section, line)
+    if length > line.length:
+        line = lengthen(stream(number, "longer"), line, setting, fitted, length)
     surface = _surface(stream(number, "surface"), stream(number, "markings"), setting, section)
     lamps = _lamps(stream(number, "lamps"), setting)
     lights = _lights(stream(number, "weather"), lamps)
@@ -56,7 +62,7 @@ def draw(number: int) -> PlaceSpec:
         number,
         setting,
         line,
-        _fitted(section, line),
+        fitted,
         surface,
         _houses(stream(number, "houses"), setting),
         _boundaries(stream(number, "boundaries"), setting, section),

@@ -57,6 +57,7 @@ class LineSpec:
 GRADE_STEP = 20.0  # [m] between grades
 RUN_OUT = 26.0  # [m] of road beyond the driven length
 RUN_IN = 8.0  # [m] of road before the start
+LONGEST_DRAWN = 85.0  # [m] longest driven line of a place whose road was not lengthened
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from twin.reality import SEED
 
 _ASPECTS = (
     *("setting", "line", "section", "surface", "markings", "houses", "boundaries", "trees", "furniture", "cars"),
-    *("lamps", "horizon", "weather", "film"),
+    *("lamps", "horizon", "weather", "film", "longer"),
 )
 """The aspects by index; new ones go to the end."""
 

@@ -262,7 +262,7 @@ _NEAR = 0.02  # [m]
 _UNBOUNDED = 1.0e30  # [samples]
 _NO_TRIANGLE = 1 << 62
 _DEPTH_STEPS = 1.0e5  # [1/m] resolution of a key's depth
-_INDEX_BITS = 20
+_INDEX_BITS = 23
 _MAX_TAPS = 6  # largest number of texture lookups along a footprint's longer axis
 
 

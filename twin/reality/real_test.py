@@ -26,17 +26,17 @@ from twin.errors import InputError
 from twin.evaluation.trials import Trial, read_trials, write_real_trials
 from twin.files import digest_file, read_json, wrap_read_errors, write_json
 from twin.learn.policy import JSON, Policy, load_policy
-from twin.reality import REALITY_VERSION, true_world
+from twin.reality import REALITY_VERSION
 from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import day_number, weather, weather_index
-from twin.reality.rasterizer import PlaceRenderer, Rasterizer
+from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_camera import TRAINED as camera_ranges
 from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of
 from twin.reality.real_judge import RealJudge
 from twin.reality.real_robot import TRAINED as robot_ranges
 from twin.reality.real_robot import RealRobot, draw_robot
 from twin.reality.road_task import CAMPUS_TASKS, RoadTask, task_of_place
-from twin.reality.trial_place import place_on_test_day, shadow_range
+from twin.reality.trial_place import place_on_test_day, rasterizer_of
 from twin.runtime import bar, exclusive_lock
 from twin.types import Image
 
@@ -57,6 +57,8 @@ class Setup:
     place: int = 0
     robot: int = 0
     camera: int = 0
+    length: float = 0.0
+    """Length to which the place's road is lengthened [m], see `place_sampling.draw`."""
 
     def __post_init__(self) -> None:
         """Raises InputError: no such robot or camera."""
@@ -80,7 +82,8 @@ class Setup:
 
     def __str__(self) -> str:
         said = f"outside training's ranges: {', '.join(self.outside)}" if self.outside else "inside training's ranges"
-        return f"place {self.place}, robot {self.robot}, camera {self.camera}; {said}"
+        place = f"place {self.place}" + (f" of {self.length:g} m" if self.length else "")
+        return f"{place}, robot {self.robot}, camera {self.camera}; {said}"
 
 
 def load_policy_file(path: Path) -> Policy:
@@ -95,11 +98,11 @@ def load_policy_file(path: Path) -> Policy:
 
 
 @lru_cache(maxsize=8)
-def rasterizer(lighting: str, intrinsics: tuple[float, ...], size: tuple[int, int], number: int) -> Rasterizer:
-    """The `Rasterizer` of a place in a weather of the real test."""
-    place = place_on_test_day(number)
-    model = true_world.world_spec(weather(lighting), place).compile()
-    return Rasterizer(model, np.array(intrinsics), size, shadow_range(place))
+def rasterizer(
+    lighting: str, intrinsics: tuple[float, ...], size: tuple[int, int], number: int, length: float = 0.0
+) -> PlaceRenderer:
+    """The rasterizer of a place in a weather of the real test."""
+    return rasterizer_of(place_on_test_day(number, length), weather(lighting), np.array(intrinsics), size)
 
 
 class RealTest:
@@ -126,8 +129,9 @@ class RealTest:
             InputError: no such place, robot or camera.
         """
         self.task, self.setup, self.size = task, setup or Setup(), size
-        self._renderer_of = renderer_of or rasterizer
-        self.robot = RealRobot(draw_robot(self.setup.robot), place_on_test_day(self.setup.place))
+        self._renderer_of = renderer_of or (lambda *given: rasterizer(*given, self.setup.length))
+        place = place_on_test_day(self.setup.place, self.setup.length)
+        self.robot = RealRobot(draw_robot(self.setup.robot), place)
         self.camera = draw_camera(self.setup.camera)
         self.judge = RealJudge(task)
 
@@ -172,7 +176,7 @@ class RealTest:
         return Trial(policy.name, self.task.name, lighting, seed, judge.cause, judge.progress, steps)
 
 
-def task_for(policy: Policy, task: str | RoadTask, place: int) -> RoadTask:
+def task_for(policy: Policy, task: str | RoadTask, place: int, length: float = 0.0) -> RoadTask:
     """The given task, or the place's task of that name, for a policy's speed limits and control step.
 
     Raises:
@@ -180,7 +184,7 @@ def task_for(policy: Policy, task: str | RoadTask, place: int) -> RoadTask:
     """
     c = policy.control
     if isinstance(task, str):
-        return task_of_place(place, task, c.speed, c.yaw_rate, c.control_timestep)
+        return task_of_place(place, task, c.speed, c.yaw_rate, c.control_timestep, length)
     if task.control_timestep != c.control_timestep:
         raise InputError(
             f"task {task.name!r} has a control step of {task.control_timestep:g} s, policy {policy.name} one of "
@@ -232,7 +236,7 @@ def run(
         done = read_trials(table) if table.exists() else []
         known = {(*_key(one), one.seed) for one in done}
         for policy in {one.name: one for one in loaded}.values():
-            test = RealTest(task_for(policy, task, setup.place), setup, policy.size)
+            test = RealTest(task_for(policy, task, setup.place, setup.length), setup, policy.size)
             for lighting in dict.fromkeys(lightings):
                 # Each weather has its own seeds: with shared ones, the starts in all weathers would be the same.
                 first = _FIRST_SEED + _SEEDS_PER_LIGHTING * weather_index(lighting)
@@ -253,7 +257,8 @@ def _check_setup(setup: Setup, table: Path, record: Path) -> None:
     given = {**asdict(setup), "version": REALITY_VERSION}
     if record.exists():
         with wrap_read_errors(record, "give another --out"):
-            known = {name: read_json(record)[name] for name in given}
+            found = {"length": 0.0, **read_json(record)}  # earlier records have no length
+            known = {name: found[name] for name in given}
         if known != given:
             raise InputError(f"{table} has trials of {known}; this call has {given}; give another --out")
     elif table.exists():

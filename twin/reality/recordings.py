@@ -14,16 +14,15 @@ from numpy.typing import NDArray
 
 from twin.errors import InputError
 from twin.geometry.images import write_image
-from twin.reality import SEED, true_world
+from twin.reality import SEED
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import Lighting, weather
 from twin.reality.place_objects import DrivenLine
-from twin.reality.rasterizer import Rasterizer
 from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of, native_size
 from twin.reality.real_robot import RealRobot, draw_robot
 from twin.reality.real_test import Setup
-from twin.reality.trial_place import place_on_test_day, shadow_range
+from twin.reality.trial_place import place_on_test_day, rasterizer_of
 from twin.runtime import track
 from twin.types import Array
 
@@ -45,13 +44,13 @@ def write_film(path: Path, setup: Setup) -> None:
     """
     if path.suffix != ".mp4" or path.is_dir():
         raise InputError(f"{path}: expected a .mp4 file to write, such as robot.mp4")
-    filmed = place_on_test_day(setup.place).lightings
+    filmed = place_on_test_day(setup.place, setup.length).lightings
     robot, camera = robot_and_camera(setup, filmed.get(LIGHTING) or next(iter(filmed.values())))
     path.parent.mkdir(parents=True, exist_ok=True)
     count = round((_STATIONS[1] - _STATIONS[0]) / _SPEED * _FPS)
     width, height = native_size()
     plan = replace(FilmingPlan(), width=width, height=height, fps=_FPS, crf=16)
-    frames = _frames(robot, camera, place_on_test_day(setup.place).route, count)
+    frames = _frames(robot, camera, place_on_test_day(setup.place, setup.length).route, count)
     write_video(track(frames, "film from the robot", unit="frame", total=count), plan, path)
 
 
@@ -71,11 +70,10 @@ def write_photo(lighting: str, path: Path, setup: Setup) -> None:
 
 def robot_and_camera(setup: Setup, light: Lighting) -> tuple[RealRobot, RealCamera]:
     """The robot at rest at the start of `_STATIONS`, and its camera with the native image size."""
-    place, numbers, size = place_on_test_day(setup.place), draw_camera(setup.camera), native_size()
+    place, numbers, size = place_on_test_day(setup.place, setup.length), draw_camera(setup.camera), native_size()
     robot = RealRobot(draw_robot(setup.robot), place)
     set_on_line(robot, place.route, _STATIONS[0])
-    model = true_world.world_spec(light, place).compile()
-    raster = Rasterizer(model, intrinsics_of(numbers, size), size, shadow_range(place))
+    raster = rasterizer_of(place, light, intrinsics_of(numbers, size), size)
     return robot, RealCamera(raster, light, numbers, size, np.random.default_rng([SEED, 43]))
 
 
@@ -134,8 +132,8 @@ def record_log(duration: float, setup: Setup) -> dict[str, Array]:
     if not duration >= 10.0:
         raise InputError(f"duration = {duration:g} s; expected at least 10")
     rng = np.random.default_rng([SEED, 42])
-    line = place_on_test_day(setup.place).route
-    robot = RealRobot(draw_robot(setup.robot), place_on_test_day(setup.place))
+    place = place_on_test_day(setup.place, setup.length)
+    line, robot = place.route, RealRobot(draw_robot(setup.robot), place)
     set_on_line(robot, line, 12.0)
     first = np.array(robot.pose)
     command, until, rows = np.zeros(2), 1.0, []

@@ -141,24 +141,31 @@ def parse_task(table: dict[str, Any], to_truth: Similarity | None = None) -> Roa
 
 
 @cache
-def _filmed_line(number: int) -> Array:
-    place = place_on_test_day(number)
-    return true_route(FilmingPlan.of(draw(number)) if number else None, place.route)[:, :2]
+def _filmed_line(number: int, length: float) -> Array:
+    place = place_on_test_day(number, length)
+    return true_route(FilmingPlan.of(draw(number, length)) if number else None, place.route)[:, :2]
 
 
 def task_of_place(
-    number: int, name: str, speed: float = 1.0, yaw_rate: float = 1.0, control_timestep: float = 0.1
+    number: int,
+    name: str,
+    speed: float = 1.0,
+    yaw_rate: float = 1.0,
+    control_timestep: float = 0.1,
+    road_length: float = 0.0,
 ) -> RoadTask:
     """A task of a place on its filmed path, for a policy's speed [m/s], yaw rate [rad/s] and control step [s].
+
+    `road_length` [m] as the length for `place_sampling.draw`.
 
     Raises:
         InputError: no such task in this place.
     """
-    offered = tasks(draw(number).line) if number else CAMPUS_TASKS
+    offered = tasks(draw(number, road_length).line) if number else CAMPUS_TASKS
     if name not in offered:
         raise InputError(f"task {name!r}: place {number} has {', '.join(offered)}")
     start, length = offered[name]
-    line = _filmed_line(number)
+    line = _filmed_line(number, road_length)
     end = min(start + length, float(np.hypot(*np.diff(line, axis=0).T).sum()))
     return RoadTask(
         *(name, line, _HALF_WIDTH, start, _START_OFFSET, _START_HEADING, end - _BUMPER),

@@ -76,7 +76,7 @@ def write_robot_bag(
             raise InputError(str(error)) from None
         limits = onnx.speed, onnx.max_yaw_rate, onnx.timestep
     size = _WIDTH, round(_WIDTH * native_size()[1] / native_size()[0])
-    test = RealTest(task_of_place(setup.place, task, *limits), setup, size)
+    test = RealTest(task_of_place(setup.place, task, *limits, road_length=setup.length), setup, size)
     robot, judge, timestep = test.robot, test.judge, test.task.control_timestep
     camera = test.reset(lighting, seed)
     fx, fy, cx, cy = intrinsics_of(test.camera, size).tolist()

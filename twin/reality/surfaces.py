@@ -19,11 +19,14 @@ def road(
     length: float,
     pixel: float,
     zebras: tuple[float, ...] = (),
+    style: np.random.Generator | None = None,
 ) -> Array32:
     """The road's surface: rows from the left edge to the right, columns along the road; lengths and `pixel` [m].
 
-    `zebras` are the distances of zebra crossings from the first column [m].
+    `zebras` are the distances of zebra crossings from the first column [m]. Parts of one road share a `style`: equal
+    generators give an equal bond of pavers, equal lines and equal colors of leaves.
     """
+    style = style or rng
     shape = (round(section.width / pixel), round(length / pixel))
     rows = shape[0]
     lateral = (section.left - (np.arange(rows) + 0.5) * pixel)[:, None]
@@ -37,15 +40,15 @@ def road(
             _slab_field(rng, image, surface.unit, pixel, 0.06, (0.16, 0.15, 0.13), 0.016)
             grains(rng, image, 0.05, _CHIPS)
         case "pavers":
-            bond = int(rng.integers(0, 3))
-            _slab_field(rng, image, surface.unit, pixel, float(rng.uniform(0.06, 0.22)), (0.2, 0.19, 0.15), 0.012, bond)
+            bond, spread = int(style.integers(0, 3)), float(style.uniform(0.06, 0.22))
+            _slab_field(rng, image, surface.unit, pixel, spread, (0.2, 0.19, 0.15), 0.012, bond)
         case _:
             _gravel(rng, image, surface, section, lateral, pixel)
     if surface.kind != "gravel":
         dirt = np.clip(1.0 - from_edge / 0.7, 0.0, 1.0) * (fbm(rng, shape, 80, 4) > 0.3)
         blend(image, surface.earth, 0.45 * dirt)
     _repair(rng, image, surface, length, pixel)
-    _mark(rng, image, surface, section, lateral, pixel, zebras)
+    _mark(rng, style, image, surface, section, lateral, pixel, zebras)
     if surface.covers > 0.0:
         for station in np.arange(rng.uniform(1.0, surface.covers), length - 3.0, surface.covers):
             station += rng.uniform(-0.3, 0.3) * surface.covers
@@ -54,7 +57,7 @@ def road(
             if section.kerb_height > 0.0:
                 gully(image, int(np.clip(station + 4.0, 1.0, length - 1.0) / pixel), rng.random() < 0.5, pixel)
     fallen = np.array([[0.55, 0.42, 0.16], [0.42, 0.28, 0.12], [0.38, 0.42, 0.18], [0.45, 0.44, 0.42]], np.float32)
-    fallen = fallen[rng.permutation(4)[: int(rng.integers(1, 4))]] * rng.uniform(0.5, 1.1, 3).astype(np.float32)
+    fallen = fallen[style.permutation(4)[: int(style.integers(1, 4))]] * style.uniform(0.5, 1.1, 3).astype(np.float32)
     speckle(rng, image, int(length * surface.litter), (0.8, float(rng.uniform(1.4, 3.2))), fallen)
     return np.clip(image, 0.02, 1.0)
 
@@ -174,6 +177,7 @@ def _repair(rng: np.random.Generator, image: Array32, surface: SurfaceSpec, leng
 
 def _mark(
     rng: np.random.Generator,
+    style: np.random.Generator,
     image: Array32,
     surface: SurfaceSpec,
     section: SectionSpec,
@@ -186,14 +190,14 @@ def _mark(
     along = (np.arange(columns) + 0.5)[None] * pixel
     worn = np.clip(1.05 - surface.wear + 0.45 * fbm(rng, (rows, columns), 40, 1.5), 0.0, 1.0)
     middle = lateral - 0.5 * (section.left - section.right)
-    period, share, wide = rng.uniform(3.0, 9.0), rng.uniform(0.35, 0.65), rng.uniform(0.05, 0.08)
+    period, share, wide = style.uniform(3.0, 9.0), style.uniform(0.35, 0.65), style.uniform(0.05, 0.08)
     lines = np.zeros((rows, columns), bool)
     if "dashes" in surface.markings:
         lines |= (np.abs(middle) < wide) & ((along % period) < share * period)
     if "centre" in surface.markings:
         lines |= np.broadcast_to(np.abs(middle) < wide, lines.shape)
     if "edges" in surface.markings:
-        inset = rng.uniform(0.12, 0.35)
+        inset = style.uniform(0.12, 0.35)
         lines |= np.broadcast_to(np.abs(np.abs(middle) - 0.5 * section.width + inset) < wide, lines.shape)
     blend(image, surface.paint, worn * lines)
     for station in zebras:
@@ -259,21 +263,29 @@ def land(rng: np.random.Generator, surface: SurfaceSpec, shape: tuple[int, int],
     return np.clip(image, 0.02, 1.0)
 
 
-def paving(rng: np.random.Generator, surface: SurfaceSpec, shape: tuple[int, int], pixel: float, kind: str) -> Array32:
-    """A sidewalk: rows across it, columns along it."""
+def paving(
+    rng: np.random.Generator,
+    surface: SurfaceSpec,
+    shape: tuple[int, int],
+    pixel: float,
+    kind: str,
+    style: np.random.Generator | None = None,
+) -> Array32:
+    """A sidewalk: rows across it, columns along it. Parts of one sidewalk share a `style`, see `road`."""
+    style = style or rng
     if kind == "gravel":
         return turf(rng, surface, shape, pixel, "gravel")
-    level = float(rng.uniform(0.26, 0.42) if kind == "asphalt" else rng.uniform(0.42, 0.62))
-    warm = float(rng.uniform(-0.04, 0.10))
+    level = float(style.uniform(0.26, 0.42) if kind == "asphalt" else style.uniform(0.42, 0.62))
+    warm = float(style.uniform(-0.04, 0.10))
     image = tinted((level * (1 + warm), level, level * (1 - warm)), fbm(rng, shape, 60, 1.5), 0.10)
     if kind == "asphalt":
         grains(rng, image, 0.14, _CHIPS)
     elif kind == "slabs":
-        unit = (float(rng.uniform(0.3, 0.8)), float(rng.uniform(0.3, 0.9)))
-        _slab_field(rng, image, unit, pixel, 0.09, (0.19, 0.2, 0.14), 0.022, int(rng.integers(0, 3)))
+        unit = (float(style.uniform(0.3, 0.8)), float(style.uniform(0.3, 0.9)))
+        _slab_field(rng, image, unit, pixel, 0.09, (0.19, 0.2, 0.14), 0.022, int(style.integers(0, 3)))
     else:
-        unit = (float(rng.uniform(0.11, 0.2)), float(rng.uniform(0.11, 0.24)))
-        _slab_field(rng, image, unit, pixel, 0.12, (0.24, 0.22, 0.17), 0.022, int(rng.integers(0, 3)))
+        unit = (float(style.uniform(0.11, 0.2)), float(style.uniform(0.11, 0.24)))
+        _slab_field(rng, image, unit, pixel, 0.12, (0.24, 0.22, 0.17), 0.022, int(style.integers(0, 3)))
     spots = np.array([[0.2, 0.2, 0.2], [0.7, 0.68, 0.64], [0.4, 0.33, 0.22]], np.float32)
     speckle(rng, image, int(shape[0] * shape[1] * 0.003), (0.7, 2.4), spots)
     return np.clip(image, 0.02, 1.0)

@@ -34,15 +34,14 @@ def sky_visibility(place: KnownPlace, points: Array) -> Array:
 
 def ground_visibility(place: KnownPlace) -> dict[str, Array]:
     """A coarse sky-visibility map for each ground texture, with rows and columns along those of the texture."""
-    first, last = place.layout.stations
-    along = np.linspace(first, last, round((last - first) / _OCCLUSION_STEP))
     grids = {}
-    for name, (top, bottom) in place.layout.bands.items():
+    for name, (first, last, top, bottom) in place.layout.bands.items():
+        along = np.linspace(first, last, round((last - first) / _OCCLUSION_STEP))
         across = np.linspace(top, bottom, max(2, round(abs(top - bottom) / _OCCLUSION_STEP)))
         grids[name] = place.route.at(along[None], across[:, None])
-    x0, x1, y0, y1 = place.layout.land
-    x, y = np.meshgrid(np.linspace(x0, x1, round(x1 - x0)), np.linspace(y1, y0, round(y1 - y0)))
-    grids["land"] = np.stack([x, y], -1)
+    for name, (x0, x1, y0, y1) in place.layout.lands.items():
+        x, y = np.meshgrid(np.linspace(x0, x1, round(x1 - x0)), np.linspace(y1, y0, round(y1 - y0)))
+        grids[name] = np.stack([x, y], -1)
     return {
         name: sky_visibility(place, np.concatenate([xy, place.route.ground_height(xy)[..., None]], -1))
         for name, xy in grids.items()

@@ -78,6 +78,8 @@ class Truth:
             "start": self.start,
             "length": self.length,
         }
+        if self.road_length > 0.0:
+            head["road_length"] = self.road_length
         head |= {"half_width": self.half_width}
         if self.number > 0:
             head |= {"lightings": self.lightings, "camera_height": self.camera_height}
@@ -96,10 +98,10 @@ class Truth:
             keys = ("times", "camera_to_world", "depth_frames", "depth")
             films = {name: TrueFilm(*(data[f"{key}_{name}"] for key in keys)) for name in head["films"]}
             number = int(head.get("place", 0))
-            route = DrawnRoad(draw(number)) if number else RoadLine(**head["route"])
+            road = DrawnRoad(draw(number, head.get("road_length", 0.0))) if number else RoadLine(**head["route"])
             size = (int(head["size"][0]), int(head["size"][1]))
             truth = Truth(
-                route,
+                road,
                 head["start"],
                 head["length"],
                 head["half_width"],
@@ -116,10 +118,17 @@ class Truth:
             )
         return truth
 
+    @property
+    def road_length(self) -> float:
+        """Length of the driven line [m] if it was lengthened, else 0."""
+        return self.route.length if self.number and self.route.length > draw(self.number).line.length else 0.0
+
     @cached_property
     def place(self) -> KnownPlace:
         """The rebuilt place."""
-        return places.build(self.route) if isinstance(self.route, RoadLine) else build_number(self.number)
+        if isinstance(self.route, RoadLine):
+            return places.build(self.route)
+        return build_number(self.number, length=self.road_length)
 
     def ground_height(self, xy: Array) -> Array:
         """Height of the ground [m], shape (..., 2) → (...)."""

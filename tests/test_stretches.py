@@ -1,0 +1,145 @@
+"""Long places: the lengthened line, what stands beside it, and its rendering one stretch at a time."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from twin.errors import InputError
+from twin.files import read_json
+from twin.geometry.cameras import pixel_grid, unproject
+from twin.reality import filming
+from twin.reality.__main__ import main, scene_task, scene_toml
+from twin.reality.drawn_place import build
+from twin.reality.drawn_road import DrawnRoad
+from twin.reality.place_sampling import MAX_FRAMES, draw
+from twin.reality.place_spec import GRADE_STEP, LONGEST_DRAWN, RUN_IN, RUN_OUT
+from twin.reality.stretches import StretchRenderer, is_long, near_stretch
+from twin.reality.truth import TrueFilm, Truth
+
+PLACE, LENGTH = 12, 220.0
+
+
+@pytest.fixture(scope="module")
+def place():
+    return build(draw(PLACE, LENGTH))
+
+
+@pytest.mark.parametrize(("length", "numbers"), [(100.0, range(1, 41)), (300.0, range(1, 41)), (2000.0, range(1, 5))])
+def test_a_lengthened_line_begins_as_drawn_and_does_not_come_back(length, numbers):
+    for number in numbers:
+        short, spec = draw(number), draw(number, length)
+        known = len(short.line.pieces)
+        assert spec.line.length == length and spec.section == short.section and spec.lights == short.lights
+        assert spec.line.pieces[:known] == short.line.pieces
+        assert spec.line.grades[: len(short.line.grades)] == short.line.grades
+        assert sum(piece.length for piece in spec.line.pieces) >= length + RUN_OUT
+        assert (len(spec.line.grades) - 1) * GRADE_STEP >= length + RUN_OUT
+        assert max(map(abs, spec.line.grades)) == max(map(abs, short.line.grades))
+        for piece in spec.line.pieces:
+            assert piece.curvature == 0.0 or 6.0 <= 1.0 / abs(piece.curvature) <= 40.0, number
+        stations = np.arange(-RUN_IN, length + RUN_OUT)
+        xy = DrawnRoad(spec).at(stations)
+        drawn = sum(piece.length for piece in short.line.pieces)
+        for k in np.flatnonzero(stations > drawn).tolist():
+            before = xy[stations < stations[k] - 65.0]
+            assert not len(before) or np.hypot(*(before - xy[k]).T).min() > 30.0, (number, stations[k])
+        for mouth in spec.line.mouths:
+            assert mouth.width / 2 < mouth.station < length, number
+
+
+def test_without_a_length_nothing_changes():
+    for number in range(1, 41):
+        assert draw(number, 20.0) == draw(number, draw(number).line.length) == draw(number), number
+        assert draw(number).line.length <= LONGEST_DRAWN
+    assert not is_long(build(draw(PLACE)))
+
+
+def test_a_long_film_takes_no_more_frames_than_its_speed_asks_for():
+    for number in range(1, 41):
+        film = draw(number, 300.0).film
+        wanted = 300.0 * len(film.passes) * len(draw(number).lights) / MAX_FRAMES
+        assert film.spacing <= 2.01 and (film.fps == np.ceil(film.speed / 2.0) or film.spacing > 0.66 * wanted), number
+        assert film.size == draw(number).film.size
+
+
+def test_things_stand_as_densely_far_along_as_at_the_start(place):
+    """Solids of 50 m of road, for every 50 m; no 50 m has less than a third of the mean."""
+    solids = [solid.center[:2] for obj in place.objects for solid in obj.solids]
+    station, lateral = place.route.project(np.array(solids))
+    counts = np.histogram(station[np.abs(lateral) < 20.0], np.arange(0.0, 201.0, 50.0))[0]
+    assert counts.min() > counts.mean() / 3.0 and counts.min() >= 5
+
+
+def test_parts_of_road_and_land_meet(place):
+    """The ground meshes have no gap where two parts of the road meet, and tiles of land surround the road."""
+    bands = place.layout.bands
+    names = [name for name in bands if name.startswith("road")]
+    assert len(names) > 1 and len(place.layout.lands) > 1
+    for one, other in pairwise(names):
+        assert bands[one][1] == bands[other][0]
+        edges = [next(obj for obj in place.objects if obj.name == name).part.vertices for name in (one, other)]
+        rows = [edge.reshape(15, -1, 3) for edge in edges]
+        assert np.array_equal(rows[0][:, -1], rows[1][:, 0])
+    stations = np.arange(0.0, LENGTH, 5.0)
+    for lateral in (-40.0, 40.0):
+        for x, y in place.route.at(stations, lateral).tolist():
+            assert any(x0 <= x <= x1 and y0 <= y <= y1 for x0, x1, y0, y1 in place.layout.lands.values())
+    assert {*place.layout.wet} >= {*bands, *place.layout.lands}
+
+
+def test_a_stretch_has_what_is_near_and_sharp_textures_there(place, monkeypatch):
+    monkeypatch.setattr("twin.reality.stretches._SIGHT", 60.0)
+    monkeypatch.setattr("twin.reality.stretches._SHARP", 20.0)
+    part, whole = near_stretch(place, 0.0, 50.0), place.textures()
+    kept = {obj.name for obj in part.objects}
+    last = f"road_{sum(name.startswith('road') for name in place.layout.bands) - 1}"
+    assert "road" in kept and last not in kept and 0 < len(kept) < len(place.objects)
+    assert {*part.layout.bands} < {*place.layout.bands} and len(part.lamp_heads) <= 24
+    images = part.textures()
+    assert {obj.texture for obj in part.objects} & {*whole} <= {*images} and images["road"] is whole["road"]
+    shrunk = [name for name, image in images.items() if image.shape != whole[name].shape]
+    assert shrunk and all(images[name].shape[1] == max(1, whole[name].shape[1] // 4) for name in shrunk)
+
+
+def test_a_frame_far_along_shows_the_road_and_things_beside_it(place):
+    """At 170 m: road below the horizon, solid things beside it, and depth that is the same by rays."""
+    plan = replace(filming.FilmingPlan.of(draw(PLACE, LENGTH)), width=160, height=92, oversize=1.0)
+    lighting = plan.lightings[0]
+    _, poses = filming.trajectory(plan, place.route, lighting)
+    pose = poses[np.argmin(np.abs(place.route.project(poses[:, :2, 3])[0] - 170.0))]
+    render = StretchRenderer(place, lambda part: filming.Renderer(lighting, part, plan))
+    light, depth = render(pose)
+    points = (unproject(pixel_grid(160, 92), plan.intrinsics) * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+    station, lateral = place.route.project(points[..., :2])
+    seen = (depth > 0.0) & (depth < 40.0)
+    height = points[..., 2] - place.route.ground_height(points[..., :2])
+    road = seen & (place.route.edges(lateral) < 0.0) & (station > 170.0) & (np.abs(height) < 0.05)
+    assert road[60:].mean() > 0.2 and road[:20].mean() == 0.0
+    assert (seen & (height > 0.5) & (place.route.edges(lateral) > 0.0)).mean() > 0.02
+    assert 0.05 < light.mean() < 0.9 and light[60:].std() > 0.005
+    frames, maps = filming.depth_maps(lighting, place, replace(plan, width=640, height=368), pose[None])
+    assert frames.tolist() == [0] and maps.shape == (1, 92, 160)
+    assert np.mean(np.abs(maps[0] - depth) < 0.02 * depth + 0.02) > 0.97
+
+
+def test_the_truth_of_a_long_place_has_its_length(place, tmp_path):
+    plan = filming.FilmingPlan.of(draw(PLACE, LENGTH))
+    times, poses = filming.trajectory(plan, place.route, "sun")
+    film = TrueFilm(times, poses, np.zeros(0, np.int64), np.zeros((0, 9, 16), np.float16))
+    road = DrawnRoad(draw(PLACE, LENGTH))
+    truth = Truth(road, 0.0, LENGTH, 1.5, plan.intrinsics, (640, 360), {"sun": film}, PLACE, {"sun": "sun"})
+    truth.save(tmp_path / "truth")
+    assert read_json(tmp_path / "truth" / "truth.json")["road_length"] == LENGTH
+    back = Truth.load(tmp_path / "truth")
+    assert back.route.length == back.road_length == LENGTH and back.length == LENGTH
+    assert f"--place {PLACE} --length 220 --out" in scene_toml(plan, "x", draw(PLACE, LENGTH), back.road_length)
+    with pytest.raises(InputError, match="a road of 220 m, this place another; give --length 220"):
+        scene_task("task.json", tmp_path, PLACE)
+
+
+@pytest.mark.parametrize(("given", "said"), [(("12", "10"), "expected 20 to 2000"), (("0", "100"), "demo's street")])
+def test_a_length_that_cannot_be_is_refused(given, said, tmp_path, capsys):
+    assert main(["film", "--place", given[0], "--length", given[1], "--out", str(tmp_path / "x")]) != 0
+    assert said in capsys.readouterr().err and not (tmp_path / "x").exists()
