@@ -149,6 +149,7 @@ class Renderer:
         camera = spec.camera("film")
         camera.fovy = float(np.rad2deg(2 * np.arctan(plan.height / 2 / plan.intrinsics[1])))
         model = spec.compile()
+        del spec, camera  # frees the second copy of all meshes and textures
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         self._host = model, data

@@ -95,7 +95,7 @@ def lengthen(rng: np.random.Generator, line: LineSpec, setting: str, section: Se
         ahead = (xy[begins[n]] - begin) / np.linalg.norm(xy[begins[n]] - begin)
         reach = (section.left if side > 0 else section.right) + _MOUTH_ROOM
         end = begin + (mouth.station - start) * ahead + side * reach * np.array([-ahead[1], ahead[0]])
-        if np.linalg.norm(xy - end, axis=1).min() > 0.8 * reach:
+        if np.linalg.norm(xy - end, axis=1).min() > 0.5 * reach:
             mouths.append(mouth)
     return replace(
         line, pieces=pieces, length=round(length, 2), grades=(*line.grades, *grades.tolist()), mouths=tuple(mouths)

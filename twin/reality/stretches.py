@@ -1,7 +1,7 @@
 """Long places, rendered one stretch of road at a time, so that time and memory do not grow with the road's length.
 
-A renderer of a stretch shows the objects within `_SIGHT` of the stretch, and only near textures at full resolution. All
-places whose road was not lengthened are rendered as a whole.
+A renderer of a stretch shows the objects within `_SIGHT` of the stretch. Those farther away than `_SHARP` have smaller
+textures and fewer, larger leaves. Places whose road was not lengthened are rendered as a whole.
 """
 
 from collections.abc import Callable
@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from twin.reality.place_objects import KnownPlace
 from twin.reality.place_spec import LONGEST_DRAWN
+from twin.reality.primitives import MeshPart
 from twin.reality.rasterizer import PlaceRenderer
 from twin.types import Array, Array32
 
 _STRETCH = 100.0  # [m] length of a stretch
 _SIGHT = 250.0  # [m] a house 8 m high is 11 pixels high there, in a picture 640 pixels and 85° wide
-_SHARP = 60.0  # [m] beyond it, `_SHRINK` texels of the road are finer than a pixel
-_SHRINK = 4  # ratio of the resolution of near textures to that of far ones
+_SHARP = 60.0  # [m] beyond it, `_SHRINK` texels of the road are finer than a pixel, and a leaf is about one pixel
+_SHRINK = 4  # ratio of the resolution of near textures to that of far ones, and of the numbers of leaves
 _LAMPS = 24  # shining lamps per stretch; renderers loop over all lamps for every pixel
 _SHADOWS = (20.0, 60.0)  # [m] of road before and after a stretch on which the rasterizer casts shadows
 _SHADOW_MARGIN = 14.0  # [m] from that road to the edges of `GroundLayout.field`
@@ -59,7 +60,11 @@ def near_stretch(place: KnownPlace, first: float, last: float) -> KnownPlace:
     boxes = np.array([(o.part.vertices[:, :2].min(0), o.part.vertices[:, :2].max(0)) for o in place.objects])
     away = np.maximum(np.maximum(boxes[:, None, 0] - line, line - boxes[:, None, 1]), 0.0)
     distances = np.hypot(away[..., 0], away[..., 1]).min(1)
-    objects = [one for one, distance in zip(place.objects, distances, strict=True) if distance < _SIGHT]
+    objects = [
+        replace(one, part=_thinned(one.part)) if one.kind == "foliage" and distance > _SHARP else one
+        for one, distance in zip(place.objects, distances, strict=True)
+        if distance < _SIGHT
+    ]
     used = {one.texture for one in objects} | {"atlas"}
     sharp = {one.texture for one, distance in zip(place.objects, distances, strict=True) if distance < _SHARP}
 
@@ -82,6 +87,18 @@ def near_stretch(place: KnownPlace, first: float, last: float) -> KnownPlace:
             field=((x0, y0), (x1, y1)),
         ),
         lamp_heads=sorted(place.lamp_heads, key=lambda head: float(np.linalg.norm(head - middle)))[:_LAMPS],
+    )
+
+
+def _thinned(leaves: MeshPart) -> MeshPart:
+    """One in `_SHRINK` leaves of `primitives.leaves`, enlarged so that their area is that of all."""
+    tips = leaves.vertices.reshape(-1, 4, 3)[::_SHRINK]
+    middle = tips.mean(1, keepdims=True)
+    kept = len(tips)
+    return MeshPart(
+        (middle + np.sqrt(_SHRINK) * (tips - middle)).reshape(-1, 3),
+        leaves.faces[: 2 * kept],
+        leaves.uv.reshape(-1, 4, 2)[::_SHRINK].reshape(-1, 2),
     )
 
 
