@@ -78,7 +78,7 @@ def build_assets(
     hits = _surface_points(views, ground, box, far)
     volume = tsdf.fuse_volume(hits, views, box, settings.voxel, far)
     clock.append(("fuse", time.perf_counter()))
-    visual, visual_metrics = _visual_mesh(volume, views, ground)
+    visual, visual_metrics = _visual_mesh(volume, views, ground, FREE_SPACE_REACH * far)
     np.savez(out / "visual.npz", **visual)  # type: ignore[arg-type]
     clock.append(("surface", time.perf_counter()))
     corridor = None
@@ -124,18 +124,24 @@ def _surface_points(views: Views, ground: Ground, box: Array, far: float) -> Arr
     return np.concatenate(hits)
 
 
-def _visual_mesh(volume: tsdf.Volume, views: Views, ground: Ground) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Returns colored triangles (of the seen surfaces above the ground, and of the ground itself), and metrics."""
+def _visual_mesh(
+    volume: tsdf.Volume, views: Views, ground: Ground, far: float
+) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """Returns colored triangles (of the seen surfaces above the ground, and of the ground itself), and metrics.
+
+    Pixels of views that are deeper than `far` [m] are background.
+    """
+    reach = 1.1 * far + 4 * volume.band  # surfaces beyond it differ by more than the tolerance from all depths
     vertices, faces = tsdf.zero_level(volume.distance, volume.origin, volume.voxel)
     above = vertices[:, 2] - ground.at(vertices[:, :2]) > 0.05
     vertices, faces = tsdf.compact(vertices, faces[above[faces].any(1)])
-    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, volume.band)
+    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, volume.band, reach)
     # Valid distances form a band around each surface. The rear boundary of that band also yields triangles. They are no
     # surface, and no view sees them, so they are removed.
     vertices, faces = tsdf.compact(vertices, faces[seen[faces].all(1)])
     vertices, faces, floaters = tsdf.remove_specks(vertices, faces, _SPECK_AREA)
     vertices, faces = tsdf.decimate(vertices, faces, _VISUAL_FACES * 2 // 3)
-    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, 2 * volume.band)
+    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, 2 * volume.band, reach)
     if seen.any():
         colors[~seen] = colors[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
     ground_vertices, ground_faces = ground.triangles(_VISUAL_GROUND_CELL, _VISUAL_FACES // 3)

@@ -46,6 +46,7 @@ def _fuse_kernel(
     world_to_camera: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
     depth: wp.array3d[wp.float32],
+    chosen: wp.array[wp.int32],
     slant: wp.array3d[wp.float32],
     far: float,
     band: float,
@@ -64,7 +65,8 @@ def _fuse_kernel(
     total = float(0.0)
     near_votes = float(0.0)
     free_votes = float(0.0)
-    for view in range(depth.shape[0]):
+    for k in range(chosen.shape[0]):
+        view = chosen[k]
         seen = _project(point, world_to_camera[view], intrinsics[view])
         z = seen[2]
         if z > 0.35 and z < reach:
@@ -111,6 +113,7 @@ def _color_kernel(
     world_to_camera: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
     depth: wp.array3d[wp.float32],
+    chosen: wp.array[wp.int32],
     rgb: wp.array4d[wp.uint8],
     tolerance: float,
     colors: wp.array[wp.vec3],
@@ -120,7 +123,8 @@ def _color_kernel(
     point = points[i]
     total = wp.vec3(0.0, 0.0, 0.0)
     weights = float(0.0)
-    for view in range(depth.shape[0]):
+    for k in range(chosen.shape[0]):
+        view = chosen[k]
         seen = _project(point, world_to_camera[view], intrinsics[view])
         z = seen[2]
         # Only surfaces that face the lens get a color. A limit of 0.1 (6°) keeps walls beside a forward-looking camera.
@@ -150,43 +154,96 @@ def fuse(points: Array, views: Views, band: float, far: float) -> tuple[NDArray,
     A distance is NaN if there are no `near` votes. Views vote for surfaces up to the depth `far` [m], and for free
     space up to `FREE_SPACE_REACH` times as far.
     """
+    distance = np.full(len(points), np.nan, np.float32)
+    near, free = (np.zeros(len(points), np.float32) for _ in range(2))
+    reach = FREE_SPACE_REACH * far
+    constants = [far, band, reach, _HALF_WEIGHT_DEPTH, _CLEARANCE, _SAME_SURFACE_RATIO]
     with wp.ScopedDevice("cpu"):
-        distance = wp.full(len(points), float("nan"), dtype=wp.float32)
-        near, free = (wp.zeros(len(points), dtype=wp.float32) for _ in range(2))
+        cameras = _camera_arrays(views)
         slant: wp.array = wp.array(views.slant, dtype=wp.float32)
-        constants = [far, band, FREE_SPACE_REACH * far, _HALF_WEIGHT_DEPTH, _CLEARANCE, _SAME_SURFACE_RATIO]
-        inputs = [*_camera_arrays(points, views), slant, *constants]
-        wp.launch(_fuse_kernel, len(points), inputs, [distance, near, free])
-        return distance.numpy(), near.numpy(), free.numpy()
+        for index, chosen in _groups(points, views, reach):
+            found = wp.full(len(index), float("nan"), dtype=wp.float32)
+            votes = [wp.zeros(len(index), dtype=wp.float32) for _ in range(2)]
+            inputs = [_vectors(points[index]), *cameras, _indices(chosen), slant, *constants]
+            wp.launch(_fuse_kernel, len(index), inputs, [found, *votes])
+            distance[index], near[index], free[index] = (values.numpy() for values in (found, *votes))
+    return distance, near, free
 
 
 def color_points(
-    points: Array, normals: Array, views: Views, tolerance: float
+    points: Array, normals: Array, views: Views, tolerance: float, reach: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Returns colors (k, 3) of surface points (k, 3) with normals (k, 3), and a mask (k,) of the points that views see.
 
     The nearest views dominate a color. A view sees a point if the point faces it and the view's depth there differs by
-    less than `tolerance` [m] plus 5 % from the point's depth.
+    less than `tolerance` [m] plus 5 % from the point's depth, which is at most `reach` [m].
     """
+    colors = np.zeros((len(points), 3), np.float32)
+    seen = np.zeros(len(points), bool)
     with wp.ScopedDevice("cpu"):
-        colors = wp.zeros(len(points), dtype=wp.vec3)
-        found = wp.zeros(len(points), dtype=wp.float32)
+        cameras = _camera_arrays(views)
         rgb: wp.array = wp.array(views.rgb, dtype=wp.uint8)
-        positions, *cameras = _camera_arrays(points, views)
-        normal_array: wp.array = wp.array(np.asarray(normals, np.float32), dtype=wp.vec3)
-        centers: wp.array = wp.array(views.camera_to_world[:, :3, 3].astype(np.float32), dtype=wp.vec3)
-        inputs = [positions, normal_array, centers, *cameras, rgb, tolerance]
-        wp.launch(_color_kernel, len(points), inputs, [colors, found])
-        return (colors.numpy() + 0.5).astype(np.uint8), found.numpy() > 0
+        centers = _vectors(views.camera_to_world[:, :3, 3])
+        for index, chosen in _groups(points, views, reach):
+            mean, found = wp.zeros(len(index), dtype=wp.vec3), wp.zeros(len(index), dtype=wp.float32)
+            where = _vectors(points[index]), _vectors(normals[index])
+            inputs = [*where, centers, *cameras, _indices(chosen), rgb, tolerance]
+            wp.launch(_color_kernel, len(index), inputs, [mean, found])
+            colors[index], seen[index] = mean.numpy(), found.numpy() > 0
+    return (colors + 0.5).astype(np.uint8), seen
 
 
-def _camera_arrays(points: Array, views: Views) -> list[wp.array]:
+def _camera_arrays(views: Views) -> list[wp.array]:
     return [
-        wp.array(np.asarray(points, np.float32), dtype=wp.vec3),
         wp.array(inverse_pose(views.camera_to_world).astype(np.float32), dtype=wp.mat44),
         wp.array(views.intrinsics.astype(np.float32), dtype=wp.vec4),
         wp.array(views.depth, dtype=wp.float32),
     ]
+
+
+def _vectors(points: Array) -> wp.array:
+    return wp.array(np.asarray(points, np.float32), dtype=wp.vec3)
+
+
+def _indices(chosen: NDArray[np.int64]) -> wp.array:
+    return wp.array(chosen, dtype=wp.int32)
+
+
+# ---- views of a group of points
+
+_GROUP_SIDE = 8.0  # [m] side of the square columns that divide points into groups
+_PIXEL_SLACK = 2.0  # [px] width of a frame around the image in which points still count as seen
+
+
+def _groups(points: Array, views: Views, reach: float) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Divides points (k, 3) into groups. Returns for each the indices of its points and of the views that may see any.
+
+    Views far away would only cost time: on a long road, almost all views are far from any point.
+    """
+    if len(points) == 0:
+        return []
+    column = np.floor(points[:, :2] / _GROUP_SIDE).astype(np.int64)
+    order = np.lexsort(column.T)
+    starts = np.flatnonzero((np.diff(column[order], axis=0) != 0).any(1)) + 1
+    groups = np.split(order, starts)
+    return [(index, views_of_box(views, points[index].min(0), points[index].max(0), reach)) for index in groups]
+
+
+def views_of_box(views: Views, low: Array, high: Array, reach: float) -> NDArray[np.int64]:
+    """Indices in order of the views that may see a point of a box up to the depth `reach` [m]; `low`, `high` (3,)."""
+    corners = np.stack(np.meshgrid(*np.stack([low, high], 1), indexing="ij"), -1).reshape(-1, 3)
+    world_to_camera = inverse_pose(views.camera_to_world)
+    x, y, z = np.moveaxis(
+        corners @ np.swapaxes(world_to_camera[:, :3, :3], 1, 2) + world_to_camera[:, None, :3, 3], 2, 0
+    )
+    height, width = views.depth.shape[1:]
+    fx, fy, cx, cy = views.intrinsics.T[..., None]
+    # All corners are outside one plane of the view's frustum, and so is the box. For z < 0 the signs are not those of
+    # pixels, but points behind the lens are outside, too.
+    left, right = fx * x + (cx + _PIXEL_SLACK) * z < 0, fx * x + (cx - width - _PIXEL_SLACK) * z > 0
+    above, below = fy * y + (cy + _PIXEL_SLACK) * z < 0, fy * y + (cy - height - _PIXEL_SLACK) * z > 0
+    outside = [one.all(1) for one in (z < 0, z > 1.001 * reach, left, right, above, below)]
+    return np.flatnonzero(~np.any(outside, axis=0))
 
 
 # ---- block-sparse volume
