@@ -42,6 +42,14 @@ class Ground:
         """Bilinear height [m] at points (..., 2), clamped to the edge."""
         return _interpolate(self.height, self.origin, self.cell, xy, order=1)
 
+    def extremes(self, low: Array, high: Array) -> tuple[float, float]:
+        """Lowest and highest height [m] between two corners (x, y), each of shape (2,) [m]."""
+        size = self.height.shape[::-1]
+        first = np.clip(np.floor((low - self.origin) / self.cell).astype(int), 0, np.array(size) - 1)
+        last = np.clip(np.ceil((high - self.origin) / self.cell).astype(int), 0, np.array(size) - 1)
+        part = self.height[first[1] : last[1] + 1, first[0] : last[0] + 1]
+        return float(part.min()), float(part.max())
+
     def coarsened(self, cell: float) -> "Ground":
         """Ground with every n-th node, n = cell / self.cell, rounded. Nodes after the last n-th one are cut off."""
         n = max(1, round(cell / self.cell))

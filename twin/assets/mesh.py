@@ -10,6 +10,7 @@ the solids, decomposes the solids into convex parts, and clears the corridor (`s
 """
 
 import time
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from twin.assets.ground import Ground, build_ground
 from twin.assets.ground_picture import ground_picture
 from twin.assets.tsdf import FREE_SPACE_REACH, color_points
 from twin.assets.views import ColorField, Views, render_views
-from twin.config import SceneConfig
+from twin.config import MeshConfig, SceneConfig
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.images import write_image
 from twin.geometry.passes import path_length
@@ -66,7 +67,7 @@ def build_assets(
     if route is None:
         # In a capture around an object, everything outside the field's near box is background.
         low, high = np.maximum(low, field.bounds[0, :2]), np.minimum(high, field.bounds[1, :2])
-    far = settings.margin + 2.0
+    far = _far(settings)
     views = render_views(field, cameras, settings.views, settings.view_width, FREE_SPACE_REACH * far)
     clock.append(("render", time.perf_counter()))
     height = _camera_height(config) if route is not None else None
@@ -75,17 +76,17 @@ def build_assets(
     clock.append(("ground", time.perf_counter()))
     top = float(ground.height.max()) + settings.max_height + _MARGIN_ABOVE
     box = np.stack([np.append(low, ground.height.min() - _MARGIN_BELOW), np.append(high, top)])
-    hits = _surface_points(views, ground, box, far)
-    volume = tsdf.fuse_volume(hits, views, box, settings.voxel, far)
-    clock.append(("fuse", time.perf_counter()))
-    visual, visual_metrics = _visual_mesh(volume, views, ground, FREE_SPACE_REACH * far)
-    np.savez(out / "visual.npz", **visual)  # type: ignore[arg-type]
-    clock.append(("surface", time.perf_counter()))
     corridor = None
     if route is not None:
         corridor = solids.Corridor(route, config.mjcf.half_width + config.mjcf.corridor_margin)
         np.savez(out / "route.npz", xy=route, z=ground.at(route))
-    pieces, left_out = solids.solid_pieces(volume, ground, corridor, cameras, settings)
+        path = route[::2]
+    fused = _fuse_sections(views, ground, corridor, path, box, settings)
+    clock.append(("fuse", time.perf_counter()))
+    visual, visual_metrics = _visual_mesh(fused, views, ground, settings.voxel, FREE_SPACE_REACH * far)
+    np.savez(out / "visual.npz", **visual)  # type: ignore[arg-type]
+    clock.append(("surface", time.perf_counter()))
+    pieces, left_out = solids.solid_pieces(fused.solid, box[0], settings.voxel, path, settings)
     clock.append(("solids", time.perf_counter()))
     part_metrics = _save_parts(pieces, corridor, ground, config, out, cache)
     clock.append(("convex", time.perf_counter()))
@@ -94,9 +95,9 @@ def build_assets(
         **visual_metrics,
         "ground": ground_metrics | _roughness(ground, route),
         "views": len(views),
-        "voxel_m": volume.voxel,
+        "voxel_m": settings.voxel,
         "floaters": {
-            "voxels_seen_through": volume.outvoted,
+            "voxels_seen_through": fused.outvoted,
             "surface_pieces": visual_metrics["floaters_removed"],
             "solid_specks": left_out["specks"],
         },
@@ -116,7 +117,7 @@ def _camera_height(config: SceneConfig) -> float:
 
 def _surface_points(views: Views, ground: Ground, box: Array, far: float) -> Array:
     """Rendered points (k, 3) [m] that are in the box and above the ground."""
-    hits = []
+    hits = [np.zeros((0, 3))]
     for i in range(len(views)):
         points = views.points(i)[(views.depth[i] > 0) & (views.depth[i] < far)]
         points = points[((points > box[0]) & (points < box[1])).all(1)]
@@ -124,24 +125,67 @@ def _surface_points(views: Views, ground: Ground, box: Array, far: float) -> Arr
     return np.concatenate(hits)
 
 
+@dataclass(frozen=True)
+class _Fused:
+    """Results of the fusion of all sections of a place."""
+
+    surface: tuple[Array, NDArray[np.int64]]
+    """Vertices (v, 3) [m] and faces (f, 3) of the zero level above the ground."""
+    solid: solids.SolidVoxels
+    outvoted: int
+    """Number of voxels at which free votes removed a surface."""
+
+
+def _fuse_sections(
+    views: Views, ground: Ground, corridor: solids.Corridor | None, path: Array, box: Array, settings: MeshConfig
+) -> _Fused:
+    """Fuses the views in one section of the place after the other, since a long road would not fit into memory."""
+    voxel, far = settings.voxel, _far(settings)
+
+    def heights(low: Array, high: Array) -> tuple[float, float]:
+        lowest, highest = ground.extremes(low, high)
+        return lowest - _MARGIN_BELOW, highest + settings.max_height + _MARGIN_ABOVE
+
+    surfaces, solid, outvoted = [], [], 0
+    sections = tsdf.divide(box, voxel, solids.frame_width(voxel), heights)
+    for section in sections if len(sections) == 1 else runtime.track(sections, "fusing depth", unit="section"):
+        low = np.maximum(box[0] + voxel * section.start, box[0])
+        high = np.minimum(box[0] + voxel * (section.start + section.shape), box[1])
+        near = views.select(tsdf.views_of_box(views, low, high, FREE_SPACE_REACH * far))
+        hits = _surface_points(near, ground, np.stack([low, high]), far)
+        if not len(hits):
+            continue
+        volume = tsdf.fuse_volume(hits, near, box[0], voxel, section, far)
+        vertices, faces = tsdf.section_surface(volume)
+        above = vertices[:, 2] - ground.at(vertices[:, :2]) > 0.05
+        surfaces.append(tsdf.compact(vertices, faces[above[faces].any(1)]))
+        solid.append(solids.solid_voxels(volume, ground, corridor, path, settings))
+        outvoted += volume.outvoted
+    return _Fused(tsdf.join_surfaces(surfaces, box[0], voxel), solids.SolidVoxels.join(solid), outvoted)
+
+
+def _far(settings: MeshConfig) -> float:
+    """Depth up to which views vote for surfaces [m]."""
+    return settings.margin + 2.0
+
+
 def _visual_mesh(
-    volume: tsdf.Volume, views: Views, ground: Ground, far: float
+    fused: _Fused, views: Views, ground: Ground, voxel: float, far: float
 ) -> tuple[dict[str, NDArray], dict[str, Any]]:
     """Returns colored triangles (of the seen surfaces above the ground, and of the ground itself), and metrics.
 
     Pixels of views that are deeper than `far` [m] are background.
     """
-    reach = 1.1 * far + 4 * volume.band  # surfaces beyond it differ by more than the tolerance from all depths
-    vertices, faces = tsdf.zero_level(volume.distance, volume.origin, volume.voxel)
-    above = vertices[:, 2] - ground.at(vertices[:, :2]) > 0.05
-    vertices, faces = tsdf.compact(vertices, faces[above[faces].any(1)])
-    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, volume.band, reach)
+    band = tsdf.BAND_VOXELS * voxel
+    reach = 1.1 * far + 4 * band  # surfaces beyond it differ by more than the tolerance from all depths
+    vertices, faces = fused.surface
+    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, band, reach)
     # Valid distances form a band around each surface. The rear boundary of that band also yields triangles. They are no
     # surface, and no view sees them, so they are removed.
     vertices, faces = tsdf.compact(vertices, faces[seen[faces].all(1)])
     vertices, faces, floaters = tsdf.remove_specks(vertices, faces, _SPECK_AREA)
     vertices, faces = tsdf.decimate(vertices, faces, _VISUAL_FACES * 2 // 3)
-    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, 2 * volume.band, reach)
+    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, 2 * band, reach)
     if seen.any():
         colors[~seen] = colors[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
     ground_vertices, ground_faces = ground.triangles(_VISUAL_GROUND_CELL, _VISUAL_FACES // 3)

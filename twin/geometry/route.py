@@ -187,12 +187,18 @@ def _check_no_fold(line: Array) -> None:
         )
 
 
-def distance_to_route(route: Array, xy: Array) -> Array:
-    """Distance [m] of points (..., 2) to a polyline (m, 2) including its end points, shape (...)."""
+def distance_to_route(route: Array, xy: Array, up_to: float = np.inf) -> Array:
+    """Distance [m] of points (..., 2) to a polyline (m, 2) including its end points, shape (...).
+
+    Distances above `up_to` [m] may be larger than they are, up to infinity; a low value saves time on long routes.
+    """
     if len(route) < 2:
         return np.linalg.norm(xy - route[0], axis=-1)
     best = np.full(np.shape(xy)[:-1], np.inf)
+    low, high = (f(xy.reshape(-1, 2), axis=0, initial=i) for f, i in ((np.min, np.inf), (np.max, -np.inf)))
     for start, end in pairwise(route):
+        if (np.maximum(start, end) < low - up_to).any() or (np.minimum(start, end) > high + up_to).any():
+            continue
         along = end - start
         fraction = np.clip((xy - start) @ along / (along @ along), 0.0, 1.0)
         best = np.minimum(best, np.linalg.norm(xy - start - fraction[..., None] * along, axis=-1))
