@@ -34,6 +34,7 @@ from twin.nerf.baked import BakedField
 from twin.scene import SceneDir
 from twin.types import Array
 
+_COUNTED_LENGTH = 100.0  # [m] on a longer route, the numbers below and those in `MeshConfig` are per this length
 _VISUAL_FACES = 150_000
 _MARGIN_ABOVE = 2.0  # [m] margin of the visual mesh's box above the highest obstacle
 _MARGIN_BELOW = 1.0  # [m] margin of the visual mesh's box below the lowest ground
@@ -68,7 +69,9 @@ def build_assets(
         # In a capture around an object, everything outside the field's near box is background.
         low, high = np.maximum(low, field.bounds[0, :2]), np.minimum(high, field.bounds[1, :2])
     far = _far(settings)
-    views = render_views(field, cameras, settings.views, settings.view_width, FREE_SPACE_REACH * far)
+    length = path_length(route) if route is not None else None
+    share = max(1.0, (length or 0.0) / _COUNTED_LENGTH)
+    views = render_views(field, cameras, round(share * settings.views), settings.view_width, FREE_SPACE_REACH * far)
     clock.append(("render", time.perf_counter()))
     height = _camera_height(config) if route is not None else None
     ground, ground_metrics = build_ground(views, cameras, points, (low, high), settings, height)
@@ -83,12 +86,14 @@ def build_assets(
         path = route[::2]
     fused = _fuse_sections(views, ground, corridor, path, box, settings)
     clock.append(("fuse", time.perf_counter()))
-    visual, visual_metrics = _visual_mesh(fused, views, ground, settings.voxel, FREE_SPACE_REACH * far)
+    visual, visual_metrics = _visual_mesh(
+        fused, views, ground, settings.voxel, FREE_SPACE_REACH * far, round(share * _VISUAL_FACES)
+    )
     np.savez(out / "visual.npz", **visual)  # type: ignore[arg-type]
     clock.append(("surface", time.perf_counter()))
     pieces, left_out = solids.solid_pieces(fused.solid, box[0], settings.voxel, path, settings)
     clock.append(("solids", time.perf_counter()))
-    part_metrics = _save_parts(pieces, corridor, ground, config, out, cache)
+    part_metrics = _save_parts(pieces, corridor, ground, config, round(share * settings.max_parts), out, cache)
     clock.append(("convex", time.perf_counter()))
     return {
         **part_metrics,
@@ -103,7 +108,7 @@ def build_assets(
         },
         "standing": left_out["standing"],
         "bounds_m": box.tolist(),
-        "route_length_m": path_length(route) if route is not None else None,
+        "route_length_m": length,
         "route": route_metrics(filmed) if filmed else None,
         "seconds_of": {name: end - start for (_, start), (name, end) in pairwise(clock)},
     }
@@ -170,9 +175,9 @@ def _far(settings: MeshConfig) -> float:
 
 
 def _visual_mesh(
-    fused: _Fused, views: Views, ground: Ground, voxel: float, far: float
+    fused: _Fused, views: Views, ground: Ground, voxel: float, far: float, max_faces: int
 ) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Returns colored triangles (of the seen surfaces above the ground, and of the ground itself), and metrics.
+    """Returns about `max_faces` colored triangles, two thirds of them above the ground, and metrics.
 
     Pixels of views that are deeper than `far` [m] are background.
     """
@@ -184,11 +189,11 @@ def _visual_mesh(
     # surface, and no view sees them, so they are removed.
     vertices, faces = tsdf.compact(vertices, faces[seen[faces].all(1)])
     vertices, faces, floaters = tsdf.remove_specks(vertices, faces, _SPECK_AREA)
-    vertices, faces = tsdf.decimate(vertices, faces, _VISUAL_FACES * 2 // 3)
+    vertices, faces = tsdf.decimate(vertices, faces, max_faces * 2 // 3)
     colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, 2 * band, reach)
     if seen.any():
         colors[~seen] = colors[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
-    ground_vertices, ground_faces = ground.triangles(_VISUAL_GROUND_CELL, _VISUAL_FACES // 3)
+    ground_vertices, ground_faces = ground.triangles(_VISUAL_GROUND_CELL, max_faces // 3)
     column, row = np.rint((ground_vertices[:, :2] - ground.origin) / ground.cell).astype(int).T
     rows, columns = ground.height.shape
     ground_colors = ground.rgb[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
@@ -210,6 +215,7 @@ def _save_parts(
     corridor: solids.Corridor | None,
     ground: Ground,
     config: SceneConfig,
+    max_parts: int,
     out: Path,
     cache: Path,
 ) -> dict[str, Any]:
@@ -220,10 +226,10 @@ def _save_parts(
     clipped = 0
     if corridor is not None:
         kept, clipped = solids.clear_corridor(decomposition.parts, corridor, ground)
-    dropped = len(kept) - config.mesh.max_parts
+    dropped = len(kept) - max_parts
     if dropped > 0:
         # Parts are sorted by distance from the path; the farthest are the least relevant to the robot.
-        kept = kept[: config.mesh.max_parts]
+        kept = kept[:max_parts]
         runtime.log_line(f"  left out the {dropped} farthest convex parts, as mesh.max_parts = {config.mesh.max_parts}")
     parts = [part for _, part in kept]
     empty = np.zeros((0, 3))
@@ -264,6 +270,6 @@ def _roughness(ground: Ground, route: Array | None) -> dict[str, float | None]:
         metrics["route_bend_rms_per_m"] = float(np.sqrt(np.mean((np.diff(height, 2) / step**2) ** 2)))
         xy = ground.origin + ground.cell * np.stack(np.meshgrid(*map(np.arange, ground.height.shape[::-1])), -1)
         coarse = (slice(None, None, 4),) * 2
-        beside = distance_to_route(route[::4], xy[coarse]) < 1.5
+        beside = distance_to_route(route[::4], xy[coarse], 1.5) < 1.5
         metrics["corridor_coverage"] = float(ground.measured[coarse][beside].mean())
     return metrics
