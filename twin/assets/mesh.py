@@ -74,7 +74,7 @@ def build_assets(
     views = render_views(field, cameras, round(share * settings.views), settings.view_width, FREE_SPACE_REACH * far)
     clock.append(("render", time.perf_counter()))
     height = _camera_height(config) if route is not None else None
-    ground, ground_metrics = build_ground(views, cameras, points, (low, high), settings, height)
+    ground, ground_metrics = build_ground(views, cameras, points, (low, high), settings, height, route)
     ground.save(out)
     clock.append(("ground", time.perf_counter()))
     top = float(ground.height.max()) + settings.max_height + _MARGIN_ABOVE
