@@ -195,3 +195,26 @@ def test_no_part_is_in_the_corridor(made):
     assert not any(inside_hull(part, points).any() for part in parts)
     behind = np.array([[CRATE.x, CRATE.y - 0.2, 0.4]])
     assert any(inside_hull(part, behind, 0.1)[0] for part in parts), "the crate must stay beside the corridor"
+
+
+@pytest.mark.parametrize(("counted_length", "views"), [(100.0, 14), (6.0, 28)])
+def test_views_are_per_length_of_a_long_route(made, monkeypatch, counted_length, views):
+    counts = []
+
+    def stop(field, cameras, count, *_):
+        counts.append(count)
+        raise StopIteration
+
+    monkeypatch.setattr(mesh, "_COUNTED_LENGTH", counted_length)
+    monkeypatch.setattr(mesh, "render_views", stop)
+    metric = made[0].parent / "2_metric"
+    with pytest.raises(StopIteration):
+        mesh.build_assets(
+            PLACE,
+            Cameras.load(metric),
+            SparsePoints.load(metric),
+            SceneConfig(mesh=SETTINGS),
+            made[0].parent / "unused",
+            made[0].parent / "cache",
+        )
+    assert counts == [pytest.approx(views, abs=1)]
