@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from twin.assets.ground import Ground, HeightData, HeightGrid, bias_to_path, cell_medians, fit_height
 
@@ -92,3 +93,22 @@ def test_bias_uses_only_data_beside_the_path():
     xyz[:, 2] = np.where(near, 0.07, 1.0)
     assert bias_to_path(HeightData(xyz, np.ones(800), np.zeros(800, np.int8)), path) == 0.07
     assert bias_to_path(HeightData(xyz[:5], np.ones(5), np.zeros(5, np.int8)), path) == 0.0
+
+
+def test_only_the_ground_near_a_long_line_is_fitted():
+    rng = np.random.default_rng(5)
+    low, high = np.array([-2.0, -2.0]), np.array([14.0, 14.0])
+    corner = np.concatenate([np.linspace([0, 0], [12, 0], 40), np.linspace([12, 0], [12, 12], 40)])
+    xyz = _noisy(rng, 4000, low, high, 0.02)
+    xyz = xyz[cKDTree(corner).query(xyz[:, :2])[0] < 1.5]
+    data = HeightData(xyz, np.full(len(xyz), 0.03), np.zeros(len(xyz), np.int8))
+    whole = HeightGrid.covering(low, high, 0.4, 10_000, corner, 2.5)
+    near = HeightGrid.covering(low, high, 0.4, 1000, corner, 2.5)
+    assert whole.fitted is None and near.fitted is not None and 0.2 < near.fitted.mean() < 0.6
+    assert (near.rows, near.columns, near.cell) == (whole.rows, whole.columns, 0.4)
+    heights = [fit_height(data, grid)[0] for grid in (whole, near)]
+    beside = cKDTree(corner).query(near.nodes().reshape(-1, 2))[0].reshape(near.rows, near.columns)
+    assert np.abs(heights[1] - heights[0])[beside < 1.0].max() < 0.01
+    assert np.abs(heights[1] - _hills(near.nodes()))[beside < 1.0].max() < 0.05
+    assert np.isfinite(heights[1]).all()
+    assert len(np.unique(heights[1])) == near.fitted.sum(), "the other nodes have heights of fitted ones"

@@ -15,6 +15,7 @@ from twin.env.irradiance import (
     Irradiance,
     IrradianceEstimator,
     spherical_harmonics_numpy,
+    view_stations,
 )
 from twin.env.obstacles import add_obstacles
 from twin.geometry.cameras import pixel_grid, unproject
@@ -34,6 +35,14 @@ def light(level=0.8, share=0.0, elevation=50.0, azimuth=0.0) -> Irradiance:
     growing = np.concatenate([[(1.0 - share) * rise], sides])[:, None] * np.ones(3)
     spots = np.random.default_rng(0).uniform(-5, 5, (200, 2))
     return Irradiance(spots, np.full((200, 3), level), np.zeros((5, 3)), growing)
+
+
+def test_views_of_a_long_route_are_few_and_where_the_robot_drives():
+    np.testing.assert_array_equal(view_stations(60.0, 20.0, 30.0), np.arange(0.0, 60.0, 2.0))
+    segment = view_stations(1000.0, 500.0, 530.0)
+    np.testing.assert_array_equal(segment, np.arange(490.0, 541.0, 2.0))
+    whole = view_stations(1000.0, 0.0, np.inf)
+    assert len(whole) == 100 and whole[0] == 0.0 and whole[-1] > 980.0
 
 
 def test_spherical_harmonics_equal_the_networks():

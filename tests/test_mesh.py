@@ -6,19 +6,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import AnalyticField, Box, Post, drive
+from scipy.ndimage import label
+from scipy.spatial import cKDTree
 
+from twin.assets import mesh, solids, tsdf
 from twin.assets.convex import ConvexPart, inside_hull
 from twin.assets.ground import Ground
 from twin.assets.mesh import build_assets
-from twin.assets.solids import HEADROOM
+from twin.assets.solids import HEADROOM, Corridor, solid_pieces
+from twin.assets.tsdf import FREE_SPACE_REACH
+from twin.assets.views import render_views
 from twin.config import MeshConfig, MetricConfig, MjcfConfig, SceneConfig, SourceConfig
-from twin.geometry.cameras import SparsePoints
+from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.route import distance_to_route
 
 HALF_WIDTH = 1.0  # [m]
 WALL = Box(7.0, 3.0, 3.0, 1.0, 1.4)
 POST = Post(6.0, -2.2, 0.15, 2.0)
 CRATE = Box(9.0, -1.3, 0.8, 1.0, 0.7)
+SETTINGS = MeshConfig(margin=4.5, views=14, view_width=100, ground_cell=0.2)
 PLACE = AnalyticField(boxes=(WALL, CRATE), posts=(POST,), slope=0.02)
 
 
@@ -31,7 +37,7 @@ def made(tmp_path_factory: pytest.TempPathFactory):
     config = SceneConfig(
         source=(SourceConfig(path="day.mp4"),),
         metric=MetricConfig(camera_height=1.8),
-        mesh=MeshConfig(margin=4.5, views=14, view_width=100, ground_cell=0.2),
+        mesh=SETTINGS,
         mjcf=MjcfConfig(half_width=HALF_WIDTH),
     )
     out = root / "4_mesh"
@@ -52,6 +58,60 @@ def _parts(folder: Path) -> list[ConvexPart]:
         ConvexPart(data["vertices"][at[i] : at[i + 1]].astype(float), data["faces"][of[i] : of[i + 1]].astype(np.int64))
         for i in range(len(at) - 1)
     ]
+
+
+@pytest.fixture(scope="module")
+def stood(made):
+    """What the fusion starts from: views, ground, corridor, path and box of the place."""
+    folder, facts = made
+    cameras = Cameras.load(folder.parent / "2_metric")
+    views = render_views(PLACE, cameras, 14, 100, FREE_SPACE_REACH * (SETTINGS.margin + 2.0))
+    route = _load(folder, "route")["xy"]
+    return views, Ground.load(folder), Corridor(route, HALF_WIDTH), route[::2], np.array(facts["bounds_m"])
+
+
+def _edges(faces):
+    """Number of faces at each edge."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+    return np.unique(edges, axis=0, return_counts=True)[1]
+
+
+def test_sections_give_the_surface_and_the_solid_of_one(stood, monkeypatch):
+    one = mesh._fuse_sections(*stood, SETTINGS)
+    monkeypatch.setattr(tsdf, "_MAX_VOXELS", 1000)
+    monkeypatch.setattr(tsdf, "_SECTION_SIDE", 32)
+    fuse, fused = tsdf.fuse_volume, []
+    monkeypatch.setattr(tsdf, "fuse_volume", lambda *given: fused.append(fuse(*given)) or fused[-1])
+    many = mesh._fuse_sections(*stood, SETTINGS)
+    assert len(fused) > 4 and max(volume.distance.size for volume in fused) < 600_000
+    for name in ("index", "field", "above"):
+        np.testing.assert_array_equal(getattr(many.solid, name), getattr(one.solid, name))
+    assert many.outvoted == one.outvoted
+    (vertices, faces), (whole_vertices, whole_faces) = many.surface, one.surface
+    assert len(vertices) == len(whole_vertices) and len(faces) == len(whole_faces)
+    assert cKDTree(vertices).query(whole_vertices)[0].max() < 1e-5
+    np.testing.assert_array_equal(np.bincount(_edges(faces)), np.bincount(_edges(whole_faces)))  # no cracks
+
+
+def test_pieces_do_not_end_at_borders_of_sections(stood, monkeypatch):
+    views, ground, corridor, path, box = stood
+    found = []
+    for most in (tsdf._MAX_VOXELS, 1000):
+        monkeypatch.setattr(tsdf, "_MAX_VOXELS", most)
+        monkeypatch.setattr(tsdf, "_SECTION_SIDE", 32)
+        solid = mesh._fuse_sections(views, ground, corridor, path, box, SETTINGS).solid
+        found.append(solid_pieces(solid, box[0], SETTINGS.voxel, path, SETTINGS))
+    assert found[0][1] == found[1][1] and len(found[0][0]) == len(found[1][0]) > 2
+    for a, b in zip(found[0][0], found[1][0], strict=True):
+        np.testing.assert_array_equal(a.vertices, b.vertices)
+        np.testing.assert_array_equal(a.faces, b.faces)
+
+
+def test_components_touch_at_corners_and_are_numbered_by_their_first_voxels():
+    solid = np.random.default_rng(0).random((9, 11, 7)) < 0.06
+    mine = solids._components(solids._keys(np.argwhere(solid)))
+    assert mine.max() > 5
+    np.testing.assert_array_equal(mine + 1, label(solid, np.ones((3, 3, 3), bool))[0][solid])
 
 
 def _wall_front():
@@ -135,3 +195,26 @@ def test_no_part_is_in_the_corridor(made):
     assert not any(inside_hull(part, points).any() for part in parts)
     behind = np.array([[CRATE.x, CRATE.y - 0.2, 0.4]])
     assert any(inside_hull(part, behind, 0.1)[0] for part in parts), "the crate must stay beside the corridor"
+
+
+@pytest.mark.parametrize(("counted_length", "views"), [(100.0, 14), (6.0, 28)])
+def test_views_are_per_length_of_a_long_route(made, monkeypatch, counted_length, views):
+    counts = []
+
+    def stop(field, cameras, count, *_):
+        counts.append(count)
+        raise StopIteration
+
+    monkeypatch.setattr(mesh, "_COUNTED_LENGTH", counted_length)
+    monkeypatch.setattr(mesh, "render_views", stop)
+    metric = made[0].parent / "2_metric"
+    with pytest.raises(StopIteration):
+        mesh.build_assets(
+            PLACE,
+            Cameras.load(metric),
+            SparsePoints.load(metric),
+            SceneConfig(mesh=SETTINGS),
+            made[0].parent / "unused",
+            made[0].parent / "cache",
+        )
+    assert counts == [pytest.approx(views, abs=1)]

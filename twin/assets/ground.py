@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.ndimage import binary_closing, gaussian_filter, gaussian_filter1d, map_coordinates
+from scipy.ndimage import binary_closing, distance_transform_edt, gaussian_filter, gaussian_filter1d, map_coordinates
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
@@ -41,6 +41,14 @@ class Ground:
     def at(self, xy: NDArray) -> NDArray[np.float64]:
         """Bilinear height [m] at points (..., 2), clamped to the edge."""
         return _interpolate(self.height, self.origin, self.cell, xy, order=1)
+
+    def extremes(self, low: Array, high: Array) -> tuple[float, float]:
+        """Lowest and highest height [m] between two corners (x, y), each of shape (2,) [m]."""
+        size = self.height.shape[::-1]
+        first = np.clip(np.floor((low - self.origin) / self.cell).astype(int), 0, np.array(size) - 1)
+        last = np.clip(np.ceil((high - self.origin) / self.cell).astype(int), 0, np.array(size) - 1)
+        part = self.height[first[1] : last[1] + 1, first[0] : last[0] + 1]
+        return float(part.min()), float(part.max())
 
     def coarsened(self, cell: float) -> "Ground":
         """Ground with every n-th node, n = cell / self.cell, rounded. Nodes after the last n-th one are cut off."""
@@ -227,8 +235,10 @@ def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> floa
 
 # ---- fit
 
-_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m]; greatest numbers of nodes of the two grids
-_MAX_CELLS = 1_500_000
+_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m]; greatest numbers of nodes of the two grids,
+# unless they are near a long line
+_BESIDE_LINE = 2.0  # [m] width of the ground that is fitted beyond `MeshConfig.margin` beside a long line
+_MAX_CELLS = 3_000_000
 _SMOOTHING_LENGTH = 0.5  # [m] structures shorter than this are smoothed away as noise
 _EXTRAPOLATION_LENGTH = 8.0  # [m] distance over which a slope continues without data
 _REWEIGHTINGS = 6
@@ -245,10 +255,25 @@ class HeightGrid:
     cell: float
     rows: int
     columns: int
+    fitted: NDArray[np.bool_] | None = None
+    """Mask (rows, columns) of the nodes that `fit_height` fits; the others get the height of the nearest of these.
+    None: all."""
 
     @staticmethod
-    def covering(low: Array, high: Array, cell: float, max_nodes: int) -> "HeightGrid":
-        """A grid over the box from `low` to `high` (x, y); the cell grows if there would be more than `max_nodes`."""
+    def covering(
+        low: Array, high: Array, cell: float, max_nodes: int, line: Array | None = None, reach: float = 0.0
+    ) -> "HeightGrid":
+        """A grid over the box from `low` to `high` (x, y).
+
+        If there would be more than `max_nodes`, only those within `reach` [m] of `line` (m, 2) are fitted, or the cell
+        grows if there is no line.
+        """
+        if line is not None and np.prod((high - low) / cell) > max_nodes:
+            full = HeightGrid.covering(low, high, cell, np.iinfo(np.int64).max)
+            away = np.ones((full.rows, full.columns), bool)
+            index, inside = full.index(line)
+            away.ravel()[index[inside]] = False
+            return replace(full, fitted=distance_transform_edt(away) * cell < reach)
         cell = max(cell, float(np.sqrt(np.prod(high - low) / max_nodes)))
         columns, rows = (int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
         return HeightGrid(np.asarray(low, float), cell, rows, columns)
@@ -258,6 +283,11 @@ class HeightGrid:
         column, row = np.rint((xy - self.origin) / self.cell).astype(int).T
         inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
         return row * self.columns + column, inside
+
+    def numbers(self) -> NDArray[np.int64]:
+        """Consecutive numbers of the fitted nodes, −1 for the others, shape (rows, columns)."""
+        fitted = np.ones((self.rows, self.columns), bool) if self.fitted is None else self.fitted
+        return np.where(fitted, np.cumsum(fitted).reshape(fitted.shape) - 1, -1)
 
     def nodes(self) -> Array:
         """Positions x, y of the nodes [m], shape (rows, columns, 2)."""
@@ -279,15 +309,17 @@ def fit_height(
     where ρ is the Geman-McClure loss. The method is iteratively reweighted least squares with sparse factorization. The
     second term smooths bumps but not slopes; the last one limits how far a slope continues without data.
 
-    At least one datum must be inside the grid. If heights `initial` (rows, columns) [m] are given, the first robust
+    At least one datum must be at a fitted node. If heights `initial` (rows, columns) [m] are given, the first robust
     weights are computed from them; otherwise the first robust weights are all 1. Returns heights (rows, columns) [m],
     and the final robust weight of each datum in [0, 1], shape (k,).
     """
-    node, inside = grid.index(data.xyz[:, :2])
-    node, z, sigma = node[inside], data.xyz[inside, 2], data.sigma[inside]
-    count = grid.rows * grid.columns
+    index, inside = grid.index(data.xyz[:, :2])
+    number = grid.numbers()
+    inside[inside] = number.ravel()[index[inside]] >= 0
+    node, z, sigma = number.ravel()[index[inside]], data.xyz[inside, 2], data.sigma[inside]
+    count = int(number.max()) + 1
     smooth = _smoothness_matrix(grid)
-    height = None if initial is None else initial.ravel()
+    height = None if initial is None else initial[number >= 0]
     robust = np.ones(len(z))
     for iteration in range(iterations):
         if height is not None:
@@ -302,29 +334,43 @@ def fit_height(
     assert height is not None
     weights = np.zeros(len(inside))
     weights[inside] = robust
-    return height.reshape(grid.rows, grid.columns), weights
+    nearest = distance_transform_edt(number < 0, return_distances=False, return_indices=True)
+    return height[number[tuple(nearest)]], weights
+
+
+_STENCILS = {  # differences as (row, column, factor) of the nodes
+    "xx": ((0, 0, 1.0), (0, 1, -2.0), (0, 2, 1.0)),
+    "yy": ((0, 0, 1.0), (1, 0, -2.0), (2, 0, 1.0)),
+    "xy": ((0, 0, 1.0), (0, 1, -1.0), (1, 0, -1.0), (1, 1, 1.0)),
+    "x": ((0, 0, -1.0), (0, 1, 1.0)),
+    "y": ((0, 0, -1.0), (1, 0, 1.0)),
+}
 
 
 def _smoothness_matrix(grid: HeightGrid) -> sparse.csr_array:
-    """λ D₂ᵀD₂ + μ D₁ᵀD₁ on the nodes. A bump of length `_SMOOTHING_LENGTH` weighs like a datum of σ = 3 cm."""
-    rows, columns = grid.rows, grid.columns
-
-    def difference(n: int, order: int) -> sparse.csr_array:
-        stencil = [-1.0, 1.0] if order == 1 else [1.0, -2.0, 1.0]
-        return sparse.diags_array(stencil, offsets=range(order + 1), shape=(n - order, n)).tocsr()
-
-    eye_r, eye_c = sparse.eye_array(rows), sparse.eye_array(columns)
-    xx = sparse.kron(eye_r, difference(columns, 2))
-    yy = sparse.kron(difference(rows, 2), eye_c)
-    xy = sparse.kron(difference(rows, 1), difference(columns, 1))
-    x, y = sparse.kron(eye_r, difference(columns, 1)), sparse.kron(difference(rows, 1), eye_c)
+    """λ D₂ᵀD₂ + μ D₁ᵀD₁ on the fitted nodes. A bump of length `_SMOOTHING_LENGTH` weighs like a datum of σ = 3 cm."""
+    number = np.pad(grid.numbers(), (0, 2), constant_values=-1)
+    row, column = np.nonzero(number >= 0)
+    squares = {}
+    for name, stencil in _STENCILS.items():
+        nodes = np.stack([number[row + down, column + right] for down, right, _ in stencil], 1)
+        nodes = nodes[(nodes >= 0).all(1)]
+        factors = np.tile([factor for _, _, factor in stencil], len(nodes))
+        starts = np.arange(len(nodes) + 1) * len(stencil)
+        difference = sparse.csr_array((factors, nodes.ravel(), starts), shape=(len(nodes), len(row)))
+        squares[name] = difference.T @ difference
     bend = max(_SMOOTHING_LENGTH / grid.cell, 0.5) ** 4 / _SIGMA_FIELD**2
     flat = bend * (grid.cell / _EXTRAPOLATION_LENGTH) ** 2
-    return (bend * (xx.T @ xx + yy.T @ yy + 2.0 * xy.T @ xy) + flat * (x.T @ x + y.T @ y)).tocsr()
+    second = squares["xx"] + squares["yy"] + 2.0 * squares["xy"]
+    return (bend * second + flat * (squares["x"] + squares["y"])).tocsr()
 
 
-def fit_low_passed(data: HeightData, low: Array, high: Array, config: MeshConfig) -> tuple[Array, HeightGrid, Array]:
+def fit_low_passed(
+    data: HeightData, low: Array, high: Array, config: MeshConfig, line: Array | None = None
+) -> tuple[Array, HeightGrid, Array]:
     """Fits heights over the box from `low` to `high` (x, y), coarse to fine; low-passes them by `ground_smoothing`.
+
+    For `line` see `build_ground`.
 
     Returns heights [m] on a grid of `ground_cell`, the grid, and the weight of each datum.
     """
@@ -332,9 +378,10 @@ def fit_low_passed(data: HeightData, low: Array, high: Array, config: MeshConfig
     if len(data.xyz) < _MIN_DATA:
         surface, weights = np.zeros((grid.rows, grid.columns)), np.zeros(len(data.xyz))
     else:
-        coarse = HeightGrid.covering(low, high, _COARSE_CELL, _COARSE_NODES)
+        reach = config.margin + _BESIDE_LINE
+        coarse = HeightGrid.covering(low, high, _COARSE_CELL, _COARSE_NODES, line, reach)
         height, _ = fit_height(data, coarse)
-        fine = HeightGrid.covering(low, high, max(0.25, grid.cell), _FINE_NODES)
+        fine = HeightGrid.covering(low, high, max(0.25, config.ground_cell), _FINE_NODES, line, reach)
         height, weights = fit_height(data, fine, coarse.sample(height, fine.nodes(), order=3), iterations=1)
         surface = fine.sample(height, grid.nodes(), order=3)
     return gaussian_filter(surface, config.ground_smoothing / grid.cell, mode="nearest"), grid, weights
@@ -347,14 +394,15 @@ def build_ground(
     box: tuple[Array, Array],
     config: MeshConfig,
     height: float | None,
+    line: Array | None = None,
 ) -> tuple[Ground, dict[str, Any]]:
     """Fits the ground over a box, given by its low and high corners (x, y) [m]. Also returns metrics for the report.
 
     `height` is the given height of the camera [m]; 0 = estimate it per source; None = do not use the path (because the
-    film goes around an object).
+    film goes around an object). If the box is large, only the ground near `line`, the route (m, 2) [m], is fitted.
     """
     low, high = box
-    coarse = HeightGrid.covering(low, high, _COARSE_CELL, _COARSE_NODES)
+    coarse = HeightGrid.covering(low, high, _COARSE_CELL, _COARSE_NODES, line, config.margin + _BESIDE_LINE)
     path, path_metrics = _path_data(cameras, None, height) if height is not None else (HeightData.empty(), {})
     level = fit_height(path, coarse, iterations=1)[0] if len(path.xyz) else np.zeros((coarse.rows, coarse.columns))
     tree = cKDTree(path.xyz[:, :2]) if len(path.xyz) else None
@@ -376,7 +424,7 @@ def build_ground(
         bias = [bias_to_path(data, path) for data in visible]
         visible = [replace(d, xyz=d.xyz - [0.0, 0.0, b]) for d, b in zip(visible, bias, strict=True)]
     data = HeightData.join([*visible, path])
-    surface, grid, weights = fit_low_passed(data, low, high, config)
+    surface, grid, weights = fit_low_passed(data, low, high, config, line)
     used = data.xyz[weights > 0.25, :2]
     measured = np.zeros((grid.rows, grid.columns), bool)
     node, inside = grid.index(used)

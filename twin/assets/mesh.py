@@ -10,6 +10,7 @@ the solids, decomposes the solids into convex parts, and clears the corridor (`s
 """
 
 import time
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from twin.assets.ground import Ground, build_ground
 from twin.assets.ground_picture import ground_picture
 from twin.assets.tsdf import FREE_SPACE_REACH, color_points
 from twin.assets.views import ColorField, Views, render_views
-from twin.config import SceneConfig
+from twin.config import MeshConfig, SceneConfig
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.images import write_image
 from twin.geometry.passes import path_length
@@ -33,6 +34,7 @@ from twin.nerf.baked import BakedField
 from twin.scene import SceneDir
 from twin.types import Array
 
+_COUNTED_LENGTH = 100.0  # [m] on a longer route, the numbers below and those in `MeshConfig` are per this length
 _VISUAL_FACES = 150_000
 _MARGIN_ABOVE = 2.0  # [m] margin of the visual mesh's box above the highest obstacle
 _MARGIN_BELOW = 1.0  # [m] margin of the visual mesh's box below the lowest ground
@@ -66,43 +68,47 @@ def build_assets(
     if route is None:
         # In a capture around an object, everything outside the field's near box is background.
         low, high = np.maximum(low, field.bounds[0, :2]), np.minimum(high, field.bounds[1, :2])
-    far = settings.margin + 2.0
-    views = render_views(field, cameras, settings.views, settings.view_width, FREE_SPACE_REACH * far)
+    far = _far(settings)
+    length = path_length(route) if route is not None else None
+    share = max(1.0, (length or 0.0) / _COUNTED_LENGTH)
+    views = render_views(field, cameras, round(share * settings.views), settings.view_width, FREE_SPACE_REACH * far)
     clock.append(("render", time.perf_counter()))
     height = _camera_height(config) if route is not None else None
-    ground, ground_metrics = build_ground(views, cameras, points, (low, high), settings, height)
+    ground, ground_metrics = build_ground(views, cameras, points, (low, high), settings, height, route)
     ground.save(out)
     clock.append(("ground", time.perf_counter()))
     top = float(ground.height.max()) + settings.max_height + _MARGIN_ABOVE
     box = np.stack([np.append(low, ground.height.min() - _MARGIN_BELOW), np.append(high, top)])
-    hits = _surface_points(views, ground, box, far)
-    volume = tsdf.fuse_volume(hits, views, box, settings.voxel, far)
-    clock.append(("fuse", time.perf_counter()))
-    visual, visual_metrics = _visual_mesh(volume, views, ground)
-    np.savez(out / "visual.npz", **visual)  # type: ignore[arg-type]
-    clock.append(("surface", time.perf_counter()))
     corridor = None
     if route is not None:
         corridor = solids.Corridor(route, config.mjcf.half_width + config.mjcf.corridor_margin)
         np.savez(out / "route.npz", xy=route, z=ground.at(route))
-    pieces, left_out = solids.solid_pieces(volume, ground, corridor, cameras, settings)
+        path = route[::2]
+    fused = _fuse_sections(views, ground, corridor, path, box, settings)
+    clock.append(("fuse", time.perf_counter()))
+    visual, visual_metrics = _visual_mesh(
+        fused, views, ground, settings.voxel, FREE_SPACE_REACH * far, round(share * _VISUAL_FACES)
+    )
+    np.savez(out / "visual.npz", **visual)  # type: ignore[arg-type]
+    clock.append(("surface", time.perf_counter()))
+    pieces, left_out = solids.solid_pieces(fused.solid, box[0], settings.voxel, path, settings)
     clock.append(("solids", time.perf_counter()))
-    part_metrics = _save_parts(pieces, corridor, ground, config, out, cache)
+    part_metrics = _save_parts(pieces, corridor, ground, config, round(share * settings.max_parts), out, cache)
     clock.append(("convex", time.perf_counter()))
     return {
         **part_metrics,
         **visual_metrics,
         "ground": ground_metrics | _roughness(ground, route),
         "views": len(views),
-        "voxel_m": volume.voxel,
+        "voxel_m": settings.voxel,
         "floaters": {
-            "voxels_seen_through": volume.outvoted,
+            "voxels_seen_through": fused.outvoted,
             "surface_pieces": visual_metrics["floaters_removed"],
             "solid_specks": left_out["specks"],
         },
         "standing": left_out["standing"],
         "bounds_m": box.tolist(),
-        "route_length_m": path_length(route) if route is not None else None,
+        "route_length_m": length,
         "route": route_metrics(filmed) if filmed else None,
         "seconds_of": {name: end - start for (_, start), (name, end) in pairwise(clock)},
     }
@@ -116,7 +122,7 @@ def _camera_height(config: SceneConfig) -> float:
 
 def _surface_points(views: Views, ground: Ground, box: Array, far: float) -> Array:
     """Rendered points (k, 3) [m] that are in the box and above the ground."""
-    hits = []
+    hits = [np.zeros((0, 3))]
     for i in range(len(views)):
         points = views.points(i)[(views.depth[i] > 0) & (views.depth[i] < far)]
         points = points[((points > box[0]) & (points < box[1])).all(1)]
@@ -124,21 +130,70 @@ def _surface_points(views: Views, ground: Ground, box: Array, far: float) -> Arr
     return np.concatenate(hits)
 
 
-def _visual_mesh(volume: tsdf.Volume, views: Views, ground: Ground) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Returns colored triangles (of the seen surfaces above the ground, and of the ground itself), and metrics."""
-    vertices, faces = tsdf.zero_level(volume.distance, volume.origin, volume.voxel)
-    above = vertices[:, 2] - ground.at(vertices[:, :2]) > 0.05
-    vertices, faces = tsdf.compact(vertices, faces[above[faces].any(1)])
-    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, volume.band)
+@dataclass(frozen=True)
+class _Fused:
+    """Results of the fusion of all sections of a place."""
+
+    surface: tuple[Array, NDArray[np.int64]]
+    """Vertices (v, 3) [m] and faces (f, 3) of the zero level above the ground."""
+    solid: solids.SolidVoxels
+    outvoted: int
+    """Number of voxels at which free votes removed a surface."""
+
+
+def _fuse_sections(
+    views: Views, ground: Ground, corridor: solids.Corridor | None, path: Array, box: Array, settings: MeshConfig
+) -> _Fused:
+    """Fuses the views in one section of the place after the other, since a long road would not fit into memory."""
+    voxel, far = settings.voxel, _far(settings)
+
+    def heights(low: Array, high: Array) -> tuple[float, float]:
+        lowest, highest = ground.extremes(low, high)
+        return lowest - _MARGIN_BELOW, highest + settings.max_height + _MARGIN_ABOVE
+
+    surfaces, solid, outvoted = [], [], 0
+    sections = tsdf.divide(box, voxel, solids.frame_width(voxel), heights)
+    for section in sections if len(sections) == 1 else runtime.track(sections, "fusing depth", unit="section"):
+        low = np.maximum(box[0] + voxel * section.start, box[0])
+        high = np.minimum(box[0] + voxel * (section.start + section.shape), box[1])
+        near = views.select(tsdf.views_of_box(views, low, high, FREE_SPACE_REACH * far))
+        hits = _surface_points(near, ground, np.stack([low, high]), far)
+        if not len(hits):
+            continue
+        volume = tsdf.fuse_volume(hits, near, box[0], voxel, section, far)
+        vertices, faces = tsdf.section_surface(volume)
+        above = vertices[:, 2] - ground.at(vertices[:, :2]) > 0.05
+        surfaces.append(tsdf.compact(vertices, faces[above[faces].any(1)]))
+        solid.append(solids.solid_voxels(volume, ground, corridor, path, settings))
+        outvoted += volume.outvoted
+    return _Fused(tsdf.join_surfaces(surfaces, box[0], voxel), solids.SolidVoxels.join(solid), outvoted)
+
+
+def _far(settings: MeshConfig) -> float:
+    """Depth up to which views vote for surfaces [m]."""
+    return settings.margin + 2.0
+
+
+def _visual_mesh(
+    fused: _Fused, views: Views, ground: Ground, voxel: float, far: float, max_faces: int
+) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """Returns about `max_faces` colored triangles, two thirds of them above the ground, and metrics.
+
+    Pixels of views that are deeper than `far` [m] are background.
+    """
+    band = tsdf.BAND_VOXELS * voxel
+    reach = 1.1 * far + 4 * band  # surfaces beyond it differ by more than the tolerance from all depths
+    vertices, faces = fused.surface
+    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, band, reach)
     # Valid distances form a band around each surface. The rear boundary of that band also yields triangles. They are no
     # surface, and no view sees them, so they are removed.
     vertices, faces = tsdf.compact(vertices, faces[seen[faces].all(1)])
     vertices, faces, floaters = tsdf.remove_specks(vertices, faces, _SPECK_AREA)
-    vertices, faces = tsdf.decimate(vertices, faces, _VISUAL_FACES * 2 // 3)
-    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, 2 * volume.band)
+    vertices, faces = tsdf.decimate(vertices, faces, max_faces * 2 // 3)
+    colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, 2 * band, reach)
     if seen.any():
         colors[~seen] = colors[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
-    ground_vertices, ground_faces = ground.triangles(_VISUAL_GROUND_CELL, _VISUAL_FACES // 3)
+    ground_vertices, ground_faces = ground.triangles(_VISUAL_GROUND_CELL, max_faces // 3)
     column, row = np.rint((ground_vertices[:, :2] - ground.origin) / ground.cell).astype(int).T
     rows, columns = ground.height.shape
     ground_colors = ground.rgb[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
@@ -160,6 +215,7 @@ def _save_parts(
     corridor: solids.Corridor | None,
     ground: Ground,
     config: SceneConfig,
+    max_parts: int,
     out: Path,
     cache: Path,
 ) -> dict[str, Any]:
@@ -170,10 +226,10 @@ def _save_parts(
     clipped = 0
     if corridor is not None:
         kept, clipped = solids.clear_corridor(decomposition.parts, corridor, ground)
-    dropped = len(kept) - config.mesh.max_parts
+    dropped = len(kept) - max_parts
     if dropped > 0:
         # Parts are sorted by distance from the path; the farthest are the least relevant to the robot.
-        kept = kept[: config.mesh.max_parts]
+        kept = kept[:max_parts]
         runtime.log_line(f"  left out the {dropped} farthest convex parts, as mesh.max_parts = {config.mesh.max_parts}")
     parts = [part for _, part in kept]
     empty = np.zeros((0, 3))
@@ -214,6 +270,6 @@ def _roughness(ground: Ground, route: Array | None) -> dict[str, float | None]:
         metrics["route_bend_rms_per_m"] = float(np.sqrt(np.mean((np.diff(height, 2) / step**2) ** 2)))
         xy = ground.origin + ground.cell * np.stack(np.meshgrid(*map(np.arange, ground.height.shape[::-1])), -1)
         coarse = (slice(None, None, 4),) * 2
-        beside = distance_to_route(route[::4], xy[coarse]) < 1.5
+        beside = distance_to_route(route[::4], xy[coarse], 1.5) < 1.5
         metrics["corridor_coverage"] = float(ground.measured[coarse][beside].mean())
     return metrics

@@ -7,17 +7,19 @@ through it, so it is free.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, find_objects, gaussian_filter, label, map_coordinates
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, map_coordinates
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from twin.assets.convex import ConvexPart, SolidPiece
 from twin.assets.ground import Ground
-from twin.assets.tsdf import Volume, zero_level
+from twin.assets.tsdf import BLOCK, Volume, zero_level
 from twin.config import MeshConfig
-from twin.geometry.cameras import Cameras
 from twin.geometry.passes import SPACING
 from twin.geometry.route import distance_to_route
 from twin.types import Array
@@ -47,19 +49,49 @@ class Corridor:
     """Half width of the corridor plus its margin [m]."""
 
 
-def solid_pieces(
-    volume: Volume, ground: Ground, corridor: Corridor | None, cameras: Cameras, config: MeshConfig
-) -> tuple[list[SolidPiece], dict[str, int]]:
-    """Closed meshes of the solid's components that reach `obstacle_height` above the ground, cut into tiles.
+@dataclass(frozen=True)
+class SolidVoxels:
+    """Voxels of the solid and their neighbors. Voxel (i, j, k) is at corner + voxel · (i, j, k)."""
 
-    Returns:
-        The pieces, nearest to the path first; and the numbers of components by kind: `standing` ones, of which the
-        pieces are made, and `specks` and `low` ones, which are left out.
-    """
-    voxel = volume.voxel
+    index: NDArray[np.int64]
+    """i, j, k in the lattice of the place, shape (n, 3)."""
+    field: NDArray[np.float32]
+    """Distance from the solid's surface [m], negative in it, shape (n,)."""
+    above: NDArray[np.float32]
+    """Height above the ground [m], shape (n,)."""
+
+    @cached_property
+    def key(self) -> NDArray[np.int64]:
+        """Numbers of the voxels, see `_keys`; ascending after `join`."""
+        return _keys(self.index)
+
+    @staticmethod
+    def join(parts: list["SolidVoxels"]) -> "SolidVoxels":
+        """The voxels of all parts, in the order of their indices."""
+        empty = SolidVoxels(np.zeros((0, 3), np.int64), np.zeros(0, np.float32), np.zeros(0, np.float32))
+        names = "index", "field", "above"
+        index, field, above = (np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in names)
+        order = np.argsort(_keys(index))
+        return SolidVoxels(index[order], field[order], above[order])
+
+
+def frame_width(voxel: float) -> int:
+    """Distance [voxels] over which `solid_voxels` depends on the volume around a voxel."""
+    filters = 4.0 * (1.0 + _SMOOTHING) + 2.0  # SciPy's Gaussian filters end at 4 σ; 2 for rounding
+    return int(np.ceil((_HIDDEN_DEPTH + _MAX_GAP) / voxel + filters)) + 2 * BLOCK
+
+
+def solid_voxels(
+    volume: Volume, ground: Ground, corridor: Corridor | None, path: Array, config: MeshConfig
+) -> SolidVoxels:
+    """The solid within `config.margin` of a path (m, 2) [m], cleared of the corridor, in one section of the place."""
+    voxel, section = volume.voxel, volume.section
+    nothing = SolidVoxels.join([])
+    distance = _distance_to_path(volume, path, config.margin)
+    if distance is None or not (volume.distance < 0).any():
+        return nothing
     columns = volume.distance.shape[:2]
-    index = np.stack(np.meshgrid(*map(np.arange, columns), indexing="ij"), -1)
-    xy = volume.origin[:2] + voxel * index
+    xy = volume.origin[:2] + voxel * np.stack(np.meshgrid(*map(np.arange, columns), indexing="ij"), -1)
     z = volume.origin[2] + voxel * np.arange(volume.distance.shape[2])
     above = (z - ground.at(xy)[..., None]).astype(np.float32)
     field = _solid_distance(volume)
@@ -67,46 +99,128 @@ def solid_pieces(
     _close_downwards(field, above, voxel)
     field = np.maximum(field, above - config.max_height)
     field = np.maximum(field, -_EMBEDDING - above)
-    path = corridor.route[::2] if corridor else cameras.positions[:, :2]
-    off_path = np.ones(columns, bool)
-    on_path = np.rint((path - volume.origin[:2]) / voxel).astype(int)
-    off_path[tuple(np.clip(on_path, 0, np.array(columns) - 1).T)] = False
-    distance = distance_transform_edt(off_path) * voxel
     field = np.maximum(field, (distance - config.margin)[..., None].astype(np.float32))
     if corridor is not None:
         near = distance < corridor.reach + 2.0
         exact = np.full(distance.shape, 10.0)
-        exact[near] = distance_to_route(corridor.route[::2], xy[near])
+        exact[near] = distance_to_route(corridor.route[::2], xy[near], corridor.reach + 2.0 + 2.0 * voxel)
         inside = (corridor.reach + _CORRIDOR_SLACK - exact)[..., None].astype(np.float32)
         field = np.where(above < HEADROOM + voxel, np.maximum(field, inside), field)
-    solid = field < 0
-    labels, count = label(solid, np.ones((3, 3, 3), bool))
+    kept = np.zeros(field.shape, bool)
+    kept[section.inner] = binary_dilation(field < 0, np.ones((3, 3, 3), bool))[section.inner]
+    return SolidVoxels(np.argwhere(kept) + section.start, field[kept], above[kept])
+
+
+def _distance_to_path(volume: Volume, path: Array, reach: float) -> Array | None:
+    """Distance [m] of the section's columns to the path, shape (x, y), exact up to `reach`; None if all are farther."""
+    voxel, section = volume.voxel, volume.section
+    beyond = int(np.ceil(reach / voxel)) + 1
+    corner = volume.origin[:2] - voxel * section.start[:2]
+    low = np.maximum(section.start[:2] - beyond, 0)
+    high = np.minimum(section.start[:2] + section.shape[:2] + beyond, section.place[:2])
+    on_path = np.clip(np.rint((path - corner) / voxel).astype(int), 0, section.place[:2] - 1)
+    on_path = on_path[((on_path >= low) & (on_path < high)).all(1)] - low
+    if len(on_path) == 0:
+        return None
+    off_path = np.ones(high - low, bool)
+    off_path[tuple(on_path.T)] = False
+    x, y = section.start[:2] - low
+    distance: Array = distance_transform_edt(off_path) * voxel
+    return distance[x : x + section.shape[0], y : y + section.shape[1]]
+
+
+def solid_pieces(
+    voxels: SolidVoxels, corner: Array, voxel: float, path: Array, config: MeshConfig
+) -> tuple[list[SolidPiece], dict[str, int]]:
+    """Closed meshes of the solid's components that reach `obstacle_height` above the ground, cut into tiles.
+
+    Args:
+        voxels: The solid of the whole place.
+        corner: Position of the lattice's voxel (0, 0, 0) [m], shape (3,).
+        voxel: Spacing of the lattice [m].
+        path: Route or positions of the cameras, shape (m, 2) [m].
+        config: Settings of the mesh.
+
+    Returns:
+        The pieces, nearest to the path first; and the numbers of components by kind: `standing` ones, of which the
+        pieces are made, and `specks` and `low` ones, which are left out.
+    """
+    solid = np.flatnonzero(voxels.field < 0)
+    component = _components(voxels.key[solid])
+    count = int(component.max(initial=-1)) + 1
     pieces: list[tuple[float, SolidPiece]] = []
     specks = low = 0
-    tile = max(4, round(_TILE_SIZE / voxel))
-    for number, part in enumerate(find_objects(labels), start=1):
-        component = labels[part] == number
-        size, heights = int(component.sum()), above[part][component]
+    side = max(4, round(_TILE_SIZE / voxel))
+    ends = np.cumsum(np.bincount(component, minlength=1))[:-1]
+    for mine in np.split(solid[np.argsort(component, kind="stable")], ends) if count else ():
+        index, heights = voxels.index[mine], voxels.above[mine]
         if heights.max() < config.obstacle_height:
             low += 1
             continue
-        if size < (_MIN_VOXELS if heights.min() < _MAX_GROUND_GAP else _MIN_HOVERING_VOXELS):
+        if len(mine) < (_MIN_VOXELS if heights.min() < _MAX_GROUND_GAP else _MIN_HOVERING_VOXELS):
             specks += 1
             continue
-        start = np.array([s.start for s in part])
-        for i in range(0, component.shape[0], tile):
-            for j in range(0, component.shape[1], tile):
-                block = component[i : i + tile, j : j + tile]
-                if block.sum() < _MIN_VOXELS // 2:
-                    continue
-                values = field[part][i : i + tile, j : j + tile]
-                values = np.where(block, values, np.maximum(values, 0.3 * voxel))
-                piece = _block_piece(values, volume, start + np.array([i, j, 0]))
-                if piece is not None:
-                    middle = ((piece.vertices.min(0) + piece.vertices.max(0)) / 2)[:2]
-                    pieces.append((float(np.linalg.norm(path - middle, axis=1).min()), piece))
+        start, end = index.min(0), index.max(0) + 1
+        tile = (index[:, :2] - start[:2]) // side
+        order = np.lexsort((tile[:, 1], tile[:, 0]))
+        borders = np.flatnonzero((np.diff(tile[order], axis=0) != 0).any(1)) + 1
+        for part in np.split(order, borders):
+            if len(part) < _MIN_VOXELS // 2:
+                continue
+            first = start + np.append(tile[part[0]] * side, 0)
+            last = np.minimum(first + np.array([side, side, end[2] - start[2]]), end)
+            values = _values_around(voxels, index[part], first, last, voxel)
+            piece = _block_piece(values, corner, voxel, first)
+            if piece is not None:
+                middle = ((piece.vertices.min(0) + piece.vertices.max(0)) / 2)[:2]
+                pieces.append((float(np.linalg.norm(path - middle, axis=1).min()), piece))
     pieces.sort(key=lambda item: item[0])
     return [piece for _, piece in pieces], {"specks": specks, "low": low, "standing": count - specks - low}
+
+
+def _components(key: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Component of each voxel, given by ascending numbers (n,), see `_keys`. Voxels also touch at edges and corners.
+
+    Components are numbered in the order of their first voxels.
+    """
+    if len(key) == 0:
+        return np.zeros(0, np.int64)
+    start, end = [], []
+    offsets = np.argwhere(np.ones((3, 3, 3), bool)) - 1
+    for step in _keys(offsets[14:]) - _keys(offsets[13:14]):  # of 13 neighbors; the other 13 have this voxel as theirs
+        at = np.minimum(np.searchsorted(key, key + step), len(key) - 1)
+        found = np.flatnonzero(key[at] == key + step)
+        start.append(found)
+        end.append(at[found])
+    ends = np.concatenate(start), np.concatenate(end)
+    graph = coo_array((np.ones(len(ends[0]), bool), ends), shape=(len(key),) * 2)
+    labels = connected_components(graph, directed=False)[1]
+    first = np.unique(labels, return_index=True)[1]
+    return np.argsort(np.argsort(first))[labels]
+
+
+def _keys(index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """A number for each voxel (n, 3), in lexical order, shape (n,)."""
+    x, y, z = (index + 1).T
+    return (x << 42) + (y << 21) + z
+
+
+def _values_around(
+    voxels: SolidVoxels, mine: NDArray[np.int64], first: NDArray[np.int64], last: NDArray[np.int64], voxel: float
+) -> NDArray[np.float32]:
+    """Distance field between two corners of the lattice, in which only the voxels `mine` (k, 3) are solid."""
+    values = np.full(last - first, 0.5 * voxel, np.float32)
+    # The voxels are sorted by x, then y, so those of a row of columns are adjacent.
+    key = voxels.key
+    for x in range(int(first[0]), int(last[0])):
+        ends = _keys(np.array([[x, first[1], first[2]], [x, last[1] - 1, last[2] - 1]]))
+        a, b = np.searchsorted(key, ends[0]), np.searchsorted(key, ends[1], "right")
+        row = voxels.index[a:b]
+        inside = (row[:, 2] >= first[2]) & (row[:, 2] < last[2])
+        values[tuple((row[inside] - first).T)] = voxels.field[a:b][inside]
+    block = np.zeros(values.shape, bool)
+    block[tuple((mine - first).T)] = True
+    return np.where(block, values, np.maximum(values, np.float32(0.3 * voxel)))
 
 
 def _solid_distance(volume: Volume) -> NDArray[np.float32]:
@@ -138,11 +252,10 @@ def _close_downwards(field: NDArray, above: NDArray, voxel: float) -> None:
     field[fill] = -0.5 * voxel
 
 
-def _block_piece(values: NDArray, volume: Volume, start: NDArray) -> SolidPiece | None:
+def _block_piece(values: NDArray, corner: Array, voxel: float, start: NDArray) -> SolidPiece | None:
     """Closed surface of a block of the distance field whose first voxel is `start`; None if the block is empty."""
-    voxel = volume.voxel
     padded = np.pad(values, 1, constant_values=0.5 * voxel)
-    origin = volume.origin + voxel * (start - 1)
+    origin = corner + voxel * (start - 1)
     vertices, faces = zero_level(padded, origin, voxel)
     if len(faces) < 4:
         return None

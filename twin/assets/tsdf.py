@@ -11,6 +11,7 @@ from elsewhere outvote them.
 # mypy: disable-error-code="index, attr-defined"
 # (mypy does not know Warp's types inside kernels)
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import fast_simplification
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from twin.assets.views import Views
@@ -46,6 +48,7 @@ def _fuse_kernel(
     world_to_camera: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
     depth: wp.array3d[wp.float32],
+    chosen: wp.array[wp.int32],
     slant: wp.array3d[wp.float32],
     far: float,
     band: float,
@@ -64,7 +67,8 @@ def _fuse_kernel(
     total = float(0.0)
     near_votes = float(0.0)
     free_votes = float(0.0)
-    for view in range(depth.shape[0]):
+    for k in range(chosen.shape[0]):
+        view = chosen[k]
         seen = _project(point, world_to_camera[view], intrinsics[view])
         z = seen[2]
         if z > 0.35 and z < reach:
@@ -111,6 +115,7 @@ def _color_kernel(
     world_to_camera: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
     depth: wp.array3d[wp.float32],
+    chosen: wp.array[wp.int32],
     rgb: wp.array4d[wp.uint8],
     tolerance: float,
     colors: wp.array[wp.vec3],
@@ -120,7 +125,8 @@ def _color_kernel(
     point = points[i]
     total = wp.vec3(0.0, 0.0, 0.0)
     weights = float(0.0)
-    for view in range(depth.shape[0]):
+    for k in range(chosen.shape[0]):
+        view = chosen[k]
         seen = _project(point, world_to_camera[view], intrinsics[view])
         z = seen[2]
         # Only surfaces that face the lens get a color. A limit of 0.1 (6°) keeps walls beside a forward-looking camera.
@@ -150,57 +156,167 @@ def fuse(points: Array, views: Views, band: float, far: float) -> tuple[NDArray,
     A distance is NaN if there are no `near` votes. Views vote for surfaces up to the depth `far` [m], and for free
     space up to `FREE_SPACE_REACH` times as far.
     """
+    distance = np.full(len(points), np.nan, np.float32)
+    near, free = (np.zeros(len(points), np.float32) for _ in range(2))
+    reach = FREE_SPACE_REACH * far
+    constants = [far, band, reach, _HALF_WEIGHT_DEPTH, _CLEARANCE, _SAME_SURFACE_RATIO]
     with wp.ScopedDevice("cpu"):
-        distance = wp.full(len(points), float("nan"), dtype=wp.float32)
-        near, free = (wp.zeros(len(points), dtype=wp.float32) for _ in range(2))
+        cameras = _camera_arrays(views)
         slant: wp.array = wp.array(views.slant, dtype=wp.float32)
-        constants = [far, band, FREE_SPACE_REACH * far, _HALF_WEIGHT_DEPTH, _CLEARANCE, _SAME_SURFACE_RATIO]
-        inputs = [*_camera_arrays(points, views), slant, *constants]
-        wp.launch(_fuse_kernel, len(points), inputs, [distance, near, free])
-        return distance.numpy(), near.numpy(), free.numpy()
+        for index, chosen in _groups(points, views, reach):
+            found = wp.full(len(index), float("nan"), dtype=wp.float32)
+            votes = [wp.zeros(len(index), dtype=wp.float32) for _ in range(2)]
+            inputs = [_vectors(points[index]), *cameras, _indices(chosen), slant, *constants]
+            wp.launch(_fuse_kernel, len(index), inputs, [found, *votes])
+            distance[index], near[index], free[index] = (values.numpy() for values in (found, *votes))
+    return distance, near, free
 
 
 def color_points(
-    points: Array, normals: Array, views: Views, tolerance: float
+    points: Array, normals: Array, views: Views, tolerance: float, reach: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Returns colors (k, 3) of surface points (k, 3) with normals (k, 3), and a mask (k,) of the points that views see.
 
     The nearest views dominate a color. A view sees a point if the point faces it and the view's depth there differs by
-    less than `tolerance` [m] plus 5 % from the point's depth.
+    less than `tolerance` [m] plus 5 % from the point's depth, which is at most `reach` [m].
     """
+    colors = np.zeros((len(points), 3), np.float32)
+    seen = np.zeros(len(points), bool)
     with wp.ScopedDevice("cpu"):
-        colors = wp.zeros(len(points), dtype=wp.vec3)
-        found = wp.zeros(len(points), dtype=wp.float32)
+        cameras = _camera_arrays(views)
         rgb: wp.array = wp.array(views.rgb, dtype=wp.uint8)
-        positions, *cameras = _camera_arrays(points, views)
-        normal_array: wp.array = wp.array(np.asarray(normals, np.float32), dtype=wp.vec3)
-        centers: wp.array = wp.array(views.camera_to_world[:, :3, 3].astype(np.float32), dtype=wp.vec3)
-        inputs = [positions, normal_array, centers, *cameras, rgb, tolerance]
-        wp.launch(_color_kernel, len(points), inputs, [colors, found])
-        return (colors.numpy() + 0.5).astype(np.uint8), found.numpy() > 0
+        centers = _vectors(views.camera_to_world[:, :3, 3])
+        for index, chosen in _groups(points, views, reach):
+            mean, found = wp.zeros(len(index), dtype=wp.vec3), wp.zeros(len(index), dtype=wp.float32)
+            where = _vectors(points[index]), _vectors(normals[index])
+            inputs = [*where, centers, *cameras, _indices(chosen), rgb, tolerance]
+            wp.launch(_color_kernel, len(index), inputs, [mean, found])
+            colors[index], seen[index] = mean.numpy(), found.numpy() > 0
+    return (colors + 0.5).astype(np.uint8), seen
 
 
-def _camera_arrays(points: Array, views: Views) -> list[wp.array]:
+def _camera_arrays(views: Views) -> list[wp.array]:
     return [
-        wp.array(np.asarray(points, np.float32), dtype=wp.vec3),
         wp.array(inverse_pose(views.camera_to_world).astype(np.float32), dtype=wp.mat44),
         wp.array(views.intrinsics.astype(np.float32), dtype=wp.vec4),
         wp.array(views.depth, dtype=wp.float32),
     ]
 
 
-# ---- block-sparse volume
+def _vectors(points: Array) -> wp.array:
+    return wp.array(np.asarray(points, np.float32), dtype=wp.vec3)
 
-_BLOCK = 4  # [voxels] side of a block
-_MAX_VOXELS = 60_000_000
-_BAND_VOXELS = 2.0  # [voxels] half width of the band around a surface
-_VOXELS_PER_LAUNCH = 400_000
+
+def _indices(chosen: NDArray[np.int64]) -> wp.array:
+    return wp.array(chosen, dtype=wp.int32)
+
+
+# ---- views of a group of points
+
+_GROUP_SIDE = 8.0  # [m] side of the square columns that divide points into groups
+_PIXEL_SLACK = 2.0  # [px] width of a frame around the image in which points still count as seen
+
+
+def _groups(points: Array, views: Views, reach: float) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Divides points (k, 3) into groups. Returns for each the indices of its points and of the views that may see any.
+
+    Views far away would only cost time: on a long road, almost all views are far from any point.
+    """
+    if len(points) == 0:
+        return []
+    column = np.floor(points[:, :2] / _GROUP_SIDE).astype(np.int64)
+    order = np.lexsort(column.T)
+    starts = np.flatnonzero((np.diff(column[order], axis=0) != 0).any(1)) + 1
+    groups = np.split(order, starts)
+    return [(index, views_of_box(views, points[index].min(0), points[index].max(0), reach)) for index in groups]
+
+
+def views_of_box(views: Views, low: Array, high: Array, reach: float) -> NDArray[np.int64]:
+    """Indices in order of the views that may see a point of a box up to the depth `reach` [m]; `low`, `high` (3,)."""
+    corners = np.stack(np.meshgrid(*np.stack([low, high], 1), indexing="ij"), -1).reshape(-1, 3)
+    world_to_camera = inverse_pose(views.camera_to_world)
+    x, y, z = np.moveaxis(
+        corners @ np.swapaxes(world_to_camera[:, :3, :3], 1, 2) + world_to_camera[:, None, :3, 3], 2, 0
+    )
+    height, width = views.depth.shape[1:]
+    fx, fy, cx, cy = views.intrinsics.T[..., None]
+    # All corners are outside one plane of the view's frustum, and so is the box. For z < 0 the signs are not those of
+    # pixels, but points behind the lens are outside, too.
+    left, right = fx * x + (cx + _PIXEL_SLACK) * z < 0, fx * x + (cx - width - _PIXEL_SLACK) * z > 0
+    above, below = fy * y + (cy + _PIXEL_SLACK) * z < 0, fy * y + (cy - height - _PIXEL_SLACK) * z > 0
+    outside = [one.all(1) for one in (z < 0, z > 1.001 * reach, left, right, above, below)]
+    return np.flatnonzero(~np.any(outside, axis=0))
+
+
+# ---- volumes
+
+BLOCK = 4
+"""[voxels] Side of the blocks that are fused or left out as a whole."""
+BAND_VOXELS = 2.0
+"""[voxels] Half width of the band around a surface."""
+_MAX_VOXELS = 40_000_000  # a place with more voxels is divided into sections
+_SECTION_SIDE = 256  # [voxels] side of a section, a multiple of `BLOCK`
 _FREE_MAJORITY = 0.75  # a surface is removed if a larger fraction of votes is `free`
 
 
 @dataclass(frozen=True)
+class Section:
+    """A box of voxels, part of the lattice of a place. All indices are of the lattice, along x, y, z.
+
+    A section is processed with a frame of voxels around it, so that filters give the same values at its border as in
+    the sections beside it.
+    """
+
+    start: NDArray[np.int64]
+    """First voxel with frame, shape (3,)."""
+    shape: NDArray[np.int64]
+    """Number of voxels with frame, shape (3,)."""
+    low: NDArray[np.int64]
+    """First voxel without frame, shape (3,)."""
+    high: NDArray[np.int64]
+    """First voxel after the section without frame, shape (3,)."""
+    place: NDArray[np.int64]
+    """Number of voxels of the lattice, shape (3,)."""
+
+    @property
+    def inner(self) -> tuple[slice, slice, slice]:
+        """Slices of the section without frame in an array with frame."""
+        x, y, z = (slice(int(a), int(b)) for a, b in zip(self.low - self.start, self.high - self.start, strict=True))
+        return x, y, z
+
+
+def divide(
+    box: Array, voxel: float, frame: int, heights: Callable[[Array, Array], tuple[float, float]]
+) -> list[Section]:
+    """Sections of a place: one if it has at most 40 million voxels, otherwise square columns of 256 voxels' side.
+
+    Args:
+        box: Low and high corner of the place, shape (2, 3) [m].
+        voxel: Spacing of the lattice [m], whose voxel (0, 0, 0) is at the low corner.
+        frame: Least width of the frame [voxels].
+        heights: Returns the lowest and highest z [m] of interest between two corners (x, y), each of shape (2,) [m].
+    """
+    blocks = np.ceil((box[1] - box[0]) / (voxel * BLOCK)).astype(np.int64) + 1
+    whole = blocks * BLOCK
+    if np.prod(whole) <= _MAX_VOXELS:
+        return [Section(np.zeros(3, np.int64), whole, np.zeros(3, np.int64), whole, whole)]
+    frame = -(-frame // BLOCK) * BLOCK
+    sections = []
+    for x in range(0, int(whole[0]), _SECTION_SIDE):
+        for y in range(0, int(whole[1]), _SECTION_SIDE):
+            low = np.array([x, y])
+            high = np.minimum(low + _SECTION_SIDE, whole[:2])
+            start, end = np.maximum(low - frame, 0), np.minimum(high + frame, whole[:2])
+            z = np.array(heights(box[0, :2] + voxel * start, box[0, :2] + voxel * end)) - box[0, 2]
+            bottom, top = np.clip(np.floor(z / (voxel * BLOCK)) + np.array([0, 2]), 0, blocks[2]).astype(int) * BLOCK
+            first, last = np.append(start, bottom), np.append(end, top)
+            sections.append(Section(first, last - first, np.append(low, bottom), np.append(high, top), whole))
+    return sections
+
+
+@dataclass(frozen=True)
 class Volume:
-    """Grid of signed distances; voxel (i, j, k) is at origin + voxel · (i, j, k) [m]."""
+    """Grid of signed distances in a section; voxel (i, j, k) is at origin + voxel · (i, j, k) [m]."""
 
     distance: NDArray[np.float32]
     """Signed distances [m], shape (x, y, z); NaN where no surface is near or no view votes."""
@@ -210,46 +326,42 @@ class Volume:
     """Position of voxel (0, 0, 0) [m], shape (3,)."""
     voxel: float
     """Grid spacing [m]."""
+    section: Section
     outvoted: int
-    """Number of voxels at which free votes removed a surface."""
-
-    @property
-    def band(self) -> float:
-        return _BAND_VOXELS * self.voxel
+    """Number of voxels of the section without frame at which free votes removed a surface."""
 
 
-def fuse_volume(hits: Array, views: Views, box: Array, voxel: float, far: float) -> Volume:
-    """Fuses views at the voxels of a box, only in blocks of 4³ voxels near the surface points `hits` (k, 3).
+def fuse_volume(hits: Array, views: Views, corner: Array, voxel: float, section: Section, far: float) -> Volume:
+    """Fuses views at the voxels of a section, only in blocks of 4³ voxels near the surface points `hits` (k, 3).
 
-    `box` has the low and the high corner, shape (2, 3) [m]. The spacing `voxel` [m] grows if the box would have more
-    than 60 million voxels. For `far` see `fuse`.
+    `corner` is the position of the lattice's voxel (0, 0, 0), shape (3,) [m], and `voxel` its spacing [m]. For `far`
+    see `fuse`.
     """
-    voxel = max(voxel, float((np.prod(box[1] - box[0]) / _MAX_VOXELS) ** (1 / 3)))
-    blocks = np.ceil((box[1] - box[0]) / (voxel * _BLOCK)).astype(int) + 1
-    active = np.zeros(blocks, bool)
-    index = np.floor((hits - box[0]) / (voxel * _BLOCK)).astype(int)
-    index = index[((index >= 0) & (index < blocks)).all(1)]
+    active = np.zeros(section.shape // BLOCK, bool)
+    index = np.floor((hits - corner) / (voxel * BLOCK)).astype(int) - section.start // BLOCK
+    index = index[((index >= 0) & (index < active.shape)).all(1)]
     active[tuple(index.T)] = True
     active = binary_dilation(active, np.ones((3, 3, 3), bool))
-    distance = np.full(blocks * _BLOCK, np.nan, np.float32)
-    inner = np.stack(np.meshgrid(*[np.arange(_BLOCK)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    voxels = (np.argwhere(active)[:, None] * _BLOCK + inner).reshape(-1, 3)
+    distance = np.full(section.shape, np.nan, np.float32)
     hidden = np.zeros(distance.shape, bool)
-    outvoted, band = 0, _BAND_VOXELS * voxel
-    for start in range(0, len(voxels), _VOXELS_PER_LAUNCH):
-        part = voxels[start : start + _VOXELS_PER_LAUNCH]
-        value, near, free = fuse(box[0] + voxel * part, views, band, far)
-        through = (near > 0) & (free > _FREE_MAJORITY * (near + free))
-        outvoted += int((through & (value < band)).sum())
-        value = np.where(through, np.fmax(value, 0.5 * voxel), value)
-        # If all votes at a voxel are `free`, it is outside every surface.
-        value = np.where((near == 0) & (free > 0), band, value)
-        distance[tuple(part.T)] = value
-        hidden[tuple(part.T)] = (near == 0) & (free == 0)
-    return Volume(distance, hidden, np.asarray(box[0], float), voxel, outvoted)
+    inner = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    voxels = (np.argwhere(active)[:, None] * BLOCK + inner).reshape(-1, 3)
+    band = BAND_VOXELS * voxel
+    value, near, free = fuse(corner + voxel * (section.start + voxels), views, band, far)
+    through = (near > 0) & (free > _FREE_MAJORITY * (near + free))
+    counted = ((section.start + voxels >= section.low) & (section.start + voxels < section.high)).all(1)
+    outvoted = int((counted & through & (value < band)).sum())
+    value = np.where(through, np.fmax(value, 0.5 * voxel), value)
+    # If all votes at a voxel are `free`, it is outside every surface.
+    value = np.where((near == 0) & (free > 0), band, value)
+    distance[tuple(voxels.T)] = value
+    hidden[tuple(voxels.T)] = (near == 0) & (free == 0)
+    return Volume(distance, hidden, corner + voxel * section.start, voxel, section, outvoted)
 
 
 # ---- triangle meshes: vertices (v, 3) [m] and faces (f, 3)
+
+_SAME_VERTEX = 1e-3  # [voxels] vertices of two sections that are nearer than this are the same vertex
 
 
 def zero_level(distance: NDArray, origin: Array, voxel: float) -> tuple[Array, NDArray[np.int64]]:
@@ -260,6 +372,35 @@ def zero_level(distance: NDArray, origin: Array, voxel: float) -> tuple[Array, N
     # A vertex on an edge with an unseen end is NaN; its triangles are dropped.
     faces = faces[np.isfinite(vertices).all(1)[faces].all(1)]
     return compact(origin + voxel * vertices.astype(np.float64), faces.astype(np.int64))
+
+
+def section_surface(volume: Volume) -> tuple[Array, NDArray[np.int64]]:
+    """Zero level of a section without frame; at the border, its vertices are also those of the section beside it."""
+    # The cells between the section's last voxels and the first ones after it belong to the section.
+    x, y, z = volume.section.inner
+    inner = slice(x.start, x.stop + 1), slice(y.start, y.stop + 1), z
+    origin = volume.origin + volume.voxel * (volume.section.low - volume.section.start)
+    return zero_level(volume.distance[inner], origin, volume.voxel)
+
+
+def join_surfaces(
+    surfaces: list[tuple[Array, NDArray[np.int64]]], corner: Array, voxel: float
+) -> tuple[Array, NDArray[np.int64]]:
+    """Joins the surfaces of the sections of a place to one mesh, without duplicates of the vertices at borders."""
+    if len(surfaces) <= 1:
+        return surfaces[0] if surfaces else (np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])
+    vertices = np.concatenate([vertices for vertices, _ in surfaces])
+    faces = np.concatenate([faces + start for (_, faces), start in zip(surfaces, starts, strict=False)])
+    at = (vertices[:, :2] - corner[:2]) / (voxel * _SECTION_SIDE)
+    border = np.flatnonzero((np.abs(at - np.rint(at)) * _SECTION_SIDE < _SAME_VERTEX).any(1))
+    pairs = border[cKDTree(vertices[border]).query_pairs(_SAME_VERTEX * voxel, output_type="ndarray")]
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(vertices),) * 2)
+    vertex = connected_components(graph, directed=False)[1]
+    first = np.unique(vertex, return_index=True)[1]
+    faces = vertex[faces].astype(np.int64)
+    whole = (faces != np.roll(faces, 1, axis=1)).all(1)
+    return vertices[first], faces[whole]
 
 
 def compact(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray[np.int64]]:

@@ -52,6 +52,10 @@ class Views:
     def __len__(self) -> int:
         return len(self.depth)
 
+    def select(self, index: NDArray[np.int64]) -> "Views":
+        """The views with these indices."""
+        return Views(*(values[index] for values in vars(self).values()))
+
     def points(self, i: int, depth: NDArray | None = None) -> Array:
         """World points (h, w, 3) [m] of the pixels of view i, at its own z-depth or at a given one (h, w)."""
         height, width = self.depth.shape[1:]

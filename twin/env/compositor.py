@@ -300,6 +300,7 @@ class Compositor:
         max_envs: int = 1,
         shaded: bool = True,
         camera: str = FRONT_CAMERA,
+        lit: tuple[float, float] = (0.0, np.inf),
     ):
         """
         Args:
@@ -309,6 +310,7 @@ class Compositor:
             max_envs: Largest number of envs per call of `render`.
             shaded: False draws obstacles in their own, unshaded colors, for comparison.
             camera: Name of the camera.
+            lit: Lowest and highest arc length of the route [m] where objects are shaded, see `IrradianceEstimator`.
         """
         self.size, self.max_envs, self._field = size, max_envs, field
         self._camera = model.camera(camera).id
@@ -322,8 +324,9 @@ class Compositor:
         self._workers = [_CompositorWorker(model, field, self._camera, size) for _ in range(count)]
         self._pool = ThreadPoolExecutor(count) if count > 1 else None
         self._shadows = ContactShadows(model, self._workers[0].renderer.geoms)
-        self._route, self._shaded, self._lock = stored_route(model), shaded, threading.Lock()
-        self._estimator = IrradianceEstimator(field, self._route) if shaded and self._shadows.bodies else None
+        self._shaded, self._lock = shaded, threading.Lock()
+        self._lit = stored_route(model), lit
+        self._estimator = IrradianceEstimator(field, *self._lit) if shaded and self._shadows.bodies else None
         self._rays = unproject(pixel_grid(*size), self.intrinsics)
 
     def render(
@@ -405,7 +408,7 @@ class Compositor:
             return None
         with self._lock:
             if self._estimator is None:  # there are no obstacles, but the robot's own body is in view
-                self._estimator = IrradianceEstimator(self._field, self._route)
+                self._estimator = IrradianceEstimator(self._field, *self._lit)
         return self._estimator.estimate(lighting, sunlight)
 
 

@@ -43,7 +43,9 @@ SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], 
 """Horizontal directions for which the incoming light is estimated, shape (4, 3)."""
 
 _CAMERA_HEIGHT, _CAMERA_PITCH = 1.0, 8.0  # [m], [°] height and downward pitch of the views from which probes are taken
-_CAMERA_STEP = 2.0  # [m] distance along the route between two views
+_CAMERA_STEP = 2.0  # [m] distance along the route between two views, or more if there would be more than `_MAX_VIEWS`
+_MAX_VIEWS = 100
+_BEYOND = 10.0  # [m] length of a long route before and after the driven segment of which views are taken
 _VIEW_SIZE, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
 _MAX_GROUND_DEPTH, _MAX_DEPTH = 7.0, 12.0  # [m] largest z-depth of ground probes and of all probes
 _GROUND_TOLERANCE = 0.12  # [m] largest height difference of ground probes from the route, plus 5 % of their distance
@@ -134,15 +136,18 @@ def _basis(normals: Array) -> Array:
 class IrradianceEstimator:
     """Estimates the irradiance of any lighting of a field."""
 
-    def __init__(self, baked: BakedField, route: Array):
+    def __init__(self, baked: BakedField, route: Array, between: tuple[float, float] = (0.0, np.inf)):
         """Renders views of the field along a route on the ground, shape (m, 3) [m].
+
+        A route of more than 200 m is too long for views of all of it. Then views are taken between two arc lengths [m],
+        about where the robot drives.
 
         Raises InputError: no ground is seen.
         """
         self._field = baked
         self._lock = threading.Lock()
         self._cache: OrderedDict[tuple[bytes, Sunlight], Irradiance] = OrderedDict()
-        points = _surface_points(baked, route)
+        points = _surface_points(baked, route, view_stations(float(arc_lengths(route)[-1]), *between))
         height, lateral = _height_above(points.positions, route)
         flat = points.normals[:, 2] > 0.9
         ground = (np.abs(height) < _GROUND_TOLERANCE + 0.05 * np.abs(lateral)) & (points.depth < _MAX_GROUND_DEPTH)
@@ -239,11 +244,22 @@ class _SurfacePoints:
         return _SurfacePoints(probes, self.positions[index], self.normals[index], self.depth[index], self.facing[index])
 
 
-def _surface_points(field: BakedField, route: Array) -> _SurfacePoints:
-    """Surface points that are visible in views along the route; pixels at depth edges are left out."""
+def view_stations(length: float, low: float, high: float) -> Array:
+    """Arc lengths [m] of the views along a route of a length [m], at most `_MAX_VIEWS`.
+
+    They are from `low` to `high` [m] and a little beyond, or all along the route if it is not too long.
+    """
+    stations = np.arange(0.0, length, _CAMERA_STEP)
+    if len(stations) > _MAX_VIEWS:
+        stations = stations[(stations >= low - _BEYOND) & (stations <= high + _BEYOND)]
+    return stations[:: max(1, -(-len(stations) // _MAX_VIEWS))]
+
+
+def _surface_points(field: BakedField, route: Array, stations: Array) -> _SurfacePoints:
+    """Surface points that are visible in views from stations of the route; pixels at depth edges are left out."""
     width, height = _VIEW_SIZE
     poses = []
-    for s in np.arange(0.0, arc_lengths(route)[-1], _CAMERA_STEP):
+    for s in stations:
         eye = point_at(route, s) + np.array([0.0, 0.0, _CAMERA_HEIGHT])
         yaw, pitch = float(heading_at(route, s)), np.deg2rad(_CAMERA_PITCH)
         ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])

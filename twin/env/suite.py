@@ -118,7 +118,7 @@ class EnvFactory:
         if self.field is not None:
             if self.options.device != CPU and self._field_only:
                 return GpuPixelObserver(self.field, self.trust, self.options, envs)
-            compositor = Compositor(self.model, self.field, size, count)
+            compositor = Compositor(self.model, self.field, size, count, lit=(self.segment.start, self.segment.end))
             return PixelObserver(compositor, self.field, self.trust, self.options, envs)
         half_width = self.options.half_width or self.world.half_width
         spec = episode_spec(self.world, self.segment.start, self.segment.end, half_width, visuals=True)
@@ -260,9 +260,11 @@ def episode_spec(world: World, start: float, end: float, half_width: float, visu
     # Parts are removed from the XML, since removing a single one from an MjSpec takes milliseconds.
     worldbody, kept = root.find("worldbody"), root.find("asset")
     assert worldbody is not None and kept is not None
-    for geom in [g for g in worldbody.findall("geom") if g.get("type") == "mesh" and not wanted(g)]:
-        worldbody.remove(geom)
-        kept.remove(next(m for m in kept.findall("mesh") if m.get("name") == geom.get("mesh")))
+    left_out = {g.get("mesh"): g for g in worldbody.findall("geom") if g.get("type") == "mesh" and not wanted(g)}
+    # One pass over each list, since a long road has thousands of parts.
+    geoms = set(left_out.values())
+    worldbody[:] = [element for element in worldbody if element not in geoms]
+    kept[:] = [element for element in kept if not (element.tag == "mesh" and element.get("name") in left_out)]
     if not visuals:
         _strip_textures(root, kept)
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))

@@ -27,6 +27,7 @@ _AGREE = np.cos(np.deg2rad(40.0))  # least cosine between the headings of joined
 _BLEND = 3.0  # [m] length before and after a join over which the joined line shifts from one to the other
 _MAX_FOLD = np.cos(np.deg2rad(120.0))  # cosine of the greatest change of heading over `_FOLD_CHORD`
 _FOLD_CHORD = 2.0  # [m] length along the line between the headings that are compared
+_STRETCH = 40  # number of segments of a long route whose distances are computed together
 _OFF_FILM = 1.0  # [m] largest distance of a line through way points from the filmed paths
 
 
@@ -200,13 +201,31 @@ def _check_no_fold(line: Array) -> None:
         )
 
 
-def distance_to_route(route: Array, xy: Array) -> Array:
-    """Distance [m] of points (..., 2) to a polyline (m, 2) including its end points, shape (...)."""
+def distance_to_route(route: Array, xy: Array, up_to: float = np.inf) -> Array:
+    """Distance [m] of points (..., 2) to a polyline (m, 2) including its end points, shape (...).
+
+    Distances above `up_to` [m] may be larger than they are, up to infinity; a low value saves time on long routes.
+    """
     if len(route) < 2:
         return np.linalg.norm(xy - route[0], axis=-1)
+    if up_to < np.inf:
+        return _distance_up_to(route, xy, up_to)
     best = np.full(np.shape(xy)[:-1], np.inf)
     for start, end in pairwise(route):
         along = end - start
         fraction = np.clip((xy - start) @ along / (along @ along), 0.0, 1.0)
         best = np.minimum(best, np.linalg.norm(xy - start - fraction[..., None] * along, axis=-1))
     return best
+
+
+def _distance_up_to(route: Array, xy: Array, up_to: float) -> Array:
+    """`distance_to_route` of the points that are near the route, and infinity for the others."""
+    points = xy.reshape(-1, 2)
+    best = np.full(len(points), np.inf)
+    tree = cKDTree(points)
+    for start in range(0, len(route) - 1, _STRETCH):
+        part = route[start : start + _STRETCH + 1]
+        middle = (part.min(0) + part.max(0)) / 2
+        near = np.array(tree.query_ball_point(middle, np.linalg.norm(part - middle, axis=1).max() + up_to), int)
+        best[near] = np.minimum(best[near], distance_to_route(part, points[near]))
+    return best.reshape(np.shape(xy)[:-1])
