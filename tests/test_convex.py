@@ -145,7 +145,7 @@ def test_clipping_keeps_exactly_one_side():
 
 def test_corridor_is_cleared_and_the_rest_stays():
     route = right_turn(length=40.0, straight=15.0, step=0.25)
-    corridor = Corridor(route, 1.0)
+    corridor = Corridor((route,), 1.0)
     parts = [
         _box((4, -0.3, -0.1), (5, 0.4, 0.8)),  # in the middle
         _box((7, 0.7, -0.1), (9, 3.0, 2.5)),  # a wall whose front is too near
@@ -168,7 +168,7 @@ def test_corridor_is_cleared_and_the_rest_stays():
 def test_a_part_beside_a_bend_loses_only_its_corner():
     route = right_turn(length=40.0, straight=15.0, step=0.25)
     part = _box((15, -3.0, -0.1), (18, -1.6, 1.0))
-    kept, clipped = clear_corridor([part], Corridor(route, 1.0), _flat())
+    kept, clipped = clear_corridor([part], Corridor((route,), 1.0), _flat())
     assert clipped == 1
     # A third of a metre of one corner is in the way.
     assert sum(_volume(rest) for _, rest in kept) > 0.9 * _volume(part)

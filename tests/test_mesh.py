@@ -67,7 +67,7 @@ def stood(made):
     cameras = Cameras.load(folder.parent / "2_metric")
     views = render_views(PLACE, cameras, 14, 100, FREE_SPACE_REACH * (SETTINGS.margin + 2.0))
     route = _load(folder, "route")["xy"]
-    return views, Ground.load(folder), Corridor(route, HALF_WIDTH), route[::2], np.array(facts["bounds_m"])
+    return views, Ground.load(folder), Corridor((route,), HALF_WIDTH), route[::2], np.array(facts["bounds_m"])
 
 
 def _edges(faces):

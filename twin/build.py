@@ -46,11 +46,7 @@ PIPELINE = (
     Stage("cameras", "twin.capture.sfm", 2, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
     Stage("field", "twin.nerf.trainer", 5, ("nerf", "mjcf.route"), ("cameras", "metric")),
-<<<<<<< HEAD
-    Stage("mesh", "twin.assets.mesh", 4, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
-=======
-    Stage("mesh", "twin.assets.mesh", 5, ("mesh", "route", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
->>>>>>> a4f530f745ebb3203bac28ffe120796eacb8b985
+    Stage("mesh", "twin.assets.mesh", 5, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.scene_xml", 4, ("mjcf", "robot"), ("metric", "mesh")),
     Stage(
         "review",

@@ -29,7 +29,7 @@ from twin.config import MeshConfig, SceneConfig
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.images import write_image
 from twin.geometry.passes import path_length
-from twin.geometry.route import distance_to_route, filmed_route, route_metrics
+from twin.geometry.route import BRANCH, distance_to_route, filmed_branches, filmed_route, route_metrics
 from twin.nerf.baked import BakedField
 from twin.scene import SceneDir
 from twin.types import Array
@@ -63,27 +63,31 @@ def build_assets(
     settings = config.mesh
     filmed = filmed_route(cameras, config.route) if config.mjcf.route else None
     route = filmed.line if filmed else None
-    path = route if route is not None else cameras.positions[:, :2]
+    branches = filmed_branches(cameras, config.branch) if filmed else {}
+    lines = () if route is None else (route, *branches.values())
+    path = np.concatenate(lines) if lines else cameras.positions[:, :2]
     low, high = path.min(0) - settings.margin, path.max(0) + settings.margin
     if route is None:
         # In a capture around an object, everything outside the field's near box is background.
         low, high = np.maximum(low, field.bounds[0, :2]), np.minimum(high, field.bounds[1, :2])
     far = _far(settings)
-    length = path_length(route) if route is not None else None
-    share = max(1.0, (length or 0.0) / _COUNTED_LENGTH)
+    share = max(1.0, sum(path_length(line) for line in lines) / _COUNTED_LENGTH)
     views = render_views(field, cameras, round(share * settings.views), settings.view_width, FREE_SPACE_REACH * far)
     clock.append(("render", time.perf_counter()))
     height = _camera_height(config) if route is not None else None
-    ground, ground_metrics = build_ground(views, cameras, points, (low, high), settings, height, route)
+    ground, ground_metrics = build_ground(
+        views, cameras, points, (low, high), settings, height, path if lines else None
+    )
     ground.save(out)
     clock.append(("ground", time.perf_counter()))
     top = float(ground.height.max()) + settings.max_height + _MARGIN_ABOVE
     box = np.stack([np.append(low, ground.height.min() - _MARGIN_BELOW), np.append(high, top)])
     corridor = None
     if route is not None:
-        corridor = solids.Corridor(route, config.mjcf.half_width + config.mjcf.corridor_margin)
-        np.savez(out / "route.npz", xy=route, z=ground.at(route))
-        path = route[::2]
+        corridor = solids.Corridor(lines, config.mjcf.half_width + config.mjcf.corridor_margin)
+        others = {f"{BRANCH}{name}": np.column_stack([line, ground.at(line)]) for name, line in branches.items()}
+        np.savez(out / "route.npz", xy=route, z=ground.at(route), **others)
+        path = np.concatenate([line[::2] for line in lines])
     fused = _fuse_sections(views, ground, corridor, path, box, settings)
     clock.append(("fuse", time.perf_counter()))
     visual, visual_metrics = _visual_mesh(
@@ -108,7 +112,8 @@ def build_assets(
         },
         "standing": left_out["standing"],
         "bounds_m": box.tolist(),
-        "route_length_m": length,
+        "route_length_m": path_length(route) if route is not None else None,
+        **({"branches_m": {name: path_length(line) for name, line in branches.items()}} if branches else {}),
         "route": route_metrics(filmed) if filmed else None,
         "seconds_of": {name: end - start for (_, start), (name, end) in pairwise(clock)},
     }

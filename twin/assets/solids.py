@@ -41,12 +41,21 @@ _CORRIDOR_SLACK = 0.02  # [m] added to the corridor's half width, against roundi
 
 @dataclass(frozen=True)
 class Corridor:
-    """Free space along the route."""
+    """Free space along the route and its branches."""
 
-    route: Array
-    """Shape (m, 2) [m]."""
+    lines: tuple[Array, ...]
+    """Each of shape (m, 2) [m]."""
     reach: float
     """Half width of the corridor plus its margin [m]."""
+
+    @property
+    def points(self) -> Array:
+        """Points of all lines [m], shape (n, 2)."""
+        return np.concatenate(self.lines)
+
+    def distance(self, xy: Array, limit: float) -> Array:
+        """Distance [m] of points (..., 2) from the nearest line, see `distance_to_route`; shape (...)."""
+        return np.min([distance_to_route(line[::2], xy, limit) for line in self.lines], 0)
 
 
 @dataclass(frozen=True)
@@ -103,7 +112,7 @@ def solid_voxels(
     if corridor is not None:
         near = distance < corridor.reach + 2.0
         exact = np.full(distance.shape, 10.0)
-        exact[near] = distance_to_route(corridor.route[::2], xy[near], corridor.reach + 2.0 + 2.0 * voxel)
+        exact[near] = corridor.distance(xy[near], corridor.reach + 2.0 + 2.0 * voxel)
         inside = (corridor.reach + _CORRIDOR_SLACK - exact)[..., None].astype(np.float32)
         field = np.where(above < HEADROOM + voxel, np.maximum(field, inside), field)
     kept = np.zeros(field.shape, bool)
@@ -276,9 +285,9 @@ def clear_corridor(
     """
     out: list[tuple[int, ConvexPart]] = []
     clipped = 0
-    reach = corridor.reach + 0.5 * _CORRIDOR_SLACK
+    reach, points = corridor.reach + 0.5 * _CORRIDOR_SLACK, corridor.points
     for i, part in enumerate(parts):
-        if _intrusion(part, corridor.route, reach, ground)[0] <= 0.0:
+        if _intrusion(part, points, reach, ground)[0] <= 0.0:
             out.append((i, part))
             continue
         clipped += 1
@@ -290,7 +299,7 @@ def clear_corridor(
         for _ in range(12):
             if lower is None:
                 break
-            depth, point, side = _intrusion(lower, corridor.route, reach, ground)
+            depth, point, side = _intrusion(lower, points, reach, ground)
             if depth <= 0.0:
                 out.append((i, lower))
                 break

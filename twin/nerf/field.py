@@ -93,7 +93,7 @@ class FieldSection:
         self.contraction: Any = space.Contraction()
         self.contraction.center = wp.vec3f(*layout.centre)
         self.contraction.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
-        self._spare: dict[tuple[int, int, int], list[Workspace]] = {}
+        self.spare: dict[tuple[int, int, int], list[Workspace]] = {}
 
     # ---- passes of a batch, each on rays [start, start + count) of a workspace
 
@@ -230,7 +230,7 @@ class FieldSection:
 
         Several threads may call this at the same time, since each dict and list operation is atomic.
         """
-        spares = self._spare.setdefault((rays, samples, extra), [])
+        spares = self.spare.setdefault((rays, samples, extra), [])
         try:
             ws = spares.pop()
         except IndexError:
@@ -265,6 +265,8 @@ class RadianceField:
         self.sections, self.road = tuple(sections), road
         self.appearance, self.parameters, self.about = appearance, parameters, about or {}
         self.device = self.sections[0].device
+        for section in self.sections[1:]:  # spare workspaces fit all sections
+            section.spare = self.sections[0].spare
 
     @property
     def lightings(self) -> tuple[str, ...]:

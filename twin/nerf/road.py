@@ -100,6 +100,11 @@ class Road:
         near = self.distances(positions) <= OVERLAP
         return [np.flatnonzero(column) for column in near.T]
 
+    def segments(self, segments: Array) -> list[Array]:
+        """For each section, those of the segments (n, 2, 3) [m] of the filmed path whose ends are both near it."""
+        start, end = self.frames(segments[:, 0]), self.frames(segments[:, 1])
+        return [segments[np.intersect1d(a, b)] for a, b in zip(start, end, strict=True)]
+
 
 def undivided_road() -> Road:
     """A road of one section."""

@@ -99,7 +99,7 @@ _NETWORK_RATE = 1e-2  # initial learning rate of networks and embeddings
 _FINAL_RATE = 0.03  # final learning rates, as a share of the initial ones
 _RISE, _FALL = 0.3, 0.1  # step of an opacity grid cell toward a more or a less opaque sample [share of the difference]
 _LOG_OFFSET = 0.05  # added to distances in the distortion loss's logarithm [share of the near box's longest half side]
-_WARM_UP = 20  # steps of rising learning rate
+_WARM_UP = 20  # steps of rising learning rate, per section
 _MOVERS_SHARE = 0.3  # share of the steps after which the field is good enough to find movers (`transients.py`)
 _EXPLORATION_SHARE = 0.15  # share of the steps, the first ones, in which sampling narrows and cameras are not refined
 
@@ -144,7 +144,7 @@ class Trainer:
         self.rng = np.random.default_rng([seed, 2])
         self.rays = -(-config.rays // _SHARDS) * _SHARDS
         self.ws = Workspace(layouts[0], self.rays, config.samples, device, _SHARDS * _FREE_POINTS, training=True)
-        self.free = [free_segments(train.select(frames), config.near_plane) for frames in self.frames]
+        self.free = self.road.segments(free_segments(train, config.near_plane))
         """Segments of each section, see `free_segments`."""
         self.refinement: PoseRefinement | None = None
         """Camera corrections; None without `nerf.refine_cameras`."""
@@ -160,8 +160,12 @@ class Trainer:
         for name, tensor in self.torch_parameters.items():
             if not name.startswith("trunk"):
                 tensor.requires_grad_(True)
-        learned = list(self.torch_parameters.values())
-        self.optimizer = torch.optim.Adam(learned, lr=_NETWORK_RATE, betas=(0.9, 0.99), eps=1e-12)
+        # A frame has gradients only in the steps of its sections. Adam's steps are larger for such rare gradients, by the
+        # square root of the number of sections.
+        self.frame_rate = 1.0 / math.sqrt(self.road.count)
+        shared = [tensor for name, tensor in self.torch_parameters.items() if name != "residuals"]
+        groups = [{"params": shared, "factor": 1.0}, {"params": [f.appearance.residuals], "factor": self.frame_rate}]
+        self.optimizer = torch.optim.Adam(groups, lr=_NETWORK_RATE, betas=(0.9, 0.99), eps=1e-12)
         self.moments = [
             [warp_view(torch.zeros_like(section.table), hashgrid.Feature) for _ in range(3)] for section in f.sections
         ]
@@ -201,7 +205,7 @@ class Trainer:
 
     def rate(self) -> float:
         """Current learning rate, as a share of the initial one."""
-        warm = min(1.0, (self.steps_done + 1) / _WARM_UP)
+        warm = min(1.0, (self.steps_done + 1) / (_WARM_UP * self.road.count))
         return warm * math.exp(math.log(_FINAL_RATE) * self.steps_done / self.steps)
 
     def step(self) -> float:
@@ -232,10 +236,10 @@ class Trainer:
         for tensor, *gradients in zip(self.torch_parameters.values(), *(r[1] for r in results), strict=True):
             tensor.grad = torch.stack(gradients).sum(0) if len(gradients) > 1 else gradients[0]
         for group in self.optimizer.param_groups:
-            group["lr"] = _NETWORK_RATE * rate
+            group["lr"] = _NETWORK_RATE * rate * group["factor"]
         self.optimizer.step()
         if self._refines:
-            self.refinement.step(rate)  # type: ignore[union-attr]
+            self.refinement.step(rate * self.frame_rate)  # type: ignore[union-attr]
         self.steps_done += 1
         return sum(r[0] for r in results) / _SHARDS
 
