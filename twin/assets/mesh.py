@@ -86,7 +86,7 @@ def build_assets(
     if route is not None:
         corridor = solids.Corridor(lines, config.mjcf.half_width + config.mjcf.corridor_margin)
         others = {f"{BRANCH}{name}": np.column_stack([line, ground.at(line)]) for name, line in branches.items()}
-        np.savez(out / "route.npz", xy=route, z=ground.at(route), **others)
+        np.savez(out / "route.npz", xy=route, z=ground.at(route), **others)  # type: ignore[arg-type]
         path = np.concatenate([line[::2] for line in lines])
     fused = _fuse_sections(views, ground, corridor, path, box, settings)
     clock.append(("fuse", time.perf_counter()))

@@ -160,8 +160,8 @@ class Trainer:
         for name, tensor in self.torch_parameters.items():
             if not name.startswith("trunk"):
                 tensor.requires_grad_(True)
-        # A frame has gradients only in the steps of its sections. Adam's steps are larger for such rare gradients, by the
-        # square root of the number of sections.
+        # A frame has gradients only in the steps of its sections. Adam's steps are larger for such rare gradients, by
+        # the square root of the number of sections.
         self.frame_rate = 1.0 / math.sqrt(self.road.count)
         shared = [tensor for name, tensor in self.torch_parameters.items() if name != "residuals"]
         groups = [{"params": shared, "factor": 1.0}, {"params": [f.appearance.residuals], "factor": self.frame_rate}]
