@@ -270,6 +270,8 @@ def _check_branches(config: SceneConfig) -> None:
         _check_route(branch, what)
     names = [branch.name for branch in config.branch]
     _check_unique(["route", *names], "routes")
+    for task in config.task:
+        _require(task.name not in names, f"[[branch]] and [[task]] {task.name!r}; a branch is a task, so rename one")
     for kind, entries in (("task", config.task), ("obstacle", config.obstacle)):
         for one in entries:
             if one.route:

@@ -234,6 +234,12 @@ def _write(out: Path, files: dict[str, bytes], head: dict[str, Any], trust: bool
         name: {"bytes": len(content), "sha256": unpack.digest(content), "coding": coded[name]}
         for name, content in sorted(files.items())
     }
+    total = sum(map(len, files.values()))
+    if total > unpack.MAX_TOTAL:
+        raise InputError(
+            f"{out}: {total / 2**30:.1f} GiB unpacked, and twin unpack takes at most {unpack.MAX_TOTAL >> 30} GiB; "
+            "build the place with a smaller nerf.max_bricks or a longer nerf.section_length"
+        )
     manifest = head | {"files": facts}
     text = _TEXT.format(
         name=head["name"],

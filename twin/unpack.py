@@ -46,7 +46,9 @@ STAGES_PACKED = ("metric", "field", "mesh", "mjcf")
 """Build stages of which some files are packed."""
 
 _MAX_FILES = 20_000
-_MAX_FILE, _MAX_TOTAL = 2 << 30, 4 << 30  # [bytes] largest file, and largest total size, unpacked
+_MAX_FILE = 2 << 30  # [bytes] largest file, unpacked
+MAX_TOTAL = 4 << 30
+"""Largest total size of the files, unpacked [bytes]."""
 _MAX_RATIO = 30  # largest total size / the pack's size
 _FREE = 16 << 20  # [bytes] a total up to this is allowed at any ratio
 _MAX_MANIFEST = 16 << 20  # [bytes]
@@ -201,7 +203,7 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
             raise InputError(f"{path}: {name} has coding {coding}; expected {PLAIN} or {DIFFERENCES}; {_CURE}")
         require_text(facts["sha256"])
         total += size
-    bound = min(_MAX_TOTAL, max(_FREE, _MAX_RATIO * path.stat().st_size))
+    bound = min(MAX_TOTAL, max(_FREE, _MAX_RATIO * path.stat().st_size))
     if total > bound:
         raise InputError(f"{path} unpacks to {total:,} bytes; expected at most {bound:,} for a file of its size")
     if missing := {*head["files"], README, MANIFEST} ^ set(by_name):

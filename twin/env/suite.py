@@ -76,6 +76,8 @@ class EnvFactory:
         world = world.along(segment.route)
         here = tuple(one for one in config.obstacle if one.route == segment.route)
         wanted = here if isinstance(parsed.obstacles, str) else parsed.obstacles
+        if not isinstance(wanted, int) and any(one.route not in ("", segment.route) for one in wanted):
+            raise InputError(f"obstacles: one is on another route than the task {task!r}; leave out its `route`")
         beside = round(parsed.randomise.bystanders[1]) if parsed.randomise else 0
         half_width = parsed.half_width or world.half_width
         obstacles = EpisodeObstacles(wanted, dataclasses.replace(world, half_width=half_width), segment, beside)

@@ -45,17 +45,11 @@ class Route:
 
 def filmed_branches(cameras: Cameras, branches: tuple[BranchConfig, ...]) -> dict[str, Array]:
     """Lines of other routes through the place by name, as `Route.line`. Raises InputError as `filmed_route` does."""
-    lines = {}
-    for branch in branches:
-        try:
-            lines[branch.name] = filmed_route(cameras, branch).line
-        except InputError as error:
-            raise InputError(f"[[branch]] {branch.name!r}: {error}") from None
-    return lines
+    return {one.name: filmed_route(cameras, one, f"[[branch]] {one.name!r}").line for one in branches}
 
 
-def filmed_route(cameras: Cameras, config: RouteConfig | None = None) -> Route:
-    """Chooses the route among the filmed passes.
+def filmed_route(cameras: Cameras, config: RouteConfig | None = None, table: str = "route") -> Route:
+    """Chooses the route among the filmed passes; error messages name `table` of scene.toml.
 
     Raises:
         InputError: the route is shorter than 2 m or folds back on itself, passes that are to be joined lie apart, a
@@ -64,12 +58,12 @@ def filmed_route(cameras: Cameras, config: RouteConfig | None = None) -> Route:
     config = config or RouteConfig()
     passes = find_passes(cameras)
     if config.points:
-        line, chosen = _through_points(config.points, passes), tuple[str, ...]()
+        line, chosen = _through_points(config.points, passes, table), tuple[str, ...]()
     elif config.passes:
-        picked = [_named(name, passes) for name in config.passes]
+        picked = [_named(name, passes, table) for name in config.passes]
         line = picked[0].path
         for one in picked[1:]:
-            line = _joined(line, one, config.max_gap)
+            line = _joined(line, one, config.max_gap, table)
         chosen = tuple(one.name for one in picked)
     else:
         line, chosen = _longest_line(passes, config.max_gap)
@@ -79,7 +73,7 @@ def filmed_route(cameras: Cameras, config: RouteConfig | None = None) -> Route:
             f"the filmed path is {length:.2f} m long, expected at least {_MIN_LENGTH:g} m; "
             "film a drive, correct [metric], or set mjcf.route = false"
         )
-    _check_no_fold(line)
+    _check_no_fold(line, table)
     return Route(line[::-1] if config.reverse else line, chosen[::-1] if config.reverse else chosen, tuple(passes))
 
 
@@ -94,12 +88,12 @@ def route_metrics(route: Route) -> dict[str, object]:
     }
 
 
-def _named(name: str, passes: list[FilmedPass]) -> FilmedPass:
+def _named(name: str, passes: list[FilmedPass], table: str) -> FilmedPass:
     """The pass with this name, or the longest pass of the source with this name."""
     fitting = [one for one in passes if name in (one.name, one.source)]
     if not fitting:
         known = ", ".join(f"{one.name} ({one.length:.1f} m)" for one in passes) or "none"
-        raise InputError(f"route.passes: no pass {short_repr(name)}; expected one of {known}")
+        raise InputError(f"{table}.passes: no pass {short_repr(name)}; expected one of {known}")
     return max(fitting, key=lambda one: one.length)
 
 
@@ -151,14 +145,14 @@ def _new_length(line: Array, joined: Array) -> float:
     return float((distance > _ASIDE).sum()) * SPACING
 
 
-def _joined(line: Array, one: FilmedPass, max_gap: float) -> Array:
+def _joined(line: Array, one: FilmedPass, max_gap: float, table: str) -> Array:
     """A line extended by a pass that the user chose."""
     distance = np.linalg.norm(one.path - line[-1], axis=1)
     k = int(np.argmin(distance))
     if distance[k] > max_gap:
         raise InputError(
-            f"route.passes: {one.name} is {distance[k]:.1f} m from the end of the pass before it, expected at most "
-            f"{max_gap:g} m; choose passes that meet, or raise route.max_gap where the way between them is free"
+            f"{table}.passes: {one.name} is {distance[k]:.1f} m from the end of the pass before it, expected at most "
+            f"{max_gap:g} m; choose passes that meet, or raise {table}.max_gap where the way between them is free"
         )
     return _blended(line, one.path[k:])
 
@@ -174,7 +168,7 @@ def _blended(line: Array, rest: Array) -> Array:
     return resample(np.concatenate([line[:-before], first, second[1:], rest[after:]]), curved=False)
 
 
-def _through_points(points: tuple[tuple[float, ...], ...], passes: list[FilmedPass]) -> Array:
+def _through_points(points: tuple[tuple[float, ...], ...], passes: list[FilmedPass], table: str) -> Array:
     line = smooth_line(np.array(points, float))
     off = (
         np.min([distance_to_route(one.path, line) for one in passes], axis=0) if passes else np.full(len(line), np.inf)
@@ -183,21 +177,21 @@ def _through_points(points: tuple[tuple[float, ...], ...], passes: list[FilmedPa
     if off[worst] > _OFF_FILM:
         x, y = line[worst]
         raise InputError(
-            f"route.points: at ({x:.1f}, {y:.1f}) the route is {off[worst]:.1f} m from the nearest filmed path, "
+            f"{table}.points: at ({x:.1f}, {y:.1f}) the route is {off[worst]:.1f} m from the nearest filmed path, "
             f"expected at most {_OFF_FILM:g} m; set the points along what was filmed (the report has a map)"
         )
     return line
 
 
-def _check_no_fold(line: Array) -> None:
+def _check_no_fold(line: Array, table: str) -> None:
     """Raises InputError: the line turns back on the spot, which the robot cannot drive."""
     directions, reach = path_directions(line), round(_FOLD_CHORD / SPACING)
     cosine = (directions[reach:] * directions[:-reach]).sum(1)
     if len(cosine) and cosine.min() < _MAX_FOLD:
         x, y = line[int(np.argmin(cosine)) + reach // 2]
         raise InputError(
-            f"the route turns back at ({x:.1f}, {y:.1f}) within {_FOLD_CHORD:g} m; choose one pass under [route], such "
-            "as passes = ['film:1']"
+            f"the route turns back at ({x:.1f}, {y:.1f}) within {_FOLD_CHORD:g} m; choose one pass, such as "
+            f"{table}.passes = ['film:1']"
         )
 
 

@@ -122,7 +122,8 @@ def _load_routes(path: Path) -> tuple[Array | None, dict[str, Array]]:
         return None, {}
     data = load_arrays(path)
     route = np.concatenate([data["xy"], data["z"][:, None]], 1).astype(np.float64)
-    return route, {key.removeprefix(BRANCH): line for key, line in data.items() if key.startswith(BRANCH)}
+    branches = {key: line.astype(np.float64) for key, line in data.items() if key.startswith(BRANCH)}
+    return route, {key.removeprefix(BRANCH): line for key, line in branches.items()}
 
 
 def film_camera(cameras: Cameras) -> PixelCamera:

@@ -109,7 +109,7 @@ class World:
                 },
             )
             m = min(len(line) for line in (world.route, *world.branches.values()))
-            lines = {"route": world.route, **world.branches}
+            lines = {"route": world.route} | {f"branch {name}": line for name, line in world.branches.items()}
             check_shapes({name: (line, (len(line), 3), "f") for name, line in lines.items()})
             if m < 2 or not world.half_width > 0.0 or min(fx, fy, width, height) <= 0:
                 raise ValueError(

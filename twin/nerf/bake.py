@@ -208,14 +208,8 @@ class _FineTuner:
         steps: int,
         seed: int,
     ):
-        self.field, self.section, self.pixels, self.steps, self.values, self.seed = (
-            field,
-            section,
-            pixels,
-            steps,
-            values,
-            seed,
-        )
+        self.field, self.section, self.pixels = field, section, pixels
+        self.steps, self.values, self.seed = steps, values, seed
         device = field.device
         self.index: Any = kernels.BrickIndex()
         near, far = brick_indices(layout, *slots)

@@ -2,7 +2,7 @@
 
 `kernels/bricks.py` defines the bricks, `brick_layout.py` their layout. The two per-ray networks, head and background
 (`network.py`), are stored beside them. A lighting is one vector, so one baked field renders the place under every
-lighting. A long road has several sections (`road.py`), which are read from disk when a camera first needs them.
+lighting. A long road has several sections (`road.py`), which are read from disk when a camera needs them.
 """
 
 import copy
@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,7 @@ from twin.runtime import available_cores, bar
 from twin.types import Array32
 from twin.warp_runtime import wp
 
-_FORMAT = 2
+_FORMAT, _FORMAT_OF_SECTIONS = 2, 3  # format with one section, and with several
 # Largest number of render targets that are kept per section, one per number of cameras and image size; the least
 # recently used one is dropped. A vector env renders either all its envs or those that reset, whose number varies.
 _MAX_TARGETS = 4
@@ -81,9 +82,7 @@ class _SectionOnDevice:
     def __init__(self, section: BakedSection, device: str):
         layout, arrays = section.layout, section.arrays
 
-        def on_device(array: NDArray, dtype: Any) -> Any:
-            return _on_device(array, dtype, device)
-
+        on_device = partial(_on_device, device=device)
         b: Any = Bricks()
         near_index, far_index = brick_indices(layout, arrays["near"], arrays["far"])
         near_index, near_skips = stored_skips(near_index, arrays["near_leap"])
@@ -109,6 +108,8 @@ class _SectionOnDevice:
         )
         self.detail = detail_grid(detail, device), stored
         self.has_detail = bool(len(detail.tiles) or len(detail.vertices))
+        self.targets: WeakKeyDictionary[BakedField, OrderedDict[tuple, _RenderTarget]] = WeakKeyDictionary()
+        """Render targets of every field object that shares this section; they are dropped with it."""
 
 
 def _on_device(array: NDArray, dtype: Any, device: str) -> Any:
@@ -139,7 +140,7 @@ class BakedField:
             networks: `network.*`, and for random lightings `probes.*` (see `appearance_prior.Probes`).
             device: `cpu` or `cuda`.
             about: JSON-able metadata stored with the field.
-            road: Tells which sections render a camera; None: a road of one section.
+            road: Determines the sections that render a camera; None: a road of one section.
         """
         self.sections, self.road = tuple(sections), road or undivided_road()
         self.lightings_by_name, self.about, self.device = lightings, about or {}, device
@@ -149,14 +150,11 @@ class BakedField:
             probes = Probes(networks["probes.features"], networks["probes.harmonics"], p)
             self.lightings_by_name = replace(lightings, probes=probes)
         self._lock = threading.Lock()
-        self._targets: dict[tuple[int, int, int, int, bool], _RenderTarget] = {}
         self._resident: OrderedDict[int, _SectionOnDevice] = OrderedDict()
         self._resident_lock = threading.Lock()
+        on_device = partial(_on_device, device=device)
         if len(self.sections) == 1:
-            self._section(0)
-
-        def on_device(array: NDArray, dtype: Any) -> Any:
-            return _on_device(array, dtype, device)
+            self._section(0, 1)
 
         self._march = kernels.march_kernel(kernels.LANES[device])
         self._color_head, weights = color_head_kernel(
@@ -257,7 +255,7 @@ class BakedField:
         """
         with self._lock:  # all callers share the render targets
             views = self._views(cameras, lighting, size, stop)
-            return self._rendered(views)[0]
+            return self._rendered(views, self._shares(views)).rendering
 
     def render_on_device(
         self,
@@ -268,16 +266,17 @@ class BakedField:
         """Renders as `render` does and passes the result to `consume`.
 
         `consume` receives two Warp arrays on the field's device: colors (n, height · width) of vec3, and opacities
-        (n, height · width). Both are valid only until it returns. They are not copied to the host, unless the cameras
-        are in several sections.
+        (n, height · width). Both are valid only until it returns. They are not copied to the host, unless several
+        sections have a share in them.
         """
         with self._lock:
             views = self._views(cameras, lighting)
-            parts = self._parts(views)
-            if len(parts) == 1:
-                target = self._render(parts[0][0], views)
+            shares = self._shares(views)
+            needed = np.flatnonzero(shares.any(0))
+            if len(needed) == 1:
+                target = self._render(int(needed[0]), views)
                 return consume(target.rgb, target.opacity)
-            out, _ = self._rendered(views)
+            out = self._rendered(views, shares).rendering
             n = len(out.rgb)
             consume(
                 wp.array(out.rgb.reshape(n, -1, 3), dtype=wp.vec3f, device=self.device),
@@ -287,15 +286,16 @@ class BakedField:
     def render_features(
         self, cameras: PosedCameras, lighting: str | NDArray, size: tuple[int, int] | None = None
     ) -> tuple[Rendering, Array32]:
-        """Renders as `render` does, without blending of sections, and also returns the features before the color head.
+        """Renders every camera by its nearest section alone, and also returns the features before the color head.
 
         Returns:
             The rendering, and a copy of opacity (channel 0) and features, shape (n, CHANNELS, height, width).
         """
         with self._lock:
-            out, features = self._rendered(self._views(cameras, lighting, size), features=True)
-            assert features is not None
-            return out, features
+            views = self._views(cameras, lighting, size)
+            out = self._rendered(views, self._shares(views, blended=False), features=True)
+            assert out.features is not None
+            return out.rendering, out.features
 
     def set_detail(self, section: int, detail: Detail) -> None:
         """Replaces the detail of a section."""
@@ -303,8 +303,8 @@ class BakedField:
             old = self.sections[section]
             new = BakedSection(old.layout, old.arrays | detail.arrays())
             self.sections = (*self.sections[:section], new, *self.sections[section + 1 :])
-            self._resident.pop(section, None)
-            self._targets.clear()
+            with self._resident_lock:
+                self._resident.pop(section, None)
 
     def alone(self, section: int) -> "BakedField":
         """A field of one section, for all cameras."""
@@ -316,7 +316,7 @@ class BakedField:
         Several such fields render at the same time, each in a thread of the caller.
         """
         out = copy.copy(self)
-        out._targets, out._lock, out._pool = {}, threading.Lock(), None
+        out._lock, out._pool = threading.Lock(), None
         return out
 
     def _views(
@@ -330,61 +330,73 @@ class BakedField:
         pose = np.asarray(cameras.camera_to_world, np.float64)
         return _Views(pose, intrinsics, size, self.head_biases(lighting, len(pose)), stop)
 
-    def _parts(self, views: "_Views", blended: bool = True) -> list[tuple[int, NDArray[np.int64], NDArray[np.float64]]]:
-        """The needed sections; for each, the indices of the views that it renders and its shares of their pictures."""
-        n = len(views.pose)
+    def _shares(self, views: "_Views", blended: bool = True) -> NDArray[np.float64]:
+        """Shares of the sections in the pictures, shape (n, sections); if not blended, 1 for the nearest section."""
         if len(self.sections) == 1:
-            return [(0, np.arange(n), np.ones(n))]
-        first, second, share = self.road.blend(views.pose[:, :3, 3])
-        if not blended:
-            share = np.zeros(n)
-        out = []
-        for k in np.unique(np.concatenate([first, second[share > 0.0]])):
-            weight = np.where(first == k, 1.0 - share, np.where(second == k, share, 0.0))
-            rows = np.flatnonzero(weight)
-            out.append((int(k), rows, weight[rows]))
+            return np.ones((len(views.pose), 1))
+        positions = views.pose[:, :3, 3]
+        return self.road.shares(positions) if blended else np.eye(len(self.sections))[self.road.nearest(positions)]
+
+    def _rendered(self, views: "_Views", shares: NDArray[np.float64], features: bool = False) -> "_Images":
+        """Renders views by the sections that have a share in them; `features` needs shares that are 0 or 1."""
+        needed = np.flatnonzero(shares.any(0)).tolist()
+        if len(needed) == 1:
+            return self._render(needed[0], views).images(features)
+        # Those in memory come first, before others take their place.
+        resident = set(self._resident)
+        parts = {}
+        for k in sorted(needed, key=lambda k: k not in resident):
+            rows = np.flatnonzero(shares[:, k])
+            # The number of views changes at every border; rounded up to a power of two, it has few render targets.
+            count = min(1 << (len(rows) - 1).bit_length(), len(shares))
+            padded = np.append(rows, np.repeat(rows[-1:], count - len(rows)))
+            parts[k] = rows, self._render(k, views.subset(padded), len(needed)).images(features)
+        n, (width, height) = len(shares), views.size
+        out = _Images(
+            Rendering(*(np.zeros((n, height, width, *channels), np.float32) for channels in ((3,), (), ()))),
+            np.zeros((n, CHANNELS, height, width), np.float32) if features else None,
+        )
+        total = out.rendering
+        for k in needed:
+            rows, one = parts[k]
+            m, share = len(rows), shares[rows, k].astype(np.float32)[:, None, None]
+            opacity = share * one.rendering.opacity[:m]
+            # Colors of rays that stop are those of the field in front alone, so they count by its opacity.
+            total.rgb[rows] += (share if views.stop is None else opacity)[..., None] * one.rendering.rgb[:m]
+            total.opacity[rows] += opacity
+            nearest = shares[rows].argmax(1) == k
+            total.depth[rows[nearest]] = one.rendering.depth[:m][nearest]
+            if out.features is not None and one.features is not None:
+                out.features[rows] = one.features[:m]
+        if views.stop is not None:
+            total.rgb[...] /= np.maximum(total.opacity, 1e-6)[..., None]
         return out
 
-    def _rendered(self, views: "_Views", features: bool = False) -> tuple[Rendering, Array32 | None]:
-        """Renders views; with `features` each by its nearest section alone, else blended where two sections meet."""
-        parts = self._parts(views, blended=not features)
-        if len(parts) == 1:
-            target = self._render(parts[0][0], views)
-            return target.result(), target.composited() if features else None
-        n, (width, height) = len(views.pose), views.size
-        rgb, composited = np.zeros((n, height, width, 3), np.float32), None
-        depth, opacity = np.zeros((2, n, height, width), np.float32)
-        if features:
-            composited = np.zeros((n, CHANNELS, height, width), np.float32)
-        for k, rows, weight in parts:
-            target = self._render(k, views.subset(rows))
-            one, share = target.result(), weight.astype(np.float32)[:, None, None]
-            rgb[rows] += share[..., None] * one.rgb
-            opacity[rows] += share * one.opacity
-            depth[rows] = np.where(share >= 0.5, one.depth, depth[rows])
-            if composited is not None:
-                composited[rows] = target.composited()
-        return Rendering(rgb, depth, opacity), composited
+    def _section(self, k: int, count: int) -> tuple[_SectionOnDevice, "OrderedDict[tuple, _RenderTarget]"]:
+        """Section k on the device, and this object's render targets of it.
 
-    def _section(self, k: int) -> _SectionOnDevice:
-        """Section k on the device; beyond `_MAX_RESIDENT` sections, the least recently used one is dropped."""
+        If more than `_MAX_RESIDENT` sections are in memory, and more than the `count` that this call needs, the least
+        recently used one is dropped.
+        """
         with self._resident_lock:
             if k not in self._resident:
                 self._resident[k] = _SectionOnDevice(self.sections[k], self.device)
             self._resident.move_to_end(k)
-            if len(self._resident) > _MAX_RESIDENT:
-                gone, _ = self._resident.popitem(last=False)
-                self._targets = {key: target for key, target in self._targets.items() if key[0] != gone}
-            return self._resident[k]
+            if len(self._resident) > max(_MAX_RESIDENT, count):
+                self._resident.popitem(last=False)
+            section = self._resident[k]
+            return section, section.targets.setdefault(self, OrderedDict())
 
-    def _render(self, k: int, views: "_Views") -> "_RenderTarget":
-        """Renders views by section k alone."""
-        key = k, len(views.pose), *views.size, views.stop is not None
-        section = self._section(k)
-        target = self._targets.pop(key, None) or _RenderTarget(self, section, *key[1:])
-        self._targets[key] = target
-        while len(self._targets) > _MAX_TARGETS * min(len(self.sections), _MAX_RESIDENT):
-            del self._targets[next(iter(self._targets))]
+    def _render(self, k: int, views: "_Views", count: int = 1) -> "_RenderTarget":
+        """Renders views by section k alone; the call needs `count` sections."""
+        section, targets = self._section(k, count)
+        key = len(views.pose), *views.size, views.stop is not None
+        if key not in targets:
+            targets[key] = _RenderTarget(self, section, *key)
+        targets.move_to_end(key)
+        if len(targets) > _MAX_TARGETS:
+            targets.popitem(last=False)
+        target = targets[key]
         target.set_cameras(views)
         if self._pool is None:
             for band in target.bands:
@@ -421,7 +433,7 @@ class BakedField:
         write_json(
             folder / "baked.json",
             {
-                "format": _FORMAT,
+                "format": _FORMAT_OF_SECTIONS if layouts[1:] else _FORMAT,
                 "layout": layouts[0],
                 **({"more_layouts": layouts[1:]} if layouts[1:] else {}),
                 "lightings": names.names,
@@ -441,9 +453,9 @@ class BakedField:
             raise InputError(f"{folder}: contains no baked.json; build the scene (again)")
         head = read_json(path)
         with wrap_read_errors(path, "build the scene again"):
-            if head.get("format") != _FORMAT:
+            if (found := head.get("format")) not in (formats := (_FORMAT, _FORMAT_OF_SECTIONS)):
                 raise InputError(
-                    f"{path}: format {short_repr(head.get('format'))}, expected {_FORMAT}; build the scene again"
+                    f"{path}: format {short_repr(found)}, expected one of {formats}; build the scene again"
                 )
             layouts = stored_layouts(head)
             names, frames = tuple(map(require_text, head["lightings"])), tuple(map(require_text, head["frames"]))
@@ -505,6 +517,7 @@ class _RenderTarget:
 
     def __init__(self, field: BakedField, section: _SectionOnDevice, n: int, width: int, height: int, stopped: bool):
         self.shape, device = (n, height, width), field.device
+        self.section = section  # its arrays live as long as the launches that read them
         across, down, pixels = -(-width // kernels.TILE), -(-height // kernels.TILE), width * height
 
         def new(shape: tuple[int, ...], dtype: Any = wp.float32) -> Any:
@@ -568,15 +581,19 @@ class _RenderTarget:
         for launch in self.launches[band]:
             launch.launch()
 
-    def result(self) -> Rendering:
-        """A copy of the images, as the buffers are reused."""
-        return Rendering(
+    def images(self, features: bool) -> "_Images":
+        """Copies of the images, as the buffers are reused; with or without features."""
+        n, height, width = self.shape
+        rendering = Rendering(
             self.rgb.numpy().reshape(*self.shape, 3).copy(),
             self.depth.numpy().reshape(self.shape).copy(),
             self.opacity.numpy().reshape(self.shape).copy(),
         )
+        return _Images(rendering, self.features.numpy().reshape(n, -1, height, width).copy() if features else None)
 
-    def composited(self) -> Array32:
-        """A copy of opacity (channel 0) and composited features, shape (n, CHANNELS, height, width)."""
-        n, height, width = self.shape
-        return self.features.numpy().reshape(n, -1, height, width).copy()
+
+@dataclass(frozen=True)
+class _Images:
+    rendering: Rendering
+    features: Array32 | None
+    """Opacity (channel 0) and composited features, shape (n, CHANNELS, height, width)."""

@@ -125,7 +125,10 @@ class TrainingPixels:
             keep = np.isin(pool.frame, frames)
             setattr(out, name, DepthSupervision(pool.frame[keep], pool.pixel[keep], pool.distance[keep]))
         if not any(self.unmasked[self.start[i] : self.start[i + 1]].any() for i in frames):
-            raise InputError("a section of the road has no pixel to train on; set nerf.section_length = 0")
+            raise InputError(
+                f"a section of the road has no pixel to train on: its {len(frames)} frames are held out or masked; "
+                "unmask some, or set nerf.section_length = 0"
+            )
         return out
 
     def _on_unmasked(self, depths: DepthSupervision) -> DepthSupervision:

@@ -42,9 +42,9 @@ from twin.nerf.rendering import FAR, Rendering
 from twin.nerf.road import Road, undivided_road
 from twin.warp_runtime import wp
 
-_FORMAT = 1
+_FORMAT, _FORMAT_OF_SECTIONS = 1, 2  # format with one section, and with several
 QUERY_POINTS = 65536
-"""Points per batch of `RadianceField.query`."""
+"""Points per batch of `FieldSection.query`."""
 _RENDER_RAYS = 4096  # rays per batch when rendering
 _RENDER_SAMPLES = 24  # samples per ray when rendering
 _HEAD_RAYS = 8192  # rays per batch of the head
@@ -257,7 +257,7 @@ class RadianceField:
         """
         Args:
             sections: Sections in the order of `road`.
-            road: Tells which section renders a camera.
+            road: Determines the section that renders a camera.
             appearance: Embeddings, on the device of the tensors.
             parameters: Weights of the networks, see `network.initial_parameters`.
             about: JSON-able metadata stored with the field.
@@ -347,7 +347,7 @@ class RadianceField:
         write_json(
             folder / "field.json",
             {
-                "format": _FORMAT,
+                "format": _FORMAT_OF_SECTIONS if self.sections[1:] else _FORMAT,
                 "layout": asdict(self.sections[0].layout),
                 **({"more_layouts": [asdict(one.layout) for one in self.sections[1:]]} if self.sections[1:] else {}),
                 "lightings": self.appearance.lightings,
@@ -369,9 +369,9 @@ class RadianceField:
             raise InputError(f"{folder}: contains no field.json; build the scene's field first")
         head = read_json(path)
         with wrap_read_errors(path, "build the scene again"):
-            if head.get("format") != _FORMAT:
+            if (found := head.get("format")) not in (formats := (_FORMAT, _FORMAT_OF_SECTIONS)):
                 raise InputError(
-                    f"{path}: format {short_repr(head.get('format'))}, expected {_FORMAT}; build the scene again"
+                    f"{path}: format {short_repr(found)}, expected one of {formats}; build the scene again"
                 )
             layouts = [
                 Layout(**(one | {key: tuple(one[key]) for key in ("centre", "half")}))

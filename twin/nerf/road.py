@@ -1,8 +1,8 @@
 """Sections of a long road. Each has its own hash grid and bricks, so that the road's length does not coarsen them.
 
 A section is the part of the filmed path that is nearer to its center than to those of the other sections. A camera is
-rendered by the section that has the nearest filmed position. Close to a border it is rendered by both, and the pictures
-are blended, so that no step shows when a robot drives across.
+rendered by the section that has the nearest filmed position. Close to a border it is rendered by all sections that meet
+there, and the pictures are blended, so that no step shows when a robot drives across.
 """
 
 from dataclasses import dataclass
@@ -24,14 +24,14 @@ ROAD_FILE = "road.safetensors"
 """File of a road of several sections."""
 OVERLAP = 12.0
 """Distance [m] from a section's own cameras up to which other cameras train it, too."""
-# The road's length is that of the shortest tree that connects filmed positions this far apart [m], so that it does not
-# matter how often and in which lane the road was filmed.
+# The road's length is that of the shortest tree through filmed positions that are this far apart [m]. So a road that is
+# filmed twice, or in another lane, is no longer than one that is filmed once.
 _ANCHOR_SPACING = 5.0
-_JUMP = 25.0  # [m] a longer step between such positions leads to a frame that was placed wrong, or to another film
+_JUMP = 25.0  # [m] a longer step of this tree does not count: it leads to a frame that was placed wrong
 _CENTER_SPACING = 1.0  # [m] spacing of the filmed positions whose medians are the centers
 _MIN_FRAMES = 10  # least number of frames of a section
 _ROUNDS = 100  # greatest number of rounds in which centers move
-_BLEND = 2.0  # [m] a picture is blended if the second section is farther than the first by less than this
+_BLEND = 2.0  # [m] a picture is blended if another section is less than this farther than the nearest one
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,8 @@ class Road:
         with wrap_read_errors(path, "build the scene again"):
             points, section = arrays["points"], arrays["section"]
             check_shapes({"points": (points, (len(points), 3), "f"), "section": (section, (len(points),), "i")})
-            if not np.array_equal(np.unique(section), np.arange(count)):
-                raise ValueError(f"the road does not have the sections 0 to {count - 1}")
+            if not np.array_equal(np.unique(section), np.arange(count)) or not np.isfinite(points).all():
+                raise ValueError(f"the road does not have the sections 0 to {count - 1}, or a point is not finite")
             return Road(points, section)
 
     @property
@@ -80,18 +80,15 @@ class Road:
         """The section that renders a camera at each of the positions (n, 3) [m], shape (n,)."""
         return self.distances(positions).argmin(1)
 
-    def blend(self, positions: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-        """Sections to render cameras at positions (n, 3) [m].
+    def shares(self, positions: Array) -> Array:
+        """Shares of the sections in pictures from positions (n, 3) [m], shape (n, count); each row sums to 1.
 
-        Returns:
-            The nearest and the second nearest section, and the second one's share of the picture, from 0 to 0.5; each
-            of shape (n,).
+        They are continuous, also where three sections meet. Only sections that are less than `_BLEND` farther than the
+        nearest one have a share.
         """
         distance = self.distances(positions)
-        first, second = np.argsort(distance, 1, kind="stable")[:, :2].T
-        rows = np.arange(len(distance))
-        farther = distance[rows, second] - distance[rows, first]
-        return first, second, np.maximum(0.0, 0.5 - 0.5 * farther / _BLEND)
+        share = np.maximum(0.0, 1.0 - (distance - distance.min(1, keepdims=True)) / _BLEND)
+        return share / share.sum(1, keepdims=True)
 
     def frames(self, positions: Array) -> list[NDArray[np.int64]]:
         """For each section, the indices of those of the positions (n, 3) [m] whose cameras train it."""
