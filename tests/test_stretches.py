@@ -95,9 +95,9 @@ def test_parts_of_road_and_land_meet(place):
 
 
 def test_a_stretch_has_what_is_near_and_sharp_textures_there(place, monkeypatch):
-    monkeypatch.setattr("twin.reality.stretches._SIGHT", 60.0)
+    monkeypatch.setattr("twin.reality.stretches._SIGHT", 50.0)
     monkeypatch.setattr("twin.reality.stretches._SHARP", 20.0)
-    part, whole = near_stretch(place, 0.0, 50.0), place.textures()
+    part, whole = near_stretch(place, 0.0, 10.0), place.textures()
     kept = {obj.name for obj in part.objects}
     last = f"road_{sum(name.startswith('road') for name in place.layout.bands) - 1}"
     assert "road" in kept and last not in kept and 0 < len(kept) < len(place.objects)

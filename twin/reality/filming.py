@@ -250,7 +250,7 @@ def film_pass(
     rng = np.random.default_rng([SEED, 13, sum(map(ord, name))])
     moving = movers(place, name, times, poses) if traffic else []
     make = partial(Renderer, lighting, plan=plan, movers=moving)
-    render = renderer or (StretchRenderer(place, make) if is_long(place) else make(place))
+    render: PlaceRenderer = renderer or (StretchRenderer(place, make) if is_long(place) else make(place))
     steps = track(list(zip(times, poses, gains, strict=True)), f"film {name}", unit="frame")
     rays = unproject(pixel_grid(plan.width, plan.height), plan.intrinsics)
 
