@@ -107,7 +107,7 @@ def test_share_of_the_second_section_changes_without_a_jump():
 
 
 def test_shares_are_continuous_where_three_sections_meet():
-    x, y, z = line(40.0).T
+    x, _, z = line(40.0).T
     arms = [np.stack([np.cos(angle) * x, np.sin(angle) * x, z], 1) for angle in (0.0, 2.0, 4.0)]
     road = Road(np.concatenate(arms), np.repeat([0, 1, 2], len(x)))
     turn, radius = np.linspace(0.0, 6.0 * np.pi, 20_000), np.linspace(3.0, 0.1, 20_000)
