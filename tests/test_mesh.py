@@ -16,9 +16,10 @@ from twin.assets.mesh import build_assets
 from twin.assets.solids import HEADROOM, Corridor, solid_pieces
 from twin.assets.tsdf import FREE_SPACE_REACH
 from twin.assets.views import render_views
-from twin.config import MeshConfig, MetricConfig, MjcfConfig, SceneConfig, SourceConfig
+from twin.config import BranchConfig, MeshConfig, MetricConfig, MjcfConfig, SceneConfig, SourceConfig
+from twin.errors import InputError
 from twin.geometry.cameras import Cameras, SparsePoints
-from twin.geometry.route import distance_to_route
+from twin.geometry.route import BRANCH, distance_to_route, filmed_branches
 
 HALF_WIDTH = 1.0  # [m]
 WALL = Box(7.0, 3.0, 3.0, 1.0, 1.4)
@@ -34,16 +35,20 @@ def made(tmp_path_factory: pytest.TempPathFactory):
     root = tmp_path_factory.mktemp("place")
     path = np.stack([np.arange(0.0, 12.01, 0.5), np.zeros(25)], -1)
     cameras = drive(PLACE, path, root / "2_metric", points=800)
+    out = root / "4_mesh"
+    out.mkdir()
+    return out, _build(cameras, root, out)
+
+
+def _build(cameras: Cameras, root: Path, out: Path, half_width: float = HALF_WIDTH, **settings):
     config = SceneConfig(
         source=(SourceConfig(path="day.mp4"),),
         metric=MetricConfig(camera_height=1.8),
         mesh=SETTINGS,
-        mjcf=MjcfConfig(half_width=HALF_WIDTH),
+        mjcf=MjcfConfig(half_width=half_width),
+        **settings,
     )
-    out = root / "4_mesh"
-    out.mkdir()
-    facts = build_assets(PLACE, cameras, SparsePoints.load(root / "2_metric"), config, out, root / "cache")
-    return out, facts
+    return build_assets(PLACE, cameras, SparsePoints.load(root / "2_metric"), config, out, root / "cache")
 
 
 def _load(folder: Path, name: str) -> dict[str, np.ndarray]:
@@ -218,3 +223,27 @@ def test_views_are_per_length_of_a_long_route(made, monkeypatch, counted_length,
             made[0].parent / "cache",
         )
     assert counts == [pytest.approx(views, abs=1)]
+
+
+def test_corridor_of_a_branch_is_free(made, tmp_path):
+    """It passes so close to the wall that the wall is cut back; beside the route alone the wall stands."""
+    root = made[0].parent
+    cameras = Cameras.load(root / "2_metric")
+    branch = BranchConfig(name="left", points=((0.0, 0.3), (3.0, 0.95), (11.0, 0.95), (12.0, 0.9)))
+    nearest = []
+    for branches in ((), (branch,)):
+        out = tmp_path / str(len(branches))
+        out.mkdir()
+        facts = _build(cameras, root, out, half_width=1.8, branch=branches)
+        line = filmed_branches(cameras, (branch,))["left"]
+        corners = np.concatenate([part.vertices for part in _parts(out)])
+        low = corners[corners[:, 2] < HEADROOM]
+        nearest.append(distance_to_route(line, low[:, :2]).min())
+    assert nearest[0] < 1.75 < 1.79 < nearest[1]
+    stored = _load(out, "route")[f"{BRANCH}left"]
+    np.testing.assert_array_equal(stored[:, :2], line)
+    np.testing.assert_allclose(stored[:, 2], Ground.load(out).at(line))
+    assert facts["branches_m"]["left"] == pytest.approx(12.1, abs=0.2)
+    wrong = BranchConfig(name="left", passes=("night",))
+    with pytest.raises(InputError, match=r"\[\[branch\]\] 'left'\.passes: no pass 'night'"):
+        filmed_branches(cameras, (wrong,))
