@@ -230,9 +230,7 @@ def main() -> int:
         error = camera_errors(cameras.camera_to_world, matched_poses(truth, cameras))["scale_error"]
         scales[name] = {"scale_error": error, "uncertainty": metric["scale_uncertainty"]}
         print(f"scale by {name}: {error:+.2%} from the truth, stated uncertainty {metric['scale_uncertainty']:.2%}")
-    if options.json:
-        save(options.json, {"builds": results, "same_frames": same, "scales": scales}, options.replace_record)
-    return 0
+    return save(options.json, {"builds": results, "same_frames": same, "scales": scales}, options.replace_record)
 
 
 def _same_pictures(scenes: dict[str, Path]) -> float:

@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 from record import add_record_options, save
+from sections import verdict
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "ros2" / "twin_policy"))
 
@@ -98,11 +99,8 @@ def main() -> int:
             for kind in _KINDS:
                 record[f"{name}.{kind}"] = figures = measure(policy, kind, options.count)
                 for figure, value in figures.items():
-                    sense, wanted = TARGETS.get(figure, ("", 0.0))
-                    met = {"≥": value >= wanted, "≤": value <= wanted}.get(sense)
-                    verdict = "" if met is None else "yes" if met else "no"
-                    target = f"{sense} {wanted:g}" if sense else ""
-                    print(f"{f'{name}.{kind}.{figure}':36} {value:12.4g} {target:>10}  {verdict}")
+                    wanted, met = verdict(figure, figures, TARGETS)
+                    print(f"{f'{name}.{kind}.{figure}':36} {value:12.4g} {wanted:>10}  {met}")
     return save(options.json, record, options.replace_record)
 
 

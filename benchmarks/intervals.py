@@ -35,6 +35,7 @@ import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,6 @@ from scipy.stats import norm
 from twin.evaluation.jackknife import (
     STATISTICS,
     PairedCells,
-    Statistic,
     jackknife_interval,
     mean_difference_interval,
     place_interval,
@@ -269,7 +269,7 @@ def _hit(ends: Callable[[], tuple[Any, ...]], aim: float | np.ndarray, count: in
 def _at_one_place(worlds: Worlds, truth: dict[str, float]) -> Hits:
     data, count = worlds.places[0], len(worlds.twin)
     return {
-        name: _hit(lambda s=statistic: jackknife_interval(s, data), truth[name], count)
+        name: _hit(partial(jackknife_interval, statistic, data), truth[name], count)
         for name, statistic in STATISTICS.items()
     }
 
@@ -279,13 +279,9 @@ def _over_places(worlds: Worlds, truth: dict[str, float]) -> Hits:
     for name, statistic in STATISTICS.items():
         for pooled in (False, True):
             key = f"{name}, pooled" if pooled else name
-            ends = _places_of(statistic, worlds, pooled)
+            ends = partial(place_interval, statistic, worlds.places, pooled)
             out[key] = _hit(ends, truth[key], len(worlds.twin))
     return out
-
-
-def _places_of(statistic: Statistic, worlds: Worlds, pooled: bool) -> Callable[[], tuple[Any, ...]]:
-    return lambda: place_interval(statistic, worlds.places, pooled)
 
 
 def _rates(worlds: Worlds) -> Hits:

@@ -22,11 +22,6 @@ _LISTED = 4
 def add_record_options(parser: argparse.ArgumentParser) -> None:
     """Adds `--json` and `--replace-record`."""
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure here")
-    add_replace_option(parser)
-
-
-def add_replace_option(parser: argparse.ArgumentParser) -> None:
-    """Adds `--replace-record`."""
     parser.add_argument(
         "--replace-record", action="store_true", help="overwrite a record even with one that lacks some of its entries"
     )

@@ -111,7 +111,7 @@ def main() -> int:
             change = value - found["clean"]["psnr"][light]
             small = f"{row['psnr_small'][light]:.2f}, lower half {row['psnr_small_lower'][light]:.2f} dB at 160×90"
             print(f"  {light:<12} {value:.2f} dB ({change:+.2f}), SSIM {row['ssim'][light]:.3f}; {small}")
-    return save(given.json, found, given.replace_record) if given.json else 0
+    return save(given.json, found, given.replace_record)
 
 
 if __name__ == "__main__":

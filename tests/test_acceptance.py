@@ -5,8 +5,8 @@ import pytest
 from acceptance import grounds
 from acceptance.drives import drive, on_ground
 from acceptance.rows import Row, Subject
-from acceptance.table import CONTROLS, MEASURES
 from acceptance.terrain import chi_on
+from husky import CONTROLS, MEASURES
 
 from twin.robot import TRACK, HuskyParams
 

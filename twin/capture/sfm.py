@@ -70,8 +70,6 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     capture = Capture.load(stage)
     work = out / "work"
     work.mkdir()
-    if settings.mapper not in ("auto", "global", "incremental"):
-        raise InputError(f"cameras.mapper = {settings.mapper!r}; expected auto, global or incremental")
     threads = min(os.cpu_count() or 1, _MAX_THREADS)
     job = asdict(settings) | {"capture": str(stage), "seed": config.seed, "threads": threads}
     run_worker(solve_mapping, job, work)

@@ -25,7 +25,6 @@ from twin.evaluation.agreement import (
     compare_cells,
     measure_agreement,
     missing_data,
-    share_estimate,
     unit_counts,
 )
 from twin.evaluation.jackknife import training_of
@@ -341,7 +340,7 @@ def _left_out(task: str, real: Sequence[Cell], twin: Cells) -> list[LeftOutLight
                 estimates = (
                     Estimate(float(twin_error.mean()), n=n, no_interval=DEPENDENT),
                     Estimate(float(error.mean()), n=n, no_interval=DEPENDENT),
-                    share_estimate(int(inside.sum()), n, DEPENDENT),
+                    Estimate(int(inside.sum()) / n, n=n, no_interval=DEPENDENT),
                 )
         out.append(LeftOutLighting(task, name, n, *estimates))
     return out

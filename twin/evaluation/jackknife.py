@@ -108,11 +108,16 @@ def training_of(policy: str) -> str:
     return policy.partition("/")[0]
 
 
-def pair_cells(real: Sequence[Cell], twin: Mapping[tuple[str, str, str], Cell]) -> PairedCells:
-    """Pairs real cells with the twin's cells, given by key; policies are ordered by task, then by first occurrence."""
+def policy_rows(real: Sequence[Cell]) -> list[list[Cell]]:
+    """Real cells of each policy; policies are ordered by task, then by first occurrence."""
     tasks = dict.fromkeys(cell.task for cell in real)
     policies = [p for task in tasks for p in dict.fromkeys((c.policy, c.task) for c in real if c.task == task)]
-    rows = [[cell for cell in real if (cell.policy, cell.task) == policy] for policy in policies]
+    return [[cell for cell in real if (cell.policy, cell.task) == policy] for policy in policies]
+
+
+def pair_cells(real: Sequence[Cell], twin: Mapping[tuple[str, str, str], Cell]) -> PairedCells:
+    """Pairs real cells with the twin's cells, given by key; rows are those of `policy_rows`."""
+    rows = policy_rows(real)
     shape = len(rows), max(map(len, rows))
     twin_rate, real_rate, weight = np.zeros((3, *shape))
     day = np.zeros(shape, np.int64)
@@ -121,9 +126,10 @@ def pair_cells(real: Sequence[Cell], twin: Mapping[tuple[str, str, str], Cell]) 
         for j, cell in enumerate(row):
             twin_rate[i, j], real_rate[i, j], weight[i, j] = twin[cell.twin_key].rate, cell.rate, 1.0
             day[i, j] = days.index(cell.lighting)
-    trainings = list(dict.fromkeys(training_of(policy) for policy, _ in policies))
-    training = np.array([trainings.index(training_of(policy)) for policy, _ in policies])
-    strata = tuple(np.array([i for i, (_, t) in enumerate(policies) if t == task]) for task in tasks)
+    runs, tasks = [training_of(row[0].policy) for row in rows], [row[0].task for row in rows]
+    trainings = list(dict.fromkeys(runs))
+    training = np.array([trainings.index(run) for run in runs])
+    strata = tuple(np.array([i for i, t in enumerate(tasks) if t == task]) for task in dict.fromkeys(tasks))
     return PairedCells(twin_rate, real_rate, weight, training, day, strata)
 
 

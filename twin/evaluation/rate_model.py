@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike
 from scipy.special import betainc, betaln, expit, logit
 
 from twin.evaluation.statistics import CONFIDENCE
-from twin.types import Array, Indices
+from twin.types import Array
 
 MIN_RATE_DAYS = 2
 """Number of days below which a policy's rate over days has no interval."""
@@ -186,13 +186,3 @@ def _shortest(mass: Array, edges: Array, confidence: float) -> tuple[float, floa
     low, high = np.interp(start, below, edges), np.interp(start + confidence, below, edges)
     best = int(np.argmin(high - low))
     return float(low[best]), float(high[best])
-
-
-def padded_counts(rows: list[list[tuple[int, int]]]) -> tuple[Indices, Indices]:
-    """Arrays of successes and trials (n, k), padded with 0, from (successes, trials) of each cell of each policy."""
-    shape = len(rows), max(map(len, rows))
-    won, driven = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
-    for i, row in enumerate(rows):
-        for j, (successes, trials) in enumerate(row):
-            won[i, j], driven[i, j] = successes, trials
-    return won, driven

@@ -106,11 +106,6 @@ class OrthographicShadowMap:
         """`height` for the kernel, without infinities."""
         return wp.array(np.maximum(self.height, np.float32(-1e9)), dtype=float, device="cpu")
 
-    @staticmethod
-    def of_mesh(vertices: Array, faces: NDArray, toward: Array, texel: float = TEXEL) -> "OrthographicShadowMap":
-        """The map of a mesh, vertices (n, 3) [m] and faces (m, 3), from a ray of the sun through each texel."""
-        return ShadowCasters(vertices, faces).seen_from(toward, texel)
-
     def visibility(self, points: NDArray, normals: NDArray | None = None, bias: float = BIAS) -> Array32:
         """Fraction of the sunlight that reaches points (n, 3) [m], shape (n,); 1 outside the map.
 
@@ -176,7 +171,10 @@ class ShadowCasters:
         ]
 
     def seen_from(self, toward: Array, texel: float = TEXEL) -> OrthographicShadowMap:
-        """The map for a sun in the direction of a unit vector (3,); `texel` [m] grows for a wide place."""
+        """The map for a sun in the direction of a unit vector (3,), from a ray of the sun through each texel.
+
+        `texel` [m] grows for a wide place.
+        """
         toward = np.asarray(toward, np.float64) / np.linalg.norm(toward)
         if not self._parts:
             return OrthographicShadowMap(toward, np.zeros(2), texel, np.full((1, 1), -np.inf, np.float32))
