@@ -99,7 +99,9 @@ def write_bag(path: Path, film: Path, truth: Truth, name: str, seed: int) -> Non
             header(grid[k] - times[0], "gps"), status, latitude, longitude, 100.0, np.zeros(9), 2
         )
         add(grid[k] - times[0], "/fix", "sensor_msgs/msg/NavSatFix", fix)
-    frames = [("base_link", "base_footprint", _at(0.0, 0.0, -_BASE)), ("base_link", "camera", seat)]
+    footprint = np.eye(4)
+    footprint[2, 3] = -_BASE
+    frames = [("base_link", "base_footprint", footprint), ("base_link", "camera", seat)]
     transforms = [_transform(types, header(0.0, parent), child, pose) for parent, child, pose in frames]
     add(0.0, "/tf_static", "tf2_msgs/msg/TFMessage", types["tf2_msgs/msg/TFMessage"](transforms))
     topics: dict[str, Any] = {}
@@ -138,12 +140,6 @@ def _drifted(base: np.ndarray) -> np.ndarray:
     out[1:, :3, 3] = np.cumsum(_LONG * turn[:-1].apply(steps), axis=0)
     out[0, :3, 3] = 0.0
     return out
-
-
-def _at(x: float, y: float, z: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, 3] = x, y, z
-    return pose
 
 
 def _transform(types: Any, header: Any, child: str, pose: np.ndarray) -> Any:

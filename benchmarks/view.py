@@ -225,9 +225,7 @@ def measure(scene: Path, minutes: float) -> dict[str, Any]:
                 time.sleep(5.0)
                 shown = (browser.evaluate("window.pictures") - before) / (time.monotonic() - began)
             browser.key("w", False)
-            rate = browser.evaluate(
-                "(document.body.textContent.match(/([0-9.]+)× real time/) || [0, '0'])[1]",
-            )
+            rate = browser.evaluate("(document.body.textContent.match(/([0-9.]+)× real time/) || [0, '0'])[1]")
             browser.click_on("button", "Stop")
             out["driving"] = {"pictures_per_s": shown, "real_time_factor": float(rate), "others_cores": other.cores}
             if minutes > 0:

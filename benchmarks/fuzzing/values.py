@@ -30,21 +30,8 @@ _TOML = (
     *("{a = 1}", '[1, "a"]', "[nan]", "[inf, -inf]", "'a'", "bare", '"\\ud800"', "[{}]", "1_000", '"\\u0000"', ""),
 )
 _WORDS = (
-    *(
-        "",
-        " ",
-        ".",
-        "..",
-        "/",
-        "~",
-        "a/b",
-        OUTSIDE_PATH,
-        "../../../../etc/passwd",
-        "/etc/passwd",
-        "/dev/null",
-        "a:b:c",
-        "+",
-    ),
+    *("", " ", ".", "..", "/", "~", "a/b", OUTSIDE_PATH, "../../../../etc/passwd", "/etc/passwd", "/dev/null"),
+    *("a:b:c", "+"),
     *("\x00", "a\x00b", "\ud800", "\udcff", "\ufeff", "\x07\x1b[31m", "a\nb", "a\r\nb", "\u202e", "é", "²", "∞", "'"),
     *("nan", "inf", "-inf", "1e400", "-1", "0", "9" * 5000, "1" + "0" * 400, "x" * 300, "%s%n", "{}", "{0}", "<b>&"),
     *("training", "held-out", "any", "+randomised", "day:night:nan", "day:night:2", "day", "true", "None", '"', "\\"),

@@ -23,9 +23,7 @@ _SIGMA_RIGHT = np.radians(1.0)
 """Mounting error of a camera's right axis [rad]; common to all frames, so averaging does not reduce it."""
 _SIGMA_ROAD = np.radians(1.0)  # [rad] standard deviation of the tilt of roads by camber
 _SIGMA_PATH = np.radians(0.3)  # [rad] standard deviation of a path's slope relative to the ground
-_PATH_SAMPLES = (
-    3.0  # number of independent heights along a path; far fewer than frames, since a path undulates smoothly
-)
+_PATH_SAMPLES = 3.0  # independent heights along a path; far fewer than frames, since a path undulates smoothly
 _MIN_VARIANCE_RATIO = 10.0
 """A principal axis of points constrains up only if the variance along it is more than this multiple of the smallest."""
 _MIN_WIDTH = 0.05

@@ -155,15 +155,13 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
 
     Raises InputError: an unknown frame, a point outside its image, or rays that do not meet.
     """
-    frames = [_marked_frame(cameras, "a", distance.frame_a, distance.a)]
-    frames.append(_marked_frame(cameras, "b", distance.frame_a, distance.b))
-    pixels = np.array([distance.a, distance.b], np.float64)
+    marked = {"a": distance.frame_a, "b": distance.frame_a}
     if distance.frame_b:
-        frames.append(_marked_frame(cameras, "a2", distance.frame_b, distance.a2))
-        frames.append(_marked_frame(cameras, "b2", distance.frame_b, distance.b2))
-        pixels = np.concatenate([pixels, np.array([distance.a2, distance.b2], np.float64)])
         if distance.frame_a == distance.frame_b:
             raise InputError(f"metric.distance: frame_a and frame_b are both {distance.frame_a!r}; mark two frames")
+        marked |= {"a2": distance.frame_b, "b2": distance.frame_b}
+    frames = [_marked_frame(cameras, key, frame, getattr(distance, key)) for key, frame in marked.items()]
+    pixels = np.array([getattr(distance, key) for key in marked], np.float64)
 
     def length(offset: Array) -> float:
         rays = [_ray(cameras, f, p) for f, p in zip(frames, pixels + offset, strict=True)]

@@ -20,14 +20,7 @@ from twin import runtime
 from twin.capture.camera_models import Lens, lens_from_json, undistortion, write_pinhole_image
 from twin.capture.capture_data import Capture
 from twin.capture.ground_matching import Part, join
-from twin.capture.mapping import (
-    MIN_FRAMES,
-    coherent_frames,
-    connections,
-    fresh_folder,
-    reconstruct,
-    registered_poses,
-)
+from twin.capture.mapping import MIN_FRAMES, coherent_frames, connections, fresh_folder, reconstruct, registered_poses
 from twin.capture.matching import (
     PROBE_INLIERS,
     Matcher,

@@ -189,10 +189,7 @@ def unit_counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, 
 def compare_cells(cell: Cell, mate: Cell) -> CellPair:
     """Compares the rate of a real cell with that of the corresponding cell `mate` of the twin."""
     value, low, high = rate_difference(
-        twin_successes=mate.successes,
-        twin_trials=mate.trials,
-        real_successes=cell.successes,
-        real_trials=cell.trials,
+        twin_successes=mate.successes, twin_trials=mate.trials, real_successes=cell.successes, real_trials=cell.trials
     )
     alone = "none for a single cell"
     in_twin, on_road = (Estimate(c.rate, n=c.trials, no_interval=alone) for c in (mate, cell))

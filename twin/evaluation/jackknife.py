@@ -33,13 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from twin.evaluation.statistics import (
-    CONFIDENCE,
-    UndefinedStatistic,
-    mmrv_batched,
-    pearson_batched,
-    spearman_batched,
-)
+from twin.evaluation.statistics import CONFIDENCE, UndefinedStatistic, mmrv_batched, pearson_batched, spearman_batched
 from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
 

@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,16 +172,9 @@ class Windows:
 
     def select(self, which: NDArray) -> "Windows":
         """Some of the windows, by mask or index; none of them counts as following another."""
-        wheels = self.wheels[which]
-        return Windows(
-            self.commands[which],
-            self.twist,
-            wheels,
-            self.poses[which],
-            self.groups[which],
-            np.zeros(len(wheels), bool),
-            None if self.acceleration is None else self.acceleration[which],
-        )
+        some: dict[str, Any] = {name: getattr(self, name)[which] for name in ("commands", "wheels", "poses", "groups")}
+        acceleration = None if self.acceleration is None else self.acceleration[which]
+        return replace(self, **some, follows=np.zeros(len(some["wheels"]), bool), acceleration=acceleration)
 
     @property
     def fresh(self) -> NDArray[np.bool_]:
@@ -479,12 +473,8 @@ def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, 
     commanded = windows.commanded_speeds[:, -1] * WHEEL_RADIUS
     end = windows.wheels[:, -1] * WHEEL_RADIUS
     measured = np.stack([end.mean(1), (end[:, 1] - end[:, 0]) / 2], -1)
-    names = (
-        ("cmd_v", "cmd_yaw_rate")
-        if windows.twist
-        else ("the mean of cmd_left and cmd_right", "the difference of cmd_left and cmd_right")
-    )
-    for i, name in enumerate(names):
+    wheels = ("the mean of cmd_left and cmd_right", "the difference of cmd_left and cmd_right")
+    for i, name in enumerate(TWIST if windows.twist else wheels):
         use = (np.abs(measured[:, i]) > 0.5 * _MOVING) & (np.abs(commanded[:, i]) > 0)
         cures = {
             _DEGREE: f"{name} looks like degrees; multiply by π/180",
