@@ -30,22 +30,17 @@ Edit = Callable[[mujoco.MjSpec], None]
 
 def option(**values: object) -> Edit:
     """An edit that sets options of the scene."""
-
-    def edit(spec: mujoco.MjSpec) -> None:
-        for name, value in values.items():
-            setattr(spec.option, name, value)
-
-    return edit
+    return lambda spec: _set(spec.option, values)
 
 
 def ground(**values: object) -> Edit:
     """An edit that sets attributes of the ground."""
+    return lambda spec: _set(spec.geom("ground"), values)
 
-    def edit(spec: mujoco.MjSpec) -> None:
-        for name, value in values.items():
-            setattr(spec.geom("ground"), name, value)
 
-    return edit
+def _set(target: object, values: dict[str, object]) -> None:
+    for name, value in values.items():
+        setattr(target, name, value)
 
 
 def pairs(spec: mujoco.MjSpec) -> None:

@@ -28,13 +28,7 @@ def add_record_options(parser: argparse.ArgumentParser) -> None:
 
 
 def lost(old: Any, new: Any, where: str = "") -> list[str]:
-    """Names of the entries that a new JSON value lacks.
-
-    Args:
-        old: The recorded value.
-        new: Its replacement.
-        where: Path of both within their record, for error messages.
-    """
+    """Names of the entries that a new JSON value lacks; `where` is the path of both values within their record."""
     if isinstance(old, dict):
         if not isinstance(new, dict):
             return [where or "all of it"]
@@ -78,7 +72,6 @@ def write_record(path: Path, record: dict[str, Any], replace: bool | None = Fals
     """Writes a record.
 
     Args:
-        path: The file.
         record: A JSON object; may contain NaN and infinity.
         replace: True overwrites a record even if the new one lacks entries. None means False in a script that has no
             `--replace-record`.

@@ -45,7 +45,6 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
 
     Args:
         steps: Control steps of all environments together.
-        folder: Folder for the scene.
     """
     import psutil
     import tqdm
@@ -98,7 +97,6 @@ def kills(times: int, folder: Path, only: str | None = None, seed: int = 0) -> d
 
     Args:
         times: Number of kills of each command.
-        folder: Folder for the scenes.
         only: "build", "train" or "validate" kills only this command; None kills all three.
         seed: Seed of the kill times.
     """

@@ -132,7 +132,6 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
     """Reads calibration, positions, extrinsics and stamps of the pictures in a bag; decodes only the first picture.
 
     Args:
-        path: See `twin.capture.bag`.
         topic: Topic of the pictures; empty for the topic with the most pictures.
 
     Raises:

@@ -75,13 +75,7 @@ class _GroundPicture:
 
 
 def join(a: Part, b: Part, read_frame: FrameReader) -> Similarity | None:
-    """The similarity from the frame of part b to that of part a; None if their grounds do not match.
-
-    Args:
-        a: A part.
-        b: Another part.
-        read_frame: See `FrameReader`.
-    """
+    """The similarity from the frame of part b to that of part a; None if their grounds do not match."""
     levels = _level_frame(a), _level_frame(b)
     if levels[0] is None or levels[1] is None:
         return None

@@ -204,11 +204,7 @@ def compare_cells(cell: Cell, mate: Cell) -> CellPair:
 def measure_agreement(task: str, real: Sequence[Cell], twin: Cells, further: Sequence[float]) -> Agreement:
     """Agreement of a group's real cells with the corresponding cells of the twin.
 
-    Args:
-        task: Name of the task, or of all tasks together.
-        real: Real cells of the group.
-        twin: The twin's cells by key.
-        further: Twin scores of policies without real trials, for `Agreement.mean_real`.
+    `further` holds the twin scores of policies without real trials, for `Agreement.mean_real`.
     """
     missing = missing_data(real, twin)
     data = pair_cells(real, twin)

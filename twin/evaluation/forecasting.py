@@ -171,8 +171,6 @@ def make_forecast(
     """Computes a forecast.
 
     Args:
-        scene: Name of the scene.
-        twin: Cells of the twin.
         real: Real cells, each with a twin cell to compare with; may be empty.
         seed: Seed of the sampling from posteriors.
         trained: Success rates in training by (policy, task), where known.

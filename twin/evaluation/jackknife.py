@@ -245,7 +245,6 @@ def mean_difference_interval(
 
     Args:
         differences: One value per pair of trainings or per place, shape (n,).
-        confidence: Confidence level of the interval.
         limits: The interval is clipped to these; by default, those of a difference of rates.
 
     Raises:

@@ -58,7 +58,6 @@ def expected_confidence(rates: Array, more: int, seed: int, so_far: bool = True)
     Args:
         rates: Samples of the true rates, shape (samples, n).
         more: Further trials per policy.
-        seed: Seed of the simulated trials.
         so_far: True: the ranking also uses the trials on which the posterior is based; False: only the further ones.
     """
     won = np.random.default_rng(seed).binomial(more, rates)

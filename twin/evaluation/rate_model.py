@@ -82,8 +82,6 @@ class RateModel:
         """Fits the counts of n policies in up to k cells, shapes (n, k); cells without trials are padding.
 
         Args:
-            successes: Successes of each cell.
-            trials: Trials of each cell.
             covariate: xᵢ [logit], shape (n,); `fit` subtracts its mean; None: no covariate.
             shared_days: True if the policies drove on the same few days; see the module's docstring.
             road: True: ρ has the road's prior; False: a uniform one.

@@ -250,7 +250,6 @@ def prediction_powered_mean(
         real: Yᵢ, shape (n,).
         twin_only: f̃ⱼ, shape (N,).
         power: λ; None: λ is tuned.
-        confidence: Confidence level of the interval.
 
     Raises:
         UndefinedStatistic: n < 5, or N < 2.

@@ -63,7 +63,6 @@ def slope_gravity(windows: Windows, model: IcrModel) -> Array:
 
     Args:
         windows: All windows of a log; without accelerations the result is zero.
-        model: Kinematics for headings and velocities.
     """
     if windows.acceleration is None:
         return np.zeros((len(windows), 2))

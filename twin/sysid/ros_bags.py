@@ -83,7 +83,6 @@ def read_bag(path: Path, filmed: FilmedPoses | None = None) -> dict[str, Array]:
     """Reads a bag into the columns that `twin.sysid.logs` describes.
 
     Args:
-        path: See `twin.capture.bag`.
         filmed: Poses to use if the bag has only poses that come from the wheels.
 
     Raises:

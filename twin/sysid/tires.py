@@ -161,8 +161,6 @@ def fit_ground(
 
     Args:
         params: The robot that gives the defaults.
-        drivetrain: See `drivetrain.fit_drivetrain`.
-        windows: All windows of a log.
         slope: See `rollout.slope_gravity`, shape (n, 2).
     """
     defaults = values_of_robot(params)
