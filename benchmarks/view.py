@@ -124,21 +124,21 @@ def drag(browser: Chromium, seconds: float) -> float:
     return float(shown)
 
 
-def rest(browser: Chromium, seconds: float = 6.0) -> float:
+def rest(browser: Chromium) -> float:
     """Time from the last event to the picture at full resolution in the browser [s]."""
     began = time.monotonic()
     width = 0
-    while time.monotonic() - began < seconds:
+    while time.monotonic() - began < 6.0:
         width = browser.evaluate("window.width")
         if width > 400:  # a coarse picture is 261 px wide
             return time.monotonic() - began
         time.sleep(0.01)
-    raise AssertionError(f"no fine picture within {seconds:g} s; the last is {width} px wide")
+    raise AssertionError(f"no fine picture within 6 s; the last is {width} px wide")
 
 
-def random_clicks(browser: Chromium, served: Served, seconds: float, seed: int = 0) -> dict[str, Any]:
+def random_clicks(browser: Chromium, served: Served, seconds: float) -> dict[str, Any]:
     """Clicks, drags, presses keys and moves sliders at random; returns actions, errors and growth of memory."""
-    rng, began, actions, early = np.random.default_rng(seed), time.monotonic(), 0, 0
+    rng, began, actions, early = np.random.default_rng(0), time.monotonic(), 0, 0
     while (now := time.monotonic() - began) < seconds:
         kind = rng.integers(5)
         if kind == 0:  # the picture

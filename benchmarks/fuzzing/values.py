@@ -115,11 +115,11 @@ def mutated(rng: Random, table: Any, toml: bool = False) -> Any:
     return out
 
 
-def _slots(tree: Any, most: int = 2000) -> list[tuple[Any, Any]]:
-    """Container and key of every entry of a tree, up to about `most`."""
+def _slots(tree: Any) -> list[tuple[Any, Any]]:
+    """Container and key of every entry of a tree, up to about 2,000."""
     out: list[tuple[Any, Any]] = []
     stack = [tree]
-    while stack and len(out) < most:
+    while stack and len(out) < 2000:
         here = stack.pop()
         keys: Sequence[Any] = list(here) if isinstance(here, dict) else range(len(here))
         for key in keys:

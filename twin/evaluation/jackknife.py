@@ -189,7 +189,7 @@ def mean_over_tasks(statistic: Callable[..., tuple[Array, Array]], data: PairedC
 # ---- intervals
 
 
-def jackknife_interval(statistic: Statistic, data: PairedCells, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
+def jackknife_interval(statistic: Statistic, data: PairedCells) -> tuple[Array, Array]:
     """Ends of the interval of a statistic at one place, shapes (...).
 
     Among experiments along leading axes, those whose units do not determine a variance get nan. Raises
@@ -212,11 +212,11 @@ def jackknife_interval(statistic: Statistic, data: PairedCells, confidence: floa
         variance = np.where(variance > 0, variance, np.maximum(parts[0], parts[1]))
         freedom = variance**2 / (parts[0] ** 2 / (trainings - 1) + parts[1] ** 2 / (days - 1))
     freedom = np.clip(freedom, (trainings - 1) / 2, trainings + days - 2)
-    return _ends(statistic, statistic.of(**data.rates()), variance, freedom, confidence)
+    return _ends(statistic, statistic.of(**data.rates()), variance, freedom)
 
 
 def place_interval(
-    statistic: Statistic, places: Sequence[PairedCells], pooled: bool = False, confidence: float = CONFIDENCE
+    statistic: Statistic, places: Sequence[PairedCells], pooled: bool = False
 ) -> tuple[Array, Array, Array]:
     """A statistic over several places, and the ends of its interval with the place as the unit, shapes (...).
 
@@ -234,12 +234,12 @@ def place_interval(
 
     value = of(each)
     left_out = np.stack([statistic.scale(of([*each[:i], *each[i + 1 :]])) for i in range(len(each))])
-    low, high = _ends(statistic, value, _spread(left_out), np.asarray(len(places) - 1.0), confidence)
+    low, high = _ends(statistic, value, _spread(left_out), np.asarray(len(places) - 1.0))
     return value, low, high
 
 
 def mean_difference_interval(
-    differences: Array, confidence: float = CONFIDENCE, limits: tuple[float, float] = (-1.0, 1.0)
+    differences: Array, limits: tuple[float, float] = (-1.0, 1.0)
 ) -> tuple[float, float, float]:
     """Mean difference of two training setups, and the ends of its interval by Student's t.
 
@@ -256,7 +256,7 @@ def mean_difference_interval(
     mean, error = float(np.mean(differences)), float(np.std(differences, ddof=1) / np.sqrt(n))
     if error < 1e-9:
         raise UndefinedStatistic("no interval: all pairs differ by the same amount")
-    half = float(student.ppf(0.5 + confidence / 2, n - 1)) * error
+    half = float(student.ppf(0.5 + CONFIDENCE / 2, n - 1)) * error
     return mean, max(mean - half, limits[0]), min(mean + half, limits[1])
 
 
@@ -270,16 +270,14 @@ def _spread(left_out: Array) -> Array:
     return np.asarray((m - 1) / m * ((left_out - left_out.mean(0)) ** 2).sum(0))
 
 
-def _ends(
-    statistic: Statistic, value: Array, variance: Array, freedom: Array, confidence: float
-) -> tuple[Array, Array]:
+def _ends(statistic: Statistic, value: Array, variance: Array, freedom: Array) -> tuple[Array, Array]:
     variance = np.where(variance > 1e-18, variance, np.nan)
     if np.ndim(variance) == 0 and np.isnan(variance):
         raise UndefinedStatistic(
             "no interval: the variance cannot be estimated, since leaving out units does not change the value, or "
             "leaves rates that are all equal"
         )
-    half = student.ppf(0.5 + confidence / 2, freedom) * np.sqrt(variance)
+    half = student.ppf(0.5 + CONFIDENCE / 2, freedom) * np.sqrt(variance)
     center = statistic.scale(value)
     low, high = statistic.inverse(center - half), statistic.inverse(center + half)
     return np.maximum(low, statistic.low), np.minimum(high, statistic.high)

@@ -120,15 +120,15 @@ class RateModel:
         """Posterior mean of each policy's rate over days, shape (n,)."""
         return np.asarray(self.posterior() @ _RATES)
 
-    def interval(self, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
+    def interval(self) -> tuple[Array, Array]:
         """Ends of the shortest credible interval of each policy's rate over days, shapes (n,)."""
-        ends = np.array([_shortest(mass, _EDGES, confidence) for mass in self.posterior()])
+        ends = np.array([_shortest(mass, _EDGES) for mass in self.posterior()])
         return ends[:, 0], ends[:, 1]
 
-    def mean_interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    def mean_interval(self) -> tuple[float, float]:
         """Ends of the shortest credible interval of μ, the rate over the population of policies and days."""
         mass = np.array([self.weight[self.means == mean].sum() for mean in _MEANS])
-        return _shortest(mass, np.sin(np.pi / 2 * np.arange(len(_MEANS) + 1) / len(_MEANS)) ** 2, confidence)
+        return _shortest(mass, np.sin(np.pi / 2 * np.arange(len(_MEANS) + 1) / len(_MEANS)) ** 2)
 
     def sample(self, rng: np.random.Generator, samples: int) -> Array:
         """Samples of the policies' rates over days, shape (samples, n)."""
@@ -176,11 +176,11 @@ def _likelihood(won: Array, driven: Array) -> Array:
     return np.asarray(np.exp(log - log.max((1, 2), keepdims=True)))
 
 
-def _shortest(mass: Array, edges: Array, confidence: float) -> tuple[float, float]:
-    """Shortest interval with mass `confidence` of a distribution that is uniform between the edges of each bin."""
+def _shortest(mass: Array, edges: Array) -> tuple[float, float]:
+    """Shortest interval with mass `CONFIDENCE` of a distribution that is uniform between the edges of each bin."""
     below = np.concatenate([[0.0], np.cumsum(mass)])
     below /= below[-1]
-    start = np.linspace(0.0, 1.0 - confidence, 201)
-    low, high = np.interp(start, below, edges), np.interp(start + confidence, below, edges)
+    start = np.linspace(0.0, 1.0 - CONFIDENCE, 201)
+    low, high = np.interp(start, below, edges), np.interp(start + CONFIDENCE, below, edges)
     best = int(np.argmin(high - low))
     return float(low[best]), float(high[best])

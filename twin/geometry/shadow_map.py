@@ -106,7 +106,7 @@ class OrthographicShadowMap:
         """`height` for the kernel, without infinities."""
         return wp.array(np.maximum(self.height, np.float32(-1e9)), dtype=float, device="cpu")
 
-    def visibility(self, points: NDArray, normals: NDArray | None = None, bias: float = BIAS) -> Array32:
+    def visibility(self, points: NDArray, normals: NDArray | None = None) -> Array32:
         """Fraction of the sunlight that reaches points (n, 3) [m], shape (n,); 1 outside the map.
 
         If the unit normals (n, 3) of the surfaces at the points are given, slopes do not shadow themselves.
@@ -119,7 +119,7 @@ class OrthographicShadowMap:
         facing: Any = wp.array(np.ascontiguousarray(normals, np.float32), dtype=wp.vec3, device="cpu")
         out = wp.empty(len(points), dtype=float, device="cpu")
         axes = (wp.vec3(*axis.tolist()) for axis in (right, upward, self.toward))
-        inputs = [self._height, at, facing, *axes, wp.vec2(*self.origin.tolist()), self.texel, bias, _RAMP]
+        inputs = [self._height, at, facing, *axes, wp.vec2(*self.origin.tolist()), self.texel, BIAS, _RAMP]
         wp.launch(_look_up, len(points), inputs=inputs, outputs=[out], device="cpu")
         return out.numpy()
 

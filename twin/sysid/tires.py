@@ -120,17 +120,12 @@ def values_of_robot(params: HuskyParams) -> dict[str, float]:
 
 
 def simulate_log(
-    params: HuskyParams,
-    values: dict[str, float],
-    drivetrain: Drivetrain,
-    windows: Windows,
-    slope: Array,
-    timestep: float | None = None,
+    params: HuskyParams, values: dict[str, float], drivetrain: Drivetrain, windows: Windows, slope: Array
 ) -> Rollouts:
     """Simulates the log's commands with these values; poses are those of the log's sensor (`_measured_poses`)."""
     targets, _ = simulate_drivetrain(drivetrain, windows)
     fitted = robot_with_values(_with_drivetrain(params, drivetrain), values)
-    out = simulate_windows(fitted, targets, windows.preceding_wheels, slope, timestep)
+    out = simulate_windows(fitted, targets, windows.preceding_wheels, slope)
     return replace(out, poses=_measured_poses(out, values, windows))
 
 
