@@ -133,17 +133,14 @@ class EventDetector:
         if hit.any() and contact.dist[hit].min() < -_TUNNEL_DEPTH:
             found.append("tunnelling")
         base = physics.base_to_world
-        if self._climbed(base):
+        ground = ground_height(physics.model, base[0, 3], base[1, 3])
+        if base[2, 3] - ground > BASE_HEIGHT + _CLIMB_HEIGHT:
             found.append("climbing")
         if hit.any() and abs(physics.speed) > _SLIDE_SPEED:
             found.append("wall_sliding")
         if not physics.touched and self._visual_mesh.inside(base):
             found.append("gap")
         return found
-
-    def _climbed(self, base: Array) -> bool:
-        ground = ground_height(self._physics.model, base[0, 3], base[1, 3])
-        return bool(base[2, 3] - ground > BASE_HEIGHT + _CLIMB_HEIGHT)
 
 
 def _episodes(

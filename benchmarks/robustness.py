@@ -166,7 +166,8 @@ def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[s
     scene = SceneDir(root)
     stages = ("capture", "cameras", "metric", "field", "mesh", "mjcf")  # not the review, whose results contain timings
     subprocess.run(_build_command(root), cwd=_ROOT, check=True)
-    wanted, longest = _results(root, stages), max(_seconds(root).values())
+    report = json.loads((root / "build" / "report.json").read_text())
+    wanted, longest = _results(root, stages), max(stage["seconds"] for stage in report["stages"].values())
     killed = finished = different = 0
     sfm_until = times // 5  # the first fifth of the kills hits builds from scratch
     while killed < times:
@@ -188,11 +189,6 @@ def _comparison(root: Path, killed: int, finished: int, different: int) -> dict[
     left = _leftovers(root)
     counts = {"killed": killed, "finished": finished, "different": different}
     return {**counts, "leftovers": left, "ok": not different and not left}
-
-
-def _seconds(root: Path) -> dict[str, float]:
-    report = json.loads((root / "build" / "report.json").read_text())
-    return {name: stage["seconds"] for name, stage in report["stages"].items()}
 
 
 _TRAIN = """

@@ -207,7 +207,8 @@ def jackknife_interval(statistic: Statistic, data: PairedCells) -> tuple[Array, 
     of_day = [data.day != d for d in np.unique(data.day[data.weight > 0])]
     both = [t | d for t in of_training for d in of_day]
     with np.errstate(invalid="ignore", divide="ignore"):
-        parts = [_variance(statistic, [data.rates(kept) for kept in units]) for units in (of_training, of_day, both)]
+        each = [[statistic.of(**data.rates(kept)) for kept in units] for units in (of_training, of_day, both)]
+        parts = [_spread(np.stack([statistic.scale(value) for value in values])) for values in each]
         variance = parts[0] + parts[1] - (1.0 if statistic.linear else _SHARE_OF_BOTH) * parts[2]
         variance = np.where(variance > 0, variance, np.maximum(parts[0], parts[1]))
         freedom = variance**2 / (parts[0] ** 2 / (trainings - 1) + parts[1] ** 2 / (days - 1))
@@ -258,10 +259,6 @@ def mean_difference_interval(
         raise UndefinedStatistic("no interval: all pairs differ by the same amount")
     half = float(student.ppf(0.5 + CONFIDENCE / 2, n - 1)) * error
     return mean, max(mean - half, limits[0]), min(mean + half, limits[1])
-
-
-def _variance(statistic: Statistic, replicates: Sequence[dict[str, Array]]) -> Array:
-    return _spread(np.stack([statistic.scale(statistic.of(**rates)) for rates in replicates]))
 
 
 def _spread(left_out: Array) -> Array:

@@ -99,7 +99,8 @@ class RateModel:
         x = given - given.mean()
         mean, correlation, slope = (a.ravel() for a in np.meshgrid(_MEANS, _CORRELATIONS, slopes, indexing="ij"))
         centers = expit(logit(mean) + slope * x[:, None])
-        prior = _masses(np.clip(centers, 1e-4, 1 - 1e-4), correlation)
+        a, b = _beta(np.clip(centers, 1e-4, 1 - 1e-4), correlation)
+        prior = np.diff(betainc(a[..., None], b[..., None], _EDGES), axis=-1)
         evidence = np.maximum(np.matmul(prior, likelihood), 1e-300)
         log = np.log(evidence).sum(0)
         weight = np.exp(log - log.max()) * _CORRELATIONS ** (_ROAD_PRIOR if road else 0.0)
@@ -156,12 +157,6 @@ def _beta(mean: Array, correlation: Array) -> tuple[Array, Array]:
     """Parameters of a Beta distribution from mean and intra-class correlation."""
     size = 1.0 / correlation - 1.0
     return mean * size, (1.0 - mean) * size
-
-
-def _masses(mean: Array, correlation: Array) -> Array:
-    """Mass of Beta distributions on the grid of rates, from means and correlations (..., h); shape (..., h, g)."""
-    a, b = _beta(mean, correlation)
-    return np.diff(betainc(a[..., None], b[..., None], _EDGES), axis=-1)
 
 
 def _likelihood(won: Array, driven: Array) -> Array:
