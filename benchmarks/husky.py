@@ -20,10 +20,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from acceptance import plane, terrain
+from acceptance import Row, Subject, plane, terrain
 from acceptance.drives import on_ground, on_plane
 from acceptance.grounds import reconstructed
-from acceptance.rows import Row, Subject
 from record import add_record_options, save
 
 from twin.assets.ground import Ground

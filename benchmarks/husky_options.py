@@ -16,9 +16,9 @@ from dataclasses import asdict, dataclass
 
 import mujoco
 import numpy as np
+from acceptance import GRAVITY
 from acceptance.drives import drive, on_ground, on_plane
 from acceptance.grounds import reconstructed
-from acceptance.rows import GRAVITY
 from record import add_record_options, save
 
 from twin.assets.ground import Ground
