@@ -212,8 +212,8 @@ def aligned(twist: bool = True, drive_errors=None, ground_errors=None, **robot) 
     drive = drivetrain.Drivetrain.from_robot(params, twist)
     prediction = Prediction("made up", windows, kinematics.predict(kinematics.NOMINAL, windows), wheels + 0.1)
     fits = [
-        Fit({}, drive_errors or {}, {}, 0.0),
-        Fit({"pose_x": 0.0, "pose_y": 0.0, "pose_late": 0.0}, ground_errors or {}, {}, 0.0),
+        Fit({}, drive_errors or {}, {}),
+        Fit({"pose_x": 0.0, "pose_y": 0.0, "pose_late": 0.0}, ground_errors or {}, {}),
     ]
     return Identification(windows, kinematics.NOMINAL, drive, *fits, params, *[prediction] * 4)
 
