@@ -76,42 +76,28 @@ _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
 }
 
 
+_COPIED = ("friction", "spin_friction", "rolling_resistance", "ground_viscosity")  # equal in `HuskyParams`
+
+
 def robot_with_values(params: HuskyParams, values: dict[str, float]) -> HuskyParams:
     """A robot with fitted values in its fields, and those of `params` in the others."""
-    x, y, z = params.center_of_mass
-    left, right = params.wheel_radius
+    x, y, z = (values[f"center_of_mass_{axis}"] for axis in "xyz")
     return replace(
         params,
-        friction=values["friction"],
-        spin_friction=values["spin_friction"],
-        rolling_resistance=values["rolling_resistance"],
+        **{name: values[name] for name in _COPIED},  # type: ignore[arg-type]
         slip_stiffness=1 / values["creep"],
-        ground_viscosity=values["ground_viscosity"],
-        center_of_mass=(
-            values.get("center_of_mass_x", x),
-            values.get("center_of_mass_y", y),
-            values.get("center_of_mass_z", z),
-        ),
-        wheel_radius=(values.get("radius_left", left), values.get("radius_right", right)),
+        center_of_mass=(x, y, z),
+        wheel_radius=(values["radius_left"], values["radius_right"]),
         servo_gain=10 ** values["log10_servo_gain"],
     )
 
 
 def values_of_robot(params: HuskyParams) -> dict[str, float]:
     """The parameters of a robot, with a pose sensor at its origin and without delay."""
-    x, y, z = params.center_of_mass
-    left, right = params.wheel_radius
-    return {
-        "friction": params.friction,
-        "spin_friction": params.spin_friction,
-        "rolling_resistance": params.rolling_resistance,
-        "creep": 1 / params.slip_stiffness,
-        "ground_viscosity": params.ground_viscosity,
-        "center_of_mass_x": x,
-        "center_of_mass_y": y,
-        "center_of_mass_z": z,
-        "radius_left": left,
-        "radius_right": right,
+    values = {name: getattr(params, name) for name in _COPIED} | {"creep": 1 / params.slip_stiffness}
+    values |= {f"center_of_mass_{axis}": at for axis, at in zip("xyz", params.center_of_mass, strict=True)}
+    values |= dict(zip(("radius_left", "radius_right"), params.wheel_radius, strict=True))
+    return values | {
         "log10_servo_gain": float(np.log10(params.servo_gain)),
         "pose_x": 0.0,
         "pose_y": 0.0,
