@@ -190,17 +190,17 @@ def main() -> int:
         lines = list(settings)
         for k, (name, one) in enumerate(sources.items()):
             film = options.scene / one["path"]
-            if kind != "bags":
-                shutil.copyfile(film, root / "input" / film.name)
-                camera = one["camera"]
-                lines += ["[[source]]", f'path = "input/{film.name}"', f"lighting = {toml_string(one['lighting'])}"]
-                lines += [
-                    f'camera = {{ model = "{camera["model"]}", params = {camera["params"]}, '
-                    f"width = {camera['width']}, height = {camera['height']} }}"
-                ]
-            else:
-                write_bag(root / "input" / name, film, truth, name, k)
-                lines += ["[[source]]", f'path = "input/{name}"', f"lighting = {toml_string(one['lighting'])}"]
+            file = name if kind == "bags" else film.name
+            lines += ["[[source]]", f'path = "input/{file}"', f"lighting = {toml_string(one['lighting'])}"]
+            if kind == "bags":
+                write_bag(root / "input" / file, film, truth, name, k)
+                continue
+            shutil.copyfile(film, root / "input" / file)
+            camera = one["camera"]
+            lines.append(
+                f'camera = {{ model = "{camera["model"]}", params = {camera["params"]}, '
+                f"width = {camera['width']}, height = {camera['height']} }}"
+            )
         write_text(root / "scene.toml", "\n".join(lines) + "\n")
     shown = options.work / "new"
     remove(shown)
