@@ -80,12 +80,12 @@ def test_visual_vs_collision_drives_the_robot_of_the_scene(scripts, monkeypatch,
 
 
 def test_peak_memory_is_that_of_this_process(scripts):
-    from field_workers import peak_bytes
+    from fuzzing.cases import peak_memory
 
-    before = peak_bytes()
+    before = peak_memory()
     block = bytearray(64 * 2**20)
     block[::4096] = b"x" * len(block[::4096])
-    assert 32 * 2**20 < peak_bytes() < before + 512 * 2**20
+    assert 32 * 2**20 < peak_memory() < before + 512 * 2**20
 
 
 @pytest.mark.realdata
