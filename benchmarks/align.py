@@ -8,7 +8,6 @@ The folder `--data` contains the logs `husky_drive` and `borealtc_asphalt`. A ru
 the machine in `docs/benchmarks.md`. The exit status is 1 if a target is missed.
 """
 
-import argparse
 import json
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import motor_currents
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin import runtime
 from twin.align import align_to_log, summary
@@ -79,12 +78,11 @@ def verdicts(figures: dict[str, Any]) -> list[tuple[str, float, float, bool]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser = record_parser(__doc__)
     parser.add_argument("--data", type=Path, default=_DATA, help="folder of the real logs")
     parser.add_argument(
         "--work", type=Path, help="folder for robot.toml, align.json and the plots (default: a temporary one)"
     )
-    add_record_options(parser)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         work = options.work or Path(scratch)

@@ -11,7 +11,6 @@ builds, and the error of each scale. With --again, the scene is built from the f
 builds from the same input differ.
 """
 
-import argparse
 import shutil
 import sys
 import tomllib
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from record import add_record_options, save
+from record import record_parser, save
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "ros2" / "twin_policy"))
@@ -169,14 +168,13 @@ def figures(root: Path, report: dict[str, Any]) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Builds a generated place from films and from bags made of them.")
+    parser = record_parser(__doc__)
     parser.add_argument("scene", type=Path, help="a folder written by `twin reality film`")
     parser.add_argument("--work", type=Path, required=True, help="folder for the bags and the scenes")
     parser.add_argument("--films", nargs="+", metavar="NAME", help="default: all")
     parser.add_argument("--again", action="store_true", help="build the scene from the films twice")
     parser.add_argument("--until", choices=("metric", "mjcf"), default="mjcf", help="last stage (default %(default)s)")
     parser.add_argument("--quick", action="store_true", help="train a small field, enough for a tiny place")
-    add_record_options(parser)
     options = parser.parse_args()
     truth = Truth.load(options.scene / "truth")
     table = tomllib.loads((options.scene / "scene.toml").read_text())

@@ -8,7 +8,6 @@ program should use meanwhile. Without --policy, the benchmark measures policies 
 `twin train`'s presets.
 """
 
-import argparse
 import os
 import sys
 import tempfile
@@ -18,7 +17,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from record import add_record_options, save
+from record import record_parser, save
 from sections import verdict
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "ros2" / "twin_policy"))
@@ -76,10 +75,9 @@ def measure(policy: OnnxPolicy, kind: str, count: int) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--policy", type=Path, help="policy folder")
     parser.add_argument("--count", type=int, default=1000, help="number of pictures of each kind")
-    add_record_options(parser)
     options = parser.parse_args()
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     cv2.setNumThreads(1)

@@ -7,13 +7,12 @@ whole route in a scene that has neither. Speeds are for 160×90 images, 10 Hz co
 of one to eight short runs in a separate process that is bound to the stated number of cores.
 """
 
-import argparse
 import platform
 import sys
 from functools import partial
 from pathlib import Path
 
-from record import add_record_options
+from record import record_parser
 from sections import run_sections, versions
 
 TARGETS: dict[str, tuple[str, float]] = {
@@ -37,10 +36,9 @@ TARGETS: dict[str, tuple[str, float]] = {
 def main() -> int:
     from env_sections import SECTIONS
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--scene", type=Path, required=True, help="a built scene, such as scenes/demo")
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
-    add_record_options(parser)
     parser.add_argument("--quick", action="store_true", help="tiny settings that only test the script")
     options = parser.parse_args()
     packages = versions("twin", "mujoco", "mujoco-warp", "warp-lang", "numpy")

@@ -7,7 +7,6 @@ Prints a table; `field_sections.py` defines each figure. `fox` reads the real ca
 a complete build and write nothing into the scene. A full run takes about 35 minutes on an otherwise idle machine.
 """
 
-import argparse
 import platform
 import sys
 import tempfile
@@ -15,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from field_common import Bench
-from record import add_record_options
+from record import record_parser
 from sections import run_sections, versions
 
 from twin.runtime import available_cores
@@ -45,11 +44,10 @@ TARGETS: dict[str, tuple[str, float]] = {
 def main() -> int:
     from field_sections import NEED_SCENE, SECTIONS
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--scene", type=Path, help="a built scene, such as scenes/demo")
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared/data")
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
-    add_record_options(parser)
     parser.add_argument(
         "--budgets",
         nargs="+",

@@ -7,7 +7,6 @@ simulation speed there. A run takes 40 s on the machine in `docs/benchmarks.md`.
 a negative control passes.
 """
 
-import argparse
 import math
 import platform
 import sys
@@ -23,7 +22,7 @@ import numpy as np
 from acceptance import Row, Subject, plane, terrain
 from acceptance.drives import on_ground, on_plane
 from acceptance.grounds import reconstructed
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.assets.ground import Ground
 from twin.loading import load_scene
@@ -151,11 +150,10 @@ def line(row: Row) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--scene", type=Path, help="a built scene")
     kinds = "row ids such as B6; `controls` for the negative controls; `speed` for the simulation speed"
     parser.add_argument("--only", nargs="+", metavar="ID", help=kinds)
-    add_record_options(parser)
     arguments = parser.parse_args()
 
     def wanted(*names: str) -> bool:

@@ -8,7 +8,6 @@ that the contacts dissipate (1 if energy is conserved); vertical acceleration at
 robot when parked on a slope (creep). A run takes 20 s.
 """
 
-import argparse
 import math
 import sys
 from collections.abc import Callable
@@ -19,7 +18,7 @@ import numpy as np
 from acceptance import GRAVITY
 from acceptance.drives import drive, on_ground, on_plane
 from acceptance.grounds import reconstructed
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.assets.ground import Ground
 from twin.mjcf.husky import check
@@ -125,8 +124,7 @@ def measure(edit: Edit | None, road: Ground) -> Cost:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_record_options(parser)
+    parser = record_parser(__doc__)
     arguments = parser.parse_args()
     road = reconstructed(np.random.default_rng(0))
     rows = {name: measure(edit, road) for name, edit in CASES.items()}

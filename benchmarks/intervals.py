@@ -31,15 +31,14 @@ fraction of such worlds over the agreement statistics. In shapes of more than te
 quarter of the worlds. The seed is fixed. A run takes ten minutes on one core.
 """
 
-import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from record import record_parser, save
 from scipy.special import expit
 from scipy.stats import norm
 
@@ -52,9 +51,6 @@ from twin.evaluation.jackknife import (
 )
 from twin.evaluation.rate_model import MIN_RATE_DAYS, MIN_SETUP_TRAININGS, RateModel
 from twin.evaluation.statistics import MIN_PREDICTORS, UndefinedStatistic, leave_one_group_out, rate_over_days
-
-sys.path.append(str(Path(__file__).parent))
-from record import add_record_options, save
 
 WORLDS = 1000
 _MEAN_OVER = 6000  # worlds from which the mean of a statistic is estimated
@@ -362,10 +358,9 @@ def _predicted(worlds: Worlds) -> Hits:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--worlds", type=int, default=WORLDS)
     parser.add_argument("--shapes", nargs="+", default=[], help="beginnings of the names of shapes (default: all)")
-    add_record_options(parser)
     given = parser.parse_args()
     shapes = {k: v for k, v in SHAPES.items() if not given.shapes or k.startswith(tuple(given.shapes))}
     record: dict[str, Any] = {"worlds": given.worlds, "shapes": {}}

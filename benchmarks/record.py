@@ -19,6 +19,13 @@ _LISTED = 4
 """Number of missing entries that an error names."""
 
 
+def record_parser(description: str | None) -> argparse.ArgumentParser:
+    """A parser with the options of `add_record_options`; `description` is the script's docstring."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_record_options(parser)
+    return parser
+
+
 def add_record_options(parser: argparse.ArgumentParser) -> None:
     """Adds `--json` and `--replace-record`."""
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure here")

@@ -9,7 +9,6 @@ its first fifth. The number of cores that other programs use is measured, too: s
 number is small.
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -21,7 +20,7 @@ from typing import Any
 import numpy as np
 import psutil
 from chromium import Chromium, find_chromium
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.errors import print_error
 
@@ -239,10 +238,9 @@ def measure(scene: Path, minutes: float) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--scene", type=Path, required=True, help="a built scene")
     parser.add_argument("--minutes", type=float, default=5.0, help="minutes of random clicking (default %(default)g)")
-    add_record_options(parser)
     given = parser.parse_args(arguments)
     if find_chromium() is None:
         return print_error("Chromium is not installed; install Debian's package chromium")
