@@ -45,19 +45,10 @@ _AHEAD, _BASE = 0.36, 0.13  # [m] lens ahead of the base, base above the ground
 _EARTH = 6_378_137.0  # [m] radius
 _QUICK = ("nerf.steps=400", "nerf.rays=2048", "nerf.max_width=240", "nerf.bake_steps=60", "nerf.max_bricks=2500")
 FIGURES = (
-    ("capture", "frames"),
-    ("cameras", "registered"),
-    ("cameras", "points"),
-    ("cameras", "reprojection_error_px"),
-    ("metric", "camera_height_median_m"),
-    ("metric", "path_length_m"),
-    ("metric", "scale_uncertainty"),
-    ("field", "psnr"),
-    ("mesh", "parts"),
-    ("mjcf", "route_length_m"),
-    ("truth", "ate_m"),
-    ("truth", "scale_error"),
-    ("truth", "ground_median_m"),
+    *(("capture", "frames"), ("cameras", "registered"), ("cameras", "points"), ("cameras", "reprojection_error_px")),
+    *(("metric", "camera_height_median_m"), ("metric", "path_length_m"), ("metric", "scale_uncertainty")),
+    *(("field", "psnr"), ("mesh", "parts"), ("mjcf", "route_length_m")),
+    *(("truth", "ate_m"), ("truth", "scale_error"), ("truth", "ground_median_m")),
 )
 
 

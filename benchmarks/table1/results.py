@@ -18,14 +18,7 @@ _BY_DAY = ("validate_by_photo", "real")
 HELD_OUT_FORECAST = "forecast_held_out"
 """Folder of the forecast from held-out lightings, if the folder `forecast` has the one from photos."""
 FORECAST = (
-    "pearson",
-    "spearman",
-    "mmrv",
-    "winner_agreement",
-    "winner_regret",
-    "bias",
-    "coverage",
-    "corrected_coverage",
+    *("pearson", "spearman", "mmrv", "winner_agreement", "winner_regret", "bias", "coverage", "corrected_coverage"),
 )
 
 
