@@ -375,7 +375,7 @@ def tables(results: dict[str, Any]) -> str:
     heads = "policies | Spearman | Pearson | MMRV | regret | road minus predicted | cells that agree"
     heads += " | real rate in predicted interval"
     lines += ["", "Ranking of all policies, finished and checkpoints, by predictor, with 90 % intervals", ""]
-    lines += [f"| days | task | predictor | {heads} |", f"|---|---|---|{'---|' * 8}"]
+    lines += [f"| days | task | predictor | {heads} |", f"|---|---|---|{'---|' * (heads.count('|') + 1)}"]
     for group, days in GROUPS.items():
         for task in ("both tasks", *TASKS.values()):
             mine = [policy for policy in policies if task in ("both tasks", policy.task)]
