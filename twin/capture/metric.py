@@ -51,7 +51,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     level, floor_source = _ground_level(cameras, points.xyz, up.direction, road)
     east: Array | None = None
     scales: dict[str, Scale] = {}
-    if max(given.camera_height, *heights.values()) > 0:
+    if max((given.camera_height, *heights.values())) > 0:
         scales["camera_height"] = scale_from_height(cameras, up, points.xyz, road, given, heights)
     if given.distance is not None:
         if road is None and not given.distance.frame_b:

@@ -310,14 +310,16 @@ def _probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> dict
     if several:
         logs[SHUFFLED] = shuffled_days(probability, data.weight, data.real, log_score)
         briers[SHUFFLED] = shuffled_days(probability, data.weight, data.real, brier)
+    gains = {TWIN: Estimate(missing="compared with itself")}
+    for name in list(logs)[1:]:
+        pair = score_pair(data, logs[TWIN], logs[name])
+        gains[name] = _with_interval(float(mean_bias(**pair.rates())), SCORE_DIFFERENCE, pair, data.cells)
     scores = tuple(
         PredictorScore(
             name,
             Estimate(mean_score(data, briers[name]), n=data.cells),
             Estimate(mean_score(data, logs[name]), n=data.cells),
-            _gain(score_pair(data, logs[TWIN], logs[name]))
-            if name != TWIN
-            else Estimate(missing="compared with itself"),
+            gains[name],
         )
         for name in logs
     )
@@ -329,10 +331,6 @@ def _probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> dict
         "calibration": calibration(probability[used], data.real[used], trials),
         "errors": errors_by_day(probability[used], data.real[used], [cell.lighting for cell in cells]),
     }
-
-
-def _gain(pair: PairedCells) -> Estimate:
-    return _with_interval(float(mean_bias(**pair.rates())), SCORE_DIFFERENCE, pair, pair.cells)
 
 
 def _twin_probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> tuple[Array, bool]:
