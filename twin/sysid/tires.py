@@ -8,6 +8,7 @@ speeds. The height of the center of mass is fitted only on slopes, as poses on l
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,10 +82,11 @@ _COPIED = ("friction", "spin_friction", "rolling_resistance", "ground_viscosity"
 
 def robot_with_values(params: HuskyParams, values: dict[str, float]) -> HuskyParams:
     """A robot with fitted values in its fields, and those of `params` in the others."""
+    copied: dict[str, Any] = {name: values[name] for name in _COPIED}
     x, y, z = (values[f"center_of_mass_{axis}"] for axis in "xyz")
     return replace(
         params,
-        **{name: values[name] for name in _COPIED},  # type: ignore[arg-type]
+        **copied,
         slip_stiffness=1 / values["creep"],
         center_of_mass=(x, y, z),
         wheel_radius=(values["radius_left"], values["radius_right"]),
