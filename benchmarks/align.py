@@ -12,7 +12,6 @@ The folder `--data` contains the logs `husky_drive` and `borealtc_asphalt`. A ru
 the machine in `docs/benchmarks.md`. The exit status is 1 if a target is missed.
 """
 
-import argparse
 import json
 import sys
 import tempfile
@@ -23,7 +22,7 @@ from typing import Any
 import motor_currents
 import numpy as np
 from numpy.typing import NDArray
-from record import add_record_options, save
+from record import record_parser, save
 from scipy.optimize import least_squares
 
 from twin import runtime
@@ -177,13 +176,12 @@ def verdicts(figures: dict[str, Any]) -> list[tuple[str, float, float, bool]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser = record_parser(__doc__)
     parser.add_argument("--data", type=Path, default=_DATA, help="folder of the real logs")
     parser.add_argument(
         "--work", type=Path, help="folder for robot.toml, align.json and the plots (default: a temporary one)"
     )
     parser.add_argument("--last-third", action="store_true", help="score the last third of the log on grass only")
-    add_record_options(parser)
     options = parser.parse_args()
     if options.last_third:
         figures = last_third(options.data)

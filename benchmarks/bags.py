@@ -11,7 +11,6 @@ builds, and the error of each scale. With --again, the scene is built from the f
 builds from the same input differ.
 """
 
-import argparse
 import shutil
 import sys
 import tomllib
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from record import add_record_options, save
+from record import record_parser, save
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "ros2" / "twin_policy"))
@@ -46,19 +45,10 @@ _AHEAD, _BASE = 0.36, 0.13  # [m] lens ahead of the base, base above the ground
 _EARTH = 6_378_137.0  # [m] radius
 _QUICK = ("nerf.steps=400", "nerf.rays=2048", "nerf.max_width=240", "nerf.bake_steps=60", "nerf.max_bricks=2500")
 FIGURES = (
-    ("capture", "frames"),
-    ("cameras", "registered"),
-    ("cameras", "points"),
-    ("cameras", "reprojection_error_px"),
-    ("metric", "camera_height_median_m"),
-    ("metric", "path_length_m"),
-    ("metric", "scale_uncertainty"),
-    ("field", "psnr"),
-    ("mesh", "parts"),
-    ("mjcf", "route_length_m"),
-    ("truth", "ate_m"),
-    ("truth", "scale_error"),
-    ("truth", "ground_median_m"),
+    *(("capture", "frames"), ("cameras", "registered"), ("cameras", "points"), ("cameras", "reprojection_error_px")),
+    *(("metric", "camera_height_median_m"), ("metric", "path_length_m"), ("metric", "scale_uncertainty")),
+    *(("field", "psnr"), ("mesh", "parts"), ("mjcf", "route_length_m")),
+    *(("truth", "ate_m"), ("truth", "scale_error"), ("truth", "ground_median_m")),
 )
 
 
@@ -99,7 +89,9 @@ def write_bag(path: Path, film: Path, truth: Truth, name: str, seed: int) -> Non
             header(grid[k] - times[0], "gps"), status, latitude, longitude, 100.0, np.zeros(9), 2
         )
         add(grid[k] - times[0], "/fix", "sensor_msgs/msg/NavSatFix", fix)
-    frames = [("base_link", "base_footprint", _at(0.0, 0.0, -_BASE)), ("base_link", "camera", seat)]
+    footprint = np.eye(4)
+    footprint[2, 3] = -_BASE
+    frames = [("base_link", "base_footprint", footprint), ("base_link", "camera", seat)]
     transforms = [_transform(types, header(0.0, parent), child, pose) for parent, child, pose in frames]
     add(0.0, "/tf_static", "tf2_msgs/msg/TFMessage", types["tf2_msgs/msg/TFMessage"](transforms))
     topics: dict[str, Any] = {}
@@ -140,12 +132,6 @@ def _drifted(base: np.ndarray) -> np.ndarray:
     return out
 
 
-def _at(x: float, y: float, z: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, 3] = x, y, z
-    return pose
-
-
 def _transform(types: Any, header: Any, child: str, pose: np.ndarray) -> Any:
     rotation = types["geometry_msgs/msg/Quaternion"](*Rotation.from_matrix(pose[:3, :3]).as_quat().tolist())
     shift = types["geometry_msgs/msg/Vector3"](*pose[:3, 3].tolist())
@@ -173,14 +159,13 @@ def figures(root: Path, report: dict[str, Any]) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Builds a generated place from films and from bags made of them.")
+    parser = record_parser(__doc__)
     parser.add_argument("scene", type=Path, help="a folder written by `twin reality film`")
     parser.add_argument("--work", type=Path, required=True, help="folder for the bags and the scenes")
     parser.add_argument("--films", nargs="+", metavar="NAME", help="default: all")
     parser.add_argument("--again", action="store_true", help="build the scene from the films twice")
     parser.add_argument("--until", choices=("metric", "mjcf"), default="mjcf", help="last stage (default %(default)s)")
     parser.add_argument("--quick", action="store_true", help="train a small field, enough for a tiny place")
-    add_record_options(parser)
     options = parser.parse_args()
     truth = Truth.load(options.scene / "truth")
     table = tomllib.loads((options.scene / "scene.toml").read_text())
@@ -194,17 +179,17 @@ def main() -> int:
         lines = list(settings)
         for k, (name, one) in enumerate(sources.items()):
             film = options.scene / one["path"]
-            if kind != "bags":
-                shutil.copyfile(film, root / "input" / film.name)
-                camera = one["camera"]
-                lines += ["[[source]]", f'path = "input/{film.name}"', f"lighting = {toml_string(one['lighting'])}"]
-                lines += [
-                    f'camera = {{ model = "{camera["model"]}", params = {camera["params"]}, '
-                    f"width = {camera['width']}, height = {camera['height']} }}"
-                ]
-            else:
-                write_bag(root / "input" / name, film, truth, name, k)
-                lines += ["[[source]]", f'path = "input/{name}"', f"lighting = {toml_string(one['lighting'])}"]
+            file = name if kind == "bags" else film.name
+            lines += ["[[source]]", f'path = "input/{file}"', f"lighting = {toml_string(one['lighting'])}"]
+            if kind == "bags":
+                write_bag(root / "input" / file, film, truth, name, k)
+                continue
+            shutil.copyfile(film, root / "input" / file)
+            camera = one["camera"]
+            lines.append(
+                f'camera = {{ model = "{camera["model"]}", params = {camera["params"]}, '
+                f"width = {camera['width']}, height = {camera['height']} }}"
+            )
         write_text(root / "scene.toml", "\n".join(lines) + "\n")
     shown = options.work / "new"
     remove(shown)
@@ -230,9 +215,7 @@ def main() -> int:
         error = camera_errors(cameras.camera_to_world, matched_poses(truth, cameras))["scale_error"]
         scales[name] = {"scale_error": error, "uncertainty": metric["scale_uncertainty"]}
         print(f"scale by {name}: {error:+.2%} from the truth, stated uncertainty {metric['scale_uncertainty']:.2%}")
-    if options.json:
-        save(options.json, {"builds": results, "same_frames": same, "scales": scales}, options.replace_record)
-    return 0
+    return save(options.json, {"builds": results, "same_frames": same, "scales": scales}, options.replace_record)
 
 
 def _same_pictures(scenes: dict[str, Path]) -> float:

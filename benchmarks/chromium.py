@@ -62,11 +62,7 @@ class Chromium:
             for domain in ("Page", "Runtime", "Log", "DOM"):
                 self.call(f"{domain}.enable")
             self.call(
-                "Emulation.setDeviceMetricsOverride",
-                width=size[0],
-                height=size[1],
-                deviceScaleFactor=1,
-                mobile=False,
+                "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False
             )
         except BaseException:
             self.close()

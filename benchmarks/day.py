@@ -9,14 +9,13 @@ policies' change of steering from rendering to image, divided by the change that
 *Lasting* change: rms over days of the mean over stations. *Local* change: rms of the deviations from this mean.
 """
 
-import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.env.domain_randomization import EVALUATION_RANGES, KNOWN_WEATHER_FRACTION, RandomizationSample
 from twin.env.mujoco_renderer import camera_intrinsics
@@ -86,13 +85,12 @@ def ratios(gaps: list[NDArray], randomised: list[NDArray], rng: np.random.Genera
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument(
         "--days", nargs="+", choices=WEATHER, default=list(WEATHER), metavar="NAME", help="default: all"
     )
     parser.add_argument("--policies", nargs="*", default=[], help="runs of the scene; names begin with the task")
-    add_record_options(parser)
     parser.add_argument(
         "--pictures", type=Path, help="folder for images: the day, the twin, the twin with randomized weather"
     )

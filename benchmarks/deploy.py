@@ -8,7 +8,6 @@ program should use meanwhile. Without --policy, the benchmark measures policies 
 `twin train`'s presets.
 """
 
-import argparse
 import os
 import sys
 import tempfile
@@ -18,7 +17,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from record import add_record_options, save
+from record import record_parser, save
+from sections import verdict
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "ros2" / "twin_policy"))
 
@@ -75,10 +75,9 @@ def measure(policy: OnnxPolicy, kind: str, count: int) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--policy", type=Path, help="policy folder")
     parser.add_argument("--count", type=int, default=1000, help="number of pictures of each kind")
-    add_record_options(parser)
     options = parser.parse_args()
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     cv2.setNumThreads(1)
@@ -98,11 +97,8 @@ def main() -> int:
             for kind in _KINDS:
                 record[f"{name}.{kind}"] = figures = measure(policy, kind, options.count)
                 for figure, value in figures.items():
-                    sense, wanted = TARGETS.get(figure, ("", 0.0))
-                    met = {"≥": value >= wanted, "≤": value <= wanted}.get(sense)
-                    verdict = "" if met is None else "yes" if met else "no"
-                    target = f"{sense} {wanted:g}" if sense else ""
-                    print(f"{f'{name}.{kind}.{figure}':36} {value:12.4g} {target:>10}  {verdict}")
+                    wanted, met = verdict(figure, figures, TARGETS)
+                    print(f"{f'{name}.{kind}.{figure}':36} {value:12.4g} {wanted:>10}  {met}")
     return save(options.json, record, options.replace_record)
 
 

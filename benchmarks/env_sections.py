@@ -1,40 +1,22 @@
 """Sections of `env.py`. Each takes a built scene and a flag `quick` for a shorter run, and returns figures by name."""
 
-import json
 import os
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from env_workers import standard_tasks
-
-_HERE = Path(__file__).parent
+from sections import run_worker
 
 
 def worker(*arguments: str | Path | int, cores: int = 1) -> dict[str, Any]:
-    """Figures of a function of `env_workers.py`, run in a separate process that is bound to `cores` cores.
-
-    Raises:
-        RuntimeError: the process failed.
-    """
-    command = [sys.executable, str(_HERE / "env_workers.py"), *map(str, arguments)]
-    path = os.pathsep.join(filter(None, [str(_HERE.parent), os.environ.get("PYTHONPATH", "")]))
+    """Figures of a function of `env_workers.py`, run in a process that is bound to `cores` cores; see `run_worker`."""
     threads = {"OMP_NUM_THREADS": str(cores), "OPENBLAS_NUM_THREADS": str(cores)}
     # MuJoCo selects its OpenGL at import; these select Mesa's software renderer.
     threads |= {"MUJOCO_GL": "egl", "LIBGL_ALWAYS_SOFTWARE": "1"}
     own = sorted(os.sched_getaffinity(0))[:cores]
-    done = subprocess.run(
-        ["taskset", "-c", ",".join(map(str, own)), *command],
-        env=os.environ | threads | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode:
-        raise RuntimeError(f"{' '.join(map(str, arguments))}:\n{done.stderr[-3000:]}")
-    return json.loads(done.stdout.splitlines()[-1])
+    return run_worker("env_workers.py", arguments, threads, ("taskset", "-c", ",".join(map(str, own))))
 
 
 def speed(scene: Path, quick: bool) -> dict[str, Any]:
@@ -110,7 +92,7 @@ def soak(scene: Path, quick: bool) -> dict[str, Any]:
 
 
 def trust(scene: Path, quick: bool) -> dict[str, Any]:
-    """Validity of the trust score (`env_trust.py`): rendered depth error by trust, on and off the filmed path."""
+    """Validity of the trust score (`env_workers.py`): rendered depth error by trust, on and off the filmed path."""
     return worker("trust", scene, cores=2)
 
 

@@ -31,12 +31,7 @@ from twin.warp_runtime import wp
 
 @wp.kernel
 def _hit(
-    mesh: wp.uint64,
-    eye: wp.vec3,
-    rays: wp.array[wp.vec3],
-    face: wp.array[int],
-    u: wp.array[float],
-    v: wp.array[float],
+    mesh: wp.uint64, eye: wp.vec3, rays: wp.array[wp.vec3], face: wp.array[int], u: wp.array[float], v: wp.array[float]
 ):
     i = wp.tid()
     hit = wp.mesh_query_ray(mesh, eye, rays[i], 1.0e3)

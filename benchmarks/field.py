@@ -7,16 +7,17 @@ Prints a table; `field_sections.py` defines each figure. `fox` reads the real ca
 a complete build and write nothing into the scene. A full run takes about 35 minutes on an otherwise idle machine.
 """
 
-import argparse
 import platform
 import sys
 import tempfile
-from importlib import metadata
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from field_common import Bench
-from record import add_record_options, save, write_so_far
+from record import record_parser
+from sections import run_sections, versions
+
+from twin.runtime import available_cores
 
 TARGETS: dict[str, tuple[str, float]] = {
     "fox.psnr_60s": ("≥", 24.0),
@@ -40,41 +41,13 @@ TARGETS: dict[str, tuple[str, float]] = {
 """Figure → comparison and target. A PSNR within a budget also fails if training exceeded the budget."""
 
 
-def verdict(name: str, figures: dict[str, Any]) -> tuple[str, str]:
-    """A figure's target and "yes" or "no"; empty strings for a figure without a target.
-
-    If training exceeded the budget of a PSNR, the second text is "no" with the time it took, even without a target.
-    """
-    sense, wanted = TARGETS.get(name, (None, 0.0))
-    overtime = ""
-    section, _, rest = name.rpartition(".")
-    if rest.startswith("psnr_") and rest.split("_")[1].removesuffix("s").isdigit():
-        budget = rest.split("_")[1]
-        wall = figures.get(f"{section}.seconds_{budget}", 0.0)
-        if wall > float(budget.removesuffix("s")):
-            overtime = f"no, took {wall:.1f} s"
-    if sense is None:
-        return "", overtime
-    value = figures[name]
-    met = value is not None and (value <= wanted if sense == "≤" else value >= wanted)
-    return f"{sense} {wanted:.4g}", overtime or ("yes" if met else "no")
-
-
-def format_figure(value: Any) -> str:
-    """A figure as text for the table."""
-    if isinstance(value, float):
-        return f"{value:.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
-    return f"{value:,}" if isinstance(value, int) else str(value)
-
-
 def main() -> int:
     from field_sections import NEED_SCENE, SECTIONS
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--scene", type=Path, help="a built scene, such as scenes/demo")
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared/data")
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), metavar="SECTION")
-    add_record_options(parser)
     parser.add_argument(
         "--budgets",
         nargs="+",
@@ -91,34 +64,12 @@ def main() -> int:
     if "fox" in sections and not (options.data / "fox").is_dir():
         parser.error(f"no folder fox in {options.data}; give another --data, or leave the section out with --only")
 
-    figures: dict[str, Any] = {}
-    record: dict[str, Any] = {}
-    print(f"{'figure':32} {'value':>16} {'target':>12}  met")
+    packages = versions("twin", "torch", "warp-lang", "numpy")
+    about = {"cores": available_cores(), "machine": platform.machine(), "versions": packages, "quick": options.quick}
     with tempfile.TemporaryDirectory() as work:
         bench = Bench(options.scene, options.data, Path(work), tuple(options.budgets), options.quick)
-        for section in sections:
-            found = SECTIONS[section](bench)
-            figures |= found
-            for name in found:
-                wanted, met = verdict(name, figures)
-                print(f"{name:32} {format_figure(figures[name]):>16} {wanted:>12}  {met}".rstrip(), flush=True)
-            if options.json:  # after every section, so that an interrupted run keeps its figures
-                record = figures | {"about": about(options)}
-                write_so_far(options.json, record)
-    return save(options.json, record, options.replace_record)
-
-
-def about(options: argparse.Namespace) -> dict[str, Any]:
-    """Machine and package versions of the measurement."""
-    from twin.nerf import buffers
-
-    packages = {name: metadata.version(name) for name in ("twin", "torch", "warp-lang", "numpy")}
-    return {
-        "cores": buffers.available_cores(),
-        "machine": platform.machine(),
-        "versions": packages,
-        "quick": options.quick,
-    }
+        chosen = [partial(SECTIONS[name], bench) for name in sections]
+        return run_sections(chosen, TARGETS, about, options.json, options.replace_record)
 
 
 if __name__ == "__main__":

@@ -1,20 +1,15 @@
 """Settings of a run of `field.py`, and functions that load fields, render and start workers."""
 
-import json
-import os
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sections import run_worker
 
 SIZE = (160, 90)
 """Width, height of the robot's image [px]."""
-
-_HERE = Path(__file__).parent
 
 
 @dataclass(frozen=True)
@@ -62,18 +57,8 @@ def render(field: Any, poses: NDArray, intrinsics: NDArray, size: tuple[int, int
 
 
 def worker(*arguments: str | Path | int, environment: dict[str, str] | None = None) -> dict[str, Any]:
-    """Figures of a function of `field_workers.py`, run in a process of its own with clean memory and caches.
-
-    Raises:
-        RuntimeError: the process failed.
-    """
-    command = [sys.executable, str(_HERE / "field_workers.py"), *map(str, arguments)]
-    path = os.pathsep.join(filter(None, [str(_HERE.parent), os.environ.get("PYTHONPATH", "")]))
-    settings = os.environ | {"PYTHONPATH": path} | (environment or {})
-    done = subprocess.run(command, env=settings, capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(f"{' '.join(map(str, arguments))}:\n{done.stderr[-3000:]}")
-    return json.loads(done.stdout.splitlines()[-1])
+    """Figures of a function of `field_workers.py`, see `run_worker`."""
+    return run_worker("field_workers.py", arguments, environment or {})
 
 
 def route_views(bench: Bench) -> Path:

@@ -140,6 +140,7 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
     from dataclasses import replace
 
     import numpy as np
+    from fuzzing.cases import peak_memory
 
     from twin.config_file import load_config
     from twin.files import read_json
@@ -160,21 +161,7 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
         cameras.select(chosen), points, replace(config.nerf, steps=int(steps)), config.seed, height, "cpu"
     )
     size = cameras.sizes[0] * min(1.0, config.nerf.max_width / cameras.sizes[0].max())
-    return {"peak_bytes": peak_bytes(), "frames": len(trained.appearance.frames), "size": np.rint(size).tolist()}
-
-
-def peak_bytes() -> int:
-    """Peak resident memory of this process [bytes].
-
-    Linux measures it from the start of the program; `getrusage` also includes the parent's memory at the fork.
-    """
-    status = Path("/proc/self/status")
-    if status.exists():
-        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
-        return int(line.split()[1]) * 1024
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return {"peak_bytes": peak_memory(), "frames": len(trained.appearance.frames), "size": np.rint(size).tolist()}
 
 
 def _views(file: str, count: int, lightings: tuple[str, ...]) -> tuple[Any, Any, list[str]]:

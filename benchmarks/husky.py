@@ -7,30 +7,95 @@ simulation speed there. A run takes 40 s on the machine in `docs/benchmarks.md`.
 a negative control passes.
 """
 
-import argparse
 import math
 import platform
 import sys
 import time
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+from acceptance import Row, Subject, plane, terrain
 from acceptance.drives import on_ground, on_plane
 from acceptance.grounds import reconstructed
-from acceptance.rows import Row, Subject
-from acceptance.table import CONTROLS, MEASURES
-from acceptance.terrain import chi_on
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.assets.ground import Ground
 from twin.loading import load_scene
+from twin.robot import WHEEL_RADIUS, WHEEL_WIDTH, WHEELS
 
 _STEPS, _PIECES, _REPEATS = 5000, 50, 7
 _SPEED = (4.0, 4.5)  # [rad/s] of the left and right wheels: a gentle bend at 0.7 m/s
+MEASURES: dict[str, Callable[[Subject], list[Row]]] = {
+    "A1": plane.composition,
+    "A2": plane.measures,
+    "B1": plane.track_ratios,
+    "B2": plane.friction_spread,
+    "B3": plane.arcs,
+    "B4 B5": plane.scrubbing,
+    "B6 B7": plane.quiet,
+    "B8": plane.drift,
+    "C1": plane.push,
+    "C2": plane.slopes,
+    "C3": plane.stall,
+    "D1 D2 D3 D5": plane.straight,
+    "D4": plane.stops,
+    "D6": plane.overshoot,
+    "E1 E2": terrain.flat_ground,
+    "E3": terrain.reconstructed_ground,
+    "E4": terrain.halved_step,
+    "P1": terrain.plates,
+    "P2": terrain.ramp,
+}
+"""Row ids → function that measures them."""
+
+
+@dataclass(frozen=True)
+class Control:
+    """A negative control: a model that is wrong in a known way."""
+
+    name: str
+    subject: Subject
+    fails: tuple[str, ...]
+    """Keys of MEASURES; the model must fail at least one row of each."""
+
+
+def _default_contacts(spec: mujoco.MjSpec) -> None:
+    for name in WHEELS:
+        tire = spec.geom(f"{name}_tyre")
+        tire.solref, tire.solimp = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
+
+
+def _pyramidal_cone(spec: mujoco.MjSpec) -> None:
+    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+
+
+def _mesh_tyres(spec: mujoco.MjSpec) -> None:
+    angle = np.arange(32) * 2 * np.pi / 32
+    rings = [(WHEEL_RADIUS * np.cos(angle), np.full(32, y), WHEEL_RADIUS * np.sin(angle)) for y in (-0.5, 0.5)]
+    mesh = spec.add_mesh(name="polygon")
+    mesh.uservert = (np.concatenate([np.stack(ring, 1) for ring in rings]) * [1.0, WHEEL_WIDTH, 1.0]).ravel()
+    for name in WHEELS:
+        tire = spec.geom(f"{name}_tyre")
+        tire.type, tire.meshname = mujoco.mjtGeom.mjGEOM_MESH, "polygon"
+
+
+def _casters(spec: mujoco.MjSpec) -> None:
+    for name in WHEELS[2:]:
+        tire = spec.geom(f"{name}_tyre")
+        tire.condim, tire.friction = 1, (0.0, 0.0, 0.0)
+
+
+CONTROLS = (
+    Control("default contacts", Subject(edit=_default_contacts), ("B6 B7",)),
+    Control("pyramidal cone", Subject(edit=_pyramidal_cone), ("B4 B5",)),
+    Control("mesh tires", Subject(edit=_mesh_tyres), ("A1", "B6 B7")),
+    Control("frictionless casters", Subject(edit=_casters), ("A1", "B1", "B4 B5")),
+)
 
 
 def steps_per_second(model: mujoco.MjModel) -> float:
@@ -71,7 +136,7 @@ def scene_rows(path: Path) -> list[Row]:
     world = scene.world()
     x, y, _, yaw = world.spawn
     ground = Ground.load(scene.scene.stage("mesh"))
-    return chi_on(Subject(world.robot), ground, (x, y, yaw), world.route, f"{path.name}'s ground")
+    return terrain.chi_on(Subject(world.robot), ground, (x, y, yaw), world.route, f"{path.name}'s ground")
 
 
 def line(row: Row) -> str:
@@ -85,11 +150,10 @@ def line(row: Row) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--scene", type=Path, help="a built scene")
     kinds = "row ids such as B6; `controls` for the negative controls; `speed` for the simulation speed"
     parser.add_argument("--only", nargs="+", metavar="ID", help=kinds)
-    add_record_options(parser)
     arguments = parser.parse_args()
 
     def wanted(*names: str) -> bool:

@@ -8,7 +8,6 @@ that the contacts dissipate (1 if energy is conserved); vertical acceleration at
 robot when parked on a slope (creep). A run takes 20 s.
 """
 
-import argparse
 import math
 import sys
 from collections.abc import Callable
@@ -16,10 +15,10 @@ from dataclasses import asdict, dataclass
 
 import mujoco
 import numpy as np
+from acceptance import GRAVITY
 from acceptance.drives import drive, on_ground, on_plane
 from acceptance.grounds import reconstructed
-from acceptance.rows import GRAVITY
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.assets.ground import Ground
 from twin.mjcf.husky import check
@@ -30,22 +29,17 @@ Edit = Callable[[mujoco.MjSpec], None]
 
 def option(**values: object) -> Edit:
     """An edit that sets options of the scene."""
-
-    def edit(spec: mujoco.MjSpec) -> None:
-        for name, value in values.items():
-            setattr(spec.option, name, value)
-
-    return edit
+    return lambda spec: _set(spec.option, values)
 
 
 def ground(**values: object) -> Edit:
     """An edit that sets attributes of the ground."""
+    return lambda spec: _set(spec.geom("ground"), values)
 
-    def edit(spec: mujoco.MjSpec) -> None:
-        for name, value in values.items():
-            setattr(spec.geom("ground"), name, value)
 
-    return edit
+def _set(target: object, values: dict[str, object]) -> None:
+    for name, value in values.items():
+        setattr(target, name, value)
 
 
 def pairs(spec: mujoco.MjSpec) -> None:
@@ -130,8 +124,7 @@ def measure(edit: Edit | None, road: Ground) -> Cost:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_record_options(parser)
+    parser = record_parser(__doc__)
     arguments = parser.parse_args()
     road = reconstructed(np.random.default_rng(0))
     rows = {name: measure(edit, road) for name, edit in CASES.items()}

@@ -31,30 +31,26 @@ fraction of such worlds over the agreement statistics. In shapes of more than te
 quarter of the worlds. The seed is fixed. A run takes ten minutes on one core.
 """
 
-import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
+from record import record_parser, save
 from scipy.special import expit
 from scipy.stats import norm
 
 from twin.evaluation.jackknife import (
     STATISTICS,
     PairedCells,
-    Statistic,
     jackknife_interval,
     mean_difference_interval,
     place_interval,
 )
 from twin.evaluation.rate_model import MIN_RATE_DAYS, MIN_SETUP_TRAININGS, RateModel
 from twin.evaluation.statistics import MIN_PREDICTORS, UndefinedStatistic, leave_one_group_out, rate_over_days
-
-sys.path.append(str(Path(__file__).parent))
-from record import add_record_options, save
 
 WORLDS = 1000
 _MEAN_OVER = 6000  # worlds from which the mean of a statistic is estimated
@@ -220,9 +216,9 @@ Where a world has several such intervals, the value is their mean.
 """
 
 
-def coverage(kind: Kind, shape: Shape, worlds: int, seed: int = 0) -> dict[str, float]:
+def coverage(kind: Kind, shape: Shape, worlds: int) -> dict[str, float]:
     """Coverage of each interval; nan if no world has it. *refused*: largest fraction of worlds without an interval."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     truth = expected(kind, shape, rng)
     parts = [
         holds(simulate(rng, kind, shape, min(_BATCH, worlds - start)), truth) for start in range(0, worlds, _BATCH)
@@ -269,7 +265,7 @@ def _hit(ends: Callable[[], tuple[Any, ...]], aim: float | np.ndarray, count: in
 def _at_one_place(worlds: Worlds, truth: dict[str, float]) -> Hits:
     data, count = worlds.places[0], len(worlds.twin)
     return {
-        name: _hit(lambda s=statistic: jackknife_interval(s, data), truth[name], count)
+        name: _hit(partial(jackknife_interval, statistic, data), truth[name], count)
         for name, statistic in STATISTICS.items()
     }
 
@@ -279,13 +275,9 @@ def _over_places(worlds: Worlds, truth: dict[str, float]) -> Hits:
     for name, statistic in STATISTICS.items():
         for pooled in (False, True):
             key = f"{name}, pooled" if pooled else name
-            ends = _places_of(statistic, worlds, pooled)
+            ends = partial(place_interval, statistic, worlds.places, pooled)
             out[key] = _hit(ends, truth[key], len(worlds.twin))
     return out
-
-
-def _places_of(statistic: Statistic, worlds: Worlds, pooled: bool) -> Callable[[], tuple[Any, ...]]:
-    return lambda: place_interval(statistic, worlds.places, pooled)
 
 
 def _rates(worlds: Worlds) -> Hits:
@@ -366,10 +358,9 @@ def _predicted(worlds: Worlds) -> Hits:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--worlds", type=int, default=WORLDS)
     parser.add_argument("--shapes", nargs="+", default=[], help="beginnings of the names of shapes (default: all)")
-    add_record_options(parser)
     given = parser.parse_args()
     shapes = {k: v for k, v in SHAPES.items() if not given.shapes or k.startswith(tuple(given.shapes))}
     record: dict[str, Any] = {"worlds": given.worlds, "shapes": {}}

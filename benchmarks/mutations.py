@@ -43,8 +43,8 @@ MUTATIONS = (
     Mutation(
         "intervals have a confidence of 0.5",
         "twin/evaluation/jackknife.py",
-        "data: PairedCells, confidence: float = CONFIDENCE)",
-        "data: PairedCells, confidence: float = 0.5)",
+        "ppf(0.5 + CONFIDENCE / 2, freedom)",
+        "ppf(0.5 + 0.5 / 2, freedom)",
         ("jackknife",),
     ),
     Mutation(

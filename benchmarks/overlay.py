@@ -9,7 +9,6 @@ that show the obstacle in the truth. *Unshaded* is the composite with plain colo
 collision geometry are also compared, along a drive on the route, see `twin/report/visual_vs_collision.py`.
 """
 
-import argparse
 import sys
 from collections import defaultdict
 from dataclasses import replace
@@ -20,7 +19,7 @@ import mujoco
 import mujoco_warp
 import numpy as np
 import warp as wp
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
@@ -271,9 +270,8 @@ def save_pictures(folder: Path, lighting: str, rows: list[tuple[str, np.ndarray,
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--scene", type=Path, required=True, help="a built scene with its truth, such as scenes/demo")
-    add_record_options(parser)
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="folder for comparison images")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     options = parser.parse_args()

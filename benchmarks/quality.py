@@ -6,7 +6,6 @@ The scene must be built up to stage `metric`; the fields are trained from its ca
 those of stage `field` alone, on an otherwise idle machine.
 """
 
-import argparse
 import sys
 import tempfile
 import time
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.config import QUALITIES
 from twin.config_file import load_config
@@ -60,11 +59,10 @@ def draw(figures: dict[str, dict[str, Any]], path: Path) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--qualities", nargs="+", choices=tuple(QUALITIES), default=list(QUALITIES))
     parser.add_argument("--picture", type=Path, help="write the plot to this file")
-    add_record_options(parser)
     options = parser.parse_args()
     figures: dict[str, dict[str, Any]] = {}
     print(f"{'quality':9} {'minutes':>7} " + " ".join(f"{column:>16}" for column in _COLUMNS))

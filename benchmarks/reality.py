@@ -9,7 +9,6 @@ film's size and that are then reduced to 160×90. The poses lie on the film's pa
 compared with the true one. `--sheet` instead writes one picture with a frame of each of the places 1 to 30.
 """
 
-import argparse
 import sys
 import time
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.images import psnr, write_image
@@ -101,9 +100,8 @@ def contact_sheet(path: Path) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--scene", type=Path, help="a built scene with truth")
-    add_record_options(parser)
     parser.add_argument("--pictures", type=Path, help="folder for pictures: rasterized, film, difference")
     parser.add_argument("--sheet", type=Path, help="only write a picture of the places 1 to 30 to this file")
     options = parser.parse_args()

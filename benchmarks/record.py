@@ -19,27 +19,23 @@ _LISTED = 4
 """Number of missing entries that an error names."""
 
 
+def record_parser(description: str | None) -> argparse.ArgumentParser:
+    """A parser with the options of `add_record_options`; `description` is the script's docstring."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_record_options(parser)
+    return parser
+
+
 def add_record_options(parser: argparse.ArgumentParser) -> None:
     """Adds `--json` and `--replace-record`."""
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure here")
-    add_replace_option(parser)
-
-
-def add_replace_option(parser: argparse.ArgumentParser) -> None:
-    """Adds `--replace-record`."""
     parser.add_argument(
         "--replace-record", action="store_true", help="overwrite a record even with one that lacks some of its entries"
     )
 
 
 def lost(old: Any, new: Any, where: str = "") -> list[str]:
-    """Names of the entries that a new JSON value lacks.
-
-    Args:
-        old: The recorded value.
-        new: Its replacement.
-        where: Path of both within their record, for error messages.
-    """
+    """Names of the entries that a new JSON value lacks; `where` is the path of both values within their record."""
     if isinstance(old, dict):
         if not isinstance(new, dict):
             return [where or "all of it"]
@@ -83,7 +79,6 @@ def write_record(path: Path, record: dict[str, Any], replace: bool | None = Fals
     """Writes a record.
 
     Args:
-        path: The file.
         record: A JSON object; may contain NaN and infinity.
         replace: True overwrites a record even if the new one lacks entries. None means False in a script that has no
             `--replace-record`.

@@ -11,7 +11,6 @@ generated scenes in a temporary folder.
 import argparse
 import contextlib
 import gc
-import hashlib
 import json
 import os
 import shutil
@@ -26,22 +25,16 @@ from typing import Any
 
 import numpy as np
 
-_ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(_ROOT), str(_ROOT / "tests")]
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from sameness import QUICK
+
+from twin.files import digest_file
+
+_ROOT = Path(__file__).resolve().parents[1]
 _ENVS = 8
 _GROWTH = 32 << 20  # [bytes] allowed memory growth of eight environments
-_QUICK = {
-    "nerf.steps": 80,
-    "nerf.rays": 1024,
-    "nerf.max_width": 160,
-    "nerf.bake_steps": 20,
-    "nerf.max_bricks": 1200,
-    "mesh.voxel": 0.2,
-    "review.fps": 3,
-    "review.width": 160,
-}
-"""Settings for a complete build in one to two minutes."""
 
 
 # ---- endurance
@@ -52,7 +45,6 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
 
     Args:
         steps: Control steps of all environments together.
-        folder: Folder for the scene.
     """
     import psutil
     import tqdm
@@ -100,17 +92,15 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
 # ---- kill -9
 
 
-def kills(times: int, folder: Path, only: str | None = None, seed: int = 0) -> dict[str, Any]:
+def kills(times: int, folder: Path, only: str | None = None) -> dict[str, Any]:
     """Kills builds, trainings and validations at random times, resumes them, and compares them with undisturbed ones.
 
     Args:
         times: Number of kills of each command.
-        folder: Folder for the scenes.
         only: "build", "train" or "validate" kills only this command; None kills all three.
-        seed: Seed of the kill times.
     """
     each = {"build": _killed_builds, "train": _killed_trainings, "validate": _killed_validations}
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     out: dict[str, Any] = {name: run(times, folder, rng) for name, run in each.items() if only in (None, name)}
     return out | {"ok": all(one["ok"] for one in out.values())}
 
@@ -148,7 +138,7 @@ def _leftovers(root: Path) -> list[str]:
 
 
 def _build_command(root: Path, *more: str) -> list[str]:
-    settings = [word for name, value in _QUICK.items() for word in ("--set", f"{name}={value}")]
+    settings = [word for one in QUICK for word in ("--set", one)]
     return [sys.executable, "-m", "twin.build", str(root), "--quiet", *settings, *more]
 
 
@@ -176,7 +166,8 @@ def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[s
     scene = SceneDir(root)
     stages = ("capture", "cameras", "metric", "field", "mesh", "mjcf")  # not the review, whose results contain timings
     subprocess.run(_build_command(root), cwd=_ROOT, check=True)
-    wanted, longest = _results(root, stages), max(_seconds(root).values())
+    report = json.loads((root / "build" / "report.json").read_text())
+    wanted, longest = _results(root, stages), max(stage["seconds"] for stage in report["stages"].values())
     killed = finished = different = 0
     sfm_until = times // 5  # the first fifth of the kills hits builds from scratch
     while killed < times:
@@ -191,19 +182,13 @@ def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[s
         if from_start:  # structure from motion is not repeatable, so later builds are compared with this one
             wanted = now
         different += now != wanted
-    leftovers = _leftovers(root)
-    return {
-        "killed": killed,
-        "finished": finished,
-        "different": different,
-        "leftovers": leftovers,
-        "ok": not different and not leftovers,
-    }
+    return _comparison(root, killed, finished, different)
 
 
-def _seconds(root: Path) -> dict[str, float]:
-    report = json.loads((root / "build" / "report.json").read_text())
-    return {name: stage["seconds"] for name, stage in report["stages"].items()}
+def _comparison(root: Path, killed: int, finished: int, different: int) -> dict[str, Any]:
+    left = _leftovers(root)
+    counts = {"killed": killed, "finished": finished, "different": different}
+    return {**counts, "leftovers": left, "ok": not different and not left}
 
 
 _TRAIN = """
@@ -295,7 +280,7 @@ def _killed_validations(times: int, folder: Path, rng: np.random.Generator) -> d
     command += ["--lightings", "day", "night+randomised", "--episodes", "60", "--processes", "2", "--quiet"]
     assert _killed_after(command, 3600.0) is False
     files = ("episodes.csv", "cells.csv", "summary.json")
-    digests = {name: _digest(root / "validation" / name) for name in files}
+    digests = {name: digest_file(root / "validation" / name) for name in files}
     killed = finished = different = 0
     while killed < times:
         shutil.rmtree(root / "validation")
@@ -303,19 +288,8 @@ def _killed_validations(times: int, folder: Path, rng: np.random.Generator) -> d
             killed += 1
         assert _killed_after(command, 3600.0) is False
         finished += 1
-        different += digests != {name: _digest(root / "validation" / name) for name in files}
-    leftovers = _leftovers(root)
-    return {
-        "killed": killed,
-        "finished": finished,
-        "different": different,
-        "leftovers": leftovers,
-        "ok": not different and not leftovers,
-    }
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+        different += digests != {name: digest_file(root / "validation" / name) for name in files}
+    return _comparison(root, killed, finished, different)
 
 
 # ---- full disk
@@ -359,7 +333,7 @@ def full_disk_fault(command: list[str], root: Path) -> str:
 def _contents(root: Path) -> dict[str, str]:
     skipped = ("/runs/", "/validation/", "/tensorboard/")  # tables there grow, and their last row may be cut
     files = [path for path in root.rglob("*") if path.is_file() and not any(s in f"/{path}" for s in skipped)]
-    return {str(path.relative_to(root)): _digest(path) for path in files}
+    return {str(path.relative_to(root)): digest_file(path) for path in files}
 
 
 def disk(folder: Path) -> dict[str, Any]:

@@ -24,20 +24,9 @@ from twin.geometry.route import filmed_route
 from twin.types import Array
 
 KINDS = (
-    "once",
-    "stops",
-    "backs_up",
-    "frames_lost",
-    "twice_with_cut",
-    "there_and_back_on_the_spot",
-    "there_and_back_other_lane",
-    "laps",
-    "loop_at_the_end",
-    "cut_in_two",
-    "two_films_overlapping",
-    "two_films_with_gap",
-    "two_lightings_one_reversed",
-    "jump_ahead",
+    *("once", "stops", "backs_up", "frames_lost", "twice_with_cut", "there_and_back_on_the_spot"),
+    *("there_and_back_other_lane", "laps", "loop_at_the_end", "cut_in_two", "two_films_overlapping"),
+    *("two_films_with_gap", "two_lightings_one_reversed", "jump_ahead"),
 )
 _DENSE = 0.05  # [m] between points of a line
 _MAX_OFF, _MAX_STEP, _MAX_TURN = 0.3, 0.3, 120.0  # [m], [m], [°]

@@ -19,8 +19,9 @@ import tempfile
 from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parents[1]
-_QUICK = ("nerf.steps=80", "nerf.rays=1024", "nerf.max_width=160", "nerf.bake_steps=20", "nerf.max_bricks=1200")
-_QUICK += ("mesh.voxel=0.2", "review.fps=3", "review.width=160")
+QUICK = ("nerf.steps=80", "nerf.rays=1024", "nerf.max_width=160", "nerf.bake_steps=20", "nerf.max_bricks=1200")
+QUICK += ("mesh.voxel=0.2", "review.fps=3", "review.width=160")
+"""Settings for a complete build in one to two minutes."""
 _STAGES = ("3_field", "4_mesh", "5_mjcf")
 _EPISODES = """
 import hashlib, itertools, json, sys
@@ -85,7 +86,7 @@ class Tree:
         return done.stdout
 
     def build(self, scene: Path) -> None:
-        settings = [word for one in _QUICK for word in ("--set", one)]
+        settings = [word for one in QUICK for word in ("--set", one)]
         self.python("-m", "twin.build", scene, "--quiet", *settings)
 
     def digests(self, scene: Path, lightings: str, work: Path) -> dict[str, str]:

@@ -9,13 +9,12 @@ nearest filmed lighting, the PSNR of each half of the photo under the fit to the
 pictures of the day from other stations of the road. *Sunny* days are those on which the sun casts shadows.
 """
 
-import argparse
 import sys
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.assets.shadow_casters import shadow_casters
 from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
@@ -107,13 +106,12 @@ def day_row(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--place", type=int, default=0, help="number of the generated place")
     parser.add_argument("--camera", type=int, default=0, help="number of the robot's camera")
     parser.add_argument("--days", type=int, nargs="+", default=list(range(20, 30)), metavar="N")
     parser.add_argument("--pictures", type=Path, help="folder for images: the day, and the twin in each variant")
-    add_record_options(parser)
     given = parser.parse_args()
     twin, setup = load_scene(given.scene), Setup(given.place, 0, given.camera)
     cameras = Cameras.load(twin.scene.stage("metric"))

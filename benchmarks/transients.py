@@ -9,7 +9,6 @@ frames as the clean films show them: the static place alone. WITHOUT is an optio
 `nerf.transients = false`. A *ghost* is visual geometry 0.1 to 2 m above the true ground of the corridor.
 """
 
-import argparse
 import sys
 import tempfile
 from dataclasses import replace
@@ -18,7 +17,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.config_file import load_config
 from twin.errors import InputError, print_error
@@ -90,11 +89,10 @@ def _stands_on(part: np.ndarray, floor: np.ndarray) -> bool:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("clean", type=Path, help="built scene of the films without traffic")
     parser.add_argument("traffic", type=Path, help="built scene of the films with traffic")
     parser.add_argument("without", type=Path, nargs="?", help="films with traffic, nerf.transients=false")
-    add_record_options(parser)
     given = parser.parse_args()
     found: dict[str, Any] = {}
     try:
@@ -111,7 +109,7 @@ def main() -> int:
             change = value - found["clean"]["psnr"][light]
             small = f"{row['psnr_small'][light]:.2f}, lower half {row['psnr_small_lower'][light]:.2f} dB at 160×90"
             print(f"  {light:<12} {value:.2f} dB ({change:+.2f}), SSIM {row['ssim'][light]:.3f}; {small}")
-    return save(given.json, found, given.replace_record) if given.json else 0
+    return save(given.json, found, given.replace_record)
 
 
 if __name__ == "__main__":

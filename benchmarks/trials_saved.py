@@ -20,7 +20,6 @@ rate of 2 to 98 %; for the others a few trials suffice even without the twin. Th
 minutes.
 """
 
-import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,15 +27,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from record import record_parser, save
 
 from twin.config import Condition
 from twin.evaluation.jackknife import training_of
 from twin.evaluation.rate_model import RateModel
 from twin.evaluation.statistics import prediction_powered_mean
 from twin.files import read_json
-
-sys.path.append(str(Path(__file__).parent))
-from record import add_record_options, save
 
 DAYS = (2, 3, 4, 6, 8, 12, 16)
 """Numbers of driven days."""
@@ -182,11 +179,10 @@ def picture(rows: dict[int, Any]) -> Figure:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--results", type=Path, default=Path(__file__).parent / "table1" / "results.json")
     parser.add_argument("--experiments", type=int, default=_EXPERIMENTS)
     parser.add_argument("--picture", type=Path, metavar="FILE")
-    add_record_options(parser)
     given = parser.parse_args()
     record = read_record(given.results)
     print(

@@ -9,7 +9,6 @@ its first fifth. The number of cores that other programs use is measured, too: s
 number is small.
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -21,7 +20,7 @@ from typing import Any
 import numpy as np
 import psutil
 from chromium import Chromium, find_chromium
-from record import add_record_options, save
+from record import record_parser, save
 
 from twin.errors import print_error
 
@@ -124,21 +123,21 @@ def drag(browser: Chromium, seconds: float) -> float:
     return float(shown)
 
 
-def rest(browser: Chromium, seconds: float = 6.0) -> float:
+def rest(browser: Chromium) -> float:
     """Time from the last event to the picture at full resolution in the browser [s]."""
     began = time.monotonic()
     width = 0
-    while time.monotonic() - began < seconds:
+    while time.monotonic() - began < 6.0:
         width = browser.evaluate("window.width")
         if width > 400:  # a coarse picture is 261 px wide
             return time.monotonic() - began
         time.sleep(0.01)
-    raise AssertionError(f"no fine picture within {seconds:g} s; the last is {width} px wide")
+    raise AssertionError(f"no fine picture within 6 s; the last is {width} px wide")
 
 
-def random_clicks(browser: Chromium, served: Served, seconds: float, seed: int = 0) -> dict[str, Any]:
+def random_clicks(browser: Chromium, served: Served, seconds: float) -> dict[str, Any]:
     """Clicks, drags, presses keys and moves sliders at random; returns actions, errors and growth of memory."""
-    rng, began, actions, early = np.random.default_rng(seed), time.monotonic(), 0, 0
+    rng, began, actions, early = np.random.default_rng(0), time.monotonic(), 0, 0
     while (now := time.monotonic() - began) < seconds:
         kind = rng.integers(5)
         if kind == 0:  # the picture
@@ -225,9 +224,7 @@ def measure(scene: Path, minutes: float) -> dict[str, Any]:
                 time.sleep(5.0)
                 shown = (browser.evaluate("window.pictures") - before) / (time.monotonic() - began)
             browser.key("w", False)
-            rate = browser.evaluate(
-                "(document.body.textContent.match(/([0-9.]+)× real time/) || [0, '0'])[1]",
-            )
+            rate = browser.evaluate("(document.body.textContent.match(/([0-9.]+)× real time/) || [0, '0'])[1]")
             browser.click_on("button", "Stop")
             out["driving"] = {"pictures_per_s": shown, "real_time_factor": float(rate), "others_cores": other.cores}
             if minutes > 0:
@@ -241,10 +238,9 @@ def measure(scene: Path, minutes: float) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("--scene", type=Path, required=True, help="a built scene")
     parser.add_argument("--minutes", type=float, default=5.0, help="minutes of random clicking (default %(default)g)")
-    add_record_options(parser)
     given = parser.parse_args(arguments)
     if find_chromium() is None:
         return print_error("Chromium is not installed; install Debian's package chromium")

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from acceptance import grounds
+from acceptance import Row, Subject, grounds
 from acceptance.drives import drive, on_ground
-from acceptance.rows import Row, Subject
-from acceptance.table import CONTROLS, MEASURES
 from acceptance.terrain import chi_on
+from husky import CONTROLS, MEASURES
 
 from twin.robot import TRACK, HuskyParams
 

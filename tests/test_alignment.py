@@ -56,7 +56,7 @@ def test_kinematics_begin_with_the_preceding_wheel_speeds():
     seen = [np.maximum(0, i * logs.SAMPLES + np.arange(logs.SAMPLES + 1) + 5) // age * age - 5 for i in range(n)]
     windows = replace(windows_of(wheels, logs.relative_poses(whole[np.maximum(0, seen)])), follows=np.arange(n) > 0)
     assert windows.measurement_times[1:, 0] == pytest.approx(-0.25)
-    distance, angle = kinematics.end_errors(kinematics.predict(kinematics.NOMINAL, windows), windows)
+    distance, angle = Prediction("nominal", windows, kinematics.predict(kinematics.NOMINAL, windows)).errors
     assert distance[1:].max() < 0.005
     assert angle[1:].max() < 0.2
 
@@ -236,8 +236,8 @@ def aligned(twist: bool = True, drive_errors=None, ground_errors=None, **robot) 
     drive = drivetrain.Drivetrain.from_robot(params, twist)
     prediction = Prediction("made up", windows, kinematics.predict(kinematics.NOMINAL, windows), wheels + 0.1)
     fits = [
-        Fit({}, drive_errors or {}, {}, 0.0),
-        Fit({"pose_x": 0.0, "pose_y": 0.0, "pose_late": 0.0}, ground_errors or {}, {}, 0.0),
+        Fit({}, drive_errors or {}, {}),
+        Fit({"pose_x": 0.0, "pose_y": 0.0, "pose_late": 0.0}, ground_errors or {}, {}),
     ]
     return Identification(windows, kinematics.NOMINAL, drive, *fits, params, *[prediction] * 4)
 
@@ -346,10 +346,10 @@ def test_kinematic_baselines_on_the_real_log(real_data: Path):
     """The figures that others got from the same log: 0.45 m and 70° nominal, 0.18 m and 7° with a fitted ICR model."""
     windows = logs.read_log(real_data / "husky_drive" / "husky_drive_dev.npz")
     held_out = ~windows.fitting
-    distance, angle = kinematics.end_errors(kinematics.predict(kinematics.NOMINAL, windows), windows)
+    distance, angle = Prediction("nominal", windows, kinematics.predict(kinematics.NOMINAL, windows)).errors
     assert np.median(distance[held_out]) == pytest.approx(0.45, abs=0.02)
     assert 65 < np.median(angle[held_out]) < 85
     model = kinematics.fit_icr(windows)
-    distance, angle = kinematics.end_errors(kinematics.predict(model, windows), windows)
+    distance, angle = Prediction("ICR", windows, kinematics.predict(model, windows)).errors
     assert np.median(distance[held_out]) == pytest.approx(0.18, abs=0.01)
     assert np.median(angle[held_out]) == pytest.approx(6.6, abs=0.6)

@@ -32,22 +32,22 @@ def test_steps_fill_a_budget_and_leave_a_margin(scripts):
 
 def test_a_score_over_its_budget_misses_its_target(scripts, monkeypatch):
     import field
+    from sections import verdict
+
+    def judged(name, figures):
+        return verdict(name, figures, field.TARGETS)
 
     monkeypatch.setitem(field.TARGETS, "fox.psnr_60s", ("≥", 25.0))
     figures = {"fox.psnr_60s": 26.0, "fox.psnr_60s_unfitted": 25.0, "fox.seconds_60s": 59.0}
-    assert field.verdict("fox.psnr_60s", figures) == ("≥ 25", "yes")
-    assert field.verdict("fox.psnr_60s", figures | {"fox.psnr_60s": 24.0}) == ("≥ 25", "no")
-    assert field.verdict("fox.seconds_60s", figures) == ("≤ 60", "yes")
+    assert judged("fox.psnr_60s", figures) == ("≥ 25", "yes")
+    assert judged("fox.psnr_60s", figures | {"fox.psnr_60s": 24.0}) == ("≥ 25", "no")
+    assert judged("fox.seconds_60s", figures) == ("≤ 60", "yes")
     overtime = figures | {"fox.seconds_60s": 61.0}
-    assert (
-        field.verdict("fox.psnr_60s", overtime)[1]
-        == field.verdict("fox.psnr_60s_unfitted", overtime)[1]
-        == "no, took 61.0 s"
-    )
+    assert judged("fox.psnr_60s", overtime)[1] == judged("fox.psnr_60s_unfitted", overtime)[1] == "no, took 61.0 s"
     differences = {"gpu.cpu_difference_mean": 1 / 255, "gpu.cpu_difference_max": 0.5}  # only the mean has a target
-    assert field.verdict("gpu.cpu_difference_mean", differences) == ("≤ 0.003922", "yes")
-    assert field.verdict("gpu.cpu_difference_max", differences) == ("", "")
-    assert field.verdict("bake.psnr_drop.sun", {"bake.psnr_drop.sun": 0.3}) == ("", "")
+    assert judged("gpu.cpu_difference_mean", differences) == ("≤ 0.003922", "yes")
+    assert judged("gpu.cpu_difference_max", differences) == ("", "")
+    assert judged("bake.psnr_drop.sun", {"bake.psnr_drop.sun": 0.3}) == ("", "")
 
 
 def test_a_missing_gpu_is_reported(scripts, monkeypatch, tmp_path):
@@ -80,12 +80,12 @@ def test_visual_vs_collision_drives_the_robot_of_the_scene(scripts, monkeypatch,
 
 
 def test_peak_memory_is_that_of_this_process(scripts):
-    from field_workers import peak_bytes
+    from fuzzing.cases import peak_memory
 
-    before = peak_bytes()
+    before = peak_memory()
     block = bytearray(64 * 2**20)
     block[::4096] = b"x" * len(block[::4096])
-    assert 32 * 2**20 < peak_bytes() < before + 512 * 2**20
+    assert 32 * 2**20 < peak_memory() < before + 512 * 2**20
 
 
 @pytest.mark.realdata

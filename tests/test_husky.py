@@ -4,9 +4,9 @@ import husky_options
 import mujoco
 import numpy as np
 import pytest
+from acceptance import MASS
 from acceptance.drives import drive, on_plane, state_at_rest
 from acceptance.grounds import reconstructed
-from acceptance.rows import MASS
 
 from twin.env.physics import HuskyPhysics
 from twin.mjcf.husky import (

@@ -10,7 +10,7 @@ from drive_logs import columns, write_csv
 from twin.align import main
 from twin.errors import InputError
 from twin.robot import WHEEL_RADIUS, HuskyParams
-from twin.sysid import kinematics, logs
+from twin.sysid import kinematics, logs, ros_bags
 
 
 def _bad(table: dict[str, np.ndarray], **changes) -> dict[str, np.ndarray]:
@@ -154,7 +154,7 @@ def test_bag_is_the_same_log(drive, tmp_path):
     from ros_bag import write_bag
 
     rows = {name: column[:900] for name, column in drive.items()}
-    bag = logs.read_log(write_bag(tmp_path / "bag", rows))
+    bag = logs.cut_windows(ros_bags.read_bag(write_bag(tmp_path / "bag", rows)), "bag")
     table = logs.cut_windows(rows, "log")
     assert len(bag) == len(table)
     for name in ("commands", "wheels", "poses", "acceleration"):
@@ -167,7 +167,7 @@ def test_a_bag_without_commands_is_refused(drive, tmp_path):
 
     bag = write_bag(tmp_path / "bag", {name: column[:50] for name, column in drive.items()}, without=("commands",))
     with pytest.raises(InputError, match=r"no topic with commands .*record it"):
-        logs.read_log(bag)
+        ros_bags.read_bag(bag)
 
 
 @pytest.mark.realdata

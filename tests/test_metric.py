@@ -289,7 +289,6 @@ def test_distance_between_marked_points(tmp_path: Path, on_ground: bool) -> None
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"metres": 0.0}, "metric.distance.metres = 0.0; expected"),
         ({"frame_a": "film0/999999"}, "no registered frame 'film0/999999'"),
         ({"a": (400.0, 10.0)}, r"metric.distance.a = \[400.0, 10.0\]; expected .* 320×240"),
         ({"b": (100.0, 200.0)}, "coincide"),
@@ -335,10 +334,6 @@ def test_a_marker_gives_metres(tmp_path: Path) -> None:
     assert metrics["marker_frames"] >= 10
     with pytest.raises(InputError, match="number 8 was found in 0 frames"):
         world.run(tmp_path / "out", marker=MarkerConfig("DICT_4X4_50", 8, side))
-    with pytest.raises(InputError, match=r"family = 'DICT_4X5'; expected one of .*DICT_4X4_50"):
-        world.run(tmp_path / "out", marker=MarkerConfig("DICT_4X5", 7, side))
-    with pytest.raises(InputError, match=r"marker.size = 0.0"):
-        world.run(tmp_path / "out", marker=MarkerConfig("DICT_4X4_50", 7, 0.0))
 
 
 def test_metric_poses_are_taken_as_they_are(tmp_path: Path) -> None:
@@ -405,11 +400,8 @@ def test_invalid_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     film = _path(count=10)
     world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0)), _similarity(0))
     cases: list[tuple[dict, str]] = [
-        ({}, "no scale given; give one of: metric.camera_height .*distance.*gps.*marker.*poses_are_metric"),
-        ({"camera_height": -1.0}, "metric.camera_height = -1.0; expected meters"),
         ({"poses_are_metric": True}, "the input has no poses"),
         ({"camera_height": 1.0, "up": "poses"}, "the input has no poses"),
-        ({"camera_height": 1.0, "up": "north"}, "metric.up = 'north'; expected ground, cameras or poses"),
     ]
     for changes, text in cases:
         with pytest.raises(InputError, match=text) as error:

@@ -5,8 +5,10 @@ import pytest
 from intervals import KINDS, Shape, simulate
 from scipy import integrate, stats
 
-from twin.evaluation.rate_model import RateModel, padded_counts
+from twin.evaluation.agreement import unit_counts
+from twin.evaluation.rate_model import RateModel
 from twin.evaluation.statistics import wilson
+from twin.evaluation.trials import Cell
 
 
 def test_single_trials_equal_integration() -> None:
@@ -96,7 +98,8 @@ def test_cells_are_shrunk_towards_their_policy() -> None:
 
 
 def test_padding_changes_nothing_and_wrong_counts_are_refused() -> None:
-    won, trials = padded_counts([[(3, 5), (5, 5)], [(2, 4)]])
+    cells = [Cell("p", "t", "day", 5, 3), Cell("p", "t", "dusk", 5, 5)], [Cell("q", "t", "day", 4, 2)]
+    won, trials = unit_counts(cells, by_day=True)
     assert won.tolist() == [[3, 5], [2, 0]] and trials.tolist() == [[5, 5], [4, 0]]
     padded = RateModel.fit(np.pad(won, ((0, 0), (0, 3))), np.pad(trials, ((0, 0), (0, 3))))
     assert np.allclose(padded.interval(), RateModel.fit(won, trials).interval())

@@ -311,11 +311,6 @@ def test_frames_without_overlap_are_refused(tmp_path: Path) -> None:
         _run(_capture_of(tmp_path / "s", noise), tmp_path / "out")
 
 
-def test_unknown_mapper_is_refused(street: Street, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected auto, global or incremental"):
-        _run(street, tmp_path / "out", mapper="magic")
-
-
 @pytest.mark.parametrize(
     ("signal", "cure"), [("ABRT", "film slower"), ("KILL", "too little memory"), ("TERM", "stopped from outside")]
 )

@@ -59,7 +59,7 @@ def test_shadow_map_equals_ray_casting(azimuth, elevation):
     toward = direction(azimuth, elevation)
     assert angles(toward)[1] == pytest.approx(elevation)
     vertices, faces = _mesh()
-    shadows = OrthographicShadowMap.of_mesh(vertices, faces, toward, texel=0.05)
+    shadows = ShadowCasters(vertices, faces).seen_from(toward, texel=0.05)
     rng = np.random.default_rng(0)
     points = rng.uniform([2.0, -6.0, 0.0], [13.0, 8.0, 2.5], (4000, 3))
     surface = Surface(vertices, faces)
@@ -76,7 +76,7 @@ def test_shadow_map_equals_ray_casting(azimuth, elevation):
 @pytest.mark.parametrize("elevation", [6.0, 40.0])
 def test_slopes_throw_no_shadows_on_themselves(elevation):
     vertices = np.array([[-20, -20, -2], [20, -20, 2], [20, 20, 2], [-20, 20, -2]], float)  # rises by a tenth along x
-    shadows = OrthographicShadowMap.of_mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), direction(200.0, elevation))
+    shadows = ShadowCasters(vertices, np.array([[0, 1, 2], [0, 2, 3]])).seen_from(direction(200.0, elevation))
     x, y = np.random.default_rng(0).uniform(-15.0, 15.0, (2, 500))
     points, normals = np.column_stack([x, y, 0.1 * x]), np.tile([-0.1, 0.0, 1.0] / np.sqrt(1.01), (500, 1))
     np.testing.assert_allclose(shadows.visibility(points, normals), 1.0, atol=1e-5)
@@ -100,7 +100,7 @@ def test_rough_triangles_are_surfaces_above_the_mesh():
 
 
 def test_shadow_map_survives_its_file():
-    shadows = OrthographicShadowMap.of_mesh(*_mesh(), direction(30.0, 40.0))
+    shadows = ShadowCasters(*_mesh()).seen_from(direction(30.0, 40.0))
     back = OrthographicShadowMap.from_json(json.loads(json.dumps(shadows.to_json())))
     points = np.random.default_rng(0).uniform(0.0, 10.0, (500, 3))
     np.testing.assert_allclose(back.visibility(points), shadows.visibility(points), atol=1e-3)
@@ -114,14 +114,14 @@ def test_shadow_map_survives_its_file():
     [{"toward": [0.0, 0.0, 2.0]}, {"toward": [1.0, 0.0, 0.0]}, {"texel_m": 0.0}, {"png": "AAAA"}, {"png": "?"}],
 )
 def test_damaged_shadow_maps_are_refused(change):
-    table = OrthographicShadowMap.of_mesh(*_mesh(), direction(30.0, 40.0)).to_json()
+    table = ShadowCasters(*_mesh()).seen_from(direction(30.0, 40.0)).to_json()
     with pytest.raises(ValueError):
         OrthographicShadowMap.from_json(table | change)
 
 
 def _sun(toward: np.ndarray) -> Sun:
     rows = [[0.5, 0.55, 0.7], [1.3, 1.2, 0.9], [0.9, 1.0, 1.2], [0.4, 0.3, 0.1], [0.0, 0.1, 0.3], [1.0, 0.8, 0.5]]
-    return Sun(OrthographicShadowMap.of_mesh(*_mesh(), toward), np.array(rows, np.float32))
+    return Sun(ShadowCasters(*_mesh()).seen_from(toward), np.array(rows, np.float32))
 
 
 def test_gain_is_that_of_its_definition():

@@ -32,7 +32,7 @@ from twin import commands, runtime
 from twin.capture.bag import is_bag
 from twin.config_file import ROBOT_TOML, load_config, merge_robot, parse_table, read_robot
 from twin.errors import InputError
-from twin.files import digest_file, exists, read_toml, write_json, write_text
+from twin.files import digest_file, read_toml, write_json, write_text
 from twin.robot import HuskyParams
 from twin.scene import SceneDir
 from twin.sysid.identification import Identification, format_error, identify, robot_toml, toml_text
@@ -87,12 +87,13 @@ def align_to_log(
 def _windows(target: str, log: Path) -> Windows:
     """The time windows of a log. If it is a bag that the scene was built from, reconstructed poses can be used."""
     root = Path(target).parent if Path(target).name == "scene.toml" else Path(target)
-    if not (is_bag(log) and exists(log) and SceneDir(root).config_file.exists()):
+    if not is_bag(log):
         return read_log(log)
     from twin.sysid.ros_bags import filmed_poses, read_bag
 
     scene = SceneDir(root)
-    return cut_windows(read_bag(log, filmed_poses(scene, load_config(scene.config_file), log)), str(log))
+    filmed = filmed_poses(scene, load_config(scene.config_file), log) if scene.config_file.exists() else None
+    return cut_windows(read_bag(log, filmed), str(log))
 
 
 def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalibration, Path]":

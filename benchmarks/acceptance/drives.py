@@ -37,14 +37,13 @@ def on_ground(
     params: HuskyParams | None = None,
     edit: Edit | None = None,
     start: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    cell: float = MjcfConfig.hfield_cell,
 ) -> mujoco.MjModel:
     """Model of the Husky on a height field as the mjcf stage writes it, starting at x, y [m] and yaw [rad]."""
     spec = mujoco.MjSpec()
     set_options(spec, params)
     with tempfile.TemporaryDirectory(prefix="twin-ground-") as folder:
         spec.modelfiledir = spec.meshdir = spec.texturedir = folder
-        add_ground(spec, ground, Path(folder), cell)
+        add_ground(spec, ground, Path(folder), MjcfConfig.hfield_cell)
         position, quaternion = rest_pose(ground.at, np.array(start[:2]), start[2])
         add_husky(spec, position, quaternion, params)
         if edit is not None:
@@ -98,9 +97,9 @@ class Recording:
         """Vertical acceleration of the camera [m/s² rms]."""
         return float(np.diff(self.camera_z, 2).std() / self.timestep**2)
 
-    def per_frame(self, values: Array, rate: float = 30.0) -> Array:
-        """Differences of a series (n,) between video frames at `rate` [1/s]."""
-        every = 1.0 / (rate * self.timestep)
+    def per_frame(self, values: Array) -> Array:
+        """Differences of a series (n,) between video frames at 30 Hz."""
+        every = 1.0 / (30.0 * self.timestep)
         steps = np.arange(0.0, len(values) - 1, every)
         return np.diff(np.interp(steps, np.arange(len(values)), values))
 

@@ -14,10 +14,10 @@ _FIELD_NOISE, _PATH_NOISE = 0.03, 0.012  # [m] σ of heights from the field and 
 _LATERAL_OFFSETS = np.array([-0.6, -0.3, 0.0, 0.3, 0.6])  # [m] from the path
 
 
-def level(height: float = 0.0, half: float = 8.0, cell: float = 0.1) -> Ground:
-    """Level ground around the origin, `half` [m] to each side."""
-    n = round(2 * half / cell) + 1
-    return _gray(np.full((n, n), height), np.array([-half, -half]), cell)
+def level(half: float = 8.0) -> Ground:
+    """Level ground around the origin, `half` [m] to each side, in cells of 0.1 m."""
+    n = round(2 * half / 0.1) + 1
+    return _gray(np.zeros((n, n)), np.array([-half, -half]), 0.1)
 
 
 def random_relief(rms: float, length: float, rng: np.random.Generator, half: float = 9.0) -> Callable[[Array], Array]:
@@ -33,16 +33,14 @@ def random_relief(rms: float, length: float, rng: np.random.Generator, half: flo
     return bumps.at
 
 
-def reconstructed(
-    rng: np.random.Generator, relief: Callable[[Array], Array] | None = None, size: tuple[float, float] = (8.0, 4.0)
-) -> Ground:
-    """Ground that the pipeline fits to noisy data of a road along x, `size` [m] to each side of the origin.
+def reconstructed(rng: np.random.Generator, relief: Callable[[Array], Array] | None = None) -> Ground:
+    """Ground that the pipeline fits to noisy data of a road along x, 16 m long and 8 m wide, around the origin.
 
     `relief` maps points (k, 2) to the true height [m]; level by default.
     """
     relief = relief or (lambda xy: np.zeros(len(xy)))
-    high = np.array(size)
-    x, y = (np.arange(-h + _SPACING / 2, h, _SPACING) for h in size)
+    high = np.array([8.0, 4.0])
+    x, y = (np.arange(-h + _SPACING / 2, h, _SPACING) for h in (8.0, 4.0))
     field = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     # The sway of a hand-held camera shifts all data of a cross-section alike.
     sway = np.repeat(rng.normal(0.0, _PATH_NOISE, len(x)), len(_LATERAL_OFFSETS))

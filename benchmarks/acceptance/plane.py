@@ -6,8 +6,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from acceptance import GRAVITY, MASS, Row, Subject
 from acceptance.drives import drive, record, state_at_rest
-from acceptance.rows import GRAVITY, MASS, Row, Subject
 from twin.env.controller import Controller
 from twin.mjcf.husky import center_of_mass, coulomb_track_ratio
 from twin.robot import REAR_HEAVY, SIDES, TRACK, WHEEL_RADIUS, WHEEL_WIDTH, WHEELBASE, WHEELS, HuskyParams

@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from acceptance import Row, Subject
 from acceptance.drives import Recording, drive, on_ground, on_plane
 from acceptance.grounds import level, random_relief, reconstructed, roughness
-from acceptance.rows import Row, Subject
 from twin.assets.ground import Ground
 from twin.robot import WHEEL_RADIUS
 from twin.types import Array

@@ -100,7 +100,6 @@ class Repetition:
         Args:
             scene: The place's scene of the forecast experiment, with its policies and its task file.
             place: Number of place, robot and camera.
-            task: Name of the task.
             python: Interpreter that can import `bpy`.
             samples: Paths per pixel.
         """

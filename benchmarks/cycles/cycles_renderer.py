@@ -108,8 +108,6 @@ class CyclesRenderer:
         """
         Args:
             python: Python interpreter of an environment that has `bpy`.
-            lighting: The lighting.
-            place: The place.
             intrinsics: fx, fy, cx, cy [px], shape (4,), with fx = fy.
             size: Width, height [px].
             samples: Paths per pixel.

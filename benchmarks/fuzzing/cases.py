@@ -105,7 +105,7 @@ def run_case(target: Target, seed: int, k: int, work: Path, samples: Any, second
     except BaseException as error:
         message = " ".join(f"{type(error).__name__}: {_text(error)}".split())[:300]
         failure, line = message or type(error).__name__, _source_line(error)
-    elapsed, peak = time.perf_counter() - start, _peak_memory()
+    elapsed, peak = time.perf_counter() - start, peak_memory()
     changed = changed_files(before, snapshot(work))
     if not failure and peak > MAX_MEMORY:
         failure = f"{peak / 2**20:,.0f} MiB"
@@ -227,8 +227,11 @@ def _reset_peak_memory() -> None:
         Path("/proc/self/clear_refs").write_text("5")
 
 
-def _peak_memory() -> int:
-    """Peak resident memory [bytes] since the last reset, or since the process began if the system has no reset."""
+def peak_memory() -> int:
+    """Peak resident memory of this process [bytes] since its begin, or since the last reset if the system has resets.
+
+    `getrusage`, which is used where there is no /proc, also includes the parent's memory at the fork.
+    """
     try:
         status = Path("/proc/self/status").read_text()
         return int(status.split("VmHWM:")[1].split()[0]) << 10

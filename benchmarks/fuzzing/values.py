@@ -30,21 +30,8 @@ _TOML = (
     *("{a = 1}", '[1, "a"]', "[nan]", "[inf, -inf]", "'a'", "bare", '"\\ud800"', "[{}]", "1_000", '"\\u0000"', ""),
 )
 _WORDS = (
-    *(
-        "",
-        " ",
-        ".",
-        "..",
-        "/",
-        "~",
-        "a/b",
-        OUTSIDE_PATH,
-        "../../../../etc/passwd",
-        "/etc/passwd",
-        "/dev/null",
-        "a:b:c",
-        "+",
-    ),
+    *("", " ", ".", "..", "/", "~", "a/b", OUTSIDE_PATH, "../../../../etc/passwd", "/etc/passwd", "/dev/null"),
+    *("a:b:c", "+"),
     *("\x00", "a\x00b", "\ud800", "\udcff", "\ufeff", "\x07\x1b[31m", "a\nb", "a\r\nb", "\u202e", "é", "²", "∞", "'"),
     *("nan", "inf", "-inf", "1e400", "-1", "0", "9" * 5000, "1" + "0" * 400, "x" * 300, "%s%n", "{}", "{0}", "<b>&"),
     *("training", "held-out", "any", "+randomised", "day:night:nan", "day:night:2", "day", "true", "None", '"', "\\"),
@@ -128,11 +115,11 @@ def mutated(rng: Random, table: Any, toml: bool = False) -> Any:
     return out
 
 
-def _slots(tree: Any, most: int = 2000) -> list[tuple[Any, Any]]:
-    """Container and key of every entry of a tree, up to about `most`."""
+def _slots(tree: Any) -> list[tuple[Any, Any]]:
+    """Container and key of every entry of a tree, up to about 2,000."""
     out: list[tuple[Any, Any]] = []
     stack = [tree]
-    while stack and len(out) < most:
+    while stack and len(out) < 2000:
         here = stack.pop()
         keys: Sequence[Any] = list(here) if isinstance(here, dict) else range(len(here))
         for key in keys:

@@ -18,14 +18,7 @@ _BY_DAY = ("validate_by_photo", "real")
 HELD_OUT_FORECAST = "forecast_held_out"
 """Folder of the forecast from held-out lightings, if the folder `forecast` has the one from photos."""
 FORECAST = (
-    "pearson",
-    "spearman",
-    "mmrv",
-    "winner_agreement",
-    "winner_regret",
-    "bias",
-    "coverage",
-    "corrected_coverage",
+    *("pearson", "spearman", "mmrv", "winner_agreement", "winner_regret", "bias", "coverage", "corrected_coverage"),
 )
 
 
@@ -61,7 +54,10 @@ def table(results: dict[str, Any]) -> str:
             some = [r for r in results["runs"] if r["finished"] and (r["setup"], r["task"]) == (setup, TASKS[task])]
             parts = {"train": [r["train"] for r in some]}
             parts |= {k: [r["policies"][0][k] for r in some] for k in _EVALUATIONS}
-            cells = [_over_days(part) if name in _BY_DAY else _pooled(part) for name, part in parts.items()]
+            cells = [
+                over_days([counts(one) for one in part]) if name in _BY_DAY else _pooled(part)
+                for name, part in parts.items()
+            ]
             ours.append(" / ".join(cells) + f" ({len(some)} runs)")
         lines.append(f"| ours | {setup} | " + " | ".join(ours) + " |")
     return "\n".join(lines)
@@ -79,14 +75,12 @@ def _pooled(parts: list[dict[str, Any]]) -> str:
     return f"{won / trials:.2f} [{low:.2f}, {high:.2f}], {won}/{trials}"
 
 
-def _over_days(parts: list[dict[str, Any]]) -> str:
-    return over_days([counts(part) for part in parts])
-
-
 def _training(folder: Path) -> dict[str, Any]:
     with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
         last = list(csv.DictReader(file))[-1]
     choice = read_json(folder / CHOICE_FILE) if (folder / CHOICE_FILE).exists() else None
+    # The chosen policy's test in the training's lighting; `choice["chosen"]` is its test under held-out lightings.
+    tests = {one["step"]: one for one in choice["candidates"]} if choice else {}
     ended, success = read_episodes(folder)
     before = success[ended <= choice["chosen"]["step"]] if choice else success
     return {
@@ -96,13 +90,8 @@ def _training(folder: Path) -> dict[str, Any]:
         "memory_mb": float(last["memory_mb"]),
         "whole_episodes": len(success),
         "exploring": _rate((before[-RECENT_EPISODES:] == 1).tolist()),
-        "train": _own_kind(choice) if choice else _rate([]),
+        "train": tests[choice["chosen"]["step"]] if choice else _rate([]),
     }
-
-
-def _own_kind(choice: dict[str, Any]) -> dict[str, Any]:
-    """The chosen policy's test in the training's lighting; `choice["chosen"]` has its test under held-out lightings."""
-    return next(one for one in choice["candidates"] if one["step"] == choice["chosen"]["step"])
 
 
 def _evaluations(name: str, twin: list[Trial], real: list[Trial]) -> dict[str, Any]:

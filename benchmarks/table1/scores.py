@@ -174,12 +174,14 @@ def scores(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]
     real = np.array([_mean(policy.real, days) for policy in mine])
     tasks = [np.array([policy.task == task for policy in mine]) for task in dict.fromkeys(p.task for p in mine)]
     regrets = [winner(twin=twin[of], real=real[of])[1] for of in tasks if of.sum() > 1]
+    by_day = [[PREDICTORS[predictor](policy, [day]) for day in days] for policy in mine]
+    cells = paired_cells(mine, days, np.array(by_day))
     return Scores(
         policies=len(mine),
         spearman=_defined(spearman, twin, real),
         pearson=_defined(pearson, twin, real),
         mmrv=_defined(mmrv, twin, real),
-        intervals={name: _interval(STATISTICS[name], _predicted_cells(predictor, mine, days)) for name in STATISTICS},
+        intervals={name: _interval(statistic, cells) for name, statistic in STATISTICS.items()},
         regret=float(np.mean(regrets)) if regrets else None,
         bias=float(np.mean(real - twin)),
         cells=_cells_held(predictor, mine, days),
@@ -198,11 +200,6 @@ def paired_cells(policies: Sequence[PolicyRecord], days: Sequence[str], twin: np
         day=np.broadcast_to(np.arange(len(days)), (len(policies), len(days))),
         strata=tuple(np.flatnonzero(np.array(tasks) == task) for task in dict.fromkeys(tasks)),
     )
-
-
-def _predicted_cells(predictor: str, policies: Sequence[PolicyRecord], days: Sequence[str]) -> PairedCells:
-    each = [[PREDICTORS[predictor](policy, [day]) for day in days] for policy in policies]
-    return paired_cells(policies, days, np.array(each))
 
 
 def _interval(statistic: Statistic, data: PairedCells) -> tuple[float, float] | None:
@@ -375,18 +372,10 @@ def tables(results: dict[str, Any]) -> str:
         for setup in SETUPS:
             cells = [finals(policies, setup, task, days) for task in TASKS.values()]
             lines.append(f"| {group} | {setup} | {' | '.join(cells)} |")
-    heads = (
-        "policies",
-        "Spearman",
-        "Pearson",
-        "MMRV",
-        "regret",
-        "road minus predicted",
-        "cells that agree",
-        "real rate in predicted interval",
-    )
+    heads = "policies | Spearman | Pearson | MMRV | regret | road minus predicted | cells that agree"
+    heads += " | real rate in predicted interval"
     lines += ["", "Ranking of all policies, finished and checkpoints, by predictor, with 90 % intervals", ""]
-    lines += [f"| days | task | predictor | {' | '.join(heads)} |", f"|---|---|---|{'---|' * len(heads)}"]
+    lines += [f"| days | task | predictor | {heads} |", f"|---|---|---|{'---|' * (heads.count('|') + 1)}"]
     for group, days in GROUPS.items():
         for task in ("both tasks", *TASKS.values()):
             mine = [policy for policy in policies if task in ("both tasks", policy.task)]

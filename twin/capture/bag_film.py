@@ -10,12 +10,15 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as Pillow
+from PIL import UnidentifiedImageError
 from scipy.spatial.transform import Rotation
 
 from twin.capture.bag import (
@@ -129,7 +132,6 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
     """Reads calibration, positions, extrinsics and stamps of the pictures in a bag; decodes only the first picture.
 
     Args:
-        path: See `twin.capture.bag`.
         topic: Topic of the pictures; empty for the topic with the most pictures.
 
     Raises:
@@ -255,32 +257,24 @@ def _decoded(picture: Any, where: str) -> Image:
     from twin_policy import PictureError
 
     try:
-        return np.ascontiguousarray(_checked(picture).decode())
+        if not hasattr(picture, "encoding"):
+            _check_compressed(picture.data)
+        return np.ascontiguousarray(picture.decode())
     except PictureError as error:
         raise InputError(f"{where}: {error}; record raw or compressed pictures of 8 bits") from None
 
 
-def _checked(picture: Any) -> Any:
-    """The picture itself, unchanged.
-
-    Raises PictureError, without decoding, for a compressed picture of unknown format or of more than `_MAX_PIXELS`.
-    """
-    from io import BytesIO
-
-    from PIL import Image as Pillow
-    from PIL import UnidentifiedImageError
-
+def _check_compressed(data: Any) -> None:
+    """Raises PictureError, without decoding, for an unknown format or more than `_MAX_PIXELS`."""
     from twin_policy import PictureError
 
-    if not hasattr(picture, "encoding"):
-        try:
-            with Pillow.open(BytesIO(bytes(picture.data))) as head:
-                width, height = head.size
-        except (UnidentifiedImageError, Pillow.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-            raise PictureError(f"{len(picture.data)} bytes are neither a JPEG nor a PNG picture ({error})") from None
-        if width * height > _MAX_PIXELS:
-            raise PictureError(f"picture of {width} x {height} px; expected at most {_MAX_PIXELS:,} px")
-    return picture
+    try:
+        with Pillow.open(BytesIO(bytes(data))) as head:
+            width, height = head.size
+    except (UnidentifiedImageError, Pillow.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
+        raise PictureError(f"{len(data)} bytes are neither a JPEG nor a PNG picture ({error})") from None
+    if width * height > _MAX_PIXELS:
+        raise PictureError(f"picture of {width} x {height} px; expected at most {_MAX_PIXELS:,} px")
 
 
 def _decode(contents: BagContents, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:

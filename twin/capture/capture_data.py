@@ -17,15 +17,7 @@ from twin import runtime
 from twin.capture.camera_models import Lens, checked_lens, same_aspect
 from twin.config import CaptureConfig, SourceConfig
 from twin.errors import InputError
-from twin.files import (
-    check_shapes,
-    is_file,
-    load_arrays,
-    read_json,
-    require_text,
-    wrap_read_errors,
-    write_json,
-)
+from twin.files import check_shapes, is_file, load_arrays, read_json, require_text, wrap_read_errors, write_json
 from twin.geometry.images import decode_image, write_image
 from twin.types import Array, Image
 

@@ -15,16 +15,8 @@ from numpy.typing import NDArray
 from twin import runtime
 from twin.capture.bag import BAG_SUFFIXES, bag_files, is_bag
 from twin.capture.bag_film import BagContents, read_contents
-from twin.capture.camera_models import Lens
 from twin.capture.capture_data import NO_GPS, Capture, FrameWriter, KeptFrames, SourceTask
-from twin.capture.formats import (
-    find_model,
-    image_files,
-    listed_files,
-    read_colmap,
-    read_image_folder,
-    read_transforms,
-)
+from twin.capture.formats import find_model, image_files, listed_files, read_colmap, read_image_folder, read_transforms
 from twin.capture.photos import read_photos
 from twin.capture.video import FilmStatistics, damage_note, format_note, read_film, video_film
 from twin.config import CaptureConfig, SceneConfig, SourceConfig
@@ -34,16 +26,8 @@ from twin.files import is_file, is_folder, require_folder
 from twin.scene import SceneDir
 from twin.types import Image
 
-_GENERIC_NAMES = (
-    "images",
-    "image",
-    "sparse",
-    "colmap",
-    "input",
-    "0",
-    "dense",
-    "data",
-)  # path components that do not identify a source
+# Path components that do not identify a source.
+_GENERIC_NAMES = ("images", "image", "sparse", "colmap", "input", "0", "dense", "data")
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
@@ -198,7 +182,9 @@ def _read_video(task: SourceTask, bag: BagContents | None) -> KeptFrames:
     for note in filter(None, (damage_note(task.path, count), format_note(task.path, count))):
         runtime.log_line(f"  {note}")
     task.check_masked(unmasked, len(index))
-    lens = task.given_lens(count.size) or _lens_of_bag(bag, count.size)
+    lens = task.given_lens(count.size)
+    if lens is None and bag is not None and bag.lens is not None:
+        lens = bag.lens.scaled(*count.size)
     info = task.info(size, lens.scaled(*size) if lens else None, lens is not None)
     metrics = {
         "kind": task.kind,
@@ -226,11 +212,6 @@ def _read_video(task: SourceTask, bag: BagContents | None) -> KeptFrames:
     }
     runtime.log_line(f"  {task.name}: {bag.topics['pictures']}; {metrics['calibration']}")
     return KeptFrames(info, index, times, list(map(tuple, fixes)), metrics, [], [], list(map(tuple, odometry)))
-
-
-def _lens_of_bag(bag: BagContents | None, size: tuple[int, int]) -> Lens | None:
-    """A bag's calibration at the size of its pictures [px]."""
-    return bag.lens.scaled(*size) if bag is not None and bag.lens is not None else None
 
 
 def _merged(kept: list[KeptFrames], config: CaptureConfig) -> Capture:

@@ -23,9 +23,7 @@ _SIGMA_RIGHT = np.radians(1.0)
 """Mounting error of a camera's right axis [rad]; common to all frames, so averaging does not reduce it."""
 _SIGMA_ROAD = np.radians(1.0)  # [rad] standard deviation of the tilt of roads by camber
 _SIGMA_PATH = np.radians(0.3)  # [rad] standard deviation of a path's slope relative to the ground
-_PATH_SAMPLES = (
-    3.0  # number of independent heights along a path; far fewer than frames, since a path undulates smoothly
-)
+_PATH_SAMPLES = 3.0  # independent heights along a path; far fewer than frames, since a path undulates smoothly
 _MIN_VARIANCE_RATIO = 10.0
 """A principal axis of points constrains up only if the variance along it is more than this multiple of the smallest."""
 _MIN_WIDTH = 0.05
@@ -36,6 +34,7 @@ _LAYER = 0.06  # half thickness of the road layer, for undulation, camber and no
 _MAX_TILT = np.radians(25.0)  # largest angle between the road's normal and the cameras' mean up axis [rad]
 MIN_ROAD_POINTS = 20  # road points needed for a reliable road
 _REACHES = (1.0, 2.0, 4.0, 8.0)  # largest offsets [drops] of the points of the road layer, tried in this order
+_MIN_AROUND = 6  # road points around a camera needed for its height in `heights_above_road`
 _MIN_CAMERA_FRACTION = 0.2  # smallest fraction of the cameras that need a height in `heights_above_road`
 _DEEPER_THAN = 1.25  # points are far below a layer if their drop exceeds this multiple of the layer's drop
 _MAX_DEEPER_FRACTION = 0.1
@@ -184,17 +183,16 @@ def _road_normal(road: Array, centers: Array, up: Array) -> Array | None:
     return axes[:, 0] if axes[:, 0] @ up > 0 else -axes[:, 0]
 
 
-def heights_above_road(points: Array, centers: Array, up: Array, drop: float, min_points: int = 6) -> Array | None:
+def heights_above_road(points: Array, centers: Array, up: Array, drop: float) -> Array | None:
     """Heights (n,) of the camera centers (n, 3) above the road.
 
     Each is the median height above the road points (k, 3) whose horizontal distance from the camera is at most `drop`,
-    or NaN if there are fewer than `min_points`. Returns None if fewer than three cameras, or fewer than a fifth, have a
-    height.
+    NaN if there are fewer than `_MIN_AROUND`. None if fewer than three cameras, or fewer than a fifth, have a height.
     """
     flat = np.eye(3) - np.outer(up, up)
     tree = cKDTree(points @ flat)
     heights = np.full(len(centers), np.nan)
     for i, near in enumerate(tree.query_ball_point(centers @ flat, drop)):
-        if len(near) >= min_points:
+        if len(near) >= _MIN_AROUND:
             heights[i] = float(np.median((centers[i] - points[near]) @ up))
     return heights if np.isfinite(heights).sum() >= max(3, _MIN_CAMERA_FRACTION * len(centers)) else None

@@ -74,26 +74,8 @@ class _GroundPicture:
     """Side of a pixel."""
 
 
-@dataclass(frozen=True)
-class _Match:
-    """k matches between the ground pictures of two parts."""
-
-    xy_a: Array
-    """Points x, y in the first picture, shape (k, 2)."""
-    xy_b: Array
-    rays_a: Array
-    """Rays of the first part, see `_rays`, shape (k, 6)."""
-    rays_b: Array
-
-
 def join(a: Part, b: Part, read_frame: FrameReader) -> Similarity | None:
-    """The similarity from the frame of part b to that of part a; None if their grounds do not match.
-
-    Args:
-        a: A part.
-        b: Another part.
-        read_frame: See `FrameReader`.
-    """
+    """The similarity from the frame of part b to that of part a; None if their grounds do not match."""
     levels = _level_frame(a), _level_frame(b)
     if levels[0] is None or levels[1] is None:
         return None
@@ -101,27 +83,23 @@ def join(a: Part, b: Part, read_frame: FrameReader) -> Similarity | None:
     poses_a, poses_b = level_a.poses(a.camera_to_world), level_b.poses(b.camera_to_world)
     common = set(a.lightings) & set(b.lightings)
     pairs = [(one, one) for one in common] or [(one, two) for one in set(a.lightings) for two in set(b.lightings)]
-    found: list[_Match] = []
+    found: list[tuple[Array, Array, Array, Array]] = []  # of two pictures: matched points (k, 2) and rays (k, 6)
     for one, two in sorted(pairs):
         picture_a = _ground_picture(a, poses_a, one, read_frame)
         picture_b = _ground_picture(b, poses_b, two, read_frame)
         if picture_a and picture_b:
             xy_a, xy_b = _matches(picture_a, picture_b)
             rays = _rays(picture_a, xy_a, poses_a, road_a), _rays(picture_b, xy_b, poses_b, road_b)
-            found.append(_Match(xy_a, xy_b, *rays))
-    fits = [_planar_similarity(one.xy_b, one.xy_a) for one in found]
+            found.append((xy_a, xy_b, *rays))
+    fits = [_planar_similarity(xy_b, xy_a) for xy_a, xy_b, *_ in found]
     count, planar = max(fits, key=lambda fit: fit[0], default=(0, np.eye(3)))
     if count < _MIN_MATCHES:
         return None
-    inliers = [
-        np.linalg.norm(one.xy_b @ planar[:2, :2].T + planar[:2, 2] - one.xy_a, axis=1) < _TOLERANCE for one in found
-    ]
-    spread = np.concatenate([one.xy_a[near] for one, near in zip(found, inliers, strict=True)])
-    if max(np.ptp(spread, axis=0)) < _MIN_EXTENT:
+    xy_a, xy_b, rays_a, rays_b = map(np.concatenate, zip(*found, strict=True))
+    near = np.linalg.norm(xy_b @ planar[:2, :2].T + planar[:2, 2] - xy_a, axis=1) < _TOLERANCE
+    if max(np.ptp(xy_a[near], axis=0)) < _MIN_EXTENT:
         return None
-    rays_a = np.concatenate([one.rays_a[near] for one, near in zip(found, inliers, strict=True)])
-    rays_b = np.concatenate([one.rays_b[near] for one, near in zip(found, inliers, strict=True)])
-    return level_a.inverse() @ _meeting_similarity(rays_a, rays_b, planar) @ level_b
+    return level_a.inverse() @ _meeting_similarity(rays_a[near], rays_b[near], planar) @ level_b
 
 
 def _level_frame(part: Part) -> tuple[Similarity, Array] | None:

@@ -65,7 +65,7 @@ class Registration:
     error: float  # mean reprojection error of the inliers [px of the photo]
 
 
-def register_photo(photo: Image, exif: PhotoExif, scene: SceneDir, seed: int = 0) -> Registration:
+def register_photo(photo: Image, exif: PhotoExif, scene: SceneDir) -> Registration:
     """Localizes an upright photo (h, w, 3) in a scene and estimates its lens.
 
     Raises InputError: fewer than `MIN_INLIERS` inliers.
@@ -76,7 +76,7 @@ def register_photo(photo: Image, exif: PhotoExif, scene: SceneDir, seed: int = 0
         work = Path(folder)
         _write_gray(work / "photo.png", photo, size)
         lenses = [(vars(lens), held, origin) for lens, held, origin in candidate_lenses(size, exif, scene)]
-        run_worker(solve_photo, {"metric": str(scene.stage("metric")), "lenses": lenses, "seed": seed}, work)
+        run_worker(solve_photo, {"metric": str(scene.stage("metric")), "lenses": lenses}, work)
         result = read_json(work / "result.json")
     return Registration(
         np.array(result["camera_to_world"]),
@@ -160,9 +160,7 @@ def solve_photo(job: dict[str, Any], work: Path) -> None:
     image, points = pixels[pairs[:, 0]], scene_map.points.xyz[pairs[:, 1]]
     found: list[tuple[_LocalizedFrame, str]] = []
     for entry, held, origin in job["lenses"]:
-        frame = _localize(
-            image, points, lens_from_json(entry), job["seed"], origin == _ESTIMATED, not held, distortion=not held
-        )
+        frame = _localize(image, points, lens_from_json(entry), origin == _ESTIMATED, not held, distortion=not held)
         if frame:
             found.append((frame, origin))
     most = max((len(frame.image) for frame, _ in found), default=0)
@@ -214,7 +212,6 @@ def _localize(
     image: Array,
     points: Array,
     lens: Lens,
-    seed: int,
     estimate_focal: bool,
     refine_focal: bool,
     distortion: bool = False,
@@ -229,7 +226,7 @@ def _localize(
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.estimate_focal_length = estimate_focal
     options.ransac.max_error = _INLIER_TOLERANCE * max(lens.width, lens.height)
-    options.ransac.min_inlier_ratio, options.ransac.random_seed = 0.02, seed
+    options.ransac.min_inlier_ratio, options.ransac.random_seed = 0.02, 0
     found = pycolmap.estimate_absolute_pose(image, points, camera, options)
     if found is None:
         return None
@@ -310,7 +307,7 @@ class FilmRegistration:
     error: float  # median over the frames of the mean reprojection error of their inliers [px]
 
 
-def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, seed: int = 0) -> FilmRegistration:
+def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir) -> FilmRegistration:
     """Localizes the frames of a film in a scene and, without a given lens, estimates their focal length.
 
     Each frame is first matched with scene frames near the previous localized frame; if that fails, the whole scene is
@@ -329,7 +326,7 @@ def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, 
         names = [f"{i:06d}.png" for i in range(len(frames))]
         for name, frame in zip(names, frames, strict=True):
             _write_gray(work / name, frame, size)
-        job = {"metric": str(scene.stage("metric")), "photos": names, "seed": seed}
+        job = {"metric": str(scene.stage("metric")), "photos": names}
         run_worker(solve_film, job | {"lens": vars(lens), "held": given is not None}, work)
         result = read_json(work / "result.json")
     scale = full[0] / size[0]
@@ -347,7 +344,7 @@ def register_film(frames: Sequence[Image], given: Lens | None, scene: SceneDir, 
 
 def solve_film(job: dict[str, Any], work: Path) -> None:
     """Runs a job of `register_film`; writes `result.json` to `work`."""
-    scene_map, lens, seed = LocalizationMap(Path(job["metric"])), lens_from_json(job["lens"]), job["seed"]
+    scene_map, lens = LocalizationMap(Path(job["metric"])), lens_from_json(job["lens"])
     free_focal = not job["held"]
     matches: list[tuple[Array, Array]] = []
     localized: dict[int, _LocalizedFrame] = {}
@@ -358,7 +355,7 @@ def solve_film(job: dict[str, Any], work: Path) -> None:
         for found in _film_matches(scene_map, descriptors, last):
             pairs = _trusted_pairs(found)
             inputs = pixels[pairs[:, 0]], scene_map.points.xyz[pairs[:, 1]]
-            if frame := _localize_frame(*inputs, lens, seed, free_focal):
+            if frame := _localize_frame(*inputs, lens, free_focal):
                 localized[k] = last = frame
                 break
         matches.append(inputs)
@@ -371,7 +368,7 @@ def solve_film(job: dict[str, Any], work: Path) -> None:
     focal_error = 0.0
     if free_focal:
         lens = _with_focal(lens, float(np.median([frame.lens.params[0] for frame in localized.values()])))
-        again = {k: frame for k, pair in enumerate(matches) if (frame := _localize_frame(*pair, lens, seed, False))}
+        again = {k: frame for k, pair in enumerate(matches) if (frame := _localize_frame(*pair, lens, False))}
         localized = again or localized
         focal, focal_error = _shared_focal(list(localized.values()), lens)
         lens = _with_focal(lens, focal)
@@ -399,8 +396,8 @@ def _film_matches(
     yield _match_similar_frames(scene_map, descriptors, show_bars=False)
 
 
-def _localize_frame(image: Array, points: Array, lens: Lens, seed: int, free_focal: bool) -> _LocalizedFrame | None:
-    frame = _localize(image, points, lens, seed, free_focal, free_focal)
+def _localize_frame(image: Array, points: Array, lens: Lens, free_focal: bool) -> _LocalizedFrame | None:
+    frame = _localize(image, points, lens, free_focal, free_focal)
     return frame if frame and len(frame.image) >= MIN_INLIERS else None
 
 

@@ -341,17 +341,8 @@ def open_database(capture: Capture, stage: Path, work: Path, free_focal: bool, t
                     done.add(image.camera_id)
                     intrinsics = None if given is None else given[i]
                     database.update_camera(_camera(source, image.camera_id, free_focal, intrinsics))
-    return Matcher(
-        path,
-        images,
-        _mask_folder(capture, stage, work),
-        capture,
-        image_ids,
-        threads,
-        seed,
-        set(),
-        np.arange(len(capture.names)),
-    )
+    masks, frames = _mask_folder(capture, stage, work), np.arange(len(capture.names))
+    return Matcher(path, images, masks, capture, image_ids, threads, seed, set(), frames)
 
 
 def _camera(source: SourceInfo, camera_id: int, free_focal: bool, intrinsics: Array | None) -> pycolmap.Camera:

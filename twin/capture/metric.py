@@ -20,7 +20,6 @@ from twin.capture.scale import (
     scale_from_height,
     scale_from_marker,
     scale_from_odometry,
-    select_scale_sources,
 )
 from twin.config import SceneConfig
 from twin.errors import InputError
@@ -40,50 +39,47 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
     Returns the content of `metric.json`, see `_metrics`.
 
-    Raises InputError: no scale is given, or the data do not determine it.
+    Raises InputError: the data do not determine the scale.
     """
     cameras, points = Cameras.load(scene.stage("cameras")), SparsePoints.load(scene.stage("cameras"))
     capture = Capture.load(scene.stage("capture"))
+    given = config.metric
     heights = {source.name: source.camera_height for source in capture.sources}
-    sources = select_scale_sources(config.metric, heights)
-    if "poses_are_metric" in sources and capture.camera_to_world is None:
+    if given.poses_are_metric and capture.camera_to_world is None:
         raise InputError("metric.poses_are_metric: the input has no poses; give metric.camera_height or another scale")
-    up, road = _find_up(cameras, points.xyz, config.metric.up, capture)
+    up, road = _find_up(cameras, points.xyz, given.up, capture)
     level, floor_source = _ground_level(cameras, points.xyz, up.direction, road)
     east: Array | None = None
     scales: dict[str, Scale] = {}
-    if "camera_height" in sources:
-        scales["camera_height"] = scale_from_height(cameras, up, points.xyz, road, config.metric, heights)
-    if "distance" in sources:
-        assert config.metric.distance is not None
-        if road is None and not config.metric.distance.frame_b:
+    if max((given.camera_height, *heights.values())) > 0:
+        scales["camera_height"] = scale_from_height(cameras, up, points.xyz, road, given, heights)
+    if given.distance is not None:
+        if road is None and not given.distance.frame_b:
             raise InputError(
                 "metric.distance: no ground was reconstructed; mark the points in a second image, too: frame_b, a2, b2"
             )
-        scales["distance"] = scale_from_distance(cameras, up.direction, level, config.metric.distance)
+        scales["distance"] = scale_from_distance(cameras, up.direction, level, given.distance)
     row = {name: i for i, name in enumerate(capture.names)}
     rows = [row[name] for name in cameras.names]
-    if "gps" in sources:
-        gps = capture.gps[rows]
+    if given.gps:
         rng = np.random.default_rng(config.seed)
-        scales["gps"], east = scale_from_gps(cameras.positions, up.direction, gps, rng)
-    if "odometry" in sources:
+        scales["gps"], east = scale_from_gps(cameras.positions, up.direction, capture.gps[rows], rng)
+    if given.odometry:
         if capture.odometry is None:
             raise InputError(
                 "metric.odometry: no source is a bag with odometry; give metric.camera_height or another scale"
             )
-        scales["odometry"] = scale_from_odometry(cameras, capture.odometry[rows], config.metric.odometry_tolerance)
-    if "marker" in sources:
-        assert config.metric.marker is not None
-        scales["marker"] = scale_from_marker(cameras, config.metric.marker)
-    if "poses_are_metric" in sources:
+        scales["odometry"] = scale_from_odometry(cameras, capture.odometry[rows], given.odometry_tolerance)
+    if given.marker is not None:
+        scales["marker"] = scale_from_marker(cameras, given.marker)
+    if given.poses_are_metric:
         scales["poses_are_metric"] = Scale(1.0, 0.0)
     scale = combine_scales(scales)
-    similarity = _level_frame(cameras, up.direction, level, scale.value, east, keep=config.metric.up == "poses")
+    similarity = _level_frame(cameras, up.direction, level, scale.value, east, keep=given.up == "poses")
     cameras, points = cameras.transformed(similarity), points.transformed(similarity)
     cameras.save(out)
     points.save(out)
-    metrics = _metrics(cameras, points, " + ".join(sources), scale, up, road, floor_source, similarity)
+    metrics = _metrics(cameras, points, " + ".join(scales), scale, up, road, floor_source, similarity)
     write_json(out / "metric.json", metrics)
     return metrics
 
@@ -95,12 +91,10 @@ def _find_up(cameras: Cameras, points: Array, method: str, capture: Capture) -> 
         up = camera_up(cameras.camera_to_world)
         tilt = np.arccos(np.clip(-cameras.camera_to_world[:, :3, 1] @ up, -1.0, 1.0))
         gravity = Gravity(up, float(np.sqrt(np.mean(tilt**2)) / np.sqrt(min(len(cameras), 10))), "cameras")
-    elif method == "poses":
+    else:
         if capture.camera_to_world is None:
             raise InputError('metric.up = "poses": the input has no poses; use "ground" or "cameras"')
         gravity = Gravity(np.array([0.0, 0.0, 1.0]), 0.0, "poses")
-    else:
-        raise InputError(f"metric.up = {method!r}; expected ground, cameras or poses")
     return gravity, find_road(points, cameras.positions, gravity.direction)
 
 

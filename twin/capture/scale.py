@@ -16,11 +16,6 @@ from twin.geometry.images import read_image
 from twin.geometry.poses import inverse_pose
 from twin.types import Array
 
-_SCALE_OPTIONS = (
-    "metric.camera_height = 0.5 (lens above the ground [m]), [metric.distance] (two marked image points and the meters "
-    "between them), metric.gps = true (positions in EXIF or a bag), metric.odometry = true (odometry in a bag), "
-    "[metric.marker] (a printed ArUco or AprilTag marker), or metric.poses_are_metric = true"
-)
 _PIXEL_ERROR = 1.0  # [px] standard deviation of a point marked by hand
 _GPS_TRIALS = 400
 _STRETCH = 2.0  # [m] length of the compared stretches of odometry; the heading hardly drifts over this length
@@ -38,31 +33,6 @@ class Scale:
     value: float
     uncertainty: float  # relative standard deviation; 0 for poses that are given as metric
     notes: dict[str, Any] = field(default_factory=dict)  # further entries of `metric.json`
-
-
-def select_scale_sources(metric: MetricConfig, source_heights: dict[str, float]) -> list[str]:
-    """The scale sources that are configured: camera_height, distance, gps, odometry, marker, poses_are_metric.
-
-    `source_heights` holds the sources' own camera heights [m], 0 for none. Raises InputError if none is configured, or
-    for a negative height.
-    """
-    heights = (metric.camera_height, *source_heights.values())
-    if any(height < 0 for height in heights):
-        raise InputError(
-            f"metric.camera_height = {metric.camera_height}; expected meters above the ground, such as 0.5"
-        )
-    options = {
-        "camera_height": any(height > 0 for height in heights),
-        "distance": metric.distance is not None,
-        "gps": metric.gps,
-        "odometry": metric.odometry,
-        "marker": metric.marker is not None,
-        "poses_are_metric": metric.poses_are_metric,
-    }
-    given = [name for name, set_ in options.items() if set_]
-    if not given:
-        raise InputError(f"no scale given; give one of: {_SCALE_OPTIONS}")
-    return given
 
 
 def combine_scales(scales: dict[str, Scale]) -> Scale:
@@ -183,19 +153,15 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
 
     `ground_level` is the height of the ground along `up` in the reconstruction's unit.
 
-    Raises InputError: an unknown frame, a point outside its image, no positive distance, or rays that do not meet.
+    Raises InputError: an unknown frame, a point outside its image, or rays that do not meet.
     """
-    if not distance.metres > 0:
-        raise InputError(f"metric.distance.metres = {distance.metres}; expected the meters between the points a and b")
-    frames = [_marked_frame(cameras, "a", distance.frame_a, distance.a)]
-    frames.append(_marked_frame(cameras, "b", distance.frame_a, distance.b))
-    pixels = np.array([distance.a, distance.b], np.float64)
+    marked = {"a": distance.frame_a, "b": distance.frame_a}
     if distance.frame_b:
-        frames.append(_marked_frame(cameras, "a2", distance.frame_b, distance.a2))
-        frames.append(_marked_frame(cameras, "b2", distance.frame_b, distance.b2))
-        pixels = np.concatenate([pixels, np.array([distance.a2, distance.b2], np.float64)])
         if distance.frame_a == distance.frame_b:
             raise InputError(f"metric.distance: frame_a and frame_b are both {distance.frame_a!r}; mark two frames")
+        marked |= {"a2": distance.frame_b, "b2": distance.frame_b}
+    frames = [_marked_frame(cameras, key, frame, getattr(distance, key)) for key, frame in marked.items()]
+    pixels = np.array([getattr(distance, key) for key in marked], np.float64)
 
     def length(offset: Array) -> float:
         rays = [_ray(cameras, f, p) for f, p in zip(frames, pixels + offset, strict=True)]
@@ -229,7 +195,7 @@ def _marked_frame(cameras: Cameras, key: str, frame: str, pixel: tuple[float, ..
         )
     index = cameras.names.index(frame)
     width, height = (int(v) for v in cameras.sizes[index])
-    if len(pixel) != 2 or not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
+    if not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
         raise InputError(f"metric.distance.{key} = {list(pixel)}; expected [u, v] within {width}×{height} px")
     return index
 
@@ -397,16 +363,9 @@ def _stretches(positions: Array) -> list[tuple[int, int]]:
 def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
     """Scale from a printed square marker (ArUco or AprilTag) in the scene, whose corners are triangulated.
 
-    Raises InputError: unknown family or number, no size, a marker not seen from two directions, or unequal sides.
+    Raises InputError: a marker not seen from two directions, or unequal sides.
     """
-    families = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
-    if marker.family not in families:
-        raise InputError(f"metric.marker.family = {marker.family!r}; expected one of {', '.join(families)}")
-    if not marker.size > 0:
-        raise InputError(f"metric.marker.size = {marker.size}; expected the side of the black square [m]")
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, marker.family))
-    if not 0 <= marker.id < len(dictionary.bytesList):
-        raise InputError(f"metric.marker.id = {marker.id}; {marker.family} has 0 to {len(dictionary.bytesList) - 1}")
     settings = cv2.aruco.DetectorParameters()
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(dictionary, settings)

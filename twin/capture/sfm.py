@@ -20,14 +20,7 @@ from twin import runtime
 from twin.capture.camera_models import Lens, lens_from_json, undistortion, write_pinhole_image
 from twin.capture.capture_data import Capture
 from twin.capture.ground_matching import Part, join
-from twin.capture.mapping import (
-    MIN_FRAMES,
-    coherent_frames,
-    connections,
-    fresh_folder,
-    reconstruct,
-    registered_poses,
-)
+from twin.capture.mapping import MIN_FRAMES, coherent_frames, connections, fresh_folder, reconstruct, registered_poses
 from twin.capture.matching import (
     PROBE_INLIERS,
     Matcher,
@@ -70,8 +63,6 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     capture = Capture.load(stage)
     work = out / "work"
     work.mkdir()
-    if settings.mapper not in ("auto", "global", "incremental"):
-        raise InputError(f"cameras.mapper = {settings.mapper!r}; expected auto, global or incremental")
     threads = min(os.cpu_count() or 1, _MAX_THREADS)
     job = asdict(settings) | {"capture": str(stage), "seed": config.seed, "threads": threads}
     run_worker(solve_mapping, job, work)

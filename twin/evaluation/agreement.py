@@ -12,16 +12,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.errors import join_names
 from twin.evaluation.jackknife import (
     STATISTICS,
     PairedCells,
+    Statistic,
     jackknife_interval,
     mean_bias,
     mean_over_tasks,
     pair_cells,
+    policy_rows,
 )
 from twin.evaluation.probability_scores import (
     SCORE_DIFFERENCE,
@@ -38,7 +39,6 @@ from twin.evaluation.probability_scores import (
     shuffled_days,
     twin_probabilities,
 )
-from twin.evaluation.rate_model import padded_counts
 from twin.evaluation.statistics import (
     MIN_POLICIES,
     MIN_PREDICTORS,
@@ -176,20 +176,20 @@ def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
 
 def unit_counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, Indices]:
     """Successes and trials of each policy's independent units, shapes (n, k): cells if `by_day`, else trials."""
-    if by_day:
-        return padded_counts([[(c.successes, c.trials) for c in row] for row in rows])
-    won = [sum(c.successes for c in row) for row in rows]
-    driven = [sum(c.trials for c in row) for row in rows]
-    return padded_counts([[(int(k < w), 1) for k in range(n)] for w, n in zip(won, driven, strict=True)])
+    units = [[(c.successes, c.trials) for c in row] for row in rows]
+    if not by_day:
+        totals = [np.sum(row, 0) for row in units]
+        units = [[(int(k < won), 1) for k in range(driven)] for won, driven in totals]
+    counts = np.zeros((2, len(units), max(map(len, units))), np.int64)
+    for i, row in enumerate(units):
+        counts[:, i, : len(row)] = np.transpose(row)
+    return counts[0], counts[1]
 
 
 def compare_cells(cell: Cell, mate: Cell) -> CellPair:
     """Compares the rate of a real cell with that of the corresponding cell `mate` of the twin."""
     value, low, high = rate_difference(
-        twin_successes=mate.successes,
-        twin_trials=mate.trials,
-        real_successes=cell.successes,
-        real_trials=cell.trials,
+        twin_successes=mate.successes, twin_trials=mate.trials, real_successes=cell.successes, real_trials=cell.trials
     )
     alone = "none for a single cell"
     in_twin, on_road = (Estimate(c.rate, n=c.trials, no_interval=alone) for c in (mate, cell))
@@ -198,22 +198,13 @@ def compare_cells(cell: Cell, mate: Cell) -> CellPair:
     return CellPair(cell.policy, cell.task, cell.lighting, mate.lighting, in_twin, on_road, bias, within)
 
 
-def share_estimate(count: int, total: int, no_interval: str) -> Estimate:
-    """A fraction with the reason why it has no interval."""
-    return Estimate(count / total, n=total, no_interval=no_interval)
-
-
 # ---- agreement
 
 
 def measure_agreement(task: str, real: Sequence[Cell], twin: Cells, further: Sequence[float]) -> Agreement:
     """Agreement of a group's real cells with the corresponding cells of the twin.
 
-    Args:
-        task: Name of the task, or of all tasks together.
-        real: Real cells of the group.
-        twin: The twin's cells by key.
-        further: Twin scores of policies without real trials, for `Agreement.mean_real`.
+    `further` holds the twin scores of policies without real trials, for `Agreement.mean_real`.
     """
     missing = missing_data(real, twin)
     data = pair_cells(real, twin)
@@ -233,7 +224,7 @@ def measure_agreement(task: str, real: Sequence[Cell], twin: Cells, further: Seq
         mmrv=_statistic("mmrv", mmrv, data),
         **_winner(data),
         bias=_statistic("bias", lambda **rates: float(mean_bias(**rates)), data),
-        coverage=share_estimate(sum(pair.within_chance for pair in pairs), len(pairs), DEPENDENT),
+        coverage=Estimate(sum(pair.within_chance for pair in pairs) / len(pairs), n=len(pairs), no_interval=DEPENDENT),
         corrected_coverage=_corrected_coverage(data),
         mean_real=_mean_real(data, further),
         trainings=data.trainings,
@@ -249,11 +240,15 @@ def _statistic(name: str, of: Callable[..., float], data: PairedCells) -> Estima
         value = of(**data.rates())
     except UndefinedStatistic as refusal:
         return Estimate(n=data.policies, missing=str(refusal))
+    return _with_interval(value, STATISTICS[name], data, data.policies)
+
+
+def _with_interval(value: float, statistic: Statistic, data: PairedCells, n: int) -> Estimate:
     try:
-        low, high = jackknife_interval(STATISTICS[name], data)
+        low, high = jackknife_interval(statistic, data)
     except UndefinedStatistic as refusal:
-        return Estimate(value, n=data.policies, no_interval=str(refusal))
-    return Estimate(value, float(low), float(high), data.policies)
+        return Estimate(value, n=n, no_interval=str(refusal))
+    return Estimate(value, float(low), float(high), n)
 
 
 def _winner(data: PairedCells) -> dict[str, Any]:
@@ -281,7 +276,7 @@ def _corrected_coverage(data: PairedCells) -> Estimate:
         hits += list((low <= y) & (y <= high))
     if not hits:
         return Estimate(missing=f"each policy needs {MIN_PREDICTORS} policies of other trainings on its task")
-    return share_estimate(int(sum(hits)), len(hits), DEPENDENT)
+    return Estimate(int(sum(hits)) / len(hits), n=len(hits), no_interval=DEPENDENT)
 
 
 def _mean_real(data: PairedCells, further: Sequence[float]) -> Estimate:
@@ -315,55 +310,32 @@ def _probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> dict
     if several:
         logs[SHUFFLED] = shuffled_days(probability, data.weight, data.real, log_score)
         briers[SHUFFLED] = shuffled_days(probability, data.weight, data.real, brier)
+    gains = {TWIN: Estimate(missing="compared with itself")}
+    for name in list(logs)[1:]:
+        pair = score_pair(data, logs[TWIN], logs[name])
+        gains[name] = _with_interval(float(mean_bias(**pair.rates())), SCORE_DIFFERENCE, pair, data.cells)
     scores = tuple(
         PredictorScore(
             name,
             Estimate(mean_score(data, briers[name]), n=data.cells),
             Estimate(mean_score(data, logs[name]), n=data.cells),
-            _gain(data, logs[TWIN], logs[name]) if name != TWIN else Estimate(missing="compared with itself"),
+            gains[name],
         )
         for name in logs
     )
     used = data.weight > 0
-    trials, days = _trials_and_days(real)
+    cells = [cell for row in policy_rows(real) for cell in row]  # in the order of the mask `used`
+    trials = np.array([cell.trials for cell in cells])
     return {
         "scores": scores,
-        "calibration": calibration(probability[used], data.real[used], trials[used]),
-        "errors": errors_by_day(probability[used], data.real[used], days[used].tolist()),
+        "calibration": calibration(probability[used], data.real[used], trials),
+        "errors": errors_by_day(probability[used], data.real[used], [cell.lighting for cell in cells]),
     }
-
-
-def _gain(data: PairedCells, score: Array, baseline: Array) -> Estimate:
-    pair = score_pair(data, score, baseline)
-    value = float(mean_bias(**pair.rates()))
-    try:
-        low, high = jackknife_interval(SCORE_DIFFERENCE, pair)
-    except UndefinedStatistic as refusal:
-        return Estimate(value, n=data.cells, no_interval=str(refusal))
-    return Estimate(value, float(low), float(high), data.cells)
-
-
-def _real_rows(real: Sequence[Cell]) -> list[list[Cell]]:
-    """Real cells by policy, in the order of `pair_cells`."""
-    tasks = dict.fromkeys(cell.task for cell in real)
-    keys = [p for task in tasks for p in dict.fromkeys((c.policy, c.task) for c in real if c.task == task)]
-    return [[cell for cell in real if (cell.policy, cell.task) == key] for key in keys]
-
-
-def _trials_and_days(real: Sequence[Cell]) -> tuple[Indices, NDArray[np.object_]]:
-    """Trials and day of each cell, in the layout of `pair_cells`."""
-    rows = _real_rows(real)
-    shape = len(rows), max(map(len, rows))
-    trials, days = np.zeros(shape, np.int64), np.full(shape, "", dtype=object)
-    for i, row in enumerate(rows):
-        for j, cell in enumerate(row):
-            trials[i, j], days[i, j] = cell.trials, cell.lighting
-    return trials, days
 
 
 def _twin_probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> tuple[Array, bool]:
     """The twin's probability of success in each real cell, and True if some policy has several twin cells."""
-    rows = _real_rows(real)
+    rows = policy_rows(real)
     mine = [list(dict.fromkeys(cell.twin_key for cell in row)) for row in rows]
     several = max(map(len, mine)) > 1
     counts = unit_counts([[twin[key] for key in keys] for keys in mine], several)

@@ -25,7 +25,6 @@ from twin.evaluation.agreement import (
     compare_cells,
     measure_agreement,
     missing_data,
-    share_estimate,
     unit_counts,
 )
 from twin.evaluation.jackknife import training_of
@@ -35,7 +34,6 @@ from twin.evaluation.statistics import (
     MIN_POLICIES,
     MIN_PREDICTORS,
     LinearCorrection,
-    UndefinedStatistic,
     mean_rate,
 )
 from twin.evaluation.trials import Cell
@@ -172,8 +170,6 @@ def make_forecast(
     """Computes a forecast.
 
     Args:
-        scene: Name of the scene.
-        twin: Cells of the twin.
         real: Real cells, each with a twin cell to compare with; may be empty.
         seed: Seed of the sampling from posteriors.
         trained: Success rates in training by (policy, task), where known.
@@ -327,22 +323,15 @@ def _left_out(task: str, real: Sequence[Cell], twin: Cells) -> list[LeftOutLight
     for name in names:
         mine = np.array([other == name for other in lightings])
         n = int(mine.sum())
-        estimates = (Estimate(missing=missing),) * 3
-        if not missing:
-            try:
-                line = LinearCorrection.fit(twin=twin_rate[~mine], real=real_rate[~mine])
-            except UndefinedStatistic:
-                none = Estimate(missing=f"the other lightings have fewer than {MIN_POLICIES} cells")
-                estimates = (none, none, none)
-            else:
-                value, low, high = line.predict(twin_rate[mine])
-                inside = (low <= real_rate[mine]) & (real_rate[mine] <= high)
-                twin_error, error = np.abs(twin_rate - real_rate)[mine], np.abs(value - real_rate[mine])
-                estimates = (
-                    Estimate(float(twin_error.mean()), n=n, no_interval=DEPENDENT),
-                    Estimate(float(error.mean()), n=n, no_interval=DEPENDENT),
-                    share_estimate(int(inside.sum()), n, DEPENDENT),
-                )
+        too_few = f"the other lightings have fewer than {MIN_POLICIES} cells" if len(real) - n < MIN_POLICIES else ""
+        if missing or too_few:
+            out.append(LeftOutLighting(task, name, n, *(Estimate(missing=missing or too_few),) * 3))
+            continue
+        line = LinearCorrection.fit(twin=twin_rate[~mine], real=real_rate[~mine])
+        value, low, high = line.predict(twin_rate[mine])
+        inside = (low <= real_rate[mine]) & (real_rate[mine] <= high)
+        means = np.abs(twin_rate - real_rate)[mine].mean(), np.abs(value - real_rate[mine]).mean(), inside.sum() / n
+        estimates = (Estimate(float(mean), n=n, no_interval=DEPENDENT) for mean in means)
         out.append(LeftOutLighting(task, name, n, *estimates))
     return out
 

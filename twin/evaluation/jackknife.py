@@ -33,13 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from twin.evaluation.statistics import (
-    CONFIDENCE,
-    UndefinedStatistic,
-    mmrv_batched,
-    pearson_batched,
-    spearman_batched,
-)
+from twin.evaluation.statistics import CONFIDENCE, UndefinedStatistic, mmrv_batched, pearson_batched, spearman_batched
 from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
 
@@ -108,11 +102,16 @@ def training_of(policy: str) -> str:
     return policy.partition("/")[0]
 
 
-def pair_cells(real: Sequence[Cell], twin: Mapping[tuple[str, str, str], Cell]) -> PairedCells:
-    """Pairs real cells with the twin's cells, given by key; policies are ordered by task, then by first occurrence."""
+def policy_rows(real: Sequence[Cell]) -> list[list[Cell]]:
+    """Real cells of each policy; policies are ordered by task, then by first occurrence."""
     tasks = dict.fromkeys(cell.task for cell in real)
     policies = [p for task in tasks for p in dict.fromkeys((c.policy, c.task) for c in real if c.task == task)]
-    rows = [[cell for cell in real if (cell.policy, cell.task) == policy] for policy in policies]
+    return [[cell for cell in real if (cell.policy, cell.task) == policy] for policy in policies]
+
+
+def pair_cells(real: Sequence[Cell], twin: Mapping[tuple[str, str, str], Cell]) -> PairedCells:
+    """Pairs real cells with the twin's cells, given by key; rows are those of `policy_rows`."""
+    rows = policy_rows(real)
     shape = len(rows), max(map(len, rows))
     twin_rate, real_rate, weight = np.zeros((3, *shape))
     day = np.zeros(shape, np.int64)
@@ -121,9 +120,10 @@ def pair_cells(real: Sequence[Cell], twin: Mapping[tuple[str, str, str], Cell]) 
         for j, cell in enumerate(row):
             twin_rate[i, j], real_rate[i, j], weight[i, j] = twin[cell.twin_key].rate, cell.rate, 1.0
             day[i, j] = days.index(cell.lighting)
-    trainings = list(dict.fromkeys(training_of(policy) for policy, _ in policies))
-    training = np.array([trainings.index(training_of(policy)) for policy, _ in policies])
-    strata = tuple(np.array([i for i, (_, t) in enumerate(policies) if t == task]) for task in tasks)
+    runs, tasks = [training_of(row[0].policy) for row in rows], [row[0].task for row in rows]
+    trainings = list(dict.fromkeys(runs))
+    training = np.array([trainings.index(run) for run in runs])
+    strata = tuple(np.array([i for i, t in enumerate(tasks) if t == task]) for task in dict.fromkeys(tasks))
     return PairedCells(twin_rate, real_rate, weight, training, day, strata)
 
 
@@ -189,7 +189,7 @@ def mean_over_tasks(statistic: Callable[..., tuple[Array, Array]], data: PairedC
 # ---- intervals
 
 
-def jackknife_interval(statistic: Statistic, data: PairedCells, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
+def jackknife_interval(statistic: Statistic, data: PairedCells) -> tuple[Array, Array]:
     """Ends of the interval of a statistic at one place, shapes (...).
 
     Among experiments along leading axes, those whose units do not determine a variance get nan. Raises
@@ -207,16 +207,17 @@ def jackknife_interval(statistic: Statistic, data: PairedCells, confidence: floa
     of_day = [data.day != d for d in np.unique(data.day[data.weight > 0])]
     both = [t | d for t in of_training for d in of_day]
     with np.errstate(invalid="ignore", divide="ignore"):
-        parts = [_variance(statistic, [data.rates(kept) for kept in units]) for units in (of_training, of_day, both)]
+        each = [[statistic.of(**data.rates(kept)) for kept in units] for units in (of_training, of_day, both)]
+        parts = [_spread(np.stack([statistic.scale(value) for value in values])) for values in each]
         variance = parts[0] + parts[1] - (1.0 if statistic.linear else _SHARE_OF_BOTH) * parts[2]
         variance = np.where(variance > 0, variance, np.maximum(parts[0], parts[1]))
         freedom = variance**2 / (parts[0] ** 2 / (trainings - 1) + parts[1] ** 2 / (days - 1))
     freedom = np.clip(freedom, (trainings - 1) / 2, trainings + days - 2)
-    return _ends(statistic, statistic.of(**data.rates()), variance, freedom, confidence)
+    return _ends(statistic, statistic.of(**data.rates()), variance, freedom)
 
 
 def place_interval(
-    statistic: Statistic, places: Sequence[PairedCells], pooled: bool = False, confidence: float = CONFIDENCE
+    statistic: Statistic, places: Sequence[PairedCells], pooled: bool = False
 ) -> tuple[Array, Array, Array]:
     """A statistic over several places, and the ends of its interval with the place as the unit, shapes (...).
 
@@ -234,18 +235,17 @@ def place_interval(
 
     value = of(each)
     left_out = np.stack([statistic.scale(of([*each[:i], *each[i + 1 :]])) for i in range(len(each))])
-    low, high = _ends(statistic, value, _spread(left_out), np.asarray(len(places) - 1.0), confidence)
+    low, high = _ends(statistic, value, _spread(left_out), np.asarray(len(places) - 1.0))
     return value, low, high
 
 
 def mean_difference_interval(
-    differences: Array, confidence: float = CONFIDENCE, limits: tuple[float, float] = (-1.0, 1.0)
+    differences: Array, limits: tuple[float, float] = (-1.0, 1.0)
 ) -> tuple[float, float, float]:
     """Mean difference of two training setups, and the ends of its interval by Student's t.
 
     Args:
         differences: One value per pair of trainings or per place, shape (n,).
-        confidence: Confidence level of the interval.
         limits: The interval is clipped to these; by default, those of a difference of rates.
 
     Raises:
@@ -257,12 +257,8 @@ def mean_difference_interval(
     mean, error = float(np.mean(differences)), float(np.std(differences, ddof=1) / np.sqrt(n))
     if error < 1e-9:
         raise UndefinedStatistic("no interval: all pairs differ by the same amount")
-    half = float(student.ppf(0.5 + confidence / 2, n - 1)) * error
+    half = float(student.ppf(0.5 + CONFIDENCE / 2, n - 1)) * error
     return mean, max(mean - half, limits[0]), min(mean + half, limits[1])
-
-
-def _variance(statistic: Statistic, replicates: Sequence[dict[str, Array]]) -> Array:
-    return _spread(np.stack([statistic.scale(statistic.of(**rates)) for rates in replicates]))
 
 
 def _spread(left_out: Array) -> Array:
@@ -271,16 +267,14 @@ def _spread(left_out: Array) -> Array:
     return np.asarray((m - 1) / m * ((left_out - left_out.mean(0)) ** 2).sum(0))
 
 
-def _ends(
-    statistic: Statistic, value: Array, variance: Array, freedom: Array, confidence: float
-) -> tuple[Array, Array]:
+def _ends(statistic: Statistic, value: Array, variance: Array, freedom: Array) -> tuple[Array, Array]:
     variance = np.where(variance > 1e-18, variance, np.nan)
     if np.ndim(variance) == 0 and np.isnan(variance):
         raise UndefinedStatistic(
             "no interval: the variance cannot be estimated, since leaving out units does not change the value, or "
             "leaves rates that are all equal"
         )
-    half = student.ppf(0.5 + confidence / 2, freedom) * np.sqrt(variance)
+    half = student.ppf(0.5 + CONFIDENCE / 2, freedom) * np.sqrt(variance)
     center = statistic.scale(value)
     low, high = statistic.inverse(center - half), statistic.inverse(center + half)
     return np.maximum(low, statistic.low), np.minimum(high, statistic.high)

@@ -12,20 +12,18 @@ recalibration are fitted to real trials; they predict each training from trials 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from twin.evaluation.jackknife import MIN_BIAS_DAYS, MIN_BIAS_TRAININGS, PairedCells, Statistic, mean_bias
+from twin.evaluation.jackknife import STATISTICS, PairedCells
 from twin.evaluation.rate_model import RateModel
 from twin.types import Array, Indices
 
 CALIBRATION_EDGES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 """Ends of the bins of predicted probability in a calibration curve."""
 
-SCORE_DIFFERENCE = Statistic(
-    mean_bias, lambda x: x, lambda x: x, -np.inf, np.inf, True, MIN_BIAS_TRAININGS, MIN_BIAS_DAYS
-)
+SCORE_DIFFERENCE = replace(STATISTICS["bias"], low=-np.inf, high=np.inf)
 """Mean over policies of the difference of two scores, as a `Statistic` for `jackknife_interval` on a `score_pair`."""
 
 _LEAST = 0.005  # log scores and recalibration clip probabilities to between this and 1 minus this

@@ -27,13 +27,13 @@ def rank_probabilities(rates: Array) -> Array:
     return np.stack([(ranks == k).mean(0) for k in range(rates.shape[-1])], -1)
 
 
-def rank_interval(probabilities: Array, confidence: float = CONFIDENCE) -> tuple[float, int, int]:
+def rank_interval(probabilities: Array) -> tuple[float, int, int]:
     """Expected rank of a policy (1 is best) from rank probabilities (n,), and the ends of its credible interval.
 
-    The ranks excluded at either end have a total probability of at most (1 − confidence) / 2.
+    The ranks excluded at either end have a total probability of at most (1 − `CONFIDENCE`) / 2.
     """
     ranks = np.arange(1, len(probabilities) + 1)
-    tail = (1.0 - confidence) / 2 + 1e-12
+    tail = (1.0 - CONFIDENCE) / 2 + 1e-12
     below = np.cumsum(probabilities)
     above = np.cumsum(probabilities[::-1])[::-1]
     return float(probabilities @ ranks), int(ranks[below > tail][0]), int(ranks[above > tail][-1])
@@ -58,7 +58,6 @@ def expected_confidence(rates: Array, more: int, seed: int, so_far: bool = True)
     Args:
         rates: Samples of the true rates, shape (samples, n).
         more: Further trials per policy.
-        seed: Seed of the simulated trials.
         so_far: True: the ranking also uses the trials on which the posterior is based; False: only the further ones.
     """
     won = np.random.default_rng(seed).binomial(more, rates)

@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike
 from scipy.special import betainc, betaln, expit, logit
 
 from twin.evaluation.statistics import CONFIDENCE
-from twin.types import Array, Indices
+from twin.types import Array
 
 MIN_RATE_DAYS = 2
 """Number of days below which a policy's rate over days has no interval."""
@@ -82,8 +82,6 @@ class RateModel:
         """Fits the counts of n policies in up to k cells, shapes (n, k); cells without trials are padding.
 
         Args:
-            successes: Successes of each cell.
-            trials: Trials of each cell.
             covariate: xᵢ [logit], shape (n,); `fit` subtracts its mean; None: no covariate.
             shared_days: True if the policies drove on the same few days; see the module's docstring.
             road: True: ρ has the road's prior; False: a uniform one.
@@ -101,7 +99,8 @@ class RateModel:
         x = given - given.mean()
         mean, correlation, slope = (a.ravel() for a in np.meshgrid(_MEANS, _CORRELATIONS, slopes, indexing="ij"))
         centers = expit(logit(mean) + slope * x[:, None])
-        prior = _masses(np.clip(centers, 1e-4, 1 - 1e-4), correlation)
+        a, b = _beta(np.clip(centers, 1e-4, 1 - 1e-4), correlation)
+        prior = np.diff(betainc(a[..., None], b[..., None], _EDGES), axis=-1)
         evidence = np.maximum(np.matmul(prior, likelihood), 1e-300)
         log = np.log(evidence).sum(0)
         weight = np.exp(log - log.max()) * _CORRELATIONS ** (_ROAD_PRIOR if road else 0.0)
@@ -122,15 +121,15 @@ class RateModel:
         """Posterior mean of each policy's rate over days, shape (n,)."""
         return np.asarray(self.posterior() @ _RATES)
 
-    def interval(self, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
+    def interval(self) -> tuple[Array, Array]:
         """Ends of the shortest credible interval of each policy's rate over days, shapes (n,)."""
-        ends = np.array([_shortest(mass, _EDGES, confidence) for mass in self.posterior()])
+        ends = np.array([_shortest(mass, _EDGES) for mass in self.posterior()])
         return ends[:, 0], ends[:, 1]
 
-    def mean_interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    def mean_interval(self) -> tuple[float, float]:
         """Ends of the shortest credible interval of μ, the rate over the population of policies and days."""
         mass = np.array([self.weight[self.means == mean].sum() for mean in _MEANS])
-        return _shortest(mass, np.sin(np.pi / 2 * np.arange(len(_MEANS) + 1) / len(_MEANS)) ** 2, confidence)
+        return _shortest(mass, np.sin(np.pi / 2 * np.arange(len(_MEANS) + 1) / len(_MEANS)) ** 2)
 
     def sample(self, rng: np.random.Generator, samples: int) -> Array:
         """Samples of the policies' rates over days, shape (samples, n)."""
@@ -160,12 +159,6 @@ def _beta(mean: Array, correlation: Array) -> tuple[Array, Array]:
     return mean * size, (1.0 - mean) * size
 
 
-def _masses(mean: Array, correlation: Array) -> Array:
-    """Mass of Beta distributions on the grid of rates, from means and correlations (..., h); shape (..., h, g)."""
-    a, b = _beta(mean, correlation)
-    return np.diff(betainc(a[..., None], b[..., None], _EDGES), axis=-1)
-
-
 def _likelihood(won: Array, driven: Array) -> Array:
     """Product over cells of the beta-binomial likelihood, shape (n, g, r), at most 1 for each policy."""
     a, b = _beta(_RATES[:, None], _CORRELATIONS[None])
@@ -178,21 +171,11 @@ def _likelihood(won: Array, driven: Array) -> Array:
     return np.asarray(np.exp(log - log.max((1, 2), keepdims=True)))
 
 
-def _shortest(mass: Array, edges: Array, confidence: float) -> tuple[float, float]:
-    """Shortest interval with mass `confidence` of a distribution that is uniform between the edges of each bin."""
+def _shortest(mass: Array, edges: Array) -> tuple[float, float]:
+    """Shortest interval with mass `CONFIDENCE` of a distribution that is uniform between the edges of each bin."""
     below = np.concatenate([[0.0], np.cumsum(mass)])
     below /= below[-1]
-    start = np.linspace(0.0, 1.0 - confidence, 201)
-    low, high = np.interp(start, below, edges), np.interp(start + confidence, below, edges)
+    start = np.linspace(0.0, 1.0 - CONFIDENCE, 201)
+    low, high = np.interp(start, below, edges), np.interp(start + CONFIDENCE, below, edges)
     best = int(np.argmin(high - low))
     return float(low[best]), float(high[best])
-
-
-def padded_counts(rows: list[list[tuple[int, int]]]) -> tuple[Indices, Indices]:
-    """Arrays of successes and trials (n, k), padded with 0, from (successes, trials) of each cell of each policy."""
-    shape = len(rows), max(map(len, rows))
-    won, driven = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
-    for i, row in enumerate(rows):
-        for j, (successes, trials) in enumerate(row):
-            won[i, j], driven[i, j] = successes, trials
-    return won, driven

@@ -55,7 +55,7 @@ def wilson(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDEN
     return np.maximum(center - half, 0.0), np.minimum(center + half, 1.0)
 
 
-def mean_rate(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
+def mean_rate(successes: ArrayLike, trials: ArrayLike) -> tuple[float, float, float]:
     """Unweighted mean of the rates of k cells with nᵢ trials, shape (k,), and the ends of its interval.
 
     The interval is Wilson's for k² / Σ 1/nᵢ trials: if all cells have the same true rate, the rate in this many trials
@@ -65,7 +65,7 @@ def mean_rate(successes: ArrayLike, trials: ArrayLike, confidence: float = CONFI
     n = np.asarray(trials, float)
     mean = float(np.mean(np.asarray(successes, float) / n))
     effective = len(n) ** 2 / np.sum(1.0 / n)
-    low, high = wilson(mean * effective, effective, confidence)
+    low, high = wilson(mean * effective, effective)
     return mean, float(low), float(high)
 
 
@@ -77,7 +77,7 @@ def rate_summary(won: int, trials: int) -> dict[str, Any]:
     return {"successes": won, "trials": trials, "rate": won / trials, "low": float(low), "high": float(high)}
 
 
-def rate_over_days(rates: ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
+def rate_over_days(rates: ArrayLike) -> tuple[float, float, float]:
     """Unweighted mean of the rates of k days, shape (k,), and the ends of its interval with the day as the unit.
 
     Trials of one day share its lighting and weather. The interval assumes that all trials of a day have the same
@@ -89,7 +89,7 @@ def rate_over_days(rates: ArrayLike, confidence: float = CONFIDENCE) -> tuple[fl
     days = np.asarray(rates, float)
     if days.ndim != 1 or not len(days) or not ((days >= 0.0) & (days <= 1.0)).all():
         raise ValueError(f"rates of shape {days.shape}: expected one in [0, 1] per day, (k,), k ≥ 1")
-    low, high = wilson(days.sum(), len(days), confidence)
+    low, high = wilson(days.sum(), len(days))
     return float(days.mean()), float(low), float(high)
 
 
@@ -231,12 +231,7 @@ class PredictionPoweredMean:
 
 
 def prediction_powered_mean(
-    *,
-    twin: ArrayLike,
-    real: ArrayLike,
-    twin_only: ArrayLike,
-    power: float | None = None,
-    confidence: float = CONFIDENCE,
+    *, twin: ArrayLike, real: ArrayLike, twin_only: ArrayLike, power: float | None = None
 ) -> PredictionPoweredMean:
     """Estimates the mean real score by PPI++.
 
@@ -250,7 +245,6 @@ def prediction_powered_mean(
         real: Yᵢ, shape (n,).
         twin_only: f̃ⱼ, shape (N,).
         power: λ; None: λ is tuned.
-        confidence: Confidence level of the interval.
 
     Raises:
         UndefinedStatistic: n < 5, or N < 2.
@@ -264,7 +258,7 @@ def prediction_powered_mean(
     mean_power = float(powers.mean())
     value = mean_power * further.mean() + float((y - powers * f).mean())
     error = np.var(y - powers * f, ddof=1) / n + mean_power**2 * np.var(further, ddof=1) / more
-    half = float(student.ppf(0.5 + confidence / 2, n - 1) * np.sqrt(error))
+    half = float(student.ppf(0.5 + CONFIDENCE / 2, n - 1) * np.sqrt(error))
     return PredictionPoweredMean(float(value), float(value - half), float(value + half), mean_power)
 
 

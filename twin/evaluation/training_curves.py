@@ -114,14 +114,14 @@ def read_episodes(folder: Path) -> tuple[Indices, Indices]:
     return steps, success
 
 
-def binned_rates(steps: Indices, success: Indices, bins: int = _MAX_BINS) -> list[tuple[float, int, int, float, float]]:
-    """Divides the episodes of `read_episodes` into up to `bins` bins with about equal numbers of episodes.
+def binned_rates(steps: Indices, success: Indices) -> list[tuple[float, int, int, float, float]]:
+    """Divides the episodes of `read_episodes` into up to `_MAX_BINS` bins with about equal numbers of episodes.
 
     Returns for each bin: mean step, successes, episodes, and the ends of the rate's interval. A bin has at least
     `_MIN_EPISODES` episodes; if there are fewer in all, there is one bin.
     """
     out = []
-    parts = max(1, min(bins, len(steps) // _MIN_EPISODES))
+    parts = max(1, min(_MAX_BINS, len(steps) // _MIN_EPISODES))
     for at, won in zip(np.array_split(steps, parts), np.array_split(success, parts), strict=True):
         low, high = wilson(won.sum(), len(won))
         out.append((float(at.mean()), int(won.sum()), len(won), float(low), float(high)))

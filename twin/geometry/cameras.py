@@ -93,15 +93,11 @@ class Cameras:
         base = folder.resolve().parent
         with wrap_read_errors(folder / "cameras.json", "build the scene again"):
             texts = {name: tuple(map(require_text, head[name])) for name in ("names", "lightings", "sources")}
-            images, masks, n = (
-                base / head["images"],
-                base / head["masks"] if head["masks"] else None,
-                len(texts["names"]),
-            )
+            images, masks = base / head["images"], base / head["masks"] if head["masks"] else None
+            n = len(texts["names"])
             if any(len(values) != n for values in texts.values()):
-                raise ValueError(
-                    ", ".join(f"{len(values)} {name}" for name, values in texts.items()) + "; expected equal numbers"
-                )
+                counts = ", ".join(f"{len(values)} {name}" for name, values in texts.items())
+                raise ValueError(f"{counts}; expected equal numbers")
         with wrap_read_errors(folder / "cameras.npz", "build the scene again"):
             arrays = {name: data[name] for name in _CAMERA_ARRAYS}
             check_shapes({name: (arrays[name], (n, *one), kind) for name, (one, kind) in _CAMERA_ARRAYS.items()})
@@ -160,7 +156,7 @@ def intrinsics_for_size(cameras: PosedCameras, size: tuple[int, int] | None) -> 
                 "pass size=(width, height) to render"
             )
         size = int(own[0, 0]), int(own[0, 1])
-    return np.asarray(cameras.intrinsics) * np.tile(np.array(size) / own, 2), size
+    return scaled_intrinsics(cameras.intrinsics, own, size), size
 
 
 def pixel_grid(width: int, height: int) -> Array:
@@ -186,8 +182,8 @@ def project(points: Array, camera_to_world: Array, intrinsics: Array) -> tuple[A
     return np.stack([fx * local[..., 0] / safe + cx, fy * local[..., 1] / safe + cy], -1), depth
 
 
-def scaled_intrinsics(intrinsics: Array, size: tuple[int, int], new_size: tuple[int, int]) -> Array:
-    """Intrinsics after resizing an image from `size` to `new_size` (width, height)."""
+def scaled_intrinsics(intrinsics: Array, size: tuple[int, int] | NDArray, new_size: tuple[int, int]) -> Array:
+    """Intrinsics (..., 4) after resizing images from `size` to `new_size` (width, height)."""
     return np.asarray(intrinsics) * np.tile(np.array(new_size) / size, 2)
 
 

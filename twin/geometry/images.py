@@ -148,14 +148,5 @@ def psnr(image: NDArray, reference: NDArray, mask: NDArray | None = None) -> flo
 
 def ssim(image: NDArray, reference: NDArray) -> float:
     """Structural similarity (Wang et al. 2004, Gaussian window σ = 1.5) of float RGB images in [0, 1]."""
-    return float(
-        structural_similarity(
-            image,
-            reference,
-            channel_axis=-1,
-            data_range=1.0,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-        )
-    )
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return float(structural_similarity(image, reference, channel_axis=-1, data_range=1.0, **window))

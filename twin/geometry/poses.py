@@ -77,11 +77,10 @@ def rotation_angle(rotation: Array) -> Array:
     return np.arctan2(np.linalg.norm(skew, axis=-1), np.trace(rotation, axis1=-2, axis2=-1) - 1.0)
 
 
-def look_at(eye: Array, target: Array, up: Array | None = None) -> Array:
-    """camera_to_world of an OpenCV camera at `eye` that looks at `target`, shape (4, 4)."""
-    up = np.array([0.0, 0.0, 1.0]) if up is None else up
+def look_at(eye: Array, target: Array) -> Array:
+    """camera_to_world of an upright OpenCV camera at `eye` that looks at `target`, shape (4, 4)."""
     forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, up)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)

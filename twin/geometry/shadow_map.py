@@ -106,12 +106,7 @@ class OrthographicShadowMap:
         """`height` for the kernel, without infinities."""
         return wp.array(np.maximum(self.height, np.float32(-1e9)), dtype=float, device="cpu")
 
-    @staticmethod
-    def of_mesh(vertices: Array, faces: NDArray, toward: Array, texel: float = TEXEL) -> "OrthographicShadowMap":
-        """The map of a mesh, vertices (n, 3) [m] and faces (m, 3), from a ray of the sun through each texel."""
-        return ShadowCasters(vertices, faces).seen_from(toward, texel)
-
-    def visibility(self, points: NDArray, normals: NDArray | None = None, bias: float = BIAS) -> Array32:
+    def visibility(self, points: NDArray, normals: NDArray | None = None) -> Array32:
         """Fraction of the sunlight that reaches points (n, 3) [m], shape (n,); 1 outside the map.
 
         If the unit normals (n, 3) of the surfaces at the points are given, slopes do not shadow themselves.
@@ -124,7 +119,7 @@ class OrthographicShadowMap:
         facing: Any = wp.array(np.ascontiguousarray(normals, np.float32), dtype=wp.vec3, device="cpu")
         out = wp.empty(len(points), dtype=float, device="cpu")
         axes = (wp.vec3(*axis.tolist()) for axis in (right, upward, self.toward))
-        inputs = [self._height, at, facing, *axes, wp.vec2(*self.origin.tolist()), self.texel, bias, _RAMP]
+        inputs = [self._height, at, facing, *axes, wp.vec2(*self.origin.tolist()), self.texel, BIAS, _RAMP]
         wp.launch(_look_up, len(points), inputs=inputs, outputs=[out], device="cpu")
         return out.numpy()
 
@@ -176,7 +171,10 @@ class ShadowCasters:
         ]
 
     def seen_from(self, toward: Array, texel: float = TEXEL) -> OrthographicShadowMap:
-        """The map for a sun in the direction of a unit vector (3,); `texel` [m] grows for a wide place."""
+        """The map for a sun in the direction of a unit vector (3,), from a ray of the sun through each texel.
+
+        `texel` [m] grows for a wide place.
+        """
         toward = np.asarray(toward, np.float64) / np.linalg.norm(toward)
         if not self._parts:
             return OrthographicShadowMap(toward, np.zeros(2), texel, np.full((1, 1), -np.inf, np.float32))

@@ -120,14 +120,10 @@ def preprocess(pictures: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
 
 
 def onnx_bytes(architecture: Architecture, weights: dict[str, Array32], notes: dict[str, str]) -> bytes:
-    """Returns the contents of an ONNX file with preprocessing and network.
+    """Returns the contents of an ONNX file with preprocessing, network and the metadata `notes`.
 
-    Its input is `pixels`, uint8 (n, 3 · stack, height, width); its output is `action`, (n, actions).
-
-    Args:
-        architecture: Sizes of the network.
-        weights: See `Architecture.shapes`.
-        notes: The file's metadata.
+    Its input is `pixels`, uint8 (n, 3 · stack, height, width); its output is `action`, (n, actions). `weights` has the
+    names and shapes of `Architecture.shapes`.
     """
     from onnx import TensorProto, helper, numpy_helper
 

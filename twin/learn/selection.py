@@ -36,7 +36,7 @@ from twin.learn.policy import copy_policy, load_policy
 from twin.learn.policy_evaluation import EpisodeResult, run_episodes
 from twin.learn.sac import has_state, saved_steps
 from twin.learn.train_config import TrainConfig
-from twin.learn.training import Drive, Segment, Watch, check_same, run_settings, train
+from twin.learn.training import Drive, Segment, Watch, check_same, checkpoint_folder, run_settings, train
 from twin.loading import Twin
 
 TESTS_FILE = "tests.json"
@@ -155,7 +155,9 @@ def train_until_learnt(
     def referee(step: int, drive: Drive) -> Segment | None:
         if planned and step >= planned[-1].until:
             with runtime.bar(f"test at {step:,}", _TEST_EPISODES, "episode") as bar:
-                tests.append(_test(config, step, lambda seeds: drive(_checkpoint(folder, step), seeds, bar.update)))
+                tests.append(
+                    _test(config, step, lambda seeds: drive(checkpoint_folder(folder, step), seeds, bar.update))
+                )
             scores = {"success": tests[-1].rate, "progress": tests[-1].progress, "reward": tests[-1].reward}
             for writer in writers:
                 writer.write({f"tests/{name}": value for name, value in scores.items()}, {}, step)
@@ -176,7 +178,7 @@ def _choose(
         options = {**config.options(), "start_along": 0.0, **condition}
         bar = runtime.bar(what, len(seeds), "episode")
         with closing(make_vector_env(twin, config.task, options, [None] * config.worlds, processes)) as envs, bar:
-            return run_episodes(load_policy(_checkpoint(folder, step)), envs, seeds, bar.update)
+            return run_episodes(load_policy(checkpoint_folder(folder, step)), envs, seeds, bar.update)
 
     seeds = _seeds(config)
     finalists = [one for one in tests if one.trials == _TEST_EPISODES]
@@ -190,7 +192,7 @@ def _choose(
     condition = Condition(HELD_OUT, True) if config.lighting_varies else Condition(config.lighting, config.randomise)
     options = condition_options(condition) if config.lighting_varies else {}
     fresh = PolicyTest.of(best.step, drive(best.step, seeds[_TEST_EPISODES:], "final test", options))
-    copy_policy(_checkpoint(folder, best.step), folder)
+    copy_policy(checkpoint_folder(folder, best.step), folder)
     by_step = {one.step: one for one in [*tests, *finalists]}
     out = {
         "steps": tests[-1].step,
@@ -245,10 +247,6 @@ def _seeds(config: TrainConfig) -> tuple[int, ...]:
     """Seeds of the test episodes, then of those of the final test."""
     sequence = np.random.SeedSequence([config.seed, _STREAM])
     return tuple(int(seed) for seed in sequence.generate_state(_TEST_EPISODES + FRESH_EPISODES))
-
-
-def _checkpoint(folder: Path, step: int) -> Path:
-    return folder / "checkpoints" / f"{step:09d}"
 
 
 def read_choice(folder: Path) -> dict[str, Any] | None:

@@ -5,7 +5,7 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from twin.config import ANY, HELD_OUT, STEERING, TRAINING, TWIST
 from twin.env.domain_randomization import Ranges
@@ -13,42 +13,12 @@ from twin.env.options import CPU, CUDA, NERF, SIMULATOR, Rewards
 from twin.errors import InputError, short_repr
 from twin.learn.policy import Control
 from twin.learn.policy_network import Architecture
+from twin.types import Range, setting_ranges
 
 _STATE_SCALES = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3, 0.3)
 """Typical magnitudes of the privileged state's components: speed [m/s], yaw rate [rad/s], cross-track error [m],
 heading error [rad], and the turns up to 1, 2 and 4 m ahead [rad]."""
 
-_LIMITS: dict[str, tuple[float, float]] = {
-    "seed": (0, 2**63 - 1),
-    "steps": (1, 10**10),
-    "worlds": (1, 4096),
-    "speed": (0.01, 10),
-    "yaw_rate": (0.01, 10),
-    "centring": (0, 1e3),
-    "steering": (0, 1e3),
-    "entropy": (-1e3, 1e3),
-    "start_along": (0, 0.999),
-    "pool": (1, 16),
-    "convolutions": (1, 4096),
-    "features": (1, 65_536),
-    "hidden": (1, 65_536),
-    "batch": (1, 65_536),
-    "buffer": (1, 10**8),
-    "starts": (0, 10**10),
-    "updates": (1e-6, 1e3),
-    "gamma": (0, 0.999999),
-    "learning_rate": (1e-9, 1),
-    "tau": (1e-9, 1),
-    "shift": (0, 64),
-    "colours": (0, 100),
-    "checkpoints": (1, 10**6),
-    "test_every": (1, 10**10),
-    "settle": (1, 10**10),
-    "cycle": (1, 10**10),
-    "success": (0, 1),
-    "save_every": (1, 10**10),
-}
-"""Lowest and highest value of each number. Beyond them, arithmetic fails, memory runs out, or a training never ends."""
 _CHOICES = {"observe": (NERF, SIMULATOR), "action": (STEERING, TWIST), "device": (CPU, CUDA)}
 
 _ROBOT_ONLY = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
@@ -63,79 +33,82 @@ def _numbers(value: Any) -> list[Any]:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Configuration of a training. The defaults are the preset for a CPU."""
+    """Configuration of a training. The defaults are the preset for a CPU.
+
+    Beyond the ranges, arithmetic fails, memory runs out, or a training never ends.
+    """
 
     task: str = "straight"
     observe: str = NERF
     """`nerf`: pictures of the radiance field; `simulator`: MuJoCo's pictures of the extracted mesh."""
     lighting: str = TRAINING
     """See `env/episode_lighting.py`; by default, a lighting is sampled for every episode."""
-    seed: int = 0
-    success: float = 0.95
+    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
+    success: Annotated[float, Range(0, 1)] = 0.95
     """Success rate at which the training ends (`selection.py`)."""
-    steps: int = 24_000
+    steps: Annotated[int, Range(1, 10**10)] = 24_000
     """Largest number of steps."""
-    worlds: int = 8
+    worlds: Annotated[int, Range(1, 4096)] = 8
     """Number of environments."""
     action: str = STEERING
     """See `Control` for `action`, `speed` and `yaw_rate`."""
-    speed: float = 1.0
-    yaw_rate: float = 1.0
-    centring: float = 1.0
+    speed: Annotated[float, Range(0.01, 10)] = 1.0
+    yaw_rate: Annotated[float, Range(0.01, 10)] = 1.0
+    centring: Annotated[float, Range(0, 1e3)] = 1.0
     """Fraction of the step reward that is lost at the corridor's edge; on the route, nothing is lost."""
-    steering: float = 0.5
+    steering: Annotated[float, Range(0, 1e3)] = 0.5
     """Fraction of the step reward that is lost at full steering."""
-    entropy: float = -0.5
+    entropy: Annotated[float, Range(-1e3, 1e3)] = -0.5
     """Target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 means a standard
     deviation of 0.15, and -1 means 0.09."""
-    start_along: float = 0.9
+    start_along: Annotated[float, Range(0, 0.999)] = 0.9
     """Half of the episodes start at a random point in this first fraction of the route segment, the others at its
     beginning. All start beside the route and at an angle to it, so that a policy practices returning to the middle."""
     randomise: bool = True
     """Randomizes the robot in every episode; if the lighting varies, also the weather and distractor objects."""
     privileged: bool = True
     """The critics, but not the policy, receive the robot's state; the encoder learns to predict it (`sac.py`)."""
-    pool: int = 2
-    convolutions: tuple[tuple[int, int, int], ...] = ((16, 5, 3), (32, 3, 2), (32, 3, 1))
+    pool: Annotated[int, Range(1, 16)] = 2
+    convolutions: Annotated[tuple[tuple[int, int, int], ...], Range(1, 4096)] = ((16, 5, 3), (32, 3, 2), (32, 3, 1))
     """Number of channels, side of the kernel and stride of each convolution."""
-    features: int = 64
-    hidden: tuple[int, ...] = (256, 256)
-    batch: int = 128
-    buffer: int = 50_000
+    features: Annotated[int, Range(1, 65_536)] = 64
+    hidden: Annotated[tuple[int, ...], Range(1, 65_536)] = (256, 256)
+    batch: Annotated[int, Range(1, 65_536)] = 128
+    buffer: Annotated[int, Range(1, 10**8)] = 50_000
     """Number of transitions in the replay buffer."""
-    starts: int = 1_000
+    starts: Annotated[int, Range(0, 10**10)] = 1_000
     """Number of steps with random actions before learning begins."""
-    updates: float = 0.5
+    updates: Annotated[float, Range(1e-6, 1e3)] = 0.5
     """Number of updates per step."""
-    gamma: float = 0.97
+    gamma: Annotated[float, Range(0, 0.999999)] = 0.97
     """Discount per step; at 0.97, a reward 36 steps (3.6 s) ahead counts a third."""
-    learning_rate: float = 5e-4
+    learning_rate: Annotated[float, Range(1e-9, 1)] = 5e-4
     """Largest learning rate; see `training.cycle_rate`."""
-    cycle: int = 12_000
+    cycle: Annotated[int, Range(1, 10**10)] = 12_000
     """Number of steps in a cycle of the learning rate, which falls within each cycle and starts high in the next."""
-    tau: float = 0.01
+    tau: Annotated[float, Range(1e-9, 1)] = 0.01
     """Averaging rate of the target critics, per update."""
-    shift: int = 2
+    shift: Annotated[int, Range(0, 64)] = 2
     """Largest random shift of preprocessed pictures in updates [px]."""
-    colours: float = 1.0
+    colours: Annotated[float, Range(0, 100)] = 1.0
     """Strength of color augmentation in updates (`replay_buffer.py`); applied only if the lighting varies."""
-    checkpoints: int = 20
+    checkpoints: Annotated[int, Range(1, 10**6)] = 20
     """Number of policies saved in `steps` steps; each test saves one more."""
-    test_every: int = 3_000
+    test_every: Annotated[int, Range(1, 10**10)] = 3_000
     """Number of steps between two tests of the policy (`selection.py`)."""
-    settle: int = 2_000
+    settle: Annotated[int, Range(1, 10**10)] = 2_000
     """Number of steps, with a falling learning rate, after tests have ended a training (`selection.py`)."""
-    save_every: int = 4_000
+    save_every: Annotated[int, Range(1, 10**10)] = 4_000
     """Number of steps between two saved states."""
     device: str = "cpu"
 
     def __post_init__(self) -> None:
         """Raises InputError: a value is out of range, or the lighting is reserved for validation."""
-        for name, (low, high) in _LIMITS.items():
+        for name, of in setting_ranges(TrainConfig).items():
             given = getattr(self, name)
             for value in _numbers(given):
-                if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-                    raise InputError(f"{name} = {short_repr(given)}; expected {low:,.10g} to {high:,.10g}")
+                if isinstance(value, bool) or not isinstance(value, int | float) or not of.low <= value <= of.high:
+                    raise InputError(f"{name} = {short_repr(given)}; expected {of.low:,.10g} to {of.high:,.10g}")
         for name, valid in _CHOICES.items():
             if getattr(self, name) not in valid:
                 choices = " or ".join(map(repr, valid))

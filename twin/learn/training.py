@@ -44,15 +44,7 @@ from twin.learn.policy import load_policy, save_policy
 from twin.learn.policy_evaluation import EpisodeResult, run_episodes
 from twin.learn.policy_network import preprocess
 from twin.learn.replay_buffer import FrameReplayBuffer
-from twin.learn.sac import (
-    DrivePolicy,
-    Encoder,
-    PixelSAC,
-    actor_weights,
-    has_state,
-    load_state,
-    save_state,
-)
+from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights, has_state, load_state, save_state
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
 from twin.loading import Twin
@@ -280,6 +272,10 @@ def prepare_folder(folder: Path) -> None:
     (folder / "state").mkdir(parents=True, exist_ok=True)
 
 
+def checkpoint_folder(folder: Path, step: int) -> Path:
+    return folder / "checkpoints" / f"{step:09d}"
+
+
 def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
     """Settings that `check_same` compares between calls of a run: the configuration, and the road's fingerprint.
 
@@ -370,7 +366,7 @@ class _RunRecorder(BaseCallback):
 
     def end(self) -> None:
         """Saves the last checkpoint and state."""
-        self._save_policy(self._folder / "checkpoints" / f"{self.model.num_timesteps:09d}")
+        self._save_policy(checkpoint_folder(self._folder, self.model.num_timesteps))
         self.save()
 
     def save(self) -> None:
@@ -406,7 +402,7 @@ class _RunRecorder(BaseCallback):
         every = self._config.steps / self._config.checkpoints
         number = int(self.model.num_timesteps / every)
         if number and self.model.num_timesteps - number * every < self._config.worlds:
-            self._save_policy(self._folder / "checkpoints" / f"{self.model.num_timesteps:09d}")
+            self._save_policy(checkpoint_folder(self._folder, self.model.num_timesteps))
 
     def _save_policy(self, folder: Path) -> None:
         c = self._config

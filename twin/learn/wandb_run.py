@@ -64,7 +64,6 @@ def wandb_run(project: str, folder: Path, config: Mapping[str, Any]) -> Iterator
     Args:
         project: Name of the project, or `entity/project`.
         folder: The training's folder, in which a folder `wandb` and the file `ID_FILE` are created.
-        config: Shown as the run's configuration.
 
     Raises:
         InputError: wandb is not installed, or it reports an error, for example that nobody is logged in.

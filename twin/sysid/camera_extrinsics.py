@@ -105,7 +105,6 @@ def camera_pose_on_ground(
     """camera_to_world (4, 4), OpenCV axes, of the camera of a robot that is at rest on the ground.
 
     Args:
-        params: The robot.
         position: x, y of the camera (2,) [m].
         heading: Heading of the base [rad].
         ground_at: Returns the ground's height [m], shape (n,), at points (n, 2).

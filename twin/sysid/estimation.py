@@ -150,7 +150,6 @@ class Fit:
     """Standard errors of the identified parameters. The others have none; their values are the defaults."""
     refused: dict[str, str]
     """A line per parameter that is not identified: its default, its standard error and the cure."""
-    negative_log_likelihood: float
 
 
 def maximize_posterior(
@@ -249,7 +248,7 @@ def fit_parameters(
             slopes = np.delete(slopes, worst, -1)
         if len(free) == count:
             found = {p.name: float(e) for p, e in zip(free, errors, strict=True)}
-            return Fit(values, found, refused, negative_log_likelihood(now, kinds))
+            return Fit(values, found, refused)
 
 
 def _prior_weights(table: list[Parameter], kinds: Kinds) -> Array:

@@ -56,8 +56,6 @@ def scene_frame(recording: TrialRecording, frame: str, start: int, scene: SceneD
     Args:
         frame: `SCENE_FRAME` or `FIT`.
         start: Time [ns] from which pictures are used.
-        scene: The scene, with its ground.
-        robot: The robot, with the pose of its camera.
 
     Raises:
         InputError: an error of `fit_frame`, or the pictures are missing or cannot be read.

@@ -145,10 +145,7 @@ def _identified_drive_fields(fit: Fit, twist: bool) -> list[str]:
 
 
 def identify(
-    windows: Windows,
-    params: HuskyParams,
-    use_slope: bool = True,
-    progress: Callable[[str], None] = lambda _: None,
+    windows: Windows, params: HuskyParams, use_slope: bool = True, progress: Callable[[str], None] = lambda _: None
 ) -> Identification:
     """Fits baseline, drivetrain, tires and ground to the windows for fitting, then predicts every window.
 

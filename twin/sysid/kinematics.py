@@ -103,12 +103,6 @@ def residuals(predicted: Array, windows: Windows) -> Array:
     return error
 
 
-def end_errors(predicted: Array, windows: Windows) -> tuple[Array, Array]:
-    """Position error [m] and yaw error [°] at the end of each window, shapes (n,)."""
-    error = interpolate_poses(predicted, windows.elapsed[:, -1]) - windows.poses[:, -1]
-    return np.hypot(error[:, 0], error[:, 1]), np.abs(np.degrees(wrap_angle(error[:, 2])))
-
-
 def track_ratios(windows: Windows, ends: Array) -> Array:
     """Track ratio chi (effective / geometric track) of each window, shape (n,), from the poses at its end (n, 3)."""
     difference = (windows.wheels[..., 1] - windows.wheels[..., 0]).mean(1) * WHEEL_RADIUS
@@ -164,7 +158,8 @@ class Prediction:
     @cached_property
     def errors(self) -> tuple[Array, Array]:
         """Position errors [m] and yaw errors [°] at the end of each window, shapes (n,)."""
-        return end_errors(self.poses, self.windows)
+        error = self.ends - self.windows.poses[:, -1]
+        return np.hypot(error[:, 0], error[:, 1]), np.abs(np.degrees(wrap_angle(error[:, 2])))
 
     def score(self, which: NDArray[np.bool_]) -> Score:
         """The score over some of the windows, a mask (n,)."""

@@ -4,13 +4,12 @@ A *window* contains evenly spaced samples of commands, wheel speeds, poses relat
 accelerations. Windows of one *group* belong to one experiment; even groups are for fitting, odd ones for scoring. A
 window *follows* the previous one if it begins when that one ends. A pose is *fresh* if it differs from the one before.
 
-`read_log` reads
+`twin.sysid.ros_bags` converts a robot's bag to the columns of a table. `read_log` reads
 
 - a table (.csv, or .npz of equally long columns) with one row per instant: `time` [s]; commands, either `cmd_v` [m/s]
   and `cmd_yaw_rate` [rad/s], or `cmd_left` and `cmd_right` [rad/s at the wheels]; `left_wheel_vel`, `right_wheel_vel`
   [rad/s]; `x`, `y` [m], `yaw` [rad] of the base in any fixed frame; optionally `acceleration_x`, `acceleration_y`
   [m/s²], proper acceleration in the base (x forward, y left; an IMU's raw reading), and `group`;
-- a robot's bag, converted to such a table (`twin.sysid.ros_bags`);
 - windows as published with DRIVE (Samson et al., BSD-3): an .npz of arrays (n, 40) at 20 Hz.
 """
 
@@ -20,13 +19,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
 from twin import runtime
-from twin.capture.bag import is_bag
 from twin.errors import InputError
 from twin.files import exists, load_arrays, read_text, wrap_read_errors
 from twin.robot import TRACK, WHEEL_RADIUS
@@ -173,16 +172,9 @@ class Windows:
 
     def select(self, which: NDArray) -> "Windows":
         """Some of the windows, by mask or index; none of them counts as following another."""
-        wheels = self.wheels[which]
-        return Windows(
-            self.commands[which],
-            self.twist,
-            wheels,
-            self.poses[which],
-            self.groups[which],
-            np.zeros(len(wheels), bool),
-            None if self.acceleration is None else self.acceleration[which],
-        )
+        some: dict[str, Any] = {name: getattr(self, name)[which] for name in ("commands", "wheels", "poses", "groups")}
+        acceleration = None if self.acceleration is None else self.acceleration[which]
+        return replace(self, **some, follows=np.zeros(len(some["wheels"]), bool), acceleration=acceleration)
 
     @property
     def fresh(self) -> NDArray[np.bool_]:
@@ -206,13 +198,9 @@ class Windows:
 
 
 def read_log(path: Path) -> Windows:
-    """Reads a log. Raises InputError: an unreadable file, missing columns, or impossible times or values."""
+    """Reads a table or windows. Raises InputError: an unreadable file, missing columns, impossible times or values."""
     if not exists(path):
         raise InputError(f"{path}: no such log; expected a .csv, an .npz or a bag")
-    if path.is_dir() or is_bag(path):
-        from twin.sysid.ros_bags import read_bag
-
-        return cut_windows(read_bag(path), str(path))
     if path.suffix == ".csv":
         return cut_windows(_read_csv(path), str(path))
     if path.suffix == ".npz":
@@ -485,12 +473,8 @@ def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, 
     commanded = windows.commanded_speeds[:, -1] * WHEEL_RADIUS
     end = windows.wheels[:, -1] * WHEEL_RADIUS
     measured = np.stack([end.mean(1), (end[:, 1] - end[:, 0]) / 2], -1)
-    names = (
-        ("cmd_v", "cmd_yaw_rate")
-        if windows.twist
-        else ("the mean of cmd_left and cmd_right", "the difference of cmd_left and cmd_right")
-    )
-    for i, name in enumerate(names):
+    wheels = ("the mean of cmd_left and cmd_right", "the difference of cmd_left and cmd_right")
+    for i, name in enumerate(TWIST if windows.twist else wheels):
         use = (np.abs(measured[:, i]) > 0.5 * _MOVING) & (np.abs(commanded[:, i]) > 0)
         cures = {
             _DEGREE: f"{name} looks like degrees; multiply by π/180",

@@ -63,7 +63,6 @@ def slope_gravity(windows: Windows, model: IcrModel) -> Array:
 
     Args:
         windows: All windows of a log; without accelerations the result is zero.
-        model: Kinematics for headings and velocities.
     """
     if windows.acceleration is None:
         return np.zeros((len(windows), 2))
@@ -220,11 +219,9 @@ def _initial_states(model: mujoco.MjModel, params: HuskyParams, start: Array) ->
     for i, sides in enumerate(start):
         rolling = sides * params.wheel_radius
         data.qvel[0] = rolling.mean()
-        # Half the speed difference [m/s] is taken as yaw rate [rad/s], without division by a track: about half of the
-        # rate to which the robot settles. It is only the start, 0.8 s before the result's first pose, and it stays,
-        # since published fits were made with it. In turns at constant wheel speeds, a start at about the settled rate
-        # changes poses by at most 1.2 mm and 0.02° (after time zero, 0.03 mm) with a friction of 0.3 or more, but by up
-        # to 3 cm and 1.1° with 0.05, the lower bound of a fit.
+        # Not divided by a track, this is about half of the yaw rate to which the robot settles. Published fits were
+        # made with it. It is the start, 0.8 s before the first pose: the settled rate would change poses by at most
+        # 1.2 mm and 0.02° with a friction of 0.3 or more, and by up to 3 cm and 1.1° with 0.05, a fit's lower bound.
         data.qvel[5] = (rolling[1] - rolling[0]) / 2
         data.qvel[joints] = np.tile(sides, 2)
         if model.na:

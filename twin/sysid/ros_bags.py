@@ -36,6 +36,7 @@ from twin.geometry.cameras import Cameras
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
 from twin.scene import SceneDir, require_stage
 from twin.sysid.camera_extrinsics import base_below_camera
+from twin.sysid.logs import ACCELERATION, POSE, TWIST, WHEEL_SPEEDS
 from twin.types import Array
 
 
@@ -82,7 +83,6 @@ def read_bag(path: Path, filmed: FilmedPoses | None = None) -> dict[str, Array]:
     """Reads a bag into the columns that `twin.sysid.logs` describes.
 
     Args:
-        path: See `twin.capture.bag`.
         filmed: Poses to use if the bag has only poses that come from the wheels.
 
     Raises:
@@ -145,12 +145,7 @@ def _wheels_of_odometry(message: Any) -> tuple[float, float]:
     return (v - half) / WHEEL_RADIUS, (v + half) / WHEEL_RADIUS
 
 
-_NAMES = {
-    "commands": ("cmd_v", "cmd_yaw_rate"),
-    "wheels": ("left_wheel_vel", "right_wheel_vel"),
-    "poses": ("x", "y", "yaw"),
-    "imu": ("acceleration_x", "acceleration_y"),
-}
+_NAMES = {"commands": TWIST, "wheels": WHEEL_SPEEDS, "poses": POSE, "imu": ACCELERATION}
 
 
 def _columns(tables: dict[str, Array]) -> dict[str, Array]:

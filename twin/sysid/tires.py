@@ -8,6 +8,7 @@ speeds. The height of the center of mass is fitted only on slopes, as poses on l
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,42 +77,29 @@ _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
 }
 
 
+_COPIED = ("friction", "spin_friction", "rolling_resistance", "ground_viscosity")  # equal in `HuskyParams`
+
+
 def robot_with_values(params: HuskyParams, values: dict[str, float]) -> HuskyParams:
     """A robot with fitted values in its fields, and those of `params` in the others."""
-    x, y, z = params.center_of_mass
-    left, right = params.wheel_radius
+    copied: dict[str, Any] = {name: values[name] for name in _COPIED}
+    x, y, z = (values[f"center_of_mass_{axis}"] for axis in "xyz")
     return replace(
         params,
-        friction=values["friction"],
-        spin_friction=values["spin_friction"],
-        rolling_resistance=values["rolling_resistance"],
+        **copied,
         slip_stiffness=1 / values["creep"],
-        ground_viscosity=values["ground_viscosity"],
-        center_of_mass=(
-            values.get("center_of_mass_x", x),
-            values.get("center_of_mass_y", y),
-            values.get("center_of_mass_z", z),
-        ),
-        wheel_radius=(values.get("radius_left", left), values.get("radius_right", right)),
+        center_of_mass=(x, y, z),
+        wheel_radius=(values["radius_left"], values["radius_right"]),
         servo_gain=10 ** values["log10_servo_gain"],
     )
 
 
 def values_of_robot(params: HuskyParams) -> dict[str, float]:
     """The parameters of a robot, with a pose sensor at its origin and without delay."""
-    x, y, z = params.center_of_mass
-    left, right = params.wheel_radius
-    return {
-        "friction": params.friction,
-        "spin_friction": params.spin_friction,
-        "rolling_resistance": params.rolling_resistance,
-        "creep": 1 / params.slip_stiffness,
-        "ground_viscosity": params.ground_viscosity,
-        "center_of_mass_x": x,
-        "center_of_mass_y": y,
-        "center_of_mass_z": z,
-        "radius_left": left,
-        "radius_right": right,
+    values = {name: getattr(params, name) for name in _COPIED} | {"creep": 1 / params.slip_stiffness}
+    values |= {f"center_of_mass_{axis}": at for axis, at in zip("xyz", params.center_of_mass, strict=True)}
+    values |= dict(zip(("radius_left", "radius_right"), params.wheel_radius, strict=True))
+    return values | {
         "log10_servo_gain": float(np.log10(params.servo_gain)),
         "pose_x": 0.0,
         "pose_y": 0.0,
@@ -120,17 +108,12 @@ def values_of_robot(params: HuskyParams) -> dict[str, float]:
 
 
 def simulate_log(
-    params: HuskyParams,
-    values: dict[str, float],
-    drivetrain: Drivetrain,
-    windows: Windows,
-    slope: Array,
-    timestep: float | None = None,
+    params: HuskyParams, values: dict[str, float], drivetrain: Drivetrain, windows: Windows, slope: Array
 ) -> Rollouts:
     """Simulates the log's commands with these values; poses are those of the log's sensor (`_measured_poses`)."""
     targets, _ = simulate_drivetrain(drivetrain, windows)
     fitted = robot_with_values(_with_drivetrain(params, drivetrain), values)
-    out = simulate_windows(fitted, targets, windows.preceding_wheels, slope, timestep)
+    out = simulate_windows(fitted, targets, windows.preceding_wheels, slope)
     return replace(out, poses=_measured_poses(out, values, windows))
 
 
@@ -161,8 +144,6 @@ def fit_ground(
 
     Args:
         params: The robot that gives the defaults.
-        drivetrain: See `drivetrain.fit_drivetrain`.
-        windows: All windows of a log.
         slope: See `rollout.slope_gravity`, shape (n, 2).
     """
     defaults = values_of_robot(params)
