@@ -260,7 +260,7 @@ _FREE_MAJORITY = 0.75  # a surface is removed if a larger fraction of votes is `
 
 
 @dataclass(frozen=True)
-class Section:
+class VolumeSection:
     """A box of voxels, part of the lattice of a place. All indices are of the lattice, along x, y, z.
 
     A section is processed with a frame of voxels around it, so that filters give the same values at its border as in
@@ -287,7 +287,7 @@ class Section:
 
 def divide(
     box: Array, voxel: float, frame: int, heights: Callable[[Array, Array], tuple[float, float]]
-) -> list[Section]:
+) -> list[VolumeSection]:
     """Sections of a place: one if it has at most 40 million voxels, otherwise square columns of 256 voxels' side.
 
     Args:
@@ -299,7 +299,7 @@ def divide(
     blocks = np.ceil((box[1] - box[0]) / (voxel * BLOCK)).astype(np.int64) + 1
     whole = blocks * BLOCK
     if np.prod(whole) <= _MAX_VOXELS:
-        return [Section(np.zeros(3, np.int64), whole, np.zeros(3, np.int64), whole, whole)]
+        return [VolumeSection(np.zeros(3, np.int64), whole, np.zeros(3, np.int64), whole, whole)]
     frame = -(-frame // BLOCK) * BLOCK
     sections = []
     for x in range(0, int(whole[0]), _SECTION_SIDE):
@@ -310,7 +310,7 @@ def divide(
             z = np.array(heights(box[0, :2] + voxel * start, box[0, :2] + voxel * end)) - box[0, 2]
             bottom, top = np.clip(np.floor(z / (voxel * BLOCK)) + np.array([0, 2]), 0, blocks[2]).astype(int) * BLOCK
             first, last = np.append(start, bottom), np.append(end, top)
-            sections.append(Section(first, last - first, np.append(low, bottom), np.append(high, top), whole))
+            sections.append(VolumeSection(first, last - first, np.append(low, bottom), np.append(high, top), whole))
     return sections
 
 
@@ -326,12 +326,12 @@ class Volume:
     """Position of voxel (0, 0, 0) [m], shape (3,)."""
     voxel: float
     """Grid spacing [m]."""
-    section: Section
+    section: VolumeSection
     outvoted: int
     """Number of voxels of the section without frame at which free votes removed a surface."""
 
 
-def fuse_volume(hits: Array, views: Views, corner: Array, voxel: float, section: Section, far: float) -> Volume:
+def fuse_volume(hits: Array, views: Views, corner: Array, voxel: float, section: VolumeSection, far: float) -> Volume:
     """Fuses views at the voxels of a section, only in blocks of 4³ voxels near the surface points `hits` (k, 3).
 
     `corner` is the position of the lattice's voxel (0, 0, 0), shape (3,) [m], and `voxel` its spacing [m]. For `far`
