@@ -269,7 +269,7 @@ def episodes(monkeypatch):
 
     whole = film.film
     monkeypatch.setattr(film, "film", spy)
-    monkeypatch.setattr("twin.report.episode_video.SceneCamera", NoCamera)
+    monkeypatch.setattr("twin.report.drive_video.SceneCamera", NoCamera)
     return seen
 
 

@@ -64,7 +64,7 @@ def film(
             not installed.
     """
     from twin.env.episode import record_episode
-    from twin.report.episode_video import write_episode_video
+    from twin.report.drive_video import write_episode_video
     from twin.report.review_video import load_ground_and_parts
 
     if rerun:
@@ -93,9 +93,10 @@ def film(
     in_cache = is_cached(scene.scene.root)
     path = out or (Path(f"{root.stem}_{name}") if in_cache else scene.scene.root / "films" / name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    driven, geometry = environment.task, load_ground_and_parts(scene.scene)
-    limits, title = (driven.segment.start, driven.segment.end), f"{task.replace('_', ' ')}: {driver_name}"
-    write_episode_video(path, episode, images, driven.world, driven.half_width, limits, geometry, title)
+    driven, title = environment.task, f"{task.replace('_', ' ')}: {driver_name}"
+    limits = driven.segment.start, driven.segment.end
+    shown = driven.world, driven.half_width, limits, load_ground_and_parts(scene.scene)
+    write_episode_video(path, episode, images, shown, title)
     if rerun:
         place = driven.world, driven.half_width, f"{scene.scene.root.resolve().name}, {title}"
         commands = episode.actions

@@ -112,8 +112,8 @@ def record_trial(
     )
     head = {"bag": str(bag), "name": row.policy, "task": row.task, "lighting": lighting, "twin_lighting": compared}
     figures = head | _figures(recording, trial, replayed, fit, views, apart)
+    from twin.report.drive_video import write_trial_video
     from twin.report.review_video import load_ground_and_parts
-    from twin.report.trial_video import write_trial_video
 
     write_trial_video(
         folder / "trial.mp4",
@@ -122,10 +122,10 @@ def record_trial(
         pictures,
         np.asarray((used - begin) * 1e-9, np.float64),
         views,
-        factory.world,
-        factory.options.half_width or factory.world.half_width,
-        (factory.segment.start, factory.segment.end),
-        load_ground_and_parts(scene.scene),
+        (
+            *(factory.world, factory.options.half_width or factory.world.half_width),
+            *((factory.segment.start, factory.segment.end), load_ground_and_parts(scene.scene)),
+        ),
         f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}",
     )
     write_json(folder / "trial.json", figures)

@@ -247,10 +247,7 @@ def _comparison_canvas(
     held_out = bool(cameras.held_out[i])
     real_frame, rgb, depth = pictures
     canvas = layout.canvas(f"The film and its twin: {lighting}", studio.name)
-    paste(canvas, real_frame, layout.left)
-    paste(canvas, rgb, layout.right)
-    draw_label(canvas, "real", layout.left, size=layout.text, bold=True)
-    draw_label(canvas, "rendered by the twin", layout.right, size=layout.text, bold=True)
+    layout.draw_panels(canvas, (real_frame, "real"), (rgb, "rendered by the twin"))
     if held_out:
         draw_label(canvas, "held out", layout.right, "bottom right", layout.text, AMBER, True)
     below, middle, right = layout.strip(*COMPARISON_STRIP)
@@ -357,11 +354,8 @@ def write_lighting_chapter(studio: Studio, map_view: MapView, budget: int, progr
             rgb = to_uint8(studio.render_frame(i, _lighting_mixture(a, b, share)).rgb[0])
             prevailing = a if share < 0.5 else b
             canvas = layout.canvas("Changing light", studio.name)
-            paste(canvas, rgb, layout.left)
-            draw_label(canvas, "rendered by the twin", layout.left, size=layout.text, bold=True)
-            if prevailing in reals:
-                paste(canvas, reals[prevailing], layout.right)
-                draw_label(canvas, f"real: {prevailing}", layout.right, size=layout.text, bold=True)
+            real = (reals[prevailing], f"real: {prevailing}") if prevailing in reals else None
+            layout.draw_panels(canvas, (rgb, "rendered by the twin"), real)
             slider, side = layout.strip(*LIGHTING_STRIP)
             draw_slider(canvas, slider, lightings, number + share, layout.text)
             paste(canvas, map_with_pose(map_view, cameras.camera_to_world[i], None, layout.text), side)
@@ -467,17 +461,15 @@ def write_drive_chapter(
             rgb = to_uint8(view.rgb[0])
             progress.update()
         canvas = layout.canvas("The Husky drives", studio.name)
-        paste(canvas, rgb, layout.left)
-        paste(canvas, from_behind, layout.right)
-        draw_label(canvas, f"robot camera: {label}", layout.left, size=layout.text, bold=True)
-        draw_label(canvas, "MuJoCo scene, solid parts outlined", layout.right, size=layout.text, bold=True)
+        robot_view, behind = (rgb, f"robot camera: {label}"), (from_behind, "MuJoCo scene, solid parts outlined")
+        layout.draw_panels(canvas, robot_view, behind)
         left, right = layout.strip(*DRIVE_STRIP)
         base = drive.base_to_world[i]
         trail = drive.base_to_world[: i + 1, :2, 3]
         paste(canvas, map_view.with_marker(base[:3, 3], base[:3, 0], trail), left)
         draw_facts(canvas, right, _drive_facts(world, drive, i, speed[i], driven[i]), layout.text)
         if i == instants[-1]:
-            _draw_outcome(canvas, studio, drive)
+            layout.draw_outcome(canvas, _outcome_text(drive), drive.reached_goal)
         studio.writer.write(canvas, round(1.5 * studio.fps) if i == instants[-1] else hold)
         if i in moments:
             camera_stills.append(rgb)
@@ -509,12 +501,10 @@ def _drive_facts(
     ]
 
 
-def _draw_outcome(canvas: NDArray[np.uint8], studio: Studio, drive: RecordedDrive) -> None:
-    text = {
+def _outcome_text(drive: RecordedDrive) -> str:
+    return {
         "goal": "goal reached",
         "touched": f"stopped: touched {join_names(drive.touched, 2)}",
         "off_corridor": "stopped: left the corridor",
         "timeout": "stopped: out of time",
-    }.get(drive.outcome, f"stopped: {drive.outcome}")
-    color = GREEN if drive.reached_goal else RED
-    draw_label(canvas, text, studio.layout.right, "bottom right", round(studio.layout.text * 1.2), color, True)
+    }[drive.outcome]

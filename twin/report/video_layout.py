@@ -89,13 +89,7 @@ def draw_text(
 
 
 def draw_label(
-    canvas: Image,
-    text: str,
-    box: Box,
-    corner: str = "top left",
-    size: int = 14,
-    color: Color = INK,
-    bold: bool = False,
+    canvas: Image, text: str, box: Box, corner: str = "top left", size: int = 14, color: Color = INK, bold: bool = False
 ) -> None:
     """Draws text on a half transparent background in a corner of a box ("top left", "bottom right", ...)."""
     x, y, width, height = box
@@ -214,6 +208,17 @@ class FrameLayout:
         draw_text(out, shorten(title, free, big, bold=True), _MARGIN, y, big, INK, bold=True)
         draw_text(out, note, width - _MARGIN, y + (big - self.text), self.text, MUTED, align="right")
         return out
+
+    def draw_panels(self, canvas: Image, left: tuple[NDArray, str], right: tuple[NDArray, str] | None) -> None:
+        """Draws the panels: a picture and its label each; None leaves the right one empty."""
+        for box, panel in ((self.left, left), (self.right, right)):
+            if panel:
+                paste(canvas, panel[0], box)
+                draw_label(canvas, panel[1], box, size=self.text, bold=True)
+
+    def draw_outcome(self, canvas: Image, text: str, success: bool) -> None:
+        """Draws the end of a drive in a corner of the right panel."""
+        draw_label(canvas, text, self.right, "bottom right", round(self.text * 1.2), GREEN if success else RED, True)
 
     def card(self, title: str, lines: list[str], color: Color = ACCENT) -> Image:
         width, height = self.size
