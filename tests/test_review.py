@@ -31,7 +31,7 @@ from twin.report.review_chapters import (
     gray_out,
     lighting_at,
 )
-from twin.report.review_video import Prefetcher, overview_pose, write_review_video
+from twin.report.review_video import overview_pose, prefetched, write_review_video
 from twin.report.video_layout import (
     FrameLayout,
     MapView,
@@ -291,14 +291,14 @@ def test_a_row_of_pictures_has_one_height() -> None:
 
 
 def test_prefetching_keeps_order_and_passes_errors_on() -> None:
-    with Prefetcher(iter(range(20)), depth=3) as items:
+    with prefetched(iter(range(20)), depth=3) as items:
         assert list(items) == list(range(20))
 
     def fails() -> Iterator[int]:
         yield 1
         raise ValueError("broken")
 
-    with Prefetcher(fails(), depth=3) as items, pytest.raises(ValueError, match="broken"):
+    with prefetched(fails(), depth=3) as items, pytest.raises(ValueError, match="broken"):
         list(items)
 
 
@@ -310,8 +310,8 @@ def test_prefetching_stops_when_nobody_reads() -> None:
             made.append(len(made))
             yield made[-1]
 
-    with Prefetcher(endless(), depth=2) as items:
-        assert next(iter(items)) == 0
+    with prefetched(endless(), depth=2) as items:
+        assert next(items) == 0
     count = len(made)
     assert count <= 5
     assert len(made) == count

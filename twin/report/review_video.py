@@ -4,13 +4,13 @@ The video has up to three chapters. The first compares real and rendered frames.
 lightings, shows changing light. The third, if there is a route, shows a scripted driver that drives the Husky along it.
 """
 
-import queue
-import threading
+import contextlib
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import mujoco
@@ -156,16 +156,11 @@ def _write_chapters(
     total = sum(map(len, chosen.values())) + len(rendered_instants(behind, drives))
     total += lighting_steps(len(field.lightings), turns) * (len(field.lightings) - 1) + 1 if turns else 0
     # MuJoCo's pictures need no view of the field; they are rendered in parallel with the first chapters.
-    with (
-        Prefetcher(
-            render_shots(model, views + behind, panel), max(4, _PREFETCH_BYTES // (3 * panel[0] * panel[1]))
-        ) as ahead,
-        bar("video", total, "view") as progress,
-    ):
+    shots, depth = render_shots(model, views + behind, panel), max(4, _PREFETCH_BYTES // (3 * panel[0] * panel[1]))
+    with prefetched(shots, depth) as pictures, bar("video", total, "view") as progress:
         write_comparison_chapter(studio, map_in(strip(*COMPARISON_STRIP)[1]), chosen, progress)
         if turns:
             write_lighting_chapter(studio, map_in(strip(*LIGHTING_STRIP)[1]), turns, progress)
-        pictures = iter(ahead)
         for number, picture in enumerate(islice(pictures, len(views))):
             caption = ("the MuJoCo scene with its solid parts outlined", "further along the route")[number]
             studio.save_picture(f"scene_{number}", "mjcf", caption, picture)
@@ -359,56 +354,25 @@ def trust_picture(s: Array, offsets: Array, trust: Array) -> Image:
 # ---- prefetching
 
 T = TypeVar("T")
+_END = object()
 
-_POLL_INTERVAL = 0.2  # [s] time between two checks for the end of the `with` block
 
+@contextlib.contextmanager
+def prefetched(items: Iterator[T], depth: int) -> Iterator[Iterator[T]]:
+    """Within the block, a thread computes `items`, up to `depth` ahead of the consumer.
 
-class Prefetcher(Generic[T]):
-    """Iterates over `items`. A thread computes them, up to `depth` items ahead of the consumer.
-
-    The thread starts when the `with` block is entered, and stops when the block is left. Warp kernels release the GIL,
-    so the thread uses a second core. If computing an item fails, the iteration raises the exception at that item.
+    Warp kernels release the GIL, so the thread uses a second core. If computing an item fails, the iteration raises the
+    exception at that item.
     """
+    with ThreadPoolExecutor(1) as pool:
+        ahead = deque(pool.submit(next, items, _END) for _ in range(depth))
 
-    def __init__(self, items: Iterator[T], depth: int):
-        self._items = items
-        self._queue: queue.Queue[tuple[bool, T | BaseException | None]] = queue.Queue(max(1, depth))
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._work, daemon=True)
+        def computed() -> Iterator[Any]:
+            while (item := ahead.popleft().result()) is not _END:
+                ahead.append(pool.submit(next, items, _END))
+                yield item
 
-    def _work(self) -> None:
         try:
-            for item in self._items:
-                self._put((True, item))
-                if self._stop.is_set():
-                    return
-            self._put((False, None))
-        except BaseException as error:  # the iteration raises it again
-            self._put((False, error))
-
-    def _put(self, entry: tuple[bool, T | BaseException | None]) -> None:
-        while not self._stop.is_set():
-            try:
-                self._queue.put(entry, timeout=_POLL_INTERVAL)
-                return
-            except queue.Full:
-                continue
-
-    def __enter__(self) -> "Prefetcher[T]":
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def __iter__(self) -> Iterator[T]:
-        while True:
-            there, item = self._queue.get()
-            if not there:
-                if isinstance(item, BaseException):
-                    raise item
-                return
-            yield item  # type: ignore[misc]
+            yield computed()
+        finally:
+            pool.shutdown(cancel_futures=True)
