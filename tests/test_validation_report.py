@@ -204,7 +204,7 @@ def test_the_page_shows_the_numbers_of_the_tables(tmp_path):
     trials += [trial("a", 7, "stuck", task="bend", light="any")]
     trained = {"a": TRAINED | {"run": "a", "first_step": 20, "test": None} | rate_summary(96, 100)}
     worst = [summarize([trial("a", k, "rollover", light="drawn_3") for k in range(5)])["cells"][0] | {"of": 16}]
-    curve = TrainingCurve("a", np.arange(10, 400, 10), np.arange(39) % 2)
+    curve = ("a", np.arange(10, 400, 10), np.arange(39) % 2)
     said = told(trials, training=trained, worst=worst)
     text = page(tmp_path, said, curve).text
     for cell in [*said["cells"], *worst]:

@@ -129,12 +129,8 @@ def record_trial(
         f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}",
     )
     write_json(folder / "trial.json", figures)
-    write_real_trials([*(one for one in known if _key(one) != _key(row)), row], table, out, compared)
+    write_real_trials([*(one for one in known if one.key != row.key), row], table, out, compared)
     return row, figures, folder
-
-
-def _key(trial: Trial) -> tuple[str, str, str, int]:
-    return trial.policy, trial.task, trial.lighting, trial.seed
 
 
 def _known_trials(table: Path, out: Path) -> list[Trial]:

@@ -29,7 +29,6 @@ from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, cam
 from twin.loading import Twin, load_writable
 from twin.report.policy_card import write_policy_cards
 from twin.report.validation_report import (
-    TrainingCurve,
     failure_map,
     summarize,
     summary_lines,
@@ -48,21 +47,12 @@ _SEARCH_SEED, _FINAL_SEED = 2_000_000, 3_000_000  # first seeds of the search fo
 _SEARCH_LIGHTINGS, _SEARCH_EPISODES, _SEARCH_KEPT = 16, 4, 4  # first round: lightings, episodes in each, lightings kept
 _MAX_PROCESSES = 1024
 
-Key = tuple[str, str, str, int]
-
 
 class Campaign:
     """Evaluation episodes of one scene and task, and the table that stores them."""
 
     def __init__(
-        self,
-        twin: Twin,
-        task: str,
-        path: Path,
-        sources: dict[str, str],
-        trust: bool,
-        processes: int,
-        ray: str | None,
+        self, twin: Twin, task: str, path: Path, sources: dict[str, str], trust: bool, processes: int, ray: str | None
     ) -> None:
         """
         Args:
@@ -76,7 +66,7 @@ class Campaign:
         """
         self._scene, self.task, self.path = str(twin.scene.root.resolve()), task, path
         self._sources, self._trust, self._processes, self._ray = sources, trust, processes, ray
-        self._done = {_key(t): t for t in _read_table(path)}
+        self._done = {t.key: t for t in _read_table(path)}
 
     def drive(self, wanted: Sequence[tuple[str, str, Iterable[int]]], what: str) -> list[Trial]:
         """Returns the trials of each (policy, lighting, seeds) in order; first drives those missing in the table."""
@@ -113,7 +103,7 @@ class Campaign:
             write_text(self.path, csv_text(EPISODE_COLUMNS, []))
         with self.path.open("a", encoding="utf-8", newline="") as file:
             file.write(csv_text(EPISODE_COLUMNS, [t.row() for t in trials]).split("\n", 1)[1])
-        self._done |= {_key(t): t for t in trials}
+        self._done |= {t.key: t for t in trials}
 
 
 def validate(
@@ -171,7 +161,7 @@ def _write_results(twin: Twin) -> dict:
     write_json(folder / "summary.json", results)
     _draw_maps(twin, folder, trials)
     runs = dict.fromkeys(trained["run"] for trained in results["training"].values())
-    curves = [TrainingCurve(run, *read_episodes(twin.scene.root / "runs" / run)) for run in runs]
+    curves = [(run, *read_episodes(twin.scene.root / "runs" / run)) for run in runs]
     write_validation_page(twin.scene, results, curves)
     write_policy_cards(twin.scene, [t.policy for t in trials])
     return results
@@ -333,10 +323,6 @@ def _draw_maps(twin: Twin, folder: Path, trials: Sequence[Trial]) -> None:
         segment = find_task(task, world, config.task)
         mine = [t for t in trials if t.task == task]
         failure_map(folder / f"failures_{task}.png", mine, world, (segment.start, segment.end))
-
-
-def _key(trial: Trial) -> Key:
-    return trial.policy, trial.task, trial.lighting, trial.seed
 
 
 def _drop_partial_row(path: Path) -> None:
