@@ -35,6 +35,10 @@ from twin.evaluation.trials import Trial, read_counts, read_trials, tally, write
 from twin.files import write_json
 from twin.learn.policy import Policy, find_policy, load_policy
 from twin.loading import load_scene
+from twin.report.bag_dataset import write_bag_dataset
+from twin.report.drive_dataset import drives_summary
+from twin.report.drive_video import write_trial_video
+from twin.report.review_video import load_ground_and_parts
 from twin.robot import PixelCamera
 from twin.sysid.frame_fit import FIT, FrameFit, scene_frame
 from twin.sysid.trial_recording import TrialRecording, read_trial
@@ -112,9 +116,6 @@ def record_trial(
     )
     head = {"bag": str(bag), "name": row.policy, "task": row.task, "lighting": lighting, "twin_lighting": compared}
     figures = head | _figures(recording, trial, replayed, fit, views, apart)
-    from twin.report.drive_video import write_trial_video
-    from twin.report.review_video import load_ground_and_parts
-
     write_trial_video(
         folder / "trial.mp4",
         trial,
@@ -289,9 +290,6 @@ def command(options: argparse.Namespace) -> None:
     names |= {"poses": options.poses, "commands": options.commands}
     topics = {kind: topic for kind, topic in names.items() if topic}
     if options.lerobot:
-        from twin.report.bag_dataset import write_bag_dataset
-        from twin.report.drive_dataset import drives_summary
-
         drives = write_bag_dataset(
             *(options.scene, options.bag, options.lerobot, options.task, options.policy, options.lighting or ""),
             *(options.cause, options.frame, topics),

@@ -18,14 +18,16 @@ from zlib import crc32
 
 from twin import commands, runtime
 from twin.config import HELD_OUT, Condition
+from twin.config_file import load_config
 from twin.env.domain_randomization import condition_options, measured_parameters
+from twin.env.route_segments import find_task
 from twin.env.suite import fingerprint
 from twin.errors import InputError
 from twin.evaluation.training_curves import read_episodes, training_summaries
 from twin.evaluation.trials import EPISODE_COLUMNS, Trial, cells_csv, csv_text, read_trials, tally
 from twin.files import digest_file, digest_json, read_json, wrap_read_errors, write_bytes, write_json, write_text
 from twin.learn.policy import JSON, find_policy, load_policy
-from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, campaign
+from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, campaign, campaign_on_ray
 from twin.loading import Twin, load_writable
 from twin.report.policy_card import write_policy_cards
 from twin.report.validation_report import (
@@ -92,8 +94,6 @@ class Campaign:
 
     def _campaign(self, chunks: list[EpisodeChunk]) -> Iterator[list[EpisodeResult]]:
         if self._ray and chunks:
-            from twin.learn.policy_evaluation import campaign_on_ray
-
             return campaign_on_ray(chunks, self._ray)
         return campaign(chunks, self._processes)
 
@@ -178,6 +178,7 @@ def _worst_lightings(path: Path) -> list[dict]:
 
 def _write_films(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[Trial]) -> None:
     """Films the typical and the worst of a policy's episodes on a task; existing films are kept."""
+    # Worker processes import this module, and need no films.
     from twin.film import film, film_name
     from twin.report.video_writer import last_frame_jpeg
 
@@ -315,9 +316,6 @@ def _digest(path: Path, source: str) -> str:
 
 
 def _draw_maps(twin: Twin, folder: Path, trials: Sequence[Trial]) -> None:
-    from twin.config_file import load_config
-    from twin.env.route_segments import find_task
-
     world, config = twin.world(), load_config(twin.scene.config_file)
     for task in dict.fromkeys(t.task for t in trials):
         segment = find_task(task, world, config.task)
