@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from films import video_info
 
 from twin.config import ReviewConfig, SceneConfig, SourceConfig
 from twin.files import read_json
@@ -46,7 +47,7 @@ from twin.report.video_layout import (
     text_width,
     wrap,
 )
-from twin.report.video_writer import read_frames, video_info
+from twin.report.video_writer import read_frames
 from twin.scene import SceneDir
 
 

@@ -196,8 +196,8 @@ _ROW_HEIGHT = 240  # [px] height of the picture of lightings
 _MAX_STILLS = 4  # largest number of lightings in it
 
 
-def write_title_card(studio: Studio, title: str, lines: list[str], seconds: float = _CARD_SECONDS) -> None:
-    studio.writer.write(studio.layout.card(title, lines), max(1, round(seconds * studio.fps)))
+def write_title_card(studio: Studio, title: str, lines: list[str]) -> None:
+    studio.writer.write(studio.layout.card(title, lines), max(1, round(_CARD_SECONDS * studio.fps)))
 
 
 def comparison_frames(studio: Studio, budget: int) -> dict[str, list[int]]:

@@ -354,21 +354,20 @@ def side_by_side(pictures: Sequence[Image], height: int) -> Image:
 # ---- map
 
 _MAP_MARGIN = 5.0  # [m] around the path
+_MAX_HEIGHT = 3.0  # [m] above the ground; the robot does not reach parts that are entirely higher
 _SUBPIXEL_BITS = 4  # fixed-point precision of OpenCV's drawing
 
 
-def footprints(
-    vertices: NDArray, vertex_start: NDArray, ground: Ground | None = None, max_height: float = 3.0
-) -> list[Array]:
+def footprints(vertices: NDArray, vertex_start: NDArray, ground: Ground | None = None) -> list[Array]:
     """Outlines of convex parts from above, each shape (k, 2) [m], counterclockwise.
 
     The vertices (v, 3) [m] of part i are those from `vertex_start[i]` to `vertex_start[i + 1]`. Parts that are
-    entirely more than `max_height` [m] above the ground are dropped, because the robot does not reach them.
+    entirely more than `_MAX_HEIGHT` above the ground are dropped.
     """
     outlines = []
     for start, end in pairwise(vertex_start):
         part = np.asarray(vertices[start:end], np.float64)
-        if ground is not None and (part[:, 2] - ground.at(part[:, :2])).min() > max_height:
+        if ground is not None and (part[:, 2] - ground.at(part[:, :2])).min() > _MAX_HEIGHT:
             continue
         try:
             outlines.append(part[ConvexHull(part[:, :2]).vertices, :2])
