@@ -148,7 +148,7 @@ def _write_chapters(
         return MapView.draw(box[2:], studio.path, ground, parts, half_width)
 
     strip, panel = studio.layout.strip, studio.layout.panel
-    views, model = _scene_shots(studio, scene, world)
+    views, model = _scene_shots(cameras, scene, world)
     behind = chase_shots(drive, frame_timing(drive, studio.fps)[0]) if drive else []
     # Warp compiles kernels at first use. The field's are compiled here, before the second thread compiles those of
     # the renderer.
@@ -184,13 +184,16 @@ def _compare_geometry(studio: Studio, scene: SceneDir, world: World, drive: Reco
     return compare_geometry(views, world, studio.cameras, Ground.load(folder), Parts.load(folder / "parts.npz"))
 
 
-def _scene_shots(studio: Studio, scene: SceneDir, world: World | None) -> tuple[list[Shot], World]:
-    folder = scene.stage("mjcf")
+def _scene_shots(cameras: Cameras, scene: SceneDir, world: World | None) -> tuple[list[Shot], World]:
+    """Two shots with the robot at its initial pose, and the world: overviews of the route, or filmed camera poses."""
     if world:
-        return route_shots(world.route), world
+        length = float(arc_lengths(world.route)[-1])
+        return [(None, overview_pose(world.route, share * length)) for share in _OVERVIEW_POSITIONS], world
     # Only the model is rendered, so the route is a placeholder.
-    model = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), folder)
-    return (camera_shots(studio.cameras) if model.model_path.exists() else []), model
+    model = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), scene.stage("mjcf"))
+    n = len(cameras)
+    frames = dict.fromkeys((n // 4, 3 * n // 4)) if model.model_path.exists() else ()
+    return [(None, cameras.camera_to_world[i]) for i in frames], model
 
 
 def load_ground_and_parts(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
@@ -257,18 +260,6 @@ def overview_pose(route: Array, s: float) -> Array:
     along = (ahead - here) * [1.0, 1.0, 0.0]
     along /= np.linalg.norm(along)
     return look_at(here - _OVERVIEW_BEHIND * along + [0.0, 0.0, _OVERVIEW_ABOVE], here + _OVERVIEW_AHEAD * along)
-
-
-def route_shots(route: Array) -> list[Shot]:
-    """Overview shots at the route's start and further along the route; the robot is at its initial pose."""
-    length = float(arc_lengths(route)[-1])
-    return [(None, overview_pose(route, share * length)) for share in _OVERVIEW_POSITIONS]
-
-
-def camera_shots(cameras: Cameras) -> list[Shot]:
-    """Shots from the camera poses of two filmed frames, for a scene without a route."""
-    n = len(cameras)
-    return [(None, cameras.camera_to_world[i]) for i in dict.fromkeys((n // 4, 3 * n // 4))]
 
 
 def chase_shots(drive: RecordedDrive, every: int) -> list[Shot]:
