@@ -135,15 +135,6 @@ def cameras_section(report: dict[str, Any]) -> Section:
     return Section("cameras", "Cameras", done, facts, cautions, verdict=verdict)
 
 
-def _scale_facts(scales: Any) -> list[Fact]:
-    """Facts that compare the scale from each source with the combined scale."""
-    facts = []
-    for name, one in (scales or {}).items():
-        text = f"{number(one['relative'] - 1.0, '{:+.2%}')} ± {number(one['uncertainty'], '{:.1%}')}"
-        facts.append(Fact(f"by {_SCALE_SOURCES.get(name, name)}", text, "compared with the combined scale"))
-    return facts
-
-
 def metric_section(report: dict[str, Any]) -> Section:
     metric = pick(report, "metric") or {}
     uncertainty = as_number(metric.get("scale_uncertainty"))
@@ -170,10 +161,18 @@ def metric_section(report: dict[str, Any]) -> Section:
         source_text = " and ".join(_SCALE_SOURCES.get(one, one) for one in str(source).split(" + "))
         sure = "" if uncertainty is None else f", with an uncertainty of about {uncertainty:.1%}"
         verdict = Verdict(f"The scale comes from {source_text}{sure}.", "good")
+    by_source = [
+        Fact(
+            f"by {_SCALE_SOURCES.get(name, name)}",
+            f"{number(one['relative'] - 1.0, '{:+.2%}')} ± {number(one['uncertainty'], '{:.1%}')}",
+            "compared with the combined scale",
+        )
+        for name, one in (metric.get("scales") or {}).items()
+    ]
     facts = [
         Fact("scale from", source_text, "as given in scene.toml"),
         Fact("scale uncertainty", number(uncertainty, "{:.1%}"), "one standard deviation, relative"),
-        *_scale_facts(metric.get("scales")),
+        *by_source,
         Fact("gravity from", str(metric.get("gravity_source") or NOT_MEASURED), "source of the vertical direction"),
         *facts_of(
             report,

@@ -63,15 +63,7 @@ _Frame = tuple[int, Image, Image, tuple[Array, Array, Array, Array | None], tupl
 
 
 def write_episode_video(path: Path, episode: Episode, observations: Sequence[Image], place: Place, title: str) -> None:
-    """Writes an episode as an mp4.
-
-    Args:
-        path: The mp4.
-        episode: The recorded episode.
-        observations: Camera image at each control step, uint8, shape (h, w, 3).
-        place: For the map.
-        title: Title in the header.
-    """
+    """Writes an episode as an mp4; `observations` are the robot's pictures at each control step, shape (h, w, 3)."""
     layout = FrameLayout.for_pictures(_WIDTH, observations[0].shape[0] / observations[0].shape[1])
     fps = max(1, round(1.0 / float(np.median(np.diff(episode.times))))) if len(episode.times) > 1 else 10
     route = place[0].route
@@ -108,14 +100,10 @@ def write_trial_video(
     """Writes a trial as an mp4 that plays in real time.
 
     Args:
-        path: The mp4.
-        trial: The judged trial.
         replayed: Poses (x, y, yaw) of the twin's replay at the trial's times, shape (k, 3).
         pictures: n pictures of the robot's camera as the policy saw them, each uint8, shape (h, w, 3).
         times: Times of the pictures since the trial's start [s], shape (n,).
         views: The twin's pictures from the same poses.
-        place: For the map.
-        title: Title in the header.
     """
     layout = FrameLayout.for_pictures(_WIDTH, pictures[0].shape[0] / pictures[0].shape[1])
     fps = max(1, round((len(times) - 1) / max(float(times[-1] - times[0]), 1e-3)))

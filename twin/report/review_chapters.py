@@ -351,7 +351,8 @@ def write_lighting_chapter(studio: Studio, map_view: MapView, budget: int, progr
     for number, (a, b) in enumerate(pairwise(lightings)):
         for k in range(steps + (number == len(lightings) - 2)):
             share = k / steps
-            rgb = to_uint8(studio.render_frame(i, _lighting_mixture(a, b, share)).rgb[0])
+            light = {0.0: a, 1.0: b}.get(share, f"{a}:{b}:{share:.6g}")
+            rgb = to_uint8(studio.render_frame(i, light).rgb[0])
             prevailing = a if share < 0.5 else b
             canvas = layout.canvas("Changing light", studio.name)
             real = (reals[prevailing], f"real: {prevailing}") if prevailing in reals else None
@@ -372,10 +373,6 @@ def write_lighting_chapter(studio: Studio, map_view: MapView, budget: int, progr
         f"one pose in {which}: {', '.join(names)}",
         side_by_side(stills[: len(names)], _ROW_HEIGHT),
     )
-
-
-def _lighting_mixture(a: str, b: str, share: float) -> str:
-    return a if share <= 0.0 else b if share >= 1.0 else f"{a}:{b}:{share:.6g}"
 
 
 # ---- drive
