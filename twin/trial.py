@@ -116,19 +116,12 @@ def record_trial(
     )
     head = {"bag": str(bag), "name": row.policy, "task": row.task, "lighting": lighting, "twin_lighting": compared}
     figures = head | _figures(recording, trial, replayed, fit, views, apart)
-    write_trial_video(
-        folder / "trial.mp4",
-        trial,
-        replayed,
-        pictures,
-        np.asarray((used - begin) * 1e-9, np.float64),
-        views,
-        (
-            *(factory.world, factory.options.half_width or factory.world.half_width),
-            *((factory.segment.start, factory.segment.end), load_ground_and_parts(scene.scene)),
-        ),
-        f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}",
-    )
+    half_width = factory.options.half_width or factory.world.half_width
+    limits = factory.segment.start, factory.segment.end
+    place = factory.world, half_width, limits, load_ground_and_parts(scene.scene)
+    seconds = np.asarray((used - begin) * 1e-9, np.float64)
+    title = f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}"
+    write_trial_video(folder / "trial.mp4", trial, replayed, pictures, seconds, views, place, title)
     write_json(folder / "trial.json", figures)
     write_real_trials([*(one for one in known if one.key != row.key), row], table, out, compared)
     return row, figures, folder

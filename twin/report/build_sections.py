@@ -107,7 +107,8 @@ def cameras_section(report: dict[str, Any]) -> Section:
         cure = "check the given poses, or let twin estimate them from the images."
         cautions.append(Caution(f"{note.capitalize()}.", cure))
     focal = {name: number(length, "{:.0f} px") for name, length in numbers(cameras.get("focal_px")).items()}
-    focals = [f"{name} {text}" for name, text in focal.items()] if len(set(focal.values())) > 1 else focal.values()
+    focals = set(focal.values())
+    texts = sorted(focals) if len(focals) < 2 else [f"{name} {text}" for name, text in focal.items()]
     facts = [
         Fact("frames placed", placed, "frames whose camera pose was estimated"),
         *facts_of(
@@ -121,11 +122,7 @@ def cameras_section(report: dict[str, Any]) -> Section:
             ("cameras.points", "points", "{:,}", "triangulated"),
         ),
         Fact("track length", number(cameras.get("mean_track_length"), "{:.1f} frames"), "frames that observe a point"),
-        Fact(
-            "focal length",
-            ", ".join(dict.fromkeys(focals)) or NOT_MEASURED,
-            "given, or estimated by the reconstruction",
-        ),
+        Fact("focal length", ", ".join(texts) or NOT_MEASURED, "given, or estimated by the reconstruction"),
         Fact("method", str(cameras.get("mapper") or NOT_MEASURED), "global, or incremental if that fails"),
     ]
     if joined := cameras.get("joined"):
