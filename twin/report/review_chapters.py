@@ -224,9 +224,8 @@ def write_comparison_chapter(studio: Studio, map_view: MapView, chosen: dict[str
         best = unseen[len(unseen) // 2] if unseen else None
         for i in frames:
             view = studio.render_frame(i)
-            real_frame, rgb = studio.real_frame(i), to_uint8(view.rgb[0])
-            depth = depth_colors(view.depth[0], view.opacity[0])
-            canvas = _comparison_canvas(studio, map_view, i, lighting, (real_frame, rgb, depth))
+            pictures = to_uint8(view.rgb[0]), depth_colors(view.depth[0], view.opacity[0])
+            canvas = _comparison_canvas(studio, map_view, i, lighting, *pictures)
             studio.writer.write(canvas, max(1, round(_COMPARISON_SECONDS * studio.fps)))
             if i == best and number == 0:
                 studio.save_picture("poster_compare", "poster", "the film and its twin", canvas)
@@ -240,14 +239,10 @@ def write_comparison_chapter(studio: Studio, map_view: MapView, chosen: dict[str
             progress.update()
 
 
-def _comparison_canvas(
-    studio: Studio, map_view: MapView, i: int, lighting: str, pictures: tuple[Image, Image, Image]
-) -> Image:
-    layout, cameras = studio.layout, studio.cameras
-    held_out = bool(cameras.held_out[i])
-    real_frame, rgb, depth = pictures
+def _comparison_canvas(studio: Studio, map_view: MapView, i: int, lighting: str, rgb: Image, depth: Image) -> Image:
+    layout, cameras, held_out = studio.layout, studio.cameras, bool(studio.cameras.held_out[i])
     canvas = layout.canvas(f"The film and its twin: {lighting}", studio.name)
-    layout.draw_panels(canvas, (real_frame, "real"), (rgb, "rendered by the twin"))
+    layout.draw_panels(canvas, (studio.real_frame(i), "real"), (rgb, "rendered by the twin"))
     if held_out:
         draw_label(canvas, "held out", layout.right, "bottom right", layout.text, AMBER, True)
     below, middle, right = layout.strip(*COMPARISON_STRIP)
@@ -257,17 +252,13 @@ def _comparison_canvas(
     pose = cameras.camera_to_world[i]
     same = np.array([name == cameras.sources[i] for name in cameras.sources])
     paste(canvas, map_with_pose(map_view, pose, cameras.positions[same][:, :2], layout.text), middle)
-    draw_facts(
-        canvas,
-        right,
-        [
-            ("lighting", lighting, ACCENT),
-            ("frame", cameras.names[i].split("/")[-1], INK),
-            ("film time", f"{cameras.times[i]:.1f} s", INK),
-            ("used to train", "no" if held_out else "yes", AMBER if held_out else MUTED),
-        ],
-        layout.text,
-    )
+    facts = [
+        ("lighting", lighting, ACCENT),
+        ("frame", cameras.names[i].split("/")[-1], INK),
+        ("film time", f"{cameras.times[i]:.1f} s", INK),
+        ("used to train", "no" if held_out else "yes", AMBER if held_out else MUTED),
+    ]
+    draw_facts(canvas, right, facts, layout.text)
     return canvas
 
 
@@ -367,12 +358,8 @@ def write_lighting_chapter(studio: Studio, map_view: MapView, budget: int, progr
             progress.update()
     names = lightings[:_MAX_STILLS]
     which = "every filmed lighting" if len(names) == len(lightings) else f"{len(names)} of {len(lightings)} lightings"
-    studio.save_picture(
-        "lightings",
-        "field",
-        f"one pose in {which}: {', '.join(names)}",
-        side_by_side(stills[: len(names)], _ROW_HEIGHT),
-    )
+    caption = f"one pose in {which}: {', '.join(names)}"
+    studio.save_picture("lightings", "field", caption, side_by_side(stills[: len(names)], _ROW_HEIGHT))
 
 
 # ---- drive

@@ -251,14 +251,13 @@ def summary_lines(results: dict[str, Any]) -> list[str]:
     out = []
     wide, light = (max((len(c[key]) for c in results["cells"]), default=0) for key in ("policy", "lighting"))
     for c in results["cells"]:
-        causes = failure_text(c)
-        out.append(
+        row = (
             f"{c['policy']:{wide}}  {c['task']}  {c['lighting']:{light}}  {c['successes']:3d}/{c['trials']:<3d} = "
-            f"{c['rate']:.2f} ({c['low']:.2f} to {c['high']:.2f})" + (f"  {causes}" if causes else "")
+            f"{c['rate']:.2f} ({c['low']:.2f} to {c['high']:.2f})  {failure_text(c)}"
         )
-        trusted, low = c["trusted"], c["low_trust"]
-        if low["trials"]:
-            counts = [f"{rate['successes']}/{rate['trials']}" for rate in (trusted, low)]
+        out.append(row.rstrip())
+        if c["low_trust"]["trials"]:
+            counts = [f"{rate['successes']}/{rate['trials']}" for rate in (c["trusted"], c["low_trust"])]
             out.append(f"{'':{wide}}  with trusted pictures {counts[0]}, with others {counts[1]}")
     for p in results["pairs"]:
         out.append(
@@ -419,11 +418,12 @@ def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: S
         "unknown": "Limitations",
         "next": "What to do next",
     }
-    counts = f"{_count(len(policies), 'policy', 'policies')}, {_count(len(lights), 'lighting', 'lightings')}"
+    counts = ((len(policies), "policy", "policies"), (len(lights), "lighting", "lightings"))
+    counted = ", ".join(f"{n} {one if n == 1 else many}" for n, one, many in counts)
     return render(
         "validation.html",
         title=f"{scene}: validation",
-        kicker=f"{counts}: {sum(c['trials'] for c in cells)} episodes in the twin.",
+        kicker=f"{counted}: {sum(c['trials'] for c in cells)} episodes in the twin.",
         verdicts=verdicts(results),
         headings={name: heading for name, heading in headings.items() if heading},
         files=["summary.json", "cells.csv", "episodes.csv"],
@@ -507,7 +507,3 @@ def _next_steps(results: dict[str, Any], root: Path) -> list[tuple[str, list[str
             [command("forecast", root, "--real", "real.csv")],
         ),
     ]
-
-
-def _count(n: int, one: str, many: str) -> str:
-    return f"{n} {one if n == 1 else many}"
