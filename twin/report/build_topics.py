@@ -75,13 +75,14 @@ def truth_section(report: dict[str, Any]) -> Section:
     kinds = {"ground": "ground", "obstacle": "obstacles of any height", "foliage": "leaves"}
     shares = {kind: truth.get(f"mesh_completeness_10cm_{kind}") for kind in kinds}
     complete = [f"{number(share, '{:.0%}')} of {kinds[kind]}" for kind, share in shares.items() if share is not None]
+    rigid = "after a rigid fit, without a change of scale"
     seen = "of that seen within 10 m of the route"
     by_kind = join_names(complete) if complete else "completeness of the mesh"
     facts = facts_of(
         truth,
         ("ate_m", "camera positions", "{:.3f} m", "root mean square, after a similarity fit of the paths"),
         ("ate_max_m", "worst camera", "{:.3f} m", "the frame with the largest error"),
-        ("ate_rigid_m", "camera positions, in the twin’s meters", "{:.3f} m", "after a rigid fit, without scaling"),
+        ("ate_rigid_m", "camera positions, in the twin’s meters", "{:.3f} m", rigid),
         ("rotation_median_deg", "camera directions", "{:.2f}°", "median"),
         ("scale_error", "scale", "{:+.2%}", "the twin’s meter compared with the true one"),
         ("tilt_deg", "gravity", "{:.2f}°", "between the twin’s vertical and the true one"),
