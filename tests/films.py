@@ -91,3 +91,17 @@ def _planes(signal: np.ndarray) -> list[np.ndarray]:
     chroma = (signal[..., 2] - luma) / 1.8814, (signal[..., 0] - luma) / 1.4746
     small = [512.0 + 896.0 * cv2.resize(one, half, interpolation=cv2.INTER_AREA) for one in chroma]
     return [64.0 + 876.0 * luma, *small]
+
+
+def video_info(path: Path) -> dict[str, str | int | float]:
+    """Returns codec, pixel format, width, height [px], fps and number of frames of a video."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        return {
+            "codec": stream.codec_context.name,
+            "pixel_format": str(stream.codec_context.pix_fmt),
+            "width": stream.width,
+            "height": stream.height,
+            "fps": float(stream.average_rate or 0),
+            "frames": stream.frames,
+        }

@@ -24,7 +24,8 @@ from twin.errors import join_names
 from twin.files import write_json
 from twin.geometry.images import write_image
 from twin.report import build_report as report_page
-from twin.report import build_sections, build_topics, section_facts
+from twin.report import build_sections, build_topics
+from twin.report import html as report_html
 from twin.report.build_report import page, write_page
 from twin.report.build_sections import SECTIONS, cautions, headline_sections, sections
 from twin.report.build_topics import truth_section
@@ -332,18 +333,18 @@ def test_every_defect_gives_a_caution_with_a_cure_in_section_and_summary(
 
 def test_the_defects_tried_cover_every_kind_of_caution(monkeypatch: pytest.MonkeyPatch) -> None:
     """A caution that the code can give and the list above lacks would not be tested."""
-    makers = (build_sections, build_topics, section_facts)
+    makers = (build_sections, build_topics, report_html)
     given: set[tuple[str, int]] = set()
     limits: set[str] = set()
     exceeded: set[str] = set()
-    above = section_facts.cautions_above
+    above = report_html.cautions_above
 
     def recording(*args: str) -> Caution:
         frame = sys._getframe(1)
         given.add((frame.f_globals["__name__"], frame.f_lineno))
         return Caution(*args)
 
-    def recording_limits(report: dict[str, Any], *rows: section_facts.Limit) -> list[Caution]:
+    def recording_limits(report: dict[str, Any], *rows: report_html.Limit) -> list[Caution]:
         limits.update(path for path, *_ in rows)
         exceeded.update(row[0] for row in rows if above(report, row))
         return above(report, *rows)
@@ -367,7 +368,7 @@ def test_the_defects_tried_cover_every_kind_of_caution(monkeypatch: pytest.Monke
         if "Caution(" in path.read_text(encoding="utf-8").replace("class Caution", "")
     }
     # The pages of a validation and of a forecast have their own.
-    assert elsewhere == {"build_sections", "build_topics", "section_facts", "validation_report", "forecast_text"}
+    assert elsewhere == {"build_sections", "build_topics", "html", "validation_report", "forecast_text"}
 
 
 @pytest.mark.usefixtures("no_charts")

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from audit import EVENTS, Findings, VisualMesh, audit
+from films import video_info
 from tiny_twin import tiny_field, tiny_twin
 from tiny_world import tiny_world
 
@@ -30,7 +31,7 @@ from twin.geometry.cameras import Viewpoints
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
 from twin.nerf.rendering import Rendering
-from twin.report.video_writer import read_frames, video_info
+from twin.report.video_writer import read_frames
 from twin.robot import TRACK, HuskyParams
 
 SMALL = {"size": (32, 18)}

@@ -132,8 +132,3 @@ def test_the_corridor_is_as_wide_as_it_says() -> None:
     x, y = outline.T
     area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
     assert area == pytest.approx(10 * 1.5)
-
-
-def test_bounds_hold_the_path() -> None:
-    low, high = figures.map_bounds(np.array([[0.0, 5.0], [3.0, -2.0]]), 1.0)
-    assert low.tolist() == [-1.0, -3.0] and high.tolist() == [4.0, 6.0]

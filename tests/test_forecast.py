@@ -346,8 +346,9 @@ def test_many_cells_are_heatmaps_above_a_collapsed_table() -> None:
             (lambda p: p.lighting, lambda p: p.bias.value),
         )
     )
-    for figure, wanted in ((forecast_report.twin_heatmap, twin), (forecast_report.road_heatmap, road)):
-        assert tile_texts(figure(candidates, pairs)) == {key: f"{100 * rate:.0f}" for key, rate in wanted.items()}
+    for field, wanted in (("twin", twin), ("real", road)):
+        figure = forecast_report.cell_heatmap(candidates, pairs, field)
+        assert tile_texts(figure) == {key: f"{100 * rate:.0f}" for key, rate in wanted.items()}
     figure = forecast_report.difference_heatmap(candidates, pairs)
     told = tile_texts(figure)
     assert {key: int(text.strip("()").replace("−", "-")) for key, text in told.items()} == {

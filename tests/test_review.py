@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from films import video_info
 
 from twin.config import ReviewConfig, SceneConfig, SourceConfig
 from twin.files import read_json
@@ -31,7 +32,7 @@ from twin.report.review_chapters import (
     gray_out,
     lighting_at,
 )
-from twin.report.review_video import Prefetcher, overview_pose, write_review_video
+from twin.report.review_video import overview_pose, prefetched, write_review_video
 from twin.report.video_layout import (
     FrameLayout,
     MapView,
@@ -46,7 +47,7 @@ from twin.report.video_layout import (
     text_width,
     wrap,
 )
-from twin.report.video_writer import read_frames, video_info
+from twin.report.video_writer import read_frames
 from twin.scene import SceneDir
 
 
@@ -291,14 +292,14 @@ def test_a_row_of_pictures_has_one_height() -> None:
 
 
 def test_prefetching_keeps_order_and_passes_errors_on() -> None:
-    with Prefetcher(iter(range(20)), depth=3) as items:
+    with prefetched(iter(range(20)), depth=3) as items:
         assert list(items) == list(range(20))
 
     def fails() -> Iterator[int]:
         yield 1
         raise ValueError("broken")
 
-    with Prefetcher(fails(), depth=3) as items, pytest.raises(ValueError, match="broken"):
+    with prefetched(fails(), depth=3) as items, pytest.raises(ValueError, match="broken"):
         list(items)
 
 
@@ -310,8 +311,8 @@ def test_prefetching_stops_when_nobody_reads() -> None:
             made.append(len(made))
             yield made[-1]
 
-    with Prefetcher(endless(), depth=2) as items:
-        assert next(iter(items)) == 0
+    with prefetched(endless(), depth=2) as items:
+        assert next(items) == 0
     count = len(made)
     assert count <= 5
     assert len(made) == count

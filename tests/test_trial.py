@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from films import video_info
 from picture_bag import CAMERA_INFO, MESSAGES, START, TYPES, Recorded, camera_info, command, image, odometry, write
 from scipy.spatial.transform import Rotation
 from test_policy import some_weights
@@ -22,7 +23,7 @@ from twin.evaluation.trials import Cell, read_results, read_trials
 from twin.learn.policy import Control, load_policy, save_policy
 from twin.learn.policy_network import Architecture
 from twin.report.bag_dataset import write_bag_dataset
-from twin.report.video_writer import read_frames, video_info
+from twin.report.video_writer import read_frames
 from twin.sysid.frame_fit import fit_frame
 from twin.sysid.trial_recording import read_trial
 

@@ -11,7 +11,6 @@ from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation, UsdVol
 
 from twin.assets.gaussians import Gaussians, gaussians_by_lighting, read_ply
 from twin.assets.views import Views
-from twin.errors import InputError
 from twin.export.usd import ground_triangles, tire_hull, variant_name, write_usd
 from twin.geometry.cameras import Viewpoints, opencv_to_mujoco, project
 from twin.mjcf.scene_xml import Parts
@@ -252,8 +251,3 @@ def test_route_and_corridor_are_curves(stage, world) -> None:
     left = np.array(UsdGeom.BasisCurves(stage.GetPrimAtPath("/World/Route/CorridorLeft")).GetPointsAttr().Get())
     assert np.allclose(np.linalg.norm((left - world.route)[:, :2], axis=1), world.half_width, atol=1e-5)
     assert np.allclose(_pose(stage, "/World/Route/Goal")[:3, 3], world.goal)
-
-
-def test_another_suffix_is_refused(tmp_path, world, splats) -> None:
-    with pytest.raises(InputError, match=r"expected a file ending in \.usdz"):
-        _write(tmp_path / "place.obj", splats, world)

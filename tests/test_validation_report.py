@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from films import video_info
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from test_forecast import Text
@@ -40,7 +41,6 @@ from twin.report.validation_report import (
     verdicts,
     worst_episode,
 )
-from twin.report.video_writer import video_info
 
 TRAINED = {"run": "ahead", "task": "ahead", "observe": "nerf", "lighting": "training", "step": 300}
 EPISODES = [(10 * k, int(k > 15)) for k in range(1, 41)]  # of the run `ahead`: step, success
@@ -204,7 +204,7 @@ def test_the_page_shows_the_numbers_of_the_tables(tmp_path):
     trials += [trial("a", 7, "stuck", task="bend", light="any")]
     trained = {"a": TRAINED | {"run": "a", "first_step": 20, "test": None} | rate_summary(96, 100)}
     worst = [summarize([trial("a", k, "rollover", light="drawn_3") for k in range(5)])["cells"][0] | {"of": 16}]
-    curve = TrainingCurve("a", np.arange(10, 400, 10), np.arange(39) % 2)
+    curve = ("a", np.arange(10, 400, 10), np.arange(39) % 2)
     said = told(trials, training=trained, worst=worst)
     text = page(tmp_path, said, curve).text
     for cell in [*said["cells"], *worst]:
@@ -269,7 +269,7 @@ def episodes(monkeypatch):
 
     whole = film.film
     monkeypatch.setattr(film, "film", spy)
-    monkeypatch.setattr("twin.report.episode_video.SceneCamera", NoCamera)
+    monkeypatch.setattr("twin.report.drive_video.SceneCamera", NoCamera)
     return seen
 
 

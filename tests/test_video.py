@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from films import video_info
 
-from twin.report.video_writer import VideoWriter, even, read_frames, video_info
+from twin.report.video_writer import VideoWriter, even, read_frames
 
 
 def _gradient(i: int, width: int = 64, height: int = 48) -> np.ndarray:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from chromium import Chromium, find_chromium
+from films import video_info
 from tiny_twin import tiny_twin
 from websockets.exceptions import InvalidStatus
 from websockets.http11 import Headers, Request
@@ -29,7 +30,7 @@ from twin.loading import Twin
 from twin.nerf.fog import Fog
 from twin.report import build_report as report_page
 from twin.report.video_layout import to_uint8
-from twin.report.video_writer import read_frames, video_info
+from twin.report.video_writer import read_frames
 from twin.scene import write_stamp
 from twin.view.__main__ import load_driving, open_page
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_times

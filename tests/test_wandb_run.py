@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
 
+from films import video_info
 from stable_baselines3.common.logger import Logger
 from test_training import SHORT
 from tiny_twin import tiny_twin
@@ -23,7 +24,6 @@ from twin.learn import selection
 from twin.learn.training import prepare_folder
 from twin.learn.training import train as train_run
 from twin.learn.wandb_run import wandb_run
-from twin.report.video_writer import video_info
 
 STAND_IN = """
 import json

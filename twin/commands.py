@@ -49,19 +49,19 @@ def parser_of(verb: str) -> argparse.ArgumentParser:
 
 
 def _new(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = (
         "Start a scene folder from films or robots' bags (ROS 2, or .bag of ROS 1; pip install 'twin[ros]'). A bag "
         "also brings the camera's calibration, GPS and odometry for the scale, and the camera's pose on the robot."
     )
-    parser.add_argument("scene", type=Path, help="folder to make, such as scenes/my_road")
-    parser.add_argument(
-        "films", type=Path, nargs="+", metavar="VIDEO", help="films, bags or image folders, one per lighting"
-    )
-    parser.add_argument("--camera-height", type=float, metavar="METRES", help="height of the lens above the ground")
-    parser.add_argument("--topic", help="topic of a bag's pictures; default: that with the most pictures")
+    add("scene", type=Path, help="folder to make, such as scenes/my_road")
+    add("films", type=Path, nargs="+", metavar="VIDEO", help="films, bags or image folders, one per lighting")
+    add("--camera-height", type=float, metavar="METRES", help="height of the lens above the ground")
+    add("--topic", help="topic of a bag's pictures; default: that with the most pictures")
 
 
 def _build(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = "Turn a filmed place into a drivable MuJoCo twin."
     parser.epilog = """\
 a scene.toml of your own road:
@@ -81,22 +81,17 @@ a scene.toml of your own road:
 
 twin new SCENE VIDEO... writes such a folder.
 """
-    parser.add_argument("scene", type=Path, help="folder with scene.toml and input/")
-    parser.add_argument("--until", choices=STAGES, metavar="STAGE", help=f"last stage to run: {', '.join(STAGES)}")
-    parser.add_argument(
-        "--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="stage to run again"
-    )
-    parser.add_argument(
-        "--quality", choices=tuple(QUALITIES), help="of the radiance field; default: as in scene.toml, or standard"
-    )
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="override scene.toml, as in nerf.steps=4000"
-    )
-    parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add("scene", type=Path, help="folder with scene.toml and input/")
+    add("--until", choices=STAGES, metavar="STAGE", help=f"last stage to run: {', '.join(STAGES)}")
+    add("--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="stage to run again")
+    add("--quality", choices=tuple(QUALITIES), help="of the radiance field; default: as in scene.toml, or standard")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="override scene.toml, as in nerf.steps=4000")
+    add("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
+    add("--quiet", action="store_true", help="no progress, no summary")
 
 
 def _relight(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = (
         "Add a lighting to a built scene from one photo: the photo is located, then an appearance embedding of the "
         "radiance field, fog and, on demand, a sun are fitted to it. Then the twin can be rendered in that light."
@@ -105,23 +100,22 @@ def _relight(parser: argparse.ArgumentParser) -> None:
         "Without --sun and --time the lighting has no sun. A sun is kept only if, with it, a fit to half of the photo "
         "explains the other half better."
     )
-    parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("photo", type=Path, help="an image file that shows the place, from near the filmed path")
-    parser.add_argument("--name", required=True, help="name of the lighting; replaces an added one of that name")
-    parser.add_argument(
+    add("scene", type=Path, help="folder of a built scene")
+    add("photo", type=Path, help="an image file that shows the place, from near the filmed path")
+    add("--name", required=True, help="name of the lighting; replaces an added one of that name")
+    add(
         "--sun",
         metavar="AZIMUTH,ELEVATION",
         help="direction [°], the azimuth counterclockwise from the scene's x axis; search: find it in the photo",
     )
-    parser.add_argument("--time", help="when the photo was taken, such as 2026-06-01T17:30+02:00; gives the sun")
-    parser.add_argument("--location", metavar="LAT,LON", help="where it was taken [°]; default: by the frames' GPS")
-    parser.add_argument(
-        "--heading", type=float, metavar="DEG", help="compass angle of the scene's x axis [°]; default: by GPS"
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add("--time", help="when the photo was taken, such as 2026-06-01T17:30+02:00; gives the sun")
+    add("--location", metavar="LAT,LON", help="where it was taken [°]; default: by the frames' GPS")
+    add("--heading", type=float, metavar="DEG", help="compass angle of the scene's x axis [°]; default: by GPS")
+    add("--quiet", action="store_true", help="no progress, no summary")
 
 
 def _align(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = (
         "Fit the Husky's parameters to the log of a real Husky's drive, and score them on parts of the log that were "
         "held out; or fit the pose of its camera to a film by that camera."
@@ -134,236 +128,222 @@ def _align(parser: argparse.ArgumentParser) -> None:
         "(pip install 'twin[ros]'). A film (.mp4, ...) has rectified pictures of the robot's front camera. In it, the "
         "robot drives 10 m or more at the scene's place, mostly straight ahead, in light like that of one of its films."
     )
-    parser.add_argument("robot", help="folder of a scene, a robot.toml, or `husky` (published values)")
-    parser.add_argument("log", type=Path, help="a .csv, an .npz, a bag, or a film")
-    parser.add_argument("--camera", action="store_true", help="fit the camera's pose to the bag's pictures")
-    parser.add_argument("--topic", help="topic of these pictures; default: that with the most pictures")
-    parser.add_argument("--out", type=Path, help="folder for robot.toml and alignment/; default: that of the scene")
-    parser.add_argument("--level", action="store_true", help="assume level ground and ignore the log's IMU")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add("robot", help="folder of a scene, a robot.toml, or `husky` (published values)")
+    add("log", type=Path, help="a .csv, an .npz, a bag, or a film")
+    add("--camera", action="store_true", help="fit the camera's pose to the bag's pictures")
+    add("--topic", help="topic of these pictures; default: that with the most pictures")
+    add("--out", type=Path, help="folder for robot.toml and alignment/; default: that of the scene")
+    add("--level", action="store_true", help="assume level ground and ignore the log's IMU")
+    add("--quiet", action="store_true", help="no progress, no summary")
 
 
 def _film(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = "Film a drive in a built scene: robot view, chase view, map, speed and reward."
-    parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("--task", default="right_turn", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument(
-        "--policy", help="a run, a checkpoint, an ONNX file or module:function; default: a scripted route follower"
-    )
-    parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
-    parser.add_argument(
+    add("scene", type=Path, help="folder of a built scene")
+    add("--task", default="right_turn", help="straight, right_turn, route, or one of scene.toml")
+    add("--policy", help="a run, a checkpoint, an ONNX file or module:function; default: a scripted route follower")
+    add("--trust", action="store_true", help="load a policy file that may run code")
+    add(
         "--lighting",
         help="a name, a mixture a:b:0.3 (30 %% of b), or a random one: training, held-out, any; each may end with "
         "+randomised (default: training)",
     )
-    parser.add_argument("--drift", action="store_true", help="the light changes during the drive")
-    parser.add_argument("--obstacles", default="scene", help="number of random obstacles; scene: those of scene.toml")
-    parser.add_argument("--randomise", action="store_true", help="randomize robot, weather and distractor objects")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the episode")
-    parser.add_argument("--out", type=Path, help="the mp4; default: a file in SCENE/films")
-    parser.add_argument(
+    add("--drift", action="store_true", help="the light changes during the drive")
+    add("--obstacles", default="scene", help="number of random obstacles; scene: those of scene.toml")
+    add("--randomise", action="store_true", help="randomize robot, weather and distractor objects")
+    add("--seed", type=int, default=0, help="seed of the episode")
+    add("--out", type=Path, help="the mp4; default: a file in SCENE/films")
+    add(
         "--rerun",
         type=Path,
         metavar="FILE",
         help="also write the drive as a Rerun recording, such as drive.rrd (pip install 'twin[rerun]')",
     )
-    parser.add_argument(
+    add(
         "--lerobot",
         type=Path,
         metavar="DIR",
         help="record drives as a LeRobot dataset instead of a film (pip install 'twin[lerobot]')",
     )
-    parser.add_argument(
+    add(
         "--episodes",
         type=int,
         default=1,
         help="drives in the dataset, with seeds from --seed on (default: %(default)s)",
     )
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add("--quiet", action="store_true", help="no progress, no summary")
 
 
 def _drive(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = (
         "Show the Husky driving, in a film or on the page of twin view. By default, the policy of a pack or of a "
         "scene's only run drives the task of its training; without such a policy, the scripted driver drives."
     )
-    parser.add_argument("scene", type=Path, help="folder of a built scene, or a pack or its name: demo")
-    parser.add_argument("--view", action="store_true", help="show the drive in the browser; press Drive there")
-    parser.add_argument("--policy", help="a run, a checkpoint, an ONNX file or module:function")
-    parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
-    parser.add_argument("--task", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5 (default: random)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the episode")
-    parser.add_argument("--port", type=int, default=8080, help="port of the page; if taken, the next free one; 0: any")
-    parser.add_argument("--out", type=Path, help="the mp4; default: in SCENE/films; for a pack, in this folder")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add("scene", type=Path, help="folder of a built scene, or a pack or its name: demo")
+    add("--view", action="store_true", help="show the drive in the browser; press Drive there")
+    add("--policy", help="a run, a checkpoint, an ONNX file or module:function")
+    add("--trust", action="store_true", help="load a policy file that may run code")
+    add("--task", help="straight, right_turn, route, or one of scene.toml")
+    add("--lighting", help="a name, or a mixture sun:night:0.5 (default: random)")
+    add("--seed", type=int, default=0, help="seed of the episode")
+    add("--port", type=int, default=8080, help="port of the page; if taken, the next free one; 0: any")
+    add("--out", type=Path, help="the mp4; default: in SCENE/films; for a pack, in this folder")
+    add("--quiet", action="store_true", help="no progress, no summary")
 
 
 def _pack(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = "Pack a built scene into one file with what driving in it needs, for another machine."
-    parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="the pack; default: NAME.twin in this folder")
-    parser.add_argument(
-        "--policy",
-        action="append",
-        default=[],
-        help="a run, a checkpoint or an ONNX file to include; may be repeated",
-    )
-    parser.add_argument(
-        "--licence", default="", metavar="TEXT", help="terms of use, such as 'CC BY 4.0'; default: not stated"
-    )
-    parser.add_argument("--with-positions", action="store_true", help="include the films' GPS positions")
-    parser.add_argument(
+    add("scene", type=Path, help="folder of a built scene")
+    add("-o", "--out", type=Path, metavar="FILE", help="the pack; default: NAME.twin in this folder")
+    add("--policy", action="append", default=[], help="a run, a checkpoint or an ONNX file to include; may be repeated")
+    add("--licence", default="", metavar="TEXT", help="terms of use, such as 'CC BY 4.0'; default: not stated")
+    add("--with-positions", action="store_true", help="include the films' GPS positions")
+    add(
         "--levels",
         type=int,
         default=256,
         help="number of values to which the radiance field's features are rounded; fewer values make the pack smaller "
         "and change the field; 256 keeps every bit",
     )
-    parser.add_argument("--trust", action="store_true", help="include policies that may run code when they are loaded")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add("--trust", action="store_true", help="include policies that may run code when they are loaded")
+    add("--quiet", action="store_true", help="no progress, no summary")
 
 
 def _unpack(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = (
         "Unpack a pack into a scene folder, in which all commands work that need no films. Its paths, sizes and "
         "digests are checked, and nothing in it runs."
     )
-    parser.add_argument("pack", type=Path, help="the file")
-    parser.add_argument("folder", type=Path, help="folder to make")
-    parser.add_argument("--trust", action="store_true", help="unpack policies that may run code when loaded, too")
-    parser.add_argument("--quiet", action="store_true", help="no summary")
+    add("pack", type=Path, help="the file")
+    add("folder", type=Path, help="folder to make")
+    add("--trust", action="store_true", help="unpack policies that may run code when loaded, too")
+    add("--quiet", action="store_true", help="no summary")
 
 
 def _view(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = (
         "Show a built scene in the browser: look around under any lighting, drive the Husky by keys or a policy, put "
         "obstacles in its way, compare film and twin, place camera paths. Or render such a path to a film."
     )
-    parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("--lighting", help="a name, or a mixture sun:night:0.5; default: the first filmed one")
-    parser.add_argument("--task", help="task of the driver: straight, right_turn, ... (default: route)")
-    parser.add_argument("--policy", help="a run, a checkpoint, an ONNX file or module:function that may drive")
-    parser.add_argument("--trust", action="store_true", help="load a policy file that may run code")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the task's episodes")
-    parser.add_argument(
+    add("scene", type=Path, help="folder of a built scene")
+    add("--lighting", help="a name, or a mixture sun:night:0.5; default: the first filmed one")
+    add("--task", help="task of the driver: straight, right_turn, ... (default: route)")
+    add("--policy", help="a run, a checkpoint, an ONNX file or module:function that may drive")
+    add("--trust", action="store_true", help="load a policy file that may run code")
+    add("--seed", type=int, default=0, help="seed of the task's episodes")
+    add(
         "--host",
         default="127.0.0.1",
         help="address to serve on; unless it is this machine's loopback, the page's URL contains a secret token",
     )
-    parser.add_argument("--port", type=int, default=8080, help="port; if taken, the next free one; 0: any")
-    parser.add_argument("--path", type=Path, help="render this saved camera path instead of showing the page")
-    parser.add_argument("--out", type=Path, help="the mp4 of --path")
-    parser.add_argument("--size", default="1280x720", help="size of the film [px]")
-    parser.add_argument("--fps", type=int, default=30, help="frames per second of the film")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no address, no summary")
+    add("--port", type=int, default=8080, help="port; if taken, the next free one; 0: any")
+    add("--path", type=Path, help="render this saved camera path instead of showing the page")
+    add("--out", type=Path, help="the mp4 of --path")
+    add("--size", default="1280x720", help="size of the film [px]")
+    add("--fps", type=int, default=30, help="frames per second of the film")
+    add("--quiet", action="store_true", help="no progress, no address, no summary")
 
 
 def _export(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = (
         "Write a built place for other programs: all of it as USD, its mesh as glTF, its radiance field as Gaussian "
         "splats, its frames and cameras for other trainers, a task's rules for evaluation elsewhere."
     )
-    parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument(
+    add("scene", type=Path, help="folder of a built scene")
+    add(
         "--usd",
         type=Path,
         metavar="FILE",
         help="write splats in every lighting, collision shapes, the Husky, its camera and route as .usdz, .usd, .usdc "
         "(pip install 'twin[usd]')",
     )
-    parser.add_argument("--glb", type=Path, metavar="FILE", help="write the visual mesh, textured (binary glTF, y up)")
-    parser.add_argument("--ply", type=Path, metavar="FILE", help="write Gaussians as 3DGS viewers read them (z up)")
-    parser.add_argument(
-        "--nerfstudio", type=Path, metavar="DIR", help="write transforms.json, frames, masks and sparse points"
-    )
-    parser.add_argument("--colmap", type=Path, metavar="DIR", help="write a COLMAP model with its frames and masks")
-    parser.add_argument(
-        "--task-file", type=Path, metavar="FILE", help="write the rules of --task as JSON, for evaluation elsewhere"
-    )
-    parser.add_argument("--task", metavar="NAME", help="a task of the scene, such as straight")
-    parser.add_argument(
+    add("--glb", type=Path, metavar="FILE", help="write the visual mesh, textured (binary glTF, y up)")
+    add("--ply", type=Path, metavar="FILE", help="write Gaussians as 3DGS viewers read them (z up)")
+    add("--nerfstudio", type=Path, metavar="DIR", help="write transforms.json, frames, masks and sparse points")
+    add("--colmap", type=Path, metavar="DIR", help="write a COLMAP model with its frames and masks")
+    add("--task-file", type=Path, metavar="FILE", help="write the rules of --task as JSON, for evaluation elsewhere")
+    add("--task", metavar="NAME", help="a task of the scene, such as straight")
+    add(
         "--lighting",
         help="lighting of --glb and --ply, and the first one in --usd: a name, or a mixture sun:night:0.5; default: "
         "first filmed one",
     )
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add("--quiet", action="store_true", help="no progress, no summary")
 
 
 def _train(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = "Train a policy by SAC from pixels."
-    parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument("--run", required=True, help="name of the run, a folder in SCENE/runs")
-    parser.add_argument("--observe", choices=("nerf", "simulator"), help="source of the pictures (default: nerf)")
-    parser.add_argument("--lighting", help="one lighting by name (default: training, which varies between episodes)")
-    parser.add_argument("--preset", choices=("cpu", "gpu"), default="cpu", help="sizes of network, batch and run")
-    parser.add_argument("--action", choices=("steering", "twist"), help="default: steering, at fixed speed")
-    parser.add_argument(
-        "--success", type=float, help="success rate in tests at which the training ends (default: 0.95)"
-    )
-    parser.add_argument(
+    add("scene", type=Path, help="folder of a built scene")
+    add("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
+    add("--run", required=True, help="name of the run, a folder in SCENE/runs")
+    add("--observe", choices=("nerf", "simulator"), help="source of the pictures (default: nerf)")
+    add("--lighting", help="one lighting by name (default: training, which varies between episodes)")
+    add("--preset", choices=("cpu", "gpu"), default="cpu", help="sizes of network, batch and run")
+    add("--action", choices=("steering", "twist"), help="default: steering, at fixed speed")
+    add("--success", type=float, help="success rate in tests at which the training ends (default: 0.95)")
+    add(
         "--steps",
         type=int,
         help="largest number of control steps, all environments together (default: 24000; gpu: 240000)",
     )
-    parser.add_argument("--worlds", type=int, help="number of parallel environments (default: 8; gpu: 32)")
-    parser.add_argument(
-        "--processes", type=int, help="processes that step the environments (default: one per core, at most 8)"
-    )
-    parser.add_argument("--updates", type=float, help="network updates per control step (default: 0.5)")
-    parser.add_argument(
-        "--steering", type=float, help="penalty of full steering, as a share of a step's reward (default: 0.5)"
-    )
-    parser.add_argument(
-        "--entropy", type=float, help="target entropy per action component [nat]; higher explores more (default: -0.5)"
-    )
-    parser.add_argument(
-        "--colours", type=float, help="strength of color augmentation where the lighting varies (default: 1.0)"
-    )
-    parser.add_argument("--seed", type=int, help="seed of every random draw (default: 0)")
-    parser.add_argument(
+    add("--worlds", type=int, help="number of parallel environments (default: 8; gpu: 32)")
+    add("--processes", type=int, help="processes that step the environments (default: one per core, at most 8)")
+    add("--updates", type=float, help="network updates per control step (default: 0.5)")
+    add("--steering", type=float, help="penalty of full steering, as a share of a step's reward (default: 0.5)")
+    add("--entropy", type=float, help="target entropy per action component [nat]; higher explores more (default: -0.5)")
+    add("--colours", type=float, help="strength of color augmentation where the lighting varies (default: 1.0)")
+    add("--seed", type=int, help="seed of every random draw (default: 0)")
+    add(
         "--randomise",
         action=argparse.BooleanOptionalAction,
         default=None,
         help="randomize the robot and, where the lighting varies, weather and distractor objects (the default)",
     )
-    parser.add_argument(
+    add(
         "--privileged",
         action=argparse.BooleanOptionalAction,
         default=None,
         help="critics receive the robot's pose in training (the default); the policy never does",
     )
-    parser.add_argument(
+    add(
         "--wandb",
         metavar="PROJECT",
         help="project of Weights & Biases, or ENTITY/PROJECT, to which numbers are logged and at the end a film of the "
         "kept policy (pip install 'twin[wandb]')",
     )
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add("--quiet", action="store_true", help="no progress, no summary")
 
 
 def _validate(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = "Measure how often policies succeed, lighting by lighting."
-    parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("--policy", nargs="+", required=True, help="runs, ONNX files or module:function")
-    parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument(
+    add("scene", type=Path, help="folder of a built scene")
+    add("--policy", nargs="+", required=True, help="runs, ONNX files or module:function")
+    add("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
+    add(
         "--lightings",
         nargs="+",
         default=[HELD_OUT, str(Condition(HELD_OUT, True))],
         help="names, mixtures a:b:0.3, or random ones: held-out, any; each may end with +randomised",
     )
-    parser.add_argument("--episodes", type=int, default=100, help="number per policy and lighting")
-    parser.add_argument("--worst", action="store_true", help="search for each policy's worst lighting")
-    parser.add_argument("--films", action="store_true", help="film each policy's typical and worst episode")
-    parser.add_argument("--trust", action="store_true", help="load policy files that may run code")
-    parser.add_argument("--processes", type=int, default=1, help="processes on this machine; each uses two cores")
-    parser.add_argument("--ray", metavar="ADDRESS", help="use a Ray cluster; auto: the one on this machine")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no table")
+    add("--episodes", type=int, default=100, help="number per policy and lighting")
+    add("--worst", action="store_true", help="search for each policy's worst lighting")
+    add("--films", action="store_true", help="film each policy's typical and worst episode")
+    add("--trust", action="store_true", help="load policy files that may run code")
+    add("--processes", type=int, default=1, help="processes on this machine; each uses two cores")
+    add("--ray", metavar="ADDRESS", help="use a Ray cluster; auto: the one on this machine")
+    add("--quiet", action="store_true", help="no progress, no table")
 
 
 def _trial(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = (
         "Evaluate a trial on the road, from the robot's ROS 2 bag, by the twin's rules. The results are a row of "
         "real.csv, a film of robot and twin side by side, and their differences in path and pictures."
@@ -373,29 +353,25 @@ def _trial(parser: argparse.ArgumentParser) -> None:
         "velocity commands, and poses: odometry that does not drift (RTK, LiDAR, filtered), or NavSatFix. Topics are "
         "found by their types."
     )
-    parser.add_argument("scene", type=Path, help="folder of a built scene")
-    parser.add_argument("bag", type=Path, nargs="+", help="the recording of one trial; with --lerobot, of any drives")
-    parser.add_argument("--policy", help="the policy that drove: a run, a checkpoint or an ONNX file")
-    parser.add_argument("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
-    parser.add_argument("--lighting", metavar="NAME", help="name of the day or light for real.csv")
-    parser.add_argument(
-        "--twin-lighting", metavar="NAME", help="the lighting of the twin that is compared; default: --lighting"
-    )
-    parser.add_argument(
+    add("scene", type=Path, help="folder of a built scene")
+    add("bag", type=Path, nargs="+", help="the recording of one trial; with --lerobot, of any drives")
+    add("--policy", help="the policy that drove: a run, a checkpoint or an ONNX file")
+    add("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
+    add("--lighting", metavar="NAME", help="name of the day or light for real.csv")
+    add("--twin-lighting", metavar="NAME", help="the lighting of the twin that is compared; default: --lighting")
+    add(
         "--cause",
         choices=("collision", "out_of_bounds", "timeout", "rollover", "stuck"),
         help="what ended the trial, if the poses do not show it",
     )
-    parser.add_argument(
-        "--out", type=Path, metavar="CSV", help="default: SCENE/real.csv; a list of trials is beside it"
-    )
-    parser.add_argument(
+    add("--out", type=Path, metavar="CSV", help="default: SCENE/real.csv; a list of trials is beside it")
+    add(
         "--frame",
         choices=("pictures", "scene"),
         default="pictures",
         help="pictures: fit the poses to the localized pictures; scene: the poses are in the scene's coordinates",
     )
-    parser.add_argument(
+    add(
         "--lerobot",
         type=Path,
         metavar="DIR",
@@ -407,11 +383,12 @@ def _trial(parser: argparse.ArgumentParser) -> None:
         ("poses", "poses"),
         ("commands", "commands"),
     ):
-        parser.add_argument(f"--{name}", metavar="TOPIC", help=f"topic of the {what}")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+        add(f"--{name}", metavar="TOPIC", help=f"topic of the {what}")
+    add("--quiet", action="store_true", help="no progress, no summary")
 
 
 def _forecast(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     parser.description = "Predict success on the road from success in the twin."
     parser.epilog = """\
 results.csv, one line per policy and lighting:
@@ -424,10 +401,10 @@ Names are those of validation/episodes.csv. If a policy was validated on several
 If the twin has no lighting of a name, a column twin_lighting names the lighting to compare with, such as
 held-out+randomised.
 """
-    parser.add_argument("scene", type=Path, help="folder of a scene with validated policies")
-    parser.add_argument("--real", type=Path, metavar="CSV", help="trials on the road; see below")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the sampling from posteriors")
-    parser.add_argument("--quiet", action="store_true", help="no summary")
+    add("scene", type=Path, help="folder of a scene with validated policies")
+    add("--real", type=Path, metavar="CSV", help="trials on the road; see below")
+    add("--seed", type=int, default=0, help="seed of the sampling from posteriors")
+    add("--quiet", action="store_true", help="no summary")
 
 
 def _reality(parser: argparse.ArgumentParser) -> None:

@@ -35,12 +35,11 @@ from twin.config import (
 from twin.errors import InputError, short_repr
 from twin.files import exists, is_link, parse_toml, read_toml
 from twin.robot import HuskyParams
+from twin.scene import MAX_NAME
 from twin.types import Range, setting_ranges
 
 ROBOT_TOML = "robot.toml"
 
-MAX_NAME = 80
-"""Largest number of characters in a name that becomes part of a file name."""
 _SECTIONS = ("capture", "cameras", "metric", "nerf", "mesh", "route", "mjcf", "review")
 
 

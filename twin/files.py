@@ -46,6 +46,9 @@ _FILE_KINDS = {
 }
 
 
+# Unlike the methods of `Path`, these return False for an invalid file name. `is_link` is True even without a target.
+exists, is_file, is_link = os.path.exists, os.path.isfile, os.path.islink
+
 # ---- reading
 
 
@@ -59,22 +62,6 @@ def regular_file(path: Path) -> Path:
     if kind != stat.S_IFREG:
         raise InputError(f"{path} is {_FILE_KINDS.get(kind, 'no regular file')}; expected a file")
     return path
-
-
-def exists(path: Path) -> bool:
-    """True if the path exists; False for an invalid file name, for which Path.exists raises an error."""
-    try:
-        return path.exists()
-    except OSError:
-        return False
-
-
-def is_link(path: Path) -> bool:
-    """True for a link, even if its target is missing; False for an invalid file name."""
-    try:
-        return path.is_symlink()
-    except (OSError, ValueError):
-        return False
 
 
 def read_bytes(path: Path, most: int | None = None) -> bytes:
@@ -363,14 +350,6 @@ def require_absent(path: Path) -> None:
     require_parent(path)
     if path.exists() or path.is_symlink():
         raise InputError(f"{path} is there already; remove it, or give another folder")
-
-
-def is_file(path: Path) -> bool:
-    """True for a regular file or a link to one; False for an invalid file name."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
 
 
 def is_folder(path: Path, cure: str) -> bool:

@@ -15,23 +15,27 @@ import argparse
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import dm_env
 import numpy as np
 
 from twin import commands, runtime
-from twin.config import STEERING
+from twin.config import STEERING, Condition
+from twin.env.domain_randomization import condition_options
+from twin.env.drivers import Driver, PolicyDriver, RouteDriver
+from twin.env.episode import Episode, record_episode
 from twin.env.suite import load
 from twin.errors import InputError
 from twin.files import new_folder, require_absent, require_parent
 from twin.geometry.poses import inverse_pose
+from twin.learn.policy import find_policy, load_policy
 from twin.loading import Twin, load_scene
+from twin.report.drive_dataset import DriveDataset, drive_instruction, drives_summary, require_pyarrow
+from twin.report.drive_video import write_episode_video
+from twin.report.rerun_recording import require_rerun, write_rerun_recording
+from twin.report.review_video import load_ground_and_parts
 from twin.unpack import is_cached
-
-if TYPE_CHECKING:
-    from twin.env.drivers import Driver
-    from twin.env.episode import Episode
 
 _MAX_DIGITS = 6  # largest number of digits in --obstacles
 
@@ -45,7 +49,7 @@ def film(
     trust: bool = False,
     rerun: Path | None = None,
     **options: Any,
-) -> tuple[Path, "Episode"]:
+) -> tuple[Path, Episode]:
     """Drives one episode and films it; returns the film's path and the episode.
 
     Args:
@@ -63,13 +67,7 @@ def film(
         InputError: the scene, task, policy or an option is unknown, the seed is negative, or rerun-sdk is needed but
             not installed.
     """
-    from twin.env.episode import record_episode
-    from twin.report.episode_video import write_episode_video
-    from twin.report.review_video import load_ground_and_parts
-
     if rerun:
-        from twin.report.rerun_recording import require_rerun, write_rerun_recording
-
         require_rerun()
         require_parent(rerun)
     scene = load_scene(root)
@@ -93,9 +91,10 @@ def film(
     in_cache = is_cached(scene.scene.root)
     path = out or (Path(f"{root.stem}_{name}") if in_cache else scene.scene.root / "films" / name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    driven, geometry = environment.task, load_ground_and_parts(scene.scene)
-    limits, title = (driven.segment.start, driven.segment.end), f"{task.replace('_', ' ')}: {driver_name}"
-    write_episode_video(path, episode, images, driven.world, driven.half_width, limits, geometry, title)
+    driven, title = environment.task, f"{task.replace('_', ' ')}: {driver_name}"
+    limits = driven.segment.start, driven.segment.end
+    shown = driven.world, driven.half_width, limits, load_ground_and_parts(scene.scene)
+    write_episode_video(path, episode, images, shown, title)
     if rerun:
         place = driven.world, driven.half_width, f"{scene.scene.root.resolve().name}, {title}"
         commands = episode.actions
@@ -114,7 +113,7 @@ def record_dataset(
     seed: int = 0,
     trust: bool = False,
     **options: Any,
-) -> list["Episode"]:
+) -> list[Episode]:
     """Drives episodes and writes them as a LeRobot dataset, see `twin.report.drive_dataset`; returns the episodes.
 
     Args:
@@ -127,9 +126,6 @@ def record_dataset(
     Raises:
         InputError: an error of `film`; `out` exists, or pyarrow is not installed.
     """
-    from twin.env.episode import record_episode
-    from twin.report.drive_dataset import DriveDataset, drive_instruction, require_pyarrow
-
     if episodes < 1:
         raise InputError(f"--episodes {episodes}: expected 1 or more")
     require_pyarrow()
@@ -166,16 +162,12 @@ def record_dataset(
 
 def _driver(
     scene: Twin, policy: str | None, seed: int, trust: bool, options: dict[str, Any]
-) -> tuple["Driver", str, dict[str, Any]]:
+) -> tuple[Driver, str, dict[str, Any]]:
     """The driver, its name, and the environment's options; given options take precedence over those of the policy."""
-    from twin.env.drivers import PolicyDriver, RouteDriver
-
     if seed < 0:
         raise InputError(f"seed = {seed}: expected 0 or more")
     if not policy:
         return RouteDriver(), "scripted driver", options
-    from twin.learn.policy import find_policy, load_policy
-
     loaded = load_policy(find_policy(scene.scene.root, policy), trust)
     return PolicyDriver(loaded), loaded.name, {**loaded.options(), **options}
 
@@ -201,8 +193,6 @@ def command(given: argparse.Namespace) -> None:
             raise InputError("--rerun records one drive, and --lerobot DIR several; leave out one of them")
         drives = record_dataset(given.scene, given.lerobot, given.episodes, *driven, given.trust, **options)
         if not given.quiet:
-            from twin.report.drive_dataset import drives_summary
-
             print(drives_summary(drives, given.lerobot))
         return
     if given.episodes != 1:
@@ -218,13 +208,10 @@ def film_options(lighting: str | None) -> dict[str, Any]:
     """Options of the environment that `--lighting` determines."""
     if not lighting:
         return {}
-    from twin.config import Condition
-    from twin.env.domain_randomization import condition_options
-
     return {name: value for name, value in condition_options(Condition.parse(lighting)).items() if value}
 
 
-def summary(path: Path, episode: "Episode") -> str:
+def summary(path: Path, episode: Episode) -> str:
     """One line with the end of the drive and the path of its film."""
     return f"{episode.cause or 'cut off'} after {episode.progress[-1]:.1f} m and {episode.times[-1]:.1f} s: {path}"
 

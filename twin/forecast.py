@@ -15,9 +15,13 @@ from pathlib import Path
 from twin import commands
 from twin.errors import InputError
 from twin.evaluation.agreement import Estimate
-from twin.evaluation.forecasting import Forecast
+from twin.evaluation.forecasting import Forecast, make_forecast
+from twin.evaluation.training_curves import training_summaries
 from twin.evaluation.trials import read_results, read_trials, tally
 from twin.files import write_text
+from twin.report.forecast_report import write_forecast_page
+from twin.report.forecast_text import candidates_csv, summary_text
+from twin.report.policy_card import write_policy_cards
 from twin.scene import SceneDir
 
 
@@ -32,12 +36,6 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
     Raises:
         InputError: nothing has been validated, or a table is invalid; then nothing is written.
     """
-    from twin.evaluation.forecasting import make_forecast
-    from twin.evaluation.training_curves import training_summaries
-    from twin.report.forecast_report import write_forecast_page
-    from twin.report.forecast_text import candidates_csv
-    from twin.report.policy_card import write_policy_cards
-
     scene = SceneDir(root)
     if not root.is_dir():
         raise InputError(f"{root} is no folder; give the scene's folder, such as scenes/demo")
@@ -62,8 +60,6 @@ def command(options: argparse.Namespace) -> None:
         raise InputError(f"--seed {options.seed}: expected 0 or more")
     result = forecast(options.scene, options.real, options.seed)
     if not options.quiet:
-        from twin.report.forecast_text import summary_text
-
         print(summary_text(result))
         print(f"look at {SceneDir(options.scene).forecast / 'forecast.html'}")
 

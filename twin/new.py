@@ -28,12 +28,12 @@ from twin.capture.frames import detect_kind
 from twin.capture.scale import local_east_north_up
 from twin.capture.video import probe
 from twin.config import RANDOMIZED, RESERVED_LIGHTINGS
-from twin.config_file import MAX_NAME, ROBOT_TOML, parse_table
+from twin.config_file import ROBOT_TOML, parse_table
 from twin.errors import InputError, join_names
 from twin.files import digest_file, exists, is_file, read_toml, toml_string, write_text
 from twin.geometry.images import write_image
 from twin.robot import BASE_HEIGHT, HuskyParams
-from twin.scene import SceneDir
+from twin.scene import MAX_NAME, SceneDir
 from twin.sysid.identification import toml_text
 
 _POSED = ("colmap", "transforms")
@@ -129,13 +129,11 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
             found, mask = _mask_lines(check, inputs, path)
             notes += [f"{film.name}: {note}" for note in check.notes + found]
         text += _SOURCE.format(path=path_text, topic=chosen, lighting=toml_string(lighting), mask=mask)
-    seat = next((bag.seat for bag in bags.values() if bag.seat), None)
-    seat_used = seat is not None and _write_seat(root / ROBOT_TOML, seat, next(b for b in bags.values() if b.seat))
-    scales = _scale_lines(list(bags.values()), camera_height, seat if seat_used else None)
+    seated = next((bag for bag in bags.values() if bag.seat), None)
+    seat = _write_seat(root / ROBOT_TOML, seated) if seated else None
+    scales = _scale_lines(list(bags.values()), camera_height, seat)
     write_text(scene.config_file, text + _REST.format(**scales))
-    for bag in bags.values():
-        runtime.log_line(_taken(bag))
-    for note in notes:
+    for note in (*map(_taken, bags.values()), *notes):
         runtime.log_line(note)
     return scene.config_file
 
@@ -196,18 +194,20 @@ def _odometry_way(bag: BagContents) -> float:
     return float(np.linalg.norm(np.diff(some[:: max(1, len(some) // 1000)], axis=0), axis=1).sum())
 
 
-def _write_seat(path: Path, seat: CameraSeat, bag: BagContents) -> bool:
-    """Writes `robot.toml` with the camera's extrinsics, unless the file exists. Returns False if they are out of the
-    ranges for a Husky."""
-    fields = {f"camera_{name}": getattr(seat, name) for name in _SEAT_FIELDS}
+def _write_seat(path: Path, bag: BagContents) -> CameraSeat | None:
+    """Writes `robot.toml` with the camera's extrinsics in a bag, unless the file exists; returns them.
+
+    Returns None if they are out of the ranges for a Husky.
+    """
+    fields = {f"camera_{name}": getattr(bag.seat, name) for name in _SEAT_FIELDS}
     try:
         parse_table(HuskyParams, {k: list(v) if isinstance(v, tuple) else v for k, v in fields.items()}, str(path))
     except InputError:
-        return False
+        return None
     if not exists(path):
         comment = f"The camera's pose on the robot is that of {bag.topics['transforms']} in {bag.path.name}."
         write_text(path, toml_text(comment, {}, {name: (value, None) for name, value in fields.items()}))
-    return True
+    return bag.seat
 
 
 def _taken(bag: BagContents) -> str:

@@ -125,8 +125,10 @@ class SceneDir:
         return (self.stage("mjcf") / "world.json").exists()
 
 
+MAX_NAME = 80
+"""Largest number of characters in a name that becomes part of a file name. File names may have 255 bytes, including the
+suffixes that twin appends."""
 _NAME = re.compile(r"\w[\w.-]*")
-_MAX_NAME = 80  # characters; file names may have 255 bytes, including the suffixes that twin appends
 
 
 def check_name(name: str, what: str) -> str:
@@ -137,8 +139,8 @@ def check_name(name: str, what: str) -> str:
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"{what} {name!r}: expected a name of letters, digits and _ . - only, no path")
-    if len(name) > _MAX_NAME or len(name.encode()) > 2 * _MAX_NAME:
-        raise InputError(f"{what} {name!r}: {len(name)} characters; expected at most {_MAX_NAME}")
+    if len(name) > MAX_NAME or len(name.encode()) > 2 * MAX_NAME:
+        raise InputError(f"{what} {name!r}: {len(name)} characters; expected at most {MAX_NAME}")
     return name
 
 

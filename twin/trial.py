@@ -35,6 +35,10 @@ from twin.evaluation.trials import Trial, read_counts, read_trials, tally, write
 from twin.files import write_json
 from twin.learn.policy import Policy, find_policy, load_policy
 from twin.loading import load_scene
+from twin.report.bag_dataset import write_bag_dataset
+from twin.report.drive_dataset import drives_summary
+from twin.report.drive_video import write_trial_video
+from twin.report.review_video import load_ground_and_parts
 from twin.robot import PixelCamera
 from twin.sysid.frame_fit import FIT, FrameFit, scene_frame
 from twin.sysid.trial_recording import TrialRecording, read_trial
@@ -112,29 +116,15 @@ def record_trial(
     )
     head = {"bag": str(bag), "name": row.policy, "task": row.task, "lighting": lighting, "twin_lighting": compared}
     figures = head | _figures(recording, trial, replayed, fit, views, apart)
-    from twin.report.review_video import load_ground_and_parts
-    from twin.report.trial_video import write_trial_video
-
-    write_trial_video(
-        folder / "trial.mp4",
-        trial,
-        replayed,
-        pictures,
-        np.asarray((used - begin) * 1e-9, np.float64),
-        views,
-        factory.world,
-        factory.options.half_width or factory.world.half_width,
-        (factory.segment.start, factory.segment.end),
-        load_ground_and_parts(scene.scene),
-        f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}",
-    )
+    half_width = factory.options.half_width or factory.world.half_width
+    limits = factory.segment.start, factory.segment.end
+    place = factory.world, half_width, limits, load_ground_and_parts(scene.scene)
+    seconds = np.asarray((used - begin) * 1e-9, np.float64)
+    title = f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}"
+    write_trial_video(folder / "trial.mp4", trial, replayed, pictures, seconds, views, place, title)
     write_json(folder / "trial.json", figures)
-    write_real_trials([*(one for one in known if _key(one) != _key(row)), row], table, out, compared)
+    write_real_trials([*(one for one in known if one.key != row.key), row], table, out, compared)
     return row, figures, folder
-
-
-def _key(trial: Trial) -> tuple[str, str, str, int]:
-    return trial.policy, trial.task, trial.lighting, trial.seed
 
 
 def _known_trials(table: Path, out: Path) -> list[Trial]:
@@ -293,9 +283,6 @@ def command(options: argparse.Namespace) -> None:
     names |= {"poses": options.poses, "commands": options.commands}
     topics = {kind: topic for kind, topic in names.items() if topic}
     if options.lerobot:
-        from twin.report.bag_dataset import write_bag_dataset
-        from twin.report.drive_dataset import drives_summary
-
         drives = write_bag_dataset(
             *(options.scene, options.bag, options.lerobot, options.task, options.policy, options.lighting or ""),
             *(options.cause, options.frame, topics),

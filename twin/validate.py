@@ -18,18 +18,19 @@ from zlib import crc32
 
 from twin import commands, runtime
 from twin.config import HELD_OUT, Condition
+from twin.config_file import load_config
 from twin.env.domain_randomization import condition_options, measured_parameters
+from twin.env.route_segments import find_task
 from twin.env.suite import fingerprint
 from twin.errors import InputError
 from twin.evaluation.training_curves import read_episodes, training_summaries
 from twin.evaluation.trials import EPISODE_COLUMNS, Trial, cells_csv, csv_text, read_trials, tally
 from twin.files import digest_file, digest_json, read_json, wrap_read_errors, write_bytes, write_json, write_text
 from twin.learn.policy import JSON, find_policy, load_policy
-from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, campaign
+from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, campaign, campaign_on_ray
 from twin.loading import Twin, load_writable
 from twin.report.policy_card import write_policy_cards
 from twin.report.validation_report import (
-    TrainingCurve,
     failure_map,
     summarize,
     summary_lines,
@@ -48,21 +49,12 @@ _SEARCH_SEED, _FINAL_SEED = 2_000_000, 3_000_000  # first seeds of the search fo
 _SEARCH_LIGHTINGS, _SEARCH_EPISODES, _SEARCH_KEPT = 16, 4, 4  # first round: lightings, episodes in each, lightings kept
 _MAX_PROCESSES = 1024
 
-Key = tuple[str, str, str, int]
-
 
 class Campaign:
     """Evaluation episodes of one scene and task, and the table that stores them."""
 
     def __init__(
-        self,
-        twin: Twin,
-        task: str,
-        path: Path,
-        sources: dict[str, str],
-        trust: bool,
-        processes: int,
-        ray: str | None,
+        self, twin: Twin, task: str, path: Path, sources: dict[str, str], trust: bool, processes: int, ray: str | None
     ) -> None:
         """
         Args:
@@ -76,7 +68,7 @@ class Campaign:
         """
         self._scene, self.task, self.path = str(twin.scene.root.resolve()), task, path
         self._sources, self._trust, self._processes, self._ray = sources, trust, processes, ray
-        self._done = {_key(t): t for t in _read_table(path)}
+        self._done = {t.key: t for t in _read_table(path)}
 
     def drive(self, wanted: Sequence[tuple[str, str, Iterable[int]]], what: str) -> list[Trial]:
         """Returns the trials of each (policy, lighting, seeds) in order; first drives those missing in the table."""
@@ -102,8 +94,6 @@ class Campaign:
 
     def _campaign(self, chunks: list[EpisodeChunk]) -> Iterator[list[EpisodeResult]]:
         if self._ray and chunks:
-            from twin.learn.policy_evaluation import campaign_on_ray
-
             return campaign_on_ray(chunks, self._ray)
         return campaign(chunks, self._processes)
 
@@ -113,7 +103,7 @@ class Campaign:
             write_text(self.path, csv_text(EPISODE_COLUMNS, []))
         with self.path.open("a", encoding="utf-8", newline="") as file:
             file.write(csv_text(EPISODE_COLUMNS, [t.row() for t in trials]).split("\n", 1)[1])
-        self._done |= {_key(t): t for t in trials}
+        self._done |= {t.key: t for t in trials}
 
 
 def validate(
@@ -171,7 +161,7 @@ def _write_results(twin: Twin) -> dict:
     write_json(folder / "summary.json", results)
     _draw_maps(twin, folder, trials)
     runs = dict.fromkeys(trained["run"] for trained in results["training"].values())
-    curves = [TrainingCurve(run, *read_episodes(twin.scene.root / "runs" / run)) for run in runs]
+    curves = [(run, *read_episodes(twin.scene.root / "runs" / run)) for run in runs]
     write_validation_page(twin.scene, results, curves)
     write_policy_cards(twin.scene, [t.policy for t in trials])
     return results
@@ -188,6 +178,7 @@ def _worst_lightings(path: Path) -> list[dict]:
 
 def _write_films(root: Path, folder: Path, source: str, trust: bool, trials: Sequence[Trial]) -> None:
     """Films the typical and the worst of a policy's episodes on a task; existing films are kept."""
+    # Worker processes import this module, and need no films.
     from twin.film import film, film_name
     from twin.report.video_writer import last_frame_jpeg
 
@@ -325,18 +316,11 @@ def _digest(path: Path, source: str) -> str:
 
 
 def _draw_maps(twin: Twin, folder: Path, trials: Sequence[Trial]) -> None:
-    from twin.config_file import load_config
-    from twin.env.route_segments import find_task
-
     world, config = twin.world(), load_config(twin.scene.config_file)
     for task in dict.fromkeys(t.task for t in trials):
         segment = find_task(task, world, config.task)
         mine = [t for t in trials if t.task == task]
         failure_map(folder / f"failures_{task}.png", mine, world.along(segment.route), (segment.start, segment.end))
-
-
-def _key(trial: Trial) -> Key:
-    return trial.policy, trial.task, trial.lighting, trial.seed
 
 
 def _drop_partial_row(path: Path) -> None:

@@ -65,6 +65,15 @@ class Trial:
     def success(self) -> bool:
         return self.cause == "goal"
 
+    @property
+    def cell(self) -> tuple[str, str, str]:
+        """Key of the trial's cell."""
+        return self.policy, self.task, self.lighting
+
+    @property
+    def key(self) -> tuple[str, str, str, int]:
+        return *self.cell, self.seed
+
     def row(self) -> tuple[str, ...]:
         """Fields of `EPISODE_COLUMNS`."""
         trust = "" if self.trust is None else f"{self.trust:.4f}"
@@ -109,7 +118,7 @@ def tally(trials: Iterable[Trial]) -> list[Cell]:
     """Counts trials by cell, in the order in which the cells first occur."""
     counts: dict[tuple[str, str, str], list[int]] = {}
     for trial in trials:
-        count = counts.setdefault((trial.policy, trial.task, trial.lighting), [0, 0])
+        count = counts.setdefault(trial.cell, [0, 0])
         count[0] += 1
         count[1] += trial.success
     return [Cell(*key, trials=n, successes=k) for key, (n, k) in counts.items()]

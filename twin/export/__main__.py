@@ -5,14 +5,12 @@
     python -m twin.export scenes/demo --nerfstudio road_ns --colmap road_colmap
     python -m twin.export scenes/demo --task straight --task-file straight.json
 
-One module per format: `usd`, `gltf`, `nerfstudio`, `colmap`; `twin.assets.gaussians` makes the splats, and
-`twin.env.task_file` the task files.
+`camera_formats` writes frames and cameras, `gltf` the mesh, and `usd` all of the place; `twin.assets.gaussians` makes
+the splats, and `twin.env.task_file` the task files.
 """
 
 import argparse
-import shutil
 import sys
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -27,18 +25,17 @@ from twin.env.options import Options
 from twin.env.route_segments import find_task
 from twin.env.task_file import write_task
 from twin.errors import InputError
-from twin.export import gltf, usd
-from twin.export.colmap import write_colmap
-from twin.export.nerfstudio import write_nerfstudio
-from twin.files import load_arrays, new_folder, require_absent, require_parent, write_bytes
-from twin.geometry.cameras import Cameras, SparsePoints
-from twin.geometry.images import write_image
+from twin.export import gltf
+from twin.export.camera_formats import write_colmap, write_nerfstudio
+from twin.files import load_arrays, require_absent, require_parent, write_bytes
+from twin.geometry.cameras import SparsePoints
 from twin.loading import Twin, load_scene
 from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import SCENE_XML
 from twin.scene import require_stage
 
 _MEGABYTE = 1e6
+_USD_SUFFIXES = (".usdz", ".usd", ".usdc")
 
 
 def command(given: argparse.Namespace) -> None:
@@ -79,9 +76,9 @@ def export(
     for path in folders:
         require_absent(path)
     if usd_file is not None:
-        if usd_file.suffix.lower() not in usd.SUFFIXES:
-            raise InputError(f"{usd_file}: expected a file ending in {', '.join(usd.SUFFIXES)}")
-        usd.require_usd()
+        if usd_file.suffix.lower() not in _USD_SUFFIXES:
+            raise InputError(f"{usd_file}: expected a file ending in {', '.join(_USD_SUFFIXES)}")
+        _require_usd()
     twin = load_scene(scene)
     lines = _field_files(twin, lighting, usd_file, glb, ply) if files else []
     if task_file and task:
@@ -94,11 +91,21 @@ def export(
     if folders:
         cameras = twin.cameras()
         points = SparsePoints.load(require_stage(twin.scene, "metric"))
-        for out, write in ((nerfstudio, _write_nerfstudio), (colmap, _write_colmap)):
+        for out, write in ((nerfstudio, write_nerfstudio), (colmap, write_colmap)):
             if out is not None:
                 write(out, cameras, points)
                 lines.append(f"{out}: {len(cameras)} frames, {len(points)} points, z up [m]")
     return lines
+
+
+def _require_usd() -> None:
+    """Raises InputError if the package usd-core is missing or too old."""
+    try:
+        from pxr import UsdVol
+    except ImportError as error:
+        raise InputError(f"{error}: --usd needs usd-core; pip install 'twin[usd]'") from None
+    if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
+        raise InputError("this usd-core has no ParticleField3DGaussianSplat; pip install 'usd-core>=26.3'")
 
 
 def _field_files(
@@ -118,12 +125,14 @@ def _field_files(
             write_bytes(ply, splats[lighting].to_ply())
             lines.append(f"{ply}: {len(splats[lighting].rgb)} gaussians under {lighting}, z up [m]")
         if usd_file:
+            from twin.export.usd import write_usd
+
             tints = {name: gltf.vertex_colors(one, mesh["vertices"].astype(np.float64)) for name, one in views.items()}
             parts = Parts.load(require_stage(twin.scene, "mesh") / "parts.npz")
             world = twin.world() if twin.scene.has_route else None
             model = mujoco.MjModel.from_xml_path(str(require_stage(twin.scene, "mjcf") / SCENE_XML))
             surface = mesh["vertices"], mesh["faces"]
-            usd.write_usd(usd_file, splats, surface, tints, parts, model, world, lighting)
+            write_usd(usd_file, splats, surface, tints, parts, model, world, lighting)
             lines.append(
                 f"{usd_file}: {len(splats[lighting].rgb)} gaussians under {', '.join(splats)}, {len(parts.vertices)} "
                 f"convex parts{', the Husky' if world else ''}, {usd_file.stat().st_size / _MEGABYTE:.0f} MB, z up [m]"
@@ -133,38 +142,6 @@ def _field_files(
         write_bytes(glb, gltf.textured_glb(mesh["vertices"].astype(np.float64), mesh["faces"], views_of_one))
         lines.append(f"{glb}: {len(mesh['faces'])} textured faces under {lighting}, y up [m]")
     return lines
-
-
-# ---- frames and cameras
-
-
-def _write_nerfstudio(out: Path, cameras: Cameras, points: SparsePoints) -> None:
-    masked = any(cameras.mask_path(i) for i in range(len(cameras)))
-    with new_folder(out) as folder:
-        _copy_frames(cameras, folder, lambda name: f"{name}.png", white=masked)
-        write_nerfstudio(folder, cameras, points, masked)
-
-
-def _write_colmap(out: Path, cameras: Cameras, points: SparsePoints) -> None:
-    with new_folder(out) as folder:
-        _copy_frames(cameras, folder, lambda name: f"{name}.png.png", white=False)
-        write_colmap(folder, cameras, points)
-
-
-def _copy_frames(cameras: Cameras, folder: Path, mask_name: Callable[[str], str], white: bool) -> None:
-    """Copies frames to `images/` and masks to `masks/`; if `white`, frames without a mask get a white one."""
-    for i, name in enumerate(cameras.names):
-        image = folder / "images" / f"{name}.png"
-        image.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(cameras.image_path(i), image)
-        mask = cameras.mask_path(i)
-        if mask or white:
-            target = folder / "masks" / mask_name(name)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if mask:
-                shutil.copyfile(mask, target)
-            else:
-                write_image(target, np.full(cameras.sizes[i, ::-1], 255, np.uint8))
 
 
 main = partial(commands.main, "export")

@@ -24,6 +24,8 @@ from typing import Any
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, UsdUtils, UsdVol, Vt
+from scipy.spatial import ConvexHull
 
 from twin.assets.gaussians import Gaussians
 from twin.errors import InputError
@@ -33,7 +35,7 @@ from twin.mjcf.world import World, corridor_edges
 from twin.robot import WHEELS, HuskyParams
 from twin.types import Array
 
-SUFFIXES = (".usdz", ".usd", ".usdc")
+_DOUBLE = UsdGeom.XformOp.PrecisionDouble
 _SH_CONSTANT = 0.28209479177387814  # spherical harmonic of degree 0, 1 / (2 √π)
 _APERTURE = 20.955  # [tenths of a meter] width of a camera's sensor; only its ratio to the focal length has an effect
 _CLIPPING = 0.01, 1000.0  # [m] nearest and farthest depth that cameras show
@@ -41,16 +43,6 @@ _RING, _SHOULDER, _SHOULDER_OFFSET = 32, 16, 0.6  # vertices at a tire's middle,
 _CURVE_WIDTH, _GOAL_RADIUS = 0.05, 0.2  # [m]
 _SUN_INTENSITY, _SKY_INTENSITY = 1500.0, 600.0  # [nit]
 _SPLAT_EXTENT = 3.0  # [standard deviations of a splat] half size of its bounding box
-
-
-def require_usd() -> None:
-    """Raises InputError if the package usd-core is missing or too old."""
-    try:
-        from pxr import UsdVol
-    except ImportError as error:
-        raise InputError(f"{error}: --usd needs usd-core; pip install 'twin[usd]'") from None
-    if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
-        raise InputError("this usd-core has no ParticleField3DGaussianSplat; pip install 'usd-core>=26.3'")
 
 
 def write_usd(
@@ -76,15 +68,10 @@ def write_usd(
         selected: The lighting that is selected in the file.
 
     Raises:
-        InputError: the suffix is not supported, usd-core is missing, or two lightings would have the same name.
+        InputError: two lightings would have the same name.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path}: expected a file ending in {', '.join(SUFFIXES)}")
     if len({variant_name(name) for name in splats}) < len(splats):
         raise InputError(f"two of the lightings {', '.join(splats)} have the same name in USD; rename one")
-    require_usd()
-    from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
-
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".twin-usd-") as folder:
         layer = Path(folder) / "place.usdc"
         stage = Usd.Stage.CreateNew(str(layer))
@@ -134,8 +121,6 @@ def _add_place(
     colors: Mapping[str, NDArray[np.uint8]],
     selected: str,
 ) -> None:
-    from pxr import Gf, Sdf, UsdGeom, UsdVol, Vt
-
     UsdGeom.Xform.Define(stage, "/World/Place")
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/World/Place/Splats")
     one = splats[selected]
@@ -172,14 +157,12 @@ def _add_place(
 
 
 def _add_lights(stage: Any, model: mujoco.MjModel) -> None:
-    from pxr import Gf, UsdLux
-
     for i in np.flatnonzero(model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL):
         sun = UsdLux.DistantLight.Define(stage, "/World/Sun")
         sun.CreateIntensityAttr(_SUN_INTENSITY)
         sun.CreateAngleAttr(0.53)
         turn = Gf.Rotation(Gf.Vec3d(0, 0, -1), Gf.Vec3d(*map(float, model.light_dir[i]))).GetQuat()
-        sun.AddOrientOp(precision=_double()).Set(turn)
+        sun.AddOrientOp(precision=_DOUBLE).Set(turn)
     sky = UsdLux.DomeLight.Define(stage, "/World/Sky")
     sky.CreateIntensityAttr(_SKY_INTENSITY)
     sky.CreateColorAttr(Gf.Vec3f(0.86, 0.89, 0.92))
@@ -189,8 +172,6 @@ def _add_lights(stage: Any, model: mujoco.MjModel) -> None:
 
 
 def _add_physics(stage: Any, model: mujoco.MjModel) -> None:
-    from pxr import Gf, UsdGeom, UsdPhysics
-
     gravity = np.asarray(model.opt.gravity)
     size = float(np.linalg.norm(gravity))
     scene = UsdPhysics.Scene.Define(stage, "/World/PhysicsScene")
@@ -201,8 +182,6 @@ def _add_physics(stage: Any, model: mujoco.MjModel) -> None:
 
 def _friction(stage: Any, path: str, value: float) -> Any:
     """A material for collisions only, with one value for static and dynamic friction."""
-    from pxr import UsdPhysics, UsdShade
-
     material = UsdShade.Material.Define(stage, path)
     physics = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
     physics.CreateStaticFrictionAttr(value)
@@ -213,8 +192,6 @@ def _friction(stage: Any, path: str, value: float) -> Any:
 
 def _collide(prim: Any, material: Any, approximation: str | None = None) -> None:
     """Makes a prim a collider; `approximation` is USD's name for the approximation of a mesh."""
-    from pxr import UsdPhysics, UsdShade
-
     UsdPhysics.CollisionAPI.Apply(prim)
     if approximation:
         UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(approximation)
@@ -222,8 +199,6 @@ def _collide(prim: Any, material: Any, approximation: str | None = None) -> None
 
 
 def _add_collision(stage: Any, model: mujoco.MjModel, parts: Parts, material: Any) -> None:
-    from pxr import UsdGeom
-
     group = UsdGeom.Xform.Define(stage, "/World/Collision")
     group.CreatePurposeAttr(UsdGeom.Tokens.guide)  # not drawn in pictures
     ground = _mesh(stage, "/World/Collision/Ground", *ground_triangles(model))
@@ -253,8 +228,6 @@ def ground_triangles(model: mujoco.MjModel) -> tuple[NDArray[np.float32], NDArra
 
 def _add_robot(stage: Any, model: mujoco.MjModel, tires: Any, bare: Any) -> None:
     """Adds the Husky at rest at the start of the route."""
-    from pxr import Gf, Sdf, UsdGeom, UsdPhysics
-
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("spawn").id)
     wheels = [f"{name}_wheel" for name in WHEELS]
@@ -303,8 +276,6 @@ def _add_robot(stage: Any, model: mujoco.MjModel, tires: Any, bare: Any) -> None
 
 def _add_geom(stage: Any, parent: str, model: mujoco.MjModel, index: int, material: Any) -> None:
     """Adds a geom to its link: a collider as a guide (not drawn), a visual geom in its color. Others are left out."""
-    from pxr import UsdGeom, Vt
-
     geom = model.geom(index)
     collides = bool(model.geom_contype[index] or model.geom_conaffinity[index])
     if not collides and model.geom_group[index] != 1:
@@ -349,8 +320,6 @@ def tire_hull(model: mujoco.MjModel, geom: int) -> tuple[NDArray[np.float32], ND
 
     PhysX allows at most 64 vertices per hull on a GPU.
     """
-    from scipy.spatial import ConvexHull
-
     size = model.geom_size[geom]
     ellipsoid = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_ELLIPSOID
     radius, half = float(size[0]), float(size[1])
@@ -379,8 +348,6 @@ def tire_hull(model: mujoco.MjModel, geom: int) -> tuple[NDArray[np.float32], ND
 
 def _add_camera(stage: Any, parent: str, model: mujoco.MjModel, index: int) -> None:
     """Adds a camera at its pose on the robot; cameras have the same axes in USD and MuJoCo."""
-    from pxr import Gf, UsdGeom
-
     camera = model.camera(index)
     width, height = (int(x) for x in model.cam_resolution[index])
     sensor, (fx, fy, right, up) = model.cam_sensorsize[index], model.cam_intrinsic[index]
@@ -402,8 +369,6 @@ def _add_camera(stage: Any, parent: str, model: mujoco.MjModel, index: int) -> N
 
 
 def _add_route(stage: Any, world: World) -> None:
-    from pxr import Gf, UsdGeom, Vt
-
     group = UsdGeom.Xform.Define(stage, "/World/Route")
     group.CreatePurposeAttr(UsdGeom.Tokens.guide)
     left, right = corridor_edges(world.route, world.half_width)
@@ -433,8 +398,6 @@ def _add_route(stage: Any, world: World) -> None:
 
 def _mesh(stage: Any, path: str, vertices: NDArray, faces: NDArray) -> Any:
     """A triangle mesh, counter-clockwise seen from outside."""
-    from pxr import UsdGeom, Vt
-
     mesh = UsdGeom.Mesh.Define(stage, path)
     mesh.CreatePointsAttr(_vectors(vertices))
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), 3))
@@ -446,23 +409,13 @@ def _mesh(stage: Any, path: str, vertices: NDArray, faces: NDArray) -> Any:
 
 def _place(prim: Any, position: Any, quaternion: Any, scale: Any = None) -> None:
     """Sets the pose of a prim in its parent: position [m], quaternion (w, x, y, z)."""
-    from pxr import Gf
-
-    prim.AddTranslateOp(precision=_double()).Set(Gf.Vec3d(*map(float, position)))
-    prim.AddOrientOp(precision=_double()).Set(Gf.Quatd(*map(float, quaternion)))
+    prim.AddTranslateOp(precision=_DOUBLE).Set(Gf.Vec3d(*map(float, position)))
+    prim.AddOrientOp(precision=_DOUBLE).Set(Gf.Quatd(*map(float, quaternion)))
     if scale is not None:
-        prim.AddScaleOp(precision=_double()).Set(Gf.Vec3d(*map(float, scale)))
-
-
-def _double() -> Any:
-    from pxr import UsdGeom
-
-    return UsdGeom.XformOp.PrecisionDouble
+        prim.AddScaleOp(precision=_DOUBLE).Set(Gf.Vec3d(*map(float, scale)))
 
 
 def _vectors(array: NDArray | Array) -> Any:
-    from pxr import Vt
-
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(array, np.float32))
 
 

@@ -19,7 +19,19 @@ from twin.mjcf.world import SCENE_XML, World
 from twin.report import figures
 from twin.report.build_sections import SECTIONS, headline_sections, sections
 from twin.report.build_topics import costs_section
-from twin.report.html import Chart, Picture, command, data_url, duration, flatten, number, numbers, pick, render
+from twin.report.html import (
+    Chart,
+    Picture,
+    as_number,
+    command,
+    data_url,
+    duration,
+    flatten,
+    number,
+    numbers,
+    pick,
+    render,
+)
 from twin.report.video_layout import load_footprints
 from twin.scene import SceneDir, stage_result
 
@@ -49,7 +61,7 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     if (mesh / "route.npz").exists():
         with np.load(mesh / "route.npz", allow_pickle=False) as data:
             route = data["xy"].astype(np.float64)
-    wide = _half_width(report) or 0.0
+    wide = as_number(pick(report, "mjcf.half_width_m")) or 0.0
     passes = find_passes(cameras) if route is not None else []
     drawn = figures.place_map(
         cameras.positions, cameras.sources, cameras.held_out, points.xyz, points.rgb, route, wide, passes
@@ -62,12 +74,6 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
         drawn = figures.ground_map(ground, path, route, wide, load_footprints(mesh / "parts.npz", ground))
         out.append(Chart("Ground and solid parts", figures.svg(drawn), "mesh"))
     return out
-
-
-def _half_width(report: dict[str, Any]) -> float | None:
-    """Half width of the corridor [m], if it is known."""
-    half_width = pick(report, "mjcf.half_width_m")
-    return float(half_width) if isinstance(half_width, int | float) else None
 
 
 def _reconstruction_charts(scene: SceneDir) -> list[Chart]:
@@ -108,7 +114,7 @@ def _drive_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     along_route = "distance along the route [m]"
     trace = pick(report, "review.trace")
     if isinstance(trace, dict) and len(trace.get("progress_m") or []) > 1:
-        limit, at = _half_width(report), trace["progress_m"]
+        limit, at = as_number(pick(report, "mjcf.half_width_m")), trace["progress_m"]
         off, speed = {"": (at, trace["cross_track_m"])}, {"": (at, trace["speed_m_s"])}
         drawn = figures.curve_chart(off, along_route, "cross-track [m], left is positive", limit)
         title = "Cross-track error of the drive" + ("" if limit is None else "; dashed: the corridor")
@@ -173,11 +179,12 @@ def page(scene: SceneDir, report: dict[str, Any]) -> str:
     name = str(report.get("scene") or scene.root.name)
     shown = [section for section in sections(report) if section.name != "costs"]
     stages: dict[str, Any] = report.get("stages") or {}
+    memory = number(_gibibytes(report.get("peak_memory_bytes")), "peak memory {:.1f} GiB")
     posters = [picture.path for picture in pictures if picture.section == "poster"]
     return render(
         "build_report.html",
         title=f"{name}: build report",
-        kicker=_kicker(report),
+        kicker=f"A filmed place as a MuJoCo twin: built in {duration(report.get('seconds'))}, {memory}.",
         headlines=headline_sections(report),
         has_video=(scene.stage("review") / "review.mp4").exists() or scene.review_mp4.exists(),
         poster=data_url(posters[-1]) if posters else None,  # if there is a drive, the last poster shows it
@@ -204,15 +211,6 @@ def page(scene: SceneDir, report: dict[str, Any]) -> str:
     )
 
 
-def _kicker(report: dict[str, Any]) -> str:
-    seconds = report.get("seconds")
-    if seconds is None:
-        each = [pick(stage, "seconds") for stage in (report.get("stages") or {}).values()]
-        seconds = sum(s for s in each if isinstance(s, int | float)) if each else None
-    memory = number(_gibibytes(report.get("peak_memory_bytes")), "peak memory {:.1f} GiB")
-    return f"A filmed place as a MuJoCo twin: built in {duration(seconds)}, {memory}."
-
-
 def _pictures(scene: SceneDir) -> list[Picture]:
     """The pictures that the review stage saved for the page, and one of the pixels that training left out."""
     folder, pictures = scene.stage("review"), []
@@ -224,22 +222,22 @@ def _pictures(scene: SceneDir) -> list[Picture]:
 
 
 def _stage_costs(stages: dict[str, Any]) -> list[dict[str, Any]]:
-    seconds = {name: pick(stage, "seconds") for name, stage in stages.items()}
-    longest = max([s for s in seconds.values() if isinstance(s, int | float)], default=0.0)
+    seconds = numbers({name: pick(stage, "seconds") for name, stage in stages.items()})
+    longest = max(seconds.values(), default=0.0)
     return [
         {
             "title": _STAGE_TITLES.get(name, name),
             "skipped": pick(stage, "skipped"),
-            "seconds": spent,
-            "share": 100.0 * spent / longest if isinstance(spent, int | float) and longest > 0 else 0.0,
+            "seconds": seconds.get(name),
+            "share": 100.0 * seconds.get(name, 0.0) / longest if longest > 0 else 0.0,
             "memory": number(_gibibytes(pick(stage, "peak_memory_bytes")), "{:.2f} GiB"),
         }
-        for (name, stage), spent in zip(stages.items(), seconds.values(), strict=True)
+        for name, stage in stages.items()
     ]
 
 
 def _gibibytes(size: Any) -> float | None:
-    return size / 2**30 if isinstance(size, int | float) else None
+    return size / 2**30 if as_number(size) is not None else None
 
 
 def _next_steps(scene: SceneDir, report: dict[str, Any]) -> list[tuple[str, list[str]]]:

@@ -15,14 +15,16 @@ from twin.report.html import (
     Fact,
     Section,
     Verdict,
+    as_number,
+    cautions_above,
     duration,
+    facts_of,
     follower_verdict,
     format_value,
     number,
     numbers,
     pick,
 )
-from twin.report.section_facts import as_number, cautions_above, facts_of
 
 _MIN_REGISTERED = 0.9  # a caution is given if fewer of the frames have a camera pose
 _LARGE_SCALE_UNCERTAINTY = 0.03  # [relative] a caution is given if it is larger
@@ -42,8 +44,7 @@ _SCALE_SOURCES = {
 
 
 def capture_section(report: dict[str, Any]) -> Section:
-    sources = pick(report, "capture.sources")
-    count = len(sources) if isinstance(sources, list | dict) else sources
+    sources = pick(report, "capture.sources") or {}
     facts = [
         *facts_of(
             report,
@@ -51,19 +52,18 @@ def capture_section(report: dict[str, Any]) -> Section:
             ("capture.train", "training frames", "{}", "the field is trained on them"),
             ("capture.held_out", "held out", "{}", "excluded from training, for evaluation"),
         ),
-        Fact("sources", number(count, "{}"), "films or photo folders, each under one lighting"),
+        Fact("sources", number(len(sources) or None, "{}"), "films or photo folders, each under one lighting"),
     ]
     cautions = []
     frames = as_number(pick(report, "capture.frames"))
     if frames is not None and frames < 20:
         cautions.append(Caution(f"Only {frames} frames were kept.", "film slower or longer, or raise capture.fps."))
-    for name, source in sources.items() if isinstance(sources, dict) else ():
-        kept, seconds, light = (pick(source, key) for key in ("kept", "duration_s", "lighting"))
-        if isinstance(kept, int):
-            length = duration(seconds) if isinstance(seconds, int | float) and seconds > 0 else None
-            about = (pick(source, "kind"), length, light and f"lighting “{light}”")
-            facts.append(Fact(str(name), f"{kept} frames", ", ".join(str(part) for part in about if part)))
-        if damaged := as_number(pick(source, "damaged")):
+    for name, source in sources.items():
+        kept, seconds, light = (source.get(key) for key in ("kept", "duration_s", "lighting"))
+        if kept is not None:
+            about = (source.get("kind"), seconds and duration(seconds), light and f"lighting “{light}”")
+            facts.append(Fact(name, f"{kept} frames", ", ".join(part for part in about if part)))
+        if damaged := source.get("damaged"):
             cure = "copy the film from the camera again if possible."
             cautions.append(Caution(f"{damaged} frame(s) of “{name}” are damaged.", cure))
     done = (
@@ -93,13 +93,11 @@ def cameras_section(report: dict[str, Any]) -> Section:
     cautions += cautions_above(
         report, ("cameras.reprojection_error_px", 1.5, "The reprojection error is {:.2f} px.", calibrate)
     )
-    outliers = cameras.get("outliers")
-    if isinstance(outliers, list) and outliers:
+    if outliers := cameras.get("outliers"):
         what = f"{len(outliers)} frame(s) were outliers of their path and were dropped: {join_names(outliers, 6)}."
         cure = "a few are normal near large moving or featureless objects; mask these if there are many."
         cautions.append(Caution(what, cure))
-    apart = cameras.get("apart")
-    if isinstance(apart, list) and apart:
+    if apart := cameras.get("apart"):
         what = (
             f"Film(s) that match the others neither by views nor by the ground were left out: {join_names(apart, 6)}."
         )
@@ -107,9 +105,10 @@ def cameras_section(report: dict[str, Any]) -> Section:
         cautions.append(Caution(what, cure))
     if note := cameras.get("note"):
         cure = "check the given poses, or let twin estimate them from the images."
-        cautions.append(Caution(f"{str(note).rstrip('.').capitalize()}.", cure))
-    track = _first_present(cameras, "mean_track_length", "track_length")
-    focal = _focal_text(_first_present(cameras, "focal_px", "focal"))
+        cautions.append(Caution(f"{note.capitalize()}.", cure))
+    focal = {name: number(length, "{:.0f} px") for name, length in numbers(cameras.get("focal_px")).items()}
+    focals = set(focal.values())
+    texts = sorted(focals) if len(focals) < 2 else [f"{name} {text}" for name, text in focal.items()]
     facts = [
         Fact("frames placed", placed, "frames whose camera pose was estimated"),
         *facts_of(
@@ -122,43 +121,15 @@ def cameras_section(report: dict[str, Any]) -> Section:
             ),
             ("cameras.points", "points", "{:,}", "triangulated"),
         ),
-        Fact("track length", number(track, "{:.1f} frames"), "frames that observe a point"),
-        Fact("focal length", focal, "given, or estimated by the reconstruction"),
+        Fact("track length", number(cameras.get("mean_track_length"), "{:.1f} frames"), "frames that observe a point"),
+        Fact("focal length", ", ".join(texts) or NOT_MEASURED, "given, or estimated by the reconstruction"),
         Fact("method", str(cameras.get("mapper") or NOT_MEASURED), "global, or incremental if that fails"),
     ]
-    joined = cameras.get("joined")
-    if isinstance(joined, list) and joined:
+    if joined := cameras.get("joined"):
         meaning = "films in the opposite direction: reconstructed separately, and placed by the ground seen from above"
         facts.append(Fact("joined by the ground", join_names(joined, 6), meaning))
     done = "Structure from motion estimated the pose of each frame from points that several frames share."
     return Section("cameras", "Cameras", done, facts, cautions, verdict=verdict)
-
-
-def _first_present(table: dict[str, Any], *keys: str) -> Any:
-    """Value of the first key whose value is not None; None if there is no such key."""
-    return next((table[key] for key in keys if table.get(key) is not None), None)
-
-
-def _focal_text(value: Any) -> str:
-    if isinstance(value, dict):
-        texts = {name: number(focal, "{:.0f} px") for name, focal in value.items()}
-        if len(set(texts.values())) == 1:
-            return next(iter(texts.values()))
-        return ", ".join(f"{name} {text}" for name, text in texts.items()) or NOT_MEASURED
-    if isinstance(value, list) and value:
-        return ", ".join(number(focal, "{:.0f} px") for focal in value[:4])
-    return number(value, "{:.0f} px")
-
-
-def _scale_facts(scales: Any) -> list[Fact]:
-    """Facts that compare the scale from each source with the combined scale."""
-    facts = []
-    for name, one in scales.items() if isinstance(scales, dict) else ():
-        relative, sigma = (as_number(pick(one, key)) for key in ("relative", "uncertainty"))
-        offset = number(None if relative is None else relative - 1.0, "{:+.2%}")
-        text = f"{offset} ± {number(sigma, '{:.1%}')}"
-        facts.append(Fact(f"by {_SCALE_SOURCES.get(name, name)}", text, "compared with the combined scale"))
-    return facts
 
 
 def metric_section(report: dict[str, Any]) -> Section:
@@ -187,12 +158,19 @@ def metric_section(report: dict[str, Any]) -> Section:
         source_text = " and ".join(_SCALE_SOURCES.get(one, one) for one in str(source).split(" + "))
         sure = "" if uncertainty is None else f", with an uncertainty of about {uncertainty:.1%}"
         verdict = Verdict(f"The scale comes from {source_text}{sure}.", "good")
-    gravity = _first_present(metric, "gravity_source", "gravity")
+    by_source = [
+        Fact(
+            f"by {_SCALE_SOURCES.get(name, name)}",
+            f"{number(one['relative'] - 1.0, '{:+.2%}')} ± {number(one['uncertainty'], '{:.1%}')}",
+            "compared with the combined scale",
+        )
+        for name, one in (metric.get("scales") or {}).items()
+    ]
     facts = [
         Fact("scale from", source_text, "as given in scene.toml"),
         Fact("scale uncertainty", number(uncertainty, "{:.1%}"), "one standard deviation, relative"),
-        *_scale_facts(metric.get("scales")),
-        Fact("gravity from", str(gravity or NOT_MEASURED), "source of the vertical direction"),
+        *by_source,
+        Fact("gravity from", str(metric.get("gravity_source") or NOT_MEASURED), "source of the vertical direction"),
         *facts_of(
             report,
             ("metric.gravity_uncertainty_deg", "tilt uncertainty", "{:.2f}°", "one standard deviation"),
@@ -373,9 +351,8 @@ def mjcf_section(report: dict[str, Any]) -> Section:
         *facts_of(report, ("mjcf.geoms", "geoms", "{:,}", "shapes in the scene")),
         Fact("folder", number(size and size / 1e6, "{:.1f} MB"), "may be moved or zipped"),
     ]
-    touched = pick(report, "mjcf.spawn_touched")
     cautions = []
-    if isinstance(touched, list) and touched:
+    if touched := pick(report, "mjcf.spawn_touched"):
         cure = "raise mjcf.corridor_margin or mesh.obstacle_height, or start the film further along."
         cautions.append(Caution(f"The robot touches {join_names(touched)} where it starts.", cure))
     return Section("mjcf", "MuJoCo scene", f"{done}build/5_mjcf/scene.xml.", facts, cautions)

@@ -164,7 +164,7 @@ class DriveDataset:
         }
         return {CAMERA: picture, **columns}
 
-    def finish(self, robot: str = "husky") -> None:
+    def finish(self) -> None:
         """Writes the tables; `add` must have been called at least once."""
         import pyarrow as pa
         from pyarrow import parquet
@@ -197,7 +197,7 @@ class DriveDataset:
             self.folder / "meta" / "info.json",
             {
                 "codebase_version": VERSION,
-                "robot_type": robot,
+                "robot_type": "husky",
                 "total_episodes": len(self._episodes),
                 "total_frames": frames,
                 "total_tasks": 1,

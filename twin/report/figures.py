@@ -36,6 +36,7 @@ _VARIABLES |= {color: f"--c{i + 1}" for i, color in enumerate(SERIES)}
 
 _WIDTH = 4.8  # [in] if a figure of this width is scaled to a phone's screen, 8.5 pt text is still legible
 _RASTER_DPI = 200
+_MAP_MARGIN = 8.0  # [m] around the path
 _MAX_POINTS = 20_000  # largest number of points drawn in a map
 _LEGEND_LETTERS = 55  # letters per row of a legend; a marker counts as four letters
 _STYLE: dict[str, Any] = {
@@ -115,18 +116,14 @@ def add_legend(figure: Figure) -> None:
 # ---- maps
 
 
-def _map_axes(low: Array, high: Array) -> tuple[Figure, Axes]:
-    """Returns a figure and its axes in meters with equal aspect, for the rectangle from `low` to `high`."""
+def _map_axes(path: Array) -> tuple[Figure, Axes, Array, Array]:
+    """Returns a figure, its axes in meters with equal aspect, and their lower and upper corner around a path (n, 2)."""
+    low, high = path.min(0) - _MAP_MARGIN, path.max(0) + _MAP_MARGIN
     extent = np.maximum(high - low, 1.0)
     figure, axes = new_figure(float(np.clip(_WIDTH * extent[1] / extent[0], 1.6, 5.6)) + 0.7)
     axes.set_aspect("equal")
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
-    return figure, axes
-
-
-def map_bounds(path: Array, margin: float = 8.0) -> tuple[Array, Array]:
-    """Lower and upper corner [m] of the bounding box of a path (n, 2), widened by a margin."""
-    return path.min(0) - margin, path.max(0) + margin
+    return figure, axes, low, high
 
 
 def corridor_outline(route: Array, half_width: float) -> Array:
@@ -153,8 +150,9 @@ def place_map(
     Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (m, 3), `route` (k, 2).
     If a source has several passes (`twin.geometry.passes`), all passes are drawn as lines with their names.
     """
-    low, high = map_bounds(positions[:, :2] if route is None else np.concatenate([positions[:, :2], route]))
-    figure, axes = _map_axes(low, high)
+    figure, axes, low, high = _map_axes(
+        positions[:, :2] if route is None else np.concatenate([positions[:, :2], route])
+    )
     shown = np.flatnonzero(((points[:, :2] > low) & (points[:, :2] < high)).all(1))
     if len(shown) > _MAX_POINTS:
         shown = shown[np.linspace(0, len(shown) - 1, _MAX_POINTS).astype(int)]
@@ -180,12 +178,11 @@ def place_map(
 @styled
 def ground_map(ground: Ground, path: Array, route: Array | None, half_width: float, parts: Sequence[Array]) -> Figure:
     """Map of the measured ground height [m], the route with its corridor, and the footprints of parts."""
-    low, high = map_bounds(path if route is None else route)
+    figure, axes, low, high = _map_axes(path if route is None else route)
     rows, columns = ground.height.shape
     x = ground.origin[0] + ground.cell * np.arange(columns)
     y = ground.origin[1] + ground.cell * np.arange(rows)
     shown = ground.measured & ((x > low[0]) & (x < high[0])) & ((y > low[1]) & (y < high[1]))[:, None]
-    figure, axes = _map_axes(low, high)
     lowest, highest = np.percentile(ground.height[shown] if shown.any() else ground.height, [1, 99])
     image = axes.imshow(
         np.ma.masked_array(ground.height, ~ground.measured),

@@ -59,18 +59,12 @@ def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "su
     Vertical: success rate on the road. Horizontal: the candidate's attribute `field`, with the axis label `label`:
     "twin" for the rate in the twin, or "corrected" for the rate predicted from policies of other trainings.
     """
-    figure, axes = new_figure(_SQUARE_SIZE)
-    axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
-    limits, ticks = RATE_AXIS.values()
-    axes.set(xlabel=label, ylabel="success on the road", ylim=limits, yticks=ticks, **RATE_AXIS)
+    figure, axes = _unit_square(label)
     driven = [c for c in forecast.candidates if c.driven and getattr(c, field).value is not None]
     for i, task in enumerate(forecast.tasks):
         mine = [c for c in driven if c.task == task]
         if mine:
-            (x, x_ends), (y, y_ends) = (
-                _error_bars([getattr(c, field) for c in mine]),
-                _error_bars([c.real for c in mine]),
-            )
+            (x, x_ends), (y, y_ends) = (_error_bars([getattr(c, name) for c in mine]) for name in (field, "real"))
             color, marker = SERIES[i % len(SERIES)], MARKERS[i % len(MARKERS)]
             axes.errorbar(x, y, xerr=x_ends, yerr=y_ends, fmt="none", ecolor=color, elinewidth=0.8, alpha=0.5)
             axes.plot(x, y, marker, color=color, ms=4.5, label=task, zorder=4)
@@ -78,6 +72,15 @@ def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "su
     if driven:
         add_legend(figure)
     return figure
+
+
+def _unit_square(label: str) -> tuple[Figure, Axes]:
+    """A figure for success on the road against the rate named by `label`; its diagonal is dashed."""
+    figure, axes = new_figure(_SQUARE_SIZE)
+    axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
+    limits, ticks = RATE_AXIS.values()
+    axes.set(xlabel=label, ylabel="success on the road", ylim=limits, yticks=ticks, **RATE_AXIS)
+    return figure, axes
 
 
 def _error_bars(estimates: Sequence[Estimate]) -> tuple[np.ndarray, np.ndarray]:
@@ -111,16 +114,7 @@ def calibration_chart(group: Agreement) -> Figure:
 
     There is one point per bin of this probability; its area and label show the number of trials in the bin.
     """
-    figure, axes = new_figure(_SQUARE_SIZE)
-    axes.plot([0, 1], [0, 1], color=MUTED, lw=0.9, ls="--", zorder=1)
-    limits, ticks = RATE_AXIS.values()
-    axes.set(
-        xlabel="success probability predicted by the twin",
-        ylabel="success on the road",
-        ylim=limits,
-        yticks=ticks,
-        **RATE_AXIS,
-    )
+    figure, axes = _unit_square("success probability predicted by the twin")
     x, y, trials = (
         np.array([getattr(it, name) for it in group.calibration]) for name in ("predicted", "observed", "trials")
     )
@@ -142,16 +136,11 @@ def rank_heatmap(candidates: Sequence[Candidate]) -> Figure:
     return heatmap(shown, policies, ranks, percent_texts(chance), "rank in the twin; probabilities in %")
 
 
-def twin_heatmap(candidates: Sequence[Candidate], pairs: Sequence[CellPair]) -> Figure:
-    return _rate_heatmap(candidates, {(pair.policy, pair.twin_lighting): pair.twin.value for pair in pairs})
-
-
-def road_heatmap(candidates: Sequence[Candidate], pairs: Sequence[CellPair]) -> Figure:
-    return _rate_heatmap(candidates, {(pair.policy, pair.lighting): pair.real.value for pair in pairs})
-
-
-def _rate_heatmap(candidates: Sequence[Candidate], rates: dict[tuple[str, str], float | None]) -> Figure:
-    policies, lightings = [c.policy for c in candidates if c.driven], list(dict.fromkeys(light for _, light in rates))
+def cell_heatmap(candidates: Sequence[Candidate], pairs: Sequence[CellPair], field: str) -> Figure:
+    """Success rates in the twin (`field`: "twin") or on the road ("real"): a row per policy, a column per lighting."""
+    light = "twin_lighting" if field == "twin" else "lighting"
+    rates = {(pair.policy, getattr(pair, light)): getattr(pair, field).value for pair in pairs}
+    policies, lightings = [c.policy for c in candidates if c.driven], list(dict.fromkeys(name for _, name in rates))
     rate = matrix(rates, policies, lightings)
     names, label = lighting_labels(lightings)
     return heatmap(rate, list(map(shorten_name, policies)), names, percent_texts(rate), label)
@@ -273,10 +262,10 @@ def _task(forecast: Forecast, task: str) -> dict[str, Any]:
         charts.append(Chart("Probability of each rank in the twin [%]", svg(rank_heatmap(mine))))
     cell_rates, differences = [], []
     if pairs and len(forecast.pairs) > MAX_TABLE_ROWS:
-        for where, field, figure in (("In the twin", "twin", twin_heatmap), ("On the road", "real", road_heatmap)):
+        for where, field in (("In the twin", "twin"), ("On the road", "real")):
             trials = sorted({getattr(pair, field).n for pair in pairs})
             n = " to ".join(str(end) for end in dict.fromkeys((trials[0], trials[-1])))
-            cell_rates.append(Chart(f"{where} [%], n = {n} per cell", svg(figure(mine, pairs))))
+            cell_rates.append(Chart(f"{where} [%], n = {n} per cell", svg(cell_heatmap(mine, pairs, field))))
         title = (
             "Road minus twin [percentage points]: red and below 0 where the twin was too optimistic, blue the "
             "opposite, pale and in parentheses where the 90% interval of the difference contains 0"

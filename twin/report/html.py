@@ -82,6 +82,11 @@ class Section:
         return self.verdict if self.verdict.mood == "bad" else replace(self.verdict, mood="mixed")
 
 
+def as_number(value: Any) -> float | None:
+    """The value if it is a number, else None."""
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
 def pick(report: Any, path: str) -> Any:
     """Returns the value at a dotted path, or None."""
     for key in path.split("."):
@@ -91,14 +96,14 @@ def pick(report: Any, path: str) -> Any:
 
 def number(value: Any, form: str = "{:.3g}") -> str:
     """Formats a number, for instance with "{:.1f} m". Returns "not measured" for anything that is not a number."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if (value := as_number(value)) is None:
         return NOT_MEASURED
     return form.format(value).replace("-", "−") if value < 0 else form.format(value)
 
 
 def duration(seconds: Any) -> str:
     """Formats seconds as "8.2 s" or "3 min 05 s"."""
-    if isinstance(seconds, bool) or not isinstance(seconds, int | float):
+    if (seconds := as_number(seconds)) is None:
         return NOT_MEASURED
     if round(seconds, 1) < 60.0:
         return f"{seconds:.1f} s"
@@ -131,8 +136,31 @@ def format_value(value: Any) -> str:
 
 
 def numbers(value: Any) -> dict[str, float]:
+    """The entries of a table that are numbers; empty for anything but a table."""
     table = value if isinstance(value, dict) else {}
-    return {str(k): float(v) for k, v in table.items() if isinstance(v, int | float) and not isinstance(v, bool)}
+    return {str(k): float(v) for k, v in table.items() if as_number(v) is not None}
+
+
+Row = tuple[str, str, str, str]
+"""Path of a number in the report, its name, its format, and its meaning."""
+Limit = tuple[str, float, str, str]
+"""Path of a number in the report, the limit of its magnitude, and the caution and its cure above the limit."""
+
+
+def facts_of(report: dict[str, Any], *rows: Row) -> list[Fact]:
+    """A fact for each row; its value is "not measured" if the report lacks the number."""
+    return [Fact(name, number(pick(report, path), form), meaning) for path, name, form, meaning in rows]
+
+
+def cautions_above(report: dict[str, Any], *limits: Limit) -> list[Caution]:
+    """Cautions about the numbers whose magnitude exceeds their limit.
+
+    The caution in a `Limit` is a format string for the magnitude and the limit.
+    """
+    found = [(as_number(pick(report, path)), limit, what, cure) for path, limit, what, cure in limits]
+    return [
+        Caution(what.format(abs(x), limit), cure) for x, limit, what, cure in found if x is not None and abs(x) > limit
+    ]
 
 
 def follower_verdict(report: dict[str, Any]) -> Verdict:

@@ -10,13 +10,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from twin.errors import InputError
-from twin.evaluation.agreement import Estimate
 from twin.evaluation.forecasting import Candidate, Forecast
 from twin.evaluation.statistics import CONFIDENCE, rate_summary
 from twin.evaluation.training_curves import validated_digests
 from twin.evaluation.trials import Cell, read_trials, tally
 from twin.files import digest_file, exists, read_json, wrap_read_errors, write_text
 from twin.learn.policy import JSON, Policy, load_policy
+from twin.report.forecast_text import format_estimate
 from twin.scene import SceneDir
 
 CARD = "README.md"
@@ -154,18 +154,13 @@ def _twin_table(cells: Sequence[Cell]) -> list[str]:
 def _road_table(known: Sequence[Candidate]) -> list[str]:
     driven = [one for one in known if one.driven]
     if not driven:
-        predicted = [f"- {one.task}: {_estimate(one.corrected)}" for one in known if one.corrected.value is not None]
+        predicted = [
+            f"- {one.task}: {format_estimate(one.corrected)}" for one in known if one.corrected.value is not None
+        ]
         told = ["", "Predicted from other policies that were driven there:", "", *predicted] if predicted else []
         return ["Not driven on the real road.", *told]
-    rows = [f"| {one.task} | {one.real.n} | {_estimate(one.real)} | {_estimate(one.twin)} |" for one in driven]
+    rows = [f"| {c.task} | {c.real.n} | {format_estimate(c.real)} | {format_estimate(c.twin)} |" for c in driven]
     return ["| task | trials | rate on the road | rate in the twin |", "|---|---|---|---|", *rows]
-
-
-def _estimate(value: Estimate) -> str:
-    if value.value is None:
-        return value.missing
-    known = value.low is not None and value.high is not None
-    return f"{value.value:.2f}" + (f" ({_interval(value.low or 0.0, value.high or 0.0)})" if known else "")
 
 
 def _interval(low: float, high: float) -> str:

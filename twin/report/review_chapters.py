@@ -196,8 +196,8 @@ _ROW_HEIGHT = 240  # [px] height of the picture of lightings
 _MAX_STILLS = 4  # largest number of lightings in it
 
 
-def write_title_card(studio: Studio, title: str, lines: list[str], seconds: float = _CARD_SECONDS) -> None:
-    studio.writer.write(studio.layout.card(title, lines), max(1, round(seconds * studio.fps)))
+def write_title_card(studio: Studio, title: str, lines: list[str]) -> None:
+    studio.writer.write(studio.layout.card(title, lines), max(1, round(_CARD_SECONDS * studio.fps)))
 
 
 def comparison_frames(studio: Studio, budget: int) -> dict[str, list[int]]:
@@ -224,9 +224,8 @@ def write_comparison_chapter(studio: Studio, map_view: MapView, chosen: dict[str
         best = unseen[len(unseen) // 2] if unseen else None
         for i in frames:
             view = studio.render_frame(i)
-            real_frame, rgb = studio.real_frame(i), to_uint8(view.rgb[0])
-            depth = depth_colors(view.depth[0], view.opacity[0])
-            canvas = _comparison_canvas(studio, map_view, i, lighting, (real_frame, rgb, depth))
+            pictures = to_uint8(view.rgb[0]), depth_colors(view.depth[0], view.opacity[0])
+            canvas = _comparison_canvas(studio, map_view, i, lighting, *pictures)
             studio.writer.write(canvas, max(1, round(_COMPARISON_SECONDS * studio.fps)))
             if i == best and number == 0:
                 studio.save_picture("poster_compare", "poster", "the film and its twin", canvas)
@@ -240,17 +239,10 @@ def write_comparison_chapter(studio: Studio, map_view: MapView, chosen: dict[str
             progress.update()
 
 
-def _comparison_canvas(
-    studio: Studio, map_view: MapView, i: int, lighting: str, pictures: tuple[Image, Image, Image]
-) -> Image:
-    layout, cameras = studio.layout, studio.cameras
-    held_out = bool(cameras.held_out[i])
-    real_frame, rgb, depth = pictures
+def _comparison_canvas(studio: Studio, map_view: MapView, i: int, lighting: str, rgb: Image, depth: Image) -> Image:
+    layout, cameras, held_out = studio.layout, studio.cameras, bool(studio.cameras.held_out[i])
     canvas = layout.canvas(f"The film and its twin: {lighting}", studio.name)
-    paste(canvas, real_frame, layout.left)
-    paste(canvas, rgb, layout.right)
-    draw_label(canvas, "real", layout.left, size=layout.text, bold=True)
-    draw_label(canvas, "rendered by the twin", layout.right, size=layout.text, bold=True)
+    layout.draw_panels(canvas, (studio.real_frame(i), "real"), (rgb, "rendered by the twin"))
     if held_out:
         draw_label(canvas, "held out", layout.right, "bottom right", layout.text, AMBER, True)
     below, middle, right = layout.strip(*COMPARISON_STRIP)
@@ -260,17 +252,13 @@ def _comparison_canvas(
     pose = cameras.camera_to_world[i]
     same = np.array([name == cameras.sources[i] for name in cameras.sources])
     paste(canvas, map_with_pose(map_view, pose, cameras.positions[same][:, :2], layout.text), middle)
-    draw_facts(
-        canvas,
-        right,
-        [
-            ("lighting", lighting, ACCENT),
-            ("frame", cameras.names[i].split("/")[-1], INK),
-            ("film time", f"{cameras.times[i]:.1f} s", INK),
-            ("used to train", "no" if held_out else "yes", AMBER if held_out else MUTED),
-        ],
-        layout.text,
-    )
+    facts = [
+        ("lighting", lighting, ACCENT),
+        ("frame", cameras.names[i].split("/")[-1], INK),
+        ("film time", f"{cameras.times[i]:.1f} s", INK),
+        ("used to train", "no" if held_out else "yes", AMBER if held_out else MUTED),
+    ]
+    draw_facts(canvas, right, facts, layout.text)
     return canvas
 
 
@@ -354,14 +342,12 @@ def write_lighting_chapter(studio: Studio, map_view: MapView, budget: int, progr
     for number, (a, b) in enumerate(pairwise(lightings)):
         for k in range(steps + (number == len(lightings) - 2)):
             share = k / steps
-            rgb = to_uint8(studio.render_frame(i, _lighting_mixture(a, b, share)).rgb[0])
+            light = {0.0: a, 1.0: b}.get(share, f"{a}:{b}:{share:.6g}")
+            rgb = to_uint8(studio.render_frame(i, light).rgb[0])
             prevailing = a if share < 0.5 else b
             canvas = layout.canvas("Changing light", studio.name)
-            paste(canvas, rgb, layout.left)
-            draw_label(canvas, "rendered by the twin", layout.left, size=layout.text, bold=True)
-            if prevailing in reals:
-                paste(canvas, reals[prevailing], layout.right)
-                draw_label(canvas, f"real: {prevailing}", layout.right, size=layout.text, bold=True)
+            real = (reals[prevailing], f"real: {prevailing}") if prevailing in reals else None
+            layout.draw_panels(canvas, (rgb, "rendered by the twin"), real)
             slider, side = layout.strip(*LIGHTING_STRIP)
             draw_slider(canvas, slider, lightings, number + share, layout.text)
             paste(canvas, map_with_pose(map_view, cameras.camera_to_world[i], None, layout.text), side)
@@ -372,16 +358,8 @@ def write_lighting_chapter(studio: Studio, map_view: MapView, budget: int, progr
             progress.update()
     names = lightings[:_MAX_STILLS]
     which = "every filmed lighting" if len(names) == len(lightings) else f"{len(names)} of {len(lightings)} lightings"
-    studio.save_picture(
-        "lightings",
-        "field",
-        f"one pose in {which}: {', '.join(names)}",
-        side_by_side(stills[: len(names)], _ROW_HEIGHT),
-    )
-
-
-def _lighting_mixture(a: str, b: str, share: float) -> str:
-    return a if share <= 0.0 else b if share >= 1.0 else f"{a}:{b}:{share:.6g}"
+    caption = f"one pose in {which}: {', '.join(names)}"
+    studio.save_picture("lightings", "field", caption, side_by_side(stills[: len(names)], _ROW_HEIGHT))
 
 
 # ---- drive
@@ -467,17 +445,15 @@ def write_drive_chapter(
             rgb = to_uint8(view.rgb[0])
             progress.update()
         canvas = layout.canvas("The Husky drives", studio.name)
-        paste(canvas, rgb, layout.left)
-        paste(canvas, from_behind, layout.right)
-        draw_label(canvas, f"robot camera: {label}", layout.left, size=layout.text, bold=True)
-        draw_label(canvas, "MuJoCo scene, solid parts outlined", layout.right, size=layout.text, bold=True)
+        robot_view, behind = (rgb, f"robot camera: {label}"), (from_behind, "MuJoCo scene, solid parts outlined")
+        layout.draw_panels(canvas, robot_view, behind)
         left, right = layout.strip(*DRIVE_STRIP)
         base = drive.base_to_world[i]
         trail = drive.base_to_world[: i + 1, :2, 3]
         paste(canvas, map_view.with_marker(base[:3, 3], base[:3, 0], trail), left)
         draw_facts(canvas, right, _drive_facts(world, drive, i, speed[i], driven[i]), layout.text)
         if i == instants[-1]:
-            _draw_outcome(canvas, studio, drive)
+            layout.draw_outcome(canvas, _outcome_text(drive), drive.reached_goal)
         studio.writer.write(canvas, round(1.5 * studio.fps) if i == instants[-1] else hold)
         if i in moments:
             camera_stills.append(rgb)
@@ -509,12 +485,10 @@ def _drive_facts(
     ]
 
 
-def _draw_outcome(canvas: NDArray[np.uint8], studio: Studio, drive: RecordedDrive) -> None:
-    text = {
+def _outcome_text(drive: RecordedDrive) -> str:
+    return {
         "goal": "goal reached",
         "touched": f"stopped: touched {join_names(drive.touched, 2)}",
         "off_corridor": "stopped: left the corridor",
         "timeout": "stopped: out of time",
-    }.get(drive.outcome, f"stopped: {drive.outcome}")
-    color = GREEN if drive.reached_goal else RED
-    draw_label(canvas, text, studio.layout.right, "bottom right", round(studio.layout.text * 1.2), color, True)
+    }[drive.outcome]

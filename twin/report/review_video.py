@@ -4,13 +4,13 @@ The video has up to three chapters. The first compares real and rendered frames.
 lightings, shows changing light. The third, if there is a route, shows a scripted driver that drives the Husky along it.
 """
 
-import queue
-import threading
+import contextlib
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import mujoco
@@ -148,7 +148,7 @@ def _write_chapters(
         return MapView.draw(box[2:], studio.path, ground, parts, half_width)
 
     strip, panel = studio.layout.strip, studio.layout.panel
-    views, model = _scene_shots(studio, scene, world)
+    views, model = _scene_shots(cameras, scene, world)
     behind = chase_shots(drive, frame_timing(drive, studio.fps)[0]) if drive else []
     # Warp compiles kernels at first use. The field's are compiled here, before the second thread compiles those of
     # the renderer.
@@ -156,16 +156,11 @@ def _write_chapters(
     total = sum(map(len, chosen.values())) + len(rendered_instants(behind, drives))
     total += lighting_steps(len(field.lightings), turns) * (len(field.lightings) - 1) + 1 if turns else 0
     # MuJoCo's pictures need no view of the field; they are rendered in parallel with the first chapters.
-    with (
-        Prefetcher(
-            render_shots(model, views + behind, panel), max(4, _PREFETCH_BYTES // (3 * panel[0] * panel[1]))
-        ) as ahead,
-        bar("video", total, "view") as progress,
-    ):
+    shots, depth = render_shots(model, views + behind, panel), max(4, _PREFETCH_BYTES // (3 * panel[0] * panel[1]))
+    with prefetched(shots, depth) as pictures, bar("video", total, "view") as progress:
         write_comparison_chapter(studio, map_in(strip(*COMPARISON_STRIP)[1]), chosen, progress)
         if turns:
             write_lighting_chapter(studio, map_in(strip(*LIGHTING_STRIP)[1]), turns, progress)
-        pictures = iter(ahead)
         for number, picture in enumerate(islice(pictures, len(views))):
             caption = ("the MuJoCo scene with its solid parts outlined", "further along the route")[number]
             studio.save_picture(f"scene_{number}", "mjcf", caption, picture)
@@ -189,13 +184,16 @@ def _compare_geometry(studio: Studio, scene: SceneDir, world: World, drive: Reco
     return compare_geometry(views, world, studio.cameras, Ground.load(folder), Parts.load(folder / "parts.npz"))
 
 
-def _scene_shots(studio: Studio, scene: SceneDir, world: World | None) -> tuple[list[Shot], World]:
-    folder = scene.stage("mjcf")
+def _scene_shots(cameras: Cameras, scene: SceneDir, world: World | None) -> tuple[list[Shot], World]:
+    """Two shots with the robot at its initial pose, and the world: overviews of the route, or filmed camera poses."""
     if world:
-        return route_shots(world.route), world
+        length = float(arc_lengths(world.route)[-1])
+        return [(None, overview_pose(world.route, share * length)) for share in _OVERVIEW_POSITIONS], world
     # Only the model is rendered, so the route is a placeholder.
-    model = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), folder)
-    return (camera_shots(studio.cameras) if model.model_path.exists() else []), model
+    model = World(np.zeros((2, 3)), 0.0, (0.0, 0.0, 0.0, 0.0), scene.stage("mjcf"))
+    n = len(cameras)
+    frames = dict.fromkeys((n // 4, 3 * n // 4)) if model.model_path.exists() else ()
+    return [(None, cameras.camera_to_world[i]) for i in frames], model
 
 
 def load_ground_and_parts(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
@@ -262,18 +260,6 @@ def overview_pose(route: Array, s: float) -> Array:
     along = (ahead - here) * [1.0, 1.0, 0.0]
     along /= np.linalg.norm(along)
     return look_at(here - _OVERVIEW_BEHIND * along + [0.0, 0.0, _OVERVIEW_ABOVE], here + _OVERVIEW_AHEAD * along)
-
-
-def route_shots(route: Array) -> list[Shot]:
-    """Overview shots at the route's start and further along the route; the robot is at its initial pose."""
-    length = float(arc_lengths(route)[-1])
-    return [(None, overview_pose(route, share * length)) for share in _OVERVIEW_POSITIONS]
-
-
-def camera_shots(cameras: Cameras) -> list[Shot]:
-    """Shots from the camera poses of two filmed frames, for a scene without a route."""
-    n = len(cameras)
-    return [(None, cameras.camera_to_world[i]) for i in dict.fromkeys((n // 4, 3 * n // 4))]
 
 
 def chase_shots(drive: RecordedDrive, every: int) -> list[Shot]:
@@ -359,56 +345,25 @@ def trust_picture(s: Array, offsets: Array, trust: Array) -> Image:
 # ---- prefetching
 
 T = TypeVar("T")
+_END = object()
 
-_POLL_INTERVAL = 0.2  # [s] time between two checks for the end of the `with` block
 
+@contextlib.contextmanager
+def prefetched(items: Iterator[T], depth: int) -> Iterator[Iterator[T]]:
+    """Within the block, a thread computes `items`, up to `depth` ahead of the consumer.
 
-class Prefetcher(Generic[T]):
-    """Iterates over `items`. A thread computes them, up to `depth` items ahead of the consumer.
-
-    The thread starts when the `with` block is entered, and stops when the block is left. Warp kernels release the GIL,
-    so the thread uses a second core. If computing an item fails, the iteration raises the exception at that item.
+    Warp kernels release the GIL, so the thread uses a second core. If computing an item fails, the iteration raises the
+    exception at that item.
     """
+    with ThreadPoolExecutor(1) as pool:
+        ahead = deque(pool.submit(next, items, _END) for _ in range(depth))
 
-    def __init__(self, items: Iterator[T], depth: int):
-        self._items = items
-        self._queue: queue.Queue[tuple[bool, T | BaseException | None]] = queue.Queue(max(1, depth))
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._work, daemon=True)
+        def computed() -> Iterator[Any]:
+            while (item := ahead.popleft().result()) is not _END:
+                ahead.append(pool.submit(next, items, _END))
+                yield item
 
-    def _work(self) -> None:
         try:
-            for item in self._items:
-                self._put((True, item))
-                if self._stop.is_set():
-                    return
-            self._put((False, None))
-        except BaseException as error:  # the iteration raises it again
-            self._put((False, error))
-
-    def _put(self, entry: tuple[bool, T | BaseException | None]) -> None:
-        while not self._stop.is_set():
-            try:
-                self._queue.put(entry, timeout=_POLL_INTERVAL)
-                return
-            except queue.Full:
-                continue
-
-    def __enter__(self) -> "Prefetcher[T]":
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def __iter__(self) -> Iterator[T]:
-        while True:
-            there, item = self._queue.get()
-            if not there:
-                if isinstance(item, BaseException):
-                    raise item
-                return
-            yield item  # type: ignore[misc]
+            yield computed()
+        finally:
+            pool.shutdown(cancel_futures=True)

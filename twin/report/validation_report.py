@@ -8,7 +8,6 @@ posters are embedded in the page.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -82,7 +81,7 @@ def summarize(trials: Sequence[Trial]) -> dict[str, Any]:
     """Counts successes and causes of failure per policy, task and lighting, and compares policies in pairs."""
     cells = []
     for cell in tally(trials):
-        own = [t for t in trials if (t.policy, t.task, t.lighting) == cell.key]
+        own = [t for t in trials if t.cell == cell.key]
         trusted = [t for t in own if t.trust is not None and t.trust >= TRUSTED]
         cells.append(
             {"policy": cell.policy, "task": cell.task, "lighting": cell.lighting}
@@ -252,14 +251,13 @@ def summary_lines(results: dict[str, Any]) -> list[str]:
     out = []
     wide, light = (max((len(c[key]) for c in results["cells"]), default=0) for key in ("policy", "lighting"))
     for c in results["cells"]:
-        causes = failure_text(c)
-        out.append(
+        row = (
             f"{c['policy']:{wide}}  {c['task']}  {c['lighting']:{light}}  {c['successes']:3d}/{c['trials']:<3d} = "
-            f"{c['rate']:.2f} ({c['low']:.2f} to {c['high']:.2f})" + (f"  {causes}" if causes else "")
+            f"{c['rate']:.2f} ({c['low']:.2f} to {c['high']:.2f})  {failure_text(c)}"
         )
-        trusted, low = c["trusted"], c["low_trust"]
-        if low["trials"]:
-            counts = [f"{rate['successes']}/{rate['trials']}" for rate in (trusted, low)]
+        out.append(row.rstrip())
+        if c["low_trust"]["trials"]:
+            counts = [f"{rate['successes']}/{rate['trials']}" for rate in (c["trusted"], c["low_trust"])]
             out.append(f"{'':{wide}}  with trusted pictures {counts[0]}, with others {counts[1]}")
     for p in results["pairs"]:
         out.append(
@@ -395,15 +393,8 @@ def failure_map(path: Path, trials: Sequence[Trial], world: World, segment: tupl
 # ---- page
 
 
-@dataclass(frozen=True)
-class TrainingCurve:
-    """Success of the episodes of a training run."""
-
-    run: str
-    steps: NDArray[np.int64]
-    """Steps at which episodes ended, ascending, shape (n,)."""
-    success: NDArray[np.int64]
-    """0 or 1, shape (n,)."""
+TrainingCurve = tuple[str, NDArray[np.int64], NDArray[np.int64]]
+"""A training run, and steps and success of its episodes (`twin.evaluation.training_curves.read_episodes`)."""
 
 
 def write_validation_page(scene: SceneDir, results: dict[str, Any], curves: Sequence[TrainingCurve]) -> None:
@@ -414,7 +405,7 @@ def write_validation_page(scene: SceneDir, results: dict[str, Any], curves: Sequ
 
 def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: Sequence[TrainingCurve]) -> str:
     """The HTML of the page of a scene; `folder` contains the maps and videos."""
-    cells, curves = results["cells"], [curve for curve in curves if len(curve.steps)]
+    cells, curves = results["cells"], [curve for curve in curves if len(curve[1])]
     policies, lights = (dict.fromkeys(c[key] for c in cells) for key in ("policy", "lighting"))
     headings = {
         "arrive": "How often does each policy reach the goal?",
@@ -427,11 +418,12 @@ def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: S
         "unknown": "Limitations",
         "next": "What to do next",
     }
-    counts = f"{_count(len(policies), 'policy', 'policies')}, {_count(len(lights), 'lighting', 'lightings')}"
+    counts = ((len(policies), "policy", "policies"), (len(lights), "lighting", "lightings"))
+    counted = ", ".join(f"{n} {one if n == 1 else many}" for n, one, many in counts)
     return render(
         "validation.html",
         title=f"{scene}: validation",
-        kicker=f"{counts}: {sum(c['trials'] for c in cells)} episodes in the twin.",
+        kicker=f"{counted}: {sum(c['trials'] for c in cells)} episodes in the twin.",
         verdicts=verdicts(results),
         headings={name: heading for name, heading in headings.items() if heading},
         files=["summary.json", "cells.csv", "episodes.csv"],
@@ -488,10 +480,9 @@ def _task(results: dict[str, Any], task: str) -> dict[str, Any]:
 
 
 def _training_chart(results: dict[str, Any], curve: TrainingCurve) -> Chart:
-    saved = sorted(t["step"] for t in results["training"].values() if t["run"] == curve.run)
-    return Chart(
-        f"{curve.run} (n = {len(curve.steps)} episodes)", svg(training_figure(curve.steps, curve.success, saved))
-    )
+    run, steps, success = curve
+    saved = sorted(t["step"] for t in results["training"].values() if t["run"] == run)
+    return Chart(f"{run} (n = {len(steps)} episodes)", svg(training_figure(steps, success, saved)))
 
 
 def _next_steps(results: dict[str, Any], root: Path) -> list[tuple[str, list[str]]]:
@@ -516,7 +507,3 @@ def _next_steps(results: dict[str, Any], root: Path) -> list[tuple[str, list[str
             [command("forecast", root, "--real", "real.csv")],
         ),
     ]
-
-
-def _count(n: int, one: str, many: str) -> str:
-    return f"{n} {one if n == 1 else many}"

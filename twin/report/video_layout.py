@@ -89,13 +89,7 @@ def draw_text(
 
 
 def draw_label(
-    canvas: Image,
-    text: str,
-    box: Box,
-    corner: str = "top left",
-    size: int = 14,
-    color: Color = INK,
-    bold: bool = False,
+    canvas: Image, text: str, box: Box, corner: str = "top left", size: int = 14, color: Color = INK, bold: bool = False
 ) -> None:
     """Draws text on a half transparent background in a corner of a box ("top left", "bottom right", ...)."""
     x, y, width, height = box
@@ -214,6 +208,17 @@ class FrameLayout:
         draw_text(out, shorten(title, free, big, bold=True), _MARGIN, y, big, INK, bold=True)
         draw_text(out, note, width - _MARGIN, y + (big - self.text), self.text, MUTED, align="right")
         return out
+
+    def draw_panels(self, canvas: Image, left: tuple[NDArray, str], right: tuple[NDArray, str] | None) -> None:
+        """Draws the panels: a picture and its label each; None leaves the right one empty."""
+        for box, panel in ((self.left, left), (self.right, right)):
+            if panel:
+                paste(canvas, panel[0], box)
+                draw_label(canvas, panel[1], box, size=self.text, bold=True)
+
+    def draw_outcome(self, canvas: Image, text: str, success: bool) -> None:
+        """Draws the end of a drive in a corner of the right panel."""
+        draw_label(canvas, text, self.right, "bottom right", round(self.text * 1.2), GREEN if success else RED, True)
 
     def card(self, title: str, lines: list[str], color: Color = ACCENT) -> Image:
         width, height = self.size
@@ -349,21 +354,20 @@ def side_by_side(pictures: Sequence[Image], height: int) -> Image:
 # ---- map
 
 _MAP_MARGIN = 5.0  # [m] around the path
+_MAX_HEIGHT = 3.0  # [m] above the ground; the robot does not reach parts that are entirely higher
 _SUBPIXEL_BITS = 4  # fixed-point precision of OpenCV's drawing
 
 
-def footprints(
-    vertices: NDArray, vertex_start: NDArray, ground: Ground | None = None, max_height: float = 3.0
-) -> list[Array]:
+def footprints(vertices: NDArray, vertex_start: NDArray, ground: Ground | None = None) -> list[Array]:
     """Outlines of convex parts from above, each shape (k, 2) [m], counterclockwise.
 
     The vertices (v, 3) [m] of part i are those from `vertex_start[i]` to `vertex_start[i + 1]`. Parts that are
-    entirely more than `max_height` [m] above the ground are dropped, because the robot does not reach them.
+    entirely more than `_MAX_HEIGHT` above the ground are dropped.
     """
     outlines = []
     for start, end in pairwise(vertex_start):
         part = np.asarray(vertices[start:end], np.float64)
-        if ground is not None and (part[:, 2] - ground.at(part[:, :2])).min() > max_height:
+        if ground is not None and (part[:, 2] - ground.at(part[:, :2])).min() > _MAX_HEIGHT:
             continue
         try:
             outlines.append(part[ConvexHull(part[:, :2]).vertices, :2])

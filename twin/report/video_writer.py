@@ -19,6 +19,7 @@ from PIL import Image
 _BT709 = 1  # number of BT.709 in ITU-T H.273, for matrix, primaries and transfer
 _LIMITED_RANGE = 1  # AVCOL_RANGE_MPEG
 _THREADS = 4  # threads of x264, a fixed number because the encoded bytes depend on it
+_POSTER_WIDTH = 640  # [px]
 
 
 def even(size: int) -> int:
@@ -103,30 +104,15 @@ def frame_indices(count: int, every: int) -> list[int]:
     return indices if indices[-1] == count - 1 else [*indices, count - 1]
 
 
-def read_frames(path: Path, every: int = 1) -> Iterator[NDArray[np.uint8]]:
+def read_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
     with av.open(str(path)) as container:
-        for i, frame in enumerate(container.decode(video=0)):
-            if i % every == 0:
-                yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
+        for frame in container.decode(video=0):
+            yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
 
 
-def last_frame_jpeg(path: Path, width: int = 640, quality: int = 80) -> bytes:
-    """Returns the last frame of a video as a JPEG of the given width [px]."""
+def last_frame_jpeg(path: Path) -> bytes:
+    """Returns the last frame of a video as a JPEG, `_POSTER_WIDTH` wide."""
     frame = Image.fromarray(deque(read_frames(path), maxlen=1)[0])
     out = io.BytesIO()
-    frame.resize((width, round(width * frame.height / frame.width))).save(out, "JPEG", quality=quality)
+    frame.resize((_POSTER_WIDTH, round(_POSTER_WIDTH * frame.height / frame.width))).save(out, "JPEG", quality=80)
     return out.getvalue()
-
-
-def video_info(path: Path) -> dict[str, str | int | float]:
-    """Returns codec, pixel format, width, height [px], fps and number of frames of a video."""
-    with av.open(str(path)) as container:
-        stream = container.streams.video[0]
-        return {
-            "codec": stream.codec_context.name,
-            "pixel_format": str(stream.codec_context.pix_fmt),
-            "width": stream.width,
-            "height": stream.height,
-            "fps": float(stream.average_rate or 0),
-            "frames": stream.frames,
-        }

@@ -25,7 +25,7 @@ from twin.nerf.fog import mixed
 from twin.nerf.sun import mixed_sunlight
 from twin.report.video_layout import to_uint8
 from twin.report.video_writer import VideoWriter
-from twin.types import Array, Image
+from twin.types import Array
 from twin.view.scene_picture import FreeCamera, ScenePicture
 
 _FORMAT = 1
@@ -168,31 +168,19 @@ def write_path_film(
     picture: ScenePicture,
     size: tuple[int, int],
     fps: int,
-    on_frame: Callable[[int, int], None] = lambda done, total: None,
+    on_frame: Callable[[int, int], None],
 ) -> int:
-    """Renders a path to an mp4 and returns its number of frames.
+    """Renders a path, without robot and obstacles, to an mp4 of an even `size` [px]; returns its number of frames.
 
-    Args:
-        out: The mp4.
-        path: The camera path.
-        picture: Renders the scene; robot and obstacles are left out.
-        size: Width, height [px]; even.
-        fps: Frames per second.
-        on_frame: Called with the numbers of frames written and in total; if it raises, nothing is written.
+    `on_frame` is called with the numbers of frames written and in total; if it raises, nothing is written.
     """
     views = path.at(path_frames(path, fps))
     with VideoWriter(out, size, fps, _CRF) as writer:
         for k, (pose, fov, lighting) in enumerate(views):
-            writer.write(path_image(picture, pose, fov, lighting, size))
+            camera = FreeCamera.of_fov(pose, float(np.deg2rad(fov)), size)
+            writer.write(to_uint8(picture.render(camera, lighting).rgb[0]))
             on_frame(k + 1, len(views))
     return len(views)
-
-
-def path_image(
-    picture: ScenePicture, pose: Array, fov: float, lighting: EpisodeLighting, size: tuple[int, int]
-) -> Image:
-    """One frame of a path's film, uint8, shape (height, width, 3)."""
-    return to_uint8(picture.render(FreeCamera.of_fov(pose, float(np.deg2rad(fov)), size), lighting).rgb[0])
 
 
 def spaced_times(views: Sequence[Array], speed: float, least: float) -> list[float]:

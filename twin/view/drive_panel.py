@@ -9,7 +9,7 @@ import viser
 
 from twin.config import OBSTACLE_KINDS
 from twin.errors import InputError, join_names
-from twin.report.episode_video import CAUSE_TEXT, draw_curves
+from twin.report.drive_video import CAUSE_TEXT, draw_curves
 from twin.report.video_layout import ACCENT, AMBER
 from twin.types import Image
 from twin.view.driving import KEYS_DRIVER, DriveFacts, Driving

@@ -8,7 +8,6 @@ import numpy as np
 import trimesh
 import viser
 from matplotlib import colormaps
-from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
@@ -129,7 +128,9 @@ def clicked_frame(cameras: Cameras, origin: Array, direction: Array) -> int | No
 
 def _visual_mesh(scene: viser.SceneApi, path: str, twin: Twin) -> viser.SceneNodeHandle:
     mesh = load_arrays(twin.scene.stage("mesh") / "visual.npz")
-    return _colored_mesh(scene, path, mesh["vertices"], mesh["faces"], mesh["colors"])
+    linear = (255.0 * (mesh["colors"] / 255.0) ** _GAMMA + 0.5).astype(np.uint8)  # glTF stores linear colors
+    surface = trimesh.Trimesh(mesh["vertices"], mesh["faces"], vertex_colors=linear, process=False)
+    return scene.add_mesh_trimesh(path, surface, **_NO_SHADOWS)
 
 
 def _ground(scene: viser.SceneApi, path: str, twin: Twin) -> viser.SceneNodeHandle:
@@ -182,12 +183,3 @@ def _trust_map(
     colors = (255.0 * colormaps["viridis"](trust.ravel())[:, :3]).astype(np.uint8)
     lifted = points.reshape(-1, 3) + _UP
     return scene.add_point_cloud(path, lifted, colors, point_size=0.08, point_shape="circle", point_shading="flat")
-
-
-def _colored_mesh(
-    scene: viser.SceneApi, path: str, vertices: NDArray, faces: NDArray, colors: NDArray
-) -> viser.SceneNodeHandle:
-    """A mesh with a color per vertex, uint8 (v, 3)."""
-    linear = (255.0 * (colors / 255.0) ** _GAMMA + 0.5).astype(np.uint8)  # glTF stores linear colors
-    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=linear, process=False)
-    return scene.add_mesh_trimesh(path, mesh, **_NO_SHADOWS)

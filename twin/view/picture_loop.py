@@ -148,10 +148,7 @@ class PictureLoop:
             if client.client_id not in self._pages:
                 return
         client.scene.set_background_image(
-            image,
-            format="jpeg",
-            jpeg_quality=quality,
-            depth=None if depth is None else np.minimum(depth, _MAX_DEPTH),
+            image, format="jpeg", jpeg_quality=quality, depth=None if depth is None else np.minimum(depth, _MAX_DEPTH)
         )
         client.flush()
         if fine:
