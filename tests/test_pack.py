@@ -26,7 +26,7 @@ from twin.geometry.poses import look_at
 from twin.nerf.baked import BakedField, BakedSection
 from twin.nerf.fog import Fog
 from twin.nerf.lightings import AddedLighting
-from twin.nerf.road import Road
+from twin.nerf.road import RoadSections
 from twin.pack import pack, rounded
 from twin.scene import SceneDir, stage_result, write_stamp
 from twin.unpack import decode_differences, encode_differences, open_scene
@@ -96,7 +96,7 @@ def test_a_packed_long_road_has_all_its_sections(tmp_path):
     stage = SceneDir(root).stage("field")
     field = BakedField.load(stage)
     x = np.linspace(-3.0, 12.0, 40)
-    road = Road(np.stack([x, 0 * x, 0 * x + 1.0], 1), (x > 3.0).astype(np.int64))
+    road = RoadSections(np.stack([x, 0 * x, 0 * x + 1.0], 1), (x > 3.0).astype(np.int64))
     sections = [field.sections[0], other_features(field.sections[0])]
     BakedField(sections, field.lightings_by_name, field.networks, road=road).save(stage)
     write_stamp(stage, "field")

@@ -24,7 +24,7 @@ from twin.nerf.dataset import TrainingPixels
 from twin.nerf.detail import fit_detail
 from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
-from twin.nerf.road import OVERLAP, Road, divide_road, undivided_road
+from twin.nerf.road import OVERLAP, RoadSections, divide_road, undivided_road
 from twin.nerf.trainer import Trainer, train_field
 
 
@@ -109,7 +109,7 @@ def test_share_of_the_second_section_changes_without_a_jump():
 def test_shares_are_continuous_where_three_sections_meet():
     x, _, z = line(40.0).T
     arms = [np.stack([np.cos(angle) * x, np.sin(angle) * x, z], 1) for angle in (0.0, 2.0, 4.0)]
-    road = Road(np.concatenate(arms), np.repeat([0, 1, 2], len(x)))
+    road = RoadSections(np.concatenate(arms), np.repeat([0, 1, 2], len(x)))
     turn, radius = np.linspace(0.0, 6.0 * np.pi, 20_000), np.linspace(3.0, 0.1, 20_000)
     spiral = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full_like(turn, 1.2)], 1)
     share = road.shares(spiral)
@@ -125,7 +125,7 @@ def two_sections() -> tuple[BakedField, BakedField, BakedField]:
     near, far = baked(wall(1.0, 11.0)), baked(wall(2.0, 11.0))
     y = np.arange(-20.0, 20.0, 0.5) + 0.25
     points = np.stack([np.full_like(y, -3.0), y, np.zeros_like(y)], 1)
-    road = Road(points, (y > 0.0).astype(np.int64))
+    road = RoadSections(points, (y > 0.0).astype(np.int64))
     both = BakedField(
         [near.sections[0], far.sections[0]], near.lightings_by_name, near.networks, near.device, road=road
     )
@@ -301,6 +301,6 @@ def test_sections_train_on_their_own_frames(tmp_path, monkeypatch):
 
 def test_road_of_one_section_needs_no_file(tmp_path):
     undivided_road().save(tmp_path)
-    assert not list(tmp_path.iterdir()) and Road.load(tmp_path, 1).count == 1
+    assert not list(tmp_path.iterdir()) and RoadSections.load(tmp_path, 1).count == 1
     with pytest.raises(InputError, match=r"road\.safetensors"):
-        Road.load(tmp_path, 2)
+        RoadSections.load(tmp_path, 2)

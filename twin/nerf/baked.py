@@ -35,7 +35,7 @@ from twin.nerf.kernels.color_head import LANES as HEAD_LANES
 from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.lightings import Lightings
 from twin.nerf.rendering import Rendering
-from twin.nerf.road import Road, undivided_road
+from twin.nerf.road import RoadSections, undivided_road
 from twin.nerf.sun import Sun, Sunlight
 from twin.nerf.surface_features import Detail, detail_grid
 from twin.runtime import available_cores, bar
@@ -131,7 +131,7 @@ class BakedField:
         networks: dict[str, NDArray],
         device: str = "cpu",
         about: dict[str, Any] | None = None,
-        road: Road | None = None,
+        road: RoadSections | None = None,
     ):
         """
         Args:
@@ -473,7 +473,7 @@ class BakedField:
                 BakedSection(layout, file=folder / section_file(k)) if k else BakedSection(layout, arrays)
                 for k, layout in enumerate(layouts)
             ]
-            road = Road.load(folder, len(layouts))
+            road = RoadSections.load(folder, len(layouts))
             lightings = Lightings(names, vectors, frames, frame_vectors)
             return BakedField(sections, lightings, networks, device, about, road)
 

@@ -39,7 +39,7 @@ from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler, space
 from twin.nerf.kernels.color_head import HARMONICS
 from twin.nerf.rendering import FAR, Rendering
-from twin.nerf.road import Road, undivided_road
+from twin.nerf.road import RoadSections, undivided_road
 from twin.warp_runtime import wp
 
 _FORMAT, _FORMAT_OF_SECTIONS = 1, 2  # format with one section, and with several
@@ -249,7 +249,7 @@ class RadianceField:
     def __init__(
         self,
         sections: Sequence[FieldSection],
-        road: Road,
+        road: RoadSections,
         appearance: Appearance,
         parameters: dict[str, torch.Tensor],
         about: dict[str, Any] | None = None,
@@ -395,11 +395,11 @@ class RadianceField:
                 )
                 for k, layout in enumerate(layouts)
             ]
-        return RadianceField(sections, Road.load(folder, len(sections)), appearance, parameters, about)
+        return RadianceField(sections, RoadSections.load(folder, len(sections)), appearance, parameters, about)
 
 
 def untrained_field(
-    layouts: Sequence[Layout], appearance: Appearance, seed: int, device: str, road: Road | None = None
+    layouts: Sequence[Layout], appearance: Appearance, seed: int, device: str, road: RoadSections | None = None
 ) -> RadianceField:
     """The field before its first training step; its density is low and almost uniform.
 

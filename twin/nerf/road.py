@@ -35,7 +35,7 @@ _BLEND = 2.0  # [m] a picture is blended if another section is less than this fa
 
 
 @dataclass(frozen=True)
-class Road:
+class RoadSections:
     """Filmed positions, and the section of each."""
 
     points: Array
@@ -50,7 +50,7 @@ class Road:
             (folder / ROAD_FILE).write_bytes(to_bytes({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
 
     @staticmethod
-    def load(folder: Path, count: int) -> "Road":
+    def load(folder: Path, count: int) -> "RoadSections":
         """Reads the road of a field with `count` sections. Raises InputError for a file that does not fit."""
         if count == 1:
             return undivided_road()
@@ -61,7 +61,7 @@ class Road:
             check_shapes({"points": (points, (len(points), 3), "f"), "section": (section, (len(points),), "i")})
             if not np.array_equal(np.unique(section), np.arange(count)) or not np.isfinite(points).all():
                 raise ValueError(f"the road does not have the sections 0 to {count - 1}, or a point is not finite")
-            return Road(points, section)
+            return RoadSections(points, section)
 
     @property
     def count(self) -> int:
@@ -103,12 +103,12 @@ class Road:
         return [segments[np.intersect1d(a, b)] for a, b in zip(start, end, strict=True)]
 
 
-def undivided_road() -> Road:
+def undivided_road() -> RoadSections:
     """A road of one section."""
-    return Road(np.zeros((1, 3)), np.zeros(1, np.int64))
+    return RoadSections(np.zeros((1, 3)), np.zeros(1, np.int64))
 
 
-def divide_road(positions: Array, length: float) -> Road:
+def divide_road(positions: Array, length: float) -> RoadSections:
     """Divides filmed positions (n, 3) [m] into sections of about the same `length` [m]; 0 = one section.
 
     The centers are those of k-medians: bends, crossings and films in both directions need no special treatment, and
@@ -119,12 +119,12 @@ def divide_road(positions: Array, length: float) -> Road:
     filmed = float(steps[steps < _JUMP].sum())
     count = min(round(filmed / length), len(positions) // _MIN_FRAMES) if length > 0.0 else 1
     if count < 2:
-        return Road(positions, np.zeros(len(positions), np.int64))
+        return RoadSections(positions, np.zeros(len(positions), np.int64))
     centers = _centers(_far_apart(anchors, count), _thinned(positions, _CENTER_SPACING))
     section = cKDTree(centers).query(positions)[1]
     enough = np.bincount(section, minlength=count) >= _MIN_FRAMES
     section = cKDTree(centers[enough]).query(positions)[1]
-    return Road(positions, np.unique(section, return_inverse=True)[1])
+    return RoadSections(positions, np.unique(section, return_inverse=True)[1])
 
 
 def _thinned(positions: Array, spacing: float) -> Array:
