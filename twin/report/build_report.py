@@ -15,6 +15,7 @@ from twin.env.route_segments import scene_tasks
 from twin.files import read_json, wrap_read_errors, write_text
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.passes import find_passes
+from twin.geometry.route import BRANCH
 from twin.mjcf.world import SCENE_XML, World
 from twin.report import figures
 from twin.report.build_sections import SECTIONS, headline_sections, sections
@@ -57,14 +58,15 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
         return []
     cameras = Cameras.load(folder)
     points = SparsePoints.load(folder) if (folder / "points.npz").exists() else SparsePoints.empty()
-    route = None
+    route, branches = None, {}
     if (mesh / "route.npz").exists():
         with np.load(mesh / "route.npz", allow_pickle=False) as data:
             route = data["xy"].astype(np.float64)
+            branches = {name.removeprefix(BRANCH): data[name][:, :2] for name in data if name.startswith(BRANCH)}
     wide = as_number(pick(report, "mjcf.half_width_m")) or 0.0
     passes = find_passes(cameras) if route is not None else []
     drawn = figures.place_map(
-        cameras.positions, cameras.sources, cameras.held_out, points.xyz, points.rgb, route, wide, passes
+        cameras.positions, cameras.sources, cameras.held_out, points.xyz, points.rgb, route, wide, passes, branches
     )
     title = f"Map of points (n = {len(points):,}), cameras (n = {len(cameras)}) and route"
     out = [Chart(title, figures.svg(drawn), "metric")]

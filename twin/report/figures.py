@@ -144,14 +144,16 @@ def place_map(
     route: Array | None = None,
     half_width: float = 0.0,
     passes: Sequence[FilmedPass] = (),
+    branches: Mapping[str, Array] | None = None,
 ) -> Figure:
     """Map [m] of the sparse points, the cameras by source (held-out ones hollow), and the route with its corridor.
 
-    Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (m, 3), `route` (k, 2).
+    Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (m, 3), `route` and `branches` (k, 2).
     If a source has several passes (`twin.geometry.passes`), all passes are drawn as lines with their names.
     """
+    others = (branches or {}).values()
     figure, axes, low, high = _map_axes(
-        positions[:, :2] if route is None else np.concatenate([positions[:, :2], route])
+        np.concatenate([positions[:, :2], *([] if route is None else [route]), *others])
     )
     shown = np.flatnonzero(((points[:, :2] > low) & (points[:, :2] < high)).all(1))
     if len(shown) > _MAX_POINTS:
@@ -161,6 +163,8 @@ def place_map(
     axes.scatter(points[shown, 0], points[shown, 1], s=0.8, c=colors, linewidths=0, rasterized=True)
     _draw_route(axes, route, half_width)
     _draw_passes(axes, passes)
+    for name, line in (branches or {}).items():
+        axes.plot(*line.T, color=INK, lw=1.0, ls="--", label=f"branch {name}", zorder=3)
     for i, source in enumerate(dict.fromkeys(sources)):
         mine = np.array([name == source for name in sources])
         color, marker = SERIES[i % len(SERIES)], MARKERS[i % len(MARKERS)]

@@ -75,9 +75,14 @@ def scene_layers(scene: viser.SceneApi, twin: Twin, field: BakedField) -> list[L
             out.append(Layer("convex parts", text, lambda path: _parts(scene, path, twin)))
     if twin.scene.has_route and _has(twin, "mjcf"):
         world = twin.world()
+        lines = [world.along(branch) for branch in ("", *world.branches)]
+
+        def drawn(draw: Callable[..., viser.SceneNodeHandle]) -> Callable[[str], list[viser.SceneNodeHandle]]:
+            return lambda path: [draw(scene, f"{path}/{k}", line) for k, line in enumerate(lines)]
+
         out += [
-            Layer("route", "the line to be driven", lambda path: [_route(scene, path, world)]),
-            Layer("corridor", "where the robot may drive", lambda path: [_corridor(scene, path, world)]),
+            Layer("route", "the line to be driven, and its branches", drawn(_route)),
+            Layer("corridor", "where the robot may drive", drawn(_corridor)),
             Layer(
                 "trust map",
                 "dark where the robot's pictures are unreliable: far from filmed cameras, or at holes in the field",
