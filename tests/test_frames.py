@@ -61,10 +61,11 @@ def test_frames_of_a_standing_camera_are_dropped(tmp_path: Path) -> None:
     assert len(capture.names) == len(shifts)
 
 
-def test_frames_per_second_and_the_upper_bound(tmp_path: Path) -> None:
+def test_frames_per_second_and_the_upper_bound(tmp_path: Path, capsys) -> None:
     film(tmp_path / "a.mp4", views([4 * i for i in range(60)]))
     assert len(captured(tmp_path, [SourceConfig(path="a.mp4")], fps=3.0)[0].names) == 12  # 4 s
     assert len(captured(tmp_path, [SourceConfig(path="a.mp4")], fps=15.0, max_frames=7)[0].names) == 7
+    assert "a.mp4: 7 of 60 frames are kept, as capture.max_frames = 7; raise it" in capsys.readouterr().err
 
 
 def test_slots_follow_the_clock_of_a_film_with_a_variable_rate(tmp_path: Path) -> None:

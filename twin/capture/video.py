@@ -23,6 +23,7 @@ from av.sidedata.sidedata import Type as SideData
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
+from twin import runtime
 from twin.capture.hdr import NAMES, hdr_to_sdr, hdr_transfer
 from twin.config import CaptureConfig
 from twin.errors import InputError
@@ -305,7 +306,13 @@ def _sharpest_per_slot(
     kept_timing, position = _joined_segments(timing, segments, film.path)
     last = int(np.flatnonzero(position >= 0)[-1])
     slots = config.frames or max(2, round(kept_timing.duration * config.fps))
-    slots = min(slots, config.max_frames, len(kept_timing.times))
+    slots = min(slots, len(kept_timing.times))
+    if slots > config.max_frames:
+        runtime.log_line(
+            f"  {film.path.name}: {config.max_frames} of {slots} frames are kept, as capture.max_frames = "
+            f"{config.max_frames}; raise it if they are more than 2 m apart, as on a long road"
+        )
+        slots = config.max_frames
     count.declared = max(timing.declared, len(timing.times)) if not segments else len(kept_timing.times)
     count.duration = kept_timing.duration
     best: _Candidate | None = None
