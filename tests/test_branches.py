@@ -9,7 +9,7 @@ from tiny_world import tiny_ground
 
 import twin
 from twin import runtime
-from twin.config import Condition
+from twin.config import Condition, TaskConfig
 from twin.config_file import load_config
 from twin.env import suite
 from twin.env.route_segments import scene_tasks
@@ -74,11 +74,11 @@ def test_branch_is_a_task_and_has_tasks(root):
     tasks = scene_tasks(world, config.task)
     assert tasks["side"].route == tasks["side_gate"].route == "side" and tasks["ahead"].route == ""
     assert tasks["side"].length == pytest.approx(arc_lengths(side())[-1])
-    too_long = config.task[-1].__class__("far", "side", 5.0, 5.0)
+    too_long = TaskConfig("far", 5.0, 5.0, "side")
     with pytest.raises(InputError, match=r"its route is 7\.8"):
         scene_tasks(world, (too_long,))
     with pytest.raises(InputError, match="has no branch 'north'; build the scene again"):
-        scene_tasks(world, (config.task[-1].__class__("far", "north", 0.0, 5.0),))
+        scene_tasks(world, (TaskConfig("far", 0.0, 5.0, "north"),))
 
 
 def test_episode_drives_along_the_branch(root):

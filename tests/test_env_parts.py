@@ -86,7 +86,7 @@ def test_configured_tasks_must_fit_the_route():
     world = route_world((17.0, 0.0))
     assert find_task("mine", world, (TaskConfig("mine", 3.0, 5.0),)).end == 8.0
     assert find_task("straight", world, (TaskConfig("straight", 1.0, 9.0),)).start == 1.0
-    with pytest.raises(InputError, match=r"from 10 m to 20 m, but the route is 17\.00 m long"):
+    with pytest.raises(InputError, match=r"from 10 m to 20 m, but its route is 17\.00 m long"):
         find_task("mine", world, (TaskConfig("mine", 10.0, 10.0),))
 
 

@@ -25,7 +25,7 @@ from twin.learn.policy import Control, Policy, load_policy, save_policy
 from twin.learn.policy_network import Architecture
 from twin.mjcf.world import World, arc_lengths, point_at
 from twin.reality import place as places
-from twin.reality import real_test, recordings
+from twin.reality import real_test, recordings, trial_place
 from twin.reality.__main__ import main
 from twin.reality.centerline import RoadLine
 from twin.reality.lighting import LIGHTINGS, WEATHER, weather, weather_index
@@ -365,8 +365,8 @@ class Recorder:
 
 def test_the_robots_film_goes_down_the_road(tmp_path, monkeypatch):
     """It weaves, stays on the road, and is of the camera's full size; nothing but a film comes out."""
-    monkeypatch.setattr(recordings, "Rasterizer", Recorder)
-    monkeypatch.setattr(recordings.true_world, "world_spec", lambda light, place: mujoco.MjSpec())
+    monkeypatch.setattr(trial_place, "Rasterizer", Recorder)
+    monkeypatch.setattr(trial_place.true_world, "world_spec", lambda light, place: mujoco.MjSpec())
     monkeypatch.setattr(recordings, "_FPS", 1)
     path = tmp_path / "robot.mp4"
     assert main(["onboard", "--out", str(path)]) == 0
@@ -381,9 +381,9 @@ def test_the_robots_film_goes_down_the_road(tmp_path, monkeypatch):
 
 def test_a_photo_is_of_the_weather_asked_for(tmp_path, monkeypatch, capsys):
     lights: list = []
-    monkeypatch.setattr(recordings, "Rasterizer", Recorder)
+    monkeypatch.setattr(trial_place, "Rasterizer", Recorder)
     monkeypatch.setattr(
-        recordings.true_world, "world_spec", lambda light, place: lights.append(light) or mujoco.MjSpec()
+        trial_place.true_world, "world_spec", lambda light, place: lights.append(light) or mujoco.MjSpec()
     )
     path = tmp_path / "photos" / "haze.png"
     assert main(["photo", "--lighting", "haze", "--out", str(path)]) == 0

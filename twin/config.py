@@ -377,12 +377,12 @@ class TaskConfig:
     """A driving task on a segment of a route, in addition to those of `twin/env/route_segments.py`."""
 
     name: str = ""
-    route: str = ""
-    """Name of the [[branch]] that the task drives along; by default the route."""
     start: float = 0.0
     """Arc length on the route at which the segment starts [m]."""
     length: float = 0.0
     """Length of the segment [m]."""
+    route: str = ""
+    """Name of the [[branch]] that the task drives along; by default the route."""
 
 
 @dataclass(frozen=True)
