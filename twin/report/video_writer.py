@@ -18,7 +18,7 @@ from PIL import Image
 
 _BT709 = 1  # number of BT.709 in ITU-T H.273, for matrix, primaries and transfer
 _LIMITED_RANGE = 1  # AVCOL_RANGE_MPEG
-_THREADS = 4  # threads of x264, a fixed number because the encoded bytes depend on it
+_THREADS = 1  # threads of x264: with four, 8 of 1,500 films had other bytes, on a busy machine
 _POSTER_WIDTH = 640  # [px]
 
 
