@@ -67,7 +67,7 @@ def _parts(folder: Path) -> list[ConvexPart]:
 
 @pytest.fixture(scope="module")
 def stood(made):
-    """What the fusion starts from: views, ground, corridor, path and box of the place."""
+    """Views, ground, corridor, path and box of the place, from which the fusion starts."""
     folder, facts = made
     cameras = Cameras.load(folder.parent / "2_metric")
     views = render_views(PLACE, cameras, 14, 100, FREE_SPACE_REACH * (SETTINGS.margin + 2.0))

@@ -343,7 +343,8 @@ class BakedField:
         if len(needed) == 1:
             return self._render(needed[0], views).images(features)
         # Those in memory come first, before others take their place.
-        resident = set(self._resident)
+        with self._resident_lock:
+            resident = set(self._resident)
         parts = {}
         for k in sorted(needed, key=lambda k: k not in resident):
             rows = np.flatnonzero(shares[:, k])
@@ -517,7 +518,9 @@ class _RenderTarget:
 
     def __init__(self, field: BakedField, section: _SectionOnDevice, n: int, width: int, height: int, stopped: bool):
         self.shape, device = (n, height, width), field.device
-        self.section = section  # its arrays live as long as the launches that read them
+        # The arrays live as long as the launches that read them. A reference to the section itself would be circular,
+        # and a dropped section would stay in memory until the next garbage collection.
+        self.arrays = section.bricks, section.detail
         across, down, pixels = -(-width // kernels.TILE), -(-height // kernels.TILE), width * height
 
         def new(shape: tuple[int, ...], dtype: Any = wp.float32) -> Any:

@@ -137,7 +137,7 @@ def _thinned(positions: Array, spacing: float) -> Array:
 
 
 def _far_apart(points: Array, count: int) -> Array:
-    """Of those points (n, 3) that have another one nearby, `count` that are far from each other."""
+    """`count` points that are far from each other, of those points (n, 3) that have another one nearby."""
     points = points[cKDTree(points).query(points, k=2)[0][:, 1] < _JUMP]
     chosen = [int(np.linalg.norm(points - np.median(points, 0), axis=1).argmax())]
     gap = np.full(len(points), np.inf)
