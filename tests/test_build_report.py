@@ -247,6 +247,7 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("cameras", "cameras.reprojection_error_px", 2.5, "2.50 px"),
     ("cameras", "cameras.outliers", ["day/000001"], "day/000001"),
     ("cameras", "cameras.apart", ["day_back"], "day_back"),
+    ("cameras", "cameras.stabilized", ["phone"], "phone"),
     ("cameras", "cameras.note", "the given poses did not fit", "The given poses did not fit."),
     ("metric", "metric.scale_uncertainty", 0.1, "10.0%"),
     ("metric", "metric.scale_disagreement", 4.2, "4.2 standard deviations"),

@@ -121,6 +121,29 @@ def test_trajectories_are_what_a_cart_does():
     assert np.abs(paths["sun"][:shortest] - paths["night"][:shortest]).max() > 0.05
 
 
+def test_poses_at_a_later_time_belong_to_the_same_film():
+    plan, road = filming.FilmingPlan(), RoadLine()
+    times, poses = filming.trajectory(plan, road, "sun")
+    again, later = filming.trajectory(plan, road, "sun", later=1.0 / plan.fps)
+    assert np.array_equal(times, again)
+    inner = slice(1, -2)  # the heading at both ends is that of the film's first and last step
+    np.testing.assert_allclose(later[inner], poses[1:][inner], atol=1e-9)
+
+
+def test_a_rolling_shutter_reads_each_row_at_its_time():
+    """A camera that yaws sees the far rows of a vertical edge displaced against each other."""
+    plan = filming.FilmingPlan(width=320, height=180)
+    light = np.zeros((180, 320, 3), np.float32)
+    light[:, 160:] = 1.0
+    rays = unproject(pixel_grid(320, 180), plan.intrinsics).astype(np.float32)
+    depth = np.zeros((180, 320), np.float32)  # the sky, which a translation does not move
+    yaw = 0.02  # to the right, so that the edge moves to the left from the first row to the last one
+    read = filming.read_rows(light, depth, rays, plan.intrinsics, np.array([0.0, yaw, 0.0, 0.1, 0.1, 0.1]))
+    edge = 320 - read[..., 0].sum(1)
+    rows = (np.arange(180) + 0.5) / 180 - 0.5
+    np.testing.assert_allclose(edge, 160 - plan.intrinsics[0] * yaw * rows, atol=0.1)
+
+
 def test_sky_is_seamless_and_brighter_by_day():
     day, night = (sky_cube_map(LIGHTINGS[name], 1, 64).reshape(6, 64, 64, 3).astype(float) for name in ("sun", "night"))
     assert day.mean() > 2 * night.mean()

@@ -457,6 +457,8 @@ def _reality(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="walkers and cars move through the films, and parked cars have left in the last lighting",
     )
+    command.add_argument("--readout", type=float, default=0.0, metavar="SECONDS", help="rolling shutter; 0: none")
+    command.add_argument("--shake", type=float, metavar="FACTOR", help="shake of the camera; 1: as on a cart")
     command = add("compare", "compare a build of a filmed place with its truth, and show it in the build's report")
     command.add_argument("scene", type=Path, help="folder of a built scene")
     command = add("drive", "the real test: drive policy files in weather that was not filmed")

@@ -150,7 +150,9 @@ def undistortion(lens: Lens) -> tuple[Lens, PixelMap | None]:
     if lens.camera.is_undistorted() or _max_displacement(lens, pinhole) < _NEGLIGIBLE_DISTORTION:
         return pinhole, None
     grid = pixel_grid(lens.width, lens.height)
-    return pinhole, (_raw_pixels(lens, grid.reshape(-1, 2), pinhole) - 0.5).reshape(grid.shape).astype(np.float32)
+    return pinhole, (raw_pixels(lens, unproject(grid.reshape(-1, 2), pinhole.intrinsics)) - 0.5).reshape(
+        grid.shape
+    ).astype(np.float32)
 
 
 def undistorted(image: Image, lens: Lens, nearest: bool = False) -> tuple[Image, Lens]:
@@ -204,8 +206,9 @@ def _fitted_pinhole(lens: Lens) -> Lens:
     return zoomed(high)
 
 
-def _raw_pixels(lens: Lens, pixels: Array, pinhole: Lens) -> Array:
-    return np.asarray(lens.camera.img_from_cam(unproject(pixels, pinhole.intrinsics)))
+def raw_pixels(lens: Lens, rays: Array) -> Array:
+    """Pixels (n, 2) of a raw image that show the directions (n, 3)."""
+    return np.asarray(lens.camera.img_from_cam(rays))
 
 
 def _border(lens: Lens) -> Array:
@@ -216,7 +219,7 @@ def _border(lens: Lens) -> Array:
 
 
 def _fits_inside(lens: Lens, pixels: Array, pinhole: Lens) -> bool:
-    raw = _raw_pixels(lens, pixels, pinhole)
+    raw = raw_pixels(lens, unproject(pixels, pinhole.intrinsics))
     return bool(np.all((raw >= 0.0) & (raw <= [lens.width, lens.height])))
 
 
@@ -224,5 +227,5 @@ def _max_displacement(lens: Lens, pinhole: Lens) -> float:
     """Largest displacement of a pixel by the distortion [px]."""
     grid = pixel_grid(lens.width, lens.height)[:: max(lens.height // 20, 1), :: max(lens.width // 20, 1)]
     pixels = np.concatenate([grid.reshape(-1, 2), _border(lens)])
-    moved = _raw_pixels(lens, pixels, pinhole) - pixels
+    moved = raw_pixels(lens, unproject(pixels, pinhole.intrinsics)) - pixels
     return float(np.abs(moved).max()) if np.all(np.isfinite(moved)) else np.inf

@@ -1,7 +1,7 @@
 """Checks a film before the build: finds defects that reduce the twin's quality and parts that are fixed to the camera.
 
 Key frames spread over the film are decoded; if these are too few, other frames are decoded, too. The timing comes from
-all packets. Stabilization and rolling shutter are not checked, because they leave no trace in the file.
+all packets. Stabilization and rolling shutter leave no trace in the file; the build finds them.
 """
 
 import contextlib

@@ -20,7 +20,15 @@ from twin import runtime
 from twin.capture.camera_models import Lens, lens_from_json, undistortion, write_pinhole_image
 from twin.capture.capture_data import Capture
 from twin.capture.ground_matching import Part, join
-from twin.capture.mapping import MIN_FRAMES, coherent_frames, connections, fresh_folder, reconstruct, registered_poses
+from twin.capture.mapping import (
+    MIN_FRAMES,
+    Mapper,
+    coherent_frames,
+    connections,
+    fresh_folder,
+    reconstruct,
+    registered_poses,
+)
 from twin.capture.matching import (
     PROBE_INLIERS,
     Matcher,
@@ -31,6 +39,7 @@ from twin.capture.matching import (
     probe_pairs,
     sequence_pairs,
 )
+from twin.capture.rolling_shutter import RollingShutter, correct_model, corrected_map, corrected_pinhole
 from twin.capture.worker import run_worker, send_message
 from twin.config import CamerasConfig, SceneConfig
 from twin.errors import InputError
@@ -71,7 +80,9 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         frames, poses = result["frames"], result["camera_to_world"]
         points = _sparse_points(result, frames, len(capture.names))
     _check_registered(capture, frames, settings)
-    intrinsics, sizes = _write_images(capture, stage, frames, list(map(lens_from_json, summary["cameras"])), out)
+    lenses = list(map(lens_from_json, summary["cameras"]))
+    shutters = {name: RollingShutter.from_json(entry) for name, entry in summary["rolling_shutters"].items()}
+    intrinsics, sizes = _write_images(capture, stage, frames, lenses, shutters, out)
     source_of = [capture.sources[int(s)] for s in capture.source_index[frames]]
     cameras = Cameras(
         names=tuple(capture.names[i] for i in frames),
@@ -125,15 +136,26 @@ def _check_registered(capture: Capture, frames: NDArray[np.int64], settings: Cam
 
 
 def _write_images(
-    capture: Capture, stage: Path, frames: NDArray[np.int64], lenses: list[Lens], out: Path
+    capture: Capture,
+    stage: Path,
+    frames: NDArray[np.int64],
+    lenses: list[Lens],
+    shutters: dict[str, RollingShutter],
+    out: Path,
 ) -> tuple[Array, NDArray[np.int64]]:
     """Writes the pinhole images and masks; returns intrinsics (n, 4) and sizes (n, 2) [px]."""
     intrinsics, sizes = np.zeros((len(frames), 4)), np.zeros((len(frames), 2), np.int64)
-    lens: Lens | None = None
+    before: tuple[Lens, str] | None = None
     for k, i in enumerate(runtime.track(frames, "pinhole images", unit="frame")):
-        if lens != lenses[k]:  # frames are sorted by source, and most sources have one lens
-            lens = lenses[k]
+        lens, source = lenses[k], capture.sources[int(capture.source_index[i])].name
+        shutter = shutters.get(source)
+        if before != (lens, source):  # frames are sorted by source, and most sources have one lens
+            before = lens, source
             pinhole, pixel_map = undistortion(lens)
+            if shutter:
+                pinhole = corrected_pinhole(lens, pinhole, shutter)
+        if shutter:
+            pixel_map = corrected_map(lens, pinhole, shutter.skews.get(int(i), np.zeros(3)), shutter.axis)
         intrinsics[k], sizes[k] = pinhole.intrinsics, (lens.width, lens.height)
         name = f"{capture.names[int(i)]}.png"
         write_pinhole_image(stage / "images" / name, out / "images" / name, pixel_map)
@@ -146,7 +168,8 @@ def _metrics(capture: Capture, cameras: Cameras, points: SparsePoints, summary: 
     counts = points.track_length
     names = [source.name for source in capture.sources]
     of_source = np.array(cameras.sources)
-    copied = ("pairs", "verified_pairs", "near_pairs", "outliers", "registered_anew", "mapper", "joined", "apart")
+    copied = ["pairs", "verified_pairs", "near_pairs", "outliers", "registered_anew", "mapper", "joined", "apart"]
+    copied += ["rolling_shutter_deg", "stabilized"]
     return {
         "registered": len(cameras),
         "total": len(capture.names),
@@ -179,11 +202,17 @@ def solve_mapping(job: dict[str, Any], work: Path) -> None:
     matcher = open_database(capture, stage, work, job["free_focal"], job["threads"], job["seed"])
     matcher.extract(job["features"], job["max_feature_size"])
     summary = _new_summary()
+    shutters: dict[str, RollingShutter] = {}
+    summary["stabilized"] = []
     if capture.camera_to_world is not None:
         summary["mapper"] = "given poses"
         solved = [(matcher, _triangulate(matcher, capture.camera_to_world, work))]
     else:
         solved = _reconstruct(matcher, job, work, summary)
+        for its_matcher, model in solved:
+            found, stabilized = correct_model(model, its_matcher, Mapper(its_matcher, job, work).refine)
+            shutters |= found
+            summary["stabilized"] += stabilized
     results = [_arrays(model, its_matcher) for its_matcher, model in solved]
     order = np.argsort(np.concatenate([one["frames"] for one in results]))
     lenses = [lens for its_matcher, model in solved for lens in _lenses(model, its_matcher)]
@@ -199,6 +228,8 @@ def solve_mapping(job: dict[str, Any], work: Path) -> None:
     summary["verified_pairs"] = sum(len(one.verified()) for one, _ in solved)
     missing = set(range(len(capture.sources))) - set(capture.source_index[arrays["frames"]].tolist())
     summary["apart"] = [capture.sources[s].name for s in sorted(missing)]
+    summary["rolling_shutters"] = {name: one.to_json() for name, one in shutters.items()}
+    summary["rolling_shutter_deg"] = {name: round(one.median_deg, 3) for name, one in shutters.items()}
     write_json(work / "result.json", summary | {"cameras": [vars(lenses[k]) for k in order]})
 
 

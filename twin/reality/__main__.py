@@ -53,6 +53,8 @@ TINY = FilmingPlan(
 
 
 _LENGTHS = (20.0, 2000.0)  # [m] range of `--length`
+_MAX_READOUT = 0.1  # [s]
+_MAX_SHAKE = 10.0
 
 
 def _tiny(plan: FilmingPlan) -> FilmingPlan:
@@ -119,6 +121,8 @@ def scene_toml(plan: FilmingPlan, name: str, spec: PlaceSpec | None = None, road
     fx, fy, cx, cy = (round(float(v), 4) for v in plan.intrinsics)
     place = f" --place {spec.number}" if spec else ""
     place += f" --length {road_length:g}" if road_length else ""
+    place += f" --readout {plan.readout:g}" if plan.readout else ""
+    place += f" --shake {plan.shake:g}" if plan.shake != (spec.film.shake if spec else FilmingPlan.shake) else ""
     height = f"camera_height = {plan.camera_height}  # metres"
     if spec:
         height = f"camera_height = {spec.film.stated_height}  # metres, ± {spec.film.height_tolerance:.3f}"
@@ -162,6 +166,12 @@ def command(options: argparse.Namespace) -> None:
             plan = _tiny(plan) if options.tiny else plan
         _check_lightings(options.lightings or [], plan.lightings if options.place else LIGHTINGS)
         plan = replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan
+        if not 0.0 <= options.readout <= _MAX_READOUT:
+            raise InputError(f"--readout {options.readout:g}: expected 0 to {_MAX_READOUT:g} s")
+        if options.shake is not None and not 0.0 <= options.shake <= _MAX_SHAKE:
+            raise InputError(f"--shake {options.shake:g}: expected 0 to {_MAX_SHAKE:g}")
+        plan = replace(plan, readout=options.readout)
+        plan = plan if options.shake is None else replace(plan, shake=options.shake)
         film(plan, options.out, options.place, options.traffic, length=options.length)
     elif options.command == "compare":
         scene = SceneDir(options.scene)

@@ -15,6 +15,7 @@ import mujoco
 import mujoco_warp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
@@ -26,11 +27,13 @@ from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.stretches import StretchRenderer, is_long
 from twin.reality.traffic import Mover, movers
 from twin.runtime import track
-from twin.types import Array
+from twin.types import Array, Array32
 from twin.warp_runtime import wp
 
 CAMERA_HEIGHT = 1.2  # [m] mean height of the lens above the ground, from which it deviates by less than 1 cm
 OUT = PassSpec("out", 0.0, False)
+_SKY_DISTANCE = 1.0e4  # [m] assumed depth of the sky, for the motion of its pixels
+_OPEN_SAMPLES = 3  # instants over which a row's exposure is averaged
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ class FilmingPlan:
     """Horizontal field of view [rad]."""
     shake: float = 1.0
     """Amplitude of the camera's rotations and vertical motion; 1 is the amplitude on a cart."""
+    readout: float = 0.0
+    """Time from the readout of a frame's first row to that of its last one [s]; 0 for a global shutter."""
     passes: tuple[PassSpec, ...] = (OUT,)
     """Passes along the road; each is filmed under every lighting."""
 
@@ -103,13 +108,20 @@ def film_name(lighting: str, one: PassSpec) -> str:
     return lighting if one.name == OUT.name else f"{lighting}_{one.name}"
 
 
-def trajectory(plan: FilmingPlan, route: DrivenLine, film: str, one: PassSpec = OUT) -> tuple[Array, Array]:
-    """Times [s], shape (n,), and camera_to_world (OpenCV axes), shape (n, 4, 4), of the film named `film`."""
+def trajectory(
+    plan: FilmingPlan, route: DrivenLine, film: str, one: PassSpec = OUT, later: float = 0.0
+) -> tuple[Array, Array]:
+    """Times [s], shape (n,), of the film named `film`, and camera_to_world (OpenCV axes), shape (n, 4, 4).
+
+    The poses are those at a time `later` [s] than the times.
+    """
     rng = np.random.default_rng([SEED, 11, sum(map(ord, film))])
     speed = plan.speed * rng.uniform(0.93, 1.07)
     frames = round(plan.length / speed * plan.fps) + 1
     times = np.arange(frames) / plan.fps
-    progress = times / times[-1]
+    duration = times[-1]
+    times = times + later
+    progress = times / duration
     station = plan.start + plan.length * progress + 0.18 * smooth_noise(rng, times, 6.0) * np.sin(np.pi * progress)
     lateral = np.clip(rng.uniform(-0.12, 0.12) + 0.12 * smooth_noise(rng, times, 9.0), -0.3, 0.3)
     if one.backwards:
@@ -125,7 +137,8 @@ def trajectory(plan: FilmingPlan, route: DrivenLine, film: str, one: PassSpec = 
     yaw = yaw + np.deg2rad(0.9) * plan.shake * smooth_noise(rng, times, 2.3)
     pitch = plan.pitch + np.deg2rad(0.5) * plan.shake * smooth_noise(rng, times, 1.3)
     roll = np.deg2rad(0.6) * plan.shake * smooth_noise(rng, times, 1.7)
-    return times, np.stack([_pose(p, a, b, c) for p, a, b, c in zip(position, yaw, pitch, roll, strict=True)])
+    poses = np.stack([_pose(p, a, b, c) for p, a, b, c in zip(position, yaw, pitch, roll, strict=True)])
+    return times - later, poses
 
 
 def _pose(position: Array, yaw: float, pitch: float, roll: float) -> Array:
@@ -208,6 +221,48 @@ class Renderer:
         return light, depth
 
 
+def read_rows(
+    light: Array32, depth: Array32, rays: Array32, intrinsics: Array, motion: Array, opened: float = 0.0
+) -> Array32:
+    """A picture (h, w, 3) by a rolling shutter: every row shows what the camera saw while the row was exposed.
+
+    A point has the camera coordinates X in the middle of the readout, and X − f (ω × X + t) after the camera has moved
+    by the fraction f of its motion (ω, t). For a pixel in a row that is read at that time, X is the point on the
+    pixel's ray at the pixel's depth. The pixel gets the color of the middle picture at the projection of
+    X + f (ω × X + t).
+
+    Args:
+        light: The picture in the middle of the readout, shape (h, w, 3).
+        depth: z-depth [m], 0 = sky, shape (h, w).
+        rays: Directions of the pixels in the camera's axes at depth 1, shape (h, w, 3).
+        intrinsics: fx, fy, cx, cy [px].
+        motion: Rotation vector [rad] and translation [m] of the camera over the readout, in its axes, shape (6,).
+        opened: Time for which a row is exposed, as a share of the readout.
+    """
+    height = len(light)
+    points = rays * np.where(depth > 0.0, depth, np.float32(_SKY_DISTANCE))[..., None]
+    flow = np.cross(motion[:3], points) + motion[3:]
+    rows = (np.arange(height) + 0.5) / height - 0.5
+    fx, fy, cx, cy = intrinsics
+    instants = _OPEN_SAMPLES if opened else 1
+    total = np.zeros_like(light)
+    for k in range(instants):
+        share = rows + opened * ((k + 0.5) / instants - 0.5)
+        at = points + share[:, None, None] * flow
+        z = np.maximum(at[..., 2], 0.05)
+        x, y = fx * at[..., 0] / z + cx - 0.5, fy * at[..., 1] / z + cy - 0.5
+        total += cv2.remap(
+            light, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+    return total / np.float32(instants)
+
+
+def motion_between(before: Array, after: Array, middle: Array) -> Array:
+    """Rotation vector [rad] and translation [m] from pose `before` to `after`, in the axes of `middle`, shape (6,)."""
+    turn = Rotation.from_matrix(middle[:3, :3].T @ after[:3, :3] @ before[:3, :3].T @ middle[:3, :3]).as_rotvec()
+    return np.concatenate([turn, middle[:3, :3].T @ (after[:3, 3] - before[:3, 3])])
+
+
 def sensor_image(
     rng: np.random.Generator, light: NDArray[np.float32], lighting: Lighting, exposure: float
 ) -> NDArray[np.uint8]:
@@ -251,17 +306,23 @@ def film_pass(
     moving = movers(place, name, times, poses) if traffic else []
     make = partial(Renderer, lighting, plan=plan, movers=moving)
     render: PlaceRenderer = renderer or (StretchRenderer(place, make) if is_long(place) else make(place))
-    steps = track(list(zip(times, poses, gains, strict=True)), f"film {name}", unit="frame")
+    half = 0.5 * plan.readout
+    begun, ended = (trajectory(plan, place.route, name, one, later)[1] for later in (-half, half))
+    steps = track(list(zip(times, poses, gains, begun, ended, strict=True)), f"film {name}", unit="frame")
     rays = unproject(pixel_grid(plan.width, plan.height), plan.intrinsics)
 
-    def frame(time: float, pose: Array, gain: float) -> NDArray[np.uint8]:
+    def frame(time: float, pose: Array, gain: float, before: Array, after: Array) -> NDArray[np.uint8]:
         here = render.at(pose) if isinstance(render, StretchRenderer) else render
         if isinstance(here, Renderer) and moving:
             here.move_to(time)
         ground = float(place.route.ground_height(pose[:2, 3]))
-        return sensor_image(rng, apply_haze(*here(pose), rays, pose, light, ground), light, gain)
+        rgb, depth = here(pose)
+        seen = apply_haze(rgb, depth, rays, pose, light, ground)
+        if plan.readout:
+            seen = read_rows(seen, depth, rays.astype(np.float32), plan.intrinsics, motion_between(before, after, pose))
+        return sensor_image(rng, seen, light, gain)
 
-    write_video((frame(float(time), pose, float(gain)) for time, pose, gain in steps), plan, path)
+    write_video((frame(float(time), pose, float(gain), *ends) for time, pose, gain, *ends in steps), plan, path)
     return times, poses
 
 

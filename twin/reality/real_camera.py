@@ -18,7 +18,7 @@ from scipy.special import expit
 from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.reality import SEED
-from twin.reality.filming import FilmingPlan, smooth_noise
+from twin.reality.filming import FilmingPlan, motion_between, read_rows, smooth_noise
 from twin.reality.lighting import Lighting, apply_haze
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_robot import RealRobot
@@ -183,8 +183,6 @@ def camera_to_base(camera: HiddenCamera) -> Array:
 
 # ---- lens, exposure and sensor
 
-_SKY_DISTANCE = 1.0e4  # [m] assumed depth of the sky, for the motion of its pixels
-_OPEN_SAMPLES = 3  # instants over which a row's exposure is averaged
 _DRIFT_TIME, _DRIFT_STEP, _DRIFT_END = 14.0, 0.2, 900.0  # [s] drift of the white balance: period, step, end
 _FULL = 0.92  # fraction of the sensor's range; brighter light blooms
 _DARK = 1.5  # lightings with a larger `exposure` double the time for which a row is exposed
@@ -286,7 +284,8 @@ class RealCamera:
         """
         camera, lighting = self.camera, self._lighting
         light = apply_haze(light, depth, self._rays, pose, lighting, ground)
-        light = self._read(light, depth, motion)
+        if np.any(motion):
+            light = read_rows(light, depth, self._rays, self._intrinsics, motion, self._shutter / camera.readout)
         light = light * (self._falloff * np.float32(lighting.exposure))
         brightness = float(light.mean())
         if self._exposure is None:
@@ -309,39 +308,6 @@ class RealCamera:
         over = np.maximum(light - _FULL, 0.0) * 3.0
         near, far = (0.012 * self._size[0], 0.05 * self._size[0])
         return np.asarray(0.6 * cv2.GaussianBlur(over, (0, 0), near) + 0.4 * cv2.GaussianBlur(over, (0, 0), far))
-
-    def _read(self, light: Array32, depth: Array32, motion: Array) -> Array32:
-        """Rolling shutter and motion blur: every row shows what the camera saw while the row was exposed.
-
-        A point has the camera coordinates X in the middle of the readout, and X − f (ω × X + t) after the camera has
-        moved by the fraction f of its motion (ω, t). For a pixel in a row that is read at that time, X is the point on
-        the pixel's ray at the pixel's depth. The pixel gets the color of the middle picture at the projection of
-        X + f (ω × X + t).
-        """
-        if not np.any(motion):
-            return light
-        height = self._size[1]
-        points = self._rays * np.where(depth > 0.0, depth, np.float32(_SKY_DISTANCE))[..., None]
-        flow = np.cross(motion[:3], points) + motion[3:]
-        rows = (np.arange(height) + 0.5) / height - 0.5
-        fx, fy, cx, cy = self._intrinsics
-        opened = self._shutter / self.camera.readout
-        total = np.zeros_like(light)
-        for k in range(_OPEN_SAMPLES):
-            share = rows + opened * ((k + 0.5) / _OPEN_SAMPLES - 0.5)
-            at = points + share[:, None, None] * flow
-            z = np.maximum(at[..., 2], 0.05)
-            x, y = fx * at[..., 0] / z + cx - 0.5, fy * at[..., 1] / z + cy - 0.5
-            total += cv2.remap(
-                light, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-            )
-        return total / np.float32(_OPEN_SAMPLES)
-
-
-def motion_between(before: Array, after: Array, middle: Array) -> Array:
-    """Rotation vector [rad] and translation [m] from pose `before` to `after`, in the axes of `middle`, shape (6,)."""
-    turn = Rotation.from_matrix(middle[:3, :3].T @ after[:3, :3] @ before[:3, :3].T @ middle[:3, :3]).as_rotvec()
-    return np.concatenate([turn, middle[:3, :3].T @ (after[:3, 3] - before[:3, 3])])
 
 
 def dirt_mask(camera: HiddenCamera, size: tuple[int, int]) -> NDArray[np.float32]:

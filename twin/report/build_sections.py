@@ -103,6 +103,10 @@ def cameras_section(report: dict[str, Any]) -> Section:
         )
         cure = "remove them, or film again along the same path, with the road in view."
         cautions.append(Caution(what, cure))
+    if stabilized := cameras.get("stabilized"):
+        films = join_names(stabilized, 6)
+        what = f"Stabilization moves the picture in these films, which bends the reconstruction: {films}."
+        cautions.append(Caution(what, "film again with stabilization off."))
     if note := cameras.get("note"):
         cure = "check the given poses, or let twin estimate them from the images."
         cautions.append(Caution(f"{note.capitalize()}.", cure))
@@ -128,6 +132,9 @@ def cameras_section(report: dict[str, Any]) -> Section:
     if joined := cameras.get("joined"):
         meaning = "films in the opposite direction: reconstructed separately, and placed by the ground seen from above"
         facts.append(Fact("joined by the ground", join_names(joined, 6), meaning))
+    if turned := numbers(cameras.get("rolling_shutter_deg")):
+        text = ", ".join(f"{name} {number(degrees, '{:.2f}°')}" for name, degrees in turned.items())
+        facts.append(Fact("rolling shutter", text, "corrected; median rotation of the camera while a frame was read"))
     done = "Structure from motion estimated the pose of each frame from points that several frames share."
     return Section("cameras", "Cameras", done, facts, cautions, verdict=verdict)
 
