@@ -33,6 +33,8 @@ from twin.types import Array
 
 _MIN_POINTS = 40  # least number of points in a frame from which its skew is fitted
 _MIN_FRAMES = 8  # least number of such frames from which a film is judged
+_JUDGED_FRAMES = 60  # most frames of a film from which it is judged
+_MIN_DEPTH = 0.01  # [median depth of the points] points nearer to the camera are not used
 _LOSS_SCALE = 0.5  # [px] scale of the Cauchy loss
 _REWEIGHTINGS = 6
 # Fits of all skews are followed by bundle adjustment, and repeated until a fit moves pixels by less than _SETTLED
@@ -99,6 +101,10 @@ class _Frame:
         points = np.array([list(self._model.points3D[points2d[k].point3D_id].xyz) for k in seen]).reshape(-1, 3)
         pose = self._image.cam_from_world().matrix()
         x = points @ pose[:, :3].T + pose[:, 3]
+        rays = self._corrected_rays()[seen]
+        # Bundle adjustment may leave a point behind a camera, and not every lens model can be inverted everywhere.
+        used = (x[:, 2] > _MIN_DEPTH * np.median(np.abs(x[:, 2]))) & np.isfinite(rays).all(1) & (rays[:, 2] > 0)
+        seen, x, rays = np.array(seen)[used], x[used], rays[used]
         focal = self._camera.mean_focal_length()
         jacobian = np.zeros((len(x), 2, 3))  # of the projection, by X
         jacobian[:, 0, 0] = jacobian[:, 1, 1] = focal / x[:, 2]
@@ -110,7 +116,6 @@ class _Frame:
                 parts.append(np.broadcast_to(focal * np.eye(2), (len(x), 2, 2)))
             else:
                 parts.append(-self._shares(_axis(effect))[seen, None, None] * by_rotation)
-        rays = self._corrected_rays()[seen]
         return np.concatenate(parts, 2), focal * (rays[:, :2] / rays[:, 2:] - x[:, :2] / x[:, 2:])
 
     def fitted_skew(self, shutter: Effect) -> Array:
@@ -160,7 +165,8 @@ def correct_model(
         frames = {i: frame for i, frame in frames.items() if frame.points >= _MIN_POINTS}
         if len(frames) < _MIN_FRAMES:
             continue
-        shutter, is_stabilized = _effects(list(frames.values()))
+        judged = list(frames.values())[:: -(-len(frames) // _JUDGED_FRAMES)]
+        shutter, is_stabilized = _effects(judged)
         if shutter:
             films[capture.sources[s].name] = shutter, frames
         if is_stabilized:
@@ -196,24 +202,29 @@ def _axis(shutter: Effect) -> int:
 def _effects(frames: list[_Frame]) -> tuple[Effect | None, bool]:
     """The kind of a film's rolling shutter, None without one, and whether the film is stabilized."""
     both: tuple[Effect, Effect] = ("rows", "columns")
-    gains = [_gain(frames, [], effect) for effect in both]
+    equations = [frame.equations(*both, "shift") for frame in frames]
+    columns = {"pose": [*range(6)], "rows": [6, 7, 8], "columns": [9, 10, 11], "shift": [12, 13]}
+
+    def gain(*effects: Effect) -> float:
+        used = [column for effect in ("pose", *effects) for column in columns[effect]]
+        return _gain([(matrix[:, :, used], error) for matrix, error in equations], len(columns[effects[-1]]))
+
+    gains = [gain(effect) for effect in both]
     shutter = both[int(np.argmax(gains))] if max(gains) >= _MIN_GAIN else None
-    return shutter, _gain(frames, [shutter] if shutter else [], "shift") >= _MIN_GAIN
+    return shutter, (gain(shutter, "shift") if shutter else gain("shift")) >= _MIN_GAIN
 
 
-def _gain(frames: list[_Frame], known: list[Effect], effect: Effect) -> float:
-    """By how much another effect reduces a film's median reprojection error, as a share of it.
+def _gain(equations: list[tuple[Array, Array]], extra: int) -> float:
+    """By how much the last `extra` parameters reduce a film's median reprojection error, as a share of it.
 
-    All parameters are fitted to every second point, and judged by the other points. The comparison has the effect's
-    median parameters in all frames, or none if that is better: a lens with another distortion than assumed changes all
-    frames equally, which shake does not.
+    All parameters are fitted to every second point, and judged by the other points. The comparison has the median of
+    those parameters in all frames, or zeros if that is better: a lens with another distortion than assumed changes all
+    frames equally, which shake does not. `equations` are those of the film's frames, see `_Frame.equations`.
     """
-    equations = [frame.equations(*known, effect) for frame in frames]
     fitted = [_solution(matrix[::2], error[::2]) for matrix, error in equations]
-    extra = 2 if effect == "shift" else 3
 
     def median_error(common: Array | None) -> float:
-        """With the parameters `common` of the effect in all frames; if None, each frame has its own."""
+        """With the parameters `common` in all frames; if None, each frame has its own."""
         errors = []
         for (matrix, error), solution in zip(equations, fitted, strict=True):
             if common is not None:
@@ -232,14 +243,13 @@ def _solution(matrix: Array, error: Array, present: Array | None = None) -> Arra
     `present` (m − 6,) are skews and shifts to which x adds; None for zeros.
     """
     flat, m = matrix.reshape(-1, matrix.shape[2]), matrix.shape[2]
-    prior = np.concatenate([np.zeros(6), np.full(m - 6, _NOISE / _PRIOR)])
+    prior = np.concatenate([np.zeros(6), np.full(m - 6, (_NOISE / _PRIOR) ** 2)])
     pull = -prior * np.concatenate([np.zeros(6), np.zeros(m - 6) if present is None else present])
     weight = np.ones(len(error))
     for _ in range(_REWEIGHTINGS):
-        each = np.repeat(weight, 2)
-        rows = np.concatenate([flat * each[:, None], np.diag(prior)])
-        solution = np.linalg.lstsq(rows, np.concatenate([error.reshape(-1) * each, pull]), rcond=None)[0]
-        weight = 1.0 / np.sqrt(1.0 + (np.linalg.norm(error - matrix @ solution, axis=1) / _LOSS_SCALE) ** 2)
+        weighted = flat.T * np.repeat(weight, 2)
+        solution = np.linalg.lstsq(weighted @ flat + np.diag(prior), weighted @ error.reshape(-1) + pull, rcond=None)[0]
+        weight = 1.0 / (1.0 + (np.linalg.norm(error - matrix @ solution, axis=1) / _LOSS_SCALE) ** 2)
     return np.asarray(solution)
 
 
