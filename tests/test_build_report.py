@@ -262,8 +262,8 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
         "moves by up to 0.200 m",
     ),
     ("mesh", "mesh.parts", 0, "Nothing solid"),
-    ("mesh", "mesh.parts_left_out", 3, "3 solid part(s) were left out"),
-    ("mesh", "mesh.parts_beyond_bound", 2, "2 solid part(s) stick out"),
+    ("mesh", "mesh.parts_left_out", 3, "3 convex part(s) were left out"),
+    ("mesh", "mesh.parts_beyond_bound", 2, "2 convex part(s) stick out"),
     ("mesh", "mesh.coacd_failed", 1, "1 piece(s)"),
     ("mesh", "mesh.ground", {"corridor_coverage": 0.2}, "Only 20%"),
     ("mjcf", "mjcf.spawn_touched", ["part_0003"], "part_0003"),
@@ -286,8 +286,8 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("truth", "truth.ate_m", 0.2, "The camera path is 0.200 m off"),
     ("truth", "truth.scale_error", -0.05, "The scale is 5.0% off"),
     ("truth", "truth.ground_median_m", 0.2, "The ground is 0.200 m off"),
-    ("truth", "truth.obstacle_median_m", 0.2, "Solid parts are 0.200 m off"),
-    ("truth", "truth.corridor_intrusions", 2, "2 solid part(s) reach into the true corridor"),
+    ("truth", "truth.obstacle_median_m", 0.2, "Convex parts are 0.200 m off"),
+    ("truth", "truth.corridor_intrusions", 2, "2 convex part(s) reach into the true corridor"),
     ("costs", "peak_memory_bytes", 6 * 2**30, "6.0 GiB of memory."),
 ]
 """Every kind of caution: its section, the number that causes it, and what is said of it."""
@@ -427,7 +427,7 @@ def test_charts_are_drawn_from_the_report(scene: SceneDir) -> None:
     text = read(page(scene, REPORT)).text
     assert "24.3 dB (n = 10)" in text
     assert "PSNR during training" in text and "Cross-track error of the drive" in text
-    assert "Ground and solid parts" not in text  # no mesh stage on disk
+    assert "Ground and convex parts" not in text  # no mesh stage on disk
 
 
 def test_a_chart_has_its_heading_as_accessible_name() -> None:

@@ -323,7 +323,7 @@ def test_unusable_films_are_refused_in_one_line(place, film, registered, tmp_pat
     bare = tmp_path / "bare"
     bare.mkdir()
     (bare / "scene.toml").write_text(place.config_file.read_text())
-    assert "has no 2_metric yet; run python -m twin.build" in refused(str(bare), str(film))
+    assert "has no 2_metric yet; run twin build" in refused(str(bare), str(film))
     assert [path.name for path in bare.iterdir()] == ["scene.toml"]
     bent = replace(registered, error=0.9)
     with monkeypatch.context() as patch:

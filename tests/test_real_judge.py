@@ -119,7 +119,7 @@ def test_a_task_goes_from_the_scenes_frame_into_the_true_one(tmp_path, task):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": "other"}, "is not a task; write one: python -m twin.export SCENE --task NAME --task-file FILE"),
+        ({"format": "other"}, "is not a task; write one: twin export SCENE --task NAME --task-file FILE"),
         ({"line": [[0.0, 0.0, 0.0]]}, "line of shape"),
         ({"goal": 500.0}, "goal 500 m on a line of"),
         ({"half_width": None}, "is damaged"),

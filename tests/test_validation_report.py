@@ -164,7 +164,7 @@ def test_the_headline_compares_what_all_have_driven():
     trials += [trial("b", k, "goal" if k < 7 else "stuck") for k in range(10)]
     (verdict,) = verdicts(told(trials))
     assert (
-        "“b” reaches the goal most often: in 7 of 10 episodes in the light that was used for all policies (day)"
+        "“b” reaches the goal most often: in 7 of 10 episodes in the lightings that were used for all policies (day)"
         in verdict.text
         and verdict.mood == "mixed"
     )
@@ -177,7 +177,7 @@ def test_the_headline_compares_what_all_have_driven():
 def test_a_weak_light_and_untrusted_pictures_are_headlines():
     trials = [*(trial("a", k) for k in range(3)), trial("a", 0, "stuck", light="night", trust=0.2)]
     first, second = verdicts(told(trials))
-    assert "least often in the light night, 0 of 1" in first.text
+    assert "least often in lighting night, 0 of 1" in first.text
     assert "1 of 4 episodes" in second.text
 
 
@@ -194,8 +194,8 @@ def test_numbers_have_intervals_and_what_is_missing_is_not_made_up(tmp_path):
     text = page(tmp_path, told([trial("my_module:act")])).text
     assert "not known" in text and "nan" not in text and "None" not in text
     assert "There is no such episode here" in text and "No videos" in text
-    for absent in ("Which policy is better", "The worst light for", "How the policies were trained"):
-        assert (absent in text) == (absent == "The worst light for")
+    for absent in ("Which policy is better", "The worst lighting for", "How the policies were trained"):
+        assert (absent in text) == (absent == "The worst lighting for")
 
 
 def test_the_page_shows_the_numbers_of_the_tables(tmp_path):
@@ -211,10 +211,10 @@ def test_the_page_shows_the_numbers_of_the_tables(tmp_path):
         assert rate_text(cell) in text and failure_text(cell) in text
     assert rate_text(trained["a"]) in text
     assert "the last 100 training episodes that began at the task’s start (the first of them ended at step 20)" in text
-    assert "trained on ahead, in varying light, for 300 steps" in text
+    assert "trained on ahead, in varying lighting, for 300 steps" in text
     tested = {"a": trained["a"] | {"test": {"step": 300, "condition": "held-out"} | rate_summary(37, 40)}}
     shown = page(tmp_path, told(trials, training=tested)).text
-    assert rate_text(tested["a"]["test"]) in shown and "final test, n = 40, light held-out" in shown
+    assert rate_text(tested["a"]["test"]) in shown and "final test, n = 40, lighting held-out" in shown
     assert rate_text(trained["a"]) not in shown
     assert "19" in text and "only A arrived" in text and "“a” is better" in text  # 31 - 12 episodes
     assert rate_text(said["cells"][0]["low_trust"]) in text
@@ -243,7 +243,7 @@ def test_the_verb_writes_a_page_that_needs_nothing_else(fresh):
     assert list(said["training"]) == ["ahead"]  # the other's run has no episodes
     won = [success for step, success in EPISODES if step <= TRAINED["step"]][-RECENT_EPISODES:]
     assert rate_text(rate_summary(sum(won), len(won))) in shown.text and "How the policies were trained" in shown.text
-    assert f"python -m twin.forecast {fresh} --real real.csv" in shown.text and "ahead,ahead,LIGHT" in shown.text
+    assert f"twin forecast {fresh} --real real.csv" in shown.text and "ahead,ahead,LIGHTING" in shown.text
     assert html.count("<svg") == html.count('<svg role="img" aria-label="') > 0
 
 

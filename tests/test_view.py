@@ -344,7 +344,7 @@ def test_a_click_finds_the_filmed_camera(scene):
 
 def test_the_report_says_how_to_look_at_the_scene(scene):
     commands = [line for _, lines in report_page._next_steps(scene.scene, {}) for line in lines]
-    assert f"python -m twin.view {scene.scene.root}" in commands
+    assert f"twin view {scene.scene.root}" in commands
     viewer = next(line for line in commands if "mujoco.viewer" in line)
     assert Path(shlex.split(viewer)[-1].removeprefix("--mjcf=")).is_file()
 
