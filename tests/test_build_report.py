@@ -295,7 +295,7 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
 
 @pytest.fixture
 def no_charts() -> Iterator[None]:
-    """Charts take a second a page and give no caution."""
+    """Replaces the charts, which take a second a page and cause no caution."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report_page, "charts", lambda scene, report: [])
         yield
@@ -332,7 +332,7 @@ def test_every_defect_gives_a_caution_with_a_cure_in_section_and_summary(
 
 
 def test_the_defects_tried_cover_every_kind_of_caution(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A caution that the code can give and the list above lacks would not be tested."""
+    """Otherwise a caution that the code can give, but the list above lacks, would not be tested."""
     makers = (build_sections, build_topics, report_html)
     given: set[tuple[str, int]] = set()
     limits: set[str] = set()
@@ -444,7 +444,7 @@ def test_templates_escape_text_and_refuse_missing_data() -> None:
 
 
 def test_the_page_says_what_to_do_next_in_commands_that_parse(scene: SceneDir) -> None:
-    """For a place whose folder needs quoting; and no training is offered where nothing drives."""
+    """Also if the scene's folder needs quoting; without a drive, no training is proposed."""
     odd = SceneDir(scene.root.parent / "my road's")
     text = read(page(odd, changed("mesh.parts", 0))).text
     assert "Look at the caution above." in text

@@ -64,7 +64,7 @@ def test_the_twin_agrees_with_the_truth(built):
 
 
 def test_the_pictures_beat_a_flat_color(built):
-    """A field that learned nothing scores about what the mean colour does; this one must know the place."""
+    """A field that learned nothing scores about as much as the mean color; this one must score more."""
     root, _ = built
     field = json.loads((root / "build/report.json").read_text())["field"]
     assert all(value > 17 for value in field["psnr"].values()), field["psnr"]
@@ -128,7 +128,7 @@ def test_the_benchmark_of_the_field_runs(built, tmp_path):
 
 @pytest.mark.slow
 def test_it_is_driven_by_what_it_sees(built, tmp_path):
-    """The environment on a real build: pictures that are those of the field, the goal reached, a film."""
+    """In the environment of a real build, pictures show the field, the goal is reached, and a film is written."""
     from twin.env.drivers import RouteDriver
     from twin.env.episode import record_episode
 

@@ -106,8 +106,9 @@ def test_training_and_held_out_lights_never_mix(field):
 
 
 def test_between_training_and_held_out_lights_is_a_gap(field):
-    """A light of a set is a fifth nearer to its own set than to the other one, and on the way from one to the other are
-    lights of neither: else training would see what is next to a held-out light."""
+    """A lighting of a set is a fifth nearer to its own set than to the other one, and lightings between the sets belong
+    to neither. Otherwise training would use lightings that are next to held-out ones.
+    """
     sets, rng = LightingSets(field), np.random.default_rng(2)
     anchors = sets.anchors
 
@@ -210,7 +211,9 @@ def test_smaller_wheels_drive_slower_and_latency_later(scene):
 
 
 def test_larger_wheels_on_the_right_turn_it_to_the_left(scene):
-    """As much as a larger speed of them would: v times the difference over the effective track."""
+    """The yaw rate is that of a larger speed of the right wheels: the difference of the speeds over the effective
+    track.
+    """
     still = {"friction": (1.0, 1.0), "payload": (0.0, 0.0), "latency": (0.0, 0.0), "wheel_radius": (1.0, 1.0)}
 
     def turned(difference: float) -> float:
@@ -292,7 +295,7 @@ def test_the_robot_stands_on_a_hundred_meters_of_relief(tmp_path):
 
 
 def test_parts_within_reach_stay(tmp_path):
-    """Everything whose distance from the corridor is less than the robot's length."""
+    """All parts whose distance from the corridor is less than the robot's length are kept."""
     world = tiny_world(tmp_path)
     kept = {geom.name for geom in episode_spec(world, 0.0, 10.0, 1.0).geoms}
     assert {"part_0000", "part_0001"} <= kept
@@ -361,7 +364,7 @@ def test_a_policy_is_a_function_by_name(scene, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_film_shows_the_drive_to_its_end(scene, tmp_path, capsys):
-    """Slow: the chase camera's kernels compile on first use."""
+    """This test is slow, because the chase camera's kernels compile on first use."""
     out = tmp_path / "drive.mp4"
     arguments = [str(scene.scene.root), "--task", "ahead", "--lighting", "night", "--out", str(out)]
     assert main(arguments) == 0

@@ -203,7 +203,7 @@ def test_every_real_lighting_is_left_out_once() -> None:
 
 
 def predicted(twin: np.ndarray, real: np.ndarray, at: float) -> tuple[float, float, float]:
-    """Textbook regression: the value at a twin score, and the ends of its nine-in-ten interval."""
+    """Textbook regression: the value at a twin score, and the ends of its 90 % interval."""
     line, n = stats.linregress(twin, real), len(twin)
     value = float(np.clip(line.intercept + line.slope * at, 0.0, 1.0))
     spread = np.sqrt(np.sum((real - line.intercept - line.slope * twin) ** 2) / (n - 2))
@@ -213,7 +213,7 @@ def predicted(twin: np.ndarray, real: np.ndarray, at: float) -> tuple[float, flo
 
 
 def test_a_lighting_left_out_is_predicted_by_the_others_alone() -> None:
-    """Dusk differs from the rest: a line fitted to it, too, would be closer."""
+    """Dusk differs from the rest; a line that was fitted to it, too, would be closer."""
     twin, real = cells(n=9, driven=9)
     real = [replace(c, successes=c.trials - c.successes) if c.lighting == "dusk" else c for c in real]
     rates, lights = {c.key: c.rate for c in twin}, np.array([c.lighting for c in real])
@@ -227,7 +227,7 @@ def test_a_lighting_left_out_is_predicted_by_the_others_alone() -> None:
 
 
 def test_policies_left_out_are_predicted_at_the_stated_confidence() -> None:
-    """As many are within the interval as by the textbook; within the one of half the cases there are fewer."""
+    """The coverage equals that of the textbook; the 50 % interval contains fewer."""
     twin, real = cells(n=12, driven=12)
     made = make_forecast("road", twin, real)
     driven = [c for c in made.candidates if c.driven]
@@ -320,7 +320,7 @@ def test_uneven_lightings_are_named() -> None:
 
 
 def tile_texts(figure) -> dict[tuple[str, str], str]:
-    """By row and column."""
+    """Texts of the tiles by row and column."""
     (axes,) = figure.axes
     rows, columns = ([text.get_text() for text in ticks] for ticks in (axes.get_yticklabels(), axes.get_xticklabels()))
     assert len(axes.collections[0].get_paths()) == len(axes.texts)
@@ -328,7 +328,7 @@ def tile_texts(figure) -> dict[tuple[str, str], str]:
 
 
 def test_many_cells_are_heatmaps_above_a_collapsed_table() -> None:
-    """The twin's by its own lightings: one that stands for many of the road is shown once."""
+    """A lighting of the twin that is compared with several real ones has one column."""
     few, many = (
         make_forecast("road", *cells(n=6, driven=6, tasks=tasks)) for tasks in (("straight",), ("a", "b", "c"))
     )
@@ -510,7 +510,7 @@ def test_intervals_leave_trainings_and_days_out() -> None:
 
 
 def test_checkpoints_of_few_trainings_have_no_interval() -> None:
-    """As many policies, but of three trainings."""
+    """The number of policies is the same, but they come from three trainings."""
     twin, real = days()
     names = {f"p{i}": f"run{i // 3}/{i}" for i in range(9)}
     twin, real = ([replace(c, policy=names[c.policy]) for c in some] for some in (twin, real))

@@ -121,7 +121,7 @@ def test_a_ply_is_read_as_it_was_written(tmp_path) -> None:
 
 
 def _sky_views(gap_rgb) -> list[Views]:
-    """Two lightings of one view of a sky, a floor, and a crown whose one half has the color of the sky, changed."""
+    """Two lightings of one view of a sky, a floor, and a tree crown; half the crown has the sky's color plus `gap_rgb`."""
     one = floor_views([(0.0, -2.0, 0.3)])
     one.camera_to_world[0] = look_at(np.array([0.0, -2.0, 0.3]), np.array([0.0, 0.0, 0.8]))
     rays = one.points(0, np.ones(SIZE[::-1])) - one.camera_to_world[0, :3, 3]

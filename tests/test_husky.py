@@ -137,7 +137,9 @@ def test_belt_couples_the_wheels_of_a_side():
 
 
 def test_front_camera_has_the_given_intrinsics():
-    """MuJoCo's own frustum (no OpenGL needed) against fx ≠ fy and an off-centre principal point, through the XML."""
+    """MuJoCo's own frustum (which needs no OpenGL) has the fx ≠ fy and the off-center principal point that the XML
+    contains.
+    """
     fx, fy, cx, cy = 125.0, 126.25, 90.0, 30.0
     spec = mujoco.MjSpec()
     add_husky(spec, camera=PixelCamera((fx, fy, cx, cy), (160, 90)))
@@ -184,7 +186,7 @@ def test_shipped_file_is_up_to_date():
 
 
 def test_shipped_file_attaches_and_drives_like_the_model():
-    """Attached to another model by `MjSpec.attach`, with `set_options`, against the model of the acceptance table."""
+    """After `MjSpec.attach` and `set_options`, the file drives like the model of the acceptance table."""
     spec = mujoco.MjSpec()
     set_options(spec)
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(50, 50, 1), pos=(0, 0, 0.5))

@@ -67,7 +67,7 @@ def _parts(folder: Path) -> list[ConvexPart]:
 
 @pytest.fixture(scope="module")
 def stood(made):
-    """Views, ground, corridor, path and box of the place, from which the fusion starts."""
+    """Views, ground, corridor, path and box of the place: the input of the fusion."""
     folder, facts = made
     cameras = Cameras.load(folder.parent / "2_metric")
     views = render_views(PLACE, cameras, 14, 100, FREE_SPACE_REACH * (SETTINGS.margin + 2.0))
@@ -226,7 +226,7 @@ def test_views_are_per_length_of_a_long_route(made, monkeypatch, counted_length,
 
 
 def test_corridor_of_a_branch_is_free(made, tmp_path):
-    """It passes so close to the wall that the wall is cut back; beside the route alone the wall stands."""
+    """The branch passes so close to the wall that the wall is cut back; the route alone leaves the wall whole."""
     root = made[0].parent
     cameras = Cameras.load(root / "2_metric")
     branch = BranchConfig(name="left", points=((0.0, 0.3), (3.0, 0.95), (11.0, 0.95), (12.0, 0.9)))

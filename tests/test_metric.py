@@ -229,7 +229,7 @@ def test_a_road_without_texture_is_found_beside_the_path() -> None:
 
 
 def _to_gps(enu: np.ndarray) -> np.ndarray:
-    """East, north, up [m] near Lund as latitude, longitude, altitude; good to millimetres over 100 m."""
+    """East, north, up [m] near Lund as latitude, longitude, altitude; accurate to millimeters over 100 m."""
     lat0, lon0, eps = 55.7, 13.2, 1e-4
     origin = np.array([[lat0, lon0, 50.0]])
     north = local_east_north_up(np.concatenate([origin, origin + np.array([[eps, 0, 0]])]))[1, 1] / eps

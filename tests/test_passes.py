@@ -101,7 +101,7 @@ def test_noise_and_an_outlier_are_smoothed_away():
 
 
 def _driven(steps: list[float]) -> np.ndarray:
-    """A path whose steps are these [m], turning slowly."""
+    """A slowly turning path with these step lengths [m]."""
     x = np.concatenate([[0.0], np.cumsum(steps)])
     return np.stack([60.0 * np.sin(x / 60.0), 60.0 - 60.0 * np.cos(x / 60.0)], -1)
 

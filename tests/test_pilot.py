@@ -257,7 +257,7 @@ def test_stamps_from_the_future_stop_it(policy):
 
 
 class Network:
-    """Stands in for ONNX Runtime's session: returns what it is told, and takes time."""
+    """Stands in for ONNX Runtime's session: returns given values after a given time."""
 
     def __init__(self, session, clock: Clock) -> None:
         self._session, self._clock, self.takes, self.output = session, clock, 0, None

@@ -79,7 +79,7 @@ def told(trials, **more) -> dict:
 
 
 def page(folder: Path, said: dict, *curves: TrainingCurve) -> Text:
-    """The page's text; the maps are any picture."""
+    """The page's text; a placeholder replaces the maps."""
     from PIL import Image
 
     for task in {c["task"] for c in said["cells"]}:
@@ -158,7 +158,7 @@ def test_every_cause_has_words():
 
 
 def test_the_headline_compares_what_all_have_driven():
-    """`b` is better where both were; that `a` also drove in easy light does not help it."""
+    """`b` is better in the lightings of both; `a` also drove in an easy one, which must not count."""
     trials = [trial("a", k, "goal" if k < 4 else "stuck") for k in range(10)]
     trials += [trial("a", k, light="easy") for k in range(90)]
     trials += [trial("b", k, "goal" if k < 7 else "stuck") for k in range(10)]
@@ -248,7 +248,7 @@ def test_the_verb_writes_a_page_that_needs_nothing_else(fresh):
 
 
 class NoCamera:
-    """In place of the camera behind the robot, whose kernels take long to compile."""
+    """Replaces the camera behind the robot, whose kernels take long to compile."""
 
     def __init__(self, world, size, obstacles):
         self.size = size
@@ -259,7 +259,7 @@ class NoCamera:
 
 @pytest.fixture
 def episodes(monkeypatch):
-    """Every episode that is filmed."""
+    """Stores every episode that is filmed."""
     seen = []
 
     def spy(*args, **options):
@@ -308,7 +308,7 @@ def test_a_film_that_ends_otherwise_than_the_table_is_refused(fresh, episodes):
 
 
 def test_any_policy_can_be_filmed_in_the_environment_it_asks_for(fresh, episodes, tmp_path, monkeypatch, capsys):
-    """A run, its folder and its ONNX file drive alike; a callable drives, too; what is no policy is one line."""
+    """A run, its folder and its ONNX file drive alike; so does a callable; anything else is refused in one line."""
     (tmp_path / "my_film_policy.py").write_text("def act(pixels):\n    return [0.0, 0.5]\n")
     monkeypatch.chdir(tmp_path)
     run = fresh / "runs" / "ahead"
@@ -336,7 +336,7 @@ def test_a_curve_has_points_of_five_episodes_and_no_more_than_it_can_show(count)
 
 
 def test_a_robot_without_identified_parameters_gives_a_caution():
-    """Where episodes are drawn anew and nothing is known of the robot, it says what would tell."""
+    """The caution appears if episodes are randomized and no parameter of the robot is identified; it names the cure."""
 
     def cautions(light: str, **more) -> str:
         return " ".join(c.what for c in limitations(told([trial(light=light)], **more)))
@@ -349,7 +349,7 @@ def test_a_robot_without_identified_parameters_gives_a_caution():
 @pytest.mark.filterwarnings("error::UserWarning")
 @pytest.mark.parametrize("lights", [2, MAX_PLOTTED_LIGHTINGS, 11])
 def test_names_of_many_lightings_leave_room_for_the_rates(lights):
-    """A legend wider than the figure, or names taller than it, would squeeze its axes to nothing."""
+    """A legend wider than the figure, or names taller than it, would leave no room for the axes."""
     names = [f"afternoon_of_day_{k}+randomised" for k in range(lights)]
     cells = summarize([trial(light=name) for name in names])["cells"]
     figure = rate_figure(cells) if lights <= MAX_PLOTTED_LIGHTINGS else rate_heatmap(cells, {})
@@ -370,7 +370,7 @@ def tiles(figure) -> dict[tuple[str, str], tuple[str, tuple[float, ...]]]:
 
 
 def test_many_lightings_are_a_heatmap_with_the_mean_of_the_shared_ones():
-    """`a` is better in every light; a mean over what each drove, or over episodes, would say otherwise."""
+    """`a` is better in every lighting; a mean over each policy's own lightings, or over episodes, would favor `b`."""
     assert MAX_PLOTTED_LIGHTINGS < 6
     won = {"a": [0, 25, 100, 100, 100, 100], "b": [None, None, 100, 75, 75, 75]}
     trials = [
@@ -399,7 +399,7 @@ def test_where_no_lighting_is_shared_there_is_no_mean():
 
 
 def test_paired_comparisons_are_a_heatmap_with_the_best_on_top():
-    """`good` arrives in 20 episodes, `fair` in 2, `poor` in none: two more may be chance."""
+    """`good` arrives in 20 episodes, `fair` in 2, `poor` in none; a difference of two may be chance."""
     won = {"poor": 0, "good": 20, "fair": 2}
     trials = [trial(name, seed, "goal" if seed < n else "collision") for name, n in won.items() for seed in range(20)]
     drawn = tiles(pair_heatmap(summarize(trials)["pairs"]))

@@ -364,7 +364,7 @@ def test_station_and_lateral_are_the_inverse_of_the_pose(scene):
 
 
 class _Drive:
-    """A drive whose keys and facts a test sees; its thread stands still, and the test steps."""
+    """A drive whose keys and facts a test sets and reads; its thread does not run, and the test makes the steps."""
 
     def __init__(self, scene, field, **more):
         self.keys, self.facts = frozenset(), []

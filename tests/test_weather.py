@@ -113,7 +113,7 @@ FOG = Fog(0.1, (0.9, 0.8, 0.7))
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    """A built scene that also knows the light of its first lighting in two airs."""
+    """A built scene with two added lightings that have the embedding of the first filmed one: one clear, one in fog."""
     runtime.set_quiet(True)
     scene = SceneDir(tiny_twin(tmp_path_factory.mktemp("photos")))
     day = [float(x) for x in twin.load_scene(scene.root).field().embedding("day")]
@@ -238,9 +238,9 @@ LEFT = np.array([0.0, np.cos(LOW), np.sin(LOW)])
 
 
 def street(ground: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Of a camera at the end of a street along x, looking along x: depth, points, and masks of what is seen.
+    """Depth, points and masks of the surfaces that a camera sees at the end of a street along x, looking along x.
 
-    The ground is so far below the camera [m]; walls end 6 m above it.
+    `ground` is the height of the camera above the ground [m]; walls end 6 m above the camera.
     """
     left, up = -RAYS[..., 0], -RAYS[..., 1]
     with np.errstate(divide="ignore"):
@@ -256,8 +256,9 @@ def street(ground: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]
 
 
 def test_evaluation_weather_is_never_mild():
-    """The road never has the film's sun: every draw of an evaluation shows another one, and shadows not filmed. Those
-    of training begin at none."""
+    """A real road never has the film's sun: every sample of an evaluation has another sun, and shadows that were not
+    filmed. Samples of training may have neither.
+    """
     ranges, rng = condition_options(Condition("day", True))["randomise"], np.random.default_rng(0)
     tried, trained = ([one.sample(rng) for _ in range(300)] for one in (ranges, Ranges()))
     for strength in ("sunlight", "shade"):
@@ -271,7 +272,7 @@ def test_evaluation_weather_is_never_mild():
 
 
 def test_a_shadow_lies_on_the_side_away_from_the_sun():
-    """What is dark above the ground darkens the ground where the sun's ray through it ends, and not before it."""
+    """A dark point above the ground darkens the ground where the sun's ray through the point ends, and nowhere else."""
     rng, differ = np.random.default_rng(0), []
     one = np.ones((200, 200, 3), np.float32)
     for turned in rng.uniform(0.0, 2.0 * np.pi, 8):

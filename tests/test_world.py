@@ -67,7 +67,7 @@ def test_heights_are_right_to_a_millimeter(exported):
 
 
 def test_coarse_height_field_keeps_nodes_and_colors_in_place(tmp_path):
-    """Nodes of the coarse field are nodes of the fine one; the texture has a texel per fine cell of the rest."""
+    """The coarse field's nodes are nodes of the fine one; the texture has a texel per fine cell."""
     ground = tiny_ground()
     rgb = np.random.default_rng(5).integers(0, 255, (*ground.height.shape, 3)).astype(np.uint8)
     ground = type(ground)(ground.height, ground.origin, ground.cell, ground.measured, rgb)
@@ -225,7 +225,7 @@ def test_a_start_inside_a_part_is_refused(tmp_path):
 
 
 def on_a_slope(tmp_path, degrees: float, robot: HuskyParams, **scene_arguments):
-    """The tiny scene on a plane that falls towards the robot's back, and the error of its export."""
+    """The tiny scene on a plane that falls towards the robot's back, and the error that its export raises."""
     scene = tiny_scene(tmp_path, **scene_arguments)
     flat = tiny_ground()
     x = np.broadcast_to(np.arange(flat.height.shape[1]) * flat.cell, flat.height.shape)
@@ -271,7 +271,7 @@ def test_a_start_too_steep_for_the_tires_is_refused(tmp_path):
     ],
 )
 def test_a_copy_that_moves_differently_is_a_bug(tmp_path, written, instead):
-    """On a steep start, where the robot's weight loads the tires."""
+    """The start is steep, so that the robot's weight loads the tires."""
     out, _ = on_a_slope(tmp_path, 25.0, HuskyParams())
     built = World.load(out).model()
     assert check_portable(out, built)["spawn_drift_m"] < 0.005
@@ -296,7 +296,7 @@ def test_rest_pose_follows_the_slope():
 
 
 def test_texels_interpolate_corner_colors_exactly():
-    """Bilinear lookup in the texture, by hand, against the linear interpolation of the corners."""
+    """Bilinear lookup in the texture equals linear interpolation of the corners' colors."""
     rng = np.random.default_rng(2)
     colors = rng.integers(60, 120, (7, 3, 3)).astype(np.uint8)  # no clamping of the fourth texel
     texture, texcoords = face_texture(colors)
@@ -312,7 +312,7 @@ def test_texels_interpolate_corner_colors_exactly():
 
 
 def test_texture_coordinates_survive_the_obj(exported):
-    """The color looked up through the compiled model equals the mesh's own at a face's corner."""
+    """The color looked up through the compiled model is the mesh's own color at a face's corner."""
     folder, _ = exported
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     with np.load(folder.parent / "4_mesh" / "visual.npz") as data:
@@ -378,7 +378,7 @@ def test_tiny_world_is_a_drivable_model(tmp_path):
 
 
 def test_projection_is_vectorized():
-    """A route of uneven segments that meets itself, and a range for each point."""
+    """The route has uneven segments and meets itself; each point has its own range."""
     rng = np.random.default_rng(0)
     angle = np.sort(rng.uniform(0.0, 4.0 * np.pi, 160))
     route = np.stack([3.0 * np.sin(angle), 2.0 * np.sin(2.0 * angle)], -1)  # an eight, twice around
