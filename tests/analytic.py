@@ -21,7 +21,7 @@ FAR = 200.0  # [m] depth of the sky
 
 
 class Box(NamedTuple):
-    """Centre (x, y), size along its own x and y, top above z = 0 [m], heading [rad]."""
+    """Center (x, y), size along its own x and y, top above z = 0 [m], heading [rad]."""
 
     x: float
     y: float
@@ -163,7 +163,7 @@ def _into(xy: Array, heading: float) -> Array:
 
 
 def right_turn(length: float = 60.0, straight: float = 30.0, radius: float = 6.0, step: float = 0.75) -> Array:
-    """Points (x, y) every `step` metres of a straight along +x, a right quarter turn and a straight on."""
+    """Points (x, y) every `step` meters of a straight along +x, a right quarter turn and a straight on."""
     s = np.arange(0.0, length + 1e-9, step)
     arc = radius * np.pi / 2
     angle = np.clip((s - straight) / radius, 0.0, np.pi / 2)

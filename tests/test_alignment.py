@@ -168,7 +168,7 @@ def test_viscosity_drags_tires_but_not_the_chassis():
         return data.qfrc_fluid[:3].copy()
 
     assert not drag(HuskyParams()).any()
-    # Stokes drag of a sphere as wide as the tyre on the mean, four of them (MuJoCo's ellipsoid model).
+    # Stokes drag of a sphere as wide as the tire on the mean, four of them (MuJoCo's ellipsoid model).
     width = 2 * (0.1651 + 0.1143 / 2 + 0.1651) / 3
     assert drag(HuskyParams(ground_viscosity=5.0))[0] == pytest.approx(-4 * 3 * np.pi * width * 5.0 * 0.5, rel=0.01)
 

@@ -59,7 +59,7 @@ def test_the_twin_agrees_with_the_truth(built):
     root, _ = built
     truth = json.loads((root / "build/report.json").read_text())["truth"]
     assert truth["ate_m"] < 0.08 and truth["ate_max_m"] < 0.30
-    assert abs(truth["scale_error"]) < 0.05  # a dozen metres and quick settings; the demo is held to 2 %
+    assert abs(truth["scale_error"]) < 0.05  # a dozen meters and quick settings; the demo is held to 2 %
     assert truth["ground_median_m"] < 0.08
 
 
@@ -157,7 +157,7 @@ def test_the_benchmark_of_the_environment_runs(built, tmp_path):
     assert done.returncode == 0, done.stderr[-3000:]
     figures = json.loads(file.read_text())
     assert figures["single.steps_per_s"] > 1 and figures["batch8.steps_per_s"] > 1
-    assert figures["driver.success"] == 1.0 and figures["driver.blind.route"] <= 1.0  # a dozen nearly straight metres
+    assert figures["driver.success"] == 1.0 and figures["driver.blind.route"] <= 1.0  # a dozen nearly straight meters
     assert figures["soak.not_finite"] == 0 and figures["audit.false_successes"] == 0
     assert figures["trust.pictures"] > 10
     assert figures["host.steps_per_s"] > 1

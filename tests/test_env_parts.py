@@ -1,4 +1,4 @@
-"""Parts of the environment: stretches of a route, lightings and their sets, randomisation, trust, the scene's model,
+"""Parts of the environment: stretches of a route, lightings and their sets, randomization, trust, the scene's model,
 recorded episodes, the audit and the film."""
 
 from dataclasses import replace
@@ -161,7 +161,7 @@ def test_sampled_lightings_follow_the_option(field):
     assert isinstance(sample_lighting("any", False, 1.0, sets, rng), EpisodeLighting)
 
 
-# ---- randomisation
+# ---- randomization
 
 
 def test_randomization_sample_changes_the_model_as_stated(scene):

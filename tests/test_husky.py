@@ -38,7 +38,7 @@ def test_the_robot_balances_at_its_center_of_mass():
     assert model.body("base_link").mass[0] == pytest.approx(46.034)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    for name in WHEELS:  # balanced: the centre of mass is on the axle, in the middle of the tyre
+    for name in WHEELS:  # balanced: the center of mass is on the axle, in the middle of the tire
         np.testing.assert_allclose(data.body(f"{name}_wheel").xipos, data.geom(f"{name}_tyre").xpos, atol=1e-9)
     base = data.body("base_link")
     np.testing.assert_allclose(base.subtree_com - base.xpos, center_of_mass(HuskyParams()))
@@ -48,7 +48,7 @@ def test_payload_moves_the_center_of_mass():
     params = HuskyParams(payload_mass=10.0, payload_position=(0.2, 0.1, 0.4))
     expected = (MASS * center_of_mass(HuskyParams()) + 10.0 * np.array([0.2, 0.1, 0.4])) / (MASS + 10.0)
     np.testing.assert_allclose(center_of_mass(params), expected)
-    # Huygens and Steiner about the common centre, by hand for the yaw axis.
+    # Huygens and Steiner about the common center, by hand for the yaw axis.
     model = on_plane(params)
     chassis = 46.034 * np.array([0.0, 0.0, 0.062]) / 56.034 + 10.0 * np.array([0.2, 0.1, 0.4]) / 56.034
     yaw = 2.0296 + 46.034 * (chassis[:2] ** 2).sum() + 10.0 * ((np.array([0.2, 0.1]) - chassis[:2]) ** 2).sum()

@@ -217,7 +217,7 @@ def test_a_shifted_mesh_is_as_far_off_as_it_was_shifted(off):
     true, mesh = Surface(square, faces), Surface(square + lift, faces)
     found = mesh_quality(true.distance(points + lift), mesh.distance(points))
     assert found["mesh_accuracy_median_m"] == pytest.approx(off, abs=1e-6)
-    assert found["mesh_chamfer_m"] == pytest.approx(min(off, 1.0), abs=1e-6)  # what is missing counts one metre
+    assert found["mesh_chamfer_m"] == pytest.approx(min(off, 1.0), abs=1e-6)  # what is missing counts one meter
     assert found["mesh_completeness_5cm"] == (off <= 0.05)
     assert found["mesh_completeness_10cm"] == (off <= 0.1)
 

@@ -48,7 +48,7 @@ def test_metrics_are_those_of_the_scene(exported):
     assert metrics["route_length_m"] == pytest.approx(arc_lengths(tiny_route())[-1])
     assert metrics["turn_deg"] == pytest.approx(-90, abs=3)
     assert metrics["spawn_touched"] == []
-    # The nearest box's near edge is 1.9 m to the left, the robot's tyre 0.34 m.
+    # The nearest box's near edge is 1.9 m to the left, the robot's tire 0.34 m.
     assert 1.5 < metrics["spawn_clearance_m"] < 4.0
     assert metrics["spawn_drift_m"] < 0.001
 
@@ -107,7 +107,7 @@ def test_level_ground_is_level(tmp_path):
 
 
 def test_parts_keep_their_places(exported):
-    """MuJoCo moves a mesh to its own centre and axes; in the world its corners must be back in place."""
+    """MuJoCo moves a mesh to its own center and axes; in the world its corners must be back in place."""
     folder, _ = exported
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     data = mujoco.MjData(model)
@@ -210,7 +210,7 @@ def test_a_route_that_is_too_short_is_refused(tmp_path):
 
 
 def test_geoms_touched_at_the_start_are_reported(tmp_path):
-    scene = tiny_scene(tmp_path, boxes=((0.0, 0.62, 0.8),))  # 2 cm into the left tyres
+    scene = tiny_scene(tmp_path, boxes=((0.0, 0.62, 0.8),))  # 2 cm into the left tires
     out = scene.stage("mjcf")
     out.mkdir()
     assert run(scene, tiny_config(), out)["spawn_touched"] == ["part_0000"]
@@ -238,7 +238,7 @@ def on_a_slope(tmp_path, degrees: float, robot: HuskyParams, **scene_arguments):
 
 
 SOFT = HuskyParams(friction=0.25, spin_friction=0.02, slip_stiffness=1 / 40, ground_viscosity=5.0)
-"""As fitted on soft ground: tyres that creep down any slope."""
+"""As fitted on soft ground: tires that creep down any slope."""
 
 
 @pytest.mark.parametrize("degrees", [2.0, 5.0, 12.0])

@@ -87,7 +87,7 @@ def filmed_corridor(root: Path, frames: int = 6) -> SceneDir:
         image = picture(pose)
         write_image(cameras.image_path(i), image)
         found = cv2.SIFT_create(1500).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-        pixels = np.unique(np.array([k.pt for k in found]) + 0.5, axis=0)  # OpenCV's first pixel centre is 0, 0
+        pixels = np.unique(np.array([k.pt for k in found]) + 0.5, axis=0)  # OpenCV's first pixel center is 0, 0
         places.append(hits(pixels, pose)[0])
         seen.append(np.full(len(pixels), i))
     xyz, frame = np.concatenate(places), np.concatenate(seen)
