@@ -297,7 +297,7 @@ def test_fields_of_the_scene_that_override_fitted_ones_are_named(tmp_path, monke
         assert main([str(target), str(log)]) == 0
         assert "overrides fitted values: friction;" in capsys.readouterr().out, target
     assert main([str(scene), str(log), "--out", str(tmp_path / "out")]) == 0
-    assert "overrides fitted values" not in capsys.readouterr().out  # what lies there is not the scene's
+    assert "overrides fitted values" not in capsys.readouterr().out  # that folder is not the scene's
 
 
 @pytest.mark.parametrize("out", ["file/out", "taken"])

@@ -88,7 +88,7 @@ def test_angles_turn_the_camera():
     np.testing.assert_allclose(axes(camera_roll=20.0)[0], [0.0, -cosine, -sine], atol=1e-12)
     both = axes(camera_yaw=20.0, camera_roll=20.0)
     np.testing.assert_allclose(both @ both.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(-both[2], [cosine, sine, 0.0], atol=1e-12)  # leaning does not turn where it looks
+    np.testing.assert_allclose(-both[2], [cosine, sine, 0.0], atol=1e-12)  # roll does not change the viewing direction
 
 
 def test_the_camera_is_where_the_model_has_it(tmp_path):

@@ -99,7 +99,7 @@ def test_training_and_held_out_lights_never_mix(field):
         for _ in range(20):
             assert sets.set_and_anchor(sets.sample(which, rng))[0] == which
     assert all(sets.set_and_anchor(field.embedding(name))[0] == TRAINING for name in field.lightings)
-    # Nearer to each other than to their own set is nobody.
+    # No two lightings of different sets are equal.
     train, held = ([sets._probe_colors(sets.sample(w, rng)) for _ in range(15)] for w in (TRAINING, HELD_OUT))
     gap = min(float(np.sqrt(((a - b) ** 2).mean())) for a in train for b in held)
     assert gap > 0.0
@@ -259,8 +259,8 @@ def test_measured_parameters_are_held_in_evaluation():
     ]
     seen.append(EVALUATION_RANGES.for_robot(HuskyParams(camera_height=0.59)).sample(np.random.default_rng(1)))
     assert [any(d.camera_shift) for d in seen] == [False, False] and [any(d.camera_turn) for d in seen] == [False, True]
-    assert EVALUATION_RANGES.for_robot(HuskyParams()) == EVALUATION_RANGES  # nothing is known of it
-    assert Ranges().for_robot(robot) == Ranges()  # training goes on drawing it
+    assert EVALUATION_RANGES.for_robot(HuskyParams()) == EVALUATION_RANGES  # no parameter is known
+    assert Ranges().for_robot(robot) == Ranges()  # training still samples it
 
 
 # ---- the model of an episode
@@ -424,7 +424,7 @@ def test_audit_finds_holes_only_where_they_are(scene, tmp_path):
     assert found.false_successes == 0 and found.events["episode_tunnelling"] == found.events["tunnelling"] == 0
     assert found.events["episode_wall_sliding"] == found.events["gap"] == found.events["climbing"] == 0
     assert set(found.summary()["steps_with"]) == {*EVENTS, *(f"episode_{name}" for name in EVENTS)}
-    # A visual mesh across the road that nothing solid stands for is a gap.
+    # A visual mesh across the road without convex parts is a gap.
     import audit as module
 
     seen = VisualMesh(stage.world)

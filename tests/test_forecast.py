@@ -164,7 +164,7 @@ def test_policies_not_driven_are_predicted_from_the_others() -> None:
     assert {c.policy for c in further} == {"p7", "p8"}
     for c in further:
         assert c.corrected.value is not None and c.corrected.n == 7
-        # The twin promises too much, and the correction takes it back.
+        # The twin's rates are too high; the correction lowers them.
         assert c.corrected.value < (c.twin.value or 0.0)
     driven = [c for c in made.candidates if c.driven]
     assert all(c.corrected.n == 6 for c in driven)
@@ -541,13 +541,13 @@ def test_the_twin_is_scored_against_guesses_without_it() -> None:
     scores = {it.predictor: it for it in group.scores}
     own, others, shuffled = scores[TWIN], scores[OTHERS], scores[SHUFFLED]
     assert own.gain.value is None and others.gain.value == pytest.approx(others.log.value - own.log.value)
-    assert others.gain.low > 0.0 and shuffled.gain.value > 0.0  # days differ, and the twin knows how
+    assert others.gain.low > 0.0 and shuffled.gain.value > 0.0  # days differ, and the twin predicts how
     assert sum(it.cells for it in group.calibration) == group.cells == 45
     assert [it.day for it in group.errors] == [f"day{k}" for k in range(5)]
     rates = {c.key: c.rate for c in real}
     wrong = sum(it.misses + it.false_alarms for it in group.errors)
     assert 0 < wrong < 12 and sum((rate >= 0.5) for rate in rates.values()) > 10
-    # A twin that knows nothing of a day gains nothing by its days.
+    # A twin that does not distinguish days is no better than with shuffled days.
     flat = [replace(c, successes=round(np.mean([o.successes for o in twin if o.policy == c.policy]))) for c in twin]
     (group,) = make_forecast("road", flat, real).groups
     assert {it.predictor: it.gain.value for it in group.scores}[SHUFFLED] == pytest.approx(0.0, abs=1e-9)
@@ -563,7 +563,7 @@ def test_the_first_sentence_says_what_may_be_believed() -> None:
     rates = pair_cells(real, {c.key: c for c in twin}).rates()
     different = sum(abs(a - b) > 1e-9 for i, a in enumerate(rates["real"]) for b in rates["real"][:i])
     assert sum(it.pairs for it in group.ordered) == different
-    # A twin that has the order backwards is not to be believed, however large its differences.
+    # A twin with the reverse order must not be believed, however large its differences.
     worse = [replace(c, successes=c.trials - c.successes) for c in twin]
     first = verdicts(make_forecast("road", worse, real))[0]
     assert first.mood == "bad" and first.text.startswith("No order of two policies in the twin may be believed yet")

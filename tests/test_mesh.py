@@ -183,7 +183,7 @@ def test_no_parts_in_free_space(made):
     folder, facts = made
     corners = np.concatenate([part.vertices for part in _parts(folder)])
     corners = corners[corners[:, 2] > PLACE.ground(corners[:, :2]) + 0.2]
-    # Hidden space behind a front counts as solid for half a meter, beyond the two voxels that the front's band is deep.
+    # Behind a front, two voxels of its band and 0.3 m of hidden space count as solid; the bound is 0.3 m wider.
     assert PLACE.distance_to_obstacles(corners).max() < 0.5 + 2 * 0.15 + 0.1
     assert facts["parts_beyond_bound"] == 0 and facts["max_protrusion_m"] <= 0.2
 

@@ -271,7 +271,9 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
     trials = read_trials(out.with_name("results_trials.csv"))
     assert len(trials) == 8 and len(cells) == 4
     starts = {(t.lighting, t.seed) for t in trials}
-    assert len(starts) == len({seed for _, seed in starts}) == 4  # alike for both policies, others in other weather
+    assert (
+        len(starts) == len({seed for _, seed in starts}) == 4
+    )  # the same for both policies, others in another weather
     for cell in cells:
         mine = [t for t in trials if (t.policy, t.lighting) == (cell.policy, cell.lighting)]
         assert (cell.trials, cell.successes) == (len(mine), sum(t.success for t in mine))

@@ -139,7 +139,7 @@ def test_training_is_the_last_episodes_before_the_policy_was_saved(tmp_path):
     with pytest.raises(InputError, match=r"choice\.json is damaged .*41 successes in 40 trials"):
         training_summaries(tmp_path, heads)
     (run / "choice.json").unlink()
-    # The run was trained on, or is another one: its curve is not that of the policy that was validated.
+    # If the run was trained further or replaced, its curve is not that of the validated policy.
     write_json(heads["r"], {"trained": {"step": 4000}})
     assert set(training_summaries(tmp_path, ["r", "r/5"])) == {"r/5"}
     shutil.rmtree(tmp_path / "validation")
@@ -290,7 +290,7 @@ def test_films_are_the_tables_episodes(fresh, episodes):
         assert video_info(folder / one["file"])["frames"] > row.steps // 2
     shown = Text((folder / "validation.html").read_text(encoding="utf-8"))
     assert {f["file"] for f in said["films"]} <= set(shown.links) and "any row of episodes.csv" in shown.text
-    # What is filmed stays, is not filmed again, and is still on the page of a call that films nothing.
+    # Films are kept, not made again, and still shown after a call without --films.
     before = len(episodes)
     assert validate.validate(fresh, ["ahead", "left"], "ahead", ["night", "held-out"], 3, films=True) == said
     assert validate.validate(fresh, ["left"], "ahead", ["night"], 2)["films"] == said["films"]
@@ -434,5 +434,5 @@ def test_long_tables_are_collapsed_below_a_figure(tmp_path):
         parts = [html[start : html.index("</section>", start)] for start in starts]
         return [(part.count("<svg"), part.count("<details")) for part in parts]
 
-    assert sections(trials) == [(1, 2), (1, 1), (0, 1)]  # the first has what the words mean, too
+    assert sections(trials) == [(1, 2), (1, 1), (0, 1)]  # the first also has the definitions
     assert sections([t for t in trials if t.policy in "p0 p1"]) == [(1, 1), (0, 0), (0, 0)]

@@ -238,7 +238,7 @@ def on_a_slope(tmp_path, degrees: float, robot: HuskyParams, **scene_arguments):
 
 
 SOFT = HuskyParams(friction=0.25, spin_friction=0.02, slip_stiffness=1 / 40, ground_viscosity=5.0)
-"""As fitted on soft ground: tires that creep down any slope."""
+"""A robot fitted on soft ground, whose tires creep down any slope."""
 
 
 @pytest.mark.parametrize("degrees", [2.0, 5.0, 12.0])
@@ -248,8 +248,8 @@ def test_a_robot_fitted_on_soft_ground_starts_on_a_slope(tmp_path, degrees, serv
     world = World.load(out)
     start = tiny_route()[0] - [BASE_HEIGHT * np.sin(np.radians(degrees)), 0.0]  # wheels at the route's start
     assert np.hypot(*(world.spawn[:2] - start)) < 0.005  # and not where it would have crept to
-    assert metrics["spawn_drift_m"] > 0.004  # it does creep, and that is told
-    assert world.model().opt.impratio == pytest.approx(1 / 40)  # what is shipped is as soft as was fitted
+    assert metrics["spawn_drift_m"] > 0.004  # it creeps, and the metrics say so
+    assert world.model().opt.impratio == pytest.approx(1 / 40)  # the exported tires are as soft as the fitted ones
 
 
 def test_a_start_inside_a_part_is_refused_on_soft_ground(tmp_path):
@@ -353,7 +353,7 @@ def test_left_of_the_route_is_positive():
     s, error = nearest_on_route(route, np.array([[5.0, 1.0], [5.0, -1.0], [9.0, 5.0]]))
     np.testing.assert_allclose(s, [5.0, 5.0, 15.0])
     np.testing.assert_allclose(error, [1.0, -1.0, 1.0])
-    # A route that meets itself: only the wanted stretch is looked at.
+    # On a route that meets itself, only the given range is searched.
     loop = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.1]])
     assert nearest_on_route(loop, np.array([0.02, 0.2]))[0] == pytest.approx(15.8)
     assert nearest_on_route(loop, np.array([0.02, 0.2]), around=(0.0, 2.0))[0] == pytest.approx(0.02)

@@ -261,7 +261,7 @@ def _report(config: SceneConfig, stamps: dict[str, Stamp], skipped: dict[str, bo
 
 
 def publish(scene: SceneDir, report: dict[str, Any]) -> None:
-    """Writes `report.json` and, if the build is complete, `report.html` and the review film.
+    """Writes `report.json` and, if the build is complete, `report.html` and the review video.
 
     Adds `truth` (the comparison with the ground truth, if there is one) and `cautions` to the report.
     """
