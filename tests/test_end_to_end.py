@@ -1,4 +1,4 @@
-"""From films to a drivable twin, on a small stretch of the known-truth world: every stage, for real."""
+"""From films to a drivable twin, on a small stretch of the simulated reality: every stage, for real."""
 
 import json
 import shutil

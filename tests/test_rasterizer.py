@@ -1,4 +1,4 @@
-"""The rasterizer of the known-truth world against rays cast one by one, and against the film's renderer."""
+"""The rasterizer of the simulated reality against rays cast one by one, and against the film's renderer."""
 
 # mypy: disable-error-code="valid-type"
 

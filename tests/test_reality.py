@@ -1,4 +1,4 @@
-"""The known-truth world: its road, its place, its films, and the comparison of a build with it."""
+"""The simulated reality: its road, its place, its films, and the comparison of a build with it."""
 
 from pathlib import Path
 

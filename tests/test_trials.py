@@ -76,7 +76,7 @@ def test_an_invalid_row_is_named(tmp_path: Path, line: str, message: str) -> Non
 
 
 def test_without_validated_trials_the_error_names_the_command(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"twin\.validate"):
+    with pytest.raises(InputError, match="twin validate"):
         read_trials(tmp_path / "episodes.csv")
 
 
