@@ -4,7 +4,7 @@
 
 Steps, each a command of `twin` that resumes where it was interrupted:
 
-- build: films the road of the simulated reality and builds the twin in SCENE; aligns the robot to a drive log and an onboard film.
+- build: films the simulated road and builds the twin in SCENE; aligns the robot to a drive log and an onboard film.
 - train: trains the three setups on both tasks.
 - validate: drives every policy in the twin under held-out lightings with everything else randomized, and finished
   policies also with nothing else randomized.
