@@ -175,7 +175,7 @@ def test_rebuilt_field_refuses_stale_lightings(scene):
         assert "old" not in field.lightings
         for asked in ("old", "day:old:0.5"):
             with pytest.raises(
-                InputError, match=r"'old': fitted to another build.*twin\.relight SCENE PHOTO --name old"
+                InputError, match=r"'old': fitted to another build.*twin relight SCENE PHOTO --name old"
             ):
                 field.embedding(asked)
     finally:

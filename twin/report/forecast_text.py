@@ -256,7 +256,7 @@ def limitations(forecast: Forecast) -> list[Caution]:
     lightings = join_names(sorted({name for c in forecast.candidates for name in c.lightings}))
     cure = (
         "validate under further lightings (any, mixtures, +randomised), film the place in that light, or add a photo "
-        "with twin.relight."
+        "with twin relight."
     )
     out.append(Caution(f"Success is unknown in light that differs from {lightings}.", cure))
     for task in forecast.tasks:
