@@ -1,7 +1,7 @@
 """Benchmark of transients: effect of walkers, cars and objects that left on a twin, against films without them.
 
-    python -m twin.reality film --place N --out CLEAN && twin build CLEAN
-    python -m twin.reality film --place N --traffic --out TRAFFIC && twin build TRAFFIC
+    twin reality film --place N --out CLEAN && twin build CLEAN
+    twin reality film --place N --traffic --out TRAFFIC && twin build TRAFFIC
     python benchmarks/transients.py CLEAN TRAFFIC [WITHOUT] [--json FILE]
 
 CLEAN and TRAFFIC are filmed with the same camera poses, exposure and noise. Every build is scored on its held-out

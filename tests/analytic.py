@@ -21,7 +21,7 @@ FAR = 200.0  # [m] depth of the sky
 
 
 class Box(NamedTuple):
-    """Centre (x, y), size along its own x and y, top above z = 0 [m], heading [rad]."""
+    """Center (x, y), size along its own x and y, top above z = 0 [m], heading [rad]."""
 
     x: float
     y: float
@@ -49,7 +49,7 @@ class Rendering(NamedTuple):
 
 @dataclass(frozen=True)
 class AnalyticField:
-    """Has what a RadianceField has."""
+    """Has the interface of a RadianceField."""
 
     boxes: tuple[Box, ...] = ()
     posts: tuple[Post, ...] = ()
@@ -93,7 +93,7 @@ class AnalyticField:
         return best
 
     def density(self, points: Array) -> NDArray[np.float32]:
-        """30 per metre inside matter, else 0."""
+        """Density: 30 per meter inside matter, otherwise 0."""
         solid = (points[:, 2] < self.ground(points[:, :2])) | (self.distance_to_obstacles(points) < 0)
         return np.where(solid, 30.0, 0.0).astype(np.float32)
 
@@ -101,7 +101,7 @@ class AnalyticField:
         return np.full(32, float(self.lightings.index(lighting)), np.float32)
 
     def render(self, cameras: PosedCameras, lighting: object, size: tuple[int, int] | None = None) -> Rendering:
-        """Exact depth; colours by what was hit."""
+        """Exact depth; the color depends on the surface that a ray hits."""
         camera_to_world = cameras.camera_to_world
         intrinsics, (width, height) = intrinsics_for_size(cameras, size)
         n = len(camera_to_world)
@@ -121,7 +121,7 @@ class AnalyticField:
         return Rendering(rgb, depth, (depth < FAR * 0.9).astype(np.float32))
 
     def _cast(self, origin: Array, rays: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Depth of the first hit of rays with unit z-depth, shape (..., 3) → (...), and what it was."""
+        """Depth of the first hit of rays with unit z-depth, shape (..., 3) → (...), and the kind of surface hit."""
         t = np.full(rays.shape[:-1], FAR)
         kind = np.zeros(rays.shape[:-1], np.int64)
 
@@ -163,7 +163,7 @@ def _into(xy: Array, heading: float) -> Array:
 
 
 def right_turn(length: float = 60.0, straight: float = 30.0, radius: float = 6.0, step: float = 0.75) -> Array:
-    """Points (x, y) every `step` metres of a straight along +x, a right quarter turn and a straight on."""
+    """Points (x, y) every `step` meters of a straight along +x, a right quarter turn and a straight on."""
     s = np.arange(0.0, length + 1e-9, step)
     arc = radius * np.pi / 2
     angle = np.clip((s - straight) / radius, 0.0, np.pi / 2)

@@ -15,14 +15,16 @@ _DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files that take long come first, or the second core would wait for them in the end."""
+    """Puts the slow files first; otherwise one core would be idle while the other finishes them."""
     order = {name: k for k, name in enumerate(_LONGEST)}
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
 
 
 @pytest.fixture(autouse=True)
 def loud() -> None:
-    """What a test reads of standard error does not depend on the tests before it: quiet is a state of the process."""
+    """Ends quiet mode, which is global to the process: a test that reads standard error must not depend on earlier
+    tests.
+    """
     runtime.set_quiet(False)
 
 
@@ -36,5 +38,5 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def drive() -> dict[str, np.ndarray]:
-    """Two and a half minutes on soft ground."""
+    """A drive of two and a half minutes on soft ground."""
     return columns(SOFT, 150.0, seed=1)

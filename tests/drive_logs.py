@@ -72,7 +72,7 @@ def columns(params: HuskyParams, duration: float, seed: int, strong: bool = True
 
 
 def write_csv(path: Path, table: dict[str, NDArray]) -> Path:
-    """As a .csv under one line of names."""
+    """Writes the log as a .csv with one line of names."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(table)
@@ -81,7 +81,7 @@ def write_csv(path: Path, table: dict[str, NDArray]) -> Path:
 
 
 def windows_of(wheels: NDArray, poses: NDArray | None = None, **others) -> logs.Windows:
-    """Windows of these wheel speeds, commanded as they are, that do not follow each other."""
+    """Windows with these wheel speeds, commanded and measured; none follows another."""
     n, k = wheels.shape[:2]
     return logs.Windows(
         **{

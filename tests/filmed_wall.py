@@ -21,7 +21,7 @@ WIDTH, HEIGHT = 160, 120
 
 def wall(seed: int = 0, size: tuple[int, int] = (200, 900)) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    # Grey, since a film halves the resolution of colour; 2 px smooth, so that a film keeps it.
+    # Gray, since a film halves the resolution of color; 2 px smooth, so that a film keeps it.
     smooth = cv2.GaussianBlur(rng.integers(0, 256, (*size, 1)).repeat(3, 2).astype(np.float32), (0, 0), 2.0)
     return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
 

@@ -72,7 +72,7 @@ def _tag(target, transfer: int) -> None:
 
 
 def _signal(picture: np.ndarray, transfer: int) -> np.ndarray:
-    """HDR signal, BT.2020, of an SDR picture, by the formulas of BT.2100 in their other direction."""
+    """HDR signal (BT.2020) of an SDR picture, by the inverse of the formulas of BT.2100."""
     bt709_to_bt2020 = [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]]
     light = 203.0 * (picture / 255.0) ** 2.4 @ np.transpose(bt709_to_bt2020)
     if transfer == PQ:

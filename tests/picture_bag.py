@@ -49,7 +49,7 @@ def image(picture: np.ndarray, stamp: int, recorded: int | None = None, encoding
 
 
 def camera_info(intrinsics: Sequence[float], size: tuple[int, int], stamp: int) -> Recorded:
-    """`intrinsics` as twin has them, from the corner of the first pixel."""
+    """`intrinsics` are in twin's convention, from the corner of the first pixel."""
     message = MESSAGES.camera_info(intrinsics, size, stamp)
     return Recorded(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", message, stamp)
 

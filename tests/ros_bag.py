@@ -19,7 +19,9 @@ _TOPICS = {
 
 
 def write_bag(path: Path, table: dict[str, NDArray], without: tuple[str, ...] = ()) -> Path:
-    """A table of `twin.sysid.logs` as a bag; the wheels' poses stand still, so that using them shows."""
+    """Writes a table of `twin.sysid.logs` as a bag; the wheels' poses stand still, so that a test notices if they are
+    used.
+    """
     store = get_typestore(Stores.LATEST)
     t = store.types
     zero = np.zeros(9)

@@ -99,7 +99,7 @@ class Node:
 
 
 def install(monkeypatch: Any) -> None:
-    """Puts the stand-ins where imports find them, until the test ends."""
+    """Installs the stand-ins under the real modules' names until the test ends."""
     modules = {name: ModuleType(name) for name in ("rclpy", "rclpy.node", "rclpy.qos", "rclpy.signals")}
     modules["rclpy.node"].Node = Node
     modules["rclpy.qos"].QoSProfile = lambda depth, reliability: SimpleNamespace(depth=depth, reliability=reliability)

@@ -62,8 +62,9 @@ def test_nan_is_outside_every_bound():
 
 
 def test_roughness_of_known_bumps():
-    """Bumps of a Gaussian kernel σ have the autocorrelation exp(−d²/4σ²), which is 1/e at 2σ; the slow rise that is
-    taken out takes a little of them along."""
+    """Bumps of a Gaussian kernel σ have the autocorrelation exp(−d²/4σ²), which is 1/e at 2σ; removing the slow rise
+    removes a little of them, too.
+    """
     relief = grounds.random_relief(0.02, 0.2, np.random.default_rng(3), half=40.0)
     flat = grounds.level(half=39.0)
     x = flat.origin[0] + flat.cell * np.arange(len(flat.height))

@@ -48,7 +48,7 @@ def test_the_icr_model_is_recovered_from_its_own_motion():
 
 
 def test_kinematics_begin_with_the_preceding_wheel_speeds():
-    """Poses of a slow sensor: a window's first one was measured while wheels did what they did in the one before."""
+    """The first pose of a slow sensor was measured in the window before, so the wheel speeds of that window matter."""
     n, age = 6, 10
     time = np.arange(n * logs.SAMPLES) * logs.PERIOD
     wheels = np.stack([4 + 2 * np.sin(time), 4 - 2 * np.sin(1.7 * time)], -1).reshape(n, logs.SAMPLES, 2)
@@ -62,7 +62,7 @@ def test_kinematics_begin_with_the_preceding_wheel_speeds():
 
 
 def test_icr_baseline_that_gets_the_slopes_slides_downhill():
-    """It is `benchmarks/align.py --last-third`'s; without drift it is the plain baseline."""
+    """Tests the baseline of `benchmarks/align.py --last-third`; without drift it is the plain baseline."""
     rng = np.random.default_rng(1)
     windows = windows_of(rng.uniform(1.0, 4.0, (8, 1, 2)) + np.zeros((8, logs.SAMPLES, 2)), follows=np.arange(8) > 0)
     slope, five = rng.normal(0.0, 0.5, (8, 2)), np.array([0.93, 0.97, 0.55, -0.62, -0.08])
@@ -85,7 +85,7 @@ def test_last_third_of_the_groups_is_for_scoring():
 
 
 def test_commands_become_the_controllers_wheel_speeds():
-    """The smooth arithmetic against the robot's controller itself, run at every phase of its 0.1 s."""
+    """The smooth drivetrain model equals the mean of the robot's controller over all phases of its 0.1 s clock."""
     params = replace(SOFT, servo_lag=0.0)
     request = (0.7, 0.9)
     speeds = []
@@ -106,7 +106,7 @@ def test_commands_become_the_controllers_wheel_speeds():
 
 
 def test_the_drivetrain_is_the_controller_run_every_step():
-    """One law in two places: with whole delays and no lag, servo targets equal the controller's to the last digits."""
+    """With delays of whole steps and no lag, servo targets equal the controller's to the last digits."""
     params = replace(SOFT, servo_lag=0.0, max_wheel_speed=0.8)
     rng = np.random.default_rng(0)
     requests = np.repeat(rng.uniform([-0.9, -2.0], [0.9, 2.0], (12, 4, 2)), logs.SAMPLES // 4, 1)
@@ -123,7 +123,9 @@ def test_the_drivetrain_is_the_controller_run_every_step():
 
 
 def test_acceleration_ramps_continue_from_window_to_window():
-    """Wheels that lag behind a ramp do not show how far it has come when a window begins; the windows before do."""
+    """Wheels lag behind a ramp, so only the commands of earlier windows determine the controller's state at a window's
+    start.
+    """
     drive = drivetrain.Drivetrain(1.0, 1.0, 9.0, 9.0, 0.2, 1.0, 9.0, 0.3)
     time = np.arange(3 * logs.SAMPLES) * logs.PERIOD
     ramp = np.maximum(0.0, time - drive.latency)
@@ -140,7 +142,7 @@ def test_acceleration_ramps_continue_from_window_to_window():
 
 @pytest.mark.parametrize("late", [0.4, 0.2, 0.07, 0.0, -0.15])
 def test_a_pose_delay_shows_earlier_poses(late):
-    """A robot that speeds up along a straight line, and one that goes on around a circle."""
+    """One robot speeds up along a straight line, another drives around a circle."""
     time = (
         np.arange(rollout.LEAD_SAMPLES + logs.SAMPLES + drivetrain.EXTRA_SAMPLES) - rollout.LEAD_SAMPLES
     ) * logs.PERIOD
@@ -166,7 +168,7 @@ def test_viscosity_drags_tires_but_not_the_chassis():
         return data.qfrc_fluid[:3].copy()
 
     assert not drag(HuskyParams()).any()
-    # Stokes drag of a sphere as wide as the tyre on the mean, four of them (MuJoCo's ellipsoid model).
+    # Stokes drag of a sphere as wide as the tire on the mean, four of them (MuJoCo's ellipsoid model).
     width = 2 * (0.1651 + 0.1143 / 2 + 0.1651) / 3
     assert drag(HuskyParams(ground_viscosity=5.0))[0] == pytest.approx(-4 * 3 * np.pi * width * 5.0 * 0.5, rel=0.01)
 
@@ -174,7 +176,9 @@ def test_viscosity_drags_tires_but_not_the_chassis():
 @pytest.mark.parametrize("speed", [0.4, 0.8])
 @pytest.mark.parametrize("share", [0.3, 0.6])
 def test_grip_grows_with_slip_over_rolling_speed(speed, share):
-    """Pushed sideways by a share of its grip, a robot that drives slides by a share of its speed, in closed form."""
+    """A driving robot that is pushed sideways by a fraction of its grip slides at a fraction of its speed, known in
+    closed form.
+    """
     params = HuskyParams(friction=0.3, rolling_resistance=0.12, motor_torque=500.0)
     model = rollout.plane_model(params)
     data = mujoco.MjData(model)
@@ -195,7 +199,9 @@ def test_grip_grows_with_slip_over_rolling_speed(speed, share):
 
 @pytest.mark.slow
 def test_a_known_robot_is_recovered(drive, tmp_path):
-    """Drive with known parameters, fit, and get them back; held-out windows are met far better than by kinematics."""
+    """The fit recovers the known parameters of a simulated drive, and predicts held-out windows far better than
+    kinematics.
+    """
     windows = logs.cut_windows(drive, "log")
     result = identify(windows, HuskyParams())
     found = result.identified
@@ -244,7 +250,9 @@ def aligned(twist: bool = True, drive_errors=None, ground_errors=None, **robot) 
 
 @pytest.mark.parametrize("twist", [True, False])
 def test_errors_of_yaw_limits_scale_with_the_multiplier(twist):
-    """ω = half speed · 2 r / (multiplier · track), and so for its error; else errors are in the field's own unit."""
+    """ω = half speed · 2 r / (multiplier · track), and its error scales alike; other errors are in the unit of their
+    field.
+    """
     errors = {"half_limit": 0.1, "half_acceleration": 0.4, "wheel_limit": 0.2, "latency": 0.03, "half_gain": 0.05}
     found = aligned(twist, errors, separation_multiplier=1.875, command_latency=0.2).identified
     per_half = 2 * WHEEL_RADIUS / (1.875 * TRACK)
@@ -289,7 +297,7 @@ def test_fields_of_the_scene_that_override_fitted_ones_are_named(tmp_path, monke
         assert main([str(target), str(log)]) == 0
         assert "overrides fitted values: friction;" in capsys.readouterr().out, target
     assert main([str(scene), str(log), "--out", str(tmp_path / "out")]) == 0
-    assert "overrides fitted values" not in capsys.readouterr().out  # what lies there is not the scene's
+    assert "overrides fitted values" not in capsys.readouterr().out  # that folder is not the scene's
 
 
 @pytest.mark.parametrize("out", ["file/out", "taken"])
@@ -322,7 +330,9 @@ def test_bad_arguments_exit_with_status_2(arguments, message, capsys, tmp_path, 
 
 
 def test_motor_effort_is_relative_to_a_straight_drive():
-    """Made-up currents: the right side, outer in a left turn, takes three times a straight drive's, the left half."""
+    """The made-up log turns left: the right side draws three times the current of a straight drive, the left half of
+    it.
+    """
     speeds = np.concatenate([np.full((50, 2), 0.5), np.full((50, 2), [0.4, 0.6])])
     amps = np.concatenate([np.full((50, 2), 2.0), np.full((50, 2), [1.0, 6.0])])
     effort = motor_currents.measured_effort(motor_currents.SteadySamples(speeds, amps))
@@ -343,7 +353,7 @@ def test_rolling_resistance_from_motor_currents():
 
 @pytest.mark.realdata
 def test_kinematic_baselines_on_the_real_log(real_data: Path):
-    """The figures that others got from the same log: 0.45 m and 70° nominal, 0.18 m and 7° with a fitted ICR model."""
+    """Others computed these errors from the same log: 0.45 m and 70° nominal, 0.18 m and 7° with a fitted ICR model."""
     windows = logs.read_log(real_data / "husky_drive" / "husky_drive_dev.npz")
     held_out = ~windows.fitting
     distance, angle = Prediction("nominal", windows, kinematics.predict(kinematics.NOMINAL, windows)).errors

@@ -30,7 +30,7 @@ def probes(k: int = 300) -> Probes:
 
 
 def lightings(vectors: list[list[float]], frames: int = 12) -> Lightings:
-    """Frames drift in exposure and warmth about the lightings, in turn."""
+    """Frames vary about the lightings in exposure and warmth, in turn."""
     v = np.array(vectors, np.float32)
     rng = np.random.default_rng(1)
     drift = rng.normal(size=(frames, 4)) * [0.2, 0.05, 0.0, 0.0]

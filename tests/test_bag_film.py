@@ -351,7 +351,7 @@ def test_a_bag_with_a_hole_is_used_and_said_to_be_damaged(tmp_path: Path, capsys
 
 
 def test_definitions_in_a_bag_are_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """rosbags would generate code from them; and one odd type would make the whole bag unreadable."""
+    """rosbags would generate code from them, and one odd type would make the whole bag unreadable."""
     import rosbags.typesys.msg
     from rosbags.typesys import Stores, get_typestore
 

@@ -89,7 +89,7 @@ def camera_at(eye=(-3.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)) -> np.ndarray:
 
 
 def wall(x: float, raw: float):
-    """Raw density `raw` beyond x [m], empty before."""
+    """Raw density `raw` beyond x [m], none before."""
     return lambda p: np.where(p[..., 0] >= x, raw, LOW)
 
 
@@ -198,7 +198,7 @@ def test_batched_cameras_equal_single_ones(monkeypatch):
 
 
 def test_image_does_not_depend_on_other_lightings_of_the_batch():
-    """Bit for bit, or an episode would depend on those that are driven beside it."""
+    """Equal bit for bit; otherwise an episode would depend on the other environments of its batch."""
     bare, rng, dim = baked(wall(1.0, 2.0)), np.random.default_rng(0), 32  # as in real fields
     head = networks(dim)
     head["network.head.0"][-dim:] = rng.normal(0, 0.1, (dim, 8))

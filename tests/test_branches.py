@@ -103,7 +103,7 @@ def test_obstacles_stand_on_their_own_route(root):
 
 
 def test_digests_of_episodes_on_the_route_do_not_depend_on_branches(root, tmp_path, monkeypatch):
-    """They are stored in validated results of builds from before there were branches."""
+    """Validations of builds that are older than branches store these digests."""
     monkeypatch.setattr(suite, "stage_result", lambda scene, stage: stage)
     cone = BRANCHED[BRANCHED.index("[[obstacle]]") : BRANCHED.rindex("[[obstacle]]")]
     before = tiny_twin(tmp_path / "place", more=cone)

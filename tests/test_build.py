@@ -70,7 +70,7 @@ def test_runs_once_then_only_what_a_change_touches(pipeline):
 
 
 def test_settings_of_a_stage_are_in_its_key():
-    """In its own key, or in that of an upstream stage."""
+    """A setting changes the stage's own key, or that of an upstream stage."""
     sections = {f.name for f in verb.dataclasses.fields(SceneConfig)} - {"name", "seed"}
     keys: dict[str, set[str]] = {}
     for stage in verb.PIPELINE:
@@ -83,7 +83,7 @@ def test_settings_of_a_stage_are_in_its_key():
 
 
 def test_a_scene_without_a_route_needs_another_field():
-    """Without a route the camera's height is not held to be constant."""
+    """Without a route, the camera's height is not assumed to be constant."""
     (stage,) = (one for one in verb.PIPELINE if one.name == "field")
     stamps = {name: types.SimpleNamespace(result="same") for name in stage.upstream}
     drive, object_filmed, wider = (
@@ -195,7 +195,9 @@ def test_bad_input_exits_2_and_a_bug_keeps_its_traceback(pipeline, capsys):
 
 
 def test_a_killed_build_resumes_and_a_second_one_refuses(pipeline, tmp_path):
-    """Kill −9 in the middle of a stage; the partial folder is removed, finished stages stay, the result is the same."""
+    """A build is killed by SIGKILL in a stage: the next one removes the partial folder, keeps finished stages, and
+    gives the same result.
+    """
     script = textwrap.dedent(
         """
         import sys, time, types

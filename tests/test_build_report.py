@@ -260,11 +260,11 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
         "field",
         "field.cross_lighting",
         {"colour_follows": {"day": 1.0}, "depth_moves_m": 0.2},
-        "moves by up to 0.200 m",
+        "changes by up to 0.200 m",
     ),
     ("mesh", "mesh.parts", 0, "Nothing solid"),
-    ("mesh", "mesh.parts_left_out", 3, "3 solid part(s) were left out"),
-    ("mesh", "mesh.parts_beyond_bound", 2, "2 solid part(s) stick out"),
+    ("mesh", "mesh.parts_left_out", 3, "3 convex part(s) were left out"),
+    ("mesh", "mesh.parts_beyond_bound", 2, "2 convex part(s) stick out"),
     ("mesh", "mesh.coacd_failed", 1, "1 piece(s)"),
     ("mesh", "mesh.ground", {"corridor_coverage": 0.2}, "Only 20%"),
     ("mjcf", "mjcf.spawn_touched", ["part_0003"], "part_0003"),
@@ -287,8 +287,8 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("truth", "truth.ate_m", 0.2, "The camera path is 0.200 m off"),
     ("truth", "truth.scale_error", -0.05, "The scale is 5.0% off"),
     ("truth", "truth.ground_median_m", 0.2, "The ground is 0.200 m off"),
-    ("truth", "truth.obstacle_median_m", 0.2, "Solid parts are 0.200 m off"),
-    ("truth", "truth.corridor_intrusions", 2, "2 solid part(s) reach into the true corridor"),
+    ("truth", "truth.obstacle_median_m", 0.2, "Convex parts are 0.200 m off"),
+    ("truth", "truth.corridor_intrusions", 2, "2 convex part(s) reach into the true corridor"),
     ("costs", "peak_memory_bytes", 6 * 2**30, "6.0 GiB of memory."),
 ]
 """Every kind of caution: its section, the number that causes it, and what is said of it."""
@@ -296,7 +296,7 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
 
 @pytest.fixture
 def no_charts() -> Iterator[None]:
-    """Charts take a second a page and give no caution."""
+    """Replaces the charts, which take a second a page and cause no caution."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report_page, "charts", lambda scene, report: [])
         yield
@@ -333,7 +333,7 @@ def test_every_defect_gives_a_caution_with_a_cure_in_section_and_summary(
 
 
 def test_the_defects_tried_cover_every_kind_of_caution(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A caution that the code can give and the list above lacks would not be tested."""
+    """Otherwise a caution that the code can give, but the list above lacks, would not be tested."""
     makers = (build_sections, build_topics, report_html)
     given: set[tuple[str, int]] = set()
     limits: set[str] = set()
@@ -428,7 +428,7 @@ def test_charts_are_drawn_from_the_report(scene: SceneDir) -> None:
     text = read(page(scene, REPORT)).text
     assert "24.3 dB (n = 10)" in text
     assert "PSNR during training" in text and "Cross-track error of the drive" in text
-    assert "Ground and solid parts" not in text  # no mesh stage on disk
+    assert "Ground and convex parts" not in text  # no mesh stage on disk
 
 
 def test_a_chart_has_its_heading_as_accessible_name() -> None:
@@ -445,26 +445,20 @@ def test_templates_escape_text_and_refuse_missing_data() -> None:
 
 
 def test_the_page_says_what_to_do_next_in_commands_that_parse(scene: SceneDir) -> None:
-    """For a place whose folder needs quoting; and no training is offered where nothing drives."""
+    """Also if the scene's folder needs quoting; without a drive, no training is proposed."""
     odd = SceneDir(scene.root.parent / "my road's")
     text = read(page(odd, changed("mesh.parts", 0))).text
     assert "Look at the caution above." in text
-    commands = [line for line in next_commands(odd, REPORT) if "twin." in line]
+    commands = [line for line in next_commands(odd, REPORT) if line.startswith("twin ")]
     for line in commands:
-        python, m, module, *arguments = shlex.split(line)
-        assert (python, m) == ("python", "-m") and str(odd.root) in arguments
+        _, verb, *arguments = shlex.split(line)
+        assert str(odd.root) in arguments
         parser = argparse.ArgumentParser()
-        VERBS[module.removeprefix("twin.")].define(parser)
+        VERBS[verb].define(parser)
         parser.parse_args(arguments)
-    assert [line.split()[2] for line in commands] == [
-        "twin.view",
-        "twin.align",
-        "twin.build",
-        "twin.train",
-        "twin.validate",
-    ]
+    assert [line.split()[1] for line in commands] == ["view", "align", "build", "train", "validate"]
     without = changed("review.not_applicable", "this is no drive")
-    assert [line.split()[2] for line in next_commands(odd, without)] == ["twin.view", "twin.export"]
+    assert [line.split()[1] for line in next_commands(odd, without)] == ["view", "export"]
 
 
 def next_commands(scene: SceneDir, report: dict[str, Any]) -> list[str]:

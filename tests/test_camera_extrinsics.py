@@ -47,7 +47,7 @@ def hills(xy):
 
 
 def drive(robot: HuskyParams, ground=hills, length: float = 18.0, count: int = 90, weave: float = 0.5) -> np.ndarray:
-    """Poses of a robot's camera on a weaving way; the base origin goes where it heads."""
+    """Poses of a robot's camera on a winding path; the base's origin moves along its heading."""
     x = np.linspace(0.0, length, count)
     heading = np.arctan(weave * 2.0 * np.pi / 11.0 * np.cos(2.0 * np.pi * x / 11.0))
     y = weave * np.sin(2.0 * np.pi * x / 11.0)
@@ -69,7 +69,9 @@ def shaken(poses: np.ndarray, metres: float, degrees: float, seed: int = 0) -> n
 
 
 def test_angles_turn_the_camera():
-    """In the compiled robot: a yaw looks left, a pitch down, and a roll leans to the right."""
+    """In the compiled robot, a positive yaw turns the view left, a pitch turns it down, and a roll leans it to the
+    right.
+    """
 
     def axes(**angles: float) -> np.ndarray:
         spec = mujoco.MjSpec()
@@ -86,11 +88,11 @@ def test_angles_turn_the_camera():
     np.testing.assert_allclose(axes(camera_roll=20.0)[0], [0.0, -cosine, -sine], atol=1e-12)
     both = axes(camera_yaw=20.0, camera_roll=20.0)
     np.testing.assert_allclose(both @ both.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(-both[2], [cosine, sine, 0.0], atol=1e-12)  # leaning does not turn where it looks
+    np.testing.assert_allclose(-both[2], [cosine, sine, 0.0], atol=1e-12)  # roll does not change the viewing direction
 
 
 def test_the_camera_is_where_the_model_has_it(tmp_path):
-    """At rest on the ground of a scene, of the robot as compiled into it."""
+    """The computed pose is that of the camera of the compiled robot, at rest on the ground of a scene."""
     world = tiny_world(tmp_path)
     model = world.model()
     data = mujoco.MjData(model)
@@ -133,7 +135,7 @@ def test_yaw_from_driving_straight_or_backwards():
 
 
 def test_gaps_and_wrong_frames_do_no_harm():
-    """Frames that were not found, and one that was found elsewhere."""
+    """Some frames were not localized, and one was localized in a wrong place."""
     poses = shaken(drive(ASKEW), 0.005, 0.1)
     astray = poses.copy()
     astray[44, :3, 3] += [5.0, 3.0, 2.0]
@@ -147,7 +149,7 @@ def test_gaps_and_wrong_frames_do_no_harm():
 
 @pytest.mark.slow
 def test_standard_errors_are_the_scatter_of_estimates():
-    """Over many films: neither a third nor three times of what the values scatter by."""
+    """Over many films, the errors scatter by 1/3 to 1.8 times the standard errors."""
     off = []
     for seed in range(24):
         seat, error = estimate_extrinsics(shaken(drive(ASKEW), 0.01, 0.3, seed), hills, ASKEW.camera_offset)
@@ -188,20 +190,20 @@ LOW = replace(ASKEW, camera_height=1.1)
 
 @pytest.fixture(scope="module")
 def filmed():
-    """Frames of a robot's camera in the corridor, and where it was."""
+    """Frames of a robot's camera in the corridor, and its true poses."""
     poses = drive(LOW, lambda xy: np.zeros(len(xy)), length=7.0, count=28, weave=0.3)
     return [picture(pose) for pose in poses], poses
 
 
 @pytest.fixture(scope="module")
 def registered(scene, filmed):
-    """The frames as they are found without a word of the lens."""
+    """The frames localized without a given lens."""
     return register_film(filmed[0], None, scene)
 
 
 @pytest.fixture
 def found_once(registered, monkeypatch):
-    """Registering takes long; a lens that is given is kept."""
+    """Replaces the slow localization by its stored result; a given lens is kept."""
     monkeypatch.setattr(
         "twin.sysid.camera_extrinsics.register_film",
         lambda frames, given, scene: replace(registered, lens=given or registered.lens),
@@ -249,7 +251,7 @@ def test_a_camera_is_aligned_by_its_film(scene, film):
 
 
 class Painted:
-    """Stands for the field: the corridor itself, under two lightings of which the second is the film's."""
+    """Stands in for the field: it shows the corridor, under two lightings; the second is the film's."""
 
     lightings = ("night", "day")
 
@@ -264,7 +266,7 @@ class Painted:
 
 @pytest.fixture
 def place(scene, monkeypatch):
-    """The scene, with a scene.toml that can be read and changed, and nothing of a robot yet."""
+    """The scene with an editable scene.toml and without robot parameters."""
     monkeypatch.setattr("twin.sysid.camera_extrinsics.load_scene", lambda root: Painted())
     before = scene.config_file.read_text()
     scene.config_file.write_text(before + "[metric]\ncamera_height = 1.2\n")
@@ -280,7 +282,9 @@ def by_hand(place, text: str) -> None:
 
 
 def test_the_verb_keeps_other_fields_and_prints_the_fit(place, film, found_once, capsys):
-    """Values in robot.toml stay, an earlier film's focal length is found anew; the pictures show the same spots."""
+    """Values in robot.toml stay, but the focal length of an earlier film is fitted again; both pictures show the same
+    spots.
+    """
     robot = place.root / "robot.toml"
     robot.write_text("friction = 0.6\ncamera_intrinsics = [400.0, 400.0, 160.0, 120.0]\ncamera_size = [320, 240]\n")
     by_hand(place, "camera_offset = [0.3, 0.05]\nmax_speed = 0.8\n")
@@ -323,7 +327,7 @@ def test_unusable_films_are_refused_in_one_line(place, film, registered, tmp_pat
     bare = tmp_path / "bare"
     bare.mkdir()
     (bare / "scene.toml").write_text(place.config_file.read_text())
-    assert "has no 2_metric yet; run python -m twin.build" in refused(str(bare), str(film))
+    assert "has no 2_metric yet; run twin build" in refused(str(bare), str(film))
     assert [path.name for path in bare.iterdir()] == ["scene.toml"]
     bent = replace(registered, error=0.9)
     with monkeypatch.context() as patch:

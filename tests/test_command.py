@@ -90,5 +90,5 @@ def test_training_in_a_scene_that_is_not_built_leaves_no_files(tmp_path, capsys)
     (tmp_path / "scene.toml").write_text('name = "bare"\n[[source]]\npath = "a.mp4"\n')
     assert main(["train", str(tmp_path), "--run", "first"]) == 2
     told = capsys.readouterr().err
-    assert told.startswith("error: ") and "run python -m twin.build" in told and told.count("\n") == 1
+    assert told.startswith("error: ") and "run twin build" in told and told.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]

@@ -107,7 +107,7 @@ def test_bad_input_is_one_line_with_a_cure(tmp_path, text, message):
 
 
 def test_missing_file_suggests_the_verb_new(tmp_path):
-    with pytest.raises(InputError, match=r"twin\.new"):
+    with pytest.raises(InputError, match="twin new"):
         load_config(tmp_path / "scene.toml")
 
 

@@ -11,7 +11,7 @@ _PARAMS = HuskyParams()
 
 
 def drive(controller: Controller, command, start: float, steps: int) -> list[np.ndarray]:
-    """Gives one command every 0.1 s (None = none) and returns what is carried out, shapes (2,)."""
+    """Gives one command every 0.1 s (None = none); returns the executed speeds and yaw rates, shapes (2,)."""
     out = []
     for k in range(steps):
         time = start + k * CONTROL_PERIOD
@@ -64,7 +64,7 @@ def test_a_command_expires_after_a_quarter_second():
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_presets_differ_in_rate_and_time_out_only(name):
-    """The same ramp in m/s², in finer steps; a command lapses after the preset's time-out, not before."""
+    """The acceleration is the same, in finer steps; a command expires after the preset's time-out, not before."""
     timing, params = CONTROLLERS[name], HuskyParams(controller=name)
     controller = Controller(params)
     controller.command(0.0, 1.0, 0.0)

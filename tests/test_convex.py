@@ -170,5 +170,5 @@ def test_a_part_beside_a_bend_loses_only_its_corner():
     part = _box((15, -3.0, -0.1), (18, -1.6, 1.0))
     kept, clipped = clear_corridor([part], Corridor((route,), 1.0), _flat())
     assert clipped == 1
-    # A third of a metre of one corner is in the way.
+    # A third of a meter of one corner is in the way.
     assert sum(_volume(rest) for _, rest in kept) > 0.9 * _volume(part)

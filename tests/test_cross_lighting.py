@@ -20,7 +20,7 @@ def quiet():
 
 
 class Stubborn(CheckeredField):
-    """A field that always shows its first lighting, and lies further away in the second one."""
+    """A field that always shows its first lighting, and is farther away under the second one."""
 
     def render(self, cameras: PosedCameras, lighting: str, size: tuple[int, int] | None = None) -> Rendering:
         seen = super().render(cameras, self.lightings[0], size)

@@ -136,7 +136,7 @@ def test_a_failure_keeps_what_was_built(tmp_path, capsys, keep):
 
 
 def _special(folder, what):
-    """A path below a folder, of a kind that no reader can take."""
+    """A path below a folder that is no regular file."""
     path = folder / "odd"
     if what == "pipe":
         os.mkfifo(path)

@@ -168,7 +168,7 @@ def test_the_renderer_adds_what_the_fit_interpolates(tables):
 
 
 def _level_of(detail: Detail, hits: np.ndarray, level: int) -> np.ndarray:
-    """Interpolated texels of one level, slowly and obviously."""
+    """Interpolated texels of one level, by a slow reference."""
     out = np.zeros((len(hits), CHANNELS))
     side = detail.texel * 2**level
     first = sum((kernels.TILE >> k) ** 2 for k in range(level))

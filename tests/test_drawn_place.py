@@ -119,7 +119,7 @@ def test_nothing_stands_in_the_way(places, number):
 
 @pytest.mark.parametrize("number", BUILT)
 def test_the_ground_mesh_is_the_true_ground(places, number):
-    """A ray straight down meets the mesh where the ground is said to be, on road and verge."""
+    """A ray straight down meets the mesh at the ground's stated height, on road and verge."""
     place, spec = places[number], draw(number)
     parts = [obj.part for obj in place.objects if obj.kind == "ground"]
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
@@ -158,7 +158,7 @@ def test_the_films_of_a_place_have_their_height_and_passes(places):
 
 
 def test_depth_agrees_with_rays_onto_the_ground(places):
-    """In a small picture, the points seen on the road lie on the true ground."""
+    """Points of the road in a small picture lie on the true ground."""
     place = places[5]
     plan = replace(filming.FilmingPlan.of(draw(5)), width=160, height=90, oversize=1.0)
     lighting = plan.lightings[0]

@@ -1,4 +1,4 @@
-"""From films to a drivable twin, on a small stretch of the known-truth world: every stage, for real."""
+"""From films to a drivable twin, on a small stretch of the simulated reality: every stage, for real."""
 
 import json
 import shutil
@@ -59,12 +59,12 @@ def test_the_twin_agrees_with_the_truth(built):
     root, _ = built
     truth = json.loads((root / "build/report.json").read_text())["truth"]
     assert truth["ate_m"] < 0.08 and truth["ate_max_m"] < 0.30
-    assert abs(truth["scale_error"]) < 0.05  # a dozen metres and quick settings; the demo is held to 2 %
+    assert abs(truth["scale_error"]) < 0.05  # a dozen meters and quick settings; the demo is held to 2 %
     assert truth["ground_median_m"] < 0.08
 
 
 def test_the_pictures_beat_a_flat_color(built):
-    """A field that learned nothing scores about what the mean colour does; this one must know the place."""
+    """A field that learned nothing scores about as much as the mean color; this one must score more."""
     root, _ = built
     field = json.loads((root / "build/report.json").read_text())["field"]
     assert all(value > 17 for value in field["psnr"].values()), field["psnr"]
@@ -128,7 +128,7 @@ def test_the_benchmark_of_the_field_runs(built, tmp_path):
 
 @pytest.mark.slow
 def test_it_is_driven_by_what_it_sees(built, tmp_path):
-    """The environment on a real build: pictures that are those of the field, the goal reached, a film."""
+    """In the environment of a real build, pictures show the field, the goal is reached, and a film is written."""
     from twin.env.drivers import RouteDriver
     from twin.env.episode import record_episode
 
@@ -157,7 +157,7 @@ def test_the_benchmark_of_the_environment_runs(built, tmp_path):
     assert done.returncode == 0, done.stderr[-3000:]
     figures = json.loads(file.read_text())
     assert figures["single.steps_per_s"] > 1 and figures["batch8.steps_per_s"] > 1
-    assert figures["driver.success"] == 1.0 and figures["driver.blind.route"] <= 1.0  # a dozen nearly straight metres
+    assert figures["driver.success"] == 1.0 and figures["driver.blind.route"] <= 1.0  # a dozen nearly straight meters
     assert figures["soak.not_finite"] == 0 and figures["audit.false_successes"] == 0
     assert figures["trust.pictures"] > 10
     assert figures["host.steps_per_s"] > 1

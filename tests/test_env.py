@@ -121,7 +121,7 @@ def test_gymnasium_and_sb3_accept_it(scene, name):
 
 @pytest.mark.parametrize("name", OPTION_SETS)
 def test_vector_environment_equals_single_environments(scene, name):
-    """Step for step, pixels and all, through the ends of episodes."""
+    """Every step is equal, pictures included, also across the ends of episodes."""
     options = OPTION_SETS[name] | {"time_limit": 1.5}
     envs = LocalVectorEnv(EnvFactory.open(scene, "bend", options), [5, 6, 7])
     single = twin.load(scene, "bend", seed=6, **options)
@@ -243,7 +243,7 @@ def test_every_cause_ends_an_episode_with_its_reward_and_discount(scene, tmp_pat
 
 @pytest.mark.parametrize("action, act", [("twist", [1.0, 0.25]), ("steering", [0.25])])
 def test_rewards_of_steering_and_cross_track(scene, action, act):
-    """A quarter of the way to one side of [-0.5, 0.5] rad/s is half of what can be asked for."""
+    """Every action commands half of the largest yaw rate (0.5 rad/s) to one side."""
     terms = {"step": 1.0, "steering": -0.5, "cross_track": -0.2}
     options = {"pixels": False, "action": action, "yaw_rate": 0.5, "rewards": terms, "start_offset": 0.3}
     environment = twin.load(scene, "bend", seed=0, **options)
@@ -310,7 +310,7 @@ def test_start_along_moves_half_of_the_starts(scene):
 
 
 def test_lighting_and_robot_do_not_change_the_start(scene):
-    """Two policies, or two lightings, can be compared on the same episodes."""
+    """So two policies, or two lightings, can be compared in the same episodes."""
     poses = []
     for options in ({}, {"lighting": "night"}, {"randomise": Ranges(payload=(0.0, 0.0))}, {"obstacles": 1}):
         environment = twin.load(scene, "bend", seed=9, **SMALL, **options)
@@ -354,7 +354,7 @@ def test_the_environment_needs_no_torch():
 
 @pytest.mark.slow
 def test_twenty_thousand_steps_leak_no_memory_and_give_no_nan(scene):
-    """No NaN, no memory growth; `benchmarks/env.py --only soak` takes five times as many, with pictures."""
+    """`benchmarks/env.py --only soak` runs five times as many steps, with pictures."""
     envs = LocalVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "randomise": True, "obstacles": 2}), [0, 1])
     rng = np.random.default_rng(0)
     envs.begin([0, 1])
@@ -415,7 +415,7 @@ def test_a_mixture_is_the_nearest_sum_of_the_filmed_lightings():
 
 @pytest.mark.parametrize("name", ["paper", "night", "crowded"])
 def test_a_large_view_changes_nothing(scene, name):
-    """Observations, rewards and infos are those without it, through the ends of episodes."""
+    """Observations, rewards and infos equal those without it, also across the ends of episodes."""
     camera = CameraOptions(vibration=0.5, exposure=0.2, shutter=0.02)
     options = OPTION_SETS[name] | {"time_limit": 0.4, "camera": camera}
     plain = DriveEnv(scene, "bend", "rgb_array", **options)
@@ -446,7 +446,7 @@ def test_a_large_view_changes_nothing(scene, name):
 
 
 def test_a_large_view_shows_what_the_policy_sees(scene):
-    """Scaled down, it is the observation: lighting, obstacles and weather included."""
+    """Scaled down, the view equals the observation, including lighting, obstacles and weather."""
     obstacles = (ObstacleConfig("it", "box", station=3.0, color=(0.9, 0.1, 0.1)),)
     pictures = {}
     for name, more in (("plain", {}), ("box", {"obstacles": obstacles}), ("weather", {"randomise": True})):
@@ -462,7 +462,7 @@ def test_a_large_view_shows_what_the_policy_sees(scene):
 
 
 def test_a_chase_view_follows_the_robot_and_shows_its_obstacles(scene):
-    """Also without pictures for the policy, and with other obstacles in every episode."""
+    """It also works without pictures for the policy, and with other obstacles in every episode."""
     environment = DriveEnv(scene, "bend", "rgb_array", render_view="chase", pixels=False, obstacles=2)
     environment.reset(seed=1)
     scenes = []
@@ -503,7 +503,7 @@ def test_a_state_never_leaves_its_bounds(scene):
 
 
 def test_a_fresh_process_makes_it_by_its_full_name(scene):
-    """As the processes of stable-baselines3's SubprocVecEnv, which have not imported `twin`."""
+    """Processes of stable-baselines3's SubprocVecEnv have not imported `twin` either."""
     code = (
         "import sys, gymnasium; assert 'twin' not in sys.modules; "
         f"env = gymnasium.make('twin:twin/Drive-v0', scene={str(scene.scene.root)!r}, task='bend', pixels=False); "

@@ -1,4 +1,4 @@
-"""Parts of the environment: stretches of a route, lightings and their sets, randomisation, trust, the scene's model,
+"""Parts of the environment: stretches of a route, lightings and their sets, randomization, trust, the scene's model,
 recorded episodes, the audit and the film."""
 
 from dataclasses import replace
@@ -99,15 +99,16 @@ def test_training_and_held_out_lights_never_mix(field):
         for _ in range(20):
             assert sets.set_and_anchor(sets.sample(which, rng))[0] == which
     assert all(sets.set_and_anchor(field.embedding(name))[0] == TRAINING for name in field.lightings)
-    # Nearer to each other than to their own set is nobody.
+    # No two lightings of different sets are equal.
     train, held = ([sets._probe_colors(sets.sample(w, rng)) for _ in range(15)] for w in (TRAINING, HELD_OUT))
     gap = min(float(np.sqrt(((a - b) ** 2).mean())) for a in train for b in held)
     assert gap > 0.0
 
 
 def test_between_training_and_held_out_lights_is_a_gap(field):
-    """A light of a set is a fifth nearer to its own set than to the other one, and on the way from one to the other are
-    lights of neither: else training would see what is next to a held-out light."""
+    """A lighting of a set is a fifth nearer to its own set than to the other one, and lightings between the sets belong
+    to neither. Otherwise training would use lightings that are next to held-out ones.
+    """
     sets, rng = LightingSets(field), np.random.default_rng(2)
     anchors = sets.anchors
 
@@ -160,7 +161,7 @@ def test_sampled_lightings_follow_the_option(field):
     assert isinstance(sample_lighting("any", False, 1.0, sets, rng), EpisodeLighting)
 
 
-# ---- randomisation
+# ---- randomization
 
 
 def test_randomization_sample_changes_the_model_as_stated(scene):
@@ -210,7 +211,9 @@ def test_smaller_wheels_drive_slower_and_latency_later(scene):
 
 
 def test_larger_wheels_on_the_right_turn_it_to_the_left(scene):
-    """As much as a larger speed of them would: v times the difference over the effective track."""
+    """The yaw rate is that of a larger speed of the right wheels: the difference of the speeds over the effective
+    track.
+    """
     still = {"friction": (1.0, 1.0), "payload": (0.0, 0.0), "latency": (0.0, 0.0), "wheel_radius": (1.0, 1.0)}
 
     def turned(difference: float) -> float:
@@ -256,8 +259,8 @@ def test_measured_parameters_are_held_in_evaluation():
     ]
     seen.append(EVALUATION_RANGES.for_robot(HuskyParams(camera_height=0.59)).sample(np.random.default_rng(1)))
     assert [any(d.camera_shift) for d in seen] == [False, False] and [any(d.camera_turn) for d in seen] == [False, True]
-    assert EVALUATION_RANGES.for_robot(HuskyParams()) == EVALUATION_RANGES  # nothing is known of it
-    assert Ranges().for_robot(robot) == Ranges()  # training goes on drawing it
+    assert EVALUATION_RANGES.for_robot(HuskyParams()) == EVALUATION_RANGES  # no parameter is known
+    assert Ranges().for_robot(robot) == Ranges()  # training still samples it
 
 
 # ---- the model of an episode
@@ -292,7 +295,7 @@ def test_the_robot_stands_on_a_hundred_meters_of_relief(tmp_path):
 
 
 def test_parts_within_reach_stay(tmp_path):
-    """Everything whose distance from the corridor is less than the robot's length."""
+    """All parts whose distance from the corridor is less than the robot's length are kept."""
     world = tiny_world(tmp_path)
     kept = {geom.name for geom in episode_spec(world, 0.0, 10.0, 1.0).geoms}
     assert {"part_0000", "part_0001"} <= kept
@@ -361,7 +364,7 @@ def test_a_policy_is_a_function_by_name(scene, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_film_shows_the_drive_to_its_end(scene, tmp_path, capsys):
-    """Slow: the chase camera's kernels compile on first use."""
+    """This test is slow, because the chase camera's kernels compile on first use."""
     out = tmp_path / "drive.mp4"
     arguments = [str(scene.scene.root), "--task", "ahead", "--lighting", "night", "--out", str(out)]
     assert main(arguments) == 0
@@ -421,7 +424,7 @@ def test_audit_finds_holes_only_where_they_are(scene, tmp_path):
     assert found.false_successes == 0 and found.events["episode_tunnelling"] == found.events["tunnelling"] == 0
     assert found.events["episode_wall_sliding"] == found.events["gap"] == found.events["climbing"] == 0
     assert set(found.summary()["steps_with"]) == {*EVENTS, *(f"episode_{name}" for name in EVENTS)}
-    # A visual mesh across the road that nothing solid stands for is a gap.
+    # A visual mesh across the road without convex parts is a gap.
     import audit as module
 
     seen = VisualMesh(stage.world)

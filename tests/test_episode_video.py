@@ -21,7 +21,7 @@ from twin.robot import PixelCamera
 def drive_along(
     x: np.ndarray, y: np.ndarray, yaw: np.ndarray, outcome: str = "goal", touched: tuple = ()
 ) -> RecordedDrive:
-    """A drive through given places, one per 0.1 s, its camera half a metre up."""
+    """A drive through given places, one per 0.1 s, its camera half a meter up."""
     base = np.tile(np.eye(4), (len(x), 1, 1))
     base[:, 0, 0], base[:, 0, 1], base[:, 1, 0], base[:, 1, 1] = np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw)
     base[:, 0, 3], base[:, 1, 3] = x, y

@@ -38,7 +38,7 @@ def test_parameters_that_move_residuals_are_identified(prior_mean):
 
 @pytest.mark.parametrize(("noise", "freedom"), [(0.02, np.inf), (1.0, np.inf), (50.0, np.inf), (1.0, 3), (1.0, 1)])
 def test_standard_errors_are_the_scatter_of_fits(noise, freedom):
-    """For residuals of any size and tail; groups of three windows are correlated, the last component is larger."""
+    """For residuals of any scale and tail; groups of three windows are correlated, and the last component is larger."""
     table = [Parameter(name, None, 2.0 * noise, -50 * noise, 50 * noise, 0.0, "") for name in "ab"]
     found, errors = [], []
     for seed in range(40):
@@ -71,7 +71,7 @@ def slope_through(y: np.ndarray, x: np.ndarray, groups: np.ndarray, instants: in
 
 @pytest.mark.parametrize("instants", [1, 40])
 def test_few_groups_do_not_shrink_standard_errors(instants):
-    """The scores of two groups may cancel by chance; the scatter of windows remains."""
+    """The scores of two groups may cancel by chance; the scatter of windows then gives the standard errors."""
     x = np.linspace(-1, 1, 200)
     for seed in range(20):
         y = 2.0 * x + np.random.default_rng(seed).normal(0, 0.1, 200)

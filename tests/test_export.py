@@ -63,7 +63,7 @@ def scene(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def out(scene, tmp_path_factory) -> Path:
-    """Everything that the verb writes."""
+    """All files that the verb writes."""
     out = tmp_path_factory.mktemp("out")
     options = {
         "usd": "p.usdz",

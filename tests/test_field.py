@@ -200,7 +200,7 @@ def test_samples_are_sorted_and_concentrate_at_the_surface(section):
 
 @pytest.mark.parametrize("seed", [0, 3, 2147, 2148, 12345, 2**31 - 1])
 def test_samples_are_jittered_for_every_seed(section, seed):
-    """Scene seeds as training and baking combine them with their step."""
+    """The seeds are those that training and baking derive from a scene's seed and a step."""
     make_opaque_below(section, 0.0)
     ws = Workspace(section.layout, 64, 16, "cpu")
     ws.origins[:] = torch.tensor([-2.0, -2.0, 1.5])

@@ -38,7 +38,7 @@ def quiet():
 
 
 def ground_image(pose: np.ndarray, brightness: float) -> np.ndarray:
-    """A chequered floor at z = 0 under a blue sky."""
+    """A checkered floor at z = 0 under a blue sky."""
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     ray = np.stack([(u - K[2]) / K[0], (v - K[3]) / K[1], np.ones_like(u)], -1) @ pose[:3, :3].T
     down = ray[..., 2] < -1e-3

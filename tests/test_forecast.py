@@ -164,7 +164,7 @@ def test_policies_not_driven_are_predicted_from_the_others() -> None:
     assert {c.policy for c in further} == {"p7", "p8"}
     for c in further:
         assert c.corrected.value is not None and c.corrected.n == 7
-        # The twin promises too much, and the correction takes it back.
+        # The twin's rates are too high; the correction lowers them.
         assert c.corrected.value < (c.twin.value or 0.0)
     driven = [c for c in made.candidates if c.driven]
     assert all(c.corrected.n == 6 for c in driven)
@@ -203,7 +203,7 @@ def test_every_real_lighting_is_left_out_once() -> None:
 
 
 def predicted(twin: np.ndarray, real: np.ndarray, at: float) -> tuple[float, float, float]:
-    """Textbook regression: the value at a twin score, and the ends of its nine-in-ten interval."""
+    """Textbook regression: the value at a twin score, and the ends of its 90 % interval."""
     line, n = stats.linregress(twin, real), len(twin)
     value = float(np.clip(line.intercept + line.slope * at, 0.0, 1.0))
     spread = np.sqrt(np.sum((real - line.intercept - line.slope * twin) ** 2) / (n - 2))
@@ -213,7 +213,7 @@ def predicted(twin: np.ndarray, real: np.ndarray, at: float) -> tuple[float, flo
 
 
 def test_a_lighting_left_out_is_predicted_by_the_others_alone() -> None:
-    """Dusk differs from the rest: a line fitted to it, too, would be closer."""
+    """Dusk differs from the rest; a line that was fitted to it, too, would be closer."""
     twin, real = cells(n=9, driven=9)
     real = [replace(c, successes=c.trials - c.successes) if c.lighting == "dusk" else c for c in real]
     rates, lights = {c.key: c.rate for c in twin}, np.array([c.lighting for c in real])
@@ -227,7 +227,7 @@ def test_a_lighting_left_out_is_predicted_by_the_others_alone() -> None:
 
 
 def test_policies_left_out_are_predicted_at_the_stated_confidence() -> None:
-    """As many are within the interval as by the textbook; within the one of half the cases there are fewer."""
+    """The coverage equals that of the textbook; the 50 % interval contains fewer."""
     twin, real = cells(n=12, driven=12)
     made = make_forecast("road", twin, real)
     driven = [c for c in made.candidates if c.driven]
@@ -307,7 +307,7 @@ def test_the_next_trials_are_of_policies_that_may_be_best_or_were_not_driven() -
     ranked = [c.policy for c in make_forecast("road", twin, []).candidates]
     assert ranked[0] in first and ranked[-1] in first and sum(name in first for name in ranked) == MIN_POLICIES
     html = forecast_page(made)
-    assert "python -m twin.forecast SCENE --real real.csv" in html and again in Text(html).text
+    assert "twin forecast SCENE --real real.csv" in html and again in Text(html).text
     assert html.count("<svg") == html.count('<svg role="img" aria-label="') > 0
 
 
@@ -320,7 +320,7 @@ def test_uneven_lightings_are_named() -> None:
 
 
 def tile_texts(figure) -> dict[tuple[str, str], str]:
-    """By row and column."""
+    """Texts of the tiles by row and column."""
     (axes,) = figure.axes
     rows, columns = ([text.get_text() for text in ticks] for ticks in (axes.get_yticklabels(), axes.get_xticklabels()))
     assert len(axes.collections[0].get_paths()) == len(axes.texts)
@@ -328,7 +328,7 @@ def tile_texts(figure) -> dict[tuple[str, str], str]:
 
 
 def test_many_cells_are_heatmaps_above_a_collapsed_table() -> None:
-    """The twin's by its own lightings: one that stands for many of the road is shown once."""
+    """A lighting of the twin that is compared with several real ones has one column."""
     few, many = (
         make_forecast("road", *cells(n=6, driven=6, tasks=tasks)) for tasks in (("straight",), ("a", "b", "c"))
     )
@@ -510,7 +510,7 @@ def test_intervals_leave_trainings_and_days_out() -> None:
 
 
 def test_checkpoints_of_few_trainings_have_no_interval() -> None:
-    """As many policies, but of three trainings."""
+    """The number of policies is the same, but they come from three trainings."""
     twin, real = days()
     names = {f"p{i}": f"run{i // 3}/{i}" for i in range(9)}
     twin, real = ([replace(c, policy=names[c.policy]) for c in some] for some in (twin, real))
@@ -541,13 +541,13 @@ def test_the_twin_is_scored_against_guesses_without_it() -> None:
     scores = {it.predictor: it for it in group.scores}
     own, others, shuffled = scores[TWIN], scores[OTHERS], scores[SHUFFLED]
     assert own.gain.value is None and others.gain.value == pytest.approx(others.log.value - own.log.value)
-    assert others.gain.low > 0.0 and shuffled.gain.value > 0.0  # days differ, and the twin knows how
+    assert others.gain.low > 0.0 and shuffled.gain.value > 0.0  # days differ, and the twin predicts how
     assert sum(it.cells for it in group.calibration) == group.cells == 45
     assert [it.day for it in group.errors] == [f"day{k}" for k in range(5)]
     rates = {c.key: c.rate for c in real}
     wrong = sum(it.misses + it.false_alarms for it in group.errors)
     assert 0 < wrong < 12 and sum((rate >= 0.5) for rate in rates.values()) > 10
-    # A twin that knows nothing of a day gains nothing by its days.
+    # A twin that does not distinguish days is no better than with shuffled days.
     flat = [replace(c, successes=round(np.mean([o.successes for o in twin if o.policy == c.policy]))) for c in twin]
     (group,) = make_forecast("road", flat, real).groups
     assert {it.predictor: it.gain.value for it in group.scores}[SHUFFLED] == pytest.approx(0.0, abs=1e-9)
@@ -563,7 +563,7 @@ def test_the_first_sentence_says_what_may_be_believed() -> None:
     rates = pair_cells(real, {c.key: c for c in twin}).rates()
     different = sum(abs(a - b) > 1e-9 for i, a in enumerate(rates["real"]) for b in rates["real"][:i])
     assert sum(it.pairs for it in group.ordered) == different
-    # A twin that has the order backwards is not to be believed, however large its differences.
+    # A twin with the reverse order must not be believed, however large its differences.
     worse = [replace(c, successes=c.trials - c.successes) for c in twin]
     first = verdicts(make_forecast("road", worse, real))[0]
     assert first.mood == "bad" and first.text.startswith("No order of two policies in the twin may be believed yet")

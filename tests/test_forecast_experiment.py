@@ -74,7 +74,7 @@ def test_a_protocol_that_cannot_be_scored_is_refused(forecast, tmp_path, old, ne
 
 
 class StandIn:
-    """In place of the commands: writes their files at once; stops after `left` calls as a kill would."""
+    """Stands in for the commands: writes their files at once, and stops after `left` calls as if killed."""
 
     def __init__(self, forecast, left=1000, unplaced=()):
         self.forecast, self.left, self.unplaced, self.calls = forecast, left, unplaced, []
@@ -133,7 +133,7 @@ def _write(path, trials):
 
 
 def _trials(policies, lightings, count):
-    """Every second trial of every policy but the first succeeds; all of that one's."""
+    """Trials in which the first policy always succeeds, and every other policy in every second trial."""
     return [
         Trial(policy, "whole", lighting, k, "goal" if k % 2 or policy == SETUPS[0] else "collision", 3.0, 30, 0.5)
         for policy in policies

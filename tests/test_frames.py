@@ -140,7 +140,7 @@ def test_a_smaller_frame_has_smaller_intrinsics(tmp_path: Path) -> None:
 
 
 def test_a_mask_hides_what_moves_with_the_camera(tmp_path: Path) -> None:
-    """A camera that drives behind a bonnet that fills most of the picture: still, unless the bonnet is masked."""
+    """The car's hood fills most of the picture, so the picture seems to stand still unless the hood is masked."""
     frames = views([5 * i for i in range(8)])
     for frame in frames:
         frame[30:] = wall(1)[30:HEIGHT, :WIDTH]

@@ -54,7 +54,7 @@ def test_gaussians_are_flat_disks_on_the_surface() -> None:
     assert np.abs(np.abs(normal[:, 2]) - 1).max() < 1e-3
     assert (splats.scales[:, 2] < splats.scales[:, 1]).all() and (splats.scales[:, 1] <= splats.scales[:, 0]).all()
     assert (splats.rgb == floor_views().rgb.reshape(-1, 3)[pixel] / np.float32(255.0)).all()
-    away = np.abs(splats.positions[:, :2]).min(1) > 0.1  # from where colours change
+    away = np.abs(splats.positions[:, :2]).min(1) > 0.1  # from where colors change
     assert np.abs(splats.rgb - _colour(splats.positions) / 255.0)[away].max() < 1e-3
 
 
@@ -121,7 +121,7 @@ def test_a_ply_is_read_as_it_was_written(tmp_path) -> None:
 
 
 def _sky_views(gap_rgb) -> list[Views]:
-    """Two lightings of one view of a sky, a floor, and a crown whose one half has the color of the sky, changed."""
+    """Two lightings of one view of a sky, a floor, and a crown; half the crown has the sky's color plus `gap_rgb`."""
     one = floor_views([(0.0, -2.0, 0.3)])
     one.camera_to_world[0] = look_at(np.array([0.0, -2.0, 0.3]), np.array([0.0, 0.0, 0.8]))
     rays = one.points(0, np.ones(SIZE[::-1])) - one.camera_to_world[0, :3, 3]

@@ -12,7 +12,7 @@ from twin.runtime import set_quiet
 
 
 class Checks:
-    """A renderer of the chequered floor of `test_fit`, with a box on it that hides some."""
+    """A renderer of the checkered floor of `test_fit`, with a box on it that hides some."""
 
     lightings = ("day",)
 

@@ -38,7 +38,7 @@ def test_the_robot_balances_at_its_center_of_mass():
     assert model.body("base_link").mass[0] == pytest.approx(46.034)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    for name in WHEELS:  # balanced: the centre of mass is on the axle, in the middle of the tyre
+    for name in WHEELS:  # balanced: the center of mass is on the axle, in the middle of the tire
         np.testing.assert_allclose(data.body(f"{name}_wheel").xipos, data.geom(f"{name}_tyre").xpos, atol=1e-9)
     base = data.body("base_link")
     np.testing.assert_allclose(base.subtree_com - base.xpos, center_of_mass(HuskyParams()))
@@ -48,7 +48,7 @@ def test_payload_moves_the_center_of_mass():
     params = HuskyParams(payload_mass=10.0, payload_position=(0.2, 0.1, 0.4))
     expected = (MASS * center_of_mass(HuskyParams()) + 10.0 * np.array([0.2, 0.1, 0.4])) / (MASS + 10.0)
     np.testing.assert_allclose(center_of_mass(params), expected)
-    # Huygens and Steiner about the common centre, by hand for the yaw axis.
+    # Huygens and Steiner about the common center, by hand for the yaw axis.
     model = on_plane(params)
     chassis = 46.034 * np.array([0.0, 0.0, 0.062]) / 56.034 + 10.0 * np.array([0.2, 0.1, 0.4]) / 56.034
     yaw = 2.0296 + 46.034 * (chassis[:2] ** 2).sum() + 10.0 * ((np.array([0.2, 0.1]) - chassis[:2]) ** 2).sum()
@@ -137,7 +137,9 @@ def test_belt_couples_the_wheels_of_a_side():
 
 
 def test_front_camera_has_the_given_intrinsics():
-    """MuJoCo's own frustum (no OpenGL needed) against fx ≠ fy and an off-centre principal point, through the XML."""
+    """MuJoCo's own frustum (which needs no OpenGL) has the fx ≠ fy and the off-center principal point that the XML
+    contains.
+    """
     fx, fy, cx, cy = 125.0, 126.25, 90.0, 30.0
     spec = mujoco.MjSpec()
     add_husky(spec, camera=PixelCamera((fx, fy, cx, cy), (160, 90)))
@@ -184,7 +186,7 @@ def test_shipped_file_is_up_to_date():
 
 
 def test_shipped_file_attaches_and_drives_like_the_model():
-    """Attached to another model by `MjSpec.attach`, with `set_options`, against the model of the acceptance table."""
+    """After `MjSpec.attach` and `set_options`, the file drives like the model of the acceptance table."""
     spec = mujoco.MjSpec()
     set_options(spec)
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(50, 50, 1), pos=(0, 0, 0.5))

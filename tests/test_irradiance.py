@@ -27,7 +27,7 @@ ROUTE = np.column_stack([np.linspace(-3.0, 3.0, 25), np.zeros(25), np.full(25, -
 
 
 def light(level=0.8, share=0.0, elevation=50.0, azimuth=0.0) -> Irradiance:
-    """A uniform sky over dim ground, and a sun, exactly."""
+    """The exact irradiance of a uniform sky over dim ground, and of a sun."""
     rise = 0.625  # of upright surfaces under such a sky
     a, e = np.deg2rad(azimuth), np.deg2rad(elevation)
     toward = np.array([np.cos(a), np.sin(a), 0.0])

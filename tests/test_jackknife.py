@@ -72,7 +72,9 @@ def test_leaving_out_a_day_drops_it_from_twin_and_road() -> None:
 
 
 def test_the_interval_of_a_mean_is_the_textbook_s_where_only_trainings_vary() -> None:
-    """All days alike: leaving one out changes nothing, and the jackknife of a mean over n is s²/n, Student's t."""
+    """All days are alike, so leaving one out changes nothing; the jackknife variance of a mean over n is s²/n, with
+    Student's t.
+    """
     differences = np.array([0.1, -0.2, 0.3, 0.05, 0.15, -0.1])
     data = cells_of(np.full((6, 4), 0.5), 0.5 + differences[:, None] * np.ones((6, 4)))
     low, high = jackknife_interval(STATISTICS["bias"], data)
@@ -81,7 +83,7 @@ def test_the_interval_of_a_mean_is_the_textbook_s_where_only_trainings_vary() ->
 
 
 def test_variance_equals_enumeration() -> None:
-    """Every unit left out by hand, in a loop over policies and days."""
+    """A loop over policies and days leaves every unit out."""
     data = random_cells()
 
     def value(rows: list[int], days: list[int], hole: tuple[int, int] | None = None) -> float:
@@ -128,7 +130,7 @@ def test_experiments_along_an_axis_are_separate() -> None:
 
 
 def test_checkpoints_of_one_training_are_one_unit() -> None:
-    """Copies of each policy as its checkpoints: the interval is not narrower than without them."""
+    """Copies of each policy as its checkpoints do not make the interval narrower."""
     data = random_cells()
     copies = cells_of(np.repeat(data.twin, 3, 0), np.repeat(data.real, 3, 0), per_training=3)
     ends = [np.array(jackknife_interval(STATISTICS["spearman"], one)) for one in (data, copies)]
@@ -148,7 +150,7 @@ def test_too_few_units_are_refused_with_the_number_that_is_needed(n: int, k: int
 
 
 def test_identical_cells_have_no_interval() -> None:
-    """Where nothing varies there is no variance to go by, and no interval of width zero."""
+    """If nothing varies, the variance cannot be estimated, and there is no interval of width zero."""
     same = cells_of(np.full((9, 5), 0.5), np.full((9, 5), 0.7))
     with pytest.raises(UndefinedStatistic, match="no interval"):
         jackknife_interval(STATISTICS["bias"], same)
@@ -199,7 +201,7 @@ def test_statistics_within_tasks_are_averaged() -> None:
 
 @pytest.mark.parametrize("kind", ["graded", "poor twin"])
 def test_intervals_cover_the_mean_over_repetitions(kind: str) -> None:
-    """Small and fast: 250 worlds, Monte-Carlo error 0.02; `benchmarks/intervals.py` has the precise figures."""
+    """250 worlds only (Monte-Carlo error 0.02); `benchmarks/intervals.py` has the precise figures."""
     rng = np.random.default_rng(0)
     shape = Shape(places=1, setups=0, trainings=12, checkpoints=1, days=6, twin_trials=5)
     truth = expected(KINDS[kind], shape, rng)

@@ -26,7 +26,7 @@ _NO_KERNEL = {"color_head"}
     "name", [*(m.name for m in pkgutil.iter_modules(kernels.__path__) if m.name not in _NO_KERNEL), *_MADE]
 )
 def test_kernels_compile_for_sm_90(name, tmp_path):
-    assert buffers.wp is wp  # importing it initialises Warp quietly
+    assert buffers.wp is wp  # importing it initializes Warp quietly
     module = _MADE[name]() if name in _MADE else import_module(f"{kernels.__name__}.{name}")
     made = wp.compile_aot_module(module, arch=_ARCH, module_dir=tmp_path, use_ptx=name in _SLOW)
     suffix = f".sm{_ARCH}.ptx" if name in _SLOW else f".sm{_ARCH}.cubin"

@@ -8,7 +8,7 @@ from twin.sysid import logs
 
 
 def held(appeared: list[list[float]]) -> logs.Windows:
-    """Windows whose pose moves on by 1 m at these samples and stays in between."""
+    """Windows whose pose moves by 1 m at these samples and stays in between."""
     poses = np.zeros((len(appeared), logs.SAMPLES + 1, 3))
     for window, samples in zip(poses, appeared, strict=True):
         for sample in samples:
@@ -17,7 +17,7 @@ def held(appeared: list[list[float]]) -> logs.Windows:
 
 
 def test_poses_have_the_period_of_their_sensor():
-    """At 10 Hz: every second sample. In samples from the window's start; negative: before it."""
+    """At 10 Hz, every second sample has a pose. Times are in samples from the window's start; negative: before it."""
     regular, old = list(range(2, 41, 2)), list(range(1, 41, 2))
     late = [2, 4, 6, 11, 12, 13, *range(14, 41, 2)]  # two came late, none was lost
     lost = [2, 4, 6, 12, *range(14, 41, 2)]
@@ -60,7 +60,7 @@ def test_measurement_times_from_times_of_appearance(period):
 
 
 def test_aperiodic_sensors_use_times_of_appearance():
-    """One that measures every 0.2 m, at several speeds, and one window of a 10 Hz sensor that came at 20 Hz."""
+    """A sensor that measures every 0.2 m, at several speeds; and a 10 Hz sensor with one window at 20 Hz."""
     by_distance = [list(range(each // 2, 41, each)) for each in (4, 5, 8, 8, 8, 10, 20)]
     steady = [list(range(2, 41, 2))] * 10 + [list(range(1, 41))]
     for appeared in (by_distance, steady):

@@ -108,7 +108,7 @@ def test_gaps_are_left_out(drive):
 
 
 def test_windows_without_poses_are_left_out(drive):
-    """A robot whose wheels turn for seconds in the same place has lost its pose; one that rests has not."""
+    """If the wheels turn for seconds while the pose stays, the poses were lost; if the robot rests, they were not."""
     held, resting = (drive["time"] > 20.4) & (drive["time"] < 25.9), drive["time"] > 130.0
     table = {name: column.copy() for name, column in drive.items()}
     for name in logs.POSE:
@@ -138,7 +138,7 @@ def test_windows_in_which_the_robot_stands_are_left_out(drive):
 
 
 def test_a_clock_set_after_the_first_row_loses_no_window(drive):
-    """One row before the clock was set: two seconds of the log are lost to the grid at most, and no memory."""
+    """One row is older than the clock's setting: at most two seconds of the log are lost, and no memory is wasted."""
     late = {name: np.concatenate([column[:1], column]) for name, column in drive.items()}
     late["time"][1:] += 1.7e9
     windows = logs.cut_windows(late, "log")

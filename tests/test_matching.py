@@ -74,7 +74,7 @@ def test_signatures_find_the_same_place_under_another_light() -> None:
 
 
 def _turning_path(count: int = 50) -> np.ndarray:
-    """30 m straight, then a right turn of 6 m radius, about a metre per frame, with centimeters of shake."""
+    """30 m straight, then a right turn of 6 m radius, about a meter per frame, with centimeters of shake."""
     s = np.linspace(0.0, 48.0, count)
     angle = np.clip((s - 30.0) / 6.0, 0.0, np.pi / 2)
     past = np.maximum(s - 30.0 - 3.0 * np.pi, 0.0)

@@ -67,7 +67,7 @@ def _parts(folder: Path) -> list[ConvexPart]:
 
 @pytest.fixture(scope="module")
 def stood(made):
-    """Views, ground, corridor, path and box of the place, from which the fusion starts."""
+    """Views, ground, corridor, path and box of the place: the input of the fusion."""
     folder, facts = made
     cameras = Cameras.load(folder.parent / "2_metric")
     views = render_views(PLACE, cameras, 14, 100, FREE_SPACE_REACH * (SETTINGS.margin + 2.0))
@@ -183,7 +183,7 @@ def test_no_parts_in_free_space(made):
     folder, facts = made
     corners = np.concatenate([part.vertices for part in _parts(folder)])
     corners = corners[corners[:, 2] > PLACE.ground(corners[:, :2]) + 0.2]
-    # Hidden space behind a front counts as solid for half a metre, beyond the two voxels that the front's band is deep.
+    # Behind a front, two voxels of its band and 0.3 m of hidden space count as solid; the bound is 0.3 m wider.
     assert PLACE.distance_to_obstacles(corners).max() < 0.5 + 2 * 0.15 + 0.1
     assert facts["parts_beyond_bound"] == 0 and facts["max_protrusion_m"] <= 0.2
 
@@ -226,7 +226,7 @@ def test_views_are_per_length_of_a_long_route(made, monkeypatch, counted_length,
 
 
 def test_corridor_of_a_branch_is_free(made, tmp_path):
-    """It passes so close to the wall that the wall is cut back; beside the route alone the wall stands."""
+    """The branch passes so close to the wall that the wall is cut back; the route alone leaves the wall whole."""
     root = made[0].parent
     cameras = Cameras.load(root / "2_metric")
     branch = BranchConfig(name="left", points=((0.0, 0.3), (3.0, 0.95), (11.0, 0.95), (12.0, 0.9)))

@@ -32,7 +32,7 @@ def _similarity(seed: int) -> Similarity:
 
 
 def _path(turn: bool = True, count: int = 60, height: float = HEIGHT, pitch: float = 0.2) -> np.ndarray:
-    """A drive along x, then (with `turn`) to the right; cameras pitched down. World: metres, z up, road z = 0."""
+    """A drive along x, then (with `turn`) to the right; cameras pitched down. World: meters, z up, road z = 0."""
     s = np.linspace(0.0, 40.0, count)
     angle = np.clip((s - 20.0) / 6.0, 0.0, np.pi / 2) if turn else 0 * s
     past = np.maximum(s - 20.0 - 3.0 * np.pi, 0.0) if turn else 0 * s
@@ -229,7 +229,7 @@ def test_a_road_without_texture_is_found_beside_the_path() -> None:
 
 
 def _to_gps(enu: np.ndarray) -> np.ndarray:
-    """East, north, up [m] near Lund as latitude, longitude, altitude; good to millimetres over 100 m."""
+    """East, north, up [m] near Lund as latitude, longitude, altitude; accurate to millimeters over 100 m."""
     lat0, lon0, eps = 55.7, 13.2, 1e-4
     origin = np.array([[lat0, lon0, 50.0]])
     north = local_east_north_up(np.concatenate([origin, origin + np.array([[eps, 0, 0]])]))[1, 1] / eps
@@ -248,7 +248,7 @@ def test_gps_gives_metres_and_east(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     film = _path(count=40)
     gps = _to_gps(film[:, :3, 3] + rng.normal(0, 0.3, (40, 3)) * [1, 1, 5])
-    gps[5] += [0.001, 0, 0]  # a hundred metres off
+    gps[5] += [0.001, 0, 0]  # a hundred meters off
     gps[9] = np.nan
     world = _world(tmp_path / "s", [film], _points(film, rng), _similarity(7), gps=gps)
     metrics = world.run(tmp_path / "out", gps=True)
@@ -320,7 +320,7 @@ def _paint_marker(pose: np.ndarray, corner: np.ndarray, side: float, pattern: np
 def test_a_marker_gives_metres(tmp_path: Path) -> None:
     side = 0.4
     film = _path(turn=False, count=12, pitch=0.05)
-    film[:, 0, 3] *= 0.05  # twelve frames within two metres
+    film[:, 0, 3] *= 0.05  # twelve frames within two meters
     film[:, 1, 3] += np.linspace(-0.5, 0.5, 12)
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     pattern = cv2.aruco.generateImageMarker(dictionary, 7, 48)

@@ -24,12 +24,12 @@ def rays() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def renderer(density) -> reference.Nerfacto:
-    """With a density by formula of points (r, s, 3), and the same color everywhere."""
+    """A renderer with a density by formula of points (r, s, 3), and one color everywhere."""
     return reference.Nerfacto((density, density), lambda points, _: (density(points), COLOR.expand(points.shape)))
 
 
 def vivid_networks():
-    """With weights so large that the picture has contrast: features of the start, ±1e-4, make an even fog."""
+    """Networks with weights so large that the picture has contrast; the initial features (±1e-4) give an even fog."""
     proposals, field = reference.networks()
     with torch.no_grad():
         for network in (*proposals, field):
@@ -94,7 +94,7 @@ def test_depth_is_along_the_axis():
 
 
 def test_hash_grid_is_trilinear():
-    """At a vertex the stored features; half way along an edge the mean of its two ends."""
+    """A vertex has its stored features; the middle of an edge has the mean of its two ends."""
     grid = reference.HashGrid(2, 17, 32)
     corner = torch.tensor([3.0, 5.0, 7.0])
     step = torch.tensor([0.0, 0.0, 1.0])

@@ -148,7 +148,7 @@ def test_any_film_name_becomes_a_valid_lighting(tmp_path, name):
 
 
 def test_an_option_whose_value_is_two_dashes_is_refused(tmp_path, capsys):
-    """argparse would return an empty list."""
+    """argparse alone would return an empty list."""
     with pytest.raises(SystemExit) as end:
         new_main([str(tmp_path / "scene"), "film.mp4", "--camera-height=--"])
     assert end.value.code == 2 and "--camera-height: expected one argument" in capsys.readouterr().err

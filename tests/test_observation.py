@@ -48,7 +48,7 @@ def film(scene, latency: float, steps: int, **options) -> np.ndarray:
 @pytest.mark.parametrize("observe", [NERF, SIMULATOR])
 @pytest.mark.parametrize(("period", "late"), [(0.1, 1), (0.1, 3), (0.05, 3), (0.014, 5)])
 def test_camera_latency_shows_the_past_state(scene, observe, period, late):
-    """Bit-identical in camera pose, robot, moving obstacles and lighting."""
+    """Camera pose, robot, moving obstacles and lighting are equal bit for bit."""
     options = {"observe": observe, "control_timestep": period, "obstacles": (WALKER,)}
     options |= {"lighting": LIGHT, "lighting_drift": True}
     steps = late + round(0.8 / period)
@@ -69,7 +69,7 @@ def views(stage: EnvFactory, shaded: bool = False) -> tuple[Compositor, SceneRen
 
 
 def standing(stage: EnvFactory, draw: RandomizationSample) -> mujoco.MjData:
-    """The robot at the start, as drawn."""
+    """The robot at its start, as rendered."""
     physics, task = stage.make_env(0)
     task.initialize_episode(physics)
     NominalModel(stage.model).apply(draw, physics.model.ptr)
@@ -95,7 +95,7 @@ def test_no_camera_sees_its_own_housing(scene, ranges):
 
 
 def test_the_rest_of_the_robot_is_seen_where_in_view(scene):
-    """A camera that looks down at its own bumper."""
+    """The camera looks down at its own bumper."""
     stage = EnvFactory.open(scene, "bend", {"size": SIZE, "start_offset": 0.0, "start_heading": 0.0})
     data = standing(stage, RandomizationSample(camera_turn=(-65.0, 0.0, 0.0)))
     bumper = data.body("base_link").xpos + data.body("base_link").xmat.reshape(3, 3) @ [0.479, 0.0, 0.165]

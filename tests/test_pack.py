@@ -310,7 +310,7 @@ def twice(manifest, entries):
 
 
 def edit(name: str, change):
-    """Changes a file, with a right digest and size."""
+    """Changes a file of a pack, and its digest and size in the manifest."""
 
     def edited(manifest, entries):
         k = next(i for i, one in enumerate(entries) if one[0].filename == name)

@@ -101,7 +101,7 @@ def test_noise_and_an_outlier_are_smoothed_away():
 
 
 def _driven(steps: list[float]) -> np.ndarray:
-    """A path whose steps are these [m], turning slowly."""
+    """A slowly turning path with these step lengths [m]."""
     x = np.concatenate([[0.0], np.cumsum(steps)])
     return np.stack([60.0 * np.sin(x / 60.0), 60.0 - 60.0 * np.cos(x / 60.0)], -1)
 
@@ -134,7 +134,7 @@ def test_lost_frames_are_no_jump_unless_the_gap_in_time_is_too_short():
 def test_frames_beside_a_cut_are_no_outliers(unit):
     cameras = draw_filming(KINDS.index("twice_with_cut")).cameras
     pose = cameras.camera_to_world.copy()
-    pose[:, :3, 3] *= unit  # a reconstruction has no metres
+    pose[:, :3, 3] *= unit  # a reconstruction has no meters
     true = np.zeros(len(cameras), bool)
     true[[6, len(cameras) - 9]] = True
     pose[true, 1, 3] += 4.0 * unit

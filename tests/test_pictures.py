@@ -128,7 +128,9 @@ def test_distortion_is_opencvs(model):
 
 @pytest.mark.parametrize("model", BENT)
 def test_a_distorted_picture_becomes_the_pinhole_cameras(model):
-    """A smooth pattern on the rays: photographed through the lens and rectified, it is the pattern itself."""
+    """A smooth pattern is a function of the rays; photographed through the lens and rectified, it is that function
+    again.
+    """
 
     def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return np.stack([128 + 100 * np.sin(9 * x + k) * np.cos(7 * y) for k in range(3)], -1)
@@ -157,7 +159,7 @@ def test_the_policys_own_picture_passes_unchanged():
 
 
 def test_whole_scales_are_plain_averages():
-    """Eight pixels by eight become one, without distortion: the mean, as a larger sensor pixel would see."""
+    """Without distortion, eight by eight pixels become one, their mean, as a larger sensor pixel would measure."""
     native = Camera((1280, 720), (530.0, 530.0, 640.0, 360.0))
     picture = np.random.default_rng(1).integers(0, 256, (720, 1280, 3), np.uint8)
     small = Rectifier(native, native.resized((160, 90)))(picture)
@@ -187,7 +189,9 @@ def test_camera_info_of_a_region_at_half_resolution():
 
 
 def test_rays_beyond_the_fold_of_a_distortion_are_not_seen():
-    """A strong barrel's polynomial turns back: a ray far out would be shown where one nearer to the axis is."""
+    """The polynomial of strong barrel distortion decreases far out, where a ray would get the pixel of one nearer to
+    the axis.
+    """
     bent = Camera((1280, 720), (400.0, 400.0, 640.0, 360.0), "plumb_bob", (-0.28, 0.0, 0.0, 0.0))
     assert bent.reach() == pytest.approx(np.sqrt(1 / (3 * 0.28)), abs=0.01)
     with pytest.raises(PictureError, match="does not see"):

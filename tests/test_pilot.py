@@ -77,7 +77,7 @@ def episode(tmp_path_factory) -> tuple[Path, Policy, list[np.ndarray], list[tupl
     """Scene, policy, and an episode's stacks and commands, driven by the policy in the environment."""
     scene = tiny_twin(tmp_path_factory.mktemp("scenes") / "tiny")
     weights = some_weights(WHOLE)
-    weights["mean.weight"] *= 0.3  # or its hyperbolic tangent is 1 all the time
+    weights["mean.weight"] *= 0.3  # otherwise the hyperbolic tangent is always 1
     world = twin.load_scene(scene).world()
     save_policy(scene / "runs" / "a", WHOLE, Control(), weights, {"camera": list(world.intrinsics)})
     policy = load_policy(scene / "runs" / "a")
@@ -166,7 +166,7 @@ def test_nothing_drives_before_the_first_picture(policy):
     bare = Pilot(policy, clock=clock.now, steady=clock.steady)
     assert "no camera_info" in bare.picture(picture(0), clock.now()).cause
     bare.set_camera(LENS)
-    assert bare.picture(picture(0), clock.now()).drives  # what was only missing does not cost a rest
+    assert bare.picture(picture(0), clock.now()).drives  # a missing camera_info causes no rest
 
 
 def test_the_first_picture_fills_the_stack(policy):
@@ -257,7 +257,7 @@ def test_stamps_from_the_future_stop_it(policy):
 
 
 class Network:
-    """Stands in for ONNX Runtime's session: returns what it is told, and takes time."""
+    """Stands in for ONNX Runtime's session: returns given values after a given time."""
 
     def __init__(self, session, clock: Clock) -> None:
         self._session, self._clock, self.takes, self.output = session, clock, 0, None
@@ -298,7 +298,7 @@ def test_slow_inference_stops_it(tmp_path):
     assert "inference took 0.110 s" in pilot.picture(picture(3), clock.now()).cause
     loose, clock = pilot_of(small_policy(tmp_path), inference=1.0)
     loose.policy._session = network = Network(loose.policy._session, clock)
-    network.takes = 310 * MS  # its picture is too old when the command is there
+    network.takes = 310 * MS  # its picture is too old when the command is ready
     assert "newest picture is 0.31 s old" in loose.picture(picture(0), clock.now()).cause
 
 
@@ -306,7 +306,7 @@ def test_a_released_deadman_switch_stops_the_robot(policy):
     pilot, clock = pilot_of(policy, deadman=0.5)
     assert pilot.picture(picture(0), clock.now()).cause == DEADMAN
     pilot.press()
-    drive(pilot, clock, 4)  # pressed at once: there was nothing to come to rest from
+    drive(pilot, clock, 4)  # no rest is needed, since the robot has not moved
     pilot.press(False)
     assert pilot.command().cause == DEADMAN
     pilot.press()
@@ -412,7 +412,7 @@ def faulty_drive(policy: OnnxPolicy, network: Network, clock: Clock, seed: int) 
         assert 0.0 <= command.v <= policy.speed and abs(command.yaw_rate) <= policy.max_yaw_rate
         assert clock.now() - command.stamp <= 0.3e9
         taken = taken_at[command.stamp]
-        if taken is not None:  # else its stamp is a lie that no clock can tell from the truth
+        if taken is not None:  # otherwise its stamp is wrong in a way that no clock can reveal
             assert clock.true - taken <= 0.3e9, (seed, clock.true - taken)
     return commands, stops
 

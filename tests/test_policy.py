@@ -30,7 +30,7 @@ def pictures(n: int, architecture: Architecture = SMALL, seed: int = 1) -> np.nd
 
 
 def naive(a: Architecture, w: dict, stack: np.ndarray) -> np.ndarray:
-    """The network written out, one stack at a time, in float64."""
+    """The network's output, one stack at a time, in float64."""
     height, width = stack.shape[1:]
     x = stack.reshape(-1, height // a.pool, a.pool, width // a.pool, a.pool).astype(float).mean((2, 4))
     x = np.floor(x + 0.5)
@@ -185,7 +185,7 @@ def test_weights_that_are_not_numbers_are_refused(tmp_path):
 
 
 def foreign(path: Path, kind=TensorProto.FLOAT, shape=("n", 12, 90, 160), actions=2, external=False) -> Path:
-    """An ONNX policy of others: the mean of the pictures' values, once per action."""
+    """An ONNX policy that twin did not write: the mean of the pictures' values, once per action."""
     one = numpy_helper.from_array(np.full((1, actions), 1 / 255, np.float32), "one")
     if external:
         one.data_location = TensorProto.EXTERNAL

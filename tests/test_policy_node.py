@@ -187,7 +187,7 @@ def test_bad_parameters_are_one_error(rig):
 
 
 def test_the_yaml_names_every_parameter_of_the_node_with_its_default():
-    """Each is declared, with the same type; no other is there."""
+    """The node declares each parameter of the file with the same type, and no other."""
     text = (ROOT / "config" / "twin_policy.yaml").read_text()
     given = YAML(typ="safe").load(text)["/**"]["ros__parameters"]
     tree = ast.parse((ROOT / "twin_policy" / "node.py").read_text())
@@ -216,7 +216,9 @@ def test_the_package_is_one_for_colcon():
 
 
 def test_the_core_needs_three_packages_and_python_3_10():
-    """Syntax of 3.10; no import but of the standard library, numpy, cv2, onnxruntime, and rclpy's in the node."""
+    """The syntax is that of 3.10; imports are the standard library, numpy, cv2, onnxruntime and, in the node, rclpy's
+    packages.
+    """
     for path in (ROOT / "twin_policy").glob("*.py"):
         tree = ast.parse(path.read_text(), feature_version=(3, 10))
         names = {alias.name.split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names}

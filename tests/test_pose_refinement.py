@@ -33,7 +33,7 @@ def test_correction_rotates_about_the_center_and_translates():
 
 
 def test_gradients_equal_finite_differences(cameras):
-    """For Σ wᵢ·featureᵢ along rays at fixed sample distances, in the near box and outside."""
+    """The loss is Σ wᵢ·featureᵢ along rays at fixed sample distances, inside and outside the near box."""
     trainer = Trainer(cameras, floor_points(cameras), REFINING, 0, "cpu")
     ws, section, refinement = trainer.ws, trainer.field.sections[0], trainer.refinement
     assert refinement is not None
@@ -83,7 +83,7 @@ def test_rotated_frames_are_corrected_in_a_trained_field(cameras, monkeypatch):
     turn = torch.as_tensor(turn - turn.mean(0))
 
     def error() -> float:
-        """Median angle between the cameras and the true ones without the mean rotation [rad]."""
+        """Median angle [rad] between the cameras and the true ones, after removing the mean rotation."""
         relative = refinement.arrays.rotation.numpy() @ given[:, :3, :3].transpose(0, 2, 1)
         angles = np.stack([relative[:, 2, 1], relative[:, 0, 2], relative[:, 1, 0]], 1)
         return float(np.median(np.linalg.norm(angles - angles.mean(0), axis=1)))

@@ -35,7 +35,7 @@ def test_a_perfect_twin_is_relied_on_and_a_useless_one_is_not() -> None:
 
 
 def test_the_powered_mean_has_no_bias() -> None:
-    """Skewed scores, whose error grows with the score: tuning λ on the six policies it is applied to is biased here."""
+    """Scores are skewed and errors grow with the score, so a λ tuned on the same six policies would be biased."""
     rng = np.random.default_rng(1)
     runs, n, more = 3000, 6, 10
     twin = rng.beta(0.6, 1.5, (runs, n + more))
@@ -108,7 +108,7 @@ def test_left_out_predictions_do_not_depend_on_their_target() -> None:
 
 @pytest.mark.parametrize("confidence", [0.5, 0.8, 0.9])
 def test_left_out_intervals_have_the_confidence_asked_for(confidence: float) -> None:
-    """An interval is as many times as wide as that of another confidence as Student's t says."""
+    """The ratio of the widths at two confidences is that of Student's t."""
     real = 0.5 + 0.1 * (Y - Y.mean())  # far from 0 and 1, where intervals end
     value, low, high = leave_one_group_out(twin=F, real=real, groups=range(6), confidence=confidence)
     _, usual_low, usual_high = leave_one_group_out(twin=F, real=real, groups=range(6))

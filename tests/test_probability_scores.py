@@ -23,7 +23,7 @@ from twin.evaluation.probability_scores import (
 @pytest.mark.parametrize("score", [brier, log_score])
 @pytest.mark.parametrize("rate", [0.2, 0.5, 0.9])
 def test_scores_are_proper(score, rate: float) -> None:
-    """The expectation is best for the true probability, and 0 is reached by certainty alone."""
+    """The expected score is best for the true probability; it is 0 only for certain and correct predictions."""
     p = np.linspace(0.01, 0.99, 99)
     assert p[np.argmin(score(p, np.full(99, rate)))] == pytest.approx(rate)
     assert score(np.array(1.0), np.array(1.0)) == pytest.approx(0.0, abs=0.006)

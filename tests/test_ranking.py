@@ -72,7 +72,9 @@ def test_confidence_grows_with_trials() -> None:
 
 
 def test_confidence_without_further_trials_is_the_posterior() -> None:
-    """With no further trials the leader is fixed: it is within the margin of the best as often as in the posterior."""
+    """Without further trials the leader is fixed, so the confidence is the posterior probability that it is within the
+    margin of the best.
+    """
     rates = of((8, 10), (6, 10), (3, 10))
     assert expected_confidence(rates, 0, 0).winner == pytest.approx(np.mean(rates[:, 0] >= rates.max(1) - MARGIN))
 

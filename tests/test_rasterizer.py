@@ -1,4 +1,4 @@
-"""The rasteriser of the known-truth world against rays cast one by one, and against the film's renderer."""
+"""The rasterizer of the simulated reality against rays cast one by one, and against the film's renderer."""
 
 # mypy: disable-error-code="valid-type"
 
@@ -30,14 +30,14 @@ def sunny(campus):
 
 
 def robot_poses(campus, lighting="sun", every=40):
-    """Where the film's camera was, but at a robot's height."""
+    """The poses of the film's camera, lowered to a robot's height."""
     poses = filming.trajectory(filming.FilmingPlan(), campus.route, lighting)[1][::every].copy()
     poses[:, 2, 3] -= 0.6
     return poses
 
 
 def test_depth_is_that_of_rays(campus, sunny):
-    """The first sample of every pixel is as far as a ray through it goes, and sky where a ray meets nothing."""
+    """The depth of a pixel's first sample is that of a ray through it; it is sky where the ray hits nothing."""
     raster, flat = Rasterizer(sunny, PLAN.intrinsics, (160, 90)), flatten(sunny)
     surface = Surface(flat.corners.reshape(-1, 3).astype(float), np.arange(3 * len(flat.corners)).reshape(-1, 3))
     first = (pixel_grid(160, 90) - 0.5 + 0.5 / SAMPLES).reshape(-1, 2)
@@ -89,7 +89,9 @@ def test_pictures_repeat(campus, sunny):
 @pytest.mark.slow
 @pytest.mark.parametrize(("lighting", "least"), [("sun", 30.0), ("night", 35.0)])
 def test_pictures_look_like_the_film(campus, lighting, least):
-    """Against frames of the film's renderer in the film's size, shrunk: nearer than its own small ones."""
+    """The rasterizer's pictures are nearer to the film's frames, scaled down, than small pictures of the film's own
+    renderer.
+    """
     model = true_world.world_spec(lighting, campus).compile()
     raster = Rasterizer(model, PLAN.intrinsics, (160, 90))
     large, small = filming.Renderer(lighting, campus, filming.FilmingPlan()), filming.Renderer(lighting, campus, PLAN)

@@ -53,7 +53,9 @@ def test_identical_cells_leave_the_ends_in_the_interval_and_do_not_make_it_a_poi
 
 
 def test_days_count_and_trials_of_one_day_hardly_do() -> None:
-    """All or nothing on half of the days: more trials a day do not narrow the interval, more days do."""
+    """On half of the days all trials succeed, on the others none: more days narrow the interval, more trials a day do
+    not.
+    """
 
     def width(days: int, trials: int) -> float:
         won = np.tile([0, trials], (4, days // 2))
@@ -110,7 +112,7 @@ def test_padding_changes_nothing_and_wrong_counts_are_refused() -> None:
 
 @pytest.mark.parametrize("kind", ["recorded", "graded"])
 def test_intervals_cover_the_rates_over_days(kind: str) -> None:
-    """Small and fast: 100 worlds of 8 policies; `benchmarks/intervals.py` has the precise figures."""
+    """100 worlds of 8 policies only; `benchmarks/intervals.py` has the precise figures."""
     shape = Shape(places=1, setups=0, trainings=8, checkpoints=1, days=4, twin_trials=5)
     worlds = simulate(np.random.default_rng(0), KINDS[kind], shape, 100)
     held = []

@@ -41,7 +41,7 @@ PLAIN = replace(
 
 
 class Street:
-    """Stands for a raster: a pattern on the ground and on a wall 12 m ahead, and the sky, from any pose."""
+    """Stands in for a rasterizer: a pattern on the ground and on a wall 12 m ahead, and the sky, from any pose."""
 
     def __init__(self, intrinsics: np.ndarray) -> None:
         self.rays, self.brightness = unproject(pixel_grid(*SIZE), intrinsics), 1.0
@@ -130,7 +130,9 @@ def test_shake_of_the_driving_robot_changes_pictures_by_3_gray_levels():
 
 
 def test_exposure_lags_and_overshoots_when_light_doubles():
-    """By a third of the brightness at first; it returns within 4 s, and swings past its target on the way."""
+    """At first the picture is half brighter or more; within 5 s it is within 20 % of the former brightness, after
+    passing it.
+    """
     names = ("exposure_target", "exposure_range", "exposure_rate", "exposure_damping")
     for number in range(4):
         seen = pictures(drawn(number, *names), count=80, brightness=lambda k: 0.6 if k < 30 else 1.2)
@@ -161,7 +163,7 @@ def test_dirt_is_a_few_spots_of_the_cameras_own():
 
 
 def test_haze_is_the_sum_along_the_ray():
-    """Against small steps through air whose extinction falls with height; on the level it is Beer's law."""
+    """Equals a sum of small steps through haze whose extinction falls with height; on a level ray, Beer's law."""
     light, rays = WEATHER["haze"], unproject(pixel_grid(*SIZE), intrinsics_of(PLAIN, SIZE))
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("x", -95.0, degrees=True).as_matrix()  # forward is y, 5° up
@@ -185,7 +187,7 @@ def test_haze_is_the_sum_along_the_ray():
 
 
 def test_rows_are_read_one_after_another():
-    """A moving camera's picture, against every row rendered from its own pose."""
+    """Every row of a moving camera's picture is compared with a rendering from that row's own pose."""
     street, camera = Street(intrinsics_of(PLAIN, SIZE)), replace(PLAIN, readout=0.03)
     mine = RealCamera(street, CLEAR, camera, SIZE, np.random.default_rng(0))
 
@@ -232,7 +234,7 @@ def test_exposure_overshoots_as_its_damping_says():
 
 
 def test_bright_things_bleed_into_their_surroundings():
-    """Around what is beyond the sensor's range only."""
+    """Bloom appears only around light beyond the sensor's range."""
     lamp = np.full((90, 160, 3), 0.2, np.float32)
     far = np.full((90, 160), 10.0, np.float32)
     bleeding = RealCamera(

@@ -42,7 +42,7 @@ NARROW = Architecture(convolutions=((2, 8, 8),), features=2, hidden=(2,))
 
 
 def steering(yaw_rate: float, seen: list | None = None) -> Policy:
-    """Always the same yaw rate [rad/s]; keeps what it is shown."""
+    """Always returns the same yaw rate [rad/s], and stores the pictures."""
 
     def act(stacks):
         if seen is not None:
@@ -57,7 +57,7 @@ def straight(setup: Setup | None = None) -> RealTest:
 
 
 def written(folder: Path, yaw_rate: float) -> Path:
-    """A policy folder that always steers alike."""
+    """The folder of a policy that always steers alike."""
     weights = {name: np.zeros(shape, np.float32) for name, shape in NARROW.shapes().items()}
     weights["mean.bias"][:] = np.arctanh(yaw_rate)
     save_policy(folder, NARROW, Control(), weights, {})
@@ -65,7 +65,7 @@ def written(folder: Path, yaw_rate: float) -> Path:
 
 
 class Grey:
-    """Stands for a raster where pictures do not matter."""
+    """Stands in for a rasterizer where pictures do not matter."""
 
     def __call__(self, pose):
         return np.full((90, 160, 3), 0.4, np.float32), np.full((90, 160), 5.0, np.float32)
@@ -80,7 +80,7 @@ def gray(monkeypatch):
 
 
 def test_nothing_leaks():
-    """No module outside `twin/reality` imports from it: robot, weather, road and trials belong to the test alone."""
+    """No module outside `twin/reality` imports from it: only the test knows its robot, weather, road and trials."""
     for path in (ROOT / "twin").rglob("*.py"):
         if path.parent.name == "reality":
             continue
@@ -99,7 +99,7 @@ LOADER = {"learn", "learn.policy", "learn.policy_network"}
 
 
 def test_the_real_test_runs_without_the_twin():
-    """A trial, the recordings and the judge load only foundations, the loader of policies and tables of trials."""
+    """Trials, recordings and their evaluation import only basic modules, the policy loader and tables of trials."""
     code = (
         "import sys\n"
         "from twin.learn.policy import Control, Policy\n"
@@ -127,7 +127,7 @@ def test_the_real_test_runs_without_the_twin():
 
 
 def test_tasks_are_the_twins():
-    """Straight 30 m and right turn 60 m of the filmed path, which is nowhere far from the road's centre."""
+    """`straight` is 30 m and `right_turn` 60 m of the filmed path, which is always near the road's center."""
     line = true_route()
     world = World(line, MjcfConfig().half_width, (0.0, 0.0, 0.0, 0.0), Path())
     options = parse_options({"pixels": False, "action": "steering"})
@@ -143,7 +143,9 @@ def test_tasks_are_the_twins():
 
 
 def test_the_corridor_is_free_and_a_drive_along_it_arrives():
-    """The robot's width beyond the corridor, nothing solid stands; who knows the way reaches the goal."""
+    """No solid is within 0.35 m (half the robot's width) of the corridor; a driver that knows the route reaches the
+    goal.
+    """
     points = point_at(true_route()[:, :2], np.arange(0.0, 60.0, 0.1))
     for obj in place_on_test_day().objects:
         for solid in obj.solids:
@@ -197,7 +199,7 @@ def test_its_light_is_not_filmed():
 
 
 def test_some_days_are_hazy_and_some_are_clear():
-    """Two in five of fifteen days are expected to be hazy; their air is as thick as stated."""
+    """Two in five of the fifteen days are expected to be hazy; their visibility is 60 to 400 m."""
     sight = np.array([one.visibility for name, one in WEATHER.items() if name.startswith("day_")])
     hazy = np.isfinite(sight)
     assert len(sight) == 15 and 2 <= hazy.sum() <= 11
@@ -214,7 +216,7 @@ def test_every_number_is_a_day_and_other_weathers_keep_their_seeds():
 
 
 def test_drawn_days_change_a_picture_by_10_gray_levels_or_more():
-    """Rendered from one pose of the true road by one camera."""
+    """All pictures are rendered from one pose of one camera."""
     test, seen = straight(), []
     for name in ("evening", "day_6", "day_9"):
         camera = test.reset(name, 1)
@@ -236,7 +238,7 @@ def test_a_policy_sees_pictures_and_nothing_else(gray):
 
 
 def test_trials_repeat_and_differ_by_seed():
-    """Pictures and outcome, through a fresh road and robot; in the true light."""
+    """Pictures and outcome of a trial repeat with a new road and robot, under the true lighting."""
     sums, ends = [], []
     for seed in (1, 1, 2):
         frames: list = []
@@ -248,7 +250,7 @@ def test_trials_repeat_and_differ_by_seed():
 
 
 def test_the_seed_alone_decides_where_a_trial_starts(gray):
-    """Not the trials before it, nor the policy, nor the light: policies are compared pair by pair."""
+    """Neither earlier trials nor policy nor lighting matter, so that policies can be compared pair by pair."""
     one, starts = straight(), []
     for seed, lighting in ((5, "rain"), (6, "dawn"), (5, "haze")):
         one.run_trial(steering(0.5), lighting, seed)
@@ -258,7 +260,7 @@ def test_the_seed_alone_decides_where_a_trial_starts(gray):
 
 
 def test_results_are_the_sums_of_trials(gray, tmp_path):
-    """As `twin.forecast` reads them; a second call drives only what is missing; a row of another file is refused."""
+    """`twin forecast` reads them; a second call drives only missing trials; a row of another policy file is refused."""
     left, ahead = written(tmp_path / "left", 0.9), written(tmp_path / "ahead", 0.001)
     out = tmp_path / "real" / "results.csv"
     stack = np.zeros((12, 90, 160), np.uint8)
@@ -269,7 +271,9 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
     trials = read_trials(out.with_name("results_trials.csv"))
     assert len(trials) == 8 and len(cells) == 4
     starts = {(t.lighting, t.seed) for t in trials}
-    assert len(starts) == len({seed for _, seed in starts}) == 4  # alike for both policies, others in other weather
+    assert (
+        len(starts) == len({seed for _, seed in starts}) == 4
+    )  # the same for both policies, others in another weather
     for cell in cells:
         mine = [t for t in trials if (t.policy, t.lighting) == (cell.policy, cell.lighting)]
         assert (cell.trials, cell.successes) == (len(mine), sum(t.success for t in mine))
@@ -301,7 +305,7 @@ def test_another_file_under_a_known_name_is_refused(gray, tmp_path):
 
 
 def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):
-    """Place, day, robot, camera, and what of them lies outside training, which is printed as well."""
+    """Place, day, robot and camera, and their values outside training's ranges, which are printed as well."""
     left, out = written(tmp_path / "left", 0.9), tmp_path / "results.csv"
     given = ["drive", "--policy", str(left), "--task", "whole", "--trials", "1", "--out", str(out)]
     numbers = ["--place", "3", "--robot", "2", "--camera", "5", "--day", "21", "--lightings", "rain"]
@@ -351,7 +355,7 @@ def test_only_a_policy_file_drives(what, tmp_path, capsys):
 
 
 class Recorder:
-    """Stands for a raster of full size; notes where it was asked to look from, and at what light."""
+    """Stands in for a full-size rasterizer; records the poses and lightings that it was asked for."""
 
     def __init__(self, model, intrinsics, size, shadow_range=None) -> None:
         self.poses, self.size = [], size
@@ -364,7 +368,7 @@ class Recorder:
 
 
 def test_the_robots_film_goes_down_the_road(tmp_path, monkeypatch):
-    """It weaves, stays on the road, and is of the camera's full size; nothing but a film comes out."""
+    """The robot weaves and stays on the road, the film has the camera's full size, and no other file is written."""
     monkeypatch.setattr(trial_place, "Rasterizer", Recorder)
     monkeypatch.setattr(trial_place.true_world, "world_spec", lambda light, place: mujoco.MjSpec())
     monkeypatch.setattr(recordings, "_FPS", 1)

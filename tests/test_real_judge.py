@@ -62,7 +62,7 @@ def drawn_paths(rng: np.random.Generator) -> Motion:
 
 
 def test_both_judges_agree_on_a_thousand_paths(task):
-    """In cause, step and progress; the twin's sees them all at once, reality's one after the other."""
+    """They agree in cause, step and progress; the twin evaluates all paths at once, the reality one after the other."""
     world, segment = winding_world()
     paths = drawn_paths(np.random.default_rng(0))
     twin, all_of_them = RewardAndTermination(world, segment, OPTIONS, PATHS), np.arange(PATHS)
@@ -107,7 +107,7 @@ def test_a_task_says_what_the_twin_does(task):
 
 
 def test_a_task_goes_from_the_scenes_frame_into_the_true_one(tmp_path, task):
-    """Turned by a quarter and shifted; lengths stay."""
+    """The frames differ by a quarter turn and a shift; lengths do not change."""
     path = tmp_path / "task.json"
     write_task(path, *winding_world(), OPTIONS)
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -119,7 +119,7 @@ def test_a_task_goes_from_the_scenes_frame_into_the_true_one(tmp_path, task):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": "other"}, "is not a task; write one: python -m twin.export SCENE --task NAME --task-file FILE"),
+        ({"format": "other"}, "is not a task; write one: twin export SCENE --task NAME --task-file FILE"),
         ({"line": [[0.0, 0.0, 0.0]]}, "line of shape"),
         ({"goal": 500.0}, "goal 500 m on a line of"),
         ({"half_width": None}, "is damaged"),

@@ -101,7 +101,9 @@ def test_real_film_with_the_robot_masked(place):
 
 
 def test_the_fox_capture_has_no_route(place):
-    """An object filmed around: field and mesh are made, and the stages about driving say that they do not apply."""
+    """The film goes around an object: field and mesh are built, and the report says that the stages about driving do
+    not apply.
+    """
     text = (
         '[[source]]\npath = "input/transforms_orig_1080x1920.json"\nimages = "input/images"\nlighting = "indoor"\n'
         '[metric]\nposes_are_metric = true\nup = "cameras"\n[mjcf]\nroute = false\n'

@@ -45,14 +45,16 @@ def track_ratio(robot: HiddenRobot, v: float, yaw_rate: float) -> float:
 
 @pytest.mark.parametrize(("v", "yaw_rate"), [(0.0, 0.3), (0.0, 1.0), (0.0, -1.8), (0.5, 0.5), (0.3, -0.6)])
 def test_a_centered_robot_turns_as_coulomb_friction_says(v, yaw_rate):
-    """chi = 1 + (L / B)² for isotropic friction on four points, of whatever coefficient; tires wind up a little."""
+    """chi = 1 + (L / B)² for isotropic friction on four points, for any coefficient; the tires' deflection changes it a
+    little.
+    """
     for friction in (0.45, 0.9):
         even = replace(STILL, friction=friction, center_forward=0.0, lateral_grip=1.0, static_excess=1.0, payload=0.0)
         assert track_ratio(even, v, yaw_rate) == pytest.approx(1.0 + (WHEELBASE / TRACK) ** 2, rel=0.04)
 
 
 def test_drawn_robots_turn_as_logs_of_a_husky_show():
-    """Those logs have chi from 1.96 to 3.5, median 2.26; simulation of points 1.8."""
+    """Logs have chi from 1.96 to 3.5, median 2.26; a simulation with four contact points has 1.8."""
     ratios = [track_ratio(draw_robot(number), 0.0, 1.0) for number in range(12)]
     assert min(ratios) > 1.75 and max(ratios) < 2.6 and np.ptp(ratios) > 0.2
     assert 1.85 < np.median(ratios) < 2.3
@@ -88,7 +90,7 @@ def test_straight_ahead_it_keeps_to_speed_and_power():
 
 
 def test_a_worn_battery_limits_speed():
-    """The back-EMF of 1 m/s is 16.8 V."""
+    """At 1 m/s the back-EMF is 16.8 V."""
     low = replace(STILL, battery_voltage=15.0)
     assert driven(on_plane(low), 1.0, 0.0, 4.0)[-1, 3] * WHEEL_RADIUS < 0.9
     sagging = replace(STILL, battery_voltage=18.0, battery_resistance=0.4)
@@ -99,7 +101,7 @@ def test_a_worn_battery_limits_speed():
 
 @pytest.mark.parametrize(("grade", "crossfall"), [(0.08, 0.0), (-0.08, 0.0), (0.0, 0.08)])
 def test_at_rest_it_stays_at_rest_on_a_slope(grade, crossfall):
-    """Before the first command, and after a drive has ended."""
+    """Both before the first command and after the end of a drive."""
     for number in range(4):
         one = on_plane(draw_robot(number), grade, crossfall)
         one.step(1.0)
@@ -133,7 +135,7 @@ def energy(one: RealRobot, grade: float) -> float:
 
 @pytest.mark.parametrize("grade", [0.0, 0.08])
 def test_without_motors_energy_only_falls(grade):
-    """But for what the tires' bristles give back: at most a hundredth of a joule."""
+    """The tires' bristles may return a hundredth of a joule."""
     for number in range(3):
         one = on_plane(replace(draw_robot(number), current_limit=0.0, shake=0.0), grade)
         one._vx, one._vy, one._rate, one._wheel = 1.0, 0.3, 1.0, [3.0, 7.0]
@@ -192,7 +194,7 @@ def test_poses_of_the_past_are_kept():
 
 
 def test_a_touch_is_an_overlap_of_footprint_and_solid():
-    """Against points sampled over the robot."""
+    """The result is compared with points sampled over the robot."""
     rng = np.random.default_rng(0)
     long, wide = (np.linspace(-0.5 * side, 0.5 * side, 90) for side in FOOTPRINT)
     points = np.stack(np.meshgrid(long, wide), -1).reshape(-1, 2)
@@ -238,7 +240,7 @@ def test_numbers_are_robots_and_some_lie_outside_training():
 
 
 def test_what_training_samples_is_stated_rightly():
-    """The facts about the twin that reality states are the twin's: default ranges on the published robot."""
+    """The twin's default ranges on the published robot are those that the reality's modules state."""
     ranges, published = Ranges(), HuskyParams()
     expected = {
         "payload": ranges.payload,

@@ -1,4 +1,4 @@
-"""The known-truth world: its road, its place, its films, and the comparison of a build with it."""
+"""The simulated reality: its road, its place, its films, and the comparison of a build with it."""
 
 from pathlib import Path
 
@@ -41,7 +41,7 @@ def truth(campus):
 
 
 def test_place_0_is_the_demos(campus):
-    """Its fingerprint, as films of it made since the demo state it."""
+    """Its fingerprint equals the one that films of the demo's place have stored since."""
     shipped = read_json(DEMO / "truth" / "truth.json")
     assert fingerprint(campus) == pytest.approx(shipped["fingerprint"], abs=1e-9)
     assert campus.number == 0 and "place" not in shipped
@@ -91,7 +91,7 @@ def test_nothing_solid_in_the_corridor(campus):
 
 
 def test_what_blocks_is_solid(campus):
-    """Each obstacle of a size that stops a robot brings a collision shape around where it is."""
+    """Every obstacle that is large enough to stop a robot has a collision shape at its place."""
     for obj in campus.objects:
         if obj.kind != "obstacle" or obj.name.endswith(("_trim", "_glass", "_day", "_lit")):
             continue
@@ -161,7 +161,7 @@ def test_truth_survives_saving(truth, tmp_path):
 
 
 def fake_build(truth: Truth, root: Path, warp: Similarity, lift: float = 0.0) -> SceneDir:
-    """A build that is the truth, moved by `warp`, its ground raised by `lift`; its parts are the true solids."""
+    """A build that equals the truth, moved by `warp`, its ground raised by `lift`; its parts are the true solids."""
     scene = SceneDir(root)
     truth.save(scene.truth)
     for stage in ("metric", "mesh"):
@@ -240,7 +240,7 @@ def test_a_shifted_mesh_is_as_far_off_as_it_was_shifted(off):
     true, mesh = Surface(square, faces), Surface(square + lift, faces)
     found = mesh_quality(true.distance(points + lift), mesh.distance(points))
     assert found["mesh_accuracy_median_m"] == pytest.approx(off, abs=1e-6)
-    assert found["mesh_chamfer_m"] == pytest.approx(min(off, 1.0), abs=1e-6)  # what is missing counts one metre
+    assert found["mesh_chamfer_m"] == pytest.approx(min(off, 1.0), abs=1e-6)  # what is missing counts one meter
     assert found["mesh_completeness_5cm"] == (off <= 0.05)
     assert found["mesh_completeness_10cm"] == (off <= 0.1)
 
@@ -271,7 +271,7 @@ def test_a_scene_without_truth_is_not_compared(tmp_path):
 
 
 def test_rigid_alignment_holds_on_a_straight_drive(truth):
-    """Centres on one line leave the roll open; the cameras' axes settle it."""
+    """Camera centers on one line do not determine the roll; the cameras' axes do."""
     poses = truth.films["sun"].camera_to_world[:30]
     line = poses.copy()
     line[:, 1:3, 3] = 0.0
@@ -318,7 +318,7 @@ def test_frames_are_true_and_rich(campus, lighting):
 
 @pytest.mark.slow
 def test_the_demo_is_this_world(campus):
-    """The shipped films show what the generator renders now."""
+    """The generator still renders the frames of the shipped films."""
     av = pytest.importorskip("av")
     truth = Truth.load(DEMO / "truth")
     for name in truth.films:

@@ -237,7 +237,7 @@ def test_baselines_do_not_look_at_the_twin_nor_at_their_own_training(scripts, re
     days = next(iter(scores.GROUPS.values()))
     _, before = scores.probabilities(policies, days)
     mine = [i for i, p in enumerate(policies) if p.name.startswith("straight_varied_0")]
-    for i in mine:  # all trials of one training turn out the other way, and the twin says nothing
+    for i in mine:  # all trials of one training end the other way, and the twin predicts 0
         p = policies[i]
         policies[i] = scores.PolicyRecord(
             p.name,

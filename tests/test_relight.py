@@ -175,7 +175,7 @@ def test_rebuilt_field_refuses_stale_lightings(scene):
         assert "old" not in field.lightings
         for asked in ("old", "day:old:0.5"):
             with pytest.raises(
-                InputError, match=r"'old': fitted to another build.*twin\.relight SCENE PHOTO --name old"
+                InputError, match=r"'old': fitted to another build.*twin relight SCENE PHOTO --name old"
             ):
                 field.embedding(asked)
     finally:
@@ -234,9 +234,7 @@ def test_lighting_of_format_1_is_stale(scene):
     try:
         fresh, stale, airs, suns = added_lightings(scene, 8)
         assert stale == ("early",) and "early" not in {**fresh, **airs, **suns}
-        with pytest.raises(
-            InputError, match=r"'early': .* by an older twin; fit its photo again: python -m twin\.relight"
-        ):
+        with pytest.raises(InputError, match=r"'early': .* by an older twin; fit its photo again: twin relight"):
             twin.load_scene(scene.root).radiance_field().embedding("early")
     finally:
         path.unlink()

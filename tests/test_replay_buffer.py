@@ -51,7 +51,7 @@ class NaiveEnvs:
 
 
 def check(buffer: FrameReplayBuffer, worlds: NaiveEnvs) -> int:
-    """Compares every transition that is whole with what went in; how many there were."""
+    """Compares every whole transition with the one that was added; returns their number."""
     filled = buffer.buffer_size if buffer.full else buffer.pos
     total, count = len(worlds.seen[0]), 0
     for world in range(ENVS):

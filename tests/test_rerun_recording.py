@@ -24,7 +24,7 @@ def scene(tmp_path_factory):
 
 
 def columns(path):
-    """By entity, its timed values in order: (times [s], component → list of values)."""
+    """The timed values of each entity in order: (times [s], component → list of values)."""
     from rerun.chunk import RrdReader
 
     out = {}

@@ -179,7 +179,7 @@ def test_device_features_stop_and_copies_agree_with_render():
 
 
 def test_colors_before_a_stop_count_by_opacity():
-    """Between the walls, one section is opaque and the other one transparent, with any color."""
+    """Between the walls, one section is opaque; the other is transparent and may have any color."""
     near, far, both = two_sections()
     stop = np.full((1, SIZE[1], SIZE[0]), 4.6)
     out = both.render(views(0.0), "day", stop=stop)

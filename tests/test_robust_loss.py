@@ -37,7 +37,7 @@ def test_instants_of_a_window_are_averaged():
 
 
 def test_no_other_scales_are_likelier():
-    """Against SciPy's likelihood, which differs by a constant."""
+    """The likelihood is SciPy's, which differs by a constant."""
     residuals = student((0.02, 0.02, 0.3), 300)
 
     def cost(position: float, yaw: float, some: np.ndarray) -> float:
@@ -87,7 +87,7 @@ def test_the_robust_jacobian_gives_exact_gradients():
 
 @pytest.mark.parametrize("noise", [0.01, 1.0, 30.0])
 def test_model_and_scales_are_found_in_alternation(noise):
-    """From far away, in any unit, with a tenth of outliers."""
+    """The start is far away, the unit arbitrary, and a tenth of the residuals are outliers."""
     residuals = noise * student((1.0,), 300)
     residuals[::10] = -80.0 * noise
     found = fit_with_scales(

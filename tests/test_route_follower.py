@@ -72,7 +72,7 @@ def test_the_same_drive_repeats_exactly(world, drive):
 
 
 def test_rear_heavy_robot_is_followed_too(tmp_path):
-    """The yaw rate achieved is 1.3 times that commanded; heading feedback must absorb it."""
+    """Its yaw rate is 1.3 times the commanded one; heading feedback must compensate for that."""
     scene = tiny_scene(tmp_path)
     out = scene.stage("mjcf")
     out.mkdir()
@@ -197,7 +197,7 @@ def test_pictures_show_robot_ground_and_parts(world, drive):
 
 
 def test_command_latency_delays_the_motion():
-    """The same drive, later by the latency: whole control steps and the rest of one."""
+    """The drive is the same, later by the latency, which is not a whole number of control steps."""
     latency = 0.14
     prompt, late = on_a_plane(), on_a_plane(HuskyParams(command_latency=latency))
     tracks: dict[HuskyPhysics, list] = {prompt: [], late: []}
@@ -234,7 +234,7 @@ def test_camera_latency_shows_the_past():
 
 
 def test_delayed_poses_belong_to_one_instant():
-    """Exactly at contact checks, which are 10 ms apart, and closely between them."""
+    """They are exact at contact checks, which are 10 ms apart, and close to the truth between these."""
     latency, step = 0.026, 0.002
     prompt, fine, coarse = on_a_plane(), *(on_a_plane(HuskyParams(camera_latency=latency)) for _ in range(2))
     past = [prompt.data.qpos.copy()]

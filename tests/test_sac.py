@@ -25,7 +25,7 @@ TINY = Architecture(SIZE, 2, 2, ((8, 5, 3),), 16, (32, 32), 1)
 
 
 class SpotEnv(gymnasium.Env):
-    """A bright spot; the action that points at it is worth most. Every episode has 5 steps."""
+    """Shows a bright spot; the action that points at it has the highest reward. Every episode has 5 steps."""
 
     observation_space = spaces.Box(0, 255, (6, 9, 16), np.uint8)
     action_space = spaces.Box(-1, 1, (1,), np.float32)
@@ -127,7 +127,7 @@ def test_critics_receive_the_state_and_the_encoder_learns_to_predict_it():
 
 
 def test_critics_use_the_state():
-    """With equal pictures, values can only depend on the state."""
+    """All pictures are equal, so values can only depend on the state."""
     model = spot_model(privileged=True)
     model.learn(120)
     pictures = torch.zeros((64, 6, 9, 16), dtype=torch.uint8)

@@ -133,7 +133,7 @@ def test_the_best_of_a_run_that_did_not_learn_is_kept(scene, tmp_path, scripted)
     choice = learn(scene, tmp_path, CONFIG)
     assert (choice["steps"], choice["why"], choice["reached"]) == (160, "steps", False)
     assert choice["chosen"]["step"] == 120  # of those with most successes the one that earns most
-    assert choice["failures"] == "50 of 50 failures at 0 to 5 m (50 by out_of_bounds); 50 in light mostly like day"
+    assert choice["failures"] == "50 of 50 failures at 0 to 5 m (50 by out_of_bounds); 50 in lightings mostly like day"
 
 
 @pytest.mark.slow
@@ -209,4 +209,4 @@ def test_failures_are_summed_up_by_place_cause_and_light():
     near = [Failure("out_of_bounds", 21.0 + k, "training: night 0.6, sun 0.4") for k in range(3)]
     far = [Failure("stuck", 40.0, "training: sun 0.9, night 0.1")]
     text = selection.failure_summary([*far, *near])
-    assert text == "3 of 4 failures at 20 to 25 m (3 by out_of_bounds); 3 in light mostly like night"
+    assert text == "3 of 4 failures at 20 to 25 m (3 by out_of_bounds); 3 in lightings mostly like night"

@@ -176,7 +176,7 @@ def test_films_in_opposite_directions_are_joined_by_the_ground(tmp_path: Path) -
 
 
 def test_a_film_of_another_road_is_left_out(tmp_path: Path) -> None:
-    """Its lighting is in another film, so the build goes on, and the metrics name it."""
+    """Another film has its lighting, so the build goes on; the metrics name the film that was left out."""
     street = _film(tmp_path / "s", there_and_back=True, same_road=False)
     metrics = _run(street, tmp_path / "out")
     assert metrics["joined"] == [] and metrics["apart"] == ["back"]

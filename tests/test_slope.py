@@ -13,7 +13,7 @@ from twin.sysid import drivetrain, kinematics, logs, rollout, tires
 
 
 def test_slope_is_found_from_accelerations():
-    """A robot that turns on a slope: gravity in its own frame turns the other way, whatever constant the IMU adds."""
+    """On a slope, gravity rotates in the frame of a turning robot, unlike a constant error of the IMU."""
     n, truth = 72, np.array([0.5, -0.3])
     rate = np.linspace(0.8, 1.2, n) * 4 * np.pi / (n * logs.DURATION)  # headings all around, twice
     wheels = np.repeat((rate[:, None] * [-1, 1] * TRACK / 2 / WHEEL_RADIUS)[:, None], logs.SAMPLES, 1)
@@ -44,7 +44,7 @@ def test_one_slope_seen_from_four_headings_is_one_slope():
 
 
 def test_slopes_are_the_gaussian_posterior():
-    """The smoother and its likelihood against the same written as one joint normal distribution."""
+    """The smoother and its likelihood equal those of one joint normal distribution."""
     rng = np.random.default_rng(0)
     readings = rng.normal(size=8) + 1j * rng.normal(size=8)
     turn = rng.uniform(-2, 2, 8)
@@ -116,7 +116,7 @@ def test_readings_without_noise_are_kept(value):
 
 
 def test_wheels_continue_their_preceding_motion():
-    """Also through a lagging servo; then the commands follow."""
+    """This holds for a lagging servo, too; after time zero the wheels follow the commands."""
     params = replace(SOFT, servo_lag=0.2)
     count = logs.SAMPLES + 1
     before = np.stack([np.linspace(6.0, -2.0, count), 1.0 + np.sin(np.arange(count) / 4)], -1)[None]
@@ -143,7 +143,7 @@ def test_wheels_continue_their_preceding_motion():
 
 
 def test_the_fit_begins_each_window_as_the_log_does(monkeypatch):
-    """For fitted windows that follow windows outside the fit."""
+    """Also for windows that are fitted and follow windows that are not."""
     rng = np.random.default_rng(0)
     n = 12
     wheels = np.repeat(rng.uniform(-3, 3, (n, 1, 2)), logs.SAMPLES, 1)
@@ -165,8 +165,9 @@ def test_the_fit_begins_each_window_as_the_log_does(monkeypatch):
 
 
 def test_a_slope_pulls_downhill():
-    """A robot that turns by scrubbing, before a window as in it, creeps down the slope that its accelerometer measures,
-    whatever its heading when the window begins."""
+    """A robot that turns by scrubbing creeps down the slope that its accelerometer measures, before and in a window,
+    for any initial heading.
+    """
     n = 12
     wheels = np.full((n, logs.SAMPLES, 2), [-3.0, 3.0])
     turning = kinematics.IcrModel(y_left=0.56, y_right=-0.56)  # as SOFT turns

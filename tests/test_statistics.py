@@ -198,7 +198,7 @@ _NOISE = 3 * np.sqrt(0.09 / _RUNS)
 
 @pytest.mark.parametrize("trials", [10, 50, 100])
 def test_wilson_covers(trials: int) -> None:
-    """Over uniformly distributed rates the mean coverage is the nominal one (Brown, Cai and DasGupta, section 4.1)."""
+    """The mean coverage over uniformly distributed rates is the nominal one (Brown, Cai and DasGupta, section 4.1)."""
     rng = np.random.default_rng(trials)
     rate = rng.uniform(size=_RUNS)
     low, high = wilson(rng.binomial(trials, rate), trials)
@@ -206,7 +206,7 @@ def test_wilson_covers(trials: int) -> None:
 
 
 def test_mean_rate_covers() -> None:
-    """At least as often as it says, as unequal rates have less variance than equal ones."""
+    """The coverage is at least the nominal one, as a mean of unequal rates has less variance."""
     rng = np.random.default_rng(3)
     trials = np.array([10, 25, 50])
     rate = rng.uniform(size=(2000, 3))

@@ -39,7 +39,7 @@ def poses(n: int, lateral: float = 0.0) -> np.ndarray:
 
 
 def film(folder: Path, n: int = 8, paint=None) -> Cameras:
-    """A drive past two boxes; `paint(i, places)` gives gray of frame i where it is not the pattern."""
+    """A drive past two boxes; `paint(i, places)` replaces the pattern's gray in frame i."""
     pose = poses(n)
     depth = PLACE.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), "day").depth
     names = tuple(f"day/{i:06d}" for i in range(n))

@@ -82,7 +82,7 @@ def cases(tmp_path_factory) -> dict[str, Case]:
 
 
 def _started(name: str, case: Case) -> tuple[subprocess.Popen, list[psutil.Process]]:
-    """The verb, once it has started its processes, and all processes that it has started."""
+    """Waits until the verb has started its processes; returns the verb and all of these."""
     process = subprocess.Popen(
         [sys.executable, "-m", f"twin.{name}", *case.arguments, "--quiet"],
         stdout=subprocess.PIPE,
@@ -139,7 +139,7 @@ def test_nothing_outlives_a_verb(cases, name, number):
 
 
 def test_children_of_a_killed_decomposition_end(tmp_path):
-    """CoACD's children, started by threads of the mesh stage."""
+    """Threads of the mesh stage start CoACD's processes."""
     script = f"""
 import trimesh, numpy as np
 from pathlib import Path

@@ -70,7 +70,7 @@ def test_a_long_film_takes_no_more_frames_than_its_speed_asks_for():
 
 
 def test_things_stand_as_densely_far_along_as_at_the_start(place):
-    """Solids of 50 m of road, for every 50 m; no 50 m has less than a third of the mean."""
+    """Every 50 m of road have at least a third of the mean number of solids per 50 m."""
     solids = [solid.center[:2] for obj in place.objects for solid in obj.solids]
     station, lateral = place.route.project(np.array(solids))
     counts = np.histogram(station[np.abs(lateral) < 20.0], np.arange(0.0, 151.0, 50.0))[0]
@@ -115,7 +115,7 @@ def test_a_stretch_has_what_is_near_and_sharp_textures_there(place, monkeypatch)
 
 
 def test_a_frame_far_along_shows_the_road_and_things_beside_it(place):
-    """At 130 m: road below the horizon, solid things beside it, and depth that is the same by rays."""
+    """At 130 m, the road is below the horizon, solid objects are beside it, and the depth equals that of cast rays."""
     plan = replace(filming.FilmingPlan.of(draw(PLACE, LENGTH)), width=160, height=92, oversize=1.0)
     lighting = plan.lightings[0]
     _, poses = filming.trajectory(plan, place.route, lighting)

@@ -62,7 +62,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 @pytest.mark.slow
 def test_a_run_killed_at_random_three_times_finishes(scene, tmp_path):
-    """As a process, with SIGKILL: all steps are there, tables have no gap and nothing twice, and the policy drives."""
+    """It is killed by SIGKILL. All steps are there, tables have no gap and no repetition, and the policy drives."""
     folder = tmp_path / "run"
     code = (
         "import sys, dataclasses; sys.path.insert(0, sys.argv[3])\n"
@@ -278,7 +278,7 @@ def test_configurations_set_the_environment():
 
 
 def test_states_are_those_of_the_environment(scene):
-    """Also of an episode's first picture, which comes with the last of the episode before."""
+    """Also for an episode's first picture, which is returned together with the last one of the episode before."""
     env = DriveVecEnv(scene, "ahead", 2, seed=3, lighting="day", time_limit=0.5, action="steering")
     env.reset()
     for _ in range(4):

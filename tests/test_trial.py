@@ -331,7 +331,7 @@ def test_headers_of_another_clock_are_replaced_by_times_of_recording(place, tmp_
 
 @pytest.mark.slow
 def test_the_played_robots_bag_has_what_its_pilot_saw(tmp_path, monkeypatch):
-    """It drives by the pilot on JPEG pictures; the recorded commands are the policy's for the recorded pictures."""
+    """The pilot drives on JPEG pictures; the recorded commands are the policy's for the recorded pictures."""
     from twin.reality.robot_bag import write_robot_bag
     from twin_policy import Limits, OnnxPolicy, Pilot
 

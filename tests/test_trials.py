@@ -76,7 +76,7 @@ def test_an_invalid_row_is_named(tmp_path: Path, line: str, message: str) -> Non
 
 
 def test_without_validated_trials_the_error_names_the_command(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"twin\.validate"):
+    with pytest.raises(InputError, match="twin validate"):
         read_trials(tmp_path / "episodes.csv")
 
 
@@ -104,7 +104,7 @@ def test_results_find_their_cell(tmp_path: Path) -> None:
         (HEADER + "other,sun,10,5\n", "line 2: policy 'other' was not validated; expected one of nerf, simulator"),
         (HEADER + "nerf,sunn,10,5\n", "line 2: lighting 'sunn' is not in the twin; did you mean 'sun'?"),
         (HEADER + "nerf,dusk,10,5\n", "expected one of held-out, sun; or add a column twin_lighting"),
-        (HEADER + "nerf,night,10,5\n", "policy 'nerf' was not validated under 'night'; run python -m twin.validate"),
+        (HEADER + "nerf,night,10,5\n", "policy 'nerf' was not validated under 'night'; run twin validate"),
         (HEADER + "simulator,sun,10,5\n", "was validated on straight and right_turn; add a column task"),
         (HEADER + "nerf,sun,10,5\nnerf,sun,10,6\n", "line 3: policy 'nerf', lighting 'sun', task 'straight' is there"),
         (HEADER + ",sun,10,5\n", "line 2: no policy; expected a name"),

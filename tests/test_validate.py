@@ -220,7 +220,7 @@ def test_a_changed_scene_is_refused(fresh):
 
 
 def test_a_table_without_a_record_is_refused(fresh):
-    """As one that an earlier version wrote, which noted no roads."""
+    """The table is like that of an earlier version, which did not record roads."""
     run(fresh, "ahead", lightings=["day"], episodes=1)
     path = fresh / "validation" / "validated.json"
     path.write_text(json.dumps({"field": "made up", "policies": json.loads(path.read_text())["policies"]}))

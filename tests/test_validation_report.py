@@ -79,7 +79,7 @@ def told(trials, **more) -> dict:
 
 
 def page(folder: Path, said: dict, *curves: TrainingCurve) -> Text:
-    """The page's text; the maps are any picture."""
+    """The page's text; a placeholder replaces the maps."""
     from PIL import Image
 
     for task in {c["task"] for c in said["cells"]}:
@@ -139,7 +139,7 @@ def test_training_is_the_last_episodes_before_the_policy_was_saved(tmp_path):
     with pytest.raises(InputError, match=r"choice\.json is damaged .*41 successes in 40 trials"):
         training_summaries(tmp_path, heads)
     (run / "choice.json").unlink()
-    # The run was trained on, or is another one: its curve is not that of the policy that was validated.
+    # If the run was trained further or replaced, its curve is not that of the validated policy.
     write_json(heads["r"], {"trained": {"step": 4000}})
     assert set(training_summaries(tmp_path, ["r", "r/5"])) == {"r/5"}
     shutil.rmtree(tmp_path / "validation")
@@ -158,13 +158,13 @@ def test_every_cause_has_words():
 
 
 def test_the_headline_compares_what_all_have_driven():
-    """`b` is better where both were; that `a` also drove in easy light does not help it."""
+    """`b` is better in the lightings of both; `a` also drove in an easy one, which must not count."""
     trials = [trial("a", k, "goal" if k < 4 else "stuck") for k in range(10)]
     trials += [trial("a", k, light="easy") for k in range(90)]
     trials += [trial("b", k, "goal" if k < 7 else "stuck") for k in range(10)]
     (verdict,) = verdicts(told(trials))
     assert (
-        "“b” reaches the goal most often: in 7 of 10 episodes in the light that was used for all policies (day)"
+        "“b” reaches the goal most often: in 7 of 10 episodes in the lightings that were used for all policies (day)"
         in verdict.text
         and verdict.mood == "mixed"
     )
@@ -177,7 +177,7 @@ def test_the_headline_compares_what_all_have_driven():
 def test_a_weak_light_and_untrusted_pictures_are_headlines():
     trials = [*(trial("a", k) for k in range(3)), trial("a", 0, "stuck", light="night", trust=0.2)]
     first, second = verdicts(told(trials))
-    assert "least often in the light night, 0 of 1" in first.text
+    assert "least often in lighting night, 0 of 1" in first.text
     assert "1 of 4 episodes" in second.text
 
 
@@ -194,8 +194,8 @@ def test_numbers_have_intervals_and_what_is_missing_is_not_made_up(tmp_path):
     text = page(tmp_path, told([trial("my_module:act")])).text
     assert "not known" in text and "nan" not in text and "None" not in text
     assert "There is no such episode here" in text and "No videos" in text
-    for absent in ("Which policy is better", "The worst light for", "How the policies were trained"):
-        assert (absent in text) == (absent == "The worst light for")
+    for absent in ("Which policy is better", "The worst lighting for", "How the policies were trained"):
+        assert (absent in text) == (absent == "The worst lighting for")
 
 
 def test_the_page_shows_the_numbers_of_the_tables(tmp_path):
@@ -211,10 +211,10 @@ def test_the_page_shows_the_numbers_of_the_tables(tmp_path):
         assert rate_text(cell) in text and failure_text(cell) in text
     assert rate_text(trained["a"]) in text
     assert "the last 100 training episodes that began at the task’s start (the first of them ended at step 20)" in text
-    assert "trained on ahead, in varying light, for 300 steps" in text
+    assert "trained on ahead, in varying lighting, for 300 steps" in text
     tested = {"a": trained["a"] | {"test": {"step": 300, "condition": "held-out"} | rate_summary(37, 40)}}
     shown = page(tmp_path, told(trials, training=tested)).text
-    assert rate_text(tested["a"]["test"]) in shown and "final test, n = 40, light held-out" in shown
+    assert rate_text(tested["a"]["test"]) in shown and "final test, n = 40, lighting held-out" in shown
     assert rate_text(trained["a"]) not in shown
     assert "19" in text and "only A arrived" in text and "“a” is better" in text  # 31 - 12 episodes
     assert rate_text(said["cells"][0]["low_trust"]) in text
@@ -243,12 +243,12 @@ def test_the_verb_writes_a_page_that_needs_nothing_else(fresh):
     assert list(said["training"]) == ["ahead"]  # the other's run has no episodes
     won = [success for step, success in EPISODES if step <= TRAINED["step"]][-RECENT_EPISODES:]
     assert rate_text(rate_summary(sum(won), len(won))) in shown.text and "How the policies were trained" in shown.text
-    assert f"python -m twin.forecast {fresh} --real real.csv" in shown.text and "ahead,ahead,LIGHT" in shown.text
+    assert f"twin forecast {fresh} --real real.csv" in shown.text and "ahead,ahead,LIGHTING" in shown.text
     assert html.count("<svg") == html.count('<svg role="img" aria-label="') > 0
 
 
 class NoCamera:
-    """In place of the camera behind the robot, whose kernels take long to compile."""
+    """Replaces the camera behind the robot, whose kernels take long to compile."""
 
     def __init__(self, world, size, obstacles):
         self.size = size
@@ -259,7 +259,7 @@ class NoCamera:
 
 @pytest.fixture
 def episodes(monkeypatch):
-    """Every episode that is filmed."""
+    """Stores every episode that is filmed."""
     seen = []
 
     def spy(*args, **options):
@@ -290,7 +290,7 @@ def test_films_are_the_tables_episodes(fresh, episodes):
         assert video_info(folder / one["file"])["frames"] > row.steps // 2
     shown = Text((folder / "validation.html").read_text(encoding="utf-8"))
     assert {f["file"] for f in said["films"]} <= set(shown.links) and "any row of episodes.csv" in shown.text
-    # What is filmed stays, is not filmed again, and is still on the page of a call that films nothing.
+    # Films are kept, not made again, and still shown after a call without --films.
     before = len(episodes)
     assert validate.validate(fresh, ["ahead", "left"], "ahead", ["night", "held-out"], 3, films=True) == said
     assert validate.validate(fresh, ["left"], "ahead", ["night"], 2)["films"] == said["films"]
@@ -308,7 +308,7 @@ def test_a_film_that_ends_otherwise_than_the_table_is_refused(fresh, episodes):
 
 
 def test_any_policy_can_be_filmed_in_the_environment_it_asks_for(fresh, episodes, tmp_path, monkeypatch, capsys):
-    """A run, its folder and its ONNX file drive alike; a callable drives, too; what is no policy is one line."""
+    """A run, its folder and its ONNX file drive alike; so does a callable; anything else is refused in one line."""
     (tmp_path / "my_film_policy.py").write_text("def act(pixels):\n    return [0.0, 0.5]\n")
     monkeypatch.chdir(tmp_path)
     run = fresh / "runs" / "ahead"
@@ -336,7 +336,7 @@ def test_a_curve_has_points_of_five_episodes_and_no_more_than_it_can_show(count)
 
 
 def test_a_robot_without_identified_parameters_gives_a_caution():
-    """Where episodes are drawn anew and nothing is known of the robot, it says what would tell."""
+    """The caution appears if episodes are randomized and no parameter of the robot is identified; it names the cure."""
 
     def cautions(light: str, **more) -> str:
         return " ".join(c.what for c in limitations(told([trial(light=light)], **more)))
@@ -349,7 +349,7 @@ def test_a_robot_without_identified_parameters_gives_a_caution():
 @pytest.mark.filterwarnings("error::UserWarning")
 @pytest.mark.parametrize("lights", [2, MAX_PLOTTED_LIGHTINGS, 11])
 def test_names_of_many_lightings_leave_room_for_the_rates(lights):
-    """A legend wider than the figure, or names taller than it, would squeeze its axes to nothing."""
+    """A legend wider than the figure, or names taller than it, would leave no room for the axes."""
     names = [f"afternoon_of_day_{k}+randomised" for k in range(lights)]
     cells = summarize([trial(light=name) for name in names])["cells"]
     figure = rate_figure(cells) if lights <= MAX_PLOTTED_LIGHTINGS else rate_heatmap(cells, {})
@@ -370,7 +370,7 @@ def tiles(figure) -> dict[tuple[str, str], tuple[str, tuple[float, ...]]]:
 
 
 def test_many_lightings_are_a_heatmap_with_the_mean_of_the_shared_ones():
-    """`a` is better in every light; a mean over what each drove, or over episodes, would say otherwise."""
+    """`a` is better in every lighting; a mean over each policy's own lightings, or over episodes, would favor `b`."""
     assert MAX_PLOTTED_LIGHTINGS < 6
     won = {"a": [0, 25, 100, 100, 100, 100], "b": [None, None, 100, 75, 75, 75]}
     trials = [
@@ -399,7 +399,7 @@ def test_where_no_lighting_is_shared_there_is_no_mean():
 
 
 def test_paired_comparisons_are_a_heatmap_with_the_best_on_top():
-    """`good` arrives in 20 episodes, `fair` in 2, `poor` in none: two more may be chance."""
+    """`good` arrives in 20 episodes, `fair` in 2, `poor` in none; a difference of two may be chance."""
     won = {"poor": 0, "good": 20, "fair": 2}
     trials = [trial(name, seed, "goal" if seed < n else "collision") for name, n in won.items() for seed in range(20)]
     drawn = tiles(pair_heatmap(summarize(trials)["pairs"]))
@@ -434,5 +434,5 @@ def test_long_tables_are_collapsed_below_a_figure(tmp_path):
         parts = [html[start : html.index("</section>", start)] for start in starts]
         return [(part.count("<svg"), part.count("<details")) for part in parts]
 
-    assert sections(trials) == [(1, 2), (1, 1), (0, 1)]  # the first has what the words mean, too
+    assert sections(trials) == [(1, 2), (1, 1), (0, 1)]  # the first also has the definitions
     assert sections([t for t in trials if t.policy in "p0 p1"]) == [(1, 1), (0, 0), (0, 0)]

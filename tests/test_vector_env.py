@@ -82,7 +82,7 @@ def test_attributes_of_tasks_are_read_and_set_in_children(spread):
 
 
 class _Foreign:
-    """A class that no child can import: it is of this process's `__main__`."""
+    """A class that no child process can import, since it belongs to this process's `__main__`."""
 
 
 def test_unpicklable_requests_and_replies_raise(spread, monkeypatch):
@@ -112,7 +112,9 @@ def test_a_process_that_dies_is_an_error_with_a_cure(spread):
 
 
 def test_interrupted_step_closes_the_environment(spread):
-    """As by Ctrl-C in a notebook: a pending reply would be taken for that to the next request."""
+    """Ctrl-C in a notebook interrupts a step like this; a pending reply would be taken for the reply to the next
+    request.
+    """
     spread.begin(range(3))
     receive = _Child.receive
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
@@ -125,7 +127,7 @@ def test_interrupted_step_closes_the_environment(spread):
 
 
 def test_children_ignore_interrupts(spread):
-    """A parent that saves its state on Ctrl-C or SIGTERM needs the environments for it."""
+    """A parent that saves its state on Ctrl-C or SIGTERM still needs the environments."""
     spread.begin(range(3))
     for child in spread._children:
         assert os.getpgid(child.process.pid) != os.getpgid(0)
@@ -134,7 +136,7 @@ def test_children_ignore_interrupts(spread):
 
 
 def test_children_end_with_their_parent(scene):
-    """However it ends, and though its script has no `if __name__ == "__main__"`."""
+    """However the parent ends, and even if its script has no `if __name__ == "__main__"`."""
     script = f"""
         import os, signal
         from twin.env.vector_env import ProcessVectorEnv
@@ -159,7 +161,7 @@ def test_children_end_with_their_parent(scene):
 
 
 def test_close_does_not_wait_for_inherited_sockets(spread):
-    """As a process forked meanwhile has them."""
+    """A process that was forked meanwhile has inherited the sockets."""
     held = [os.dup(child.pipe.fileno()) for child in spread._children]
     spread.close()
     assert all(child.process.poll() == -signal.SIGKILL for child in spread._children)

@@ -149,7 +149,7 @@ def test_gpu_contact_ends_the_episode(scene):
 
 @pytest.mark.parametrize("latency", [0.0, 0.1])
 def test_gpu_frame_stacks_equal_those_on_the_host(scene, latency, monkeypatch):
-    """Across episode ends, for subsets of environments, and as a tensor that shares memory."""
+    """Also across episode ends, for subsets of environments, and as a tensor that shares memory."""
     stage = EnvFactory.open(
         scene, "bend", {"obstacles": (), "lighting": ("day", "night"), "lighting_drift": True, **SMALL}
     )

@@ -26,7 +26,7 @@ def test_a_film_is_h264_yuv420p_and_keeps_its_pictures(tmp_path: Path) -> None:
     read = list(read_frames(path))
     assert len(read) == 10
     for got, expected in zip(read, frames, strict=True):
-        # Colours survive the way through YUV: a wrong matrix or range is off by ten levels or more.
+        # Colors survive the way through YUV: a wrong matrix or range is off by ten levels or more.
         assert np.abs(got.astype(int) - expected).mean() < 4.0
 
 

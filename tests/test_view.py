@@ -344,7 +344,7 @@ def test_a_click_finds_the_filmed_camera(scene):
 
 def test_the_report_says_how_to_look_at_the_scene(scene):
     commands = [line for _, lines in report_page._next_steps(scene.scene, {}) for line in lines]
-    assert f"python -m twin.view {scene.scene.root}" in commands
+    assert f"twin view {scene.scene.root}" in commands
     viewer = next(line for line in commands if "mujoco.viewer" in line)
     assert Path(shlex.split(viewer)[-1].removeprefix("--mjcf=")).is_file()
 
@@ -364,7 +364,7 @@ def test_station_and_lateral_are_the_inverse_of_the_pose(scene):
 
 
 class _Drive:
-    """A drive whose keys and facts a test sees; its thread stands still, and the test steps."""
+    """A drive whose keys and facts a test sets and reads; its thread does not run, and the test makes the steps."""
 
     def __init__(self, scene, field, **more):
         self.keys, self.facts = frozenset(), []

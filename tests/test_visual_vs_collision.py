@@ -28,7 +28,7 @@ STATIONS = (0.0, 1.0, 2.0)
 
 
 class SolidField:
-    """Hits of MuJoCo's own rays, one by one."""
+    """A field that shows the collision geometry, by casting MuJoCo's rays one by one."""
 
     lightings = ("day",)
 

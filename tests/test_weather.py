@@ -113,7 +113,7 @@ FOG = Fog(0.1, (0.9, 0.8, 0.7))
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    """A built scene that also knows the light of its first lighting in two airs."""
+    """A built scene with two added lightings that have the embedding of the first filmed one: one clear, one in fog."""
     runtime.set_quiet(True)
     scene = SceneDir(tiny_twin(tmp_path_factory.mktemp("photos")))
     day = [float(x) for x in twin.load_scene(scene.root).field().embedding("day")]
@@ -144,7 +144,7 @@ def test_fog_of_a_photo_is_applied(photos):
     bare = [
         EnvFactory.open(built, "ahead", {"lighting": name, **SMALL})._field_only for name in ("day", "clear", "foggy")
     ]
-    assert bare == [True, True, False]  # pictures that stay on a device have no air
+    assert bare == [True, True, False]  # pictures that stay on a device have no fog
     assert not EnvFactory.open(built, "ahead", {"lighting": ("day", "foggy"), **SMALL})._field_only
 
 
@@ -163,7 +163,7 @@ def test_fog_is_applied_after_relighting_and_shadows(photos):
     distance = seen.depth[0] * np.linalg.norm(rays, axis=-1)
     expected = FOG.apply(lit, distance.astype(np.float32))
     np.testing.assert_allclose(shown, 255.0 * np.clip(expected, 0.0, 1.0), atol=1.0)
-    assert np.abs(255.0 * expected - 255.0 * FOG.apply(seen.rgb[0], distance)).max() > 10.0  # it shows
+    assert np.abs(255.0 * expected - 255.0 * FOG.apply(seen.rgb[0], distance)).max() > 10.0  # the fog is visible
 
 
 def test_fog_drifts_with_the_lighting(photos):
@@ -173,7 +173,7 @@ def test_fog_drifts_with_the_lighting(photos):
         return sample_lighting(wanted, True, 10.0, sets, np.random.default_rng(seed))
 
     ends = {light("foggy", seed).name for seed in range(20)}
-    assert ends == {"foggy → day", "foggy → night"}  # filmed ones
+    assert ends == {"foggy → day", "foggy → night"}  # both are filmed lightings
     away = light("foggy")
     for time, share in ((0.0, 1.0), (2.5, 0.75), (5.0, 0.5), (10.0, 0.0), (99.0, 0.0)):
         air = away.fog_at(time)
@@ -226,7 +226,7 @@ def test_solid_shadows_have_straight_edges_and_no_seam():
         steps = np.abs(np.diff(patterns, axis=axis)).mean()
         seam = np.abs(np.take(patterns, 0, axis) - np.take(patterns, -1, axis)).mean()
         assert 0.3 * steps < seam < 3.0 * steps
-    # Posts lie along the sun's direction, which a row of the pattern is: what is dark goes on along it.
+    # Shadows of posts lie along the sun's direction, which is that of the pattern's rows.
     along, across = (np.abs(np.diff(patterns, axis=axis)).mean() for axis in (2, 1))
     assert across > 1.1 * along
 
@@ -238,9 +238,9 @@ LEFT = np.array([0.0, np.cos(LOW), np.sin(LOW)])
 
 
 def street(ground: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Of a camera at the end of a street along x, looking along x: depth, points, and masks of what is seen.
+    """Depth, points and masks of the surfaces that a camera sees at the end of a street along x, looking along x.
 
-    The ground is so far below the camera [m]; walls end 6 m above it.
+    `ground` is the height of the camera above the ground [m]; walls end 6 m above the camera.
     """
     left, up = -RAYS[..., 0], -RAYS[..., 1]
     with np.errstate(divide="ignore"):
@@ -256,8 +256,9 @@ def street(ground: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]
 
 
 def test_evaluation_weather_is_never_mild():
-    """The road never has the film's sun: every draw of an evaluation shows another one, and shadows not filmed. Those
-    of training begin at none."""
+    """A real road never has the film's sun: every sample of an evaluation has another sun, and shadows that were not
+    filmed. Samples of training may have neither.
+    """
     ranges, rng = condition_options(Condition("day", True))["randomise"], np.random.default_rng(0)
     tried, trained = ([one.sample(rng) for _ in range(300)] for one in (ranges, Ranges()))
     for strength in ("sunlight", "shade"):
@@ -271,14 +272,14 @@ def test_evaluation_weather_is_never_mild():
 
 
 def test_a_shadow_lies_on_the_side_away_from_the_sun():
-    """What is dark above the ground darkens the ground where the sun's ray through it ends, and not before it."""
+    """A dark point above the ground darkens the ground where the sun's ray through the point ends, and nowhere else."""
     rng, differ = np.random.default_rng(0), []
     one = np.ones((200, 200, 3), np.float32)
     for turned in rng.uniform(0.0, 2.0 * np.pi, 8):
         sun = np.array([np.cos(LOW) * np.cos(turned), np.cos(LOW) * np.sin(turned), np.sin(LOW)])
         shadows = CastShadows(0.7, sun, rng)
         above = np.append(rng.uniform(-10.0, 10.0, (200, 200, 2)), rng.uniform(0.5, 3.0, (200, 200, 1)), -1)
-        ray = above[..., 2:] / sun[2] * sun  # to as high as it is
+        ray = above[..., 2:] / sun[2] * sun  # from the ground to the point
         light, away, towards = (
             shadows.apply(one, one[..., 0], points)[..., 1]
             for points in (above, above - ray, above + ray * [1.0, 1.0, -1.0])
@@ -349,7 +350,7 @@ def test_sun_is_fixed_in_the_world_and_casts_the_shadows():
             lit = weather.apply(rgb, depth, RAYS, pose)
             seen.append(np.median(lit[:20, 20:-20, 1]) / 0.5)
         sun = weather._relighting._sun
-        assert seen == pytest.approx([np.exp(0.7 * (-sun[0] - sun[2]))] * 2, rel=0.01)  # the wall looks back at us
+        assert seen == pytest.approx([np.exp(0.7 * (-sun[0] - sun[2]))] * 2, rel=0.01)  # the wall faces the camera
         ratios.append(seen[0])
     assert max(ratios) > 1.3 and min(ratios) < 0.6
     sides = weather._relighting

@@ -48,7 +48,7 @@ def test_metrics_are_those_of_the_scene(exported):
     assert metrics["route_length_m"] == pytest.approx(arc_lengths(tiny_route())[-1])
     assert metrics["turn_deg"] == pytest.approx(-90, abs=3)
     assert metrics["spawn_touched"] == []
-    # The nearest box's near edge is 1.9 m to the left, the robot's tyre 0.34 m.
+    # The nearest box's near edge is 1.9 m to the left, the robot's tire 0.34 m.
     assert 1.5 < metrics["spawn_clearance_m"] < 4.0
     assert metrics["spawn_drift_m"] < 0.001
 
@@ -67,7 +67,7 @@ def test_heights_are_right_to_a_millimeter(exported):
 
 
 def test_coarse_height_field_keeps_nodes_and_colors_in_place(tmp_path):
-    """Nodes of the coarse field are nodes of the fine one; the texture has a texel per fine cell of the rest."""
+    """The coarse field's nodes are nodes of the fine one; the texture has a texel per fine cell."""
     ground = tiny_ground()
     rgb = np.random.default_rng(5).integers(0, 255, (*ground.height.shape, 3)).astype(np.uint8)
     ground = type(ground)(ground.height, ground.origin, ground.cell, ground.measured, rgb)
@@ -107,7 +107,7 @@ def test_level_ground_is_level(tmp_path):
 
 
 def test_parts_keep_their_places(exported):
-    """MuJoCo moves a mesh to its own centre and axes; in the world its corners must be back in place."""
+    """MuJoCo moves a mesh to its own center and axes; in the world its corners must be back in place."""
     folder, _ = exported
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     data = mujoco.MjData(model)
@@ -210,7 +210,7 @@ def test_a_route_that_is_too_short_is_refused(tmp_path):
 
 
 def test_geoms_touched_at_the_start_are_reported(tmp_path):
-    scene = tiny_scene(tmp_path, boxes=((0.0, 0.62, 0.8),))  # 2 cm into the left tyres
+    scene = tiny_scene(tmp_path, boxes=((0.0, 0.62, 0.8),))  # 2 cm into the left tires
     out = scene.stage("mjcf")
     out.mkdir()
     assert run(scene, tiny_config(), out)["spawn_touched"] == ["part_0000"]
@@ -225,7 +225,7 @@ def test_a_start_inside_a_part_is_refused(tmp_path):
 
 
 def on_a_slope(tmp_path, degrees: float, robot: HuskyParams, **scene_arguments):
-    """The tiny scene on a plane that falls towards the robot's back, and the error of its export."""
+    """The tiny scene on a plane that falls towards the robot's back, and the error that its export raises."""
     scene = tiny_scene(tmp_path, **scene_arguments)
     flat = tiny_ground()
     x = np.broadcast_to(np.arange(flat.height.shape[1]) * flat.cell, flat.height.shape)
@@ -238,7 +238,7 @@ def on_a_slope(tmp_path, degrees: float, robot: HuskyParams, **scene_arguments):
 
 
 SOFT = HuskyParams(friction=0.25, spin_friction=0.02, slip_stiffness=1 / 40, ground_viscosity=5.0)
-"""As fitted on soft ground: tyres that creep down any slope."""
+"""A robot fitted on soft ground, whose tires creep down any slope."""
 
 
 @pytest.mark.parametrize("degrees", [2.0, 5.0, 12.0])
@@ -248,8 +248,8 @@ def test_a_robot_fitted_on_soft_ground_starts_on_a_slope(tmp_path, degrees, serv
     world = World.load(out)
     start = tiny_route()[0] - [BASE_HEIGHT * np.sin(np.radians(degrees)), 0.0]  # wheels at the route's start
     assert np.hypot(*(world.spawn[:2] - start)) < 0.005  # and not where it would have crept to
-    assert metrics["spawn_drift_m"] > 0.004  # it does creep, and that is told
-    assert world.model().opt.impratio == pytest.approx(1 / 40)  # what is shipped is as soft as was fitted
+    assert metrics["spawn_drift_m"] > 0.004  # it creeps, and the metrics say so
+    assert world.model().opt.impratio == pytest.approx(1 / 40)  # the exported tires are as soft as the fitted ones
 
 
 def test_a_start_inside_a_part_is_refused_on_soft_ground(tmp_path):
@@ -271,7 +271,7 @@ def test_a_start_too_steep_for_the_tires_is_refused(tmp_path):
     ],
 )
 def test_a_copy_that_moves_differently_is_a_bug(tmp_path, written, instead):
-    """On a steep start, where the robot's weight loads the tires."""
+    """The start is steep, so that the robot's weight loads the tires."""
     out, _ = on_a_slope(tmp_path, 25.0, HuskyParams())
     built = World.load(out).model()
     assert check_portable(out, built)["spawn_drift_m"] < 0.005
@@ -296,7 +296,7 @@ def test_rest_pose_follows_the_slope():
 
 
 def test_texels_interpolate_corner_colors_exactly():
-    """Bilinear lookup in the texture, by hand, against the linear interpolation of the corners."""
+    """Bilinear lookup in the texture equals linear interpolation of the corners' colors."""
     rng = np.random.default_rng(2)
     colors = rng.integers(60, 120, (7, 3, 3)).astype(np.uint8)  # no clamping of the fourth texel
     texture, texcoords = face_texture(colors)
@@ -312,7 +312,7 @@ def test_texels_interpolate_corner_colors_exactly():
 
 
 def test_texture_coordinates_survive_the_obj(exported):
-    """The color looked up through the compiled model equals the mesh's own at a face's corner."""
+    """The color looked up through the compiled model is the mesh's own color at a face's corner."""
     folder, _ = exported
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     with np.load(folder.parent / "4_mesh" / "visual.npz") as data:
@@ -353,7 +353,7 @@ def test_left_of_the_route_is_positive():
     s, error = nearest_on_route(route, np.array([[5.0, 1.0], [5.0, -1.0], [9.0, 5.0]]))
     np.testing.assert_allclose(s, [5.0, 5.0, 15.0])
     np.testing.assert_allclose(error, [1.0, -1.0, 1.0])
-    # A route that meets itself: only the wanted stretch is looked at.
+    # On a route that meets itself, only the given range is searched.
     loop = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.1]])
     assert nearest_on_route(loop, np.array([0.02, 0.2]))[0] == pytest.approx(15.8)
     assert nearest_on_route(loop, np.array([0.02, 0.2]), around=(0.0, 2.0))[0] == pytest.approx(0.02)
@@ -378,7 +378,7 @@ def test_tiny_world_is_a_drivable_model(tmp_path):
 
 
 def test_projection_is_vectorized():
-    """A route of uneven segments that meets itself, and a range for each point."""
+    """The route has uneven segments and meets itself; each point has its own range."""
     rng = np.random.default_rng(0)
     angle = np.sort(rng.uniform(0.0, 4.0 * np.pi, 160))
     route = np.stack([3.0 * np.sin(angle), 2.0 * np.sin(2.0 * angle)], -1)  # an eight, twice around

@@ -31,7 +31,7 @@ TEXTURES = [_texture(np.random.default_rng(i)) for i in range(len(_PLANES))]
 
 
 def hits(pixels: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray = K) -> tuple[np.ndarray, np.ndarray]:
-    """Where the rays of pixels (..., 2) meet the corridor (..., 3) [m], and which plane that is (...)."""
+    """Points (..., 3) [m] where the rays of pixels (..., 2) meet the corridor, and the index (...) of the plane."""
     rays = unproject(pixels, intrinsics) @ pose[:3, :3].T
     depth, which = np.full(rays.shape[:-1], np.inf), np.zeros(rays.shape[:-1], int)
     for k, (axis, level, _, _) in enumerate(_PLANES):
@@ -46,7 +46,7 @@ def hits(pixels: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray = K) -> tu
 def picture(
     pose: np.ndarray, size: tuple[int, int] = SIZE, intrinsics: np.ndarray = K, tint=(1.0, 1.0, 1.0)
 ) -> np.ndarray:
-    """What a camera sees, uint8, shape (h, w, 3)."""
+    """A camera's picture, uint8, shape (h, w, 3)."""
     place, which = hits(pixel_grid(*size), pose, intrinsics)
     image = np.zeros((*place.shape[:2], 3))
     for k, (_, _, a, b) in enumerate(_PLANES):
@@ -87,7 +87,7 @@ def filmed_corridor(root: Path, frames: int = 6) -> SceneDir:
         image = picture(pose)
         write_image(cameras.image_path(i), image)
         found = cv2.SIFT_create(1500).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-        pixels = np.unique(np.array([k.pt for k in found]) + 0.5, axis=0)  # OpenCV's first pixel centre is 0, 0
+        pixels = np.unique(np.array([k.pt for k in found]) + 0.5, axis=0)  # OpenCV's first pixel center is 0, 0
         places.append(hits(pixels, pose)[0])
         seen.append(np.full(len(pixels), i))
     xyz, frame = np.concatenate(places), np.concatenate(seen)

@@ -13,7 +13,7 @@ SMALL = Architecture((32, 18), 2, 1, ((4, 5, 4),), 8, (8,), 1)
 
 
 def tiny_runs(root: Path, trained: dict[str, Any] | None = None) -> None:
-    """Adds them to the scene `root`; `trained` is what `ahead` says of its training."""
+    """Adds the policies to the scene `root`; `trained` is the record of the training of `ahead`."""
     for name, turn in (("ahead", 0.0), ("left", 0.8)):
         weights = some_weights(SMALL)
         weights["mean.weight"] *= 0.3

@@ -1,9 +1,9 @@
 """`twin align`: fits the Husky's parameters to a drive log, or its front camera to a film by that camera.
 
-    python -m twin.align scenes/demo drive.csv
-    python -m twin.align scenes/demo robot.mp4
-    python -m twin.align scenes/my_road drive.mcap [--camera]
-    python -m twin.align husky drive.npz --out aligned
+    twin align scenes/demo drive.csv
+    twin align scenes/demo robot.mp4
+    twin align scenes/my_road drive.mcap [--camera]
+    twin align husky drive.npz --out aligned
 
 System identification fits the controller's limits and latency, the servo's lag, tires, ground, center of mass and
 effective wheel radii to half of the log. The other half is held out to score this fit, and a kinematic model

@@ -1,6 +1,6 @@
 """`twin build`: builds a drivable twin of a filmed place, stage by stage; stages that are up to date are skipped.
 
-    python -m twin.build SCENE [--until STAGE] [--force STAGE] [--set nerf.steps=4000] [--device cpu|cuda] [--quiet]
+    twin build SCENE [--until STAGE] [--force STAGE] [--set nerf.steps=4000] [--device cpu|cuda] [--quiet]
 
 A stage writes `build/<folder>.partial`, which is renamed at the end. `twin.scene` defines when a stage is up to date.
 """
@@ -261,7 +261,7 @@ def _report(config: SceneConfig, stamps: dict[str, Stamp], skipped: dict[str, bo
 
 
 def publish(scene: SceneDir, report: dict[str, Any]) -> None:
-    """Writes `report.json` and, if the build is complete, `report.html` and the review film.
+    """Writes `report.json` and, if the build is complete, `report.html` and the review video.
 
     Adds `truth` (the comparison with the ground truth, if there is one) and `cautions` to the report.
     """

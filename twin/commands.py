@@ -56,7 +56,7 @@ def _new(parser: argparse.ArgumentParser) -> None:
     )
     add("scene", type=Path, help="folder to make, such as scenes/my_road")
     add("films", type=Path, nargs="+", metavar="VIDEO", help="films, bags or image folders, one per lighting")
-    add("--camera-height", type=float, metavar="METRES", help="height of the lens above the ground")
+    add("--camera-height", type=float, metavar="METERS", help="height of the lens above the ground")
     add("--topic", help="topic of a bag's pictures; default: that with the most pictures")
 
 
@@ -72,9 +72,10 @@ a scene.toml of your own road:
   # mask = "input/robot.png"      # 0 = ignore (an image, or a folder named like the frames)
   # camera = { model = "PINHOLE", params = [fx, fy, cx, cy], width = 1280, height = 720 }
 
-  [metric]                        # the source of the scale, one of
+  [metric]                        # the source of the scale: one or more of
   camera_height = 1.2             #   lens above the ground [m]
   # gps = true                    #   positions in EXIF or a bag
+  # odometry = true               #   distances by a bag's odometry
   # distance = { metres = 5.0, frame_a = "morning/000010", a = [u, v], b = [u, v] }
   # marker = { family = "DICT_APRILTAG_36h11", id = 0, size = 0.2 }
   # poses_are_metric = true       #   poses of the input, in meters
@@ -84,7 +85,7 @@ twin new SCENE VIDEO... writes such a folder.
     add("scene", type=Path, help="folder with scene.toml and input/")
     add("--until", choices=STAGES, metavar="STAGE", help=f"last stage to run: {', '.join(STAGES)}")
     add("--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="stage to run again")
-    add("--quality", choices=tuple(QUALITIES), help="of the radiance field; default: as in scene.toml, or standard")
+    add("--quality", choices=tuple(QUALITIES), help="sharpness of the field; default: as in scene.toml, or standard")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="override scene.toml, as in nerf.steps=4000")
     add("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
     add("--quiet", action="store_true", help="no progress, no summary")
@@ -94,7 +95,7 @@ def _relight(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     parser.description = (
         "Add a lighting to a built scene from one photo: the photo is located, then an appearance embedding of the "
-        "radiance field, fog and, on demand, a sun are fitted to it. Then the twin can be rendered in that light."
+        "radiance field, fog and, on demand, a sun are fitted to it. Then the twin can be rendered in that lighting."
     )
     parser.epilog = (
         "Without --sun and --time the lighting has no sun. A sun is kept only if, with it, a fit to half of the photo "
@@ -126,7 +127,7 @@ def _align(parser: argparse.ArgumentParser) -> None:
         "acceleration_x, acceleration_y [m/s²] and group. Or a ROS bag with cmd_vel, joint states (or the wheels' "
         "odometry), poses other than wheel odometry (or pictures from which the scene was built) and optionally an IMU "
         "(pip install 'twin[ros]'). A film (.mp4, ...) has rectified pictures of the robot's front camera. In it, the "
-        "robot drives 10 m or more at the scene's place, mostly straight ahead, in light like that of one of its films."
+        "robot drives about 20 m at the scene's place, mostly straight ahead, in light like that of one of its films."
     )
     add("robot", help="folder of a scene, a robot.toml, or `husky` (published values)")
     add("log", type=Path, help="a .csv, an .npz, a bag, or a film")
@@ -140,7 +141,7 @@ def _align(parser: argparse.ArgumentParser) -> None:
 def _film(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     parser.description = "Film a drive in a built scene: robot view, chase view, map, speed and reward."
-    add("scene", type=Path, help="folder of a built scene")
+    add("scene", type=Path, help="folder of a built scene, or a pack")
     add("--task", default="right_turn", help="straight, right_turn, route, or one of scene.toml")
     add("--policy", help="a run, a checkpoint, an ONNX file or module:function; default: a scripted route follower")
     add("--trust", action="store_true", help="load a policy file that may run code")
@@ -182,7 +183,7 @@ def _drive(parser: argparse.ArgumentParser) -> None:
         "scene's only run drives the task of its training; without such a policy, the scripted driver drives."
     )
     add("scene", type=Path, help="folder of a built scene, or a pack or its name: demo")
-    add("--view", action="store_true", help="show the drive in the browser; press Drive there")
+    add("--view", action="store_true", help="show the drive in the browser; press Start driving there")
     add("--policy", help="a run, a checkpoint, an ONNX file or module:function")
     add("--trust", action="store_true", help="load a policy file that may run code")
     add("--task", help="straight, right_turn, route, or one of scene.toml")
@@ -230,7 +231,7 @@ def _view(parser: argparse.ArgumentParser) -> None:
         "Show a built scene in the browser: look around under any lighting, drive the Husky by keys or a policy, put "
         "obstacles in its way, compare film and twin, place camera paths. Or render such a path to a film."
     )
-    add("scene", type=Path, help="folder of a built scene")
+    add("scene", type=Path, help="folder of a built scene, or a pack")
     add("--lighting", help="a name, or a mixture sun:night:0.5; default: the first filmed one")
     add("--task", help="task of the driver: straight, right_turn, ... (default: route)")
     add("--policy", help="a run, a checkpoint, an ONNX file or module:function that may drive")
@@ -255,7 +256,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
         "Write a built place for other programs: all of it as USD, its mesh as glTF, its radiance field as Gaussian "
         "splats, its frames and cameras for other trainers, a task's rules for evaluation elsewhere."
     )
-    add("scene", type=Path, help="folder of a built scene")
+    add("scene", type=Path, help="folder of a built scene, or a pack")
     add(
         "--usd",
         type=Path,
@@ -325,7 +326,7 @@ def _validate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     parser.description = "Measure how often policies succeed, lighting by lighting."
     add("scene", type=Path, help="folder of a built scene")
-    add("--policy", nargs="+", required=True, help="runs, ONNX files or module:function")
+    add("--policy", nargs="+", required=True, help="runs, checkpoints, ONNX files or module:function")
     add("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
     add(
         "--lightings",
@@ -345,19 +346,19 @@ def _validate(parser: argparse.ArgumentParser) -> None:
 def _trial(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     parser.description = (
-        "Evaluate a trial on the road, from the robot's ROS 2 bag, by the twin's rules. The results are a row of "
+        "Evaluate a trial on the road, from the robot's ROS bag, by the twin's rules. The results are a row of "
         "real.csv, a film of robot and twin side by side, and their differences in path and pictures."
     )
     parser.epilog = (
-        "The bag (a folder, .mcap or .db3; pip install 'twin[ros]') has the front camera's pictures and camera_info, "
-        "velocity commands, and poses: odometry that does not drift (RTK, LiDAR, filtered), or NavSatFix. Topics are "
-        "found by their types."
+        "The bag (a folder, .mcap, .db3 or .bag; pip install 'twin[ros]') has the front camera's pictures and "
+        "camera_info, velocity commands, and poses: odometry that does not drift (RTK, LiDAR, filtered), or NavSatFix. "
+        "Topics are found by their types."
     )
     add("scene", type=Path, help="folder of a built scene")
     add("bag", type=Path, nargs="+", help="the recording of one trial; with --lerobot, of any drives")
     add("--policy", help="the policy that drove: a run, a checkpoint or an ONNX file")
     add("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
-    add("--lighting", metavar="NAME", help="name of the day or light for real.csv")
+    add("--lighting", metavar="NAME", help="name of the day or lighting in real.csv")
     add("--twin-lighting", metavar="NAME", help="the lighting of the twin that is compared; default: --lighting")
     add(
         "--cause",
@@ -391,7 +392,7 @@ def _forecast(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     parser.description = "Predict success on the road from success in the twin."
     parser.epilog = """\
-results.csv, one line per policy and lighting:
+real.csv, one line per policy and lighting:
 
   policy,lighting,trials,successes
   first,morning,10,8
@@ -477,7 +478,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
         "--out",
         type=Path,
         required=True,
-        help="results.csv, with a table of trials beside it; only one command at a time may write it",
+        help="real.csv, with a table of trials beside it; only one command at a time may write it",
     )
     command.add_argument(
         "--twin-lighting", default=str(Condition(HELD_OUT, True)), help="the twin's lighting to compare with"
@@ -485,7 +486,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument("--films", type=Path, help="folder for a film of every trial, as the robot saw it")
     command = add("log", "a drive log of the place's Husky, for twin align")
     command.add_argument("--out", type=Path, required=True, help="drive.csv")
-    command.add_argument("--duration", type=float, default=300.0, help="of the drive [s]")
+    command.add_argument("--duration", type=float, default=300.0, help="length of the drive [s]")
     robot(command, camera=False)
     command = add("onboard", "a film by the place's Husky, for twin align")
     command.add_argument("--out", type=Path, required=True, help="robot.mp4")
@@ -505,7 +506,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
 
 VERBS = {
     "new": Verb("start a scene folder from films or photos", _new, "twin.new"),
-    "build": Verb("turn a scene folder into a drivable twin, with a report and a review film", _build, "twin.build"),
+    "build": Verb("turn a scene folder into a drivable twin, with a report and a review video", _build, "twin.build"),
     "relight": Verb("add a lighting to a built scene, from one photo", _relight, "twin.relight"),
     "align": Verb("fit the robot to a log of a real one, or its camera to a film", _align, "twin.align"),
     "drive": Verb("show the Husky driving in a scene or a pack", _drive, "twin.drive"),

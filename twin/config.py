@@ -327,17 +327,17 @@ class MjcfConfig:
 
 @dataclass(frozen=True)
 class ReviewConfig:
-    """The review film."""
+    """The review video."""
 
     speed: Annotated[float, Range(0.01)] = 1.0
     """Speed of the scripted follower [m/s]."""
     fps: Annotated[int, Range(1, 240)] = 10
     width: Annotated[int, Range(1, 4096)] = 480
-    """Width of one panel of the film [px]."""
+    """Width of one panel of the video [px]."""
     render_width: Annotated[int, Range(1, 4096)] = 224
     """Longer side of renderings of the radiance field [px]; they are scaled up to the panel."""
     renders: Annotated[int, Range(0)] = 120
-    """Number of renderings of the radiance field in the film; more renderings make the film smoother and the build
+    """Number of renderings of the radiance field in the video; more renderings make the video smoother and the build
     longer."""
 
 

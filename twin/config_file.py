@@ -51,7 +51,7 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
     """
     table = _read_table(path)
     if table is None:
-        raise InputError(f"no scene.toml at {path}; write one, or run python -m twin.new SCENE VIDEO...")
+        raise InputError(f"no scene.toml at {path}; write one, or run twin new SCENE VIDEO...")
     for override in overrides:
         _apply_override(table, override)
     if isinstance(table.get("robot", {}), dict):

@@ -1,6 +1,6 @@
 """`twin forecast`: forecasts success on the real road from success in the twin.
 
-    python -m twin.forecast SCENE [--real results.csv]
+    twin forecast SCENE [--real results.csv]
 
 This reads `validation/episodes.csv`, which `twin.validate` writes, and the user's table of real trials. It writes
 `forecast.json`, `forecast.csv` and `forecast.html` to `<SCENE>/forecast`. Without real trials, it only ranks the

@@ -65,7 +65,7 @@ class Twin:
     def report(self) -> dict[str, Any]:
         """`report.json` of the last build."""
         if not self.scene.report_json.exists():
-            raise InputError(f"{self.scene.report_json} is missing; run python -m twin.build {self.scene.root}")
+            raise InputError(f"{self.scene.report_json} is missing; run twin build {self.scene.root}")
         return read_json(self.scene.report_json)
 
 

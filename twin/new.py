@@ -1,9 +1,9 @@
 """`twin new`: creates a scene folder from films or a robot's bags.
 
-    python -m twin.new scenes/my_road day.mp4 dusk.mp4 --camera-height 1.2
+    twin new scenes/my_road day.mp4 dusk.mp4 --camera-height 1.2
 
 This writes `scenes/my_road/scene.toml` with the common settings and copies the films into `input/`;
-`python -m twin.build scenes/my_road` then builds the scene. A bag (`twin.capture.bag_film`) provides pictures and their
+`twin build scenes/my_road` then builds the scene. A bag (`twin.capture.bag_film`) provides pictures and their
 calibration. Its GPS and odometry become sources of scale. Its `/tf_static` gives the camera's extrinsics (height,
 position and angles on the robot), which are written to `robot.toml`.
 
@@ -337,7 +337,7 @@ def command(options: argparse.Namespace) -> None:
     print(f"wrote {config}")
     if not any(read_toml(config)["metric"].values()):
         print("fill in [metric] there: the build needs a metric scale")
-    print(f"next: python -m twin.build {options.scene}")
+    print(f"next: twin build {options.scene}")
 
 
 main = partial(commands.main, "new")

@@ -1,7 +1,7 @@
 """`twin relight`: adds a lighting to a built scene from a single photo.
 
-    python -m twin.relight scenes/demo photo.jpg --name afternoon
-    python -m twin.relight scenes/demo photo.jpg --name afternoon --time 2026-06-01T17:30+02:00 --location 48.14,11.58
+    twin relight scenes/demo photo.jpg --name afternoon
+    twin relight scenes/demo photo.jpg --name afternoon --time 2026-06-01T17:30+02:00 --location 48.14,11.58
 
 This localizes the photo, then fits an appearance embedding and fog so that renderings of the frozen radiance field
 match the photo. The lighting is saved as `<scene>/lightings/afternoon.json`, with an image beside it that shows the
@@ -322,7 +322,7 @@ def relight(
     has_mesh = (scene.stage("mesh") / "visual.npz").exists()
     casters = shadow_casters(scene, BakedField.load(scene.stage("field"))) if source and has_mesh else None
     if source and casters is None:
-        raise InputError("a sun needs the build stage mesh, for its shadows; run python -m twin.build SCENE")
+        raise InputError("a sun needs the build stage mesh, for its shadows; run twin build SCENE")
     image, facts = load_photo(photo, None)
     try:
         found = register_photo(image, facts, scene)

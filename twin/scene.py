@@ -259,7 +259,7 @@ def _verified_stamp(scene: SceneDir, stage: str) -> Stamp:
             f"{scene.root} was unpacked from a pack, which has no {STAGES[stage]}, nor films; ask its sender for those"
         )
     if not path.exists():
-        raise InputError(f"{scene.root} has no {STAGES[stage]} yet; run python -m twin.build {scene.root}")
+        raise InputError(f"{scene.root} has no {STAGES[stage]} yet; run twin build {scene.root}")
     facts = regular_file(path).stat()
     return _verified_once(folder, (facts.st_mtime_ns, facts.st_size))
 

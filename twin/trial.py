@@ -1,6 +1,6 @@
 """`twin trial`: evaluates a robot's recording of a trial: counts it in `real.csv`, and compares it with the twin.
 
-    python -m twin.trial scenes/my_road monday_1.mcap --policy first --task straight --lighting monday
+    twin trial scenes/my_road monday_1.mcap --policy first --task straight --lighting monday
 
 The bag has the front camera's pictures and camera_info, commands, and poses (RTK, LiDAR or filtered odometry). Pictures
 are localized in the scene, and the poses are fitted to their positions. Then the twin's rules of success and failure
@@ -12,7 +12,7 @@ has the outcome; the distance between the final positions of the real robot and 
 commands; the similarity of the pictures; and the fraction of recorded commands that the policy repeats when it receives
 the recorded pictures. The trial is counted in `real.csv`, and listed with its cause in `real_trials.csv` beside it.
 
-    python -m twin.trial scenes/my_road monday_1.mcap monday_2.mcap --task straight --lerobot drives
+    twin trial scenes/my_road monday_1.mcap monday_2.mcap --task straight --lerobot drives
 
 With `--lerobot`, recordings are written as a dataset for learning instead; see `twin/report/bag_dataset.py`.
 """

@@ -1,6 +1,6 @@
 """`twin unpack`: unpacks a *pack*, a file with all that driving in a built scene needs. `twin.pack` writes packs.
 
-    python -m twin.unpack demo.twin scenes/demo_copy
+    twin unpack demo.twin scenes/demo_copy
 
 A pack is a zip: `README.txt` for people, `manifest.json`, then the files of a scene folder. The manifest has the size
 and SHA-256 of each file as unpacked, and the file's *coding*: `plain`, or `differences` for the field

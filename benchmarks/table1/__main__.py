@@ -1,15 +1,15 @@
-"""Replication of table 1 of DriveEnv-NeRF (arXiv 2403.15791) in the known-truth world, a simulated road.
+"""Replication of table 1 of DriveEnv-NeRF (arXiv 2403.15791) in the simulated reality (`twin reality`).
 
     python benchmarks/table1 SCENE [--seeds 0 1] [--jobs 2] [--steps train validate photos real forecast]
 
 Steps, each a command of `twin` that resumes where it was interrupted:
 
-- build: films the known-truth world and builds the twin in SCENE; aligns the robot to a drive log and an onboard film.
+- build: films the simulated road and builds the twin in SCENE; aligns the robot to a drive log and an onboard film.
 - train: trains the three setups on both tasks.
 - validate: drives every policy in the twin under held-out lightings with everything else randomized, and finished
   policies also with nothing else randomized.
 - photos: drives every policy in the twin under a lighting from one photo of each test day.
-- real: drives every policy in the known-truth world under weather that was not filmed.
+- real: drives every policy in the simulated reality under weather that was not filmed.
 - forecast: forecasts real success, once from held-out lightings, once from the photos.
 
 The defaults are the published plan; the same call with more seeds adds runs. `results.json` beside this file records

@@ -2,7 +2,7 @@
 
     python benchmarks/table1/picture.py SCENE docs/forecast.jpg
 
-Shows randomized episodes of the twin, test days of the known-truth world, the twin under lightings from a photo of each
+Shows randomized episodes of the twin, test days of the simulated reality, the twin under lightings from a photo of each
 of these days, success on the road against success in the twin for every policy, and a training's success curve. SCENE
 holds the results of `benchmarks/table1`.
 """

@@ -38,7 +38,7 @@ PHOTOS = tuple(str(Condition(name, True)) for name in WEATHER)
 PHOTO_EPISODES = 5
 """Episodes in the twin per policy and weather."""
 TRIALS = MIN_TRIALS
-"""Trials in the known-truth world per policy and weather, the minimum of a forecast."""
+"""Trials in the simulated reality per policy and weather, the minimum of a forecast."""
 PAPER: dict[tuple[str, str], tuple[float, float, float]] = {
     ("simulator", "straight"): (0.94, 0.57, 0.00),
     ("one_light", "straight"): (1.00, 0.19, 0.00),

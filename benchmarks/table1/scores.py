@@ -136,7 +136,7 @@ def _mean(counts: Counts, days: Sequence[str]) -> float:
 
 PREDICTORS: dict[str, Callable[[PolicyRecord, Sequence[str]], float]] = {
     "twin, by a photo of each day": by_photo,
-    "twin, held-out lights": lambda policy, days: policy.held_out,
+    "twin, held-out lightings": lambda policy, days: policy.held_out,
     "rule without the twin": lambda policy, days: rule(policy),
 }
 

@@ -142,12 +142,12 @@ class Forecast:
         """Reads `forecast.json`. Raises InputError: no such file, or an invalid one."""
         path = folder / _FILE
         if not exists(path):
-            raise InputError(f"{path} does not exist; run python -m twin.forecast SCENE")
-        with wrap_read_errors(path, "run python -m twin.forecast SCENE anew"):
+            raise InputError(f"{path} does not exist; run twin forecast SCENE")
+        with wrap_read_errors(path, "run twin forecast SCENE anew"):
             try:
                 return parse_table(Forecast, _without_nulls(read_json(path)), str(path))
             except InputError as error:
-                raise InputError(f"{error}; run python -m twin.forecast SCENE anew") from None
+                raise InputError(f"{error}; run twin forecast SCENE anew") from None
 
 
 def _without_nulls(value: Any) -> Any:

@@ -41,7 +41,7 @@ RECENT_EPISODES = 20
 beginning of the task's route segment."""
 
 _MAX_COUNT, _MAX_SEED = 10**6, 2**63 - 1  # largest count in a table, and largest seed
-_VALIDATE_COMMAND = "python -m twin.validate"
+_VALIDATE_COMMAND = "twin validate"
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """`twin export`: writes a built scene for other programs.
 
-    python -m twin.export scenes/demo --usd road.usdz
-    python -m twin.export scenes/demo --glb road.glb --ply road.ply --lighting night
-    python -m twin.export scenes/demo --nerfstudio road_ns --colmap road_colmap
-    python -m twin.export scenes/demo --task straight --task-file straight.json
+    twin export scenes/demo --usd road.usdz
+    twin export scenes/demo --glb road.glb --ply road.ply --lighting night
+    twin export scenes/demo --nerfstudio road_ns --colmap road_colmap
+    twin export scenes/demo --task straight --task-file straight.json
 
 `camera_formats` writes frames and cameras, `gltf` the mesh, and `usd` all of the place; `twin.assets.gaussians` makes
 the splats, and `twin.env.task_file` the task files.

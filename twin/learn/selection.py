@@ -217,7 +217,7 @@ def failure_summary(failures: Sequence[Failure]) -> str:
     cause, by_cause = _most([one.cause for one, b in zip(failures, bins, strict=True) if b == where])
     light, by_light = _most([_main_light(one.lighting) for one in failures])
     place = f"{count} of {len(failures)} failures at {where * _PLACE:g} to {(where + 1) * _PLACE:g} m"
-    return f"{place} ({by_cause} by {cause}); {by_light} in light mostly like {light}"
+    return f"{place} ({by_cause} by {cause}); {by_light} in lightings mostly like {light}"
 
 
 def _main_light(lighting: str) -> str:

@@ -115,7 +115,7 @@ class TrainConfig:
                 raise InputError(f"{name} = {short_repr(getattr(self, name))}; expected {choices}")
         if self.lighting in (HELD_OUT, ANY):
             raise InputError(
-                f"lighting = {self.lighting!r}: held-out lightings are reserved for python -m twin.validate; "
+                f"lighting = {self.lighting!r}: held-out lightings are reserved for twin validate; "
                 f"expected {TRAINING!r} or the name of a lighting"
             )
 

@@ -1,7 +1,7 @@
 """Lightings by name, as NumPy arrays for rendering without torch, and lightings added to a built scene.
 
 A lighting is requested by its name, by a frame (`day/000012`), or as a mixture `day:night:0.3`, 30 % of the way from
-day to night. Random lightings come from `appearance_prior.py`. `python -m twin.relight` fits a lighting to a photo and
+day to night. Random lightings come from `appearance_prior.py`. `twin relight` fits a lighting to a photo and
 stores it in `<scene>/lightings/<name>.json`, outside `build/`, since users may delete `build/` at any time. An
 embedding is valid for one field only, so each file stores the content digest of its field stage; with any other build
 of the field, the lighting is *stale*.
@@ -62,7 +62,7 @@ class Lightings:
         if lighting in self.stale:
             raise InputError(
                 f"lighting {lighting!r}: fitted to another build of this field, or by an older twin; fit its photo "
-                f"again: python -m twin.relight SCENE PHOTO --name {lighting}"
+                f"again: twin relight SCENE PHOTO --name {lighting}"
             )
         raise InputError(f"lighting {lighting!r}: unknown; the field has {', '.join(self.names)}")
 

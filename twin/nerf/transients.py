@@ -164,7 +164,8 @@ def mover_masks(pixels: TrainingPixels, depths: list[Array32]) -> list[NDArray[n
     cells = [frame_cells(pixels, i, side, depth) for i, depth in enumerate(depths)]
     static = [replace(one, depth=depth) for one, depth in zip(cells, static_depths(pixels, cells), strict=True)]
 
-    # The field's depths are wrong where it contains the mover, medians at thin things: a mover differs under both.
+    # The field's depths are wrong where it contains the mover, the median depths at thin objects. So a mover must
+    # differ under both.
     def find(i: int) -> NDArray[np.bool_]:
         excess = np.fmin(difference(pixels, cells, i), difference(pixels, static, i))
         return cleaned(excess > 1.0, excess > _WEAK)

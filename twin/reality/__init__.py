@@ -1,4 +1,4 @@
-"""The known-truth world: generated places, filmed like real ones, in which policies drive in the *real test*.
+"""The simulated reality: generated places, filmed like real ones, in which policies drive in the *real test*.
 
 Place 0, the campus road, is designed; the others are random. The rest of `twin` imports nothing from this package.
 Only `comparison.py`, `twin reality drive` with a task file, benchmarks and tests read a scene's folder `truth`.

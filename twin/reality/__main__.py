@@ -1,13 +1,13 @@
 """`twin reality`: films a generated place whose truth is known, drives in it, and measures builds of it.
 
-    python -m twin.reality film [--place NUMBER [--length METERS]] --out DIR
-    python -m twin.reality compare DIR
-    python -m twin.reality drive --policy FILE... --task straight [--place N] [--robot N] [--camera N] --day 1 2
+    twin reality film [--place NUMBER [--length METERS]] --out DIR
+    twin reality compare DIR
+    twin reality drive --policy FILE... --task straight [--place N] [--robot N] [--camera N] --day 1 2
         --out results.csv
-    python -m twin.reality log --out drive.csv
-    python -m twin.reality onboard --out robot.mp4
-    python -m twin.reality bag --lighting dawn --out dawn_1
-    python -m twin.reality photo --lighting dawn --out dawn.png
+    twin reality log --out drive.csv
+    twin reality onboard --out robot.mp4
+    twin reality bag --lighting dawn --out dawn_1
+    twin reality photo --lighting dawn --out dawn.png
 
 `film` writes a scene folder: `scene.toml`, `input/*.mp4` and `truth/`. `compare` measures a build against that truth.
 `drive` drives policies in weather that was not filmed. `log` writes a drive log, for `twin.align`. `onboard` writes a
@@ -123,10 +123,10 @@ def scene_toml(plan: FilmingPlan, name: str, spec: PlaceSpec | None = None, road
     place += f" --length {road_length:g}" if road_length else ""
     place += f" --readout {plan.readout:g}" if plan.readout else ""
     place += f" --shake {plan.shake:g}" if plan.shake != (spec.film.shake if spec else FilmingPlan.shake) else ""
-    height = f"camera_height = {plan.camera_height}  # metres"
+    height = f"camera_height = {plan.camera_height}  # [m]"
     if spec:
-        height = f"camera_height = {spec.film.stated_height}  # metres, ± {spec.film.height_tolerance:.3f}"
-    lines = [f"# A drive through the known-truth world, filmed by python -m twin.reality film{place} --out THIS_FOLDER"]
+        height = f"camera_height = {spec.film.stated_height}  # [m], ± {spec.film.height_tolerance:.3f}"
+    lines = [f"# A generated place, filmed by twin reality film{place} --out THIS_FOLDER"]
     lines += [f"name = {toml_string(name)}", "seed = 0", "", "[metric]", height, ""]
     for lighting in plan.lightings:
         for one in plan.passes:
@@ -227,7 +227,7 @@ def scene_task(given: str, scene: Path | None, place: int, length: float = 0.0) 
         raise InputError(f"{given} is in the frame of a scene; give --scene, the folder that it was exported from")
     root = SceneDir(scene)
     if not (root.truth / "truth.npz").exists():
-        raise InputError(f"{scene} has no truth; only scenes of `python -m twin.reality film` have one")
+        raise InputError(f"{scene} has no truth; only scenes of `twin reality film` have one")
     truth = Truth.load(root.truth)
     if truth.number != place:
         raise InputError(f"{scene} is a film of place {truth.number}; give --place {truth.number}")

@@ -53,7 +53,7 @@ def compare(scene: SceneDir) -> dict[str, Any]:
         InputError: the scene has no truth, or a stage up to the mesh has not been built.
     """
     if not (scene.truth / "truth.npz").exists():
-        raise InputError(f"{scene.root} has no truth; only scenes of `python -m twin.reality film` have one")
+        raise InputError(f"{scene.root} has no truth; only scenes of `twin reality film` have one")
     of = {stage: stage_result(scene, stage) for stage in ("metric", "field", "mesh")}
     compared = {"of": of, **measure(scene)}
     write_json(scene.truth_json, compared)

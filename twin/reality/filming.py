@@ -1,4 +1,4 @@
-"""Films of the known-truth world: trajectory of the camera, exposure, sensor noise and video encoding.
+"""Films of the simulated reality: trajectory of the camera, exposure, sensor noise and video encoding.
 
 A *film* is a sequence of frames at a fixed rate under one lighting; the true pose of every frame is known. Every film
 has its own speed, lateral wander and shake, so that no two films share a viewpoint.

@@ -1,4 +1,4 @@
-"""Lightings of the known-truth world: lights, sky, haze and the camera's exposure under them.
+"""Lightings of the simulated reality: lights, sky, haze and the camera's exposure under them.
 
 `LIGHTINGS` are those of films of the campus road; `WEATHER` are those of the real test, which are not filmed. Colors
 are display values, not radiometric ones: the renderer adds lights linearly and clips at 1, and `filming.py` applies

@@ -1,4 +1,4 @@
-"""CPU rasterizer for the images of the robot's camera in the known-truth world: small images in a few milliseconds.
+"""CPU rasterizer for the images of the robot's camera in the simulated reality: small images in a few milliseconds.
 
 The static world is flattened once into triangles, mip-mapped textures, lights and a shadow map. An image takes two
 passes over 2 × 2 samples per pixel: the first finds each sample's nearest triangle, the second computes its color.

@@ -25,7 +25,7 @@ from twin.types import Array
 CAMPUS_TASKS = {"straight": (0.0, 30.0), "right_turn": (0.25, 60.0), "route": (0.0, 60.349)}
 """Start and length [m] of the tasks of place 0, by name; a test compares them with those that the twin finds."""
 
-_WRITE = "write one: python -m twin.export SCENE --task NAME --task-file FILE"
+_WRITE = "write one: twin export SCENE --task NAME --task-file FILE"
 _HALF_WIDTH = 1.0  # [m]
 _BUMPER = 0.5  # [m] from the base to the front bumper
 _STUCK = (0.1, 5.0)  # [m], [s]

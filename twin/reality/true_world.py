@@ -1,4 +1,4 @@
-"""The known-truth world as a MuJoCo model for rendering, with visual geoms only; nothing collides."""
+"""The simulated reality as a MuJoCo model for rendering, with visual geoms only; nothing collides."""
 
 from collections.abc import Mapping
 

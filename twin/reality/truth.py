@@ -1,7 +1,7 @@
 """Ground truth of a generated scene: poses, some depth maps, and the place, which is rebuilt from parameters.
 
-`python -m twin.reality film` writes it to `<scene>/truth`. A build must not read it; `twin/reality/comparison.py`,
-`python -m twin.reality drive`, benchmarks and tests read it.
+`twin reality film` writes it to `<scene>/truth`. A build must not read it; `twin/reality/comparison.py`,
+`twin reality drive`, benchmarks and tests read it.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -113,9 +113,7 @@ class Truth:
                 head.get("camera_height", CAMERA_HEIGHT),
             )
         if not np.allclose(head["fingerprint"], fingerprint(truth.place), atol=1e-4):
-            raise InputError(
-                f"{folder}: filmed in another version of the place; film again: python -m twin.reality film"
-            )
+            raise InputError(f"{folder}: filmed in another version of the place; film again: twin reality film")
         return truth
 
     @property

@@ -52,7 +52,7 @@ def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
 
 
 def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
-    """Two maps: of the reconstruction, and of the ground's height with the solid parts."""
+    """Two maps: of the reconstruction, and of the ground's height with the convex parts."""
     folder, mesh = scene.stage("metric"), scene.stage("mesh")
     if not (folder / "cameras.npz").exists():
         return []
@@ -74,7 +74,7 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
         ground = Ground.load(mesh)
         path = cameras.positions[:, :2] if route is None else route
         drawn = figures.ground_map(ground, path, route, wide, load_footprints(mesh / "parts.npz", ground))
-        out.append(Chart("Ground and solid parts", figures.svg(drawn), "mesh"))
+        out.append(Chart("Ground and convex parts", figures.svg(drawn), "mesh"))
     return out
 
 
@@ -145,7 +145,7 @@ def _drive_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
 
 
 def load_truth_comparison(scene: SceneDir) -> dict[str, Any] | None:
-    """Loads the comparison of this build with ground truth, written by `python -m twin.reality compare`.
+    """Loads the comparison of this build with ground truth, written by `twin reality compare`.
 
     Returns:
         A dictionary with `figures` (see `twin.reality.comparison`) and `camera_errors_m` (a list per source [m]); None
@@ -153,7 +153,7 @@ def load_truth_comparison(scene: SceneDir) -> dict[str, Any] | None:
     """
     if not scene.truth_json.exists():
         return None
-    with wrap_read_errors(scene.truth_json, f"run python -m twin.reality compare {scene.root}"):
+    with wrap_read_errors(scene.truth_json, f"run twin reality compare {scene.root}"):
         compared = dict(read_json(scene.truth_json))
         if any(
             not scene.stage(name).exists() or stage_result(scene, name) != result
@@ -258,7 +258,7 @@ def _next_steps(scene: SceneDir, report: dict[str, Any]) -> list[tuple[str, list
     out.append((look, [command("view", root)]))
     if scene.has_route:
         shown = shlex.join(["python", "-m", "mujoco.viewer", f"--mjcf={scene.stage('mjcf') / SCENE_XML}"])
-        out.append(("MuJoCo’s own viewer shows the physical scene, with its solid parts:", [shown]))
+        out.append(("MuJoCo’s own viewer shows the physical scene, with its convex parts:", [shown]))
     if pick(report, "review.not_applicable"):
         mesh = command("export", root, "--glb", "place.glb")
         return [*out, ("There is no drive here, so no policy can be trained. Other programs can use the mesh:", [mesh])]

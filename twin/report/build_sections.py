@@ -218,7 +218,7 @@ def field_section(report: dict[str, Any]) -> Section:
         text = f"{value:.1f} dB PSNR" + (f", {ssim[name]:.2f} SSIM" if name in ssim else "")
         facts.append(Fact(name, text, f"on {frames}, compared with the real film"))
         if value < _LOW_PSNR:
-            cure = "raise nerf.steps, mask moving things, film slower in this light, or film it from more places."
+            cure = "raise nerf.steps, mask moving things, film slower in this lighting, or film it from more places."
             cautions.append(Caution(f"“{name}” is rendered at only {value:.1f} dB.", cure))
         if name in n and n[name] < _FEW_HELD_OUT:
             what = f"Only {n[name]:.0f} frame(s) of “{name}” were held out, so its PSNR is uncertain."
@@ -265,8 +265,8 @@ def cross_lighting_facts(report: dict[str, Any]) -> tuple[list[Fact], list[Cauti
         )
         facts.append(Fact(f"{name}, swapped in", f"{share:.0%}", meaning))
         if share < _LOW_LIGHTING_AGREEMENT:
-            what = f"Only {share:.0%} of the places filmed in other light resemble “{name}” when rendered in it."
-            cure = "film every light along the same path; lights that look very similar reach about 50% at best."
+            what = f"Only {share:.0%} of the places filmed in other lightings resemble “{name}” when rendered in it."
+            cure = "film every lighting along the same path; very similar lightings reach about 50% at best."
             cautions.append(Caution(what, cure))
     moves = (
         "field.cross_lighting.depth_moves_m",
@@ -274,7 +274,7 @@ def cross_lighting_facts(report: dict[str, Any]) -> tuple[list[Fact], list[Cauti
         "{:.3f} m",
         "largest change between lightings; zero by design",
     )
-    what = "Depth moves by up to {:.3f} m with the light."
+    what = "Depth changes by up to {:.3f} m with the lighting."
     cautions += cautions_above(report, (moves[0], 1e-3, what, "this is a bug; please report it."))
     return facts + (facts_of(report, moves) if follows else []), cautions
 
@@ -289,13 +289,13 @@ def mesh_section(report: dict[str, Any]) -> Section:
         (
             "mesh.parts_left_out",
             0,
-            "{} solid part(s) were left out because of mesh.max_parts.",
+            "{} convex part(s) were left out because of mesh.max_parts.",
             "raise mesh.max_parts, or raise mesh.voxel for fewer parts.",
         ),
         (
             "mesh.parts_beyond_bound",
             0,
-            "{} solid part(s) stick out of their surface by more than mesh.max_protrusion.",
+            "{} convex part(s) stick out of their surface by more than mesh.max_protrusion.",
             "raise mesh.max_parts, which allows smaller parts, or lower mesh.voxel.",
         ),
         (
@@ -312,7 +312,7 @@ def mesh_section(report: dict[str, Any]) -> Section:
         cautions.append(Caution(what, cure))
     facts = facts_of(
         report,
-        ("mesh.parts", "solid parts", "{}", "convex collision geometry"),
+        ("mesh.parts", "convex parts", "{}", "convex collision geometry"),
         ("mesh.faces", "surface", "{:,} triangles", "visual mesh, without collisions"),
         ("mesh.ground.coverage", "ground measured", "{:.0%}", "the rest of its area was interpolated"),
         ("mesh.ground.corridor_coverage", "along the route", "{:.0%}", "of the ground was measured"),
@@ -349,7 +349,7 @@ def mjcf_section(report: dict[str, Any]) -> Section:
             report,
             ("mjcf.route_length_m", "route", "{:.1f} m", _route_choice(report)),
             ("mjcf.turn_deg", "turn", "{:+.0f}°", "from the first heading to the last; right is negative"),
-            ("mjcf.half_width_m", "corridor", "± {:.2f} m", "kept free of solid parts"),
+            ("mjcf.half_width_m", "corridor", "± {:.2f} m", "kept free of convex parts"),
             ("mjcf.spawn_clearance_m", "free at the start", "{:.2f} m", "robot to the nearest part"),
         )
     size = as_number(pick(report, "mjcf.assets_bytes"))
@@ -379,7 +379,7 @@ def review_section(report: dict[str, Any]) -> Section:
             cautions.append(Caution("The scripted driver did not reach the goal.", cure))
         if touched:
             cure = (
-                "these are solid parts in or beside the corridor; if nothing is there in reality, mask what moved "
+                "these are convex parts in or beside the corridor; if nothing is there in reality, mask what moved "
                 "while filming, or raise mjcf.corridor_margin."
             )
             cautions.append(Caution(f"The robot touched {join_names(touched, 8)}.", cure))

@@ -68,8 +68,7 @@ def truth_section(report: dict[str, Any]) -> Section:
     name, title = "truth", "Comparison with ground truth"
     if not isinstance(truth, dict):
         reason = (
-            "there is no ground truth to compare with; it exists for generated places only (python -m twin.reality "
-            "compare SCENE)"
+            "there is no ground truth to compare with; it exists for generated places only (twin reality compare SCENE)"
         )
         return Section(name, title, "", not_applicable=reason)
     kinds = {"ground": "ground", "obstacle": "obstacles of any height", "foliage": "leaves"}
@@ -88,8 +87,8 @@ def truth_section(report: dict[str, Any]) -> Section:
         ("tilt_deg", "gravity", "{:.2f}°", "between the twin’s vertical and the true one"),
         ("ground_median_m", "ground height", "{:.3f} m", "median error inside the corridor"),
         ("ground_p95_m", "the same, 95th percentile", "{:.3f} m", "error inside the corridor"),
-        ("obstacle_accuracy_m", "solid parts to true surface", "{:.3f} m", "median: accuracy of the parts"),
-        ("obstacle_completeness_m", "true surface to solid parts", "{:.3f} m", "median: completeness of the parts"),
+        ("obstacle_accuracy_m", "convex parts to true surface", "{:.3f} m", "median: accuracy of the parts"),
+        ("obstacle_completeness_m", "true surface to convex parts", "{:.3f} m", "median: completeness of the parts"),
         ("mesh_accuracy_median_m", "visual mesh to true surface", "{:.3f} m", "median: accuracy of the mesh"),
         ("mesh_accuracy_mean_m", "the same, mean", "{:.3f} m", "errors above 1 m count as 1 m"),
         ("mesh_completeness_5cm", "true surface within 5 cm of the mesh", "{:.0%}", seen),
@@ -105,8 +104,8 @@ def truth_section(report: dict[str, Any]) -> Section:
         ("ate_m", 0.08, "The camera path is {:.3f} m off, more than {:.3f} m.", "give the camera’s calibration."),
         ("scale_error", 0.02, "The scale is {:.1%} off, more than {:.1%}.", "check the source of the scale."),
         ("ground_median_m", 0.04, "The ground is {:.3f} m off, more than {:.3f} m.", "check the camera’s height."),
-        ("obstacle_median_m", 0.1, "Solid parts are {:.3f} m off, more than {:.3f} m.", "lower mesh.max_protrusion."),
-        ("corridor_intrusions", 0, "{} solid part(s) reach into the true corridor.", wider),
+        ("obstacle_median_m", 0.1, "Convex parts are {:.3f} m off, more than {:.3f} m.", "lower mesh.max_protrusion."),
+        ("corridor_intrusions", 0, "{} convex part(s) reach into the true corridor.", wider),
     )
     off, ground = as_number(truth.get("ate_m")), as_number(truth.get("ground_median_m"))
     verdict = None

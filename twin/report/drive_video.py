@@ -57,7 +57,7 @@ Curve = tuple[str, Array, Color]
 """Name, values (k,) and color."""
 Place = tuple[World, float, tuple[float, float], tuple[Ground | None, list[Array]]]
 """For the map: the world; half width of the corridor [m]; arc lengths of the task's start and end on the route [m]; and
-ground and outlines of solid parts (`twin.report.review_video.load_ground_and_parts`)."""
+ground and outlines of convex parts (`twin.report.review_video.load_ground_and_parts`)."""
 _Frame = tuple[int, Image, Image, tuple[Array, Array, Array, Array | None], tuple[str, str], float]
 """Index of the instant, left and right picture, arguments of `MapView.with_marker`, a further fact, and the trust."""
 
@@ -82,7 +82,7 @@ def write_episode_video(path: Path, episode: Episode, observations: Sequence[Ima
             yield i, observations[i], from_behind, marker, ("reward", f"{total[i]:.1f}"), float(episode.trust[i])
 
     end = f"collision with {join_names(episode.touched, 2)}" if episode.cause == "collision" else None
-    texts = title, f"lighting: {episode.lighting}, {_EVERY}× speed", "MuJoCo scene, solid parts outlined"
+    texts = title, f"lighting: {episode.lighting}, {_EVERY}× speed", "MuJoCo scene, convex parts outlined"
     curves = [("speed [m/s]", episode.speed, ACCENT), ("cumulative reward", total, GREEN)]
     _write_frames(path, layout, fps, place, texts, episode, curves, frames(), len(instants), end)
 

@@ -201,7 +201,7 @@ def ground_map(ground: Ground, path: Array, route: Array | None, half_width: flo
     _draw_route(axes, route, half_width)
     if len(parts):
         look: dict[str, Any] = {"facecolors": SERIES[1], "edgecolors": SERIES[1], "alpha": 0.55, "lw": 0.5}
-        axes.add_collection(PolyCollection(list(parts), label="solid part", **look))
+        axes.add_collection(PolyCollection(list(parts), label="convex part", **look))
     color_axes = axes.inset_axes((1.03, 0.0, 0.035, 1.0))  # as tall as the map
     bar = figure.colorbar(image, cax=color_axes, label="height of the ground [m]")
     bar.outline.set_visible(False)

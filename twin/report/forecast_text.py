@@ -256,7 +256,7 @@ def limitations(forecast: Forecast) -> list[Caution]:
     lightings = join_names(sorted({name for c in forecast.candidates for name in c.lightings}))
     cure = (
         "validate under further lightings (any, mixtures, +randomised), film the place in that light, or add a photo "
-        "with twin.relight."
+        "with twin relight."
     )
     out.append(Caution(f"Success is unknown in light that differs from {lightings}.", cure))
     for task in forecast.tasks:
@@ -291,7 +291,7 @@ def next_trials(forecast: Forecast) -> list[str]:
         if len(driven) < enough:
             some = [mine[round(k)] for k in np.linspace(0, len(mine) - 1, enough)]
             names = join_names([c.policy for c in some if not c.driven], MIN_POLICIES)
-            out.append(f"{task}: drive {names}, {MIN_TRIALS} times or more in each light.")
+            out.append(f"{task}: drive {names}, {MIN_TRIALS} times or more in each lighting.")
             continue
         best = [c for c in driven if c.real_ranks and c.real_ranks[0] >= _POSSIBLY_BEST]
         if len(best) > 1:
@@ -300,7 +300,7 @@ def next_trials(forecast: Forecast) -> list[str]:
                 f"{task}: drive these again; each may be the best policy, with the probability in parentheses: {odds}."
             )
         elif best:
-            out.append(f"{task}: drive {best[0].policy} on further days, in new light, since it is probably the best.")
+            out.append(f"{task}: drive {best[0].policy} on further days, in new lightings; it is probably the best.")
         if unseen := [c.policy for c in mine if not c.driven]:
             out.append(
                 f"{task}: drive the policies without real trials, best in the twin first: {join_names(unseen, 6)}."

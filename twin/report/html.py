@@ -233,7 +233,7 @@ def data_url(path: Path) -> str:
 
 def command(verb: str, *arguments: object) -> str:
     """A command of this package for a shell, with quoted arguments."""
-    return shlex.join(["python", "-m", f"twin.{verb}", *map(str, arguments)])
+    return shlex.join(["twin", verb, *map(str, arguments)])
 
 
 _TEMPLATES = Environment(

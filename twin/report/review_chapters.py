@@ -429,7 +429,7 @@ def write_drive_chapter(
             f"A scripted driver without camera follows the {arc_lengths(world.route)[-1]:.1f} m route in MuJoCo, to "
             "test whether the route is drivable.",
             "Left: the radiance field, from the robot’s camera. Right: the MuJoCo scene from behind the robot, "
-            "with its solid parts outlined. " + (f"{shown_speed:.3g}× speed." if shown_speed > 1.01 else ""),
+            "with its convex parts outlined. " + (f"{shown_speed:.3g}× speed." if shown_speed > 1.01 else ""),
         ],
     )
     rendered = set(rendered_instants(instants, budget))
@@ -445,7 +445,7 @@ def write_drive_chapter(
             rgb = to_uint8(view.rgb[0])
             progress.update()
         canvas = layout.canvas("The Husky drives", studio.name)
-        robot_view, behind = (rgb, f"robot camera: {label}"), (from_behind, "MuJoCo scene, solid parts outlined")
+        robot_view, behind = (rgb, f"robot camera: {label}"), (from_behind, "MuJoCo scene, convex parts outlined")
         layout.draw_panels(canvas, robot_view, behind)
         left, right = layout.strip(*DRIVE_STRIP)
         base = drive.base_to_world[i]

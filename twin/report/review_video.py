@@ -162,7 +162,7 @@ def _write_chapters(
         if turns:
             write_lighting_chapter(studio, map_in(strip(*LIGHTING_STRIP)[1]), turns, progress)
         for number, picture in enumerate(islice(pictures, len(views))):
-            caption = ("the MuJoCo scene with its solid parts outlined", "further along the route")[number]
+            caption = ("the MuJoCo scene with its convex parts outlined", "further along the route")[number]
             studio.save_picture(f"scene_{number}", "mjcf", caption, picture)
         if world and drive:
             write_drive_chapter(studio, map_in(strip(*DRIVE_STRIP)[0]), world, drive, pictures, drives, progress)

@@ -62,9 +62,9 @@ FAILURES = {
 }
 """Cause of failure → its name and meaning."""
 LIGHTING_SETS = {
-    HELD_OUT: "another light for every episode, sampled from those reserved for evaluation",
-    TRAINING: "another light for every episode, sampled from those used in training",
-    ANY: "another light for every episode, sampled from all plausible lights",
+    HELD_OUT: "another lighting for every episode, sampled from those reserved for evaluation",
+    TRAINING: "another lighting for every episode, sampled from those used in training",
+    ANY: "another lighting for every episode, sampled from all plausible lightings",
 }
 """Name of a set of lightings → its meaning."""
 
@@ -143,26 +143,28 @@ def lighting_text(lighting: str) -> str:
     if condition.randomised:
         return (
             f"{lighting_text(condition.lighting)}. Each episode also has its own sun, shadows, "
-            "objects beside the corridor, and values of the robot parameters that were not identified; the haze varies "
-            "too, unless the lighting was fitted to a photo, which then determines the haze"
+            "distractor objects, and values of the robot parameters that were not identified; the fog varies too, "
+            "unless the lighting was fitted to a photo, which then determines the fog"
         )
     if lighting.startswith("drawn_"):
-        return f"light number {lighting[6:]} of those sampled in the search"
+        return f"lighting number {lighting[6:]} of those sampled in the search"
     if lighting.count(":") == 2:
         a, b, part = lighting.split(":")
         return f"{float(part):.0%} of the way from {a} to {b}"
-    return LIGHTING_SETS.get(lighting, "the same light in every episode")
+    return LIGHTING_SETS.get(lighting, "the same lighting in every episode")
 
 
 def training_text(trained: dict[str, Any]) -> str:
     """Describes a training and the episodes that measured its result; see `training_summaries`."""
     test = trained["test"]
     if test:
-        episodes = f"final test, n = {test['trials']}" + (f", light {test['condition']}" if test["condition"] else "")
+        episodes = f"final test, n = {test['trials']}" + (
+            f", lighting {test['condition']}" if test["condition"] else ""
+        )
     else:
         since = f"the first of them ended at step {trained['first_step']:,}"
         episodes = f"the last {trained['trials']} training episodes that began at the task’s start ({since})"
-    light = "in varying light" if trained["lighting"] in (TRAINING, ANY) else f"in the light {trained['lighting']}"
+    light = "in varying lighting" if trained["lighting"] in (TRAINING, ANY) else f"in lighting {trained['lighting']}"
     light = "from MuJoCo’s pictures of the mesh" if trained["observe"] == "simulator" else light
     return f"{episodes}; trained on {trained['task']}, {light}, for {trained['step']:,} steps"
 
@@ -207,11 +209,11 @@ def _task_verdict(task: str, cells: list[dict[str, Any]]) -> Verdict:
     every = dict.fromkeys(c["lighting"] for c in cells)
     if len(common) < len(every):
         names = join_names(name for name in every if name in common)
-        text += f" in the light that was used for all policies ({names})"
+        text += f" in the lightings that were used for all policies ({names})"
     text += f", and {join_names(f'“{name}”' for name in tied)} as often" if tied else ""
     weakest = min(shared[best], key=lambda c: c["rate"])
     if weakest["rate"] < max(c["rate"] for c in shared[best]):
-        text += f"; least often in the light {weakest['lighting']}, {weakest['successes']} of {weakest['trials']}"
+        text += f"; least often in lighting {weakest['lighting']}, {weakest['successes']} of {weakest['trials']}"
     mood = "good" if means[best] >= _GOOD_RATE else "mixed" if means[best] >= _MIXED_RATE else "bad"
     return Verdict(f"{text}.", mood)
 
@@ -220,7 +222,7 @@ def limitations(results: dict[str, Any]) -> list[Caution]:
     """Limits of the validation, with cures."""
     cells = results["cells"]
     what = "These are success rates in the twin. Success on the road was not measured here."
-    out = [Caution(what, "drive some of the policies on the road and run python -m twin.forecast.")]
+    out = [Caution(what, "drive some of the policies on the road and run twin forecast.")]
     if few := [c["trials"] for c in cells if c["trials"] < FEW_EPISODES]:
         what = (
             f"{len(few)} of {len(cells)} rates come from fewer than {FEW_EPISODES} episodes (minimum: {min(few)}), so "
@@ -233,11 +235,11 @@ def limitations(results: dict[str, Any]) -> list[Caution]:
             f"The result may differ for your robot: under {join_names(drawn)} the robot's parameters are random in "
             "each episode, because those of your robot have not been identified."
         )
-        cure = "log five minutes of driving, run python -m twin.align, build again and validate again."
+        cure = "log five minutes of driving, run twin align, build again and validate again."
         out.append(Caution(what, cure))
     searched = {(w["policy"], w["task"]) for w in results.get("worst", [])}
     if left := dict.fromkeys(c["policy"] for c in cells if (c["policy"], c["task"]) not in searched):
-        what = f"The worst light for {join_names(left)} is not known: no search was made."
+        what = f"The worst lighting for {join_names(left)} is not known: no search was made."
         out.append(Caution(what, "run the same command with --worst."))
     return out
 
@@ -292,7 +294,7 @@ def rate_figure(cells: Sequence[dict[str, Any]]) -> Figure:
     rates: dict[str, list[tuple[str, float, float, float]]] = {}
     for c in cells:
         rates.setdefault(c["lighting"], []).append((c["policy"], c["rate"], c["low"], c["high"]))
-    label = "success rate" if len(rates) > 1 else f"success rate in the light {next(iter(rates))}"
+    label = "success rate" if len(rates) > 1 else f"success rate in lighting {next(iter(rates))}"
     return rate_chart(list(dict.fromkeys(c["policy"] for c in cells)), rates, label)
 
 
@@ -410,7 +412,7 @@ def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: S
     headings = {
         "arrive": "How often does each policy reach the goal?",
         "better": "Which policy is better?" if results["pairs"] else "",
-        "worst": "The worst light" if results["worst"] else "",
+        "worst": "The worst lighting" if results["worst"] else "",
         "trust": "Are the pictures reliable?",
         "where": "Where do the policies fail?",
         "films": "Videos",
@@ -432,7 +434,9 @@ def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: S
         definitions={name: lighting_text(name) for name in lights}
         | {FAILURES[cause][0]: FAILURES[cause][1] for c in cells for cause in c["causes"]},
         untrusted=[c for c in cells if c["low_trust"]["trials"]],
-        maps=[Picture(folder / f"failures_{task}.png", f"{task}, all policies and lights") for task in tasks(results)],
+        maps=[
+            Picture(folder / f"failures_{task}.png", f"{task}, all policies and lightings") for task in tasks(results)
+        ],
         films=[
             film
             | {"url": quote(film["file"]), "poster": data_url(folder / film["poster"])}
@@ -458,12 +462,12 @@ def _task(results: dict[str, Any], task: str) -> dict[str, Any]:
     """A task's cells, pairs and charts, for the page's template."""
     mine, pairs = ([it for it in results[key] if it["task"] == task] for key in ("cells", "pairs"))
     least, most = min(c["trials"] for c in mine), max(c["trials"] for c in mine)
-    each = f"n = {least} per light" if least == most else f"n = {least} to {most} per light"
+    each = f"n = {least} per lighting" if least == most else f"n = {least} to {most} per lighting"
     if len({c["lighting"] for c in mine}) <= MAX_PLOTTED_LIGHTINGS:
         title, figure = f"Share of episodes that reached the goal, with 90% intervals ({each})", rate_figure(mine)
     else:
         trained = {policy: (row["test"] or row)["rate"] for policy, row in results["training"].items()}
-        title = f"Episodes that reached the goal [%] ({each}); the mean is over the lights that all policies drove in"
+        title = f"Episodes that reached the goal [%] ({each}); means: lightings that all policies drove in"
         figure = rate_heatmap(mine, trained)
     pair_title = (
         "Number of episodes in which only the row’s policy reached the goal, minus the number in which only the "
@@ -488,18 +492,18 @@ def _training_chart(results: dict[str, Any], curve: TrainingCurve) -> Chart:
 def _next_steps(results: dict[str, Any], root: Path) -> list[tuple[str, list[str]]]:
     """Next steps after a validation: texts with their commands."""
     policies = list(dict.fromkeys((c["policy"], c["task"]) for c in results["cells"]))
-    rows = [(policy, task, "LIGHT", "TRIALS", "SUCCESSES") for policy, task in policies[:2]]
+    rows = [(policy, task, "LIGHTING", "TRIALS", "SUCCESSES") for policy, task in policies[:2]]
     table = csv_text(("policy", "task", "lighting", "trials", "successes"), rows).splitlines()
     return [
         (
             f"Drive some of these policies on the road, good and bad ones, on several days: at least {MIN_POLICIES} "
-            f"policies, each at least {MIN_TRIALS} times in each light.",
+            f"policies, each at least {MIN_TRIALS} times in each lighting.",
             [],
         ),
         (
-            "Write real.csv, with a line for each policy and light: the light’s name, how often you drove, and how "
-            "often the goal was reached. If the twin has no light of that name, add a column twin_lighting with "
-            "the twin’s light to compare with, for instance held-out.",
+            "Write real.csv, with a line for each policy and lighting: its name, how often you drove, and how often "
+            "the goal was reached. If the twin has no lighting of that name, add a column twin_lighting with the "
+            "twin’s lighting to compare with, for instance held-out.",
             [*table, *(["…"] if len(policies) > 2 else [])],
         ),
         (

@@ -395,7 +395,7 @@ def map_rotation(path: Array) -> Array:
 
 @dataclass(frozen=True)
 class MapView:
-    """The scene from above: ground colors, corridor, solid parts and path.
+    """The scene from above: ground colors, corridor, convex parts and path.
 
     The map is rotated so that the longest extent of the path runs from left to right. Pixels are (column, row).
     """

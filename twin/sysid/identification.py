@@ -188,7 +188,7 @@ def robot_toml(identification: Identification, previous: dict[str, Any], log: st
     scoring = int((~identification.windows.fitting).sum())
     score = identification.fitted.score(~identification.windows.fitting)
     comment = (
-        f"Fitted to {Path(log).name} by python -m twin.align; median error after 2 s on {scoring} held-out windows: "
+        f"Fitted to {Path(log).name} by twin align; median error after 2 s on {scoring} held-out windows: "
         f"{score.position_m:.3f} m, {score.yaw_deg:.1f}°."
     )
     return toml_text(comment, previous, identification.identified)

@@ -401,7 +401,7 @@ def _need(columns: dict[str, Array], names: tuple[str, ...], where: str) -> None
     if missing:
         raise InputError(
             f"{where}: no column {', '.join(missing)} among {', '.join(sorted(columns)) or 'none'}; "
-            "name the columns as `python -m twin.align --help` says"
+            "name the columns as `twin align --help` says"
         )
 
 

@@ -34,7 +34,7 @@ from twin.view.scene_picture import ObjectState
 KEYS_DRIVER, SCRIPTED_DRIVER = "keys W A S D", "scripted driver"
 
 _PER_KIND = 4  # obstacles of each kind that may be added to those of scene.toml
-_REACH = 25.0  # [m] from the route, up to which solid parts block a robot that is driven by keys
+_REACH = 25.0  # [m] from the route, up to which convex parts block a robot that is driven by keys
 _LONG = 1e6  # [s] time limit of a drive by keys
 _MAX_LAG = 0.5  # [s] largest lag behind real time that is caught up; the rest is dropped
 _POSE_STEPS = 12  # iterations of `station_and_lateral`

@@ -71,7 +71,7 @@ def scene_layers(scene: viser.SceneApi, twin: Twin, field: BakedField) -> list[L
             Layer("ground", "the height field that the wheels roll on", lambda path: [_ground(scene, path, twin)]),
         ]
         if (mesh / "parts.npz").exists():
-            text = "the solid parts that the robot collides with"
+            text = "the convex parts that the robot collides with"
             out.append(Layer("convex parts", text, lambda path: _parts(scene, path, twin)))
     if twin.scene.has_route and _has(twin, "mjcf"):
         world = twin.world()

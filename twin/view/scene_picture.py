@@ -78,7 +78,7 @@ class ScenePicture:
 
     def add_objects(self, world: World, obstacles: tuple[ObstacleConfig, ...]) -> None:
         """Adds the robot of a world, and obstacles, to the pictures; an `ObjectState` lists obstacles in this order."""
-        spec = episode_spec(world, 0.0, 0.0, 0.0)  # solid parts are not drawn
+        spec = episode_spec(world, 0.0, 0.0, 0.0)  # convex parts are not drawn
         add_obstacles(spec, obstacles, world)
         spec.worldbody.add_camera(name=_CAMERA)
         model = spec.compile()
