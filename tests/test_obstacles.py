@@ -85,6 +85,13 @@ def test_moving_obstacle_returns_at_its_speed():
     assert yaw == pytest.approx((14.0 - 10.0) / 9.0, abs=0.1)  # it faces along the bend
 
 
+def test_a_negative_delay_makes_no_jump():
+    late = ObstacleConfig("p", "pedestrian", 5.0, -2.0, to=(5.0, 2.0), speed=1.25, delay=-7.3)
+    lateral = np.array([obstacle_pose(late, ROUTE, t)[1] for t in np.arange(0.0, 12.0, 0.1)])
+    assert np.abs(np.diff(lateral)).max() < 0.126
+    assert lateral[73] == pytest.approx(-2.0)
+
+
 @pytest.mark.parametrize("kind", OBSTACLE_KINDS)
 def test_every_kind_stands_on_the_ground_and_is_bumped_into(world, kind):
     told = (ObstacleConfig("it", kind, 6.0, 0.0, yaw=90.0),)
