@@ -461,6 +461,21 @@ def test_a_large_view_shows_what_the_policy_sees(scene):
         assert np.abs(pictures[name].astype(float) - pictures["plain"]).mean() > 1.0 or name == "plain"
 
 
+def test_motion_blur_leaves_the_sky_of_the_simulator_sharp(scene):
+    """Driving straight ahead moves nothing in the sky."""
+    pictures = []
+    for camera in (None, CameraOptions(shutter=0.05)):
+        environment = twin.load(
+            scene, "ahead", 0, size=(64, 36), observe="simulator", camera=camera, start_heading=0.0, start_offset=0.0
+        )
+        environment.reset()
+        for _ in range(12):
+            step = environment.step([1.0, 0.0])
+        pictures.append(step.observation["pixels"][-1].astype(float))
+    blur = np.abs(pictures[1] - pictures[0]).mean((1, 2))
+    assert blur[17:22].mean() > 0.2 and blur[:12].max() < 0.05  # horizon, sky
+
+
 def test_a_chase_view_follows_the_robot_and_shows_its_obstacles(scene):
     """Also without pictures for the policy, and with other obstacles in every episode."""
     environment = DriveEnv(scene, "bend", "rgb_array", render_view="chase", pixels=False, obstacles=2)

@@ -169,12 +169,12 @@ class SceneRenderer:
                 rgb[k], depth[k] = self._workers[number].render(datas[k], poses[k])
 
         list(self._pool.map(render_share, range(len(self._workers))))
+        far = np.where(depth > 0.0, depth, np.float32(FAR))
         for k, one in enumerate(weather):
             if one:
-                far = np.where(depth[k] > 0.0, depth[k], np.float32(FAR))
-                rgb[k] = one.apply(rgb[k], far, self._rays, poses[k])
+                rgb[k] = one.apply(rgb[k], far[k], self._rays, poses[k])
         for k, camera_noise in enumerate(noise or ()):
-            rgb[k] = camera_noise.apply(rgb[k], depth[k], poses[k], datas[k].time, self._rays, self.intrinsics)
+            rgb[k] = camera_noise.apply(rgb[k], far[k], poses[k], datas[k].time, self._rays, self.intrinsics)
         return Rendering(rgb, depth, (depth > 0.0).astype(np.float32))
 
 
