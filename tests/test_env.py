@@ -342,6 +342,9 @@ def test_unknown_tasks_and_options_are_refused(scene):
         twin.load(scene, "bend", lightning="day")
     with pytest.raises(InputError, match="unknown; the field has day, night"):
         twin.load(scene, "bend", lighting="noon")
+    for camera in ({"shutter": -0.02}, {"vibration": -1.0}, {"blur_samples": 0}, {"blur_samples": 2.5}):
+        with pytest.raises(InputError, match="camera = .*; expected None, or CameraOptions of numbers from 0"):
+            twin.load(scene, "bend", camera=CameraOptions(**camera))
     for options in ({"action": "jump"}, {"stack": 0}, {"control_timestep": 0.5}, {"rewards": {"fame": 1.0}}):
         with pytest.raises(InputError):
             twin.load(scene, "bend", **options)

@@ -106,7 +106,7 @@ class Options:
 
 # ---- checks
 
-_MAX_NUMBER, _MAX_SIDE, _MAX_STACK, _MAX_OBSTACLES = 1e6, 4096, 64, 1000
+_MAX_NUMBER, _MAX_SIDE, _MAX_STACK, _MAX_OBSTACLES, _MAX_BLUR_SAMPLES = 1e6, 4096, 64, 1000, 1000
 
 Check = tuple[Callable[[Any], bool], str]
 """A function that returns True for valid values, and the text that describes valid values in an error."""
@@ -186,8 +186,15 @@ _CHECKS: dict[str, Check] = {
         f"'scene', a whole number from 0 to {_MAX_OBSTACLES}, or a list of ObstacleConfig",
     ),
     "camera": (
-        lambda value: value is None or (isinstance(value, CameraOptions) and _are_numbers(value)),
-        f"None, or CameraOptions of numbers within ±{_MAX_NUMBER:,.0f}",
+        lambda value: (
+            value is None
+            or (
+                isinstance(value, CameraOptions)
+                and all(_is_number(x) and x >= 0.0 for x in (value.vibration, value.exposure, value.shutter))
+                and _is_integer(value.blur_samples, 1, _MAX_BLUR_SAMPLES)
+            )
+        ),
+        f"None, or CameraOptions of numbers from 0 to {_MAX_NUMBER:,.0f}, with 1 to {_MAX_BLUR_SAMPLES} blur_samples",
     ),
     "randomise": (lambda value: value is None or isinstance(value, Ranges), "True, False, None or Ranges"),
     "device": _one_of(CPU, CUDA),
