@@ -17,6 +17,7 @@ from twin.env.camera_noise import CameraOptions
 from twin.env.controller import COMMAND_TIMEOUT
 from twin.env.domain_randomization import Ranges
 from twin.errors import InputError, short_repr
+from twin.mjcf.husky import TIMESTEP
 from twin.types import Array
 from twin.warp_runtime import wp
 
@@ -152,8 +153,9 @@ _CHECKS: dict[str, Check] = {
         f"Rewards, or a dict of numbers, within ±{_MAX_NUMBER:,.0f}",
     ),
     "control_timestep": (
-        lambda x: _is_number(x) and 0.01 <= x <= COMMAND_TIMEOUT,
-        f"a number from 0.01 to {COMMAND_TIMEOUT} [s]: the robot stops when no command arrives for longer",
+        lambda x: _is_number(x) and 0.01 <= x <= COMMAND_TIMEOUT and abs(x / TIMESTEP - round(x / TIMESTEP)) < 1e-8,
+        f"a multiple of {TIMESTEP} [s], the time step of the physics, from 0.01 to {COMMAND_TIMEOUT} [s]: the robot "
+        "stops when no command arrives for longer",
     ),
     "size": IMAGE_SIZE,
     "stack": (lambda value: _is_integer(value, 1, _MAX_STACK), f"a whole number from 1 to {_MAX_STACK}"),
