@@ -23,6 +23,7 @@ from twin.env.domain_randomization import Ranges
 from twin.env.drivers import BlindDriver, RouteDriver
 from twin.env.gym_env import DriveEnv
 from twin.env.mujoco_renderer import chase_poses
+from twin.env.options import parse_options
 from twin.env.suite import EnvFactory
 from twin.env.task import Motion
 from twin.env.vector_env_local import LocalVectorEnv, mixture_text
@@ -342,6 +343,10 @@ def test_unknown_tasks_and_options_are_refused(scene):
         twin.load(scene, "bend", lightning="day")
     with pytest.raises(InputError, match="unknown; the field has day, night"):
         twin.load(scene, "bend", lighting="noon")
+    for name in ("obstacles", "state"):
+        with pytest.raises(InputError, match=rf"{name} = array\(\[1, 2\]\); expected"):
+            twin.load(scene, "bend", **{name: np.array([1, 2])})
+    assert parse_options({"obstacles": np.int64(3)}) == parse_options({"obstacles": 3})
     with pytest.raises(InputError, match=r"control_timestep = 0\.015; expected a multiple of 0\.002 \[s\]"):
         twin.load(scene, "bend", control_timestep=0.015)
     for camera in ({"shutter": -0.02}, {"vibration": -1.0}, {"blur_samples": 0}, {"blur_samples": 2.5}):

@@ -160,7 +160,10 @@ _CHECKS: dict[str, Check] = {
     "size": IMAGE_SIZE,
     "stack": (lambda value: _is_integer(value, 1, _MAX_STACK), f"a whole number from 1 to {_MAX_STACK}"),
     "pixels": _BOOLEAN,
-    "state": (lambda value: value in (None, ODOMETRY, PRIVILEGED), f"None, {ODOMETRY!r} or {PRIVILEGED!r}"),
+    "state": (
+        lambda value: value is None or (isinstance(value, str) and value in (ODOMETRY, PRIVILEGED)),
+        f"None, {ODOMETRY!r} or {PRIVILEGED!r}",
+    ),
     "action": _one_of(TWIST, STEERING),
     "speed": _AT_LEAST_001,
     "yaw_rate": _AT_LEAST_001,
@@ -181,7 +184,7 @@ _CHECKS: dict[str, Check] = {
     "lighting_drift": _BOOLEAN,
     "obstacles": (
         lambda value: (
-            value == "scene"
+            (isinstance(value, str) and value == "scene")
             or (_is_sequence(value) and all(isinstance(one, ObstacleConfig) for one in value))
             or _is_integer(value, 0, _MAX_OBSTACLES)
         ),
@@ -212,6 +215,8 @@ def parse_options(given: dict[str, Any]) -> Options:
     given = dict(given)
     if isinstance(given.get("randomise"), bool):
         given["randomise"] = Ranges() if given["randomise"] else None
+    if isinstance(given.get("obstacles"), np.integer):
+        given["obstacles"] = int(given["obstacles"])
     if isinstance(given.get("rewards"), dict):
         given["rewards"] = _from_keywords(Rewards, given["rewards"], "reward")
     options = _from_keywords(Options, given, "option")
