@@ -553,7 +553,13 @@ def test_wrong_gymnasium_arguments_are_refused(scene):
             DriveEnv(scene, "bend", "rgb_array", **options)
     with pytest.raises(gymnasium.error.ResetNeeded, match="render before reset"):
         DriveEnv(scene, "bend", "rgb_array", render_size=(64, 36)).render()
-    environment = DriveEnv(scene, "bend", pixels=False)
-    with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+    environment = DriveEnv(scene, "bend", pixels=False, time_limit=0.1)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="step before reset"):
         environment.step(environment.action_space.sample())
+    environment.reset()
+    assert environment.step(environment.action_space.sample())[3]
+    with pytest.raises(gymnasium.error.ResetNeeded, match="after the end of an episode"):
+        environment.step(environment.action_space.sample())
+    environment.reset()
+    environment.step(environment.action_space.sample())
     environment.close()
