@@ -220,8 +220,11 @@ class DriveVectorEnv(VectorEnv):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Resets all environments; if `seed` is one number, environment i gets `seed` + i."""
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
-        for i, one in enumerate(seeds or ()):
+        if seed is None or isinstance(seed, int | np.integer):
+            seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        elif len(seeds := list(seed)) != self.num_envs:
+            raise InputError(f"{len(seeds)} seeds; expected {self.num_envs}, one per environment, or one number")
+        for i, one in enumerate(seeds):
             if one is not None:
                 self.vector_env.seed(i, one)
         self.vector_env.begin(range(self.num_envs))
