@@ -212,6 +212,7 @@ class DriveVectorEnv(VectorEnv):
         self.num_envs, self.render_mode = num_envs, _check_render_mode(render_mode)
         self._started = False
         self.vector_env = make_vector_env(scene, task, options, [None] * num_envs, processes)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vector_env.options.control_timestep)}
         self.single_observation_space, self.single_action_space = make_spaces(self.vector_env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
