@@ -207,6 +207,7 @@ def test_the_last_word_of_a_training_in_varied_light_is_under_held_out_light(sce
 def test_failures_are_summed_up_by_place_cause_and_light():
     assert selection.failure_summary([]) == ""
     near = [Failure("out_of_bounds", 21.0 + k, "training: night 0.6, sun 0.4") for k in range(3)]
+    assert selection.failure_summary([Failure("collision", -0.02, "sun")]).startswith("1 of 1 failures at 0 to 5 m")
     far = [Failure("stuck", 40.0, "training: sun 0.9, night 0.1")]
     text = selection.failure_summary([*far, *near])
     assert text == "3 of 4 failures at 20 to 25 m (3 by out_of_bounds); 3 in light mostly like night"
