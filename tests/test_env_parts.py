@@ -237,6 +237,7 @@ def test_invalid_ranges_are_refused():
         {"payload": (-1.0, 0.0)},
         {"latency": (0.2, 0.1)},
         {"extinction": (-0.1, 0.0)},
+        {"camera_shift": ((0.0, 0.0), (0.1, 0.1))},
     ]
     for ranges in (*wrong, {"bystanders": (-1, 2)}):
         with pytest.raises(InputError):
