@@ -350,7 +350,7 @@ def test_unknown_tasks_and_options_are_refused(scene):
     with pytest.raises(InputError, match=r"control_timestep = 0\.015; expected a multiple of 0\.002 \[s\]"):
         twin.load(scene, "bend", control_timestep=0.015)
     for camera in ({"shutter": -0.02}, {"vibration": -1.0}, {"blur_samples": 0}, {"blur_samples": 2.5}):
-        with pytest.raises(InputError, match="camera = .*; expected None, or CameraOptions of numbers from 0"):
+        with pytest.raises(InputError, match=r"camera = .*; expected None, or CameraOptions of numbers from 0"):
             twin.load(scene, "bend", camera=CameraOptions(**camera))
     for options in ({"action": "jump"}, {"stack": 0}, {"control_timestep": 0.5}, {"rewards": {"fame": 1.0}}):
         with pytest.raises(InputError):

@@ -115,7 +115,7 @@ class TrainConfig:
                 raise InputError(f"{name} = {short_repr(getattr(self, name))}; expected {choices}")
         try:
             _ = self.architecture
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise InputError(f"no network of these sizes: {error}") from None
         if self.lighting in (HELD_OUT, ANY):
             raise InputError(
