@@ -280,6 +280,8 @@ def test_parts_out_of_reach_change_no_result(tmp_path):
 
 def test_the_robot_stands_on_a_hundred_meters_of_relief(tmp_path):
     physics = HuskyPhysics(tiny_world(tmp_path).model())
+    with pytest.raises(InputError, match=r"start at x = 300\.0 m, y = 0\.0 m, beyond the ground"):
+        physics.set_pose(300.0, 0.0, 0.0)
     model, points = physics.model, np.array([[0.0, 0.1], [2.0, -0.2]])
     model.hfield_data[:] = np.linspace(0.4, 0.8, len(model.hfield_data))
     low = physics._ground_height(points)
