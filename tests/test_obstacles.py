@@ -183,3 +183,14 @@ def test_obstacles_of_scene_toml(tmp_path):
         path.write_text(head + "[[obstacle]]\n" + wrong + "\n")
         with pytest.raises(InputError, match=told):
             load_config(path)
+
+
+def test_obstacles_made_in_python_are_checked_like_those_of_scene_toml(world):
+    for wrong, words in (
+        ({"to": (3.0,)}, "expected station and lateral"),
+        ({"kind": "box", "size": (1.0, 2.0)}, "expected length, width, height"),
+        ({"color": (200.0, 0.0, 0.0)}, "expected values from 0 to 1"),
+        ({"station": float("nan")}, "expected finite numbers"),
+    ):
+        with pytest.raises(InputError, match=words):
+            add_obstacles(flat_spec(), (ObstacleConfig(**({"kind": "cone"} | wrong)),), world)

@@ -12,7 +12,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from twin.config import OBSTACLE_KINDS, ObstacleConfig
+from twin.config import ObstacleConfig
+from twin.config_file import check_obstacles
 from twin.env.obstacle_models import RADIUS, ObstacleModel, add_obstacle_geoms
 from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
@@ -45,15 +46,11 @@ def add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[ObstacleConfig], worl
     """Adds obstacles' bodies, below the ground, and the route to a scene; `place` moves them in the compiled model.
 
     Raises:
-        InputError: a kind is unknown, or two obstacles have the same name.
+        InputError: see `check_obstacles`.
     """
-    names = [body_name(one, k) for k, one in enumerate(obstacles)]
-    if len(set(names)) < len(names):
-        raise InputError(f"two obstacles are named {max(names, key=names.count)!r}; give each a different name")
-    for name, one in zip(names, obstacles, strict=True):
-        if one.kind not in OBSTACLE_KINDS:
-            raise InputError(f"obstacle kind {one.kind!r}: expected one of {', '.join(OBSTACLE_KINDS)}")
-        body = spec.worldbody.add_body(name=name, mocap=True, pos=(0, 0, _PARKED_HEIGHT))
+    check_obstacles(obstacles)
+    for k, one in enumerate(obstacles):
+        body = spec.worldbody.add_body(name=body_name(one, k), mocap=True, pos=(0, 0, _PARKED_HEIGHT))
         add_obstacle_geoms(ObstacleModel(spec, body), one.kind, one.color, one.size)
     if not any(numeric.name == _ROUTE_NUMERIC for numeric in spec.numerics):
         spec.add_numeric(name=_ROUTE_NUMERIC, size=world.route.size, data=world.route.ravel())
