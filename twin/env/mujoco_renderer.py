@@ -73,9 +73,11 @@ class RayCaster:
         import mujoco_warp as mjw  # slow to import
 
         self._mjw = mjw
-        with wp.ScopedDevice("cpu"):
-            self._model, self._data = mjw.put_model(model), mjw.put_data(model, data)
-            self._context = mjw.create_render_context(model, render_rgb=True, render_depth=True, **context)
+        # Warp's default device is global to the process. Threads set it to the CPU and restore it, which is safe in
+        # parallel only if it is the CPU before, too; on a machine with a GPU, it is the GPU until this line.
+        wp.set_device("cpu")
+        self._model, self._data = mjw.put_model(model), mjw.put_data(model, data)
+        self._context = mjw.create_render_context(model, render_rgb=True, render_depth=True, **context)
         self.max_rays: int = self._context.ray.shape[0]
 
     def set_poses(self, **poses: Array) -> None:
