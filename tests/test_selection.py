@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -134,6 +135,20 @@ def test_the_best_of_a_run_that_did_not_learn_is_kept(scene, tmp_path, scripted)
     assert (choice["steps"], choice["why"], choice["reached"]) == (160, "steps", False)
     assert choice["chosen"]["step"] == 120  # of those with most successes the one that earns most
     assert choice["failures"] == "50 of 50 failures at 0 to 5 m (50 by out_of_bounds); 50 in light mostly like day"
+
+
+def test_a_stopped_run_can_end_where_it_was_stopped(scene, tmp_path, scripted):
+    """By fewer steps than were done: the policy at hand is tested, too."""
+
+    def interrupt(steps, recent) -> None:
+        if steps == 60:
+            signal.raise_signal(signal.SIGTERM)
+
+    scripted[0][60] = (30, 1.0)
+    with pytest.raises(KeyboardInterrupt):
+        train_until_learnt(scene, tmp_path, CONFIG, interrupt, processes=1)
+    choice = learn(scene, tmp_path, replace(CONFIG, steps=40))
+    assert (choice["steps"], choice["why"], choice["chosen"]["step"]) == (60, "steps", 60)
 
 
 @pytest.mark.slow
