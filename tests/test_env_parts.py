@@ -17,7 +17,7 @@ from twin import runtime
 from twin.config import HELD_OUT, TRAINING, TaskConfig
 from twin.env.domain_randomization import EVALUATION_RANGES, NominalModel, RandomizationSample, Ranges
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
-from twin.env.episode import Episode, record_episode
+from twin.env.episode import record_episode
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
 from twin.env.options import parse_options
 from twin.env.physics import HuskyPhysics
@@ -331,18 +331,13 @@ def test_trust_falls_with_distance_turn_and_missing_road():
 # ---- episodes, drivers, films
 
 
-def test_episode_round_trip(scene, tmp_path):
+def test_an_episode_is_recorded_to_its_end(scene):
     environment = twin.load(scene, "ahead", 0, obstacles=0, lighting="night", **SMALL)
     episode = record_episode(environment, RouteDriver())
     assert episode.success and episode.lighting == "night" and episode.progress[-1] == pytest.approx(3.5, abs=0.15)
     assert len(episode.times) == len(episode.actions) == len(episode.trust)
     assert episode.rewards.sum() == pytest.approx(0.1 * (len(episode.times) - 1))
-    episode.save(tmp_path)
-    back = Episode.load(tmp_path)
-    for name in ("times", "qpos", "actions", "rewards"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(episode, name))
-    assert replace(back, **{n: getattr(episode, n) for n in ("times",)}).cause == episode.cause
-    assert back.obstacles == episode.obstacles and back.randomisation["payload"] == 0.0
+    assert episode.obstacles == () and episode.randomisation["payload"] == 0.0
 
 
 def test_a_policy_is_a_function_by_name(scene, tmp_path, monkeypatch):
