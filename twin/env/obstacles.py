@@ -156,9 +156,7 @@ def random_obstacles(
     return tuple(out)
 
 
-def random_distractors(
-    world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
-) -> tuple[ObstacleConfig, ...]:
+def random_distractors(world: World, rng: np.random.Generator, count: int) -> tuple[ObstacleConfig, ...]:
     """Samples distractor objects beside the corridor, out of reach of a robot within it.
 
     They are named as in `random_obstacles`. A winding route may leave room for fewer than `count`.
@@ -166,7 +164,7 @@ def random_distractors(
     route, out = world.route[:, :2], []
     length = float(arc_lengths(world.route)[-1])
     for k in range(count):
-        kind = str(rng.choice(list(kinds)))
+        kind = str(rng.choice(list(STATIC_KINDS)))
         nearest = world.half_width + _ROBOT_RADIUS + RADIUS[kind]
         for _ in range(_MAX_TRIES):
             station = float(rng.uniform(0.0, length))
