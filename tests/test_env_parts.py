@@ -1,7 +1,6 @@
 """Parts of the environment: stretches of a route, lightings and their sets, randomisation, trust, the scene's model,
 recorded episodes, the audit and the film."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import mujoco
