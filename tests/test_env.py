@@ -23,6 +23,7 @@ from twin.env.domain_randomization import Ranges
 from twin.env.drivers import BlindDriver, RouteDriver
 from twin.env.gym_env import DriveEnv
 from twin.env.mujoco_renderer import chase_poses
+from twin.env.options import parse_options
 from twin.env.suite import EnvFactory
 from twin.env.task import Motion
 from twin.env.vector_env_local import LocalVectorEnv, mixture_text
@@ -342,6 +343,15 @@ def test_unknown_tasks_and_options_are_refused(scene):
         twin.load(scene, "bend", lightning="day")
     with pytest.raises(InputError, match="unknown; the field has day, night"):
         twin.load(scene, "bend", lighting="noon")
+    for name in ("obstacles", "state"):
+        with pytest.raises(InputError, match=rf"{name} = array\(\[1, 2\]\); expected"):
+            twin.load(scene, "bend", **{name: np.array([1, 2])})
+    assert parse_options({"obstacles": np.int64(3)}) == parse_options({"obstacles": 3})
+    with pytest.raises(InputError, match=r"control_timestep = 0\.015; expected a multiple of 0\.002 \[s\]"):
+        twin.load(scene, "bend", control_timestep=0.015)
+    for camera in ({"shutter": -0.02}, {"vibration": -1.0}, {"blur_samples": 0}, {"blur_samples": 2.5}):
+        with pytest.raises(InputError, match=r"camera = .*; expected None, or CameraOptions of numbers from 0"):
+            twin.load(scene, "bend", camera=CameraOptions(**camera))
     for options in ({"action": "jump"}, {"stack": 0}, {"control_timestep": 0.5}, {"rewards": {"fame": 1.0}}):
         with pytest.raises(InputError):
             twin.load(scene, "bend", **options)
@@ -461,6 +471,21 @@ def test_a_large_view_shows_what_the_policy_sees(scene):
         assert np.abs(pictures[name].astype(float) - pictures["plain"]).mean() > 1.0 or name == "plain"
 
 
+def test_motion_blur_leaves_the_sky_of_the_simulator_sharp(scene):
+    """Driving straight ahead moves nothing in the sky."""
+    pictures = []
+    for camera in (None, CameraOptions(shutter=0.05)):
+        environment = twin.load(
+            scene, "ahead", 0, size=(64, 36), observe="simulator", camera=camera, start_heading=0.0, start_offset=0.0
+        )
+        environment.reset()
+        for _ in range(12):
+            step = environment.step([1.0, 0.0])
+        pictures.append(step.observation["pixels"][-1].astype(float))
+    blur = np.abs(pictures[1] - pictures[0]).mean((1, 2))
+    assert blur[17:22].mean() > 0.2 and blur[:12].max() < 0.05  # horizon, sky
+
+
 def test_a_chase_view_follows_the_robot_and_shows_its_obstacles(scene):
     """It also works without pictures for the policy, and with other obstacles in every episode."""
     environment = DriveEnv(scene, "bend", "rgb_array", render_view="chase", pixels=False, obstacles=2)
@@ -528,7 +553,13 @@ def test_wrong_gymnasium_arguments_are_refused(scene):
             DriveEnv(scene, "bend", "rgb_array", **options)
     with pytest.raises(gymnasium.error.ResetNeeded, match="render before reset"):
         DriveEnv(scene, "bend", "rgb_array", render_size=(64, 36)).render()
-    environment = DriveEnv(scene, "bend", pixels=False)
-    with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+    environment = DriveEnv(scene, "bend", pixels=False, time_limit=0.1)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="step before reset"):
         environment.step(environment.action_space.sample())
+    environment.reset()
+    assert environment.step(environment.action_space.sample())[3]
+    with pytest.raises(gymnasium.error.ResetNeeded, match="after the end of an episode"):
+        environment.step(environment.action_space.sample())
+    environment.reset()
+    environment.step(environment.action_space.sample())
     environment.close()

@@ -238,6 +238,9 @@ def test_check_names_what_is_wrong_in_a_scene_of_defaults():
     assert [one.option for one in check(spec.compile())] == ["cone", "impratio", "integrator"]
     set_options(spec)
     assert not check(spec.compile())
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # the robot would fall through the floor
+    assert [one.option for one in check(spec.compile())] == ["flag constraint"]
+    spec.option.disableflags = 0
     spec.geom("floor").priority = 1
     assert [one.option for one in check(spec.compile())] == ["priority of geom floor"]
     assert "the wheels hop" in str(check(spec.compile())[0])

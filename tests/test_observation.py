@@ -1,6 +1,9 @@
 """Observations: images of the right instant, without the camera's own housing."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -12,11 +15,12 @@ from twin import runtime
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
 from twin.env.domain_randomization import NominalModel, RandomizationSample, Ranges
-from twin.env.mujoco_renderer import SceneRenderer
+from twin.env.mujoco_renderer import RayCaster, SceneRenderer
 from twin.env.options import NERF, SIMULATOR
 from twin.env.physics import camera_pose
 from twin.env.suite import DriveEnvironment, EnvFactory
 from twin.geometry.cameras import Viewpoints
+from twin.warp_runtime import wp
 
 SIZE = (64, 36)
 WALKER = ObstacleConfig("walker", "pedestrian", station=2.5, lateral=-0.6, to=(2.5, 0.6), speed=1.5)
@@ -59,6 +63,33 @@ def test_camera_latency_shows_the_past_state(scene, observe, period, late):
     empty = film(scene, 0.0, steps, **(options | {"obstacles": ()}))
     there = [np.flatnonzero((a != b)[: SIZE[1] // 4].any((0, 2))) for a, b in zip(prompt, empty, strict=True)]
     assert len(there[0]) and len(there[-1]) and there[0].mean() > there[steps // 2].mean() + 5
+
+
+def test_ray_casters_in_parallel_stay_on_the_cpu(scene, monkeypatch):
+    """On a machine with a GPU, too, which is Warp's default device there."""
+    runtime, model = wp.get_device("cpu").runtime, scene.world().model()
+    monkeypatch.setattr(runtime, "default_device", "the GPU")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    casters = [RayCaster(model, data, cam_res=(8, 8), cam_active=["front"]) for _ in range(2)]
+    first_ended, second_began, seen = threading.Event(), threading.Event(), []
+
+    def first(*_) -> None:
+        assert second_began.wait(60)
+
+    def second(*_) -> None:
+        second_began.set()
+        assert first_ended.wait(60)
+        seen.append(runtime.default_device)
+
+    for caster, render in zip(casters, (first, second), strict=True):
+        caster._mjw = SimpleNamespace(render=render)
+    with ThreadPoolExecutor(2) as pool:
+        futures = [pool.submit(caster.cast) for caster in casters]
+        futures[0].result(60)
+        first_ended.set()
+        futures[1].result(60)
+    assert seen == [wp.get_device("cpu")]
 
 
 def views(stage: EnvFactory, shaded: bool = False) -> tuple[Compositor, SceneRenderer]:

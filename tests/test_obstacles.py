@@ -85,6 +85,13 @@ def test_moving_obstacle_returns_at_its_speed():
     assert yaw == pytest.approx((14.0 - 10.0) / 9.0, abs=0.1)  # it faces along the bend
 
 
+def test_a_negative_delay_makes_no_jump():
+    late = ObstacleConfig("p", "pedestrian", 5.0, -2.0, to=(5.0, 2.0), speed=1.25, delay=-7.3)
+    lateral = np.array([obstacle_pose(late, ROUTE, t)[1] for t in np.arange(0.0, 12.0, 0.1)])
+    assert np.abs(np.diff(lateral)).max() < 0.126
+    assert lateral[73] == pytest.approx(-2.0)
+
+
 @pytest.mark.parametrize("kind", OBSTACLE_KINDS)
 def test_every_kind_stands_on_the_ground_and_is_bumped_into(world, kind):
     told = (ObstacleConfig("it", kind, 6.0, 0.0, yaw=90.0),)
@@ -176,3 +183,14 @@ def test_obstacles_of_scene_toml(tmp_path):
         path.write_text(head + "[[obstacle]]\n" + wrong + "\n")
         with pytest.raises(InputError, match=told):
             load_config(path)
+
+
+def test_obstacles_made_in_python_are_checked_like_those_of_scene_toml(world):
+    for wrong, words in (
+        ({"to": (3.0,)}, "expected station and lateral"),
+        ({"kind": "box", "size": (1.0, 2.0)}, "expected length, width, height"),
+        ({"color": (200.0, 0.0, 0.0)}, "expected values from 0 to 1"),
+        ({"station": float("nan")}, "expected finite numbers"),
+    ):
+        with pytest.raises(InputError, match=words):
+            add_obstacles(flat_spec(), (ObstacleConfig(**({"kind": "cone"} | wrong)),), world)

@@ -162,6 +162,7 @@ DAMAGE = {
     "no such control": (lambda f: edit(f, control__thrust=1.0), "thrust"),
     "no such speed": (lambda f: edit(f, control__speed="fast"), "speed = 'fast'"),
     "no such action": (lambda f: edit(f, control__action="fly"), "fly"),
+    "no training": (lambda f: edit(f, trained=5), "trained = 5; expected a table"),
     "actions that do not fit": (lambda f: edit(f, control__action="twist"), "expected 2"),
 }
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from tiny_world import tiny_config, tiny_scene, tiny_world
+from tiny_world import export, tiny_config, tiny_scene, tiny_world
 
 from twin.env.drivers import follow_route, pursuit_curvature
 from twin.env.mujoco_renderer import SceneCamera, blend_parts, chase_poses
@@ -13,7 +13,6 @@ from twin.env.physics import HuskyPhysics
 from twin.geometry.cameras import project
 from twin.geometry.poses import inverse_pose
 from twin.mjcf.husky import add_husky, set_options
-from twin.mjcf.scene_xml import run
 from twin.mjcf.world import World
 from twin.report.video_writer import frame_indices
 from twin.robot import REAR_HEAVY, HuskyParams
@@ -73,11 +72,8 @@ def test_the_same_drive_repeats_exactly(world, drive):
 
 def test_rear_heavy_robot_is_followed_too(tmp_path):
     """Its yaw rate is 1.3 times the commanded one; heading feedback must compensate for that."""
-    scene = tiny_scene(tmp_path)
-    out = scene.stage("mjcf")
-    out.mkdir()
-    run(scene, replace(tiny_config(), robot=HuskyParams(center_of_mass=REAR_HEAVY)), out)
-    world = World.load(out)
+    config = replace(tiny_config(), robot=HuskyParams(center_of_mass=REAR_HEAVY))
+    world = World.load(export(tiny_scene(tmp_path), config)[0])
     assert world.robot.center_of_mass == REAR_HEAVY
     assert world.model().body("base_link").ipos[0] == pytest.approx(-0.085)
     drive = follow_route(world, HuskyPhysics(world.model(), world.robot))
@@ -85,11 +81,7 @@ def test_rear_heavy_robot_is_followed_too(tmp_path):
 
 
 def test_an_obstacle_on_the_road_ends_the_drive(tmp_path):
-    scene = tiny_scene(tmp_path, boxes=((4.0, -3.0, 0.8), (3.5, 0.1, 0.8)))
-    out = scene.stage("mjcf")
-    out.mkdir()
-    run(scene, tiny_config(), out)
-    world = World.load(out)
+    world = World.load(export(tiny_scene(tmp_path, boxes=((4.0, -3.0, 0.8), (3.5, 0.1, 0.8))))[0])
     drive = follow_route(world, HuskyPhysics(world.model(), world.robot))
     assert drive.outcome == "touched" and drive.touched == ("part_0001",)
     # The bumper of the chassis is 0.49 m ahead of the base, the box begins at 3.2 m.
@@ -276,11 +268,3 @@ def test_delayed_poses_of_moving_obstacles(latency):
         time = max(0.0, 0.1 * (k + 1) - latency)
         assert physics.delayed_data.time == pytest.approx(time, abs=1e-9)
         np.testing.assert_allclose(physics.delayed_data.body("walker").xpos, [3.0 + 2.0 * time, 1.0, 0.0])
-
-
-def test_zero_latency_shows_the_present():
-    physics = on_a_plane()
-    for _ in range(3):
-        physics.command(1.0, 0.5)
-        physics.step()
-    np.testing.assert_allclose(physics.delayed_camera_to_world, physics.camera_to_world, atol=1e-12)

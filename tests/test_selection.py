@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -136,6 +137,20 @@ def test_the_best_of_a_run_that_did_not_learn_is_kept(scene, tmp_path, scripted)
     assert choice["failures"] == "50 of 50 failures at 0 to 5 m (50 by out_of_bounds); 50 in lightings mostly like day"
 
 
+def test_a_stopped_run_can_end_where_it_was_stopped(scene, tmp_path, scripted):
+    """By fewer steps than were done: the policy at hand is tested, too."""
+
+    def interrupt(steps, recent) -> None:
+        if steps == 60:
+            signal.raise_signal(signal.SIGTERM)
+
+    scripted[0][60] = (30, 1.0)
+    with pytest.raises(KeyboardInterrupt):
+        train_until_learnt(scene, tmp_path, CONFIG, interrupt, processes=1)
+    choice = learn(scene, tmp_path, replace(CONFIG, steps=40))
+    assert (choice["steps"], choice["why"], choice["chosen"]["step"]) == (60, "steps", 60)
+
+
 @pytest.mark.slow
 def test_a_choice_stays_until_more_is_asked(scene, tmp_path, scripted):
     script, asked = scripted
@@ -207,6 +222,7 @@ def test_the_last_word_of_a_training_in_varied_light_is_under_held_out_light(sce
 def test_failures_are_summed_up_by_place_cause_and_light():
     assert selection.failure_summary([]) == ""
     near = [Failure("out_of_bounds", 21.0 + k, "training: night 0.6, sun 0.4") for k in range(3)]
+    assert selection.failure_summary([Failure("collision", -0.02, "sun")]).startswith("1 of 1 failures at 0 to 5 m")
     far = [Failure("stuck", 40.0, "training: sun 0.9, night 0.1")]
     text = selection.failure_summary([*far, *near])
     assert text == "3 of 4 failures at 20 to 25 m (3 by out_of_bounds); 3 in lightings mostly like night"

@@ -222,6 +222,12 @@ def test_impossible_configurations_are_refused(wrong):
         TrainConfig(**wrong)
 
 
+@pytest.mark.parametrize("sizes", [{"pool": 3}, {"hidden": 64}, {"convolutions": ((16, 90, 1),)}, {"features": 5000}])
+def test_networks_that_do_not_exist_are_refused(sizes):
+    with pytest.raises(InputError, match="no network of these sizes"):
+        TrainConfig(**sizes)
+
+
 def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     from twin.learn.training import train as run
 

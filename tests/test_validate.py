@@ -77,6 +77,16 @@ def test_processes_give_the_same_results(scene):
     assert list(campaign(chunks, processes=2)) == list(campaign(chunks))
 
 
+def test_a_policy_trained_again_is_driven_anew(scene):
+    """In one process, too, as by `validate` in a notebook."""
+    again = scene / "runs" / "again"
+    for name in ("ahead", "left"):
+        shutil.rmtree(again, ignore_errors=True)
+        shutil.copytree(scene / "runs" / name, again)
+        assert list(campaign([chunk(scene, [0], name="again")])) == list(campaign([chunk(scene, [0], name=name)]))
+    shutil.rmtree(again)
+
+
 def test_sampled_lightings_do_not_depend_on_earlier_ones(scene):
     def light(numbers):
         stage = EnvFactory.open(load_scene(scene), "ahead", {"size": (32, 18)})

@@ -13,6 +13,7 @@ from tiny_twin import tiny_twin
 
 import twin
 from twin import runtime
+from twin.env.gym_env import DriveVectorEnv
 from twin.env.suite import EnvFactory
 from twin.env.vector_env import ProcessVectorEnv, _Child, make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
@@ -79,6 +80,22 @@ def test_attributes_of_tasks_are_read_and_set_in_children(spread):
     assert spread.info(1)["episode_seed"] == 77 and spread.get(-1, "time_limit") == before + 1.0  # and it goes on
     with pytest.raises(IndexError):
         spread.step(np.zeros((1, spread.action_size)), [3])
+
+
+def test_seeds_of_gymnasium_are_numbers_or_one_per_environment(scene):
+    envs = DriveVectorEnv(2, scene, "bend", processes=1, pixels=False, control_timestep=0.05)
+    assert envs.metadata["render_fps"] == 20
+
+    def episodes(seed) -> list[int]:
+        return envs.reset(seed=seed)[1]["episode_seed"].tolist()
+
+    assert episodes(np.int64(0)) == episodes(0) == episodes([0, 1]) == episodes(np.arange(2))
+    assert episodes((0, None))[0] == episodes(0)[0] and episodes(None) != episodes(0)
+    for seeds in ([1], [1, 2, 3]):
+        with pytest.raises(InputError, match=f"{len(seeds)} seeds; expected 2, one per environment"):
+            envs.reset(seed=seeds)
+    with pytest.raises(InputError, match="0 environments; expected at least 1"):
+        DriveVectorEnv(0, scene, "bend", pixels=False)
 
 
 class _Foreign:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from tiny_world import box, tiny_config, tiny_ground, tiny_route, tiny_scene, tiny_world
+from tiny_world import box, export, tiny_config, tiny_ground, tiny_route, tiny_scene, tiny_world
 
 from twin.errors import InputError
 from twin.geometry.images import read_image
@@ -19,7 +19,6 @@ from twin.mjcf.scene_xml import (
     face_texture,
     film_camera,
     rest_pose,
-    run,
 )
 from twin.mjcf.world import World, arc_lengths, corridor_edges, heading_at, nearest_on_route, point_at, total_turn
 from twin.robot import BASE_HEIGHT, CAMERA_SIZE, HuskyParams
@@ -27,10 +26,7 @@ from twin.robot import BASE_HEIGHT, CAMERA_SIZE, HuskyParams
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    scene = tiny_scene(tmp_path_factory.mktemp("scene"))
-    out = scene.stage("mjcf")
-    out.mkdir()
-    return out, run(scene, tiny_config(half_width=0.8), out)
+    return export(tiny_scene(tmp_path_factory.mktemp("scene")), tiny_config(half_width=0.8))
 
 
 def ray_down(model, data, xy, groups=(1, 0, 0, 0, 0, 0)) -> float:
@@ -96,9 +92,7 @@ def test_level_ground_is_level(tmp_path):
     ground = tiny_ground()
     flat = type(ground)(np.full_like(ground.height, 0.7), ground.origin, ground.cell, ground.measured, ground.rgb)
     flat.save(scene.stage("mesh"))
-    out = scene.stage("mjcf")
-    out.mkdir()
-    run(scene, tiny_config(), out)
+    out, _ = export(scene)
     model = World.load(out).model()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -180,48 +174,32 @@ def test_camera_of_another_shape_keeps_square_pixels(exported):
 
 def test_without_a_route_there_is_no_robot(tmp_path):
     scene = tiny_scene(tmp_path, route=False)
-    out = scene.stage("mjcf")
-    out.mkdir()
-    metrics = run(scene, tiny_config(), out)
+    out, metrics = export(scene)
     assert not metrics["has_route"] and "no route" in metrics["note"]
     model = mujoco.MjModel.from_xml_path(str(out / "scene.xml"))
     assert model.nu == 0 and model.nq == 0 and model.geom("part_0001").id >= 0
     assert not scene.has_route
 
 
-def test_a_route_that_starts_off_the_ground_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("xy", "words"),
+    [(tiny_route() - [2.5, 0.0], r"0\.50 m from the edge"), (tiny_route()[:4], r"is 0\.75 m long")],
+)
+def test_a_route_that_is_too_short_or_starts_off_the_ground_is_refused(tmp_path, xy, words):
     scene = tiny_scene(tmp_path)
-    xy = tiny_route() - [2.5, 0.0]
     np.savez(scene.stage("mesh") / "route.npz", xy=xy, z=tiny_ground().at(xy))
-    out = scene.stage("mjcf")
-    out.mkdir()
-    with pytest.raises(InputError, match=r"0\.50 m from the edge"):
-        run(scene, tiny_config(), out)
-
-
-def test_a_route_that_is_too_short_is_refused(tmp_path):
-    scene = tiny_scene(tmp_path)
-    xy = tiny_route()[:4]
-    np.savez(scene.stage("mesh") / "route.npz", xy=xy, z=tiny_ground().at(xy))
-    out = scene.stage("mjcf")
-    out.mkdir()
-    with pytest.raises(InputError, match=r"is 0\.75 m long"):
-        run(scene, tiny_config(), out)
+    with pytest.raises(InputError, match=words):
+        export(scene)
 
 
 def test_geoms_touched_at_the_start_are_reported(tmp_path):
     scene = tiny_scene(tmp_path, boxes=((0.0, 0.62, 0.8),))  # 2 cm into the left tires
-    out = scene.stage("mjcf")
-    out.mkdir()
-    assert run(scene, tiny_config(), out)["spawn_touched"] == ["part_0000"]
+    assert export(scene)[1]["spawn_touched"] == ["part_0000"]
 
 
 def test_a_start_inside_a_part_is_refused(tmp_path):
-    scene = tiny_scene(tmp_path, boxes=((0.4, 0.3, 0.5),))
-    out = scene.stage("mjcf")
-    out.mkdir()
     with pytest.raises(InputError, match="does not rest"):
-        run(scene, tiny_config(), out)
+        export(tiny_scene(tmp_path, boxes=((0.4, 0.3, 0.5),)))
 
 
 def on_a_slope(tmp_path, degrees: float, robot: HuskyParams, **scene_arguments):
@@ -232,9 +210,7 @@ def on_a_slope(tmp_path, degrees: float, robot: HuskyParams, **scene_arguments):
     ground = type(flat)(np.tan(np.radians(degrees)) * x, flat.origin, flat.cell, flat.measured, flat.rgb)
     ground.save(scene.stage("mesh"))
     np.savez(scene.stage("mesh") / "route.npz", xy=tiny_route(), z=ground.at(tiny_route()))
-    out = scene.stage("mjcf")
-    out.mkdir()
-    return out, run(scene, replace(tiny_config(), robot=robot), out)
+    return export(scene, replace(tiny_config(), robot=robot))
 
 
 SOFT = HuskyParams(friction=0.25, spin_friction=0.02, slip_stiffness=1 / 40, ground_viscosity=5.0)

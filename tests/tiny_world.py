@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -79,9 +80,12 @@ def tiny_config(**mjcf) -> SceneConfig:
     return replace(SceneConfig(name="tiny"), mjcf=MjcfConfig(**mjcf))
 
 
-def tiny_world(root: Path, **mjcf) -> World:
-    scene = tiny_scene(root)
+def export(scene: SceneDir, config: SceneConfig | None = None) -> tuple[Path, dict[str, Any]]:
+    """Runs the stage `mjcf`; its folder and metrics."""
     out = scene.stage("mjcf")
     out.mkdir()
-    run(scene, tiny_config(**mjcf), out)
-    return World.load(out)
+    return out, run(scene, config or tiny_config(), out)
+
+
+def tiny_world(root: Path, **mjcf) -> World:
+    return World.load(export(tiny_scene(root), tiny_config(**mjcf))[0])

@@ -10,7 +10,7 @@ import difflib
 import math
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -185,7 +185,7 @@ def _check(config: SceneConfig, folder: str) -> None:
     _check_segments(config.capture.keep, "capture.keep")
     _check_route(config.route, "route")
     _check_branches(config)
-    _check_obstacles(config.obstacle)
+    check_obstacles(config.obstacle)
     _check_metric(config.metric)
     metric = config.metric
     scales = (
@@ -345,8 +345,11 @@ def _check_segments(parts: tuple[tuple[float, ...], ...], what: str) -> None:
         end = part[1]
 
 
-def _check_obstacles(obstacles: tuple[ObstacleConfig, ...]) -> None:
+def check_obstacles(obstacles: Sequence[ObstacleConfig]) -> None:
+    """Raises InputError for obstacles that cannot be built, or that have the same name."""
     for one in obstacles:
+        numbers = (one.station, one.lateral, one.yaw, one.speed, one.delay, *one.to, *one.color, *one.size)
+        _require(all(map(math.isfinite, numbers)), f"[[obstacle]] {short_repr(one)}; expected finite numbers")
         _check_choice(one.kind, OBSTACLE_KINDS, "[[obstacle]] kind")
         if one.name:
             _check_name(one.name, "[[obstacle]] name")

@@ -315,9 +315,7 @@ class Compositor:
         self.size, self.max_envs, self._field = size, max_envs, field
         self._camera = model.camera(camera).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
-        # Warp's default device is global to the process. Workers set it to the CPU and restore it, which is safe in
-        # parallel only if it is always the CPU.
-        wp.set_device("cpu")
+        wp.set_device("cpu")  # see `RayCaster`
         count = min(max_envs, available_cores()) if field.device == "cpu" else 1
         # On a GPU there is one worker, since all threads would share one CUDA stream. Workers are created one after the
         # other: each may compile Warp kernels, and compiling in two threads at once corrupts them.

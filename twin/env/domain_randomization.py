@@ -107,7 +107,7 @@ class Ranges:
             least, most = _BOUNDS.get(name, (-_MAX_BOUND, _MAX_BOUND))
             try:
                 low, high = np.asarray(pair, float)
-                valid = (low.ndim == 0 or name in _PER_AXIS) and bool(
+                valid = (low.ndim == 0 or (name in _PER_AXIS and low.shape == (3,))) and bool(
                     np.all((least <= low) & (low <= high) & (high <= most))
                 )
             except (TypeError, ValueError, OverflowError):

@@ -1,18 +1,15 @@
 """A recorded episode: actions, results, and the data for rendering it again."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import dm_env
 import numpy as np
 
 from twin.config import ObstacleConfig
-from twin.config_file import parse_table
 from twin.env.drivers import Driver
 from twin.env.task import control
-from twin.files import read_json, write_json
 from twin.types import Array
 
 _ARRAY_FIELDS = ("times", "base_to_world", "qpos", "actions", "rewards", "speed", "cross_track", "progress", "trust")
@@ -55,22 +52,6 @@ class Episode:
     @property
     def success(self) -> bool:
         return self.cause == "goal"
-
-    def save(self, folder: Path) -> None:
-        """Writes `episode.npz` and `episode.json`."""
-        folder.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(folder / "episode.npz", **{name: getattr(self, name) for name in _ARRAY_FIELDS})
-        write_json(folder / "episode.json", {k: v for k, v in asdict(self).items() if k not in _ARRAY_FIELDS})
-
-    @staticmethod
-    def load(folder: Path) -> "Episode":
-        head = read_json(folder / "episode.json")
-        head["touched"] = tuple(head["touched"])
-        head["obstacles"] = tuple(
-            parse_table(ObstacleConfig, one, str(folder / "episode.json")) for one in head["obstacles"]
-        )
-        with np.load(folder / "episode.npz", allow_pickle=False) as data:
-            return Episode(**{name: data[name] for name in _ARRAY_FIELDS}, **head)
 
 
 def record_episode(

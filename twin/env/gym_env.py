@@ -131,7 +131,7 @@ class DriveEnv(gymnasium.Env):
         self._scene: SceneCamera | None = None
         self._chase: ChaseCamera | None = None
         self.vector_env = make_vector_env(scene, task, options, [None])
-        self._started = False
+        self._started, self._over = False, False
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vector_env.options.control_timestep)}
         self.observation_space, self.action_space = make_spaces(self.vector_env)
 
@@ -140,7 +140,7 @@ class DriveEnv(gymnasium.Env):
         if seed is not None:
             self.vector_env.seed(0, seed)
         self.vector_env.begin([0])
-        self._started = True
+        self._started, self._over = True, False
         if self._render_view == CHASE and self.render_mode:
             base = self._local.physics[0].base_to_world
             self._chase = ChaseCamera(base)
@@ -148,12 +148,13 @@ class DriveEnv(gymnasium.Env):
         return of_one(observations(self.vector_env), 0), _info(self.vector_env, 0)
 
     def step(self, action: NDArray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        if not self._started:
-            raise ResetNeeded("step before reset; call reset() first")
+        if self._over or not self._started:
+            raise ResetNeeded("step before reset, or after the end of an episode; call reset() first")
         out = self.vector_env.step(np.asarray(action)[None])
         if self._chase:
             self._chase_pose = self._chase.follow(self._local.physics[0].base_to_world)
         end = bool(out.terminated[0]), bool(out.truncated[0])
+        self._over = any(end)
         return of_one(observations(self.vector_env), 0), float(out.reward[0]), *end, _info(self.vector_env, 0)
 
     def render(self) -> NDArray | None:
@@ -211,6 +212,7 @@ class DriveVectorEnv(VectorEnv):
         self.num_envs, self.render_mode = num_envs, _check_render_mode(render_mode)
         self._started = False
         self.vector_env = make_vector_env(scene, task, options, [None] * num_envs, processes)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vector_env.options.control_timestep)}
         self.single_observation_space, self.single_action_space = make_spaces(self.vector_env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -219,8 +221,11 @@ class DriveVectorEnv(VectorEnv):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Resets all environments; if `seed` is one number, environment i gets `seed` + i."""
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
-        for i, one in enumerate(seeds or ()):
+        if seed is None or isinstance(seed, int | np.integer):
+            seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        elif len(seeds := list(seed)) != self.num_envs:
+            raise InputError(f"{len(seeds)} seeds; expected {self.num_envs}, one per environment, or one number")
+        for i, one in enumerate(seeds):
             if one is not None:
                 self.vector_env.seed(i, one)
         self.vector_env.begin(range(self.num_envs))

@@ -73,9 +73,11 @@ class RayCaster:
         import mujoco_warp as mjw  # slow to import
 
         self._mjw = mjw
-        with wp.ScopedDevice("cpu"):
-            self._model, self._data = mjw.put_model(model), mjw.put_data(model, data)
-            self._context = mjw.create_render_context(model, render_rgb=True, render_depth=True, **context)
+        # Warp's default device is global to the process. Threads set it to the CPU and restore it, which is safe in
+        # parallel only if it is the CPU before, too; on a machine with a GPU, it is the GPU until this line.
+        wp.set_device("cpu")
+        self._model, self._data = mjw.put_model(model), mjw.put_data(model, data)
+        self._context = mjw.create_render_context(model, render_rgb=True, render_depth=True, **context)
         self.max_rays: int = self._context.ray.shape[0]
 
     def set_poses(self, **poses: Array) -> None:
@@ -169,12 +171,12 @@ class SceneRenderer:
                 rgb[k], depth[k] = self._workers[number].render(datas[k], poses[k])
 
         list(self._pool.map(render_share, range(len(self._workers))))
+        far = np.where(depth > 0.0, depth, np.float32(FAR))
         for k, one in enumerate(weather):
             if one:
-                far = np.where(depth[k] > 0.0, depth[k], np.float32(FAR))
-                rgb[k] = one.apply(rgb[k], far, self._rays, poses[k])
+                rgb[k] = one.apply(rgb[k], far[k], self._rays, poses[k])
         for k, camera_noise in enumerate(noise or ()):
-            rgb[k] = camera_noise.apply(rgb[k], depth[k], poses[k], datas[k].time, self._rays, self.intrinsics)
+            rgb[k] = camera_noise.apply(rgb[k], far[k], poses[k], datas[k].time, self._rays, self.intrinsics)
         return Rendering(rgb, depth, (depth > 0.0).astype(np.float32))
 
 

@@ -89,7 +89,7 @@ class PixelObserver:
         fog = self.lightings[i].fog_at(0.0)  # type: ignore[union-attr]
         # Lightings fitted to a photo always have a fog; for a clear day, its extinction is 0.
         if fog is not None and o.randomise and o.randomise.hold_known:
-            task.set_weather(task.sample.for_known_weather())
+            task.sample = task.sample.for_known_weather()
         has_weather = fog is not None or o.randomise
         sun = main_sun(self.lightings[i].sunlight_at(0.0))  # type: ignore[union-attr]
         known_sun = sun.toward if sun else None

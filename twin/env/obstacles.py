@@ -12,7 +12,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from twin.config import OBSTACLE_KINDS, ObstacleConfig
+from twin.config import ObstacleConfig
+from twin.config_file import check_obstacles
 from twin.env.obstacle_models import RADIUS, ObstacleModel, add_obstacle_geoms
 from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
@@ -45,15 +46,11 @@ def add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[ObstacleConfig], worl
     """Adds obstacles' bodies, below the ground, and the route to a scene; `place` moves them in the compiled model.
 
     Raises:
-        InputError: a kind is unknown, or two obstacles have the same name.
+        InputError: see `check_obstacles`.
     """
-    names = [body_name(one, k) for k, one in enumerate(obstacles)]
-    if len(set(names)) < len(names):
-        raise InputError(f"two obstacles are named {max(names, key=names.count)!r}; give each a different name")
-    for name, one in zip(names, obstacles, strict=True):
-        if one.kind not in OBSTACLE_KINDS:
-            raise InputError(f"obstacle kind {one.kind!r}: expected one of {', '.join(OBSTACLE_KINDS)}")
-        body = spec.worldbody.add_body(name=name, mocap=True, pos=(0, 0, _PARKED_HEIGHT))
+    check_obstacles(obstacles)
+    for k, one in enumerate(obstacles):
+        body = spec.worldbody.add_body(name=body_name(one, k), mocap=True, pos=(0, 0, _PARKED_HEIGHT))
         add_obstacle_geoms(ObstacleModel(spec, body), one.kind, one.color, one.size)
     if not any(numeric.name == _ROUTE_NUMERIC for numeric in spec.numerics):
         spec.add_numeric(name=_ROUTE_NUMERIC, size=world.route.size, data=world.route.ravel())
@@ -93,7 +90,7 @@ def obstacle_pose(obstacle: ObstacleConfig, route: Array, time: float) -> tuple[
     if length < 1e-9:
         return (*_route_point(route, *start), float(heading_at(route, start[0])) + turn)
     passes = (time + obstacle.delay) * obstacle.speed / length
-    back = bool(int(passes) % 2)
+    back = bool(passes // 1.0 % 2.0)  # a pass back; also before the first pass, if the delay is negative
     share = passes % 1.0
     station, lateral = start + step * (1.0 - share if back else share)
     x, y = _route_point(route, station, lateral)
@@ -159,9 +156,7 @@ def random_obstacles(
     return tuple(out)
 
 
-def random_distractors(
-    world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
-) -> tuple[ObstacleConfig, ...]:
+def random_distractors(world: World, rng: np.random.Generator, count: int) -> tuple[ObstacleConfig, ...]:
     """Samples distractor objects beside the corridor, out of reach of a robot within it.
 
     They are named as in `random_obstacles`. A winding route may leave room for fewer than `count`.
@@ -169,7 +164,7 @@ def random_distractors(
     route, out = world.route[:, :2], []
     length = float(arc_lengths(world.route)[-1])
     for k in range(count):
-        kind = str(rng.choice(list(kinds)))
+        kind = str(rng.choice(list(STATIC_KINDS)))
         nearest = world.half_width + _ROBOT_RADIUS + RADIUS[kind]
         for _ in range(_MAX_TRIES):
             station = float(rng.uniform(0.0, length))

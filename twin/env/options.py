@@ -17,6 +17,7 @@ from twin.env.camera_noise import CameraOptions
 from twin.env.controller import COMMAND_TIMEOUT
 from twin.env.domain_randomization import Ranges
 from twin.errors import InputError, short_repr
+from twin.mjcf.husky import TIMESTEP
 from twin.types import Array
 from twin.warp_runtime import wp
 
@@ -106,7 +107,7 @@ class Options:
 
 # ---- checks
 
-_MAX_NUMBER, _MAX_SIDE, _MAX_STACK, _MAX_OBSTACLES = 1e6, 4096, 64, 1000
+_MAX_NUMBER, _MAX_SIDE, _MAX_STACK, _MAX_OBSTACLES, _MAX_BLUR_SAMPLES = 1e6, 4096, 64, 1000, 1000
 
 Check = tuple[Callable[[Any], bool], str]
 """A function that returns True for valid values, and the text that describes valid values in an error."""
@@ -152,13 +153,17 @@ _CHECKS: dict[str, Check] = {
         f"Rewards, or a dict of numbers, within ±{_MAX_NUMBER:,.0f}",
     ),
     "control_timestep": (
-        lambda x: _is_number(x) and 0.01 <= x <= COMMAND_TIMEOUT,
-        f"a number from 0.01 to {COMMAND_TIMEOUT} [s]: the robot stops when no command arrives for longer",
+        lambda x: _is_number(x) and 0.01 <= x <= COMMAND_TIMEOUT and abs(x / TIMESTEP - round(x / TIMESTEP)) < 1e-8,
+        f"a multiple of {TIMESTEP} [s], the time step of the physics, from 0.01 to {COMMAND_TIMEOUT} [s]: the robot "
+        "stops when no command arrives for longer",
     ),
     "size": IMAGE_SIZE,
     "stack": (lambda value: _is_integer(value, 1, _MAX_STACK), f"a whole number from 1 to {_MAX_STACK}"),
     "pixels": _BOOLEAN,
-    "state": (lambda value: value in (None, ODOMETRY, PRIVILEGED), f"None, {ODOMETRY!r} or {PRIVILEGED!r}"),
+    "state": (
+        lambda value: value is None or (isinstance(value, str) and value in (ODOMETRY, PRIVILEGED)),
+        f"None, {ODOMETRY!r} or {PRIVILEGED!r}",
+    ),
     "action": _one_of(TWIST, STEERING),
     "speed": _AT_LEAST_001,
     "yaw_rate": _AT_LEAST_001,
@@ -179,15 +184,22 @@ _CHECKS: dict[str, Check] = {
     "lighting_drift": _BOOLEAN,
     "obstacles": (
         lambda value: (
-            value == "scene"
+            (isinstance(value, str) and value == "scene")
             or (_is_sequence(value) and all(isinstance(one, ObstacleConfig) for one in value))
             or _is_integer(value, 0, _MAX_OBSTACLES)
         ),
         f"'scene', a whole number from 0 to {_MAX_OBSTACLES}, or a list of ObstacleConfig",
     ),
     "camera": (
-        lambda value: value is None or (isinstance(value, CameraOptions) and _are_numbers(value)),
-        f"None, or CameraOptions of numbers within ±{_MAX_NUMBER:,.0f}",
+        lambda value: (
+            value is None
+            or (
+                isinstance(value, CameraOptions)
+                and all(_is_number(x) and x >= 0.0 for x in (value.vibration, value.exposure, value.shutter))
+                and _is_integer(value.blur_samples, 1, _MAX_BLUR_SAMPLES)
+            )
+        ),
+        f"None, or CameraOptions of numbers from 0 to {_MAX_NUMBER:,.0f}, with 1 to {_MAX_BLUR_SAMPLES} blur_samples",
     ),
     "randomise": (lambda value: value is None or isinstance(value, Ranges), "True, False, None or Ranges"),
     "device": _one_of(CPU, CUDA),
@@ -203,6 +215,8 @@ def parse_options(given: dict[str, Any]) -> Options:
     given = dict(given)
     if isinstance(given.get("randomise"), bool):
         given["randomise"] = Ranges() if given["randomise"] else None
+    if isinstance(given.get("obstacles"), np.integer):
+        given["obstacles"] = int(given["obstacles"])
     if isinstance(given.get("rewards"), dict):
         given["rewards"] = _from_keywords(Rewards, given["rewards"], "reward")
     options = _from_keywords(Options, given, "option")

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from twin.env.controller import CONTROL_PERIOD, Controller
+from twin.errors import InputError
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.mjcf.scene_xml import rest_pose
 from twin.robot import GEAR_RATIO, SIDES, WHEELS, HuskyParams
@@ -84,7 +85,10 @@ class HuskyPhysics:
         self.begin()
 
     def set_pose(self, x: float, y: float, yaw: float) -> None:
-        """Sets the robot at rest on the ground at x, y [m] and yaw [rad], lets it settle, and sets the time to 0."""
+        """Sets the robot at rest on the ground at x, y [m] and yaw [rad], lets it settle, and sets the time to 0.
+
+        Raises InputError: there is no ground below a wheel.
+        """
         position, quaternion = rest_pose(self._ground_height, np.array([x, y]), yaw)
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:3], self.data.qpos[3:7] = position, quaternion
@@ -108,12 +112,16 @@ class HuskyPhysics:
         relief = self.model.hfield_size[self.model.geom_dataid[self._ground], 2]
         top = self.model.geom_pos[self._ground, 2] + max(_RAY_START, relief + 1.0)
         down = np.array([0.0, 0.0, -1.0])
-        return np.array(
-            [
-                top - mujoco.mj_rayHfield(self.model, self.data, self._ground, np.array([*p, top]), down, None)
-                for p in xy
-            ]
+        depths = np.array(
+            [mujoco.mj_rayHfield(self.model, self.data, self._ground, np.array([*p, top]), down, None) for p in xy]
         )
+        if depths.min() < 0.0:  # rays that miss
+            x, y = xy.mean(0)
+            raise InputError(
+                f"the robot would start at x = {x:.1f} m, y = {y:.1f} m, beyond the ground; expected a start on it: "
+                "lower start_offset, or raise mesh.margin and build again"
+            )
+        return top - depths
 
     def command(self, v: float, yaw_rate: float) -> None:
         """Commands a speed [m/s] and a yaw rate [rad/s]; the command expires after the controller's time-out."""

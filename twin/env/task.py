@@ -272,7 +272,6 @@ class DriveTask(control.Task):
         """Seed of the current episode."""
         self.sample = RandomizationSample()
         """Randomized robot and weather of the current episode."""
-        self._record = self.sample.record()
         self.obstacles: tuple[ObstacleConfig, ...] = ()
         """Obstacles of the current episode."""
         self._start_station = segment.start
@@ -280,10 +279,6 @@ class DriveTask(control.Task):
     def seed(self, seed: int | None) -> None:
         """Starts a new sequence of episodes."""
         self._rng = np.random.default_rng(seed)
-
-    def set_weather(self, sample: RandomizationSample) -> None:
-        """Replaces the current episode's sample by one that differs only in its weather."""
-        self.sample, self._record = sample, sample.record()
 
     def rng(self, stream: int) -> np.random.Generator:
         """Returns a new generator of one stream of the current episode."""
@@ -295,7 +290,6 @@ class DriveTask(control.Task):
         self.episode_seed = int(self._rng.integers(2**63))
         ranges = self.options.randomise
         self.sample = ranges.sample(self.rng(ROBOT)) if ranges else RandomizationSample()
-        self._record = self.sample.record()
         if self._nominal:
             self._nominal.apply(self.sample, physics.model.ptr)
         params = self.world.robot
@@ -397,7 +391,7 @@ class DriveTask(control.Task):
             "speed": speed,
             "touched": list(touched),
             "episode_seed": self.episode_seed,
-            "randomisation": self._record.copy(),
+            "randomisation": self.sample.record(),
         }
 
     def _bounds(self) -> tuple[Array, Array]:

@@ -318,8 +318,10 @@ def make_vector_env(
         processes: Number of processes on a CPU; None: one per core, but at most 8, with at least two environments each.
 
     Raises:
-        InputError: as in `EnvFactory.open`; also if `processes` is below 1.
+        InputError: as in `EnvFactory.open`; also if `processes` is below 1, or there are no seeds.
     """
+    if not seeds:
+        raise InputError("0 environments; expected at least 1")
     if processes is not None and processes < 1:
         raise InputError(f"processes = {processes}; expected at least 1")
     if parse_options(options).device == CPU:

@@ -352,6 +352,8 @@ def _head(head: Any, path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path}: version {head.get('version')!r}; expected {VERSION}: it was written by another version of twin"
         )
+    if not isinstance(head.get("trained", {}), dict):
+        raise InputError(f"{path}: trained = {short_repr(head['trained'])}; expected a table; copy the whole run again")
     return head
 
 

@@ -121,6 +121,8 @@ def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[lis
     because memory ran out.
     """
     if processes == 1:
+        for cache in (_policy, _factory, _vector_env):  # files may have changed since an earlier campaign
+            cache.cache_clear()
         yield from map(run_chunk, chunks)
         return
     # Workers are spawned, since the threads of Warp and MuJoCo do not survive a fork.

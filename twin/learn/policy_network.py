@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.errors import short_repr
 from twin.types import Array32
 
 NORM_EPSILON = 1e-5
@@ -47,7 +48,7 @@ class Architecture:
             raise ValueError(f"size = {self.size}: expected (width, height)")
         numbers = [*self.size, self.stack, self.features, self.actions, *self.hidden, *sum(self.convolutions, ())]
         if not all(isinstance(n, int) and 1 <= n <= 4096 for n in numbers):
-            raise ValueError(f"sizes {numbers}: expected whole numbers from 1 to 4096")
+            raise ValueError(f"sizes {short_repr(numbers)}: expected whole numbers from 1 to 4096")
         if self.pool not in (1, 2, 4) or any(n % self.pool for n in self.size):
             raise ValueError(f"pool = {self.pool}: expected 1, 2 or 4, and a divisor of both picture sides")
         if any(len(one) != 3 for one in self.convolutions) or not 1 <= len(self.convolutions) <= 8:

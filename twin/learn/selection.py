@@ -212,7 +212,7 @@ def failure_summary(failures: Sequence[Failure]) -> str:
     """A sentence on where, why and in which light most of the failures happened; empty without failures."""
     if not failures:
         return ""
-    bins = [int(one.progress // _PLACE) for one in failures]
+    bins = [max(0, int(one.progress // _PLACE)) for one in failures]  # progress may be slightly negative at the start
     where, count = _most(bins)
     cause, by_cause = _most([one.cause for one, b in zip(failures, bins, strict=True) if b == where])
     light, by_light = _most([_main_light(one.lighting) for one in failures])

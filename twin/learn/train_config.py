@@ -113,6 +113,10 @@ class TrainConfig:
             if getattr(self, name) not in valid:
                 choices = " or ".join(map(repr, valid))
                 raise InputError(f"{name} = {short_repr(getattr(self, name))}; expected {choices}")
+        try:
+            _ = self.architecture
+        except (TypeError, ValueError) as error:
+            raise InputError(f"no network of these sizes: {error}") from None
         if self.lighting in (HELD_OUT, ANY):
             raise InputError(
                 f"lighting = {self.lighting!r}: held-out lightings are reserved for twin validate; "

@@ -183,7 +183,9 @@ def train(
             whole = Segment(config.steps, None)
             while segment := plan(model.num_timesteps, drive):
                 left = segment.until - model.num_timesteps
-                if left <= 0:
+                if left <= 0:  # the training was stopped beyond the segment's end, or right at it
+                    recorder.init_callback(model)
+                    recorder.save_checkpoint()
                     continue
                 (folder / CHOICE_FILE).unlink(missing_ok=True)  # more steps invalidate the selection
                 model.lr_schedule = partial(_learning_rate, config, model, segment)
@@ -366,7 +368,7 @@ class _RunRecorder(BaseCallback):
 
     def end(self) -> None:
         """Saves the last checkpoint and state."""
-        self._save_policy(checkpoint_folder(self._folder, self.model.num_timesteps))
+        self.save_checkpoint()
         self.save()
 
     def save(self) -> None:
@@ -402,7 +404,10 @@ class _RunRecorder(BaseCallback):
         every = self._config.steps / self._config.checkpoints
         number = int(self.model.num_timesteps / every)
         if number and self.model.num_timesteps - number * every < self._config.worlds:
-            self._save_policy(checkpoint_folder(self._folder, self.model.num_timesteps))
+            self.save_checkpoint()
+
+    def save_checkpoint(self) -> None:
+        self._save_policy(checkpoint_folder(self._folder, self.model.num_timesteps))
 
     def _save_policy(self, folder: Path) -> None:
         c = self._config

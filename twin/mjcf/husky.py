@@ -121,6 +121,7 @@ def check(model: mujoco.MjModel) -> list[WrongOption]:
     override = bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE)
     expect(not override, "flag override", "enabled", "disabled", COSTS["contact"])
     for bit, flag in (
+        (mujoco.mjtDisableBit.mjDSBL_CONSTRAINT, "constraint"),
         (mujoco.mjtDisableBit.mjDSBL_EQUALITY, "equality"),
         (mujoco.mjtDisableBit.mjDSBL_CONTACT, "contact"),
         (mujoco.mjtDisableBit.mjDSBL_ACTUATION, "actuation"),
