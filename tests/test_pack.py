@@ -358,6 +358,7 @@ HOSTILE = {
     "no zip": (lambda *_: lambda content: b"twin" * 100, "is damaged"),
     "include": (edit(XML, lambda b: b.replace(b"<asset>", b'<include file="/a"/><asset>', 1)), "names a file"),
     "path": (edit(XML, lambda b: b.replace(b'meshdir="assets"', b'meshdir="/etc"', 1)), "names a file"),
+    "sky": (edit(XML, lambda b: b.replace(b"<asset>", b'<asset><texture fileback="/a.png"/>', 1)), "names a file"),
     "config": (edit("scene.toml", lambda b: b + b"surprise = 1\n"), "surprise"),
     "untrusted": (add("policies/a.zip"), "if you trust its sender, twin unpack --trust"),
 }  # fmt: skip

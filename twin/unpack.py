@@ -64,7 +64,10 @@ _PLACES = re.compile(
 )
 _CURE = "fetch it again, or ask its sender for another"
 _NOT_A_PACK = "expected a pack, as twin pack writes it"
-_XML_PATHS = ("file", "meshdir", "texturedir", "assetdir", "fileright", "fileleft", "fileup", "filedown", "filefront")
+_XML_PATHS = (
+    *("file", "meshdir", "texturedir", "assetdir"),
+    *("fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"),
+)
 _XML_REFUSED = ("include", "plugin", "extension", "model", "attach")  # elements that load other files or code
 _HEADER = 8  # [bytes] of a safetensors file before its header; they contain the header's length
 
