@@ -5,6 +5,7 @@ import json
 import multiprocessing
 import stat
 import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -376,6 +377,23 @@ def test_a_hostile_pack_gets_one_line_and_leaves_nothing(packed, tmp_path, capsy
     assert not list(place.iterdir()) and not (tmp_path / "evil.toml").exists()
     assert main(["drive", str(bad)]) == 2  # nor does the cache keep anything
     assert not list((tmp_path / "cache" / "twin" / "packs").glob("*"))
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_DEFLATED])
+def test_a_manifest_that_inflates_beyond_its_declared_size_takes_no_memory(tmp_path, method):
+    bad = tmp_path / "bomb.twin"
+    with zipfile.ZipFile(bad, "w", method) as archive:
+        archive.writestr("manifest.json", bytes(100 << 20))
+    content = bytearray(bad.read_bytes())
+    struct.pack_into("<I", content, content.rfind(b"PK\x01\x02") + 24, 1000)  # the declared size
+    bad.write_bytes(content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"bomb\.twin"):
+            unpack.read_manifest(bad)
+        assert tracemalloc.get_traced_memory()[1] < 10 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_folder_with_something_in_it_is_kept(packed, tmp_path):

@@ -184,9 +184,17 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
     by_name = {entry.filename: entry for entry in entries}
     if len({name.lower() for name in by_name}) < len(entries):
         raise InputError(f"{path} has a name twice; {_CURE}")
+    for entry in entries:
+        kind, name = stat.S_IFMT(entry.external_attr >> 16), short_repr(entry.filename)
+        if kind not in (0, stat.S_IFREG) or entry.is_dir():
+            raise InputError(f"{path}: {name} is not a regular file; {_CURE}")
+        if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise InputError(f"{path}: {name} is encrypted, or compressed by another method than deflate; {_CURE}")
     if MANIFEST not in by_name or by_name[MANIFEST].file_size > _MAX_MANIFEST:
         raise InputError(f"{path} has no {MANIFEST} of at most {_MAX_MANIFEST >> 20} MB; {_NOT_A_PACK}")
-    head = parse_json(archive.read(MANIFEST).decode("utf-8"), f"{path}: {MANIFEST}")
+    with archive.open(MANIFEST) as file:  # `archive.read` would inflate more than the declared size before it looks
+        text = file.read(by_name[MANIFEST].file_size).decode("utf-8")
+    head = parse_json(text, f"{path}: {MANIFEST}")
     if not isinstance(head, dict) or head.get("format") != FORMAT:
         raise InputError(f"{path}: no {FORMAT}; {_NOT_A_PACK}")
     if head.get("version") != VERSION:
@@ -214,14 +222,9 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path}: {name} is listed in {MANIFEST} but not in the pack, or in the pack but not listed; {_CURE}"
         )
-    for name, entry in by_name.items():
-        kind = stat.S_IFMT(entry.external_attr >> 16)
-        if kind not in (0, stat.S_IFREG) or entry.is_dir():
-            raise InputError(f"{path}: {name} is not a regular file; {_CURE}")
-        if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise InputError(f"{path}: {name} is encrypted, or compressed by another method than deflate; {_CURE}")
-        if name in head["files"] and entry.file_size != head["files"][name]["bytes"]:
-            raise InputError(f"{path}: {name} has {entry.file_size:,} bytes; {MANIFEST} says otherwise; {_CURE}")
+    for name, facts in head["files"].items():
+        if by_name[name].file_size != facts["bytes"]:
+            raise InputError(f"{path}: {name} has {by_name[name].file_size:,} bytes; {MANIFEST} says otherwise; {_CURE}")
     head["name"] = require_text(head["name"])
     head["policies"] = list(map(require_text, head["policies"]))
     return head
