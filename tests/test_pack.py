@@ -156,6 +156,15 @@ def test_coding_is_undone_exactly():
     np.testing.assert_array_equal(load_safetensors(coded)["float"], arrays["float"])
 
 
+def test_coded_arrays_may_not_overlap():
+    content = to_safetensors({"a": np.zeros((4, 5), np.uint8)})
+    (length,) = struct.unpack_from("<Q", content)
+    one = json.loads(content[8 : 8 + length])["a"]
+    text = json.dumps({"a": one, "b": one}).encode()
+    with pytest.raises(ValueError, match="overlap"):
+        decode_differences(struct.pack("<Q", len(text)) + text + content[8 + length :])
+
+
 def test_the_same_scene_gives_the_same_pack(root, packed, tmp_path):
     again, _ = pack(root, tmp_path / "place.twin", ["ahead"])
     assert again.read_bytes() == packed.read_bytes()

@@ -104,15 +104,17 @@ def _recode(content: bytes, change: Any) -> bytes:
     if length > len(content) - _HEADER:
         raise ValueError(f"its header has {length:,} bytes, but the file only {len(content):,}")
     out, start = bytearray(content), _HEADER + length
+    left = len(content) - start
     for name, tensor in json.loads(content[_HEADER:start]).items():
         if name == "__metadata__" or tensor["dtype"] != "U8" or len(tensor["shape"]) < 2:
             continue
         first, last = tensor["data_offsets"]
         shape = [int(n) for n in tensor["shape"]]
-        if not 0 <= first <= last <= len(content) - start or min(shape) < 0 or math.prod(shape) != last - first:
+        left -= last - first  # arrays that overlap would take time without bound
+        if not 0 <= first <= last <= len(content) - start or min(shape + [left]) < 0 or math.prod(shape) != last - first:
             raise ValueError(
-                f"{short_repr(name)}: shape {shape} does not match bytes {first} to {last}, or these are not within "
-                f"the {len(content) - start} data bytes"
+                f"{short_repr(name)}: shape {shape} does not match bytes {first} to {last}, or these overlap others or "
+                f"are not within the {len(content) - start} data bytes"
             )
         if last > first:
             flat = np.frombuffer(content, np.uint8, last - first, start + first)
