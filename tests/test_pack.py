@@ -410,8 +410,17 @@ def test_a_folder_with_something_in_it_is_kept(packed, tmp_path):
     (tmp_path / "mine" / "file").write_text("x")
     with pytest.raises(InputError, match="exists"):
         unpack.unpack(packed, tmp_path / "mine")
-    (tmp_path / "empty").mkdir()
-    unpack.unpack(packed, tmp_path / "empty")
+
+
+def test_an_empty_folder_is_filled_also_through_a_link_or_as_the_working_folder(packed, tmp_path, monkeypatch):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    unpack.unpack(packed, tmp_path / "link")
+    monkeypatch.chdir(tmp_path / "b")
+    unpack.unpack(packed, Path())
+    names = {one.name for one in (tmp_path / "a").iterdir()}
+    assert unpack.PACK_JSON in names and names == {one.name for one in (tmp_path / "b").iterdir()}
 
 
 def test_an_sb3_zip_is_packed_and_unpacked_by_trust_alone(root, tmp_path, monkeypatch):

@@ -140,7 +140,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
 def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
     """Unpacks a pack into a new folder; returns its manifest.
 
-    The folder is created only after everything was written and checked.
+    The folder is created or filled only after everything was written and checked.
 
     Args:
         path: The pack.
@@ -157,10 +157,12 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
         raise InputError(
             f"{path} has {zips[0]}, which may run code when it is loaded; if you trust its sender, twin unpack --trust"
         )
-    if exists(folder) and not (folder.is_dir() and not any(folder.iterdir())):
+    is_there = exists(folder)
+    if is_there and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder} exists; give a folder that does not")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name[:80]}.", suffix=".partial", dir=folder.parent))
+    beside = folder if is_there else folder.parent
+    beside.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name[:80]}.", suffix=".partial", dir=beside))
     try:
         with wrap_read_errors(path, _CURE), zipfile.ZipFile(path) as archive:
             for name, facts in manifest["files"].items():
@@ -169,10 +171,13 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
                 _extract(archive, name, facts, target)
         _check_contents(partial, path)
         (partial / PACK_JSON).write_bytes(json.dumps(manifest, indent=1).encode())
-        partial.chmod(0o755)
-        if folder.is_dir():
-            folder.rmdir()
-        partial.rename(folder)
+        if is_there:  # it may be the working folder, or a link, so it is filled
+            for one in list(partial.iterdir()):
+                one.rename(folder / one.name)
+            partial.rmdir()
+        else:
+            partial.chmod(0o755)
+            partial.rename(folder)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
