@@ -3,6 +3,7 @@
 import io
 import json
 import multiprocessing
+import resource
 import stat
 import struct
 import tracemalloc
@@ -421,6 +422,17 @@ def test_an_empty_folder_is_filled_also_through_a_link_or_as_the_working_folder(
     unpack.unpack(packed, Path())
     names = {one.name for one in (tmp_path / "a").iterdir()}
     assert unpack.PACK_JSON in names and names == {one.name for one in (tmp_path / "b").iterdir()}
+
+
+def test_a_file_that_cannot_be_written_is_no_damage_to_the_pack(packed, tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            unpack.unpack(packed, tmp_path / "out")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_sb3_zip_is_packed_and_unpacked_by_trust_alone(root, tmp_path, monkeypatch):

@@ -150,6 +150,7 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
     Raises:
         InputError: an error of `read_manifest`; a file differs from its declaration; the folder exists and is not
             empty; or the pack has a policy that may run code and is not trusted.
+        OSError: the folder cannot be written.
     """
     manifest = read_manifest(path)
     zips = [name for name in manifest["files"] if name.endswith(".zip")]
@@ -178,8 +179,10 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
         else:
             partial.chmod(0o755)
             partial.rename(folder)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
+        if isinstance(error, InputError) and isinstance(error.__cause__, OSError):
+            raise error.__cause__ from None  # such as a full disk: the pack is not damaged
         raise
     return manifest
 
