@@ -450,6 +450,13 @@ def test_an_sb3_zip_is_packed_and_unpacked_by_trust_alone(root, tmp_path, monkey
     assert (tmp_path / "y" / "policies" / "a.zip").read_bytes() == zipped.read_bytes()
 
 
+def test_a_policy_whose_name_unpack_would_refuse_is_refused(root, tmp_path):
+    (tmp_path / "my policy.onnx").write_bytes((root / "runs" / "ahead" / "policy.onnx").read_bytes())
+    with pytest.raises(InputError, match=r"'policies/my policy\.onnx' cannot be in a pack; rename it"):
+        pack(root, tmp_path / "x.twin", [str(tmp_path / "my policy.onnx")])
+    assert not (tmp_path / "x.twin").exists()
+
+
 def test_a_function_has_no_place_in_a_pack(root, tmp_path):
     with pytest.raises(InputError, match="policy operator:neg"):
         pack(root, tmp_path / "x.twin", ["operator:neg"])

@@ -32,7 +32,7 @@ from safetensors.numpy import save as to_bytes
 from twin import commands, runtime, unpack
 from twin.capture.capture_data import Capture
 from twin.config_file import ROBOT_TOML
-from twin.errors import InputError
+from twin.errors import InputError, short_repr
 from twin.files import atomic_path, digest_json, json_bytes, load_tensors, read_bytes, read_json, read_toml, toml_value
 from twin.learn.policy import JSON, ONNX, WEIGHTS, find_policy, load_policy
 from twin.loading import Twin, load_scene
@@ -234,6 +234,12 @@ def _write(out: Path, files: dict[str, bytes], head: dict[str, Any], trust: bool
         name: {"bytes": len(content), "sha256": unpack.digest(content), "coding": coded[name]}
         for name, content in sorted(files.items())
     }
+    for name in files:
+        if not unpack.PLACES.fullmatch(name):
+            raise InputError(
+                f"{short_repr(name)} cannot be in a pack; rename it: letters, digits and _ . + - only, not beginning with "
+                "one of . + -"
+            )
     total = sum(map(len, files.values()))
     if total > unpack.MAX_TOTAL:
         raise InputError(

@@ -7,7 +7,7 @@ and SHA-256 of each file as unpacked, and the file's *coding*: `plain`, or `diff
 (see `encode_differences`).
 
 A pack may come from anyone, so unpacking runs nothing in it. A pack is refused if it has a name that does not match
-`_PLACES` (such as a path that leads elsewhere), a link, the same name twice, a size above the bounds or different from
+`PLACES` (such as a path that leads elsewhere), a link, the same name twice, a size above the bounds or different from
 the declared one, or a wrong digest. Then nothing remains on the disk.
 """
 
@@ -54,7 +54,7 @@ _FREE = 16 << 20  # [bytes] a total up to this is allowed at any ratio
 _MAX_MANIFEST = 16 << 20  # [bytes]
 _CHUNK = 4 << 20  # [bytes]
 _N = r"\w[\w.+-]{0,99}"  # a name in a path; it cannot begin with a dot, so ".." is excluded
-_PLACES = re.compile(
+PLACES = re.compile(
     rf"scene\.toml|robot\.toml|positions\.csv|lightings/{_N}\.json"
     rf"|build/{STAGES['metric']}/(cameras\.(json|npz)|stamp\.json)"
     rf"|build/{STAGES['field']}/(baked\.json|baked(_[1-9][0-9]{{0,3}})?\.safetensors|road\.safetensors|stamp\.json)"
@@ -62,6 +62,7 @@ _PLACES = re.compile(
     rf"|build/{STAGES['mjcf']}/(scene\.xml|world\.json|stamp\.json|assets/{_N}\.(obj|png|bin))"
     rf"|runs/{_N}/(checkpoints/{_N}/)?policy\.(json|safetensors|onnx)|policies/{_N}\.(onnx|zip)"
 )
+"""Pattern of the names that files of a pack may have."""
 _CURE = "fetch it again, or ask its sender for another"
 _NOT_A_PACK = "expected a pack, as twin pack writes it"
 _XML_PATHS = (
@@ -214,7 +215,7 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         )
     total = 0
     for name, facts in head["files"].items():
-        if not _PLACES.fullmatch(name):
+        if not PLACES.fullmatch(name):
             raise InputError(f"{path}: {short_repr(name)} is not a file of a scene; {_CURE}")
         size = facts["bytes"]
         if not isinstance(size, int) or not 0 <= size <= _MAX_FILE:
