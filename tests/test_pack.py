@@ -457,6 +457,14 @@ def test_a_policy_whose_name_unpack_would_refuse_is_refused(root, tmp_path):
     assert not (tmp_path / "x.twin").exists()
 
 
+def test_two_policies_of_one_name_are_refused(root, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "policy.onnx").write_bytes((root / "runs" / "ahead" / "policy.onnx").read_bytes())
+    with pytest.raises(InputError, match=r"the pack has a policy policies/policy\.onnx already"):
+        pack(root, tmp_path / "x.twin", [str(tmp_path / name / "policy.onnx") for name in ("a", "b")])
+
+
 def test_a_function_has_no_place_in_a_pack(root, tmp_path):
     with pytest.raises(InputError, match="policy operator:neg"):
         pack(root, tmp_path / "x.twin", ["operator:neg"])

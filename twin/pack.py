@@ -103,7 +103,11 @@ def pack(
     files: dict[str, bytes] = {"scene.toml": _scene_toml(scene, name)}
     if (scene.root / ROBOT_TOML).exists():
         files[ROBOT_TOML] = _toml(read_toml(scene.root / ROBOT_TOML))
-    names = [_add_policy(files, scene.root, one, trust) for one in dict.fromkeys(policies)]
+    names: list[str] = []
+    for one in dict.fromkeys(policies):
+        names.append(_add_policy(files, scene.root, one, trust))
+        if names[-1] in names[:-1]:
+            raise InputError(f"--policy {one}: the pack has a policy {names[-1]} already; rename one, or leave it out")
     if positions:
         files["positions.csv"] = _positions(twin)
     field = _add_stages(files, scene, levels)
