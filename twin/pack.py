@@ -183,11 +183,9 @@ def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
     results = {}
     for stage in unpack.STAGES_PACKED:
         folder = require_stage(scene, stage)
-        names: tuple[str, ...] = _PACKED.get(stage, _MESH)
-        if stage == "mjcf":
-            names = tuple(p.relative_to(folder).as_posix() for p in sorted(folder.rglob("*")) if p.is_file())
-        kept = {name: read_bytes(folder / name) for name in names if name != "stamp.json" and (folder / name).is_file()}
         stamp = Stamp.verified(folder)
+        names = tuple(stamp.files) if stage == "mjcf" else _PACKED.get(stage, _MESH)
+        kept = {name: read_bytes(folder / name) for name in names if (folder / name).is_file()}
         results[stage] = stamp.result
         if stage == "field":
             for k, layout in enumerate(stored_layouts(read_json(folder / "baked.json"))):
