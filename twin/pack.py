@@ -126,7 +126,7 @@ def pack(
         "levels": levels,
         "packages": package_versions(),
     }
-    return out, _write(out, files, head, trust)
+    return out, _write(out, files, head)
 
 
 def _scene_toml(scene: SceneDir, name: str) -> bytes:
@@ -230,7 +230,7 @@ def rounded(values: NDArray[np.uint8], step: float) -> NDArray[np.uint8]:
     return np.clip(np.round(table), 0, LEVELS - 1).astype(np.uint8)[values]
 
 
-def _write(out: Path, files: dict[str, bytes], head: dict[str, Any], trust: bool) -> dict[str, Any]:
+def _write(out: Path, files: dict[str, bytes], head: dict[str, Any]) -> dict[str, Any]:
     coded = {name: unpack.DIFFERENCES if _IS_BAKED.search(name) else unpack.PLAIN for name in files}
     facts = {
         name: {"bytes": len(content), "sha256": unpack.digest(content), "coding": coded[name]}
@@ -258,11 +258,11 @@ def _write(out: Path, files: dict[str, bytes], head: dict[str, Any], trust: bool
         positions="GPS positions of the frames are in positions.csv."
         if head["positions"]
         else "No GPS position is, either.",
-        zips=", but a policy in policies/ may when it is loaded" if trust else "",
+        zips=", but a policy in policies/ may when it is loaded" if any(n.endswith(".zip") for n in files) else "",
     )
     with (
         atomic_path(out) as partial,
-        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
+        zipfile.ZipFile(partial, "w") as archive,
         runtime.bar("pack", len(files), "file", after=1.0) as progress,
     ):
         archive.writestr(_entry(unpack.README), text.encode())
