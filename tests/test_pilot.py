@@ -321,6 +321,21 @@ def test_a_released_deadman_switch_stops_the_robot(policy):
     assert pilot.picture(picture(7), clock.now()).cause == DEADMAN
 
 
+def test_a_held_deadman_switch_is_not_the_cause_of_a_stop(policy):
+    pilot, clock = pilot_of(policy, deadman=0.5)
+    assert pilot.command().cause == DEADMAN
+    pilot.press()
+    assert pilot.command().cause == WAITING
+
+
+def test_without_a_deadman_switch_its_messages_have_no_effect(policy):
+    pilot, clock = pilot_of(policy)
+    drive(pilot, clock, 3)
+    for held in (True, False):
+        pilot.press(held)
+        assert pilot.command().drives
+
+
 def test_a_new_calibration_stops_it_and_the_old_one_does_not(policy):
     pilot, clock = pilot_of(policy)
     drive(pilot, clock, 3)

@@ -132,12 +132,13 @@ class Pilot:
             raise
 
     def press(self, held: bool = True) -> None:
-        """Handles a message of the deadman switch."""
+        """Handles a message of the deadman switch; has no effect if there is none."""
         if held:
             self._pressed = self._steady()
-        elif self._is_held:
-            self._stop(DEADMAN)
+            if self._command.cause == DEADMAN:
+                self._command = Command(cause=WAITING)
         self._is_held = held
+        self._may_drive()
 
     def picture(self, picture: Any, stamp: int) -> Command:
         """Handles a picture with its stamp [ns]: an object with `decode()`, such as RawPicture, or RGB uint8 (h, w, 3).
