@@ -249,6 +249,22 @@ def test_a_jump_of_the_clock_stops_it(policy, jump):
     assert pilot.picture(picture(6), clock.now()).drives
 
 
+def test_simulated_time_that_begins_anew_stops_it(policy):
+    """As when a bag is played in a loop, or a simulation is reset."""
+    clock = Clock()
+    pilot = Pilot(policy, Limits(deadman=0.5), clock=clock.now, steady=clock.now)
+    pilot.set_camera(LENS)
+    clock.true = 3600 * 1000 * MS
+    pilot.press()
+    assert pilot.picture(picture(0), clock.now()).drives
+    clock.true = 0
+    assert "the clock jumped by -3600.00 s" in pilot.command().cause
+    clock.true = 1100 * MS
+    assert pilot.picture(picture(1), clock.now()).cause == DEADMAN  # its last message is too old by now
+    pilot.press()
+    assert pilot.picture(picture(1), clock.now()).drives
+
+
 def test_stamps_from_the_future_stop_it(policy):
     pilot, clock = pilot_of(policy)
     drive(pilot, clock, 5)
