@@ -226,6 +226,7 @@ def test_late_pictures_do_not_drive(policy):
     [
         (np.zeros((90, 160, 3), np.uint8), r"picture (90, 160, 3) uint8; expected 18 x 32 px"),
         (np.zeros((18, 32), np.uint8), r"expected 18 x 32 px"),
+        (np.zeros(5, np.uint8), r"expected 18 x 32 px"),
         (RawPicture("rgb8", 32, 18, 96, bytes(100)), r"has 100 bytes"),
         (CompressedPicture(b"rubbish"), r"neither a JPEG nor a PNG"),
     ],
