@@ -487,6 +487,16 @@ def test_damaged_policies_get_one_line(tmp_path, change, message):
     assert "\n" not in str(error.value)
 
 
+def test_a_network_of_another_size_than_its_metadata_gets_one_line(tmp_path):
+    save_policy(tmp_path, SMALL, Control("twist"), some_weights(SMALL), {})
+    (tmp_path / "policy.json").unlink()
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(path.read_bytes().replace(b'"size": [32, 18]', b'"size": [30, 18]'))
+    with pytest.raises(ValueError, match=r"policy\.onnx: its network does not run") as error:
+        OnnxPolicy(tmp_path)
+    assert "\n" not in str(error.value)
+
+
 def test_the_onnx_file_alone_suffices(tmp_path):
     policy = small_policy(tmp_path, trained={"camera": [20.0, 20.0, 16.0, 9.0]})
     (tmp_path / "policy.json").unlink()
