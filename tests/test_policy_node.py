@@ -120,6 +120,7 @@ def test_it_drives_while_the_switch_is_held(rig):
     stack = np.concatenate([picture(k).transpose(2, 0, 1) for k in (0, 0, 1, 2)])
     sent = r.published[-1][1]
     assert type(sent).__name__ == "TwistStamped" and sent.header.frame_id == "base_link"
+    r.show(2)  # doubled: the same picture, without a new command
     commands = r.commands()
     assert len(commands) == 3 and commands[-1] == r.node.pilot.policy.command(stack)
 

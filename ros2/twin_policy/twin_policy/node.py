@@ -50,6 +50,7 @@ class PolicyNode(Node):
         self._rectified, self._frame = parameter("rectified", False), parameter("frame_id", "base_link")
         self._button, self._said, self._released = int(parameter("deadman_button", -1)), "", self._steady()
         self._stamped = parameter("stamped", True)
+        self._sent = 0  # stamp of the picture behind the last driving command [ns]
         self._commands = self.create_publisher(TwistStamped if self._stamped else Twist, "cmd_vel", 1)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -80,7 +81,8 @@ class PolicyNode(Node):
     def _on_picture(self, picture: Any, header: Any) -> None:
         stamp = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
         command = self.pilot.picture(picture, stamp)
-        if command.drives and command.stamp == stamp:
+        if command.drives and command.stamp == stamp != self._sent:
+            self._sent = stamp
             self._publish(command)
 
     def _on_camera_info(self, message: Any) -> None:
