@@ -63,7 +63,10 @@ class PolicyNode(Node):
             self.create_subscription(Bool, "deadman", lambda message: self.pilot.press(message.data), 1)
         else:
             self.create_subscription(Joy, "joy", self._on_joy, 1)
-        self.create_timer(1.0 / float(parameter("watchdog_rate", 20.0)), self._watch)
+        rate = float(parameter("watchdog_rate", 20.0))
+        if not 1.0 <= rate <= 1000.0:
+            raise ValueError(f"watchdog_rate = {rate}; expected 1 to 1000 Hz")
+        self.create_timer(1.0 / rate, self._watch)
         self.create_timer(1.0, self._diagnose)
 
     def _now(self) -> int:
