@@ -182,6 +182,8 @@ def test_bad_parameters_are_one_error(rig):
         rig(policy_camera=[1.0, 2.0])
     with pytest.raises(ValueError, match="timeout = "):
         rig(timeout=0.0)
+    with pytest.raises(ValueError, match="parameter rest: "):
+        rig(rest=1)  # an integer
     with pytest.raises(ValueError, match="watchdog_rate = "):
         rig(watchdog_rate=0.0)
 

@@ -31,7 +31,10 @@ class PolicyNode(Node):
         super().__init__("twin_policy", **options)
 
         def parameter(name: str, default: Any) -> Any:
-            return self.declare_parameter(name, default).value
+            try:
+                return self.declare_parameter(name, default).value
+            except Exception as error:  # another type than the default's, such as 1 for 1.0
+                raise ValueError(f"parameter {name}: {error}") from None
 
         policy = OnnxPolicy(parameter("policy", ""))
         limits = Limits(
