@@ -6,12 +6,14 @@ Without ROS, nothing here runs the middleware: topics, executors and launch file
 import ast
 import importlib
 import importlib.util
+import runpy
 import shutil
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 from xml.etree import ElementTree
 
 import numpy as np
@@ -208,6 +210,17 @@ def test_the_yaml_names_every_parameter_of_the_node_with_its_default():
     assert {name: type(value) for name, value in given.items()} == {
         name: type(value) for name, value in expected.items()
     }
+
+
+def test_the_launch_file_requires_the_policy_and_nothing_else(monkeypatch):
+    """As it replaces the parameter file's policy, a default would replace it by none."""
+    for name in ("ament_index_python", "launch", "launch.actions", "launch.substitutions", "launch_ros"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    monkeypatch.setitem(sys.modules, "launch_ros.actions", MagicMock())
+    monkeypatch.setitem(sys.modules, "ament_index_python.packages", MagicMock(get_package_share_directory=str))
+    runpy.run_path(str(ROOT / "launch" / "twin_policy.launch.py"))["generate_launch_description"]()
+    declared = sys.modules["launch.actions"].DeclareLaunchArgument.call_args_list
+    assert [one.args[0] for one in declared if one.kwargs["default_value"] is None] == ["policy"]
 
 
 def test_the_package_is_one_for_colcon():
