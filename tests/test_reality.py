@@ -1,5 +1,6 @@
 """The known-truth world: its road, its place, its films, and the comparison of a build with it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from twin.files import read_json
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, umeyama
-from twin.reality import centerline, filming, place
+from twin.reality import centerline, comparison, filming, place, primitives
 from twin.reality.centerline import RoadLine
 from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, measure, mesh_quality
 from twin.reality.lighting import LIGHTINGS, sky_cube_map
@@ -222,17 +223,26 @@ def test_a_shifted_mesh_is_as_far_off_as_it_was_shifted(off):
     assert found["mesh_completeness_10cm"] == (off <= 0.1)
 
 
+def save_visual(scene: SceneDir, truth: Truth, kinds: set[str]) -> None:
+    """A visual mesh that is the truth's objects of some kinds."""
+    part = primitives.join([t.part for t in truth.place.objects if t.kind in kinds])
+    np.savez(scene.stage("mesh") / "visual.npz", vertices=part.vertices, faces=part.faces)
+
+
+def test_a_place_without_leaves_is_measured(truth, campus, tmp_path):
+    scene = fake_build(truth, tmp_path, _IDENTITY)
+    save_visual(scene, truth, {"ground"})
+    bare = replace(truth)
+    vars(bare)["place"] = replace(campus, objects=[one for one in campus.objects if one.kind != "foliage"])
+    found = comparison._surface_errors(scene.stage("mesh"), bare, _IDENTITY, truth.films["sun"].camera_to_world[:4])
+    assert found["mesh_completeness_10cm_ground"] == 1.0 and "mesh_completeness_10cm_foliage" not in found
+
+
 def test_a_mesh_that_is_the_truth_is_complete_and_one_without_houses_is_not(truth, tmp_path):
     found = []
     for name, kinds in (("all", {"ground", "obstacle", "foliage"}), ("flat", {"ground"})):
         scene = fake_build(truth, tmp_path / name, _IDENTITY)
-        parts = [t.part for t in truth.place.objects if t.kind in kinds]
-        starts = np.cumsum([0] + [len(p.vertices) for p in parts])
-        np.savez(
-            scene.stage("mesh") / "visual.npz",
-            vertices=np.concatenate([p.vertices for p in parts]),
-            faces=np.concatenate([p.faces + start for p, start in zip(parts, starts, strict=False)]),
-        )
+        save_visual(scene, truth, kinds)
         found.append(measure(scene)["figures"])
     whole, flat = found
     assert whole["mesh_chamfer_m"] < 1e-3 and whole["mesh_completeness_5cm"] == 1.0

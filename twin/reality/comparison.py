@@ -202,6 +202,8 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
             to_mesh = visual.distance(seen_points)
             out |= mesh_quality(whole.distance(near), to_mesh)
             for kind, objects in kinds.items():
+                if not objects:  # such as the foliage of place 17
+                    continue
                 mine = _surface([(p.vertices, p.faces) for p in objects]).distance(seen_points) < 1e-3
                 if mine.any():
                     out[f"mesh_completeness_10cm_{kind}"] = float((to_mesh[mine] <= 0.1).mean())
