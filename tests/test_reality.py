@@ -16,7 +16,7 @@ from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, umeyama
 from twin.reality import centerline, comparison, filming, place, primitives
 from twin.reality.centerline import RoadLine
-from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, measure, mesh_quality
+from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, matched_poses, measure, mesh_quality
 from twin.reality.lighting import LIGHTINGS, sky_cube_map
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, fingerprint
 from twin.scene import SceneDir
@@ -255,6 +255,13 @@ def test_a_mesh_that_is_the_truth_is_complete_and_one_without_houses_is_not(trut
 def test_a_scene_without_truth_is_not_compared(tmp_path):
     with pytest.raises(InputError, match="has no truth"):
         compare(SceneDir(tmp_path))
+
+
+def test_a_source_that_the_truth_does_not_have_is_refused(truth, tmp_path):
+    cameras = Cameras.load(fake_build(truth, tmp_path, _IDENTITY).stage("metric"))
+    other = replace(cameras, sources=("phone",) * len(cameras), lightings=("dusk",) * len(cameras))
+    with pytest.raises(InputError, match="source phone was filmed under dusk; the truth has only the films sun, night"):
+        matched_poses(truth, other)
 
 
 def test_rigid_alignment_holds_on_a_straight_drive(truth):

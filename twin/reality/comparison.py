@@ -100,12 +100,18 @@ def measure(scene: SceneDir) -> dict[str, Any]:
 
 
 def matched_poses(truth: Truth, cameras: Cameras) -> Array:
-    """True poses of a build's cameras, shape (n, 4, 4)."""
+    """True poses of a build's cameras, shape (n, 4, 4). Raises InputError for a source that the truth does not have."""
     out = np.empty((len(cameras), 4, 4))
     for source in sorted(set(cameras.sources)):
         rows = np.array([s == source for s in cameras.sources])
         lighting = next(light for light, row in zip(cameras.lightings, rows, strict=True) if row)
-        out[rows] = truth.poses(source if source in truth.films else lighting, cameras.times[rows])
+        film = source if source in truth.films else lighting
+        if film not in truth.films:
+            raise InputError(
+                f"source {source} was filmed under {lighting}; the truth has only the films {', '.join(truth.films)}; "
+                "leave this source out"
+            )
+        out[rows] = truth.poses(film, cameras.times[rows])
     return out
 
 
