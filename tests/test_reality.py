@@ -138,6 +138,17 @@ def test_truth_survives_saving(truth, tmp_path):
     assert np.allclose(between[0, :3, 3], truth.films["sun"].camera_to_world[:2, :3, 3].mean(0))
 
 
+def test_a_truth_that_was_cut_off_is_one_line(truth, tmp_path):
+    truth.save(tmp_path)
+    (tmp_path / "truth.npz").write_bytes((tmp_path / "truth.npz").read_bytes()[:2000])
+    with pytest.raises(InputError, match=r"truth\.npz is damaged"):
+        Truth.load(tmp_path)
+    truth.save(tmp_path)
+    (tmp_path / "truth.json").write_text("{}")
+    with pytest.raises(InputError, match=r"is damaged \(KeyError.*film again"):
+        Truth.load(tmp_path)
+
+
 def fake_build(truth: Truth, root: Path, warp: Similarity, lift: float = 0.0) -> SceneDir:
     """A build that is the truth, moved by `warp`, its ground raised by `lift`; its parts are the true solids."""
     scene = SceneDir(root)
