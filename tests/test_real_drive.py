@@ -292,6 +292,14 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
         real_test.run([left], "straight", ["rain"], 4, out)
 
 
+def test_results_are_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for out in (Path(), tmp_path):
+        with pytest.raises(InputError, match=r"is a folder; give a file to write, such as .*results\.csv"):
+            real_test.run([written(tmp_path / "left", 0.9)], "straight", ["rain"], 1, out)
+    assert [one.name for one in tmp_path.iterdir()] == ["left"]
+
+
 def test_another_file_under_a_known_name_is_refused(gray, tmp_path):
     left = written(tmp_path / "left", 0.9)
     real_test.run([left], "straight", ["rain"], 1, tmp_path / "results.csv")

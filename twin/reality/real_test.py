@@ -220,7 +220,7 @@ def run(
         All trials of the table, including those of earlier calls.
 
     Raises:
-        InputError: unknown names, unusable policy files, a different file under a known policy name, a table of another
+        InputError: unknown names, `out` is a folder, unusable policy files, a different file under a known policy name, a table of another
             setup, or another process that writes the same table.
     """
     setup = setup or Setup()
@@ -228,6 +228,8 @@ def run(
         weather(name)
     if not 1 <= trials <= _SEEDS_PER_LIGHTING:
         raise InputError(f"trials = {trials}; expected 1 to {_SEEDS_PER_LIGHTING}")
+    if out.is_dir():
+        raise InputError(f"{out} is a folder; give a file to write, such as {out / 'results.csv'}")
     table = out.with_name(f"{out.stem}_trials.csv")
     loaded = [load_policy_file(path) for path in policies]
     with exclusive_lock(out.with_name(f".{out.stem}.lock"), f"{out} is being written"):
