@@ -334,6 +334,12 @@ def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):
     assert "robot -1: expected 0 or more" in capsys.readouterr().err
 
 
+def test_a_length_below_that_of_the_road_is_refused():
+    with pytest.raises(InputError, match=r"--length 20: the road of place 3 has 47\.15 m; give more, or leave"):
+        Setup(place=3, length=20.0)
+    assert "place 3 of 60 m" in str(Setup(place=3, length=60.0))
+
+
 def test_a_task_of_another_control_step_is_refused():
     policy = Policy("slow", lambda stacks: np.zeros((len(stacks), 1), np.float32), Control(control_timestep=0.2))
     assert task_for(policy, "straight", 0).control_timestep == 0.2
