@@ -219,7 +219,7 @@ def run(
         out: Results file as read by `twin.forecast`. `<name>_trials.csv` beside it has a row per trial,
             `<name>_policies.json` the digests of the policy files, `<name>_setup.json` place, robot and camera.
         twin_lighting: Value of the column of this name in new rows.
-        films: Folder for a film of every trial, from the robot's camera.
+        films: Folder for a film of every trial that is driven now, from the robot's camera.
         setup: Place, robot and camera, the same in all rows of a table.
 
     Returns:
