@@ -339,7 +339,7 @@ def test_a_released_deadman_switch_stops_the_robot(policy):
 
 
 def test_a_held_deadman_switch_is_not_the_cause_of_a_stop(policy):
-    pilot, clock = pilot_of(policy, deadman=0.5)
+    pilot, _ = pilot_of(policy, deadman=0.5)
     assert pilot.command().cause == DEADMAN
     pilot.press()
     assert pilot.command().cause == WAITING

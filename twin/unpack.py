@@ -112,7 +112,8 @@ def _recode(content: bytes, change: Any) -> bytes:
         first, last = tensor["data_offsets"]
         shape = [int(n) for n in tensor["shape"]]
         left -= last - first  # arrays that overlap would take time without bound
-        if not 0 <= first <= last <= len(content) - start or min(shape + [left]) < 0 or math.prod(shape) != last - first:
+        inside = 0 <= first <= last <= len(content) - start and left >= 0
+        if not inside or min(shape) < 0 or math.prod(shape) != last - first:
             raise ValueError(
                 f"{short_repr(name)}: shape {shape} does not match bytes {first} to {last}, or these overlap others or "
                 f"are not within the {len(content) - start} data bytes"
@@ -235,7 +236,9 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         )
     for name, facts in head["files"].items():
         if by_name[name].file_size != facts["bytes"]:
-            raise InputError(f"{path}: {name} has {by_name[name].file_size:,} bytes; {MANIFEST} says otherwise; {_CURE}")
+            raise InputError(
+                f"{path}: {name} has {by_name[name].file_size:,} bytes; {MANIFEST} says otherwise; {_CURE}"
+            )
     head["name"] = require_text(head["name"])
     head["policies"] = list(map(require_text, head["policies"]))
     return head

@@ -226,8 +226,8 @@ def run(
         All trials of the table, including those of earlier calls.
 
     Raises:
-        InputError: unknown names, `out` is a folder, unusable policy files, a different file under a known policy name, a table of another
-            setup, or another process that writes the same table.
+        InputError: unknown names, `out` is a folder, unusable policy files, a different file under a known policy name,
+            a table of another setup, or another process that writes the same table.
     """
     setup = setup or Setup()
     for name in lightings:
