@@ -171,11 +171,12 @@ def test_compressed_pictures_and_bad_calibrations(rig):
     if not HAS_ROS:
         assert "image/compressed" in r.node.subscriptions and "image" not in r.node.subscriptions
     r.node._on_camera_info(r.module.CameraInfo())  # an uncalibrated camera's, all zeros
-    assert r.node.pilot.command().cause
-    r.calibrate()
     message = r.stamped(r.module.CompressedImage())
     message.data = image(picture(0), 0, encoding="png").message.data.tobytes()
     r.node._on_compressed(message)
+    assert "is the camera calibrated?" in r.node.pilot.command().cause
+    r.calibrate()
+    r.node._on_compressed(r.stamped(message))
     assert len(r.commands()) == 1
 
 

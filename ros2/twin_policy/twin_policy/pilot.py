@@ -100,7 +100,8 @@ class Pilot:
         """Time from the arrival of the last used picture to its command [s]."""
         self._pinhole, self._clock, self._steady = pinhole or policy.camera, clock, steady
         self._rectifier: Rectifier | None = None
-        self._no_camera = "no camera_info, so pictures cannot be rectified"
+        self.no_camera = "no camera_info, so pictures cannot be rectified"
+        """Cause of stops before the first valid camera."""
         self._offset: int | None = None  # clock − steady [ns]
         self._pressed = 0
         self._is_held = False
@@ -128,7 +129,7 @@ class Pilot:
         try:
             self._rectifier = Rectifier(camera, pinhole)
         except PictureError as error:
-            self._no_camera = str(error)
+            self.no_camera = str(error)
             raise
 
     def press(self, held: bool = True) -> None:
@@ -158,7 +159,7 @@ class Pilot:
             return self.command()
         if self._rectifier is None:
             self.counts["waiting"] += 1
-            return self._stop(self._no_camera, rest=False)
+            return self._stop(self.no_camera, rest=False)
         try:
             decoded = picture if isinstance(picture, np.ndarray) else picture.decode()
             newest = self._rectifier(decoded).transpose(2, 0, 1)
