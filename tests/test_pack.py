@@ -247,6 +247,8 @@ def test_verbs_that_need_films_say_what_is_absent(packed, tmp_path, capsys):
     there = str(tmp_path / "there")
     assert main(["relight", there, str(tmp_path / "photo.png"), "--name", "noon"]) == 2
     assert "has no 1_capture, nor films" in capsys.readouterr().err
+    assert main(["export", there, "--colmap", str(tmp_path / "colmap")]) == 2
+    assert "has no 1_capture, nor films" in capsys.readouterr().err
     assert main(["build", there]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 
