@@ -68,7 +68,8 @@ class Node:
     def declare_parameter(self, name: str, value: Any = None) -> Any:
         assert name not in self.parameters
         self.parameters[name] = self.overrides.get(name, value)
-        assert type(self.parameters[name]) is type(value), name  # rclpy's parameters keep the type of their default
+        if type(self.parameters[name]) is not type(value):  # rclpy's parameters keep the type of their default
+            raise TypeError(f"Trying to set parameter '{name}' to '{self.parameters[name]}'")
         return SimpleNamespace(value=self.parameters[name])
 
     def get_parameter(self, name: str) -> Any:

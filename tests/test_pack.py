@@ -3,8 +3,10 @@
 import io
 import json
 import multiprocessing
+import resource
 import stat
 import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -155,8 +157,20 @@ def test_coding_is_undone_exactly():
     np.testing.assert_array_equal(load_safetensors(coded)["float"], arrays["float"])
 
 
+def test_coded_arrays_may_not_overlap():
+    content = to_safetensors({"a": np.zeros((4, 5), np.uint8)})
+    (length,) = struct.unpack_from("<Q", content)
+    one = json.loads(content[8 : 8 + length])["a"]
+    text = json.dumps({"a": one, "b": one}).encode()
+    with pytest.raises(ValueError, match="overlap"):
+        decode_differences(struct.pack("<Q", len(text)) + text + content[8 + length :])
+
+
 def test_the_same_scene_gives_the_same_pack(root, packed, tmp_path):
-    again, _ = pack(root, tmp_path / "place.twin", ["ahead"])
+    stray = SceneDir(root).stage("mjcf") / "MUJOCO_LOG.TXT"  # not of the build, and refused by unpack
+    stray.write_text("x")
+    again, _ = pack(root, tmp_path / "place.twin", ["ahead"], trust=True)  # without effect, as there is no zip
+    stray.unlink()
     assert again.read_bytes() == packed.read_bytes()
 
 
@@ -232,6 +246,8 @@ def test_verbs_that_need_films_say_what_is_absent(packed, tmp_path, capsys):
     (tmp_path / "photo.png").write_bytes(b"")
     there = str(tmp_path / "there")
     assert main(["relight", there, str(tmp_path / "photo.png"), "--name", "noon"]) == 2
+    assert "has no 1_capture, nor films" in capsys.readouterr().err
+    assert main(["export", there, "--colmap", str(tmp_path / "colmap")]) == 2
     assert "has no 1_capture, nor films" in capsys.readouterr().err
     assert main(["build", there]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
@@ -358,6 +374,7 @@ HOSTILE = {
     "no zip": (lambda *_: lambda content: b"twin" * 100, "is damaged"),
     "include": (edit(XML, lambda b: b.replace(b"<asset>", b'<include file="/a"/><asset>', 1)), "names a file"),
     "path": (edit(XML, lambda b: b.replace(b'meshdir="assets"', b'meshdir="/etc"', 1)), "names a file"),
+    "sky": (edit(XML, lambda b: b.replace(b"<asset>", b'<asset><texture fileback="/a.png"/>', 1)), "names a file"),
     "config": (edit("scene.toml", lambda b: b + b"surprise = 1\n"), "surprise"),
     "untrusted": (add("policies/a.zip"), "if you trust its sender, twin unpack --trust"),
 }  # fmt: skip
@@ -377,13 +394,50 @@ def test_a_hostile_pack_gets_one_line_and_leaves_nothing(packed, tmp_path, capsy
     assert not list((tmp_path / "cache" / "twin" / "packs").glob("*"))
 
 
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_DEFLATED])
+def test_a_manifest_that_inflates_beyond_its_declared_size_takes_no_memory(tmp_path, method):
+    bad = tmp_path / "bomb.twin"
+    with zipfile.ZipFile(bad, "w", method) as archive:
+        archive.writestr("manifest.json", bytes(100 << 20))
+    content = bytearray(bad.read_bytes())
+    struct.pack_into("<I", content, content.rfind(b"PK\x01\x02") + 24, 1000)  # the declared size
+    bad.write_bytes(content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"bomb\.twin"):
+            unpack.read_manifest(bad)
+        assert tracemalloc.get_traced_memory()[1] < 10 << 20
+    finally:
+        tracemalloc.stop()
+
+
 def test_a_folder_with_something_in_it_is_kept(packed, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "file").write_text("x")
     with pytest.raises(InputError, match="exists"):
         unpack.unpack(packed, tmp_path / "mine")
-    (tmp_path / "empty").mkdir()
-    unpack.unpack(packed, tmp_path / "empty")
+
+
+def test_an_empty_folder_is_filled_also_through_a_link_or_as_the_working_folder(packed, tmp_path, monkeypatch):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    unpack.unpack(packed, tmp_path / "link")
+    monkeypatch.chdir(tmp_path / "b")
+    unpack.unpack(packed, Path())
+    names = {one.name for one in (tmp_path / "a").iterdir()}
+    assert unpack.PACK_JSON in names and names == {one.name for one in (tmp_path / "b").iterdir()}
+
+
+def test_a_file_that_cannot_be_written_is_no_damage_to_the_pack(packed, tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            unpack.unpack(packed, tmp_path / "out")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_sb3_zip_is_packed_and_unpacked_by_trust_alone(root, tmp_path, monkeypatch):
@@ -399,6 +453,21 @@ def test_an_sb3_zip_is_packed_and_unpacked_by_trust_alone(root, tmp_path, monkey
         open_scene(out)
     unpack.unpack(out, tmp_path / "y", trust=True)
     assert (tmp_path / "y" / "policies" / "a.zip").read_bytes() == zipped.read_bytes()
+
+
+def test_a_policy_whose_name_unpack_would_refuse_is_refused(root, tmp_path):
+    (tmp_path / "my policy.onnx").write_bytes((root / "runs" / "ahead" / "policy.onnx").read_bytes())
+    with pytest.raises(InputError, match=r"'policies/my policy\.onnx' cannot be in a pack; rename it"):
+        pack(root, tmp_path / "x.twin", [str(tmp_path / "my policy.onnx")])
+    assert not (tmp_path / "x.twin").exists()
+
+
+def test_two_policies_of_one_name_are_refused(root, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "policy.onnx").write_bytes((root / "runs" / "ahead" / "policy.onnx").read_bytes())
+    with pytest.raises(InputError, match=r"the pack has a policy policies/policy\.onnx already"):
+        pack(root, tmp_path / "x.twin", [str(tmp_path / name / "policy.onnx") for name in ("a", "b")])
 
 
 def test_a_function_has_no_place_in_a_pack(root, tmp_path):

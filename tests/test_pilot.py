@@ -226,6 +226,7 @@ def test_late_pictures_do_not_drive(policy):
     [
         (np.zeros((90, 160, 3), np.uint8), r"picture (90, 160, 3) uint8; expected 18 x 32 px"),
         (np.zeros((18, 32), np.uint8), r"expected 18 x 32 px"),
+        (np.zeros(5, np.uint8), r"expected 18 x 32 px"),
         (RawPicture("rgb8", 32, 18, 96, bytes(100)), r"has 100 bytes"),
         (CompressedPicture(b"rubbish"), r"neither a JPEG nor a PNG"),
     ],
@@ -247,6 +248,22 @@ def test_a_jump_of_the_clock_stops_it(policy, jump):
     assert f"the clock jumped by {jump:+.2f} s" in pilot.command().cause
     clock.true += 1100 * MS
     assert pilot.picture(picture(6), clock.now()).drives
+
+
+def test_simulated_time_that_begins_anew_stops_it(policy):
+    """As when a bag is played in a loop, or a simulation is reset."""
+    clock = Clock()
+    pilot = Pilot(policy, Limits(deadman=0.5), clock=clock.now, steady=clock.now)
+    pilot.set_camera(LENS)
+    clock.true = 3600 * 1000 * MS
+    pilot.press()
+    assert pilot.picture(picture(0), clock.now()).drives
+    clock.true = 0
+    assert "the clock jumped by -3600.00 s" in pilot.command().cause
+    clock.true = 1100 * MS
+    assert pilot.picture(picture(1), clock.now()).cause == DEADMAN  # its last message is too old by now
+    pilot.press()
+    assert pilot.picture(picture(1), clock.now()).drives
 
 
 def test_stamps_from_the_future_stop_it(policy):
@@ -319,6 +336,21 @@ def test_a_released_deadman_switch_stops_the_robot(policy):
     assert pilot.picture(picture(6), clock.now()).drives
     clock.true += 301 * MS  # no message of the switch for longer than it holds
     assert pilot.picture(picture(7), clock.now()).cause == DEADMAN
+
+
+def test_a_held_deadman_switch_is_not_the_cause_of_a_stop(policy):
+    pilot, _ = pilot_of(policy, deadman=0.5)
+    assert pilot.command().cause == DEADMAN
+    pilot.press()
+    assert pilot.command().cause == WAITING
+
+
+def test_without_a_deadman_switch_its_messages_have_no_effect(policy):
+    pilot, clock = pilot_of(policy)
+    drive(pilot, clock, 3)
+    for held in (True, False):
+        pilot.press(held)
+        assert pilot.command().drives
 
 
 def test_a_new_calibration_stops_it_and_the_old_one_does_not(policy):
@@ -451,6 +483,16 @@ def test_damaged_policies_get_one_line(tmp_path, change, message):
     save_policy(tmp_path, SMALL, Control("twist"), some_weights(SMALL), {})
     change(tmp_path)
     with pytest.raises(ValueError, match=message) as error:
+        OnnxPolicy(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_network_of_another_size_than_its_metadata_gets_one_line(tmp_path):
+    save_policy(tmp_path, SMALL, Control("twist"), some_weights(SMALL), {})
+    (tmp_path / "policy.json").unlink()
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(path.read_bytes().replace(b'"size": [32, 18]', b'"size": [30, 18]'))
+    with pytest.raises(ValueError, match=r"policy\.onnx: its network does not run") as error:
         OnnxPolicy(tmp_path)
     assert "\n" not in str(error.value)
 

@@ -6,12 +6,14 @@ Without ROS, nothing here runs the middleware: topics, executors and launch file
 import ast
 import importlib
 import importlib.util
+import runpy
 import shutil
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 from xml.etree import ElementTree
 
 import numpy as np
@@ -120,6 +122,7 @@ def test_it_drives_while_the_switch_is_held(rig):
     stack = np.concatenate([picture(k).transpose(2, 0, 1) for k in (0, 0, 1, 2)])
     sent = r.published[-1][1]
     assert type(sent).__name__ == "TwistStamped" and sent.header.frame_id == "base_link"
+    r.show(2)  # doubled: the same picture, without a new command
     commands = r.commands()
     assert len(commands) == 3 and commands[-1] == r.node.pilot.policy.command(stack)
 
@@ -168,11 +171,12 @@ def test_compressed_pictures_and_bad_calibrations(rig):
     if not HAS_ROS:
         assert "image/compressed" in r.node.subscriptions and "image" not in r.node.subscriptions
     r.node._on_camera_info(r.module.CameraInfo())  # an uncalibrated camera's, all zeros
-    assert r.node.pilot.command().cause
-    r.calibrate()
     message = r.stamped(r.module.CompressedImage())
     message.data = image(picture(0), 0, encoding="png").message.data.tobytes()
     r.node._on_compressed(message)
+    assert "is the camera calibrated?" in r.node.pilot.command().cause
+    r.calibrate()
+    r.node._on_compressed(r.stamped(message))
     assert len(r.commands()) == 1
 
 
@@ -181,6 +185,10 @@ def test_bad_parameters_are_one_error(rig):
         rig(policy_camera=[1.0, 2.0])
     with pytest.raises(ValueError, match="timeout = "):
         rig(timeout=0.0)
+    with pytest.raises(ValueError, match="parameter rest: "):
+        rig(rest=1)  # an integer
+    with pytest.raises(ValueError, match="watchdog_rate = "):
+        rig(watchdog_rate=0.0)
 
 
 # ---- what the package says
@@ -203,6 +211,17 @@ def test_the_yaml_names_every_parameter_of_the_node_with_its_default():
     assert {name: type(value) for name, value in given.items()} == {
         name: type(value) for name, value in expected.items()
     }
+
+
+def test_the_launch_file_requires_the_policy_and_nothing_else(monkeypatch):
+    """As it replaces the parameter file's policy, a default would replace it by none."""
+    for name in ("ament_index_python", "launch", "launch.actions", "launch.substitutions", "launch_ros"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    monkeypatch.setitem(sys.modules, "launch_ros.actions", MagicMock())
+    monkeypatch.setitem(sys.modules, "ament_index_python.packages", MagicMock(get_package_share_directory=str))
+    runpy.run_path(str(ROOT / "launch" / "twin_policy.launch.py"))["generate_launch_description"]()
+    declared = sys.modules["launch.actions"].DeclareLaunchArgument.call_args_list
+    assert [one.args[0] for one in declared if one.kwargs["default_value"] is None] == ["policy"]
 
 
 def test_the_package_is_one_for_colcon():

@@ -296,6 +296,14 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
         real_test.run([left], "straight", ["rain"], 4, out)
 
 
+def test_results_are_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for out in (Path(), tmp_path):
+        with pytest.raises(InputError, match=r"is a folder; give a file to write, such as .*results\.csv"):
+            real_test.run([written(tmp_path / "left", 0.9)], "straight", ["rain"], 1, out)
+    assert [one.name for one in tmp_path.iterdir()] == ["left"]
+
+
 def test_another_file_under_a_known_name_is_refused(gray, tmp_path):
     left = written(tmp_path / "left", 0.9)
     real_test.run([left], "straight", ["rain"], 1, tmp_path / "results.csv")
@@ -328,6 +336,12 @@ def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):
     assert read_results(out, [Cell("left", "whole", "held-out+randomised", 10, 5)])
     assert main([*given, "--place", "3", "--robot", "-1"]) == 2
     assert "robot -1: expected 0 or more" in capsys.readouterr().err
+
+
+def test_a_length_below_that_of_the_road_is_refused():
+    with pytest.raises(InputError, match=r"--length 20: the road of place 3 has 47\.15 m; give more, or leave"):
+        Setup(place=3, length=20.0)
+    assert "place 3 of 60 m" in str(Setup(place=3, length=60.0))
 
 
 def test_a_task_of_another_control_step_is_refused():
@@ -409,5 +423,6 @@ def test_the_log_is_what_alignment_reads(tmp_path):
     assert np.abs(np.diff(table["yaw"])).max() < 0.3
     first, again, other = (recordings.record_log(12.0, Setup(robot=number))["x"] for number in (0, 0, 1))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
-    with pytest.raises(InputError, match="duration = 3 s"):
-        recordings.record_log(3.0, Setup())
+    for duration in (3.0, np.inf):
+        with pytest.raises(InputError, match=f"duration = {duration:g} s; expected 10 to 36000"):
+            recordings.record_log(duration, Setup())

@@ -1,5 +1,6 @@
 """The simulated reality: its road, its place, its films, and the comparison of a build with it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,9 +14,9 @@ from twin.files import read_json
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, umeyama
-from twin.reality import centerline, filming, place
+from twin.reality import centerline, comparison, filming, place, primitives
 from twin.reality.centerline import RoadLine
-from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, measure, mesh_quality
+from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, matched_poses, measure, mesh_quality
 from twin.reality.lighting import LIGHTINGS, sky_cube_map
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, fingerprint
 from twin.scene import SceneDir
@@ -160,6 +161,17 @@ def test_truth_survives_saving(truth, tmp_path):
     assert np.allclose(between[0, :3, 3], truth.films["sun"].camera_to_world[:2, :3, 3].mean(0))
 
 
+def test_a_truth_that_was_cut_off_is_one_line(truth, tmp_path):
+    truth.save(tmp_path)
+    (tmp_path / "truth.npz").write_bytes((tmp_path / "truth.npz").read_bytes()[:2000])
+    with pytest.raises(InputError, match=r"truth\.npz is damaged"):
+        Truth.load(tmp_path)
+    truth.save(tmp_path)
+    (tmp_path / "truth.json").write_text("{}")
+    with pytest.raises(InputError, match=r"is damaged \(KeyError.*film again"):
+        Truth.load(tmp_path)
+
+
 def fake_build(truth: Truth, root: Path, warp: Similarity, lift: float = 0.0) -> SceneDir:
     """A build that equals the truth, moved by `warp`, its ground raised by `lift`; its parts are the true solids."""
     scene = SceneDir(root)
@@ -245,17 +257,26 @@ def test_a_shifted_mesh_is_as_far_off_as_it_was_shifted(off):
     assert found["mesh_completeness_10cm"] == (off <= 0.1)
 
 
+def save_visual(scene: SceneDir, truth: Truth, kinds: set[str]) -> None:
+    """A visual mesh that is the truth's objects of some kinds."""
+    part = primitives.join([t.part for t in truth.place.objects if t.kind in kinds])
+    np.savez(scene.stage("mesh") / "visual.npz", vertices=part.vertices, faces=part.faces)
+
+
+def test_a_place_without_leaves_is_measured(truth, campus, tmp_path):
+    scene = fake_build(truth, tmp_path, _IDENTITY)
+    save_visual(scene, truth, {"ground"})
+    bare = replace(truth)
+    vars(bare)["place"] = replace(campus, objects=[one for one in campus.objects if one.kind != "foliage"])
+    found = comparison._surface_errors(scene.stage("mesh"), bare, _IDENTITY, truth.films["sun"].camera_to_world[:4])
+    assert found["mesh_completeness_10cm_ground"] == 1.0 and "mesh_completeness_10cm_foliage" not in found
+
+
 def test_a_mesh_that_is_the_truth_is_complete_and_one_without_houses_is_not(truth, tmp_path):
     found = []
     for name, kinds in (("all", {"ground", "obstacle", "foliage"}), ("flat", {"ground"})):
         scene = fake_build(truth, tmp_path / name, _IDENTITY)
-        parts = [t.part for t in truth.place.objects if t.kind in kinds]
-        starts = np.cumsum([0] + [len(p.vertices) for p in parts])
-        np.savez(
-            scene.stage("mesh") / "visual.npz",
-            vertices=np.concatenate([p.vertices for p in parts]),
-            faces=np.concatenate([p.faces + start for p, start in zip(parts, starts, strict=False)]),
-        )
+        save_visual(scene, truth, kinds)
         found.append(measure(scene)["figures"])
     whole, flat = found
     assert whole["mesh_chamfer_m"] < 1e-3 and whole["mesh_completeness_5cm"] == 1.0
@@ -268,6 +289,13 @@ def test_a_mesh_that_is_the_truth_is_complete_and_one_without_houses_is_not(trut
 def test_a_scene_without_truth_is_not_compared(tmp_path):
     with pytest.raises(InputError, match="has no truth"):
         compare(SceneDir(tmp_path))
+
+
+def test_a_source_that_the_truth_does_not_have_is_refused(truth, tmp_path):
+    cameras = Cameras.load(fake_build(truth, tmp_path, _IDENTITY).stage("metric"))
+    other = replace(cameras, sources=("phone",) * len(cameras), lightings=("dusk",) * len(cameras))
+    with pytest.raises(InputError, match="source phone was filmed under dusk; the truth has only the films sun, night"):
+        matched_poses(truth, other)
 
 
 def test_rigid_alignment_holds_on_a_straight_drive(truth):

@@ -483,7 +483,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--twin-lighting", default=str(Condition(HELD_OUT, True)), help="the twin's lighting to compare with"
     )
-    command.add_argument("--films", type=Path, help="folder for a film of every trial, as the robot saw it")
+    command.add_argument("--films", type=Path, help="folder for a film of every trial driven now, as the robot saw it")
     command = add("log", "a drive log of the place's Husky, for twin align")
     command.add_argument("--out", type=Path, required=True, help="drive.csv")
     command.add_argument("--duration", type=float, default=300.0, help="length of the drive [s]")

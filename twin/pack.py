@@ -32,7 +32,7 @@ from safetensors.numpy import save as to_bytes
 from twin import commands, runtime, unpack
 from twin.capture.capture_data import Capture
 from twin.config_file import ROBOT_TOML
-from twin.errors import InputError
+from twin.errors import InputError, short_repr
 from twin.files import atomic_path, digest_json, json_bytes, load_tensors, read_bytes, read_json, read_toml, toml_value
 from twin.learn.policy import JSON, ONNX, WEIGHTS, find_policy, load_policy
 from twin.loading import Twin, load_scene
@@ -103,7 +103,11 @@ def pack(
     files: dict[str, bytes] = {"scene.toml": _scene_toml(scene, name)}
     if (scene.root / ROBOT_TOML).exists():
         files[ROBOT_TOML] = _toml(read_toml(scene.root / ROBOT_TOML))
-    names = [_add_policy(files, scene.root, one, trust) for one in dict.fromkeys(policies)]
+    names: list[str] = []
+    for one in dict.fromkeys(policies):
+        names.append(_add_policy(files, scene.root, one, trust))
+        if names[-1] in names[:-1]:
+            raise InputError(f"--policy {one}: the pack has a policy {names[-1]} already; rename one, or leave it out")
     if positions:
         files["positions.csv"] = _positions(twin)
     field = _add_stages(files, scene, levels)
@@ -122,7 +126,7 @@ def pack(
         "levels": levels,
         "packages": package_versions(),
     }
-    return out, _write(out, files, head, trust)
+    return out, _write(out, files, head)
 
 
 def _scene_toml(scene: SceneDir, name: str) -> bytes:
@@ -179,11 +183,9 @@ def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
     results = {}
     for stage in unpack.STAGES_PACKED:
         folder = require_stage(scene, stage)
-        names: tuple[str, ...] = _PACKED.get(stage, _MESH)
-        if stage == "mjcf":
-            names = tuple(p.relative_to(folder).as_posix() for p in sorted(folder.rglob("*")) if p.is_file())
-        kept = {name: read_bytes(folder / name) for name in names if name != "stamp.json" and (folder / name).is_file()}
         stamp = Stamp.verified(folder)
+        names = tuple(stamp.files) if stage == "mjcf" else _PACKED.get(stage, _MESH)
+        kept = {name: read_bytes(folder / name) for name in names if (folder / name).is_file()}
         results[stage] = stamp.result
         if stage == "field":
             for k, layout in enumerate(stored_layouts(read_json(folder / "baked.json"))):
@@ -228,12 +230,18 @@ def rounded(values: NDArray[np.uint8], step: float) -> NDArray[np.uint8]:
     return np.clip(np.round(table), 0, LEVELS - 1).astype(np.uint8)[values]
 
 
-def _write(out: Path, files: dict[str, bytes], head: dict[str, Any], trust: bool) -> dict[str, Any]:
+def _write(out: Path, files: dict[str, bytes], head: dict[str, Any]) -> dict[str, Any]:
     coded = {name: unpack.DIFFERENCES if _IS_BAKED.search(name) else unpack.PLAIN for name in files}
     facts = {
         name: {"bytes": len(content), "sha256": unpack.digest(content), "coding": coded[name]}
         for name, content in sorted(files.items())
     }
+    for name in files:
+        if not unpack.PLACES.fullmatch(name):
+            raise InputError(
+                f"{short_repr(name)} cannot be in a pack; rename it: letters, digits and _ . + - only, and at the beginning "
+                "no . + -"
+            )
     total = sum(map(len, files.values()))
     if total > unpack.MAX_TOTAL:
         raise InputError(
@@ -250,11 +258,11 @@ def _write(out: Path, files: dict[str, bytes], head: dict[str, Any], trust: bool
         positions="GPS positions of the frames are in positions.csv."
         if head["positions"]
         else "No GPS position is, either.",
-        zips=", but a policy in policies/ may when it is loaded" if trust else "",
+        zips=", but a policy in policies/ may when it is loaded" if any(n.endswith(".zip") for n in files) else "",
     )
     with (
         atomic_path(out) as partial,
-        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
+        zipfile.ZipFile(partial, "w") as archive,
         runtime.bar("pack", len(files), "file", after=1.0) as progress,
     ):
         archive.writestr(_entry(unpack.README), text.encode())

@@ -7,7 +7,7 @@ and SHA-256 of each file as unpacked, and the file's *coding*: `plain`, or `diff
 (see `encode_differences`).
 
 A pack may come from anyone, so unpacking runs nothing in it. A pack is refused if it has a name that does not match
-`_PLACES` (such as a path that leads elsewhere), a link, the same name twice, a size above the bounds or different from
+`PLACES` (such as a path that leads elsewhere), a link, the same name twice, a size above the bounds or different from
 the declared one, or a wrong digest. Then nothing remains on the disk.
 """
 
@@ -54,7 +54,7 @@ _FREE = 16 << 20  # [bytes] a total up to this is allowed at any ratio
 _MAX_MANIFEST = 16 << 20  # [bytes]
 _CHUNK = 4 << 20  # [bytes]
 _N = r"\w[\w.+-]{0,99}"  # a name in a path; it cannot begin with a dot, so ".." is excluded
-_PLACES = re.compile(
+PLACES = re.compile(
     rf"scene\.toml|robot\.toml|positions\.csv|lightings/{_N}\.json"
     rf"|build/{STAGES['metric']}/(cameras\.(json|npz)|stamp\.json)"
     rf"|build/{STAGES['field']}/(baked\.json|baked(_[1-9][0-9]{{0,3}})?\.safetensors|road\.safetensors|stamp\.json)"
@@ -62,9 +62,13 @@ _PLACES = re.compile(
     rf"|build/{STAGES['mjcf']}/(scene\.xml|world\.json|stamp\.json|assets/{_N}\.(obj|png|bin))"
     rf"|runs/{_N}/(checkpoints/{_N}/)?policy\.(json|safetensors|onnx)|policies/{_N}\.(onnx|zip)"
 )
+"""Pattern of the names that files of a pack may have."""
 _CURE = "fetch it again, or ask its sender for another"
 _NOT_A_PACK = "expected a pack, as twin pack writes it"
-_XML_PATHS = ("file", "meshdir", "texturedir", "assetdir", "fileright", "fileleft", "fileup", "filedown", "filefront")
+_XML_PATHS = (
+    *("file", "meshdir", "texturedir", "assetdir"),
+    *("fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"),
+)
 _XML_REFUSED = ("include", "plugin", "extension", "model", "attach")  # elements that load other files or code
 _HEADER = 8  # [bytes] of a safetensors file before its header; they contain the header's length
 
@@ -101,15 +105,18 @@ def _recode(content: bytes, change: Any) -> bytes:
     if length > len(content) - _HEADER:
         raise ValueError(f"its header has {length:,} bytes, but the file only {len(content):,}")
     out, start = bytearray(content), _HEADER + length
+    left = len(content) - start
     for name, tensor in json.loads(content[_HEADER:start]).items():
         if name == "__metadata__" or tensor["dtype"] != "U8" or len(tensor["shape"]) < 2:
             continue
         first, last = tensor["data_offsets"]
         shape = [int(n) for n in tensor["shape"]]
-        if not 0 <= first <= last <= len(content) - start or min(shape) < 0 or math.prod(shape) != last - first:
+        left -= last - first  # arrays that overlap would take time without bound
+        inside = 0 <= first <= last <= len(content) - start and left >= 0
+        if not inside or min(shape) < 0 or math.prod(shape) != last - first:
             raise ValueError(
-                f"{short_repr(name)}: shape {shape} does not match bytes {first} to {last}, or these are not within "
-                f"the {len(content) - start} data bytes"
+                f"{short_repr(name)}: shape {shape} does not match bytes {first} to {last}, or these overlap others or "
+                f"are not within the {len(content) - start} data bytes"
             )
         if last > first:
             flat = np.frombuffer(content, np.uint8, last - first, start + first)
@@ -135,7 +142,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
 def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
     """Unpacks a pack into a new folder; returns its manifest.
 
-    The folder is created only after everything was written and checked.
+    The folder is created or filled only after everything was written and checked.
 
     Args:
         path: The pack.
@@ -145,6 +152,7 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
     Raises:
         InputError: an error of `read_manifest`; a file differs from its declaration; the folder exists and is not
             empty; or the pack has a policy that may run code and is not trusted.
+        OSError: the folder cannot be written.
     """
     manifest = read_manifest(path)
     zips = [name for name in manifest["files"] if name.endswith(".zip")]
@@ -152,10 +160,12 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
         raise InputError(
             f"{path} has {zips[0]}, which may run code when it is loaded; if you trust its sender, twin unpack --trust"
         )
-    if exists(folder) and not (folder.is_dir() and not any(folder.iterdir())):
+    is_there = exists(folder)
+    if is_there and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder} exists; give a folder that does not")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name[:80]}.", suffix=".partial", dir=folder.parent))
+    beside = folder if is_there else folder.parent
+    beside.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name[:80]}.", suffix=".partial", dir=beside))
     try:
         with wrap_read_errors(path, _CURE), zipfile.ZipFile(path) as archive:
             for name, facts in manifest["files"].items():
@@ -164,12 +174,17 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
                 _extract(archive, name, facts, target)
         _check_contents(partial, path)
         (partial / PACK_JSON).write_bytes(json.dumps(manifest, indent=1).encode())
-        partial.chmod(0o755)
-        if folder.is_dir():
-            folder.rmdir()
-        partial.rename(folder)
-    except BaseException:
+        if is_there:  # it may be the working folder, or a link, so it is filled
+            for one in list(partial.iterdir()):
+                one.rename(folder / one.name)
+            partial.rmdir()
+        else:
+            partial.chmod(0o755)
+            partial.rename(folder)
+    except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
+        if isinstance(error, InputError) and isinstance(error.__cause__, OSError):
+            raise error.__cause__ from None  # such as a full disk: the pack is not damaged
         raise
     return manifest
 
@@ -181,9 +196,17 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
     by_name = {entry.filename: entry for entry in entries}
     if len({name.lower() for name in by_name}) < len(entries):
         raise InputError(f"{path} has a name twice; {_CURE}")
+    for entry in entries:
+        kind, name = stat.S_IFMT(entry.external_attr >> 16), short_repr(entry.filename)
+        if kind not in (0, stat.S_IFREG) or entry.is_dir():
+            raise InputError(f"{path}: {name} is not a regular file; {_CURE}")
+        if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise InputError(f"{path}: {name} is encrypted, or compressed by another method than deflate; {_CURE}")
     if MANIFEST not in by_name or by_name[MANIFEST].file_size > _MAX_MANIFEST:
         raise InputError(f"{path} has no {MANIFEST} of at most {_MAX_MANIFEST >> 20} MB; {_NOT_A_PACK}")
-    head = parse_json(archive.read(MANIFEST).decode("utf-8"), f"{path}: {MANIFEST}")
+    with archive.open(MANIFEST) as file:  # `archive.read` would inflate more than the declared size before it looks
+        text = file.read(by_name[MANIFEST].file_size).decode("utf-8")
+    head = parse_json(text, f"{path}: {MANIFEST}")
     if not isinstance(head, dict) or head.get("format") != FORMAT:
         raise InputError(f"{path}: no {FORMAT}; {_NOT_A_PACK}")
     if head.get("version") != VERSION:
@@ -193,7 +216,7 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         )
     total = 0
     for name, facts in head["files"].items():
-        if not _PLACES.fullmatch(name):
+        if not PLACES.fullmatch(name):
             raise InputError(f"{path}: {short_repr(name)} is not a file of a scene; {_CURE}")
         size = facts["bytes"]
         if not isinstance(size, int) or not 0 <= size <= _MAX_FILE:
@@ -211,14 +234,11 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path}: {name} is listed in {MANIFEST} but not in the pack, or in the pack but not listed; {_CURE}"
         )
-    for name, entry in by_name.items():
-        kind = stat.S_IFMT(entry.external_attr >> 16)
-        if kind not in (0, stat.S_IFREG) or entry.is_dir():
-            raise InputError(f"{path}: {name} is not a regular file; {_CURE}")
-        if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise InputError(f"{path}: {name} is encrypted, or compressed by another method than deflate; {_CURE}")
-        if name in head["files"] and entry.file_size != head["files"][name]["bytes"]:
-            raise InputError(f"{path}: {name} has {entry.file_size:,} bytes; {MANIFEST} says otherwise; {_CURE}")
+    for name, facts in head["files"].items():
+        if by_name[name].file_size != facts["bytes"]:
+            raise InputError(
+                f"{path}: {name} has {by_name[name].file_size:,} bytes; {MANIFEST} says otherwise; {_CURE}"
+            )
     head["name"] = require_text(head["name"])
     head["policies"] = list(map(require_text, head["policies"]))
     return head

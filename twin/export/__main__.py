@@ -32,7 +32,7 @@ from twin.geometry.cameras import SparsePoints
 from twin.loading import Twin, load_scene
 from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import SCENE_XML
-from twin.scene import require_stage
+from twin.scene import PACK_JSON, require_stage
 
 _MEGABYTE = 1e6
 _USD_SUFFIXES = (".usdz", ".usd", ".usdc")
@@ -60,7 +60,7 @@ def export(
     """Writes the given files and folders; returns a summary line for each. Colors do not include a lighting's fog.
 
     Raises:
-        InputError: nothing to write, the scene is not built, the lighting or task is unknown, an output folder does not
+        InputError: nothing to write, the scene is not built, or is a pack and frames are wanted, the lighting or task is unknown, an output folder does not
             exist, or a folder to write is there already.
     """
     files, folders = [one for one in (usd_file, glb, ply) if one], [one for one in (nerfstudio, colmap) if one]
@@ -89,6 +89,8 @@ def export(
         write_task(task_file, world.along(segment.route), segment, Options())
         lines.append(f"{task_file}: {task}, {segment.length:.1f} m long, starts {segment.start:.1f} m along the route")
     if folders:
+        if (twin.scene.root / PACK_JSON).exists():
+            require_stage(twin.scene, "capture")  # raises InputError: a pack has no frames
         cameras = twin.cameras()
         points = SparsePoints.load(require_stage(twin.scene, "metric"))
         for out, write in ((nerfstudio, write_nerfstudio), (colmap, write_colmap)):

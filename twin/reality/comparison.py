@@ -100,12 +100,18 @@ def measure(scene: SceneDir) -> dict[str, Any]:
 
 
 def matched_poses(truth: Truth, cameras: Cameras) -> Array:
-    """True poses of a build's cameras, shape (n, 4, 4)."""
+    """True poses of a build's cameras, shape (n, 4, 4). Raises InputError for a source that the truth does not have."""
     out = np.empty((len(cameras), 4, 4))
     for source in sorted(set(cameras.sources)):
         rows = np.array([s == source for s in cameras.sources])
         lighting = next(light for light, row in zip(cameras.lightings, rows, strict=True) if row)
-        out[rows] = truth.poses(source if source in truth.films else lighting, cameras.times[rows])
+        film = source if source in truth.films else lighting
+        if film not in truth.films:
+            raise InputError(
+                f"source {source} was filmed under {lighting}; the truth has only the films {', '.join(truth.films)}; "
+                "leave this source out"
+            )
+        out[rows] = truth.poses(film, cameras.times[rows])
     return out
 
 
@@ -202,6 +208,8 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
             to_mesh = visual.distance(seen_points)
             out |= mesh_quality(whole.distance(near), to_mesh)
             for kind, objects in kinds.items():
+                if not objects:  # such as the foliage of place 17
+                    continue
                 mine = _surface([(p.vertices, p.faces) for p in objects]).distance(seen_points) < 1e-3
                 if mine.any():
                     out[f"mesh_completeness_10cm_{kind}"] = float((to_mesh[mine] <= 0.1).mean())

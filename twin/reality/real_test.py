@@ -29,6 +29,7 @@ from twin.learn.policy import JSON, Policy, load_policy
 from twin.reality import REALITY_VERSION
 from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import day_number, weather, weather_index
+from twin.reality.place_sampling import draw
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_camera import TRAINED as camera_ranges
 from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of
@@ -61,8 +62,13 @@ class Setup:
     """Length to which the place's road is lengthened [m], see `place_sampling.draw`."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: no such robot or camera."""
+        """Raises InputError: no such robot or camera, or a length below that of the place's road."""
         draw_robot(self.robot), draw_camera(self.camera)
+        if self.length and self.place and self.length < (sampled := draw(self.place).line.length):
+            raise InputError(
+                f"--length {self.length:g}: the road of place {self.place} has {sampled:g} m; give more, or leave "
+                "--length out"
+            )
 
     @property
     def outside(self) -> list[str]:
@@ -213,21 +219,23 @@ def run(
         out: Results file as read by `twin.forecast`. `<name>_trials.csv` beside it has a row per trial,
             `<name>_policies.json` the digests of the policy files, `<name>_setup.json` place, robot and camera.
         twin_lighting: Value of the column of this name in new rows.
-        films: Folder for a film of every trial, from the robot's camera.
+        films: Folder for a film of every trial that is driven now, from the robot's camera.
         setup: Place, robot and camera, the same in all rows of a table.
 
     Returns:
         All trials of the table, including those of earlier calls.
 
     Raises:
-        InputError: unknown names, unusable policy files, a different file under a known policy name, a table of another
-            setup, or another process that writes the same table.
+        InputError: unknown names, `out` is a folder, unusable policy files, a different file under a known policy name,
+            a table of another setup, or another process that writes the same table.
     """
     setup = setup or Setup()
     for name in lightings:
         weather(name)
     if not 1 <= trials <= _SEEDS_PER_LIGHTING:
         raise InputError(f"trials = {trials}; expected 1 to {_SEEDS_PER_LIGHTING}")
+    if out.is_dir():
+        raise InputError(f"{out} is a folder; give a file to write, such as {out / 'results.csv'}")
     table = out.with_name(f"{out.stem}_trials.csv")
     loaded = [load_policy_file(path) for path in policies]
     with exclusive_lock(out.with_name(f".{out.stem}.lock"), f"{out} is being written"):

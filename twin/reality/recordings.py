@@ -109,6 +109,7 @@ LOG_COLUMNS = (
     *("acceleration_x", "acceleration_y"),
 )
 
+_DURATIONS = (10.0, 36_000.0)  # [s] range of a log's duration
 _LOG_PERIOD = 0.05  # [s] between two rows
 _COMMAND_ROWS = 2  # rows between two commands
 _MAX_LATERAL, _LOG_STATIONS = 1.7, (4.0, 26.0)  # [m] bounds of the base's position
@@ -127,10 +128,10 @@ def record_log(duration: float, setup: Setup) -> dict[str, Array]:
     frame of the first pose.
 
     Raises:
-        InputError: `duration` < 10 s.
+        InputError: `duration` is not within `_DURATIONS`.
     """
-    if not duration >= 10.0:
-        raise InputError(f"duration = {duration:g} s; expected at least 10")
+    if not _DURATIONS[0] <= duration <= _DURATIONS[1]:
+        raise InputError(f"duration = {duration:g} s; expected {_DURATIONS[0]:g} to {_DURATIONS[1]:g}")
     rng = np.random.default_rng([SEED, 42])
     place = place_on_test_day(setup.place, setup.length)
     line, robot = place.route, RealRobot(draw_robot(setup.robot), place)

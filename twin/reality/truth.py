@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from twin.errors import InputError
-from twin.files import read_json, write_json
+from twin.files import load_arrays, read_json, wrap_read_errors, write_json
 from twin.reality import SEED
 from twin.reality import place as places
 from twin.reality.centerline import RoadLine
@@ -91,23 +91,21 @@ class Truth:
         """Reads a truth and rebuilds its place.
 
         Raises:
-            InputError: this version of the code builds another place than the one filmed.
+            InputError: the files are damaged, or this version of the code builds another place than the one filmed.
         """
-        head = read_json(folder / "truth.json")
-        with np.load(folder / "truth.npz", allow_pickle=False) as data:
+        with wrap_read_errors(folder, "film again: python -m twin.reality film"):
+            head = read_json(folder / "truth.json")
+            data = load_arrays(folder / "truth.npz")
             keys = ("times", "camera_to_world", "depth_frames", "depth")
-            films = {name: TrueFilm(*(data[f"{key}_{name}"] for key in keys)) for name in head["films"]}
             number = int(head.get("place", 0))
-            road = DrawnRoad(draw(number, head.get("road_length", 0.0))) if number else RoadLine(**head["route"])
-            size = (int(head["size"][0]), int(head["size"][1]))
             truth = Truth(
-                road,
+                DrawnRoad(draw(number, head.get("road_length", 0.0))) if number else RoadLine(**head["route"]),
                 head["start"],
                 head["length"],
                 head["half_width"],
                 data["intrinsics"],
-                size,
-                films,
+                (int(head["size"][0]), int(head["size"][1])),
+                {name: TrueFilm(*(data[f"{key}_{name}"] for key in keys)) for name in head["films"]},
                 number,
                 head.get("lightings", {}),
                 head.get("camera_height", CAMERA_HEIGHT),

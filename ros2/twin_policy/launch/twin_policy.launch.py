@@ -9,7 +9,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 ARGUMENTS = {
-    "policy": ("", "policy folder, or policy.onnx"),
+    "policy": (None, "policy folder, or policy.onnx"),
     "namespace": ("", "the robot's namespace, such as a200_0000"),
     "image": ("sensors/camera_0/color/image", "topic of the pictures"),
     "image_compressed": ("sensors/camera_0/color/compressed", "topic of JPEG or PNG pictures, if compressed is true"),
@@ -20,7 +20,7 @@ ARGUMENTS = {
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Arguments: `ARGUMENTS`, and `parameters`, the file with all other settings."""
+    """Arguments: `ARGUMENTS` (None: required), and `parameters`, the file with all other settings."""
     settings = Path(get_package_share_directory("twin_policy")) / "config" / "twin_policy.yaml"
     arguments = [DeclareLaunchArgument(k, default_value=v, description=d) for k, (v, d) in ARGUMENTS.items()]
     arguments.append(DeclareLaunchArgument("parameters", default_value=str(settings), description="parameters (YAML)"))

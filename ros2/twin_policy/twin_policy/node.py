@@ -31,7 +31,10 @@ class PolicyNode(Node):
         super().__init__("twin_policy", **options)
 
         def parameter(name: str, default: Any) -> Any:
-            return self.declare_parameter(name, default).value
+            try:
+                return self.declare_parameter(name, default).value
+            except Exception as error:  # another type than the default's, such as 1 for 1.0
+                raise ValueError(f"parameter {name}: {error}") from None
 
         policy = OnnxPolicy(parameter("policy", ""))
         limits = Limits(
@@ -50,6 +53,7 @@ class PolicyNode(Node):
         self._rectified, self._frame = parameter("rectified", False), parameter("frame_id", "base_link")
         self._button, self._said, self._released = int(parameter("deadman_button", -1)), "", self._steady()
         self._stamped = parameter("stamped", True)
+        self._sent = 0  # stamp of the picture behind the last driving command [ns]
         self._commands = self.create_publisher(TwistStamped if self._stamped else Twist, "cmd_vel", 1)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -62,7 +66,10 @@ class PolicyNode(Node):
             self.create_subscription(Bool, "deadman", lambda message: self.pilot.press(message.data), 1)
         else:
             self.create_subscription(Joy, "joy", self._on_joy, 1)
-        self.create_timer(1.0 / float(parameter("watchdog_rate", 20.0)), self._watch)
+        rate = float(parameter("watchdog_rate", 20.0))
+        if not 1.0 <= rate <= 1000.0:
+            raise ValueError(f"watchdog_rate = {rate}; expected 1 to 1000 Hz")
+        self.create_timer(1.0 / rate, self._watch)
         self.create_timer(1.0, self._diagnose)
 
     def _now(self) -> int:
@@ -80,13 +87,15 @@ class PolicyNode(Node):
     def _on_picture(self, picture: Any, header: Any) -> None:
         stamp = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
         command = self.pilot.picture(picture, stamp)
-        if command.drives and command.stamp == stamp:
+        if command.drives and command.stamp == stamp != self._sent:
+            self._sent = stamp
             self._publish(command)
 
     def _on_camera_info(self, message: Any) -> None:
         try:
             self.pilot.set_camera(Camera.from_info(message, self._rectified))
         except PictureError as error:
+            self.pilot.no_camera = str(error)
             self.get_logger().error(f"camera_info: {error}", throttle_duration_sec=5.0)
 
     def _on_joy(self, message: Any) -> None:

@@ -71,8 +71,11 @@ class OnnxPolicy:
             raise ValueError(f"{path}: control {control}; expected steering or twist, and numbers in (0, 10]")
         self.name = path.parent.name if path.name == "policy.onnx" else path.stem
         self._actions = 1 if self.action == "steering" else 2
-        (self._input,) = self._session.get_inputs()
-        self.run(np.zeros(self.stack_shape, np.uint8))  # the first run is slow, and fails if the shapes do not fit
+        try:
+            (self._input,) = self._session.get_inputs()
+            self.run(np.zeros(self.stack_shape, np.uint8))  # the first run is slow, and fails if the shapes do not fit
+        except Exception as error:  # as above
+            raise ValueError(f"{path}: its network does not run: {str(error).splitlines()[0]}") from None
 
     @property
     def stack_shape(self) -> tuple[int, int, int]:

@@ -227,8 +227,7 @@ class Rectifier:
 
     def __call__(self, picture: np.ndarray) -> np.ndarray:
         """RGB (h, w, 3) of the camera → RGB of the pinhole camera. Raises PictureError: another size."""
-        height, width = picture.shape[:2]
-        if (width, height) != self.camera.size or picture.shape[2:] != (3,) or picture.dtype != np.uint8:
+        if picture.shape != (*self.camera.size[::-1], 3) or picture.dtype != np.uint8:
             raise PictureError(
                 f"picture {picture.shape} {picture.dtype}; expected {self.camera.size[1]} x {self.camera.size[0]} px "
                 "RGB uint8, as its camera_info says"

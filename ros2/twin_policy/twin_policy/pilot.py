@@ -4,8 +4,8 @@ As in twin's environment, a policy sees a stack of the last few pictures, `times
 picture after standing fills the whole stack. Pictures that come faster are skipped. A *stop* is a command of zeros
 with a *cause*. A stop empties the stack, and the robot rests before the next picture counts as the first of an episode.
 
-A pilot has two clocks: `clock`, which also stamps the pictures, and `steady`, which never jumps. Both return
-nanoseconds. A pilot is not thread-safe.
+A pilot has two clocks: `clock`, which also stamps the pictures, and `steady`, which never jumps; in a simulation both
+are the simulated time. Both return nanoseconds. A pilot is not thread-safe.
 """
 
 import time
@@ -100,11 +100,12 @@ class Pilot:
         """Time from the arrival of the last used picture to its command [s]."""
         self._pinhole, self._clock, self._steady = pinhole or policy.camera, clock, steady
         self._rectifier: Rectifier | None = None
-        self._no_camera = "no camera_info, so pictures cannot be rectified"
+        self.no_camera = "no camera_info, so pictures cannot be rectified"
+        """Cause of stops before the first valid camera."""
         self._offset: int | None = None  # clock − steady [ns]
         self._pressed = 0
         self._is_held = False
-        self._rest_until = steady()
+        self._last = self._rest_until = steady()
         self._command = Command(cause=WAITING)
         self.stack = np.zeros((0, 3, policy.size[1], policy.size[0]), np.uint8)
         """The last pictures, uint8 (0 or stack, 3, height, width), the newest last; empty after a stop."""
@@ -128,16 +129,17 @@ class Pilot:
         try:
             self._rectifier = Rectifier(camera, pinhole)
         except PictureError as error:
-            self._no_camera = str(error)
+            self.no_camera = str(error)
             raise
 
     def press(self, held: bool = True) -> None:
-        """Handles a message of the deadman switch."""
+        """Handles a message of the deadman switch; has no effect if there is none."""
         if held:
             self._pressed = self._steady()
-        elif self._is_held:
-            self._stop(DEADMAN)
+            if self._command.cause == DEADMAN:
+                self._command = Command(cause=WAITING)
         self._is_held = held
+        self._may_drive()
 
     def picture(self, picture: Any, stamp: int) -> Command:
         """Handles a picture with its stamp [ns]: an object with `decode()`, such as RawPicture, or RGB uint8 (h, w, 3).
@@ -157,7 +159,7 @@ class Pilot:
             return self.command()
         if self._rectifier is None:
             self.counts["waiting"] += 1
-            return self._stop(self._no_camera, rest=False)
+            return self._stop(self.no_camera, rest=False)
         try:
             decoded = picture if isinstance(picture, np.ndarray) else picture.decode()
             newest = self._rectifier(decoded).transpose(2, 0, 1)
@@ -196,9 +198,11 @@ class Pilot:
 
     def _may_drive(self) -> bool:
         """False while the robot has to stand. Also stops it if a clock jumped or the deadman switch is not held."""
-        steady, offset = self._steady(), self._clock() - self._steady()
+        steady = self._steady()
+        offset = self._clock() - steady
         jump = 0 if self._offset is None else offset - self._offset
-        self._offset = offset
+        jump = min(steady - self._last, 0) or jump  # simulated time, which is both clocks, may go back
+        self._last, self._offset, self._pressed = steady, offset, min(self._pressed, steady)
         if abs(jump) > self._nanoseconds(self.limits.clock_jump):
             self._stop(f"the clock jumped by {jump * 1e-9:+.2f} s")
         if self.limits.deadman and self._is_held:
