@@ -83,6 +83,10 @@ def test_frames_calibration_and_positions_come_from_the_bag(tmp_path: Path, stor
     assert np.allclose(capture.odometry[:, 2], 0.6)  # the lens above base_link
 
 
+def test_a_folder_named_like_a_bag_of_ros_1(tmp_path: Path) -> None:
+    assert read_contents(write(tmp_path / "drive.bag", whole())).size == (WIDTH, HEIGHT)
+
+
 @pytest.mark.parametrize("encoding", ["bgra8", "png", "jpeg"])
 def test_encodings(tmp_path: Path, encoding: str) -> None:
     bag = write(tmp_path / "drive", whole(encoding))
