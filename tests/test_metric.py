@@ -156,6 +156,16 @@ def test_sources_carried_at_different_heights_agree(tmp_path: Path) -> None:
     assert metrics["scale_per_source_relative"] == pytest.approx([1.0, 1.0], abs=0.02)
 
 
+def test_a_height_of_a_film_that_was_not_placed_is_refused(tmp_path: Path) -> None:
+    film = _path()
+    points = _points(film, np.random.default_rng(2))
+    world = _world(tmp_path / "s", [film, film], points, _similarity(8), heights=(0.0, 1.3))
+    cameras = Cameras.load(world.scene.stage("cameras"))
+    cameras.select(np.array(cameras.sources) == "film0").save(world.scene.stage("cameras"))
+    with pytest.raises(InputError, match=r"no frame was registered of the sources with a camera_height \(film1\)"):
+        world.run(tmp_path / "out")
+
+
 def test_few_road_points_are_reported(tmp_path: Path) -> None:
     film = _path()
     world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0), on_road=8)[:8], _similarity(0))
