@@ -359,6 +359,16 @@ def test_metric_poses_are_taken_as_they_are(tmp_path: Path) -> None:
     assert metrics["scale"] == 1.0 and metrics["gravity_source"] == "poses"
 
 
+def test_georeferenced_poses_are_refused(tmp_path: Path) -> None:
+    """With up = "poses" the world would keep them, and single precision rounds 5,400 km to half a meter."""
+    film = _path()
+    utm = Similarity(1.0, np.eye(3), np.array([5e5, 5.4e6, 0.0]))
+    world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(2)), utm, posed=True)
+    with pytest.raises(InputError, match=r"a camera is 5,400,000 m from the origin \(expected at most 10,000 m\)"):
+        world.run(tmp_path / "out", up="poses", poses_are_metric=True)
+    assert world.run(tmp_path / "out", poses_are_metric=True)["scale"] == 1.0
+
+
 def test_two_scales_are_combined_by_their_uncertainties() -> None:
     a, b = Scale(2.0, 0.01), Scale(2.02, 0.03, {"gps_frames": 7})
     both = combine_scales({"camera_height": a, "gps": b})
