@@ -81,8 +81,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     offset = float(np.abs(cameras.positions).max())
     if given.up == "poses" and offset > _MAX_OFFSET:
         raise InputError(
-            f'metric.up = "poses": a camera is {offset:,.0f} m from the origin (expected at most {_MAX_OFFSET:,.0f} m); '
-            'subtract a common position from all poses, or use metric.up = "ground"'
+            f'metric.up = "poses": a camera is {offset:,.0f} m from the origin (expected at most {_MAX_OFFSET:,.0f} '
+            'm); subtract a common position from all poses, or use metric.up = "ground"'
         )
     cameras.save(out)
     points.save(out)

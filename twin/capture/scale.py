@@ -109,8 +109,8 @@ def scale_from_height(
     if not scales:
         given = ", ".join(name for name, height in own.items() if height > 0)
         raise InputError(
-            f"metric.camera_height: no frame was registered of the sources with a camera_height ({given}); give that of "
-            "the other sources, too, or another scale"
+            f"metric.camera_height: no frame was registered of the sources with a camera_height ({given}); give that "
+            "of the other sources, too, or another scale"
         )
     value = float(np.average(scales, weights=weights))
     layer = road.spread / road.drop / np.sqrt(len(road.points))
