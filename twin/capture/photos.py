@@ -129,7 +129,7 @@ def _time(photo: Any) -> float | None:
         return None
     fraction = str(photo.get(ExifTags.Base.SubsecTimeOriginal) or "").strip("\x00 ")
     seconds = (taken - datetime(1970, 1, 1)).total_seconds()
-    return seconds + (float(f"0.{fraction}") if fraction.isdigit() else 0.0)
+    return seconds + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
 
 
 def _finite(value: Any, missing: float = 0.0) -> float:
