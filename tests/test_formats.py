@@ -158,7 +158,7 @@ def test_nerfstudio_format(tmp_path: Path) -> None:
 def test_a_camera_per_image_overrides_the_shared_one(tmp_path: Path) -> None:
     path = _transforms(tmp_path, _images(tmp_path), fl_x=60.0, w=64, h=48)
     table = json.loads(path.read_text())
-    table["frames"][2] |= {"fl_x": 80.0, "cx": 30.0}
+    table["frames"][2] |= {"fl_x": 80.0, "cx": 30.0, "cy": None}  # null: not given, so the middle of the image
     path.write_text(json.dumps(table))
     lenses = read_transforms(path).lenses
     assert lenses is not None

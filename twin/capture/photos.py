@@ -152,6 +152,10 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
         runtime.log_line(
             f"  {task.path.name}: {images.missing} images are listed but do not exist; the build goes on without them"
         )
+    if images.missing_masks:
+        runtime.log_line(
+            f"  {task.path.name}: {images.missing_masks} masks are listed but do not exist; these images are used whole"
+        )
     lenses = images.lenses
     if lenses and (given := task.given_lens((lenses[0].width, lenses[0].height))):
         lenses = (given,) * len(lenses)
