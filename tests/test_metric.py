@@ -1,6 +1,7 @@
 """Stage `metric`: a reconstruction in a random frame is transformed back to the level, metric world."""
 
 import dataclasses
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -213,6 +214,19 @@ def test_the_road_is_found_below_curbs_and_above_mismatches() -> None:
     assert road is not None and road.reliable
     assert road.drop == pytest.approx(HEIGHT, abs=0.02)
     assert np.mean(np.abs(points[road.points, 2]) < 0.1) > 0.95
+
+
+def test_the_road_of_many_points_takes_little_memory() -> None:
+    rng = np.random.default_rng(0)
+    points = np.stack([rng.uniform(0, 300, 50_000), rng.normal(0, 1, 50_000), rng.normal(0, 0.02, 50_000)], 1)
+    centers = np.stack([np.linspace(0, 300, 300), np.zeros(300), np.full(300, HEIGHT)], 1)
+    tracemalloc.start()
+    try:
+        road = find_road(points, centers, np.array([0.0, 0.0, 1.0]))
+        assert road is not None and len(road.points) > 30_000
+        assert tracemalloc.get_traced_memory()[1] < 30e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_camera_led_around_an_object_has_no_road() -> None:
