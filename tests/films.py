@@ -26,12 +26,15 @@ def write_film(
     pictures: Sequence[np.ndarray],
     times: Sequence[int] | None = None,
     codec: str = "libx264",
+    side: Fraction = Fraction(1),
     **options: str,
 ) -> None:
-    """Writes an SDR film; `times` in milliseconds, by default ten pictures a second."""
+    """Writes an SDR film; `times` in milliseconds, by default ten pictures a second. Pixels are `side` times as wide as
+    high. An MP4 film shows only what is at times of 0 or more, as a film does that a phone has trimmed."""
     height, width = pictures[0].shape[:2]
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options={"avoid_negative_ts": "disabled"}) as container:
         stream = container.add_stream(codec, rate=25 if codec == "mpeg2video" else 10, options=options)
+        stream.codec_context.sample_aspect_ratio = side
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         if times is not None:
             stream.codec_context.time_base = Fraction(1, 1000)

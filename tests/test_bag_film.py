@@ -83,6 +83,10 @@ def test_frames_calibration_and_positions_come_from_the_bag(tmp_path: Path, stor
     assert np.allclose(capture.odometry[:, 2], 0.6)  # the lens above base_link
 
 
+def test_a_folder_named_like_a_bag_of_ros_1(tmp_path: Path) -> None:
+    assert read_contents(write(tmp_path / "drive.bag", whole())).size == (WIDTH, HEIGHT)
+
+
 @pytest.mark.parametrize("encoding", ["bgra8", "png", "jpeg"])
 def test_encodings(tmp_path: Path, encoding: str) -> None:
     bag = write(tmp_path / "drive", whole(encoding))
@@ -294,13 +298,15 @@ BAD = {
 
 def _short() -> list[Recorded]:
     out = pictures(views(SHIFTS), TIMES)
-    out[0].message.step = 100
+    for one in out:
+        one.message.step = 100
     return out
 
 
 def _rubbish() -> list[Recorded]:
     out = pictures(views(SHIFTS), TIMES, "jpeg")
-    out[0].message.data = np.arange(5, dtype=np.uint8)
+    for one in out:
+        one.message.data = np.arange(5, dtype=np.uint8)
     return out
 
 
@@ -341,13 +347,13 @@ def test_a_bag_with_a_hole_is_used_and_said_to_be_damaged(tmp_path: Path, capsys
     file = next(bag.glob("*.mcap"))
     data = file.read_bytes()
     where = [found.start() for found in re.finditer(b"\xff\xd8\xff", data)]
-    for start in where[10:16]:
+    for start in (where[0], *where[10:16]):  # a camera's first picture is often damaged
         data = data[:start] + bytes(500) + data[start + 500 :]
     file.write_bytes(data)
     capture, metrics, _ = captured(tmp_path, [SourceConfig(path="bag")], frames=30)
-    assert len(capture.names) == metrics["sources"]["bag"]["decoded"] == 24
-    assert metrics["sources"]["bag"]["damaged"] == 6
-    assert "bag: damaged; 24 of 30 frames could be decoded" in capsys.readouterr().err
+    assert len(capture.names) == metrics["sources"]["bag"]["decoded"] == 23
+    assert metrics["sources"]["bag"]["damaged"] == 7
+    assert "bag: damaged; 23 of 30 frames could be decoded" in capsys.readouterr().err
 
 
 def test_definitions_in_a_bag_are_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

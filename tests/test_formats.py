@@ -158,7 +158,7 @@ def test_nerfstudio_format(tmp_path: Path) -> None:
 def test_a_camera_per_image_overrides_the_shared_one(tmp_path: Path) -> None:
     path = _transforms(tmp_path, _images(tmp_path), fl_x=60.0, w=64, h=48)
     table = json.loads(path.read_text())
-    table["frames"][2] |= {"fl_x": 80.0, "cx": 30.0}
+    table["frames"][2] |= {"fl_x": 80.0, "cx": 30.0, "cy": None}  # null: not given, so the middle of the image
     path.write_text(json.dumps(table))
     lenses = read_transforms(path).lenses
     assert lenses is not None
@@ -266,6 +266,7 @@ def test_photos_come_in_natural_order(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     assert [path.name for path in read_image_folder(tmp_path).paths] == ["a.JPG", "b9.png", "b10.png"]
     assert natural_key("1a") < natural_key("a1")
+    assert natural_key("5²6.jpg") < natural_key("5²10.jpg")  # `str.isdigit` is true of "²", but `int` refuses it
 
 
 def test_exif_gives_focal_length_place_and_time(tmp_path: Path) -> None:
@@ -274,7 +275,7 @@ def test_exif_gives_focal_length_place_and_time(tmp_path: Path) -> None:
     photo = exif.get_ifd(ExifTags.IFD.Exif)
     photo[ExifTags.Base.FocalLengthIn35mmFilm] = 28
     photo[ExifTags.Base.DateTimeOriginal] = "2024:05:01 12:00:30"
-    photo[ExifTags.Base.SubsecTimeOriginal] = "25"
+    photo[ExifTags.Base.SubsecTimeOriginal] = "2534"
     gps = exif.get_ifd(ExifTags.IFD.GPSInfo)
     gps[ExifTags.GPS.GPSLatitudeRef], gps[ExifTags.GPS.GPSLatitude] = "S", (33.0, 51.0, 36.0)
     gps[ExifTags.GPS.GPSLongitudeRef], gps[ExifTags.GPS.GPSLongitude] = "E", (151.0, 12.0, 0.0)
@@ -283,7 +284,10 @@ def test_exif_gives_focal_length_place_and_time(tmp_path: Path) -> None:
     exif_found = read_exif(tmp_path / "a.jpg")
     assert exif_found.orientation == 6
     np.testing.assert_allclose(exif_found.gps, (-33.86, 151.2, -4.5))
-    assert exif_found.time is not None and exif_found.time % 60 == pytest.approx(30.25)
+    assert exif_found.time is not None and exif_found.time % 60 == pytest.approx(30.2534)
+    data = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "a.jpg").write_bytes(data.replace(b"2534\0", b"\xb2534\0"))  # "²", a digit that is no number
+    assert read_exif(tmp_path / "a.jpg").time % 60 == 30.0
     # 28 mm of a 43.27 mm diagonal is 323.6 of a 500 px diagonal.
     assert exif_found.focal == pytest.approx(28.0 / math.hypot(36, 24) * 500 / 400)
 

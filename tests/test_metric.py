@@ -1,6 +1,7 @@
 """Stage `metric`: a reconstruction in a random frame is transformed back to the level, metric world."""
 
 import dataclasses
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -156,6 +157,16 @@ def test_sources_carried_at_different_heights_agree(tmp_path: Path) -> None:
     assert metrics["scale_per_source_relative"] == pytest.approx([1.0, 1.0], abs=0.02)
 
 
+def test_a_height_of_a_film_that_was_not_placed_is_refused(tmp_path: Path) -> None:
+    film = _path()
+    points = _points(film, np.random.default_rng(2))
+    world = _world(tmp_path / "s", [film, film], points, _similarity(8), heights=(0.0, 1.3))
+    cameras = Cameras.load(world.scene.stage("cameras"))
+    cameras.select(np.array(cameras.sources) == "film0").save(world.scene.stage("cameras"))
+    with pytest.raises(InputError, match=r"no frame was registered of the sources with a camera_height \(film1\)"):
+        world.run(tmp_path / "out")
+
+
 def test_few_road_points_are_reported(tmp_path: Path) -> None:
     film = _path()
     world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(0), on_road=8)[:8], _similarity(0))
@@ -203,6 +214,19 @@ def test_the_road_is_found_below_curbs_and_above_mismatches() -> None:
     assert road is not None and road.reliable
     assert road.drop == pytest.approx(HEIGHT, abs=0.02)
     assert np.mean(np.abs(points[road.points, 2]) < 0.1) > 0.95
+
+
+def test_the_road_of_many_points_takes_little_memory() -> None:
+    rng = np.random.default_rng(0)
+    points = np.stack([rng.uniform(0, 300, 50_000), rng.normal(0, 1, 50_000), rng.normal(0, 0.02, 50_000)], 1)
+    centers = np.stack([np.linspace(0, 300, 300), np.zeros(300), np.full(300, HEIGHT)], 1)
+    tracemalloc.start()
+    try:
+        road = find_road(points, centers, np.array([0.0, 0.0, 1.0]))
+        assert road is not None and len(road.points) > 30_000
+        assert tracemalloc.get_traced_memory()[1] < 30e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_camera_led_around_an_object_has_no_road() -> None:
@@ -347,6 +371,16 @@ def test_metric_poses_are_taken_as_they_are(tmp_path: Path) -> None:
     np.testing.assert_allclose(placed[:, :2], film[:, :2, 3] + [10.0, -4.0], atol=1e-9)
     np.testing.assert_allclose(placed[:, 2], film[:, 2, 3], atol=0.02)
     assert metrics["scale"] == 1.0 and metrics["gravity_source"] == "poses"
+
+
+def test_georeferenced_poses_are_refused(tmp_path: Path) -> None:
+    """With up = "poses" the world would keep them, and single precision rounds 5,400 km to half a meter."""
+    film = _path()
+    utm = Similarity(1.0, np.eye(3), np.array([5e5, 5.4e6, 0.0]))
+    world = _world(tmp_path / "s", [film], _points(film, np.random.default_rng(2)), utm, posed=True)
+    with pytest.raises(InputError, match=r"a camera is 5,400,000 m from the origin \(expected at most 10,000 m\)"):
+        world.run(tmp_path / "out", up="poses", poses_are_metric=True)
+    assert world.run(tmp_path / "out", poses_are_metric=True)["scale"] == 1.0
 
 
 def test_two_scales_are_combined_by_their_uncertainties() -> None:

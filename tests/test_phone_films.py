@@ -1,6 +1,8 @@
 """Films as phones and camcorders make them: HDR, interlaced, HEIC; and what `twin new` says of films."""
 
+import gc
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -12,7 +14,7 @@ from films import HLG, PQ, street, write_film, write_hdr_film
 from twin.capture.film_check import check_film
 from twin.capture.formats import image_files
 from twin.capture.photos import load_photo
-from twin.capture.video import FilmStatistics, format_note, read_film, video_film
+from twin.capture.video import FilmStatistics, damage_note, decode, format_note, read_film, upright, video_film
 from twin.config import CaptureConfig
 from twin.errors import InputError
 from twin.geometry.images import read_image
@@ -86,6 +88,42 @@ def test_frames_of_a_varying_rate_are_taken_by_their_times(tmp_path):
     assert len(kept) == 3 and kept[0] <= 0.12 and kept[1:] == [1.0, 3.0]  # by index they would be 0.04, 1 and 2.04 s
 
 
+def test_a_trimmed_film_is_not_called_damaged(tmp_path):
+    write_film(tmp_path / "phone.mp4", street(20), [100 * k - 800 for k in range(20)], bf="0")
+    got, count, times = read(tmp_path / "phone.mp4")
+    assert len(got) == count.declared == 12 and times[0] == 0.0
+    assert damage_note(tmp_path / "phone.mp4", count) is None
+
+
+def test_a_colon_in_a_films_name_is_no_protocol(tmp_path, monkeypatch):
+    write_film(tmp_path / "a.mp4", street(4))
+    monkeypatch.chdir(tmp_path)
+    path = (tmp_path / "a.mp4").rename("2026-06-01T17:30:00.mp4")
+    assert len(read(path)[0]) == 4 and check_film(path).notes
+
+
+def test_a_film_of_an_unknown_codec_is_refused(tmp_path):
+    path = tmp_path / "a.mp4"
+    write_film(path, street(4))
+    path.write_bytes(path.read_bytes().replace(b"avc1", b"zzzz"))
+    for look in (read, check_film):
+        with pytest.raises(InputError, match=r"a\.mp4: FFmpeg does not know this film's codec; convert it"):
+            look(path)
+
+
+def test_a_frame_is_freed_without_a_garbage_collection(tmp_path):
+    """The collector hardly runs while films are decoded, and a frame of 4K takes 12 MB."""
+    write_film(tmp_path / "a.mp4", street(30))
+    gc.collect()
+    gc.disable()
+    try:
+        for _, frame in decode(tmp_path / "a.mp4", FilmStatistics()):
+            upright(frame)
+        assert sum(isinstance(one, av.VideoFrame) for one in gc.get_objects()) < 10
+    finally:
+        gc.enable()
+
+
 # ---- HEIC
 
 
@@ -147,6 +185,7 @@ def test_what_is_wrong_with_a_film_is_named_with_a_cure(tmp_path):
     assert check_film(tmp_path / "i.mp4").notes == [
         "HDR (HLG): converted to SDR by a fixed curve; turn HDR off for the next film"
     ]
+    assert check(tmp_path / "k.mp4", good, side=Fraction(4, 3)).startswith("pixels are 1.33 times as wide as high")
     write_film(tmp_path / "j.mpg", good, codec="mpeg2video", flags="+ildct+ilme")
     assert any(note.startswith("interlaced: ") for note in check_film(tmp_path / "j.mpg").notes)
 

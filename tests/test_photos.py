@@ -91,6 +91,14 @@ def test_images_of_different_distortions_are_undistorted(tmp_path: Path) -> None
     assert (read_image(out / "images/posed/000000.png") != views([0])[0]).any()
 
 
+def test_a_listed_mask_that_is_missing_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_image(tmp_path / "posed/there.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    _posed(tmp_path, [{"mask_path": "there.png"}, {"mask_path": "gone.png"}, {}], fl_x=150.0)
+    _, _, out = captured(tmp_path, [SourceConfig(path="posed")])
+    assert len(list((out / "masks/posed").iterdir())) == 1
+    assert "posed: 1 masks are listed but do not exist; these images are used whole" in capsys.readouterr().err
+
+
 def test_poses_are_used_only_if_every_source_has_them(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     _posed(tmp_path, [{}] * 3, fl_x=150.0)
     film(tmp_path / "film.mp4", views([5 * i for i in range(6)]))

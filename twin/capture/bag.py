@@ -112,7 +112,7 @@ def open_bag(path: Path, cure: str = "record it anew") -> Iterator[Bag]:
         raise InputError(f"{metadata} has {metadata.stat().st_size:,} bytes; expected at most {_MAX_METADATA:,}")
     with contextlib.ExitStack() as stack:
         with _wrap_errors(path, cure):
-            if path.suffix.lower() == ".bag":
+            if path.suffix.lower() == ".bag" and not path.is_dir():
                 store = get_typestore(Stores.ROS1_NOETIC)
                 store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
                 reader: Any = stack.enter_context(rosbag1.Reader(path))

@@ -81,7 +81,7 @@ class BagContents:
     """Other topics with pictures, which are not used."""
     encoding: str
     size: tuple[int, int]
-    """Width, height of the first picture [px]."""
+    """Width, height of the first undamaged picture [px]."""
     recorded: int
     """Number of pictures according to the bag's index."""
     stamps: NDArray[np.int64]
@@ -129,7 +129,7 @@ class _Rows:
 
 
 def read_contents(path: Path, topic: str = "") -> BagContents:
-    """Reads calibration, positions, extrinsics and stamps of the pictures in a bag; decodes only the first picture.
+    """Reads calibration, positions, extrinsics and stamps of the pictures in a bag; decodes only one picture.
 
     Args:
         topic: Topic of the pictures; empty for the topic with the most pictures.
@@ -140,7 +140,10 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
     """
     with open_bag(path) as bag:
         topics = _topics(bag.connections, path, topic)
-        rows = {kind: _Rows() for kind in topics}
+        where = f"{path}: {topics['pictures']}"
+        picture: Any = None  # the first one that is not damaged
+        problem: InputError | None = None
+        rows = {kind: _Rows() for kind in topics if kind in ("pictures", "fixes", "odometry")}
         first: dict[str, Any] = {}
         transforms: dict[str, tuple[str, Array]] = {}
         kinds = {name: kind for kind, name in topics.items()}
@@ -149,22 +152,27 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
             first.setdefault(kind, message)
             if kind == "transforms":
                 _add_transforms(transforms, message)
-            elif kind != "camera":
+            elif kind == "pictures" and picture is None:
+                try:
+                    height, width = _decoded(candidate := picture_of(message), where).shape[:2]
+                    picture = candidate
+                except InputError as error:
+                    problem = problem or error
+            if kind in rows:
                 rows[kind].times.extend((header_time(message), recorded))
                 rows[kind].values.extend(_values(kind, message))
         recorded = messages_by_topic(bag.connections, (RAW, COMPRESSED))[topics["pictures"]]
         others = tuple(name for name in picture_topics(bag.connections) if name != topics["pictures"])
     if not rows["pictures"].times:
         raise InputError(f"{path}: no message on {topics['pictures']}; record it")
-    where = f"{path}: {topics['pictures']}"
+    if problem is not None and picture is None:
+        raise problem
     times = {
         kind: message_times(np.array(one.times, np.int64).reshape(-1, 2), topics[kind], path)
         for kind, one in rows.items()
         if one.times
     }
     position, stamps = _ordered(times["pictures"], where)
-    picture = picture_of(first["pictures"])
-    height, width = _decoded(picture, where).shape[:2]
     frame = str(first["pictures"].header.frame_id)
     lens, note = _lens(first.get("camera"), topics, frame, (width, height), path)
     camera_to_base = _pose_in_base(transforms, frame)

@@ -16,7 +16,7 @@ import numpy as np
 
 from twin.capture.hdr import NAMES, hdr_transfer
 from twin.capture.static_mask import MIN_FRAMES, static_parts
-from twin.capture.video import FilmTiming, fitted_size, probe, sharpness, upright
+from twin.capture.video import FilmTiming, fitted_size, open_film, probe, sharpness, upright
 from twin.geometry.images import resize
 from twin.types import Array, Image
 
@@ -49,12 +49,18 @@ def check_film(path: Path) -> FilmCheck:
     """Checks a film. Raises InputError: see `probe`."""
     timing = probe(path)
     notes = _timing_notes(timing)
-    frames = _samples(path, "NONKEY")
-    if len(frames) < MIN_FRAMES:
-        frames = _samples(path, "DEFAULT")
-    if not frames:
+    first, small = _samples(path, "NONKEY")
+    if len(small) < MIN_FRAMES:
+        first, small = _samples(path, "DEFAULT")
+    if first is None:
         return FilmCheck([*notes, "no frame can be decoded; copy the film again from the camera"])
-    first = frames[0]
+    with open_film(path) as (_, stream):
+        side = stream.sample_aspect_ratio or 1
+    if side != 1:
+        notes.append(
+            f"pixels are {float(side):.3g} times as wide as high, but the build takes them for square; convert the "
+            "film (ffmpeg -vf scale=iw*sar:ih,setsar=1), or give a calibration with fx and fy"
+        )
     if transfer := hdr_transfer(first):
         notes.append(f"HDR ({NAMES[transfer]}): converted to SDR by a fixed curve; turn HDR off for the next film")
     if first.interlaced_frame:
@@ -63,15 +69,11 @@ def check_film(path: Path) -> FilmCheck:
         )
     if max(first.width, first.height) < _MIN_SIDE:
         notes.append(f"{first.width}x{first.height}: small pictures make a soft twin; film in 1920x1080")
-    small = []
-    for frame in frames:
-        image = upright(frame)
-        size = (image.shape[1], image.shape[0])
-        small.append(np.asarray(resize(image, *fitted_size(*size, _WIDTH)), np.uint8))
     static = static_parts(small)
     mask = None
     if static.mask is not None:
         used = np.where(static.mask, 0, 255).astype(np.uint8)
+        size = upright(first).shape[1::-1]
         mask = np.asarray(cv2.resize(used, size, interpolation=cv2.INTER_NEAREST), np.uint8)
     return FilmCheck(notes + _picture_notes(small), static.note, mask)
 
@@ -94,21 +96,27 @@ def _timing_notes(timing: FilmTiming) -> list[str]:
     return notes
 
 
-def _samples(path: Path, skip: Literal["NONKEY", "DEFAULT"]) -> list[av.VideoFrame]:
-    """Frames spread over the film, fewer than twice `_SAMPLES`; with `skip` = NONKEY only key frames."""
-    found: list[av.VideoFrame] = []
+def _samples(path: Path, skip: Literal["NONKEY", "DEFAULT"]) -> tuple[av.VideoFrame | None, list[Image]]:
+    """The first frame, and upright pictures of frames spread over the film, fewer than twice `_SAMPLES`.
+
+    With `skip` = NONKEY only key frames are decoded. The pictures are `_WIDTH` wide: 120 frames of 4K take 2 GB.
+    """
+    first: av.VideoFrame | None = None
+    small: list[Image] = []
     every = 1
-    with av.open(str(path)) as container:
-        stream = container.streams.video[0]
+    with open_film(path) as (container, stream):
         stream.codec_context.skip_frame = skip
         stream.thread_type = "AUTO"
         with contextlib.suppress(av.error.FFmpegError):  # the frames before the damage suffice for the check
             for number, frame in enumerate(container.decode(stream)):
+                first = first or frame
                 if number % every == 0:
-                    found.append(frame)
-                if len(found) == 2 * _SAMPLES:
-                    found, every = found[::2], 2 * every
-    return found
+                    image = upright(frame)
+                    size = fitted_size(image.shape[1], image.shape[0], _WIDTH)
+                    small.append(np.asarray(resize(image, *size), np.uint8))
+                if len(small) == 2 * _SAMPLES:
+                    small, every = small[::2], 2 * every
+    return first, small
 
 
 def _picture_notes(small: list[Image]) -> list[str]:

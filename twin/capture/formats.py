@@ -178,11 +178,12 @@ class ImageSet:
     camera_to_world: Array | None = None  # OpenCV axes, shape (n, 4, 4); None without poses
     masks: tuple[Path | None, ...] | None = None  # file or None per image; None if the set lists no masks
     missing: int = 0  # number of listed images that do not exist
+    missing_masks: int = 0  # number of listed masks that do not exist
 
 
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that puts `frame10` after `frame9`."""
-    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", text) if part)
+    return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", text) if part)
 
 
 def read_image_folder(folder: Path) -> ImageSet:
@@ -241,7 +242,7 @@ def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageS
         raise InputError(f"{path}: no frames in it; expected a nerfstudio or instant-ngp transforms.json")
     to_original, scale = _undo_world_transform(table, path)
     entries: dict[Path, tuple[Lens, Array, Path | None]] = {}
-    missing = 0
+    missing = missing_masks = 0
     for i, frame in enumerate(frames):
         where = f"{path}: frame {i}"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
@@ -260,6 +261,7 @@ def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageS
         if not isinstance(mask, str | None):
             raise InputError(f"{where}: mask_path = {short_repr(mask)}; expected a path")
         mask_path = path.parent / mask if mask and is_file(path.parent / mask) else None
+        missing_masks += bool(mask) and mask_path is None
         entries.setdefault(file, (lens_from_transforms({**table, **frame}, file, where), world, mask_path))
     if not entries:
         raise InputError(
@@ -274,6 +276,7 @@ def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageS
         np.stack([entries[file][1] for file in files]),
         masks if any(masks) else None,
         missing,
+        missing_masks,
     )
 
 
@@ -300,10 +303,10 @@ def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
     """
 
     def number(key: str, default: float = 0.0) -> float:
-        value = table.get(key, default)
+        value = table.get(key)
         if value is not None and not _is_number(value, _MAX_CAMERA_VALUE):
             raise InputError(f"{where}: {key} = {short_repr(value)}; expected a finite number")
-        return value or 0.0
+        return default if value is None else value
 
     width, height = (round(number("w")), round(number("h"))) if "w" in table and "h" in table else image_size(file)
     fx, fy = number("fl_x"), number("fl_y")

@@ -133,8 +133,8 @@ def _layer(drop: Array, offset: Array, reach: float) -> Road | None:
         return None
     drops, offsets = drop[below], offset[below]
     layers = np.geomspace(np.quantile(drops, 0.01), drops.max(), 400)
-    inside = (np.abs(drops - layers[:, None]) < _LAYER * layers[:, None]) & (offsets < reach * layers[:, None])
-    support = inside.sum(1)
+    # One layer at a time: all at once would take gigabytes for the points of a long road.
+    support = np.array([np.sum((np.abs(drops - h) < _LAYER * h) & (offsets < reach * h)) for h in layers])
     height = float(layers[np.flatnonzero(support >= 0.5 * support.max())[-1]])
     for _ in range(5):  # centers the layer on its median
         chosen = (np.abs(drops - height) < _LAYER * height) & (offsets < reach * height)

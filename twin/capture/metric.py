@@ -31,6 +31,7 @@ from twin.types import Array
 
 _INITIAL_FRACTION = 0.08
 """Fraction of the first source's path, from its start, that gives the initial driving direction."""
+_MAX_OFFSET = 10_000.0  # [m] largest coordinate of a camera; later stages compute in single precision
 _FLOOR_QUANTILE = 0.02  # quantile of the points' heights at which the floor is, if no road is found
 
 
@@ -39,7 +40,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
     Returns the content of `metric.json`, see `_metrics`.
 
-    Raises InputError: the data do not determine the scale.
+    Raises InputError: the data do not determine the scale, or with metric.up = "poses" the origin is far away.
     """
     cameras, points = Cameras.load(scene.stage("cameras")), SparsePoints.load(scene.stage("cameras"))
     capture = Capture.load(scene.stage("capture"))
@@ -77,6 +78,12 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     scale = combine_scales(scales)
     similarity = _level_frame(cameras, up.direction, level, scale.value, east, keep=given.up == "poses")
     cameras, points = cameras.transformed(similarity), points.transformed(similarity)
+    offset = float(np.abs(cameras.positions).max())
+    if given.up == "poses" and offset > _MAX_OFFSET:
+        raise InputError(
+            f'metric.up = "poses": a camera is {offset:,.0f} m from the origin (expected at most {_MAX_OFFSET:,.0f} '
+            'm); subtract a common position from all poses, or use metric.up = "ground"'
+        )
     cameras.save(out)
     points.save(out)
     metrics = _metrics(cameras, points, " + ".join(scales), scale, up, road, floor_source, similarity)

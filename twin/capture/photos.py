@@ -129,7 +129,7 @@ def _time(photo: Any) -> float | None:
         return None
     fraction = str(photo.get(ExifTags.Base.SubsecTimeOriginal) or "").strip("\x00 ")
     seconds = (taken - datetime(1970, 1, 1)).total_seconds()
-    return seconds + (float(f"0.{fraction}") if fraction.isdigit() else 0.0)
+    return seconds + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
 
 
 def _finite(value: Any, missing: float = 0.0) -> float:
@@ -151,6 +151,10 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
     if images.missing:
         runtime.log_line(
             f"  {task.path.name}: {images.missing} images are listed but do not exist; the build goes on without them"
+        )
+    if images.missing_masks:
+        runtime.log_line(
+            f"  {task.path.name}: {images.missing_masks} masks are listed but do not exist; these images are used whole"
         )
     lenses = images.lenses
     if lenses and (given := task.given_lens((lenses[0].width, lenses[0].height))):

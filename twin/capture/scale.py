@@ -77,7 +77,7 @@ def scale_from_height(
     these errors: the tolerance of the given heights, the variation of the reconstructed heights along the path and
     between sources, the error of the up direction, and the height difference of the ground across the path.
 
-    Raises InputError without a road.
+    Raises InputError: no road, or no source with a height has a frame.
     """
     if road is None:
         raise InputError(
@@ -106,6 +106,12 @@ def scale_from_height(
         spreads.append(spread * true_height / height)
         # A road undulates smoothly, so the heights along it count as at most six independent ones.
         sigmas.append(spread / height / np.sqrt(min(count, 6)))
+    if not scales:
+        given = ", ".join(name for name, height in own.items() if height > 0)
+        raise InputError(
+            f"metric.camera_height: no frame was registered of the sources with a camera_height ({given}); give that "
+            "of the other sources, too, or another scale"
+        )
     value = float(np.average(scales, weights=weights))
     layer = road.spread / road.drop / np.sqrt(len(road.points))
     between = float(np.std(scales) / value) if len(scales) > 1 else 0.0

@@ -19,6 +19,7 @@ import av.error
 import av.filter
 import cv2
 import numpy as np
+from av.sidedata.sidedata import SideDataContainer
 from av.sidedata.sidedata import Type as SideData
 from av.video.frame import PictureType
 from numpy.typing import NDArray
@@ -109,7 +110,7 @@ class FilmTiming:
 
     times: Array  # presentation times since the first frame [s], sorted, shape (n,)
     start: float  # time stamp of the first frame in its stream [s]
-    declared: int  # number of frames declared by the container; n if it declares none
+    declared: int  # number of frames that the container declares and shows; n if it declares none
 
     @property
     def interval(self) -> float:
@@ -128,16 +129,17 @@ def probe(path: Path) -> FilmTiming:
     Raises InputError: not a video, or too damaged to have a readable packet.
     """
     times: list[float] = []
+    discarded = 0  # frames before or after the part that an edit list shows, as in a trimmed film
     regular_file(path)
     try:
-        with av.open(str(path)) as container:
-            stream = _video_stream(container, path)
+        with open_film(path) as (container, stream):
             with contextlib.suppress(av.error.FFmpegError):  # the packets before the end of a truncated file suffice
                 for packet in container.demux(stream):
                     stamp = packet.pts if packet.pts is not None else packet.dts
+                    discarded += packet.is_discard
                     if stamp is not None and not packet.is_discard:
                         times.append(float(stamp * packet.time_base))
-            declared = stream.frames
+            declared = stream.frames - discarded
             rate = float(stream.average_rate or 25)
     except InputError:
         raise
@@ -152,7 +154,7 @@ def probe(path: Path) -> FilmTiming:
     at = np.sort(np.array(times))
     if len(at) > 1 and at[-1] == at[0]:  # a raw stream without time stamps
         at = np.arange(len(at)) / rate
-    return FilmTiming(at - at[0], float(at[0]), declared or len(at))
+    return FilmTiming(at - at[0], float(at[0]), declared if declared > 0 else len(at))
 
 
 def frame_index(time: float | None, timing: FilmTiming, last: int) -> int:
@@ -414,8 +416,7 @@ def _intact_frames(path: Path, count: FilmStatistics) -> Iterator[tuple[float | 
     A decoder conceals a damaged frame by a guess and predicts later frames from it. Therefore all frames from a
     damaged one to the next key frame are skipped, and so are the B frames before it that depend on it.
     """
-    with av.open(str(path)) as container:
-        stream = _video_stream(container, path)
+    with open_film(path) as (container, stream):
         stream.thread_type = "AUTO"
         pending: list[av.VideoFrame] = []  # B frames, until the frame that they depend on is decoded without damage
         broken = False
@@ -453,10 +454,17 @@ def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> 
         yield end
 
 
-def _video_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
-    if not container.streams.video:
-        raise InputError(f"{path}: no video stream in this file; give a film, an image folder or a posed image set")
-    return container.streams.video[0]
+@contextlib.contextmanager
+def open_film(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+    """Opens a film file and its first video stream. Raises InputError: no such stream, or none that can be decoded."""
+    # Without the prefix, FFmpeg takes the beginning of a name such as `17:30.mp4` for a protocol.
+    with av.open(f"file:{path}") as container:
+        if not container.streams.video:
+            raise InputError(f"{path}: no video stream in this file; give a film, an image folder or a posed image set")
+        stream = container.streams.video[0]
+        if stream.codec_context is None:
+            raise InputError(f"{path}: FFmpeg does not know this film's codec; convert it to H.264 or H.265")
+        yield container, stream
 
 
 # ---- size and orientation
@@ -472,7 +480,8 @@ def upright(frame: av.VideoFrame) -> Image:
     """A frame as SDR RGB, rotated and mirrored by its display matrix in multiples of 90°."""
     transfer = hdr_transfer(frame)
     image = hdr_to_sdr(frame, transfer) if transfer else np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
-    side = frame.side_data.get(SideData.DISPLAYMATRIX)  # type: ignore[call-overload]
+    # `frame.side_data` would keep the container in the frame, a cycle: many large frames would wait for the collector.
+    side = SideDataContainer(frame).get(SideData.DISPLAYMATRIX)  # type: ignore[call-overload]
     if side is None:
         return image
     matrix = np.frombuffer(bytes(side), np.int32, 9).reshape(3, 3)[:2, :2] / 65536.0
