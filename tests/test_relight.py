@@ -228,6 +228,17 @@ def test_error_names_a_damaged_file(scene):
         path.unlink()
 
 
+def test_a_file_that_is_being_written_is_no_lighting(scene):
+    scene.lightings.mkdir(exist_ok=True)
+    before = added_lightings(scene, 8)
+    partial = scene.lightings / ".afternoon.partial.json"  # see `files.atomic_path`
+    partial.write_text('{"format": 2, "na')
+    try:
+        assert repr(added_lightings(scene, 8)) == repr(before)
+    finally:
+        partial.unlink()
+
+
 def test_lighting_of_format_1_is_stale(scene):
     path = scene.lightings / "early.json"
     path.write_text('{"format": 1, "name": "early", "embedding": [0, 0, 0, 0, 0, 0, 0, 0], "field": "first"}')
