@@ -93,12 +93,12 @@ class Lightings:
 
     @cached_property
     def prior(self) -> appearance_prior.AppearancePrior:
-        """The prior of plausible embeddings. Raises InputError without probes."""
+        """The prior of embeddings that resemble the filmed lightings. Raises InputError without probes."""
         if self.probes is None:
             raise InputError(
                 "this field has no probes to check random lightings; use the baked one, twin.load_scene(SCENE).field()"
             )
-        return appearance_prior.AppearancePrior(self.probes, self.vectors, self.frame_vectors)
+        return appearance_prior.AppearancePrior(self.probes, self.filmed().vectors, self.frame_vectors)
 
     def added(
         self,
