@@ -265,7 +265,19 @@ def test_random_lightings_are_equal_after_loading(tmp_path):
     again = BakedField.load(tmp_path)
     drawn = field.sample_lighting(np.random.default_rng(0))
     assert np.array_equal(drawn, again.sample_lighting(np.random.default_rng(0)))
+    again.add_lightings({"photo": np.full_like(drawn, 0.5)})  # photos change no random lighting
+    assert np.array_equal(drawn, again.sample_lighting(np.random.default_rng(0)))
     assert again.render(Viewpoints.of(camera_at(), K, SIZE), drawn).rgb.shape == (1, SIZE[1], SIZE[0], 3)
+
+
+def test_probes_that_do_not_fit_each_other_are_refused(tmp_path):
+    bare = baked(wall(1.0, 3.0))
+    probes = {"probes.features": np.zeros((5, 15), np.float32), "probes.harmonics": np.zeros((4, 16), np.float32)}
+    baked_of_arrays(LAYOUT, bare.lightings_by_name, {**bare.sections[0].arrays, **bare.networks, **probes}).save(
+        tmp_path
+    )
+    with pytest.raises(InputError, match=r"probes\.harmonics"):
+        BakedField.load(tmp_path)
 
 
 def test_unreadable_baked_field_is_an_input_error(tmp_path):

@@ -216,6 +216,7 @@ def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path):
         ("tiles", tiles + 10**6),
         ("vertices", fields[0].sections[0].arrays["detail.vertices"][:12]),
         ("sides", np.zeros(3)),
+        ("origin", np.array([np.nan, 0.0])),
         ("heights", np.zeros((2, 2, 2), np.float32)),
     ):
         section = BakedSection(fields[0].sections[0].layout, fields[0].sections[0].arrays | {f"detail.{name}": value})

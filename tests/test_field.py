@@ -1,5 +1,7 @@
 """Radiance field: kernels against slow references, analytic scenes, files, names of lightings."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -292,6 +294,30 @@ def test_save_and_load_are_the_identity(field, tmp_path):
 
 def test_loading_from_an_empty_folder_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match=r"field\.json"):
+        RadianceField.load(tmp_path, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("layout", {"log2_table": 20}),
+        ("layout", {"levels": 9}),
+        ("layout", {"hidden": 32}),
+        ("lightings", ["day"]),
+        ("frame_lighting", [0, 0, 2]),
+        ("more_layouts", [{"levels": 9}]),
+    ],
+)
+def test_tensors_that_do_not_fit_the_layout_are_refused(field, tmp_path, key, value):
+    """Kernels would read beyond them."""
+    field.save(tmp_path)
+    head = json.loads((tmp_path / "field.json").read_text())
+    layout = head["layout"]
+    head[key] = {**layout, **value} if key == "layout" else value
+    if key == "more_layouts":
+        head[key] = [{**layout, **value[0]}]
+    (tmp_path / "field.json").write_text(json.dumps(head))
+    with pytest.raises(InputError, match=r"field\.safetensors is damaged"):
         RadianceField.load(tmp_path, "cpu")
 
 

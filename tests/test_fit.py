@@ -17,7 +17,7 @@ from twin.nerf import buffers
 from twin.nerf.appearance import fit_appearance
 from twin.nerf.bake import bake
 from twin.nerf.baked import BakedField
-from twin.nerf.buffers import CameraArrays, single_threaded_torch
+from twin.nerf.buffers import CameraArrays, Workspace, single_threaded_torch
 from twin.nerf.dataset import TrainingPixels, load_frame
 from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
@@ -160,6 +160,25 @@ def test_free_segments_follow_the_path_without_jumps(cameras):
     assert len(free_segments(cameras, 0.0)) == 0
 
 
+@pytest.mark.parametrize("half_extent", [0.0, 0.5])
+def test_free_points_are_near_the_path_also_outside_the_near_box(cameras, half_extent):
+    trainer = Trainer(cameras, SparsePoints.empty(), replace(CONFIG, near_half_extent=half_extent), 0, "cpu")
+    position = 4.0 * trainer._free_points(0, 1000).numpy() - 2.0
+    m = np.maximum(np.abs(position).max(1, keepdims=True), 1.0)
+    layout = trainer.field.sections[0].layout
+    points = position / m / (2.0 - m) * layout.half + layout.centre  # |position| = 2 − 1/|u| outside the near box
+    nearest = cameras.positions[0] + np.clip(points[:, :1] - cameras.positions[0, 0], 0.0, 3.5) * [1.0, 0.0, 0.0]
+    assert np.linalg.norm(points - nearest, axis=1).max() < CONFIG.near_plane + 1e-3
+
+
+def test_no_sample_is_at_the_camera(cameras):
+    trainer = Trainer(cameras, SparsePoints.empty(), replace(CONFIG, near_plane=0.0), 0, "cpu")
+    ws = Workspace(trainer.field.sections[0].layout, 2808, CONFIG.samples, "cpu")
+    trainer.field.sections[0].cast(ws, trainer.arrays, 0, 2808)
+    trainer.field.sections[0].sample(ws, 2807, 1, 0.1, seed=6763)  # the first random number is 0
+    assert ws.distances[2807].min() > 0.0
+
+
 def test_camera_height_is_used_only_if_known_and_constant():
     metric = {"camera_height_median_m": 1.2, "local_height_spread_m": 0.01, "road_reliable": True}
     assert constant_height(metric) == 1.2
@@ -202,6 +221,8 @@ def test_training_learns_the_floor_and_both_lightings(cameras):
     for name in ("day", "night"):
         assert metrics["psnr"][name] > 17.0
         assert metrics["psnr"][name] > metrics["psnr_wrong_lighting"][name] + 3.0
+    small = evaluate(field, cameras, 16)  # too small for SSIM's window
+    assert small["ssim"] == {} and small["psnr"].keys() == {"day", "night"}
     i = int(np.flatnonzero(cameras.held_out)[0])
     result = field.render(Viewpoints.of(cameras.camera_to_world[i : i + 1], K, (WIDTH, HEIGHT)), "day")
     lower = slice(HEIGHT // 2, None)

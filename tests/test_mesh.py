@@ -151,6 +151,15 @@ def test_layout_of_files(made):
     json.dumps(facts, allow_nan=False)
 
 
+def test_coverage_is_unknown_if_no_coarse_node_is_near_the_route():
+    ground = Ground(
+        np.zeros((21, 41)), np.full(2, -10.0), 1.0, np.ones((21, 41), bool), np.zeros((21, 41, 3), np.uint8)
+    )
+    route = np.stack([np.arange(0.0, 20.0, 0.25), np.zeros(80)], 1)
+    assert mesh._roughness(ground, route)["corridor_coverage"] is None
+    assert mesh._roughness(ground, route + np.array([0.0, 2.0]))["corridor_coverage"] == 1.0
+
+
 def test_route_is_the_filmed_line(made):
     route = _load(made[0], "route")["xy"]
     assert np.allclose(route[[0, -1]], [[0, 0], [12, 0]], atol=0.05) and np.abs(route[:, 1]).max() < 0.02

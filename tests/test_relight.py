@@ -19,7 +19,7 @@ from twin.nerf.buffers import Layout
 from twin.nerf.field import RadianceField, untrained_field
 from twin.nerf.fog import Fog, mixed
 from twin.nerf.lightings import AddedLighting, Lightings, added_lightings, check_name
-from twin.relight import PhotoFit, comparison, fit_photo, main
+from twin.relight import PhotoFit, comparison, fit_photo, main, summary
 from twin.report import video_layout
 from twin.report.video_layout import draw_label
 from twin.scene import SceneDir, stage_result, write_stamp
@@ -197,7 +197,7 @@ def test_unusable_input_ends_with_one_line_and_status_2(scene, tmp_path, capsys)
         ([str(tmp_path), photo, "--name", "x"], "no scene.toml"),
         ([str(scene.root), photo, "--name", "x", "--sun", "high"], "--sun high: expected azimuth and elevation"),
         ([str(scene.root), photo, "--name", "x", "--time", "noon"], "--time 'noon': expected date, time and offset"),
-        ([str(scene.root), photo, "--name", "x", "--sun", "120,35"], "a sun needs the build stage mesh"),
+        ([str(scene.root), photo, "--name", "x", "--sun", "120,35"], "has no 4_mesh yet; run python -m twin.build"),
     ):
         assert main([*arguments, "--quiet"]) == 2
         error = capsys.readouterr().err.strip()
@@ -228,6 +228,17 @@ def test_error_names_a_damaged_file(scene):
         path.unlink()
 
 
+def test_a_file_that_is_being_written_is_no_lighting(scene):
+    scene.lightings.mkdir(exist_ok=True)
+    before = added_lightings(scene, 8)
+    partial = scene.lightings / ".afternoon.partial.json"  # see `files.atomic_path`
+    partial.write_text('{"format": 2, "na')
+    try:
+        assert repr(added_lightings(scene, 8)) == repr(before)
+    finally:
+        partial.unlink()
+
+
 def test_lighting_of_format_1_is_stale(scene):
     path = scene.lightings / "early.json"
     path.write_text('{"format": 1, "name": "early", "embedding": [0, 0, 0, 0, 0, 0, 0, 0], "field": "first"}')
@@ -250,6 +261,14 @@ def test_fog_of_a_hazy_photo_is_stored_and_printed(scene, monkeypatch, capsys):
     assert main([str(scene.root), str(scene.root / "photo.png"), "--name", "hazy"]) == 0
     assert "visibility 100 m; without fog those halves have 12.3 dB" in capsys.readouterr().out
     assert added_lightings(scene, 8)[2]["hazy"] == air
+
+
+@pytest.mark.parametrize(("sun", "words"), [(None, "without fog those"), (object(), "without fog and sun those")])
+def test_summary_names_what_the_compared_fit_lacks(sun, words):
+    numbers = "inliers matches reprojection_error_px from_path_m focal_px psnr_nearest psnr_fitted psnr_other_half"
+    figures = dict.fromkeys([*numbers.split(), "psnr_clear_other_half"], 1.0)
+    figures |= {"camera_to_world": np.eye(4).tolist(), "focal_from": "the photo", "nearest": "day"}
+    assert words in summary(AddedLighting("hazy", [], Fog(0.03), "first", "photo.png", figures, sun))
 
 
 def test_lightings_can_be_added():

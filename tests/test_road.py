@@ -246,6 +246,14 @@ def test_section_with_indices_out_of_range_is_refused(tmp_path):
         BakedField.load(tmp_path).render(views(2.9), "day")
 
 
+def test_damaged_detail_is_refused_before_rendering(tmp_path):
+    near, _, both = two_sections()
+    bad = BakedSection(LAYOUT, near.sections[0].arrays | {"detail.sides": np.zeros(3)})
+    BakedField([bad, near.sections[0]], near.lightings_by_name, near.networks, road=both.road).save(tmp_path)
+    with pytest.raises(InputError, match=r"baked\.safetensors"):
+        BakedField.load(tmp_path)
+
+
 # ---- training
 
 

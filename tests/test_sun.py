@@ -18,6 +18,7 @@ from twin.env.irradiance import IrradianceEstimator
 from twin.env.suite import EnvFactory
 from twin.env.weather import Weather
 from twin.errors import InputError
+from twin.files import load_arrays
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import look_at
@@ -260,7 +261,6 @@ def built(tmp_path_factory):
     runtime.set_quiet(True)
     scene = SceneDir(tiny_twin(tmp_path_factory.mktemp("sunny")))
     casters = shadow_casters(scene, twin.load_scene(scene.root).field())
-    assert casters is not None
     day = [float(x) for x in twin.load_scene(scene.root).field().embedding("day")]
     rows = np.array([[0.4] * 3, [0.9] * 3, [0.9] * 3, [0.2] * 3, [0.1] * 3, [0.8, 0.7, 0.5]], np.float32)
     sun = Sun(casters.seen_from(direction(150.0, 30.0)), rows)
@@ -268,6 +268,15 @@ def built(tmp_path_factory):
     AddedLighting("sunny", day, Fog(), result, "photo.png", {}, sun).save(scene)
     AddedLighting("plain", day, Fog(), result, "photo.png", {}).save(scene)
     return twin.load_scene(scene.root)
+
+
+def test_a_damaged_mesh_is_an_input_error(tmp_path):
+    scene = SceneDir(tiny_twin(tmp_path))
+    path = scene.stage("mesh") / "visual.npz"
+    arrays = load_arrays(path)
+    np.savez(path, **arrays | {"faces": arrays["faces"] + 10**6})
+    with pytest.raises(InputError, match=r"visual\.npz"):
+        shadow_casters(scene, twin.load_scene(scene.root).field())
 
 
 SMALL = {"size": (48, 27), "stack": 1}

@@ -38,6 +38,7 @@ from twin.learn.policy import JSON, ONNX, WEIGHTS, find_policy, load_policy
 from twin.loading import Twin, load_scene
 from twin.nerf.baked import section_file, stored_layouts
 from twin.nerf.brick_layout import BrickLayout, samples_read
+from twin.nerf.lightings import lighting_files
 from twin.nerf.road import ROAD_FILE
 from twin.scene import STAGES, SceneDir, Stamp, package_versions, require_stage, stage_result
 
@@ -111,7 +112,7 @@ def pack(
     if positions:
         files["positions.csv"] = _positions(twin)
     field = _add_stages(files, scene, levels)
-    for path in sorted(scene.lightings.glob("*.json")):
+    for path in lighting_files(scene):
         lighting = read_json(path)
         if lighting.get("field") == stage_result(scene, "field"):  # lightings of an older field are left out
             lighting |= {"field": field, "photo": PurePath(str(lighting.get("photo"))).name}

@@ -319,10 +319,10 @@ def relight(
     field = RadianceField.load(scene.stage("field"))
     check_name(name, field.lightings)
     source = find_sun(scene, sun, time, location, heading)
-    has_mesh = (scene.stage("mesh") / "visual.npz").exists()
-    casters = shadow_casters(scene, BakedField.load(scene.stage("field"))) if source and has_mesh else None
-    if source and casters is None:
-        raise InputError("a sun needs the build stage mesh, for its shadows; run twin build SCENE")
+    casters = None
+    if source:
+        require_stage(scene, "mesh")  # before the baked field is read
+        casters = shadow_casters(scene, BakedField.load(scene.stage("field")))
     image, facts = load_photo(photo, None)
     try:
         found = register_photo(image, facts, scene)
@@ -366,7 +366,8 @@ def relight(
 
 def summary(lighting: AddedLighting) -> str:
     f, fog = lighting.figures, lighting.air
-    clear = f"without fog those halves have {f['psnr_clear_other_half']:.1f} dB"
+    neither = " and sun" if lighting.sun else ""
+    clear = f"without fog{neither} those halves have {f['psnr_clear_other_half']:.1f} dB"
     x, y, z = np.array(f["camera_to_world"])[:3, 3]
     return (
         f"registered with {f['inliers']} inliers of {f['matches']} matches at ({x:.2f}, {y:.2f}, {z:.2f}) m, "

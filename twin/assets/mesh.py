@@ -276,5 +276,6 @@ def _roughness(ground: Ground, route: Array | None) -> dict[str, float | None]:
         xy = ground.origin + ground.cell * np.stack(np.meshgrid(*map(np.arange, ground.height.shape[::-1])), -1)
         coarse = (slice(None, None, 4),) * 2
         beside = distance_to_route(route[::4], xy[coarse], 1.5) < 1.5
-        metrics["corridor_coverage"] = float(ground.measured[coarse][beside].mean())
+        # With wide cells no coarse node may be near the route.
+        metrics["corridor_coverage"] = float(ground.measured[coarse][beside].mean()) if beside.any() else None
     return metrics

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from twin.assets.ground import Ground
 from twin.assets.views import Views, render_views
-from twin.files import load_arrays, wrap_read_errors
+from twin.files import load_arrays
 from twin.geometry.cameras import Cameras
 from twin.geometry.shadow_map import ShadowCasters
 from twin.nerf.rendering import RenderableField
-from twin.scene import SceneDir
+from twin.scene import SceneDir, require_stage
 from twin.types import Array
 
 _VIEWS, _WIDTH = 40, 96  # number of rendered poses, and their width [px]
@@ -24,18 +24,11 @@ _LEAST_HEIGHT = 1.0  # [m] lowest height above the ground outside the mesh's box
 _OVERLAP = 0.5  # [m] by which the triangles begin below the top of the mesh's box, and within its sides
 
 
-def shadow_casters(scene: SceneDir, field: RenderableField) -> ShadowCasters | None:
-    """The surfaces of a scene that cast shadows; None if its mesh stage is not built.
-
-    Raises InputError if the mesh is damaged.
-    """
-    stage = scene.stage("mesh")
-    path = stage / "visual.npz"
-    if not path.exists():
-        return None
-    with wrap_read_errors(path, "build the scene again"):
-        data = load_arrays(path)
-        vertices, faces = data["vertices"].astype(np.float64), data["faces"].astype(np.int64)
+def shadow_casters(scene: SceneDir, field: RenderableField) -> ShadowCasters:
+    """The surfaces of a scene that cast shadows. Raises InputError if its mesh is not built or damaged."""
+    stage = require_stage(scene, "mesh")
+    data = load_arrays(stage / "visual.npz")
+    vertices, faces = data["vertices"].astype(np.float64), data["faces"].astype(np.int64)
     views = render_views(field, Cameras.load(scene.stage("metric")), _VIEWS, _WIDTH, _REACH)
     return ShadowCasters(vertices, faces, *rough_triangles(views, Ground.load(stage), vertices))
 

@@ -72,7 +72,6 @@ class BakedSection:
         arrays = load_tensors(self._file)
         with wrap_read_errors(self._file, "build the scene again"):
             check_arrays(self.layout, arrays)
-            Detail.of_arrays(arrays)
         return arrays
 
 

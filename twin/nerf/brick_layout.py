@@ -13,6 +13,7 @@ from twin.files import check_shapes
 from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, HALF_CORNERS
 from twin.nerf.kernels.color_head import HARMONICS
 from twin.nerf.kernels.composite import CHANNELS
+from twin.nerf.surface_features import Detail
 
 _MAX_EMPTY_OPACITY = 0.03  # a cell that blocks at most this share of light counts as empty
 
@@ -142,6 +143,7 @@ def check_arrays(layout: BrickLayout, arrays: dict[str, NDArray]) -> None:
         inside = not len(index) or (index.min() >= 0 and (index < np.array(shape)).all())
         if not inside or len(np.unique(np.ravel_multi_index(tuple(index.T), shape))) < len(index):
             raise ValueError(f"{name}: a brick is outside the grid of {shape} bricks or occurs twice")
+    Detail.of_arrays(arrays)
 
 
 def check_networks(networks: dict[str, NDArray], dim: int) -> None:
@@ -158,6 +160,9 @@ def check_networks(networks: dict[str, NDArray], dim: int) -> None:
         "network.backdrop.0.bias": (background,),
         "network.backdrop.1": (background, CHANNELS - 1),
     }
+    if "probes.features" in networks:
+        count = len(networks["probes.features"])
+        shapes |= {"probes.features": (count, CHANNELS - 1), "probes.harmonics": (count, HARMONICS)}
     check_shapes({name: (networks[name], shape, "f") for name, shape in shapes.items()})
     if hidden % 8 or not hidden:
         raise ValueError(f"the head has {hidden} hidden units; expected a multiple of 8")

@@ -83,7 +83,8 @@ def score_frame(
         # SSIM takes no mask. Copying masked pixels from the frame limits their effect to windows that contain them.
         shown[~mask] = image[~mask]
         side = slice(width // 2, None) if half is left else slice(None, width // 2)
-        ssims.append(ssim(shown[:, side], image[:, side]))
+        if min(height, width // 2) >= _SSIM_WINDOW:
+            ssims.append(ssim(shown[:, side], image[:, side]))
     if baked is not None and len(fitted) == 2:
         out |= _small_scores(baked, camera, image, mask, fitted)
     others = [name for name in field.lightings if name != cameras.lightings[i]]

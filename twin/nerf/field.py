@@ -19,10 +19,11 @@ from safetensors.torch import load_file
 from safetensors.torch import save as to_bytes
 
 from twin.errors import InputError, short_repr
-from twin.files import read_json, regular_file, require_text, wrap_read_errors, write_json
+from twin.files import check_shapes, read_json, regular_file, require_text, wrap_read_errors, write_json
 from twin.geometry.cameras import PosedCameras, intrinsics_for_size
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
+from twin.nerf.brick_layout import check_networks
 from twin.nerf.buffers import (
     CameraArrays,
     Layout,
@@ -382,6 +383,7 @@ class RadianceField:
         path = regular_file(folder / "field.safetensors")
         with wrap_read_errors(path, "build the scene again"):
             tensors = load_file(str(path), device=device)
+            _check_tensors(tensors, layouts, len(names), len(frames), frame_lighting)
             appearance = Appearance(
                 names, frames, frame_lighting, tensors["appearance.vectors"], tensors["appearance.residuals"]
             )
@@ -396,6 +398,29 @@ class RadianceField:
                 for k, layout in enumerate(layouts)
             ]
         return RadianceField(sections, RoadSections.load(folder, len(sections)), appearance, parameters, about)
+
+
+def _check_tensors(
+    tensors: dict[str, torch.Tensor], layouts: Sequence[Layout], lightings: int, frames: int, frame_lighting: NDArray
+) -> None:
+    """Raises ValueError if tensors do not fit the layouts, as a kernel would read beyond them."""
+    first, arrays = layouts[0], {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
+    if len({(layout.levels, layout.hidden) for layout in layouts}) > 1:
+        raise ValueError("the sections have different numbers of levels or hidden units")
+    check_networks(arrays, first.appearance_dim)
+    shapes: dict[str, tuple[int, ...]] = {
+        "network.trunk.0": (first.levels * hashgrid.FEATURES, first.hidden),
+        "network.trunk.1": (first.hidden, volume.CHANNELS),
+        "appearance.vectors": (lightings, first.appearance_dim),
+        "appearance.residuals": (frames, first.appearance_dim),
+    }
+    for k, layout in enumerate(layouts):
+        shapes[f"{_prefix(k)}table"] = (first.levels, 2**layout.log2_table, hashgrid.FEATURES)
+        for name, (shape, _) in zip(("near", "far"), opacity_grid_sizes(layout.near_box), strict=True):
+            shapes[f"{_prefix(k)}grid.{name}"] = shape
+    check_shapes({name: (arrays[name], shape, "f") for name, shape in shapes.items()})
+    if frame_lighting.shape != (frames,) or not np.isin(frame_lighting, np.arange(lightings)).all():
+        raise ValueError(f"frame_lighting is not one of {lightings} lightings for each of {frames} frames")
 
 
 def untrained_field(

@@ -10,6 +10,7 @@ of the field, the lighting is *stale*.
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -92,12 +93,12 @@ class Lightings:
 
     @cached_property
     def prior(self) -> appearance_prior.AppearancePrior:
-        """The prior of plausible embeddings. Raises InputError without probes."""
+        """The prior of embeddings that resemble the filmed lightings. Raises InputError without probes."""
         if self.probes is None:
             raise InputError(
                 "this field has no probes to check random lightings; use the baked one, twin.load_scene(SCENE).field()"
             )
-        return appearance_prior.AppearancePrior(self.probes, self.vectors, self.frame_vectors)
+        return appearance_prior.AppearancePrior(self.probes, self.filmed().vectors, self.frame_vectors)
 
     def added(
         self,
@@ -182,6 +183,11 @@ def check_name(name: str, filmed: tuple[str, ...]) -> None:
         raise InputError(f"--name {name!r}: the place was filmed under a lighting of this name; choose another")
 
 
+def lighting_files(scene: SceneDir) -> list[Path]:
+    """Files of the lightings added to a scene, without those that are being written or whose writer was killed."""
+    return sorted(path for path in scene.lightings.glob("*.json") if not path.name.startswith("."))
+
+
 def added_lightings(
     scene: SceneDir, dim: int
 ) -> tuple[dict[str, Array32], tuple[str, ...], dict[str, Fog], dict[str, Sun]]:
@@ -194,7 +200,7 @@ def added_lightings(
     fogs: dict[str, Fog] = {}
     suns: dict[str, Sun] = {}
     stale = []
-    for path in sorted(scene.lightings.glob("*.json")):
+    for path in lighting_files(scene):
         with wrap_read_errors(path, "fit it again or delete it"):
             head = read_json(path)
             if head["format"] == 1:  # has no fog

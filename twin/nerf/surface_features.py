@@ -88,6 +88,8 @@ class Detail:
             raise ValueError(f"detail.vertices has {rows} rows; expected a power of 2 from 8 on")
         if not (sides > 0.0).all() or named["tiles"].min(initial=0) < 0 or named["tiles"].max(initial=0) >= _MAX_INDEX:
             raise ValueError(f"detail.sides not above 0, or detail.tiles not from 0 to {_MAX_INDEX - 1}")
+        if not np.isfinite(named["origin"]).all():
+            raise ValueError(f"detail.origin = {named['origin'].tolist()}; expected finite numbers")
         height_cell, texel, cell = map(float, sides)
         return Detail(height_cell=height_cell, texel=texel, cell=cell, **named)
 

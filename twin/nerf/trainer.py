@@ -93,6 +93,7 @@ _SHARDS = 4  # shards per batch, see `buffers.py`
 _CELL_PIXELS = 2.0  # projected side of the finest hash cell at the distance of near surfaces [px of a training frame]
 _GROWTH_RANGE = (1.3, 2.2)  # limits of the factor between the cells per axis of consecutive hash levels
 _HIDDEN = 64  # units per hidden layer
+_MIN_NEAR_PLANE = 1e-3  # [m] losses divide by distances along rays, so no sample may be at a camera
 _TRIPLE_SHARE = 0.3  # share of the rays that come in triples, for the plane loss
 _FREE_POINTS = 256  # free points per shard and step
 _NETWORK_RATE = 1e-2  # initial learning rate of networks and embeddings
@@ -180,7 +181,7 @@ class Trainer:
         return Layout(
             near_box.center,
             near_box.half,
-            near_plane=config.near_plane,
+            near_plane=max(config.near_plane, _MIN_NEAR_PLANE),
             levels=config.levels,
             growth=self._growth(near_box),
             log2_table=config.log2_table,
@@ -390,7 +391,9 @@ class Trainer:
         offset *= self.config.near_plane * self.rng.random((n, 1)) ** (1 / 3) / np.linalg.norm(offset, axis=1)[:, None]
         x = pick[:, 0] + (pick[:, 1] - pick[:, 0]) * self.rng.random((n, 1)) + offset
         layout = self.field.sections[section].layout
-        u = (x - np.array(layout.centre)) / np.array(layout.half)  # not contracted: the path is in the near box
+        u = (x - np.array(layout.centre)) / np.array(layout.half)
+        m = np.maximum(np.abs(u).max(1, keepdims=True), 1.0)  # contraction, see `kernels/space.py`
+        u *= (2.0 - 1.0 / m) / m
         return torch.as_tensor((u * 0.25 + 0.5).clip(0.0, 1.0 - 1e-6).astype(np.float32), device=self.device)
 
     def finish(self) -> RadianceField:
