@@ -296,6 +296,14 @@ def test_without_real_trials_statistics_are_missing() -> None:
     assert plan.basis == "twin" and plan.more_for_winner is not None and plan.more_for_winner > 0
 
 
+def test_days_of_a_single_policy_do_not_change_a_plan_from_the_twin() -> None:
+    """With one driven policy, the plan assumes the twin's rates: one lighting, whatever the number of real days."""
+    twin = [Cell(f"p{i}", "straight", "held-out", 50, won) for i, won in enumerate((15, 27, 31, 27, 41))]
+    days = [Cell("p0", "straight", day, 5, 2, "held-out") for day in ("monday", "tuesday")]
+    one, two = (make_forecast("road", twin, days[:k]).plans for k in (1, 2))
+    assert one == two and one[0].basis == "twin"
+
+
 def test_the_next_trials_are_of_policies_that_may_be_best_or_were_not_driven() -> None:
     twin, real = cells(n=9, driven=7)
     made = make_forecast("road", twin, real)

@@ -343,7 +343,7 @@ def _allocation(task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int
     if len(policies) < 2:
         return TrialAllocation(task, len(policies), basis, None, None, 0, 0)
     rows = [[c for c in cells if c.policy == policy] for policy in policies]
-    by_day = on_road or len({c.lighting for c in real}) > 1
+    by_day = on_road or (bool(real) and len({c.lighting for c in twin}) > 1)  # as in `_candidates`
     rates = _sampled_rates(rows, by_day, np.random.default_rng([seed, 3]))
     now = ranking.expected_confidence(rates, 0, seed, on_road)
     more = [ranking.trials_needed(rates, what, seed, on_road) for what in ("winner", "order")]
