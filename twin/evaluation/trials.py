@@ -134,6 +134,23 @@ def cells_csv(cells: Iterable[Cell]) -> str:
     return csv_text(CELL_COLUMNS, rows)
 
 
+def recorded_trials(table: Path, out: Path) -> list[Trial]:
+    """The real trials in `table`, if it exists.
+
+    Raises InputError: the results table `out` has further trials, which `write_real_trials` would lose.
+    """
+    known = read_trials(table) if table.exists() else []
+    explained = {cell.key: cell for cell in tally(known)}
+    for key, (trials, _) in (read_counts(out) if out.exists() else {}).items():
+        mine = explained[key].trials if key in explained else 0
+        if trials > mine:
+            raise InputError(
+                f"{out}: {trials} trials of {key[0]} under {key[2]}, of which {table.name} has {mine}; give another "
+                "--out, and join the two by hand"
+            )
+    return known
+
+
 def write_real_trials(
     trials: Sequence[Trial],
     table: Path,
