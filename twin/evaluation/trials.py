@@ -163,11 +163,8 @@ def write_real_trials(
     Cells that are already in `out` keep their `twin_lighting` and `SETUP_COLUMNS`. For other cells, `setup`, if given,
     returns the values of `SETUP_COLUMNS` for a lighting's name.
     """
-    known: dict[tuple[str, str, str], dict[str, str]] = {}
-    if out.exists():
-        with wrap_read_errors(out, "give another --out"):
-            for row in csv.DictReader(io.StringIO(read_text(out), newline="")):
-                known[row["policy"], row["task"], row["lighting"]] = row
+    recorded = _rows(out, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS) if out.exists() else ()
+    known = {(row["policy"], row.get("task", ""), row["lighting"]): row for _, row in recorded}
     rows = []
     for c in tally(trials):
         new = {"twin_lighting": twin_lighting}
