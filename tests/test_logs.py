@@ -96,7 +96,11 @@ def test_csv_and_npz_are_the_same_log(drive, tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("", "no row of numbers"), ("time,x\n", "no row of numbers"), ("time,x,,x,\n0,1,,2,\n", "column x appears 2 times")],
+    [
+        ("", "no row of numbers"),
+        ("time,x\n", "no row of numbers"),
+        ("time,x,,x,\n0,1,,2,\n", "column x appears 2 times"),
+    ],
 )
 def test_bad_tables_are_refused(text, message, tmp_path):
     (tmp_path / "log.csv").write_text(text)

@@ -296,7 +296,9 @@ def test_results_from_elsewhere_are_not_overwritten(gray, tmp_path):
     """The user's own results, written by hand: `drive` would replace them by its own rows."""
     out = tmp_path / "real.csv"
     out.write_text(text := "policy,lighting,trials,successes,twin_lighting\nmine,monday,10,8,held-out\n")
-    with pytest.raises(InputError, match=r"10 trials of mine under monday, of which real_trials\.csv has 0; give another"):
+    with pytest.raises(
+        InputError, match=r"10 trials of mine under monday, of which real_trials\.csv has 0; give another"
+    ):
         real_test.run([written(tmp_path / "left", 0.9)], "straight", ["rain"], 1, out)
     assert out.read_text() == text
 

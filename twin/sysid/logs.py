@@ -226,7 +226,9 @@ def _read_csv(path: Path) -> dict[str, Array]:
     names = [name.strip() for name in head]
     twice = [name for name, count in Counter(names).items() if name and count > 1]
     if twice:
-        raise InputError(f"{path}: column {twice[0]} appears {names.count(twice[0])} times; expected once; rename the others")
+        raise InputError(
+            f"{path}: column {twice[0]} appears {names.count(twice[0])} times; expected once; rename the others"
+        )
     return {name: values[:, i] for i, name in enumerate(names)}
 
 
