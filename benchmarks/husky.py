@@ -153,7 +153,8 @@ def main() -> int:
     parser = record_parser(__doc__)
     parser.add_argument("--scene", type=Path, help="a built scene")
     kinds = "row ids such as B6; `controls` for the negative controls; `speed` for the simulation speed"
-    parser.add_argument("--only", nargs="+", metavar="ID", help=kinds)
+    ids = (*" ".join(MEASURES).split(), "controls", "speed")
+    parser.add_argument("--only", nargs="+", choices=ids, metavar="ID", help=kinds)
     arguments = parser.parse_args()
 
     def wanted(*names: str) -> bool:

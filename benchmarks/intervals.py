@@ -363,6 +363,8 @@ def main() -> int:
     parser.add_argument("--shapes", nargs="+", default=[], help="beginnings of the names of shapes (default: all)")
     given = parser.parse_args()
     shapes = {k: v for k, v in SHAPES.items() if not given.shapes or k.startswith(tuple(given.shapes))}
+    if not shapes:
+        parser.error(f"no shape begins with {' or '.join(given.shapes)}; there are {', '.join(SHAPES)}")
     record: dict[str, Any] = {"worlds": given.worlds, "shapes": {}}
     heads: list[str] = []
     for name, shape in shapes.items():

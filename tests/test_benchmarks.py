@@ -3,6 +3,7 @@
 `test_end_to_end.py` runs the benchmarks that need a built scene.
 """
 
+import importlib
 import json
 import subprocess
 import sys
@@ -109,6 +110,14 @@ def test_the_husky_table_is_printed_and_written(tmp_path):
     assert [row["id"] for row in rows] == ["A1", "B4", "B5", "B5"] and all(row["passed"] for row in rows)
     assert rows[-1]["high"] is None and rows[-1]["low"] == 0.0  # an open limit
     assert done.stdout.count(" pass\n") == 4 and "motor power / dissipated power" in done.stdout
+
+
+@pytest.mark.parametrize(("script", "option"), [("husky", "--only"), ("intervals", "--shapes")])
+def test_a_run_that_would_measure_nothing_is_refused(scripts, monkeypatch, capsys, script, option):
+    monkeypatch.setattr(sys, "argv", [script, option, "b6"])
+    with pytest.raises(SystemExit) as stop:
+        importlib.import_module(script).main()
+    assert stop.value.code == 2 and "b6" in capsys.readouterr().err
 
 
 def test_more_bodies_are_fewer_steps_per_second(scripts):

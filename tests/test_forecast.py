@@ -17,7 +17,15 @@ from twin.evaluation.agreement import OTHERS, SHUFFLED, TWIN, Estimate
 from twin.evaluation.forecasting import ALL_TASKS, Forecast, make_forecast
 from twin.evaluation.jackknife import STATISTICS as WITH_INTERVAL
 from twin.evaluation.jackknife import jackknife_interval, pair_cells
-from twin.evaluation.statistics import MIN_POLICIES, mean_rate, mmrv, pearson, rate_difference, spearman
+from twin.evaluation.statistics import (
+    MIN_POLICIES,
+    mean_rate,
+    mmrv,
+    pearson,
+    prediction_powered_mean,
+    rate_difference,
+    spearman,
+)
 from twin.evaluation.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
 from twin.forecast import forecast, main
 from twin.report import forecast_report
@@ -172,6 +180,22 @@ def test_policies_not_driven_are_predicted_from_the_others() -> None:
     assert group.mean_real.n == 9 and group.corrected_coverage.missing  # six others are too few for intervals
 
 
+def test_a_lighting_compared_with_more_days_counts_more_for_policies_not_driven_too() -> None:
+    """Three sunny days and one night, on which the road equals the twin: the line is the diagonal."""
+    won = {"sun": (20, 24, 30, 34, 38, 44, 48), "night": (2, 10, 4, 16, 8, 12, 20)}
+    twin = [Cell(f"p{i}", "straight", light, 50, won[light][i]) for i in range(7) for light in won]
+    twin += [Cell(name, "straight", light, 50, won[light][3]) for name in ("new", "other") for light in won]
+    days = {"monday": "sun", "tuesday": "sun", "friday": "sun", "friday night": "night"}
+    real = [Cell(f"p{i}", "straight", d, 50, won[of][i], of) for i in range(7) for d, of in days.items()]
+    made = make_forecast("road", twin, real)
+    new = next(c for c in made.candidates if c.policy == "new")
+    assert new.twin.value == pytest.approx(0.5) and new.corrected.value == pytest.approx((3 * 34 + 16) / 200)
+    over_days = [(3 * won["sun"][i] + won["night"][i]) / 200 for i in range(7)]
+    twin_only = [over_days[3]] * 2
+    expected = prediction_powered_mean(twin=over_days, real=over_days, twin_only=twin_only).value
+    assert made.groups[0].mean_real.value == pytest.approx(expected)
+
+
 def test_a_group_of_all_tasks_combines_those_of_the_tasks() -> None:
     twin, real = cells(tasks=("straight", "right_turn"))
     made = make_forecast("road", twin, real)
@@ -294,6 +318,14 @@ def test_without_real_trials_statistics_are_missing() -> None:
     assert any("unknown how well the twin ranks" in caution.what for caution in limitations(made))
     (plan,) = made.plans
     assert plan.basis == "twin" and plan.more_for_winner is not None and plan.more_for_winner > 0
+
+
+def test_days_of_a_single_policy_do_not_change_a_plan_from_the_twin() -> None:
+    """With one driven policy, the plan assumes the twin's rates: one lighting, whatever the number of real days."""
+    twin = [Cell(f"p{i}", "straight", "held-out", 50, won) for i, won in enumerate((15, 27, 31, 27, 41))]
+    days = [Cell("p0", "straight", day, 5, 2, "held-out") for day in ("monday", "tuesday")]
+    one, two = (make_forecast("road", twin, days[:k]).plans for k in (1, 2))
+    assert one == two and one[0].basis == "twin"
 
 
 def test_the_next_trials_are_of_policies_that_may_be_best_or_were_not_driven() -> None:

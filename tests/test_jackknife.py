@@ -15,11 +15,10 @@ from twin.evaluation.jackknife import (
     PairedCells,
     jackknife_interval,
     mean_difference_interval,
-    mean_over_tasks,
     pair_cells,
     place_interval,
 )
-from twin.evaluation.statistics import UndefinedStatistic, spearman_batched, winner_batched
+from twin.evaluation.statistics import UndefinedStatistic, spearman_batched
 from twin.evaluation.trials import Cell
 
 TWIN = [
@@ -187,13 +186,6 @@ def test_differences_of_setups_are_paired() -> None:
         mean_difference_interval(differences[:4])
     with pytest.raises(UndefinedStatistic, match="all pairs differ by the same"):
         mean_difference_interval(np.full(6, 0.5))
-
-
-def test_statistics_within_tasks_are_averaged() -> None:
-    twin, real = np.array([[0.9], [0.1], [0.2], [0.3]]), np.array([[0.5], [0.8], [0.1], [0.4]])
-    data = replace(cells_of(twin, real), strata=(np.array([0, 1]), np.array([2, 3])))
-    agreement, regret = mean_over_tasks(winner_batched, data)
-    assert float(agreement) == 0.5 and float(regret) == pytest.approx(0.15)
 
 
 # ---- coverage

@@ -86,12 +86,26 @@ def test_a_log_with_too_few_turns_is_refused(tmp_path):
 
 def test_csv_and_npz_are_the_same_log(drive, tmp_path):
     np.savez(tmp_path / "log.npz", **drive)
-    one = logs.read_log(write_csv(tmp_path / "log.csv", drive))
+    one = logs.read_log(write_csv(tmp_path / "log.CSV", drive))
     other = logs.read_log(tmp_path / "log.npz")
     assert np.array_equal(one.poses, other.poses)
     assert np.array_equal(one.wheels, other.wheels)
     assert one.follows[1:].all()
     assert len(one) == 74
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no row of numbers"),
+        ("time,x\n", "no row of numbers"),
+        ("time,x,,x,\n0,1,,2,\n", "column x appears 2 times"),
+    ],
+)
+def test_bad_tables_are_refused(text, message, tmp_path):
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(InputError, match=message):
+        logs.read_log(tmp_path / "log.csv")
 
 
 def test_nothing_in_an_npz_runs_code(tmp_path):

@@ -1,5 +1,7 @@
 """The ranking: probabilities against closed forms, coverage of intervals, numbers of further trials."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -109,6 +111,15 @@ def test_no_more_trials_than_the_maximum_are_needed(needed: float, monkeypatch: 
 
     monkeypatch.setattr(ranking, "expected_confidence", confidence)
     assert trials_needed(of((5, 10), (6, 10)), "winner", 0) == (needed if needed <= MAX_TRIALS else None)
+
+
+def test_memory_grows_in_proportion_to_the_policies() -> None:
+    rates = of(*((k % 11, 10) for k in range(80)), samples=1000)
+    tracemalloc.start()
+    expected_confidence(rates, 20, 0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 12 * rates.nbytes
 
 
 def test_equal_policies_need_no_order() -> None:

@@ -304,6 +304,17 @@ def test_results_are_a_file(tmp_path, monkeypatch):
     assert [one.name for one in tmp_path.iterdir()] == ["left"]
 
 
+def test_results_from_elsewhere_are_not_overwritten(gray, tmp_path):
+    """The user's own results, written by hand: `drive` would replace them by its own rows."""
+    out = tmp_path / "real.csv"
+    out.write_text(text := "policy,lighting,trials,successes,twin_lighting\nmine,monday,10,8,held-out\n")
+    with pytest.raises(
+        InputError, match=r"10 trials of mine under monday, of which real_trials\.csv has 0; give another"
+    ):
+        real_test.run([written(tmp_path / "left", 0.9)], "straight", ["rain"], 1, out)
+    assert out.read_text() == text
+
+
 def test_another_file_under_a_known_name_is_refused(gray, tmp_path):
     left = written(tmp_path / "left", 0.9)
     real_test.run([left], "straight", ["rain"], 1, tmp_path / "results.csv")

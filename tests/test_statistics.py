@@ -19,7 +19,6 @@ from twin.evaluation.statistics import (
     spearman_batched,
     wilson,
     winner,
-    winner_batched,
 )
 
 
@@ -186,8 +185,6 @@ def test_rows_are_the_same_statistics() -> None:
             else:
                 assert got[i] == pytest.approx(one(twin=twin[i], real=real[i]))
     assert np.isnan(pearson_batched(twin=twin, real=real)[3])
-    agreement, regret = winner_batched(twin=twin, real=real)
-    assert (agreement[5], regret[5]) == winner(twin=twin[5], real=real[5])
 
 
 # ---- simulated coverage; 20,000 experiments: Monte-Carlo error 0.002, three times that is allowed beyond the rule

@@ -264,6 +264,20 @@ def test_bad_bags_are_refused_in_one_line(place, tmp_path, kind, capsys):
     assert not (tmp_path / "real.csv").exists()
 
 
+@pytest.mark.parametrize(
+    ("kind", "topic"), [("pictures", "/odom"), ("camera", "/odom"), ("poses", "/joy_vel"), ("commands", "/odom")]
+)
+def test_a_topic_of_another_kind_is_refused(kind, topic, tmp_path):
+    stamps = [START + k * STEP for k in range(3)]
+    twists = [command(0.5, 0.0, stamp) for stamp in stamps]
+    messages = [camera_info((30.0, 30.0, 32.0, 18.0), (64, 36), START), image(np.zeros((36, 64, 3), np.uint8), START)]
+    messages += [*twists, *(odometry(np.eye(4), stamp) for stamp in stamps)]
+    bag = write(tmp_path / "bag", messages + [replace(one, topic="/joy_vel") for one in twists])
+    assert len(read_trial(bag).poses) == 3
+    with pytest.raises(InputError, match=rf"{topic} \({kind}\) has \w+/msg/\w+; expected \w+/msg/\w+"):
+        read_trial(bag, {kind: topic})
+
+
 def test_missing_and_foreign_files_are_refused_in_one_line(place, tmp_path):
     with pytest.raises(InputError, match="no such bag"):
         read_trial(tmp_path / "none")

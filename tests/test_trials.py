@@ -16,6 +16,7 @@ from twin.evaluation.trials import (
     read_results,
     read_trials,
     tally,
+    write_real_trials,
 )
 
 TRIALS = [
@@ -46,6 +47,12 @@ def test_trials_are_read_as_written(tmp_path: Path) -> None:
         Cell("nerf", "straight", "sun", 2, 1),
         Cell("runs/a, b", "straight", "sun:night:0.3", 1, 0),
     ]
+
+
+def test_a_results_table_with_spaces_after_its_commas_is_continued(tmp_path: Path) -> None:
+    out = write(tmp_path, "policy, lighting, trials, successes, task, twin_lighting\nnerf, sun, 1, 1, straight, noon\n")
+    write_real_trials(TRIALS[:2], tmp_path / "t.csv", out, "sun")
+    assert out.read_text() == "policy,lighting,trials,successes,task,twin_lighting\nnerf,sun,2,1,straight,noon\n"
 
 
 def test_cells_have_their_interval() -> None:

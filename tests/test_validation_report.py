@@ -11,6 +11,7 @@ import pytest
 from films import video_info
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from test_forecast import Text
 from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
@@ -18,7 +19,7 @@ from tiny_twin import tiny_twin
 from twin import film, runtime, validate
 from twin.errors import InputError
 from twin.evaluation.statistics import rate_summary
-from twin.evaluation.training_curves import binned_rates, training_summaries
+from twin.evaluation.training_curves import binned_rates, plot_success_curve, training_summaries
 from twin.evaluation.trials import EPISODE_COLUMNS, RECENT_EPISODES, Trial, csv_text, read_trials
 from twin.files import digest_file, write_json
 from twin.report.figures import SERIES
@@ -326,13 +327,17 @@ def test_any_policy_can_be_filmed_in_the_environment_it_asks_for(fresh, episodes
     assert capsys.readouterr().err.startswith("error: no policy nobody")
 
 
-@pytest.mark.parametrize("count", [1, 4, 24, 1000])
+@pytest.mark.parametrize("count", [1, 4, 27, 1000])
 def test_a_curve_has_points_of_five_episodes_and_no_more_than_it_can_show(count):
     won = np.arange(count) % 3 == 0
     points = binned_rates(np.arange(count), won)
     assert sum(n for _, _, n, _, _ in points) == count and sum(k for _, k, _, _, _ in points) == won.sum()
     assert all(n >= min(5, count) and low - 1e-9 <= k / n <= high + 1e-9 for _, k, n, low, high in points)
     assert len(points) == min(25, max(1, count // 5))
+    axes = Figure().subplots()
+    plot_success_curve(axes, np.arange(count), won, SERIES[0])
+    sizes = "5 to 6" if count == 27 else str(points[0][2])
+    assert axes.lines[0].get_label() == f"{count} episodes, {sizes} per point"
 
 
 def test_a_robot_without_identified_parameters_gives_a_caution():

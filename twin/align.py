@@ -86,12 +86,11 @@ def align_to_log(
 
 def _windows(target: str, log: Path) -> Windows:
     """The time windows of a log. If it is a bag that the scene was built from, reconstructed poses can be used."""
-    root = Path(target).parent if Path(target).name == "scene.toml" else Path(target)
     if not is_bag(log):
         return read_log(log)
     from twin.sysid.ros_bags import filmed_poses, read_bag
 
-    scene = SceneDir(root)
+    scene = SceneDir(_scene_root(target))
     filmed = filmed_poses(scene, load_config(scene.config_file), log) if scene.config_file.exists() else None
     return cut_windows(read_bag(log, filmed), str(log))
 
@@ -104,7 +103,7 @@ def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalib
     """
     from twin.sysid.camera_extrinsics import calibrate_camera, write_camera_comparison
 
-    root = Path(target).parent if Path(target).name == "scene.toml" else Path(target)
+    root = _scene_root(target)
     scene = SceneDir(root)
     if not scene.config_file.exists():
         raise InputError(f"{target}: a film needs a built scene to be localized in; give the scene's folder")
@@ -137,10 +136,15 @@ def _robot(target: str) -> tuple[HuskyParams, dict[str, Any], Path | None]:
     if path.name.endswith(".toml") and path.is_file() and path.name != "scene.toml":
         kept = read_robot(path)
         return parse_table(HuskyParams, kept, str(path)), kept, path.parent
-    root = path.parent if path.name == "scene.toml" else path
+    root = _scene_root(target)
     if not SceneDir(root).config_file.exists():
         raise InputError(f"{target}: no scene.toml there; give a scene's folder, a robot.toml, or `{PUBLISHED_ROBOT}`")
     return load_config(SceneDir(root).config_file).robot, read_robot(root / ROBOT_TOML), root
+
+
+def _scene_root(target: str) -> Path:
+    path = Path(target)
+    return path.parent if path.name == "scene.toml" else path
 
 
 def _check_writable(folder: Path, cure: str = "give another folder with --out") -> None:

@@ -31,7 +31,7 @@ from twin.config import Condition
 from twin.env.suite import EnvFactory
 from twin.errors import InputError
 from twin.evaluation.trial_judge import JudgedTrial, TrialViews, judge, replay, view
-from twin.evaluation.trials import Trial, read_counts, read_trials, tally, write_real_trials
+from twin.evaluation.trials import Trial, recorded_trials, write_real_trials
 from twin.files import write_json
 from twin.learn.policy import Policy, find_policy, load_policy
 from twin.loading import load_scene
@@ -85,7 +85,7 @@ def record_trial(
     recording = read_trial(bag, topics)
     out = out or root / "real.csv"
     table = out.with_name(f"{out.stem}_trials.csv")
-    known = _known_trials(table, out)
+    known = recorded_trials(table, out)
     compared = twin_lighting or lighting
     factory = EnvFactory.open(scene, task, policy.options())
     if factory.field is None:
@@ -125,20 +125,6 @@ def record_trial(
     write_json(folder / "trial.json", figures)
     write_real_trials([*(one for one in known if one.key != row.key), row], table, out, compared)
     return row, figures, folder
-
-
-def _known_trials(table: Path, out: Path) -> list[Trial]:
-    """The trials recorded so far. Raises InputError: `out` has further trials, which would be lost."""
-    known = read_trials(table) if table.exists() else []
-    explained = {cell.key: cell for cell in tally(known)}
-    for key, (trials, _) in (read_counts(out) if out.exists() else {}).items():
-        mine = explained[key].trials if key in explained else 0
-        if trials > mine:
-            raise InputError(
-                f"{out}: {trials} trials of {key[0]} under {key[2]}, of which {table.name} has {mine}; give another "
-                "--out, and join the two by hand"
-            )
-    return known
 
 
 class _PolicyOfPictures:

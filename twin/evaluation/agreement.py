@@ -20,7 +20,6 @@ from twin.evaluation.jackknife import (
     Statistic,
     jackknife_interval,
     mean_bias,
-    mean_over_tasks,
     pair_cells,
     policy_rows,
 )
@@ -50,7 +49,7 @@ from twin.evaluation.statistics import (
     prediction_powered_mean,
     rate_difference,
     spearman,
-    winner_batched,
+    winner,
 )
 from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
@@ -254,9 +253,11 @@ def _with_interval(value: float, statistic: Statistic, data: PairedCells, n: int
 def _winner(data: PairedCells) -> dict[str, Any]:
     """Agreement and regret of the twin's best policy, as means over tasks with two policies or more."""
     n, names = data.policies, ("winner_agreement", "winner_regret")
-    if all(len(members) < 2 for members in data.strata):
+    rates = data.rates()
+    each = [winner(twin=rates["twin"][of], real=rates["real"][of]) for of in data.strata if len(of) > 1]
+    if not each:
         return dict.fromkeys(names, Estimate(n=n, missing="no task has two policies"))
-    values = mean_over_tasks(winner_batched, data)
+    values = np.mean(each, 0)
     return {k: Estimate(float(v), n=n, no_interval=_MAXIMUM) for k, v in zip(names, values, strict=True)}
 
 

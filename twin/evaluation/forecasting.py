@@ -6,6 +6,7 @@ candidate is *driven* if it has real trials. A *day* is a lighting of the real t
 its checkpoints. `agreement` compares the driven candidates of one task, or of all tasks, with the twin.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -65,7 +66,8 @@ class Candidate:
     real_ranks: tuple[float, ...]
     """Probability of each rank on the road among driven candidates; empty unless this and another one are driven."""
     corrected: Estimate
-    """Real rate, predicted from its twin score and the rates of the driven candidates of other trainings."""
+    """Real rate, predicted from its twin rates, in which each lighting counts as often as real days are compared with
+    it, and from the rates of the driven candidates of other trainings."""
     trained: Estimate = _NOT_KNOWN
     """Success rate in the last training episodes before the policy was saved."""
 
@@ -177,20 +179,26 @@ def make_forecast(
     tasks = tuple(dict.fromkeys(cell.task for cell in twin))
     found = {cell.key: cell for cell in twin}
     candidates: list[Candidate] = []
-    comparable: list[Candidate] = []
+    further: list[float] = []
     groups, left_out, allocations = [], [], []
     for task in tasks:
         task_twin, task_real = ([cell for cell in cells if cell.task == task] for cells in (twin, real))
         task_candidates, lightings = _candidates(task, task_twin, task_real, seed)
         if task_real:
-            task_comparable = [c for c in task_candidates if set(c.lightings) == set(lightings)]
-            groups.append(measure_agreement(task, task_real, found, _undriven_scores(task_comparable)))
-            comparable += task_comparable
+            rows = [
+                [found[c.policy, task, name] for name in lightings]
+                for c in task_candidates
+                if not c.driven and set(c.lightings) == set(lightings)
+            ]
+            days = _days_by_lighting(task_real)
+            task_further = [_score_over_days(row, days) for row in rows]
+            groups.append(measure_agreement(task, task_real, found, task_further))
+            further += task_further
             left_out += _left_out(task, task_real, found)
         allocations.append(_allocation(task, [c for c in task_twin if c.lighting in lightings], task_real, seed))
         candidates += [replace(c, trained=(trained or {}).get((c.policy, task), c.trained)) for c in task_candidates]
     if len(groups) > 1:
-        groups.append(measure_agreement(ALL_TASKS, real, found, _undriven_scores(comparable)))
+        groups.append(measure_agreement(ALL_TASKS, real, found, further))
     return Forecast(
         scene=scene,
         twin_trials=sum(cell.trials for cell in twin),
@@ -205,9 +213,17 @@ def make_forecast(
     )
 
 
-def _undriven_scores(candidates: Sequence[Candidate]) -> list[float]:
-    """Twin scores of the candidates without real trials."""
-    return [c.twin.value for c in candidates if not c.driven and c.twin.value is not None]
+def _days_by_lighting(real: Sequence[Cell]) -> Counter[str]:
+    """Number of days that are compared with each of the twin's lightings."""
+    return Counter(compared for _, compared in dict.fromkeys((c.lighting, c.twin_key[2]) for c in real))
+
+
+def _score_over_days(cells: Sequence[Cell], days: Counter[str]) -> float:
+    """Mean twin rate over real days of a policy without real trials; `cells` has one cell per compared lighting.
+
+    As in the scores of the driven policies, a lighting with which three days are compared counts three times.
+    """
+    return float(np.average([c.rate for c in cells], weights=[days[c.lighting] for c in cells]))
 
 
 def _candidates(
@@ -257,6 +273,7 @@ def _corrected(
 ) -> list[Estimate]:
     """Real rate of each candidate, predicted from the driven candidates of other trainings."""
     scores = {i: _scores(mine, twin) for i, mine in enumerate(driven) if mine}
+    days = _days_by_lighting([cell for mine in driven for cell in mine])
     missing = "; ".join(missing_data([cell for mine in driven for cell in mine], twin))
     out = []
     for i, mine in enumerate(cells):
@@ -269,7 +286,7 @@ def _corrected(
             out.append(Estimate(missing=f"not validated under all compared lightings ({join_names(lightings)})"))
         else:
             line = LinearCorrection.fit(twin=[f for f, _ in others], real=[y for _, y in others])
-            score = scores[i][0] if i in scores else _mean_rate(mine).value
+            score = scores[i][0] if i in scores else _score_over_days(mine, days)
             value, low, high = map(float, line.predict(np.array(score)))
             if line.n < MIN_PREDICTORS:
                 few = f"too few for an interval: {line.n} policies of other trainings, {MIN_PREDICTORS} are needed"
@@ -343,7 +360,7 @@ def _allocation(task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int
     if len(policies) < 2:
         return TrialAllocation(task, len(policies), basis, None, None, 0, 0)
     rows = [[c for c in cells if c.policy == policy] for policy in policies]
-    by_day = on_road or len({c.lighting for c in real}) > 1
+    by_day = on_road or (bool(real) and len({c.lighting for c in twin}) > 1)  # as in `_candidates`
     rates = _sampled_rates(rows, by_day, np.random.default_rng([seed, 3]))
     now = ranking.expected_confidence(rates, 0, seed, on_road)
     more = [ranking.trials_needed(rates, what, seed, on_road) for what in ("winner", "order")]

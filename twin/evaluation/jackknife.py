@@ -179,13 +179,6 @@ STATISTICS = {
 the best policy alone."""
 
 
-def mean_over_tasks(statistic: Callable[..., tuple[Array, Array]], data: PairedCells) -> tuple[Array, Array]:
-    """Means, over the tasks with two policies or more, of the two values that `statistic` returns."""
-    rates = data.rates()
-    each = [statistic(twin=rates["twin"][..., of], real=rates["real"][..., of]) for of in data.strata if len(of) > 1]
-    return np.mean([one[0] for one in each], 0), np.mean([one[1] for one in each], 0)
-
-
 # ---- intervals
 
 

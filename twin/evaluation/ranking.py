@@ -71,11 +71,14 @@ def expected_confidence(rates: Array, more: int, seed: int, so_far: bool = True)
     leading = np.isclose(known, known.max(-1, keepdims=True), rtol=0.0, atol=1e-12)
     good = rates >= rates.max(-1, keepdims=True) - MARGIN
     winner = ((leading & good).sum(-1) / leading.sum(-1)).mean()
-    gap, known_gap = rates[:, :, None] - rates[:, None, :], known[:, :, None] - known[:, None, :]
-    apart = gap > MARGIN
-    right = np.where(np.isclose(known_gap, 0.0, rtol=0.0, atol=1e-12), 0.5, known_gap > 0)
-    order = (right * apart).sum() / apart.sum() if apart.any() else 1.0
-    return RankingConfidence(float(winner), float(order))
+    right, pairs = 0.0, 0
+    for i in range(rates.shape[-1]):  # all pairs at once would take gigabytes for a hundred policies
+        apart = rates[:, i : i + 1] - rates > MARGIN
+        known_gap = (known[:, i : i + 1] - known)[apart]
+        tied = np.abs(known_gap) <= 1e-12
+        right += 0.5 * np.count_nonzero(tied) + np.count_nonzero(known_gap[~tied] > 0)
+        pairs += len(known_gap)
+    return RankingConfidence(float(winner), float(right / pairs) if pairs else 1.0)
 
 
 def trials_needed(rates: Array, what: str, seed: int, so_far: bool = True) -> int | None:

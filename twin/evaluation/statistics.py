@@ -150,8 +150,10 @@ def winner(*, twin: ArrayLike, real: ArrayLike) -> tuple[float, float]:
     best policy minus that of the twin's best policy. Raises UndefinedStatistic: fewer than two policies.
     """
     twin, real = _validated(twin, real, needed=2, varied=False)
-    agreement, regret = winner_batched(twin=twin, real=real)
-    return float(agreement), float(regret)
+    twin, real = _rounded(twin), _rounded(real)
+    chosen = twin == twin.max()
+    share = chosen / chosen.sum()
+    return float((share * (real == real.max())).sum()), float((share * (real.max() - real)).sum())
 
 
 def pearson_batched(*, twin: Array, real: Array) -> Array:
@@ -174,15 +176,6 @@ def mmrv_batched(*, twin: Array, real: Array) -> Array:
     violated = (twin[..., :, None] < twin[..., None, :]) != (real[..., :, None] < real[..., None, :])
     size = np.abs(real[..., :, None] - real[..., None, :])
     return (size * violated).max(-1).mean(-1)
-
-
-def winner_batched(*, twin: Array, real: Array) -> tuple[Array, Array]:
-    """`winner` over leading axes, shape (..., n) → (...) each."""
-    twin, real = _rounded(twin), _rounded(real)
-    chosen = twin == twin.max(-1, keepdims=True)
-    best = real.max(-1, keepdims=True)
-    share = chosen / chosen.sum(-1, keepdims=True)
-    return (share * (real == best)).sum(-1), (share * (best - real)).sum(-1)
 
 
 def _rounded(scores: Array) -> Array:

@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from twin.errors import InputError
 from twin.evaluation.statistics import rate_summary, wilson
@@ -15,10 +16,6 @@ from twin.evaluation.trials import RECENT_EPISODES
 from twin.files import digest_file, read_json, read_text, regular_file, wrap_read_errors
 from twin.scene import SceneDir
 from twin.types import Indices
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from matplotlib.axes import Axes
 
 CHOICE_FILE = "choice.json"
 """File of a run that records the selection of its policy; see `learn/selection.py`."""
@@ -132,14 +129,20 @@ def plot_success_curve(axes: Axes, steps: Indices, success: Indices, color: str)
     """Plots the success rate over steps, with its interval; see `binned_rates`. Needs at least one episode."""
     step, won, count, low, high = np.array(binned_rates(steps, success), float).T
     axes.fill_between(step, low, high, color=color, alpha=0.2, linewidth=0, label="90 % interval")
-    axes.plot(step, won / count, ".-", color=color, label=f"{len(steps)} episodes, {int(count[0])} per point")
+    label = f"{len(steps)} episodes, {_range_text(count.astype(int).tolist())} per point"
+    axes.plot(step, won / count, ".-", color=color, label=label)
+
+
+def _range_text(counts: Iterable[int]) -> str:
+    """Smallest and largest of some numbers, as "5 to 6" or "5"."""
+    ends = sorted(counts)
+    return " to ".join(map(str, dict.fromkeys((ends[0], ends[-1]))))
 
 
 def _plot_choice(axes: Axes, choice: dict[str, Any]) -> None:
     tried, chosen = choice["candidates"], choice["chosen"]
     shares = [one["successes"] / one["trials"] for one in tried]
-    counts = sorted({one["trials"] for one in tried})
-    label = f"tests without exploration, {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} episodes each"
+    label = f"tests without exploration, {_range_text(one['trials'] for one in tried)} episodes each"
     axes.plot([one["step"] for one in tried], shares, "o", color="#d95f02", fillstyle="none", label=label)
     rate = chosen["successes"] / chosen["trials"]
     low, high = wilson(chosen["successes"], chosen["trials"])
@@ -152,7 +155,8 @@ def write_success_curve(folder: Path) -> Path:
     """Writes `success.png` to a run's folder: success over steps with 90 % intervals, and the selected policy."""
     steps, success = read_episodes(folder)
     path = folder / "success.png"
-    figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
+    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+    axes = figure.subplots()
     if len(steps):
         plot_success_curve(axes, steps, success, "#1f77b4")
     if (folder / CHOICE_FILE).exists():
@@ -163,5 +167,4 @@ def write_success_curve(folder: Path) -> Path:
     axes.set(xlabel="steps of all environments", ylabel="success rate", ylim=(-0.04, 1.04), xlim=(0, None))
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
     return path

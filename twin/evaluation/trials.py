@@ -134,6 +134,23 @@ def cells_csv(cells: Iterable[Cell]) -> str:
     return csv_text(CELL_COLUMNS, rows)
 
 
+def recorded_trials(table: Path, out: Path) -> list[Trial]:
+    """The real trials in `table`, if it exists.
+
+    Raises InputError: the results table `out` has further trials, which `write_real_trials` would lose.
+    """
+    known = read_trials(table) if table.exists() else []
+    explained = {cell.key: cell for cell in tally(known)}
+    for key, (trials, _) in (read_counts(out) if out.exists() else {}).items():
+        mine = explained[key].trials if key in explained else 0
+        if trials > mine:
+            raise InputError(
+                f"{out}: {trials} trials of {key[0]} under {key[2]}, of which {table.name} has {mine}; give another "
+                "--out, and join the two by hand"
+            )
+    return known
+
+
 def write_real_trials(
     trials: Sequence[Trial],
     table: Path,
@@ -146,11 +163,8 @@ def write_real_trials(
     Cells that are already in `out` keep their `twin_lighting` and `SETUP_COLUMNS`. For other cells, `setup`, if given,
     returns the values of `SETUP_COLUMNS` for a lighting's name.
     """
-    known: dict[tuple[str, str, str], dict[str, str]] = {}
-    if out.exists():
-        with wrap_read_errors(out, "give another --out"):
-            for row in csv.DictReader(io.StringIO(read_text(out), newline="")):
-                known[row["policy"], row["task"], row["lighting"]] = row
+    recorded = _rows(out, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS) if out.exists() else ()
+    known = {(row["policy"], row.get("task", ""), row["lighting"]): row for _, row in recorded}
     rows = []
     for c in tally(trials):
         new = {"twin_lighting": twin_lighting}

@@ -15,6 +15,7 @@ window *follows* the previous one if it begins when that one ends. A pose is *fr
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -201,9 +202,9 @@ def read_log(path: Path) -> Windows:
     """Reads a table or windows. Raises InputError: an unreadable file, missing columns, impossible times or values."""
     if not exists(path):
         raise InputError(f"{path}: no such log; expected a .csv, an .npz or a bag")
-    if path.suffix == ".csv":
+    if path.suffix.lower() == ".csv":
         return cut_windows(_read_csv(path), str(path))
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         columns = read_npz(path)
         if columns.get("icp_x", np.zeros(0)).ndim == 2:
             return _published_windows(columns, str(path))
@@ -214,13 +215,21 @@ def read_log(path: Path) -> Windows:
 def _read_csv(path: Path) -> dict[str, Array]:
     text = read_text(path, _MAX_BYTES)
     try:
-        head, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row]
+        head, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row] or [[]]
         values = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path}: not a table of numbers under one line of names: {error}; export it anew") from None
+    if not rows:
+        raise InputError(f"{path}: no row of numbers; expected one per instant, under a line of names; export it anew")
     if values.ndim != 2 or values.shape[1] != len(head):
         raise InputError(f"{path}: {len(head)} names in the first line, but rows of another length; export it anew")
-    return {name.strip(): values[:, i] for i, name in enumerate(head)}
+    names = [name.strip() for name in head]
+    twice = [name for name, count in Counter(names).items() if name and count > 1]
+    if twice:
+        raise InputError(
+            f"{path}: column {twice[0]} appears {names.count(twice[0])} times; expected once; rename the others"
+        )
+    return {name: values[:, i] for i, name in enumerate(names)}
 
 
 def read_npz(path: Path) -> dict[str, Array]:

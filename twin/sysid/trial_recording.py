@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from twin.capture.bag import (
     CAMERA_INFO,
+    COMPRESSED,
     FIX,
+    RAW,
     TYPES,
     VALUES,
     choose_camera_info,
@@ -34,6 +36,13 @@ from twin.types import Array, Image
 from twin_policy import Camera, PictureError, Rectifier
 
 _STEP = 0.3  # [m] a satellite fix's heading is the direction of motion from this far before it to this far after it
+_TYPES = {
+    "pictures": (RAW, COMPRESSED),
+    "camera": (CAMERA_INFO,),
+    "poses": (*TYPES["poses"], FIX),
+    "commands": TYPES["commands"],
+}
+"""Message types that a topic of each kind may have."""
 _MOVING = 0.02  # [m/s], [rad/s]; a drive starts with the first command that exceeds this
 
 
@@ -184,6 +193,11 @@ def _choose(connections: Any, path: Path, given: dict[str, str]) -> dict[str, An
         found = [one for one in filled if one.topic == topic]
         if not found:
             raise InputError(f"{path}: no topic {topic} ({kind}); there are {topic_names(connections)}")
+        if found[0].msgtype not in _TYPES[kind]:
+            expected = " or ".join(_TYPES[kind])
+            raise InputError(
+                f"{path}: {topic} ({kind}) has {found[0].msgtype}; expected {expected}; give another topic"
+            )
         chosen[kind] = found[0]
     if "pictures" not in chosen:
         topic = choose_pictures(filled, path)
