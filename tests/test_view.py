@@ -6,8 +6,10 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from http import HTTPStatus
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -36,7 +38,7 @@ from twin.view.__main__ import load_driving, open_page
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_times
 from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, station_and_lateral
 from twin.view.guarded_server import Gate, HeldKeys, open_server
-from twin.view.layers import clicked_frame
+from twin.view.layers import _trust_map, clicked_frame
 from twin.view.lighting_panel import slider_lighting
 from twin.view.picture_loop import COARSE_AREA, FilmedFrame, add_film, film_camera, picture_size
 from twin.view.scene_picture import FreeCamera, ScenePicture
@@ -340,6 +342,15 @@ def test_a_click_finds_the_filmed_camera(scene):
         aside = np.array([-1.0, 3.0, 2.0])
         assert clicked_frame(cameras, aside, cameras.positions[i] - aside) == i
     assert clicked_frame(cameras, origin, np.array([-1.0, 0.0, 0.0])) is None
+
+
+@pytest.mark.parametrize("half_width", [1.0, 1.2])  # at 1.2 m, the last step ends 1e-15 m beyond the last offset
+def test_the_trust_map_covers_the_corridor(scene, field, half_width):
+    shown = SimpleNamespace(add_point_cloud=lambda path, points, colors, **look: points)
+    world = replace(scene.world(), half_width=half_width)
+    points = _trust_map(shown, "/trust", scene, world, scene.cameras(), field)
+    at_start = points[np.abs(points[:, 0] - world.route[0, 0]) < 1e-6]
+    assert np.ptp(at_start[:, 1]) == pytest.approx(8.0 * half_width, abs=0.4)
 
 
 def test_the_report_says_how_to_look_at_the_scene(scene):
