@@ -23,7 +23,9 @@ from websockets.sync.client import connect
 
 import twin
 from twin.__main__ import main
+from twin.config import ObstacleConfig
 from twin.env.episode_lighting import EpisodeLighting
+from twin.env.obstacles import obstacle_pose
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.images import write_image
@@ -364,12 +366,9 @@ def test_the_report_says_how_to_look_at_the_scene(scene):
 
 
 def test_station_and_lateral_are_the_inverse_of_the_pose(scene):
-    from twin.config import ObstacleConfig
-    from twin.env.obstacles import obstacle_pose
-
     route = scene.world().route
-    for xy in ([1.0, 0.4], [6.5, 0.2], [7.5, -2.0], [8.3, -4.5], [-1.0, 0.5], [3.0, -0.7]):
-        station, lateral = station_and_lateral(route, np.array(xy))
+    for xy in np.random.default_rng(0).uniform((-8.0, -10.0), (14.0, 6.0), (60, 2)):  # inside and outside of the bend
+        station, lateral = station_and_lateral(route, xy)
         x, y, _ = obstacle_pose(ObstacleConfig(station=station, lateral=lateral), route, 0.0)
         np.testing.assert_allclose([x, y], xy, atol=2e-3)
 

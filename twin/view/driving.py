@@ -15,6 +15,7 @@ from typing import Any
 import dm_env
 import numpy as np
 from dm_control.rl.control import PhysicsError
+from scipy.optimize import brentq
 
 from twin.config import OBSTACLE_KINDS, ObstacleConfig
 from twin.config_file import load_config
@@ -26,7 +27,7 @@ from twin.env.route_segments import RouteSegment, find_task
 from twin.env.suite import DriveEnvironment, EnvFactory
 from twin.env.task import DrivePhysics, DriveTask
 from twin.loading import Twin
-from twin.mjcf.world import World, arc_lengths, heading_at, nearest_on_route
+from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.nerf.baked import BakedField
 from twin.types import Array, Image
 from twin.view.scene_picture import ObjectState
@@ -37,7 +38,7 @@ _PER_KIND = 4  # obstacles of each kind that may be added to those of scene.toml
 _REACH = 25.0  # [m] from the route, up to which solid parts block a robot that is driven by keys
 _LONG = 1e6  # [s] time limit of a drive by keys
 _MAX_LAG = 0.5  # [s] largest lag behind real time that is caught up; the rest is dropped
-_POSE_STEPS = 12  # iterations of `station_and_lateral`
+_STATION_STEP = 0.1  # [m] between the stations that `station_and_lateral` tries
 
 
 @dataclass(frozen=True)
@@ -130,18 +131,26 @@ class PlacedObstacles(EpisodeObstacles):
 
 
 def station_and_lateral(route: Array, xy: Array) -> tuple[float, float]:
-    """Station and lateral [m] for which `obstacle_pose` in `twin.env.obstacles` returns the point `xy` (2,)."""
+    """Station and lateral [m] for which `obstacle_pose` in `twin.env.obstacles` returns the point `xy` (2,).
+
+    Of several solutions, the one with the smallest distance from the route is returned.
+    """
     length = float(arc_lengths(route)[-1])
-    foot, cross = nearest_on_route(route[:, :2], xy)
-    station, lateral = float(foot), float(cross)
-    for _ in range(_POSE_STEPS):
-        x, y, _ = obstacle_pose(ObstacleConfig(station=station, lateral=lateral), route, 0.0)
-        heading = float(heading_at(route, station))
-        along, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
-        error = xy - np.array([x, y])
-        station = float(np.clip(station + error @ along, -2.0 * length, 3.0 * length))
-        lateral += float(error @ left)
-    return station, lateral
+
+    def offset(s: Any) -> tuple[Any, Any]:
+        """How far the point is ahead and to the left of the route's point at station s [m]."""
+        heading = heading_at(route, s)
+        x, y = (xy - point_at(route[:, :2], s)).T
+        beyond = s - np.clip(s, 0.0, length)
+        return x * np.cos(heading) + y * np.sin(heading) - beyond, y * np.cos(heading) - x * np.sin(heading)
+
+    reach = float(np.linalg.norm(xy - route[0, :2])) + length + 1.0
+    s = np.arange(-reach, length + reach, _STATION_STEP)
+    ahead, left = offset(s)
+    passed = np.flatnonzero((ahead[:-1] >= 0.0) & (ahead[1:] < 0.0))
+    k = passed[np.abs(left[passed]).argmin()]
+    station = brentq(lambda at: offset(at)[0], s[k], s[k + 1])
+    return station, float(offset(station)[1])
 
 
 class FreeDrive(DriveTask):
