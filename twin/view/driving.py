@@ -9,7 +9,7 @@ import copy
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import dm_env
@@ -26,6 +26,8 @@ from twin.env.physics import camera_pose
 from twin.env.route_segments import RouteSegment, find_task
 from twin.env.suite import DriveEnvironment, EnvFactory
 from twin.env.task import DrivePhysics, DriveTask
+from twin.errors import InputError
+from twin.files import toml_value
 from twin.loading import Twin
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.nerf.baked import BakedField
@@ -88,7 +90,12 @@ class PlacedObstacles(EpisodeObstacles):
         super().__init__((), world, segment)
         self._world = world
         named = tuple(replace(one, name=one.name or f"{one.kind}_{k}") for k, one in enumerate(given))
-        spare = [ObstacleConfig(f"added_{kind}_{k}", kind) for kind in OBSTACLE_KINDS for k in range(_PER_KIND)]
+        spare: list[ObstacleConfig] = []
+        for kind in OBSTACLE_KINDS:
+            # scene.toml may have obstacles of an earlier page.
+            numbered = (f"added_{kind}_{k}" for k in range(_PER_KIND + len(named)))
+            free = [name for name in numbered if all(name != one.name for one in named)]
+            spare += [ObstacleConfig(name, kind, route=segment.route) for name in free[:_PER_KIND]]
         self._pool = (*named, *spare)
         self.standing: dict[str, ObstacleConfig] = {one.name: one for one in named}
         """The standing obstacles by name."""
@@ -120,14 +127,11 @@ class PlacedObstacles(EpisodeObstacles):
 
     def toml(self) -> str:
         """The standing obstacles as [[obstacle]] tables of scene.toml."""
-        rows = []
-        for one in self.standing.values():
-            rows.append(
-                f'[[obstacle]]\nname = "{one.name}"\nkind = "{one.kind}"\nstation = {one.station:.2f}\n'
-                f"lateral = {one.lateral:.2f}\nyaw = {one.yaw:.0f}"
-                + (f"\nto = [{one.to[0]:.2f}, {one.to[1]:.2f}]\nspeed = {one.speed:.2f}" if one.to else "")
-            )
-        return "\n\n".join(rows)
+        usual = asdict(ObstacleConfig())
+        return "\n\n".join(
+            "\n".join(["[[obstacle]]", *(f"{k} = {toml_value(v)}" for k, v in asdict(one).items() if v != usual[k])])
+            for one in self.standing.values()
+        )
 
 
 def station_and_lateral(route: Array, xy: Array) -> tuple[float, float]:
