@@ -23,10 +23,12 @@ from websockets.sync.client import connect
 
 import twin
 from twin.__main__ import main
-from twin.config import ObstacleConfig
+from twin.config import OBSTACLE_KINDS, ObstacleConfig
 from twin.env.episode_lighting import EpisodeLighting
 from twin.env.obstacles import obstacle_pose
+from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
+from twin.files import parse_toml
 from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.images import write_image
 from twin.geometry.poses import look_at
@@ -38,7 +40,7 @@ from twin.report.video_writer import read_frames
 from twin.scene import write_stamp
 from twin.view.__main__ import load_driving, open_page
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_times
-from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, station_and_lateral
+from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, PlacedObstacles, station_and_lateral
 from twin.view.guarded_server import Gate, HeldKeys, open_server
 from twin.view.layers import _trust_map, clicked_frame
 from twin.view.lighting_panel import slider_lighting
@@ -376,10 +378,10 @@ def test_station_and_lateral_are_the_inverse_of_the_pose(scene):
 class _Drive:
     """A drive whose keys and facts a test sees; its thread stands still, and the test steps."""
 
-    def __init__(self, scene, field, **more):
-        self.keys, self.facts = frozenset(), []
-        lighting = named_lighting(field, "day")
-        self.driving = Driving(scene, field, "ahead", None, lighting, lambda: self.keys, self.facts.append, **more)
+    def __init__(self, scene, field, policy=None):
+        self.keys, self.facts, self.errors = frozenset(), [], []
+        told = lambda: self.keys, self.facts.append, self.errors.append
+        self.driving = Driving(scene, field, "ahead", policy, named_lighting(field, "day"), *told)
 
     def steps(self, count: int, keys: str = ""):
         self.keys = frozenset(keys)
@@ -466,6 +468,59 @@ def test_a_start_on_an_obstacle_is_refused(drive):
         driving.reset()
     driving.obstacles.standing.clear()
     driving.reset()
+
+
+def test_a_failed_start_is_tried_again(drive):
+    driving = drive.driving
+    driving.choose(SCRIPTED_DRIVER)
+    driving.reset()
+    x, y = drive.facts[-1].base_to_world[:2, 3]
+    driving.choose(KEYS_DRIVER)
+    driving.obstacles.put(driving.obstacles.free("car"), x, y, 0.0)
+    for begin in (lambda: driving.choose(SCRIPTED_DRIVER), driving.start):
+        with pytest.raises(InputError, match="touches"):
+            begin()
+        assert not driving.running
+    driving.obstacles.standing.clear()
+    driving.start()
+    driving.pause()
+    assert drive.facts[-1].time < 0.5
+
+
+def test_an_error_of_a_policy_ends_its_drive_only(scene, field):
+    def policy(pixels):
+        raise KeyError("weights")
+
+    policy.name, policy.options = "broken", dict
+    drive = _Drive(scene, field, policy)
+    driving = drive.driving
+    try:
+        driving.choose("policy broken")
+        driving.start()
+        _wait(lambda: drive.errors)
+        assert isinstance(drive.errors[0], KeyError) and not driving.running
+        driving.choose(SCRIPTED_DRIVER)
+        driving.start()
+        _wait(lambda: drive.facts[-1].time > 0.15)
+        assert len(drive.errors) == 1
+    finally:
+        driving.close()
+
+
+def test_obstacles_of_the_page_may_be_copied_to_scene_toml(scene):
+    world = scene.world()
+    segment = RouteSegment("ahead", 0.5, 4.5, "side")
+    given = ObstacleConfig(
+        "added_car_0", "car", 5.0, 0.5, to=(6.0, 0.5), delay=2.0, color=(1.0, 0.0, 0.0), route="side"
+    )
+    placed = PlacedObstacles(world, segment, (given,))
+    assert placed.free("car") == "added_car_1"  # a car of an earlier page has the first name
+    placed.put("added_car_1", 2.0, 1.0, 0.3)
+    copied = parse_toml(placed.toml(), "the panel")["obstacle"]
+    again = [ObstacleConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in one.items()}) for one in copied]
+    assert again == list(placed.standing.values())
+    names = [one.name for one in placed.pool]
+    assert len(set(names)) == len(names) == 1 + 4 * len(OBSTACLE_KINDS)
 
 
 # ---- in the browser

@@ -191,6 +191,7 @@ class Driving:
         lighting: EpisodeLighting,
         held: Callable[[], frozenset[str]],
         on_step: Callable[[DriveFacts], None],
+        on_error: Callable[[Exception], None],
         seed: int = 0,
     ) -> None:
         """
@@ -202,12 +203,13 @@ class Driving:
             lighting: Lighting of the robot's pictures.
             held: Returns the held keys.
             on_step: Called after every control step, on the stepping thread, and after every reset, on any thread.
+            on_error: Called on the stepping thread after an error of a driver or the simulation, which ends the drive.
             seed: Seed of the task's episodes.
 
         Raises:
             InputError: the scene cannot be driven, or has no such task.
         """
-        self._lighting, self._on_step, self._seed = lighting, on_step, seed
+        self._lighting, self._on_step, self._on_error, self._seed = lighting, on_step, on_error, seed
         shared = LoadedTwin(twin.scene, field.single_threaded())
         config = load_config(twin.scene.config_file)
         options: dict[str, Any] = {"lighting": field.lightings[0], "observe": "nerf"}
@@ -281,7 +283,7 @@ class Driving:
 
     def start(self) -> None:
         with self._lock:
-            if self._step is not None and self._step.last():
+            if self._step is None or self._step.last():
                 self.reset()
         self._running.set()
 
@@ -289,10 +291,14 @@ class Driving:
         self._running.clear()
 
     def reset(self) -> None:
-        """Starts a new episode."""
+        """Starts a new episode. Raises InputError, and pauses, if the robot cannot start, as on an obstacle."""
         with self._lock:
-            environment = self.environment
-            self._step = environment.relight(environment.reset(), self._lighting)
+            environment, self._step = self.environment, None
+            try:
+                self._step = environment.relight(environment.reset(), self._lighting)
+            except InputError:
+                self.pause()
+                raise
             self._report(np.zeros(2))
 
     def set_lighting(self, lighting: EpisodeLighting) -> None:
@@ -336,8 +342,12 @@ class Driving:
             began = time.monotonic()
             with self._lock:
                 if self._running.is_set():
-                    self._advance()
-            period = self.environment.task.options.control_timestep
+                    try:
+                        self._advance()
+                    except Exception as error:  # a policy may raise anything
+                        self.pause()
+                        self._on_error(error)
+                period = self.environment.task.options.control_timestep
             due = max(due + period, time.monotonic() - _MAX_LAG)
             time.sleep(max(0.0, due - time.monotonic()))
             self._rate += 0.2 * (period / max(time.monotonic() - began, 1e-3) - self._rate)

@@ -88,3 +88,8 @@ class Page:
         """Shows the state of the drive after a control step or a reset; called on several threads."""
         if self._drive is not None:
             self._drive.drove(facts)
+
+    def drive_failed(self, error: Exception) -> None:
+        """Shows why a drive has ended with an error."""
+        if self._drive is not None:
+            self._drive.failed(error)
