@@ -26,13 +26,13 @@ class Page:
         self._drive: DrivePanel | None = None
         tabs = self.viewer.server.gui.add_tab_group()
         with tabs.add_tab("Look", viser.Icon.SUN):
-            lightings = LightingPanel(self.viewer)
+            self.lightings = LightingPanel(self.viewer)
             self._build_layers()
         self._drive_tab = tabs.add_tab("Drive", viser.Icon.STEERING_WHEEL)
         with self._drive_tab:
             self._drive_note = self.viewer.server.gui.add_markdown("The robot is being loaded ...")
         with tabs.add_tab("Film", viser.Icon.MOVIE):
-            self.film = FilmPanel(self.viewer, lightings)
+            self.film = FilmPanel(self.viewer, self.lightings)
         with tabs.add_tab("Path", viser.Icon.ROUTE):
             self._path = PathPanel(self.viewer)
         self.viewer.serve(self._moved)
