@@ -44,7 +44,7 @@ from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, PlacedObsta
 from twin.view.guarded_server import Gate, HeldKeys, open_server
 from twin.view.layers import _trust_map, clicked_frame
 from twin.view.lighting_panel import slider_lighting
-from twin.view.picture_loop import COARSE_AREA, FilmedFrame, add_film, film_camera, picture_size
+from twin.view.picture_loop import COARSE_AREA, FilmedFrame, PictureLoop, Shot, add_film, film_camera, picture_size
 from twin.view.scene_picture import FreeCamera, ScenePicture
 
 SIZE = (160, 90)
@@ -521,6 +521,141 @@ def test_obstacles_of_the_page_may_be_copied_to_scene_toml(scene):
     assert again == list(placed.standing.values())
     names = [one.name for one in placed.pool]
     assert len(set(names)) == len(names) == 1 + 4 * len(OBSTACLE_KINDS)
+
+
+# ---- pages, without a browser
+
+
+@pytest.fixture(scope="module")
+def page(scene):
+    page = open_page(scene, port=0)
+    yield page
+    page.viewer.close()
+
+
+@pytest.fixture
+def notices(page, monkeypatch) -> list[str]:
+    """Texts of the notices that the test causes."""
+    out = []
+    monkeypatch.setattr(page.viewer, "notify", lambda title, body, *more: out.append(body))
+    return out
+
+
+class _Client:
+    """The server's handle of a page."""
+
+    def __init__(self):
+        self.client_id, self.flush = 7, lambda: None
+        self.camera = SimpleNamespace(
+            image_width=160, image_height=90, position=np.zeros(3), on_update=lambda work: None
+        )
+        self.pictures, self.notices = [], []
+        self.scene = SimpleNamespace(set_background_image=lambda image, **how: self.pictures.append(image))
+
+    def add_notification(self, title, body, **how):
+        self.notices.append(body)
+
+
+def _views(field, apart: float) -> list:
+    """Two key views [m] apart, in two lightings."""
+    poses = [look_at(np.array([x, 0.0, 1.3]), np.array([x + 3.0, 0.0, 1.0])) for x in (0.0, apart)]
+    return [(pose, 60.0, named_lighting(field, name)) for pose, name in zip(poses, ("day", "night"), strict=True)]
+
+
+def test_a_flight_ends_in_the_lighting_of_before_or_in_the_one_chosen_meanwhile(page, field, monkeypatch):
+    viewer, panel, client = page.viewer, page._path, _Client()
+    monkeypatch.setattr(viewer, "clients", lambda: [client])
+    monkeypatch.setattr(viewer, "place", lambda *given: None)
+    monkeypatch.setattr(panel, "_keys", _views(field, 0.5))  # for 1 s
+    before, night, click = viewer.lighting, named_lighting(field, "night"), SimpleNamespace(client=client)
+    panel._fly(click)
+    _wait(lambda: viewer.lighting.name == "day → night")
+    panel._fly(click)
+    time.sleep(1.5)
+    _wait(lambda: not panel._fly_button.disabled)
+    assert viewer.lighting is before
+    panel._fly(click)
+    _wait(lambda: viewer.lighting.name == "day → night")
+    viewer.set_lighting(night)
+    _wait(lambda: not panel._fly_button.disabled)
+    assert viewer.lighting is night
+    viewer.set_lighting(before)
+
+
+def test_a_path_that_cannot_be_shown_or_saved_is_a_notice(page, field, notices, monkeypatch):
+    viewer, panel = page.viewer, page._path
+    monkeypatch.setattr(panel, "_keys", _views(field, 6000.0))
+    with viewer.locked():
+        panel._show()
+    assert "remove views" in notices[0]
+    monkeypatch.setattr(panel, "_keys", _views(field, 0.5))
+    in_the_way = viewer.twin.scene.root / "paths"
+    in_the_way.write_text("no folder")
+    with viewer.locked():
+        panel._save()
+    in_the_way.unlink()
+    assert str(in_the_way) in notices[1]
+
+
+def test_a_page_that_closes_while_it_connects_is_not_rendered(page, monkeypatch):
+    viewer, callbacks = page.viewer, []
+    server = SimpleNamespace(
+        get_clients=dict, on_client_connect=callbacks.append, on_client_disconnect=callbacks.append
+    )
+    monkeypatch.setattr(viewer, "server", server)
+    monkeypatch.setattr(viewer, "place", lambda *given: None)
+    viewer.serve(lambda client: None)
+    callbacks[0](_Client())
+    assert not viewer.loop._pages
+
+
+def test_pictures_go_on_after_an_error(field, capsys):
+    pose = look_at(np.array([0.0, 0.0, 1.3]), np.array([3.0, 0.0, 1.0]))
+    shot, client, broken = Shot(pose, 1.0, named_lighting(field, "day"), None, False), _Client(), True
+
+    def shoot(client):
+        if broken:
+            raise InputError("section 2 is missing")
+        return shot
+
+    loop = PictureLoop(ScenePicture(field), shoot)
+    try:
+        loop.add(client)
+        _wait(lambda: client.notices)
+        loop.touch()
+        broken = False
+        loop.touch()
+        _wait(lambda: loop.fine)
+        assert client.notices == ["section 2 is missing"] and client.pictures[-1].shape == (90, 160, 3)
+    finally:
+        loop.close()
+
+
+def test_a_photo_replaces_no_lighting_but_the_named_one(page, notices, monkeypatch):
+    panel = page.lightings
+    given = []
+    monkeypatch.setattr(page.viewer, "submit", lambda job, name, *more: given.append(name))
+    for name in ("day.jpg", "new year.heic"):
+        panel._photo_given(name, b"")
+    panel._name.value = "day"
+    panel._photo_given("image.jpg", b"")
+    panel._name.value, panel._upload.disabled = "", False
+    assert given == ["day_2", "new_year", "day"]
+
+
+def test_a_damaged_lighting_takes_no_other_away(page, field):
+    folder, names = page.viewer.twin.scene.lightings, page.viewer.field.lightings
+    folder.mkdir()
+    (folder / "dusk.json").write_text("{")
+    page.viewer.field.add_lightings({"dawn": np.zeros(4, np.float32)})
+    try:
+        with pytest.raises(InputError, match="dusk"):
+            page.lightings._reload()
+        assert page.viewer.field.lightings == (*names, "dawn")
+    finally:
+        (folder / "dusk.json").unlink()
+        page.lightings._reload()
+    assert page.viewer.field.lightings == names
 
 
 # ---- in the browser
