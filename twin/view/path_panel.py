@@ -12,6 +12,7 @@ from twin.env.episode_lighting import EpisodeLighting
 from twin.errors import InputError
 from twin.scene import check_name
 from twin.types import Array
+from twin.unpack import is_cached
 from twin.view.camera_path import CameraPath, KeyView, path_frames, spaced_times, write_path_film
 from twin.view.layers import wxyz_of
 from twin.view.viewer import Viewer, camera_pose_of
@@ -25,7 +26,8 @@ class PathPanel:
     """The tab "Path"."""
 
     def __init__(self, viewer: Viewer) -> None:
-        self._viewer, self._root = viewer, viewer.twin.scene.root
+        self._viewer, root = viewer, viewer.twin.scene.root
+        self._root = Path.cwd() if is_cached(root) else root  # for results; a pack's cache may be deleted
         self._keys: list[tuple[Array, float, EpisodeLighting]] = []
         self.nodes: list[viser.SceneNodeHandle] = []
         """The key views and the path between them, as the browser draws them."""
@@ -103,7 +105,7 @@ class PathPanel:
         path, file = self._path(), self._file()
         file.parent.mkdir(exist_ok=True)
         path.save(file)
-        text = f"{file}; to film it: twin view {self._root} --path {file} --out film.mp4"
+        text = f"{file}; to film it: twin view {self._viewer.twin.scene.root} --path {file} --out film.mp4"
         self._viewer.notify("Path saved", text, "green")
 
     def _load(self) -> None:
