@@ -38,12 +38,14 @@ from twin.report import build_report as report_page
 from twin.report.video_layout import to_uint8
 from twin.report.video_writer import read_frames
 from twin.scene import write_stamp
+from twin.view import scene_picture
 from twin.view.__main__ import load_driving, open_page
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_times
 from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, PlacedObstacles, station_and_lateral
 from twin.view.guarded_server import Gate, HeldKeys, open_server
 from twin.view.layers import _trust_map, clicked_frame
 from twin.view.lighting_panel import slider_lighting
+from twin.view.path_panel import PathPanel
 from twin.view.picture_loop import COARSE_AREA, FilmedFrame, PictureLoop, Shot, add_film, film_camera, picture_size
 from twin.view.scene_picture import FreeCamera, ScenePicture
 
@@ -595,6 +597,27 @@ def test_a_path_that_cannot_be_shown_or_saved_is_a_notice(page, field, notices, 
         panel._save()
     in_the_way.unlink()
     assert str(in_the_way) in notices[1]
+
+
+def test_results_of_a_pack_are_written_to_the_working_folder(page, field, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("twin.view.path_panel.is_cached", lambda root: True)
+    panel = PathPanel(page.viewer)
+    panel._keys = _views(field, 0.5)
+    panel._save()
+    assert len(CameraPath.load(tmp_path / "paths" / "path.json", field).views) == 2
+
+
+def test_pages_of_four_sizes_keep_their_compositors(scene, field, monkeypatch):
+    made = []
+    monkeypatch.setattr(scene_picture, "Compositor", lambda *given, **more: made.append(given))
+    picture = ScenePicture(field)
+    picture.add_objects(scene.world(), ())
+    for _ in range(2):
+        for width in (320, 330, 340, 350):
+            for scale in (1, 4):
+                picture._compositor(FreeCamera.of_fov(np.eye(4), 1.0, (scale * width, scale * 180)))
+    assert len(made) == 8
 
 
 def test_a_page_that_closes_while_it_connects_is_not_rendered(page, monkeypatch):
