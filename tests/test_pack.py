@@ -218,6 +218,8 @@ def test_drive_films_a_pack_by_its_name(packed, tmp_path, monkeypatch, capsys):
     assert main(["drive", "tiny", "--lighting", "night"]) == 0
     film = Path(capsys.readouterr().out.split(": ")[-1].strip())
     assert film.name.startswith("tiny_ahead_") and film.stat().st_size > 10_000
+    assert main(["drive", "tiny", "--view", "--out", "a.mp4"]) == 2
+    assert "leave out one of them" in capsys.readouterr().err
     assert main(["drive", "nowhere"]) == 2
     assert "no nowhere.twin here or in scenes/" in capsys.readouterr().err
 
@@ -236,8 +238,9 @@ def test_drive_says_what_is_wrong_with_a_pack_that_is_there(packed, tmp_path, mo
 
 
 def test_verbs_that_add_results_ask_for_a_folder(packed, capsys):
-    for arguments in (["validate", str(packed), "--policy", "ahead"], ["train", str(packed), "--run", "x"]):
-        assert main(arguments) == 2
+    trial = ["a.mcap", "--policy", "ahead", "--lighting", "monday"]
+    for verb, more in (("validate", ["--policy", "ahead"]), ("train", ["--run", "x"]), ("trial", trial)):
+        assert main([verb, str(packed), *more]) == 2
         assert "unpack it where results may go: twin unpack" in capsys.readouterr().err
 
 

@@ -170,6 +170,7 @@ def test_a_drive_by_hand_needs_no_policy_and_no_outcome(place, tmp_path):
         (["a", "--lighting", "day"], "a trial needs --policy; without a policy, --lerobot DIR records"),
         (["a", "--policy", "ahead"], "a trial needs --lighting"),
         (["a", "b", "--lerobot", "out", "--cause", "stuck"], "--cause stuck applies to one bag; there are 2"),
+        (["a", "--lerobot", "out", "--out", "real.csv"], "--out and --twin-lighting are for real.csv"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused_in_one_line(place, options, words, capsys):

@@ -6,8 +6,10 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from http import HTTPStatus
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -21,8 +23,12 @@ from websockets.sync.client import connect
 
 import twin
 from twin.__main__ import main
+from twin.config import OBSTACLE_KINDS, ObstacleConfig
 from twin.env.episode_lighting import EpisodeLighting
+from twin.env.obstacles import obstacle_pose
+from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
+from twin.files import parse_toml
 from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.images import write_image
 from twin.geometry.poses import look_at
@@ -32,13 +38,15 @@ from twin.report import build_report as report_page
 from twin.report.video_layout import to_uint8
 from twin.report.video_writer import read_frames
 from twin.scene import write_stamp
+from twin.view import scene_picture
 from twin.view.__main__ import load_driving, open_page
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_times
-from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, station_and_lateral
+from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, PlacedObstacles, station_and_lateral
 from twin.view.guarded_server import Gate, HeldKeys, open_server
-from twin.view.layers import clicked_frame
+from twin.view.layers import _trust_map, clicked_frame
 from twin.view.lighting_panel import slider_lighting
-from twin.view.picture_loop import COARSE_AREA, FilmedFrame, add_film, film_camera, picture_size
+from twin.view.path_panel import PathPanel
+from twin.view.picture_loop import COARSE_AREA, FilmedFrame, PictureLoop, Shot, add_film, film_camera, picture_size
 from twin.view.scene_picture import FreeCamera, ScenePicture
 
 SIZE = (160, 90)
@@ -342,6 +350,15 @@ def test_a_click_finds_the_filmed_camera(scene):
     assert clicked_frame(cameras, origin, np.array([-1.0, 0.0, 0.0])) is None
 
 
+@pytest.mark.parametrize("half_width", [1.0, 1.2])  # at 1.2 m, the last step ends 1e-15 m beyond the last offset
+def test_the_trust_map_covers_the_corridor(scene, field, half_width):
+    shown = SimpleNamespace(add_point_cloud=lambda path, points, colors, **look: points)
+    world = replace(scene.world(), half_width=half_width)
+    points = _trust_map(shown, "/trust", scene, world, scene.cameras(), field)
+    at_start = points[np.abs(points[:, 0] - world.route[0, 0]) < 1e-6]
+    assert np.ptp(at_start[:, 1]) == pytest.approx(8.0 * half_width, abs=0.4)
+
+
 def test_the_report_says_how_to_look_at_the_scene(scene):
     commands = [line for _, lines in report_page._next_steps(scene.scene, {}) for line in lines]
     assert f"twin view {scene.scene.root}" in commands
@@ -353,12 +370,9 @@ def test_the_report_says_how_to_look_at_the_scene(scene):
 
 
 def test_station_and_lateral_are_the_inverse_of_the_pose(scene):
-    from twin.config import ObstacleConfig
-    from twin.env.obstacles import obstacle_pose
-
     route = scene.world().route
-    for xy in ([1.0, 0.4], [6.5, 0.2], [7.5, -2.0], [8.3, -4.5], [-1.0, 0.5], [3.0, -0.7]):
-        station, lateral = station_and_lateral(route, np.array(xy))
+    for xy in np.random.default_rng(0).uniform((-8.0, -10.0), (14.0, 6.0), (60, 2)):  # inside and outside of the bend
+        station, lateral = station_and_lateral(route, xy)
         x, y, _ = obstacle_pose(ObstacleConfig(station=station, lateral=lateral), route, 0.0)
         np.testing.assert_allclose([x, y], xy, atol=2e-3)
 
@@ -366,10 +380,10 @@ def test_station_and_lateral_are_the_inverse_of_the_pose(scene):
 class _Drive:
     """A drive whose keys and facts a test sets and reads; its thread does not run, and the test makes the steps."""
 
-    def __init__(self, scene, field, **more):
-        self.keys, self.facts = frozenset(), []
-        lighting = named_lighting(field, "day")
-        self.driving = Driving(scene, field, "ahead", None, lighting, lambda: self.keys, self.facts.append, **more)
+    def __init__(self, scene, field, policy=None):
+        self.keys, self.facts, self.errors = frozenset(), [], []
+        told = lambda: self.keys, self.facts.append, self.errors.append
+        self.driving = Driving(scene, field, "ahead", policy, named_lighting(field, "day"), *told)
 
     def steps(self, count: int, keys: str = ""):
         self.keys = frozenset(keys)
@@ -456,6 +470,215 @@ def test_a_start_on_an_obstacle_is_refused(drive):
         driving.reset()
     driving.obstacles.standing.clear()
     driving.reset()
+
+
+def test_a_failed_start_is_tried_again(drive):
+    driving = drive.driving
+    driving.choose(SCRIPTED_DRIVER)
+    driving.reset()
+    x, y = drive.facts[-1].base_to_world[:2, 3]
+    driving.choose(KEYS_DRIVER)
+    driving.obstacles.put(driving.obstacles.free("car"), x, y, 0.0)
+    for begin in (lambda: driving.choose(SCRIPTED_DRIVER), driving.start):
+        with pytest.raises(InputError, match="touches"):
+            begin()
+        assert not driving.running
+    driving.obstacles.standing.clear()
+    driving.start()
+    driving.pause()
+    assert drive.facts[-1].time < 0.5
+
+
+def test_an_error_of_a_policy_ends_its_drive_only(scene, field):
+    def policy(pixels):
+        raise KeyError("weights")
+
+    policy.name, policy.options = "broken", dict
+    drive = _Drive(scene, field, policy)
+    driving = drive.driving
+    try:
+        driving.choose("policy broken")
+        driving.start()
+        _wait(lambda: drive.errors)
+        assert isinstance(drive.errors[0], KeyError) and not driving.running
+        driving.choose(SCRIPTED_DRIVER)
+        driving.start()
+        _wait(lambda: drive.facts[-1].time > 0.15)
+        assert len(drive.errors) == 1
+    finally:
+        driving.close()
+
+
+def test_obstacles_of_the_page_may_be_copied_to_scene_toml(scene):
+    world = scene.world()
+    segment = RouteSegment("ahead", 0.5, 4.5, "side")
+    given = ObstacleConfig(
+        "added_car_0", "car", 5.0, 0.5, to=(6.0, 0.5), delay=2.0, color=(1.0, 0.0, 0.0), route="side"
+    )
+    placed = PlacedObstacles(world, segment, (given,))
+    assert placed.free("car") == "added_car_1"  # a car of an earlier page has the first name
+    placed.put("added_car_1", 2.0, 1.0, 0.3)
+    copied = parse_toml(placed.toml(), "the panel")["obstacle"]
+    again = [ObstacleConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in one.items()}) for one in copied]
+    assert again == list(placed.standing.values())
+    names = [one.name for one in placed.pool]
+    assert len(set(names)) == len(names) == 1 + 4 * len(OBSTACLE_KINDS)
+
+
+# ---- pages, without a browser
+
+
+@pytest.fixture(scope="module")
+def page(scene):
+    page = open_page(scene, port=0)
+    yield page
+    page.viewer.close()
+
+
+@pytest.fixture
+def notices(page, monkeypatch) -> list[str]:
+    """Texts of the notices that the test causes."""
+    out = []
+    monkeypatch.setattr(page.viewer, "notify", lambda title, body, *more: out.append(body))
+    return out
+
+
+class _Client:
+    """The server's handle of a page."""
+
+    def __init__(self):
+        self.client_id, self.flush = 7, lambda: None
+        self.camera = SimpleNamespace(
+            image_width=160, image_height=90, position=np.zeros(3), on_update=lambda work: None
+        )
+        self.pictures, self.notices = [], []
+        self.scene = SimpleNamespace(set_background_image=lambda image, **how: self.pictures.append(image))
+
+    def add_notification(self, title, body, **how):
+        self.notices.append(body)
+
+
+def _views(field, apart: float) -> list:
+    """Two key views [m] apart, in two lightings."""
+    poses = [look_at(np.array([x, 0.0, 1.3]), np.array([x + 3.0, 0.0, 1.0])) for x in (0.0, apart)]
+    return [(pose, 60.0, named_lighting(field, name)) for pose, name in zip(poses, ("day", "night"), strict=True)]
+
+
+def test_a_flight_ends_in_the_lighting_of_before_or_in_the_one_chosen_meanwhile(page, field, monkeypatch):
+    viewer, panel, client = page.viewer, page._path, _Client()
+    monkeypatch.setattr(viewer, "clients", lambda: [client])
+    monkeypatch.setattr(viewer, "place", lambda *given: None)
+    monkeypatch.setattr(panel, "_keys", _views(field, 0.5))  # for 1 s
+    before, night, click = viewer.lighting, named_lighting(field, "night"), SimpleNamespace(client=client)
+    panel._fly(click)
+    _wait(lambda: viewer.lighting.name == "day → night")
+    panel._fly(click)
+    time.sleep(1.5)
+    _wait(lambda: not panel._fly_button.disabled)
+    assert viewer.lighting is before
+    panel._fly(click)
+    _wait(lambda: viewer.lighting.name == "day → night")
+    viewer.set_lighting(night)
+    _wait(lambda: not panel._fly_button.disabled)
+    assert viewer.lighting is night
+    viewer.set_lighting(before)
+
+
+def test_a_path_that_cannot_be_shown_or_saved_is_a_notice(page, field, notices, monkeypatch):
+    viewer, panel = page.viewer, page._path
+    monkeypatch.setattr(panel, "_keys", _views(field, 6000.0))
+    with viewer.locked():
+        panel._show()
+    assert "remove views" in notices[0]
+    monkeypatch.setattr(panel, "_keys", _views(field, 0.5))
+    in_the_way = viewer.twin.scene.root / "paths"
+    in_the_way.write_text("no folder")
+    with viewer.locked():
+        panel._save()
+    in_the_way.unlink()
+    assert str(in_the_way) in notices[1]
+
+
+def test_results_of_a_pack_are_written_to_the_working_folder(page, field, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("twin.view.path_panel.is_cached", lambda root: True)
+    panel = PathPanel(page.viewer)
+    panel._keys = _views(field, 0.5)
+    panel._save()
+    assert len(CameraPath.load(tmp_path / "paths" / "path.json", field).views) == 2
+
+
+def test_pages_of_four_sizes_keep_their_compositors(scene, field, monkeypatch):
+    made = []
+    monkeypatch.setattr(scene_picture, "Compositor", lambda *given, **more: made.append(given))
+    picture = ScenePicture(field)
+    picture.add_objects(scene.world(), ())
+    for _ in range(2):
+        for width in (320, 330, 340, 350):
+            for scale in (1, 4):
+                picture._compositor(FreeCamera.of_fov(np.eye(4), 1.0, (scale * width, scale * 180)))
+    assert len(made) == 8
+
+
+def test_a_page_that_closes_while_it_connects_is_not_rendered(page, monkeypatch):
+    viewer, callbacks = page.viewer, []
+    server = SimpleNamespace(
+        get_clients=dict, on_client_connect=callbacks.append, on_client_disconnect=callbacks.append
+    )
+    monkeypatch.setattr(viewer, "server", server)
+    monkeypatch.setattr(viewer, "place", lambda *given: None)
+    viewer.serve(lambda client: None)
+    callbacks[0](_Client())
+    assert not viewer.loop._pages
+
+
+def test_pictures_go_on_after_an_error(field, capsys):
+    pose = look_at(np.array([0.0, 0.0, 1.3]), np.array([3.0, 0.0, 1.0]))
+    shot, client, broken = Shot(pose, 1.0, named_lighting(field, "day"), None, False), _Client(), True
+
+    def shoot(client):
+        if broken:
+            raise InputError("section 2 is missing")
+        return shot
+
+    loop = PictureLoop(ScenePicture(field), shoot)
+    try:
+        loop.add(client)
+        _wait(lambda: client.notices)
+        loop.touch()
+        broken = False
+        loop.touch()
+        _wait(lambda: loop.fine)
+        assert client.notices == ["section 2 is missing"] and client.pictures[-1].shape == (90, 160, 3)
+    finally:
+        loop.close()
+
+
+def test_a_photo_replaces_no_lighting_but_the_named_one(page, notices, monkeypatch):
+    panel = page.lightings
+    given = []
+    monkeypatch.setattr(page.viewer, "submit", lambda job, name, *more: given.append(name))
+    for name in ("day.jpg", "new year.heic"):
+        panel._photo_given(name, b"")
+    panel._name.value = "day"
+    panel._photo_given("image.jpg", b"")
+    panel._name.value, panel._upload.disabled = "", False
+    assert given == ["day_2", "new_year", "day"]
+
+
+def test_a_damaged_lighting_takes_no_other_away(page, field):
+    folder, names = page.viewer.twin.scene.lightings, page.viewer.field.lightings
+    folder.mkdir()
+    (folder / "dusk.json").write_text("{")
+    page.viewer.field.add_lightings({"dawn": np.zeros(4, np.float32)})
+    try:
+        with pytest.raises(InputError, match="dusk"):
+            page.lightings._reload()
+        assert page.viewer.field.lightings == (*names, "dawn")
+    finally:
+        (folder / "dusk.json").unlink()
+        page.lightings._reload()
+    assert page.viewer.field.lightings == names
 
 
 # ---- in the browser

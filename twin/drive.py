@@ -49,6 +49,8 @@ def command(given: argparse.Namespace) -> None:
     policy = chosen_policy(twin, given.policy)
     task = chosen_task(twin, given.task, policy, given.trust)
     if given.view:
+        if given.out:
+            raise InputError("--out names a film, and --view records none; leave out one of them")
         from twin.view.__main__ import serve
 
         view = {"task": task, "policy": policy, "host": "127.0.0.1", "port": given.port}

@@ -34,7 +34,7 @@ from twin.evaluation.trial_judge import JudgedTrial, TrialViews, judge, replay, 
 from twin.evaluation.trials import Trial, recorded_trials, write_real_trials
 from twin.files import write_json
 from twin.learn.policy import Policy, find_policy, load_policy
-from twin.loading import load_scene
+from twin.loading import load_writable
 from twin.report.bag_dataset import write_bag_dataset
 from twin.report.drive_dataset import drives_summary
 from twin.report.drive_video import write_trial_video
@@ -80,7 +80,7 @@ def record_trial(
     Raises:
         InputError: scene, policy, bag or table is unusable, or the trial has no outcome.
     """
-    scene = load_scene(root)
+    scene = load_writable(root)
     policy = load_policy(find_policy(root, policy_name))
     recording = read_trial(bag, topics)
     out = out or root / "real.csv"
@@ -269,6 +269,8 @@ def command(options: argparse.Namespace) -> None:
     names |= {"poses": options.poses, "commands": options.commands}
     topics = {kind: topic for kind, topic in names.items() if topic}
     if options.lerobot:
+        if options.out or options.twin_lighting:
+            raise InputError("--out and --twin-lighting are for real.csv, and --lerobot writes none; leave them out")
         drives = write_bag_dataset(
             *(options.scene, options.bag, options.lerobot, options.task, options.policy, options.lighting or ""),
             *(options.cause, options.frame, topics),

@@ -47,7 +47,7 @@ def write_bag_dataset(
     """Writes recordings of drives as a LeRobot dataset; returns the drives as episodes.
 
     Args:
-        root: A built scene.
+        root: A built scene, or a pack.
         bags: One drive each, by a policy or by hand; see `twin.sysid.trial_recording`.
         out: The dataset's folder; must not exist.
         task: See `twin.load`.
@@ -65,7 +65,7 @@ def write_bag_dataset(
     require_pyarrow()
     require_absent(out)
     scene = load_scene(root)
-    policy = load_policy(find_policy(root, policy_name)) if policy_name else None
+    policy = load_policy(find_policy(scene.scene.root, policy_name)) if policy_name else None
     seen = policy.options() if policy else {}
     factory = EnvFactory.open(scene, task, {**seen, "action": TWIST, "pixels": False})
     options = factory.options

@@ -162,7 +162,8 @@ def load_driving(page: "Page", task: str | None = None, policy: "Policy | None" 
 
         shown = page.viewer
         held = shown.guarded.keys.held
-        driving = Driving(shown.twin, shown.field, task or "route", policy, shown.lighting, held, page.drove, seed)
+        follow = page.drove, page.drive_failed
+        driving = Driving(shown.twin, shown.field, task or "route", policy, shown.lighting, held, *follow, seed)
     except InputError as error:
         if task is not None or policy is not None:
             raise

@@ -1,6 +1,7 @@
 """The page's controls that drive the robot and place obstacles, and its display of the drive's state."""
 
 import time
+import traceback
 from collections import deque
 from collections.abc import Iterable
 
@@ -56,8 +57,10 @@ class DrivePanel:
         self._show_obstacles()
 
     def _choose_driver(self) -> None:
-        self._driving.choose(self._driver.value)
-        self._show_running()
+        try:
+            self._driving.choose(self._driver.value)
+        finally:
+            self._show_running()
 
     def _toggle_drive(self) -> None:
         if self._driving.running:
@@ -68,7 +71,11 @@ class DrivePanel:
         self._show_running()
 
     def _restart(self) -> None:
-        self._driving.reset()
+        try:
+            self._driving.reset()
+        finally:
+            if not self._driving.running:
+                self._show_running()
         self._viewer.stop_following()
 
     def _show_running(self) -> None:
@@ -103,6 +110,15 @@ class DrivePanel:
             color = "green" if facts.cause == "goal" else "orange"
             self._viewer.notify("The drive has ended", f"{text} after {facts.progress:.1f} m", color)
             self._show_running()
+
+    def failed(self, error: Exception) -> None:
+        """Shows the error that has ended the drive."""
+        text = str(error)
+        if not isinstance(error, InputError):
+            traceback.print_exception(error)
+            text = f"{type(error).__name__}: {error}"
+        self._viewer.notify("The drive has stopped", text, "red")
+        self._show_running()
 
     # ---- obstacles
 

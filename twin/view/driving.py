@@ -9,12 +9,13 @@ import copy
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import dm_env
 import numpy as np
 from dm_control.rl.control import PhysicsError
+from scipy.optimize import brentq
 
 from twin.config import OBSTACLE_KINDS, ObstacleConfig
 from twin.config_file import load_config
@@ -25,8 +26,10 @@ from twin.env.physics import camera_pose
 from twin.env.route_segments import RouteSegment, find_task
 from twin.env.suite import DriveEnvironment, EnvFactory
 from twin.env.task import DrivePhysics, DriveTask
+from twin.errors import InputError
+from twin.files import toml_value
 from twin.loading import Twin
-from twin.mjcf.world import World, arc_lengths, heading_at, nearest_on_route
+from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.nerf.baked import BakedField
 from twin.types import Array, Image
 from twin.view.scene_picture import ObjectState
@@ -37,7 +40,7 @@ _PER_KIND = 4  # obstacles of each kind that may be added to those of scene.toml
 _REACH = 25.0  # [m] from the route, up to which convex parts block a robot that is driven by keys
 _LONG = 1e6  # [s] time limit of a drive by keys
 _MAX_LAG = 0.5  # [s] largest lag behind real time that is caught up; the rest is dropped
-_POSE_STEPS = 12  # iterations of `station_and_lateral`
+_STATION_STEP = 0.1  # [m] between the stations that `station_and_lateral` tries
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,12 @@ class PlacedObstacles(EpisodeObstacles):
         super().__init__((), world, segment)
         self._world = world
         named = tuple(replace(one, name=one.name or f"{one.kind}_{k}") for k, one in enumerate(given))
-        spare = [ObstacleConfig(f"added_{kind}_{k}", kind) for kind in OBSTACLE_KINDS for k in range(_PER_KIND)]
+        spare: list[ObstacleConfig] = []
+        for kind in OBSTACLE_KINDS:
+            # scene.toml may have obstacles of an earlier page.
+            numbered = (f"added_{kind}_{k}" for k in range(_PER_KIND + len(named)))
+            free = [name for name in numbered if all(name != one.name for one in named)]
+            spare += [ObstacleConfig(name, kind, route=segment.route) for name in free[:_PER_KIND]]
         self._pool = (*named, *spare)
         self.standing: dict[str, ObstacleConfig] = {one.name: one for one in named}
         """The standing obstacles by name."""
@@ -119,29 +127,34 @@ class PlacedObstacles(EpisodeObstacles):
 
     def toml(self) -> str:
         """The standing obstacles as [[obstacle]] tables of scene.toml."""
-        rows = []
-        for one in self.standing.values():
-            rows.append(
-                f'[[obstacle]]\nname = "{one.name}"\nkind = "{one.kind}"\nstation = {one.station:.2f}\n'
-                f"lateral = {one.lateral:.2f}\nyaw = {one.yaw:.0f}"
-                + (f"\nto = [{one.to[0]:.2f}, {one.to[1]:.2f}]\nspeed = {one.speed:.2f}" if one.to else "")
-            )
-        return "\n\n".join(rows)
+        usual = asdict(ObstacleConfig())
+        return "\n\n".join(
+            "\n".join(["[[obstacle]]", *(f"{k} = {toml_value(v)}" for k, v in asdict(one).items() if v != usual[k])])
+            for one in self.standing.values()
+        )
 
 
 def station_and_lateral(route: Array, xy: Array) -> tuple[float, float]:
-    """Station and lateral [m] for which `obstacle_pose` in `twin.env.obstacles` returns the point `xy` (2,)."""
+    """Station and lateral [m] for which `obstacle_pose` in `twin.env.obstacles` returns the point `xy` (2,).
+
+    Of several solutions, the one with the smallest distance from the route is returned.
+    """
     length = float(arc_lengths(route)[-1])
-    foot, cross = nearest_on_route(route[:, :2], xy)
-    station, lateral = float(foot), float(cross)
-    for _ in range(_POSE_STEPS):
-        x, y, _ = obstacle_pose(ObstacleConfig(station=station, lateral=lateral), route, 0.0)
-        heading = float(heading_at(route, station))
-        along, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
-        error = xy - np.array([x, y])
-        station = float(np.clip(station + error @ along, -2.0 * length, 3.0 * length))
-        lateral += float(error @ left)
-    return station, lateral
+
+    def offset(s: Any) -> tuple[Any, Any]:
+        """How far the point is ahead and to the left of the route's point at station s [m]."""
+        heading = heading_at(route, s)
+        x, y = (xy - point_at(route[:, :2], s)).T
+        beyond = s - np.clip(s, 0.0, length)
+        return x * np.cos(heading) + y * np.sin(heading) - beyond, y * np.cos(heading) - x * np.sin(heading)
+
+    reach = float(np.linalg.norm(xy - route[0, :2])) + length + 1.0
+    s = np.arange(-reach, length + reach, _STATION_STEP)
+    ahead, left = offset(s)
+    passed = np.flatnonzero((ahead[:-1] >= 0.0) & (ahead[1:] < 0.0))
+    k = passed[np.abs(left[passed]).argmin()]
+    station = brentq(lambda at: offset(at)[0], s[k], s[k + 1])
+    return station, float(offset(station)[1])
 
 
 class FreeDrive(DriveTask):
@@ -178,6 +191,7 @@ class Driving:
         lighting: EpisodeLighting,
         held: Callable[[], frozenset[str]],
         on_step: Callable[[DriveFacts], None],
+        on_error: Callable[[Exception], None],
         seed: int = 0,
     ) -> None:
         """
@@ -189,12 +203,13 @@ class Driving:
             lighting: Lighting of the robot's pictures.
             held: Returns the held keys.
             on_step: Called after every control step, on the stepping thread, and after every reset, on any thread.
+            on_error: Called on the stepping thread after an error of a driver or the simulation, which ends the drive.
             seed: Seed of the task's episodes.
 
         Raises:
             InputError: the scene cannot be driven, or has no such task.
         """
-        self._lighting, self._on_step, self._seed = lighting, on_step, seed
+        self._lighting, self._on_step, self._on_error, self._seed = lighting, on_step, on_error, seed
         shared = LoadedTwin(twin.scene, field.single_threaded())
         config = load_config(twin.scene.config_file)
         options: dict[str, Any] = {"lighting": field.lightings[0], "observe": "nerf"}
@@ -268,7 +283,7 @@ class Driving:
 
     def start(self) -> None:
         with self._lock:
-            if self._step is not None and self._step.last():
+            if self._step is None or self._step.last():
                 self.reset()
         self._running.set()
 
@@ -276,10 +291,14 @@ class Driving:
         self._running.clear()
 
     def reset(self) -> None:
-        """Starts a new episode."""
+        """Starts a new episode. Raises InputError, and pauses, if the robot cannot start, as on an obstacle."""
         with self._lock:
-            environment = self.environment
-            self._step = environment.relight(environment.reset(), self._lighting)
+            environment, self._step = self.environment, None
+            try:
+                self._step = environment.relight(environment.reset(), self._lighting)
+            except InputError:
+                self.pause()
+                raise
             self._report(np.zeros(2))
 
     def set_lighting(self, lighting: EpisodeLighting) -> None:
@@ -323,8 +342,12 @@ class Driving:
             began = time.monotonic()
             with self._lock:
                 if self._running.is_set():
-                    self._advance()
-            period = self.environment.task.options.control_timestep
+                    try:
+                        self._advance()
+                    except Exception as error:  # a policy may raise anything
+                        self.pause()
+                        self._on_error(error)
+                period = self.environment.task.options.control_timestep
             due = max(due + period, time.monotonic() - _MAX_LAG)
             time.sleep(max(0.0, due - time.monotonic()))
             self._rate += 0.2 * (period / max(time.monotonic() - began, 1e-3) - self._rate)

@@ -55,8 +55,9 @@ class FilmPanel:
 
     def moved(self, client: viser.ClientHandle) -> None:
         """Ends the comparison if a page's camera has moved away from the frame's camera."""
-        if self.index is not None and time.monotonic() - self._placed > _ECHO_TIME:
-            pose = self._cameras.camera_to_world[self.index]
+        index = self.index  # other threads change it
+        if index is not None and time.monotonic() - self._placed > _ECHO_TIME:
+            pose = self._cameras.camera_to_world[index]
             axis = camera_pose_of(client)[:3, 2]
             away = np.linalg.norm(client.camera.position - pose[:3, 3]) > MOVED
             if away or np.linalg.norm(axis - pose[:3, 2]) > _TURNED:

@@ -177,8 +177,8 @@ def _trust_map(
     scene: viser.SceneApi, path: str, twin: Twin, world: World, cameras: Cameras, field: BakedField
 ) -> viser.SceneNodeHandle:
     s, offsets, trust = trust_grid(field, cameras, world)
-    finer = np.arange(0.0, s[-1], _TRUST_STEP), np.arange(offsets[0], offsets[-1] + 1e-6, _TRUST_STEP)
-    along, aside = np.meshgrid(*finer)
+    aside = np.arange(offsets[0], offsets[-1] + 1e-6, _TRUST_STEP).clip(max=offsets[-1])
+    along, aside = np.meshgrid(np.arange(0.0, s[-1], _TRUST_STEP), aside)
     trust = RegularGridInterpolator((offsets, s), trust)(np.stack([aside, along], -1))
     heading = heading_at(world.route, along)
     left = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], -1)

@@ -1,5 +1,6 @@
 """The page's controls of the lighting: a slider through the field's lightings, sampling, and relighting by a photo."""
 
+import itertools
 import subprocess
 import sys
 import tempfile
@@ -11,6 +12,7 @@ import viser
 
 from twin.env.episode_lighting import EpisodeLighting
 from twin.errors import InputError
+from twin.files import exists
 from twin.nerf.baked import BakedField
 from twin.nerf.lightings import added_lightings
 from twin.runtime import child_environment
@@ -79,12 +81,18 @@ class LightingPanel:
         with self._viewer.locked():
             if len(content) > _MAX_PHOTO:
                 raise InputError(f"{name}: {len(content) >> 20} MB; expected a photo of at most {_MAX_PHOTO >> 20} MB")
-            lighting = self._name.value.strip() or "".join(c if c.isalnum() else "_" for c in Path(name).stem)
+            lighting = self._name.value.strip() or self._unused_name(Path(name).stem)
             check_name(lighting, "name")
             self._upload.disabled = True
             text = f"{name}: finding its camera pose and fitting its lighting; this takes about a minute."
             self._viewer.notify("Relighting", text)
             self._viewer.submit(self._relight, lighting, Path(name).suffix, content)
+
+    def _unused_name(self, stem: str) -> str:
+        """A name made from a photo's; numbered if it exists, as phones upload every photo as "image.jpg"."""
+        stem, folder = "".join(c if c.isalnum() else "_" for c in stem), self._viewer.twin.scene.lightings
+        names = (f"{stem}_{k}" if k > 1 else stem for k in itertools.count(1))
+        return next(one for one in names if one not in self._field.lightings and not exists(folder / f"{one}.json"))
 
     def _relight(self, name: str, suffix: str, content: bytes) -> None:
         """Adds a photo's lighting by `twin relight` in another process, which frees its large memory when it ends."""
@@ -111,9 +119,9 @@ class LightingPanel:
 
     def _reload(self) -> None:
         """Reloads the lightings that photos have added to the scene."""
-        names = self._field.lightings_by_name.filmed()
-        self._field.lightings_by_name = names
-        self._field.add_lightings(*added_lightings(self._viewer.twin.scene, names.vectors.shape[1]))
+        filmed = self._field.lightings_by_name.filmed()
+        added = added_lightings(self._viewer.twin.scene, filmed.vectors.shape[1])
+        self._field.lightings_by_name = filmed.added(*added)
         value = min(float(self._slider.value), len(self._field.lightings) - 1.0)
         self._slider.remove()
         with self._folder:

@@ -26,13 +26,13 @@ class Page:
         self._drive: DrivePanel | None = None
         tabs = self.viewer.server.gui.add_tab_group()
         with tabs.add_tab("Look", viser.Icon.SUN):
-            lightings = LightingPanel(self.viewer)
+            self.lightings = LightingPanel(self.viewer)
             self._build_layers()
         self._drive_tab = tabs.add_tab("Drive", viser.Icon.STEERING_WHEEL)
         with self._drive_tab:
             self._drive_note = self.viewer.server.gui.add_markdown("The robot is being loaded ...")
         with tabs.add_tab("Film", viser.Icon.MOVIE):
-            self.film = FilmPanel(self.viewer, lightings)
+            self.film = FilmPanel(self.viewer, self.lightings)
         with tabs.add_tab("Path", viser.Icon.ROUTE):
             self._path = PathPanel(self.viewer)
         self.viewer.serve(self._moved)
@@ -88,3 +88,8 @@ class Page:
         """Shows the state of the drive after a control step or a reset; called on several threads."""
         if self._drive is not None:
             self._drive.drove(facts)
+
+    def drive_failed(self, error: Exception) -> None:
+        """Shows why a drive has ended with an error."""
+        if self._drive is not None:
+            self._drive.failed(error)

@@ -12,6 +12,7 @@ from twin.env.episode_lighting import EpisodeLighting
 from twin.errors import InputError
 from twin.scene import check_name
 from twin.types import Array
+from twin.unpack import is_cached
 from twin.view.camera_path import CameraPath, KeyView, path_frames, spaced_times, write_path_film
 from twin.view.layers import wxyz_of
 from twin.view.viewer import Viewer, camera_pose_of
@@ -25,7 +26,8 @@ class PathPanel:
     """The tab "Path"."""
 
     def __init__(self, viewer: Viewer) -> None:
-        self._viewer, self._root = viewer, viewer.twin.scene.root
+        self._viewer, root = viewer, viewer.twin.scene.root
+        self._root = Path.cwd() if is_cached(root) else root  # for results; a pack's cache may be deleted
         self._keys: list[tuple[Array, float, EpisodeLighting]] = []
         self.nodes: list[viser.SceneNodeHandle] = []
         """The key views and the path between them, as the browser draws them."""
@@ -37,7 +39,8 @@ class PathPanel:
         self._speed = gui.add_slider("speed [m/s]", 0.2, 5.0, 0.1, _SPEED)
         viewer.on_update(self._speed, self._show)
         self._name = gui.add_text("Name", "path")
-        viewer.on_click(gui.add_button("Fly along it", icon=viser.Icon.PLAYER_PLAY), self._fly)
+        self._fly_button = gui.add_button("Fly along it", icon=viser.Icon.PLAYER_PLAY)
+        viewer.on_click(self._fly_button, self._fly)
         viewer.on_click(gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY), lambda event: self._save())
         viewer.on_click(gui.add_button("Load", icon=viser.Icon.FOLDER_OPEN), lambda event: self._load())
         self._film_button = gui.add_button("Render to a film", icon=viser.Icon.MOVIE)
@@ -46,11 +49,14 @@ class PathPanel:
         self._show()
 
     def _path(self) -> CameraPath:
-        """The path through the key views. Raises InputError: fewer than two."""
+        """The path through the key views. Raises InputError: fewer than two, too many, or a path that is too long."""
         if len(self._keys) < 2:
             raise InputError(f"{len(self._keys)} views; add two or more: move the camera, then press Add this view")
         times = spaced_times([pose for pose, _, _ in self._keys], float(self._speed.value), _MIN_STEP)
-        return CameraPath(tuple(KeyView(t, *view) for t, view in zip(times, self._keys, strict=True)))
+        try:
+            return CameraPath(tuple(KeyView(t, *view) for t, view in zip(times, self._keys, strict=True)))
+        except ValueError as error:
+            raise InputError(f"{error}; remove views, or raise the speed") from None
 
     def _file(self) -> Path:
         return self._root / "paths" / f"{check_name(self._name.value.strip(), 'name')}.json"
@@ -99,7 +105,7 @@ class PathPanel:
         path, file = self._path(), self._file()
         file.parent.mkdir(exist_ok=True)
         path.save(file)
-        text = f"{file}; to film it: twin view {self._root} --path {file} --out film.mp4"
+        text = f"{file}; to film it: twin view {self._viewer.twin.scene.root} --path {file} --out film.mp4"
         self._viewer.notify("Path saved", text, "green")
 
     def _load(self) -> None:
@@ -110,18 +116,29 @@ class PathPanel:
     def _fly(self, event: viser.GuiEvent) -> None:
         """Moves the camera of the user's page along the path in real time."""
         client, path = event.client, self._path()
-        if client is not None:
+        if client is not None and not self._fly_button.disabled:
+            self._fly_button.disabled = True
             threading.Thread(target=self._fly_along, args=(client, path), daemon=True).start()
 
     def _fly_along(self, client: viser.ClientHandle, path: CameraPath) -> None:
+        """Ends with the lighting from before, unless another was chosen in flight, which ends the flight."""
         viewer = self._viewer
-        before, began = viewer.lighting, time.monotonic()
-        while (now := time.monotonic() - began) < path.duration and client in viewer.clients():
-            pose, fov, lighting = path.at(np.array([now]))[0]
-            viewer.lighting = lighting
-            viewer.place(client, pose, float(np.deg2rad(fov)))
-            time.sleep(0.05)
-        viewer.set_lighting(before)
+        before = shown = viewer.lighting
+        began = time.monotonic()
+        try:
+            while (now := time.monotonic() - began) < path.duration and client in viewer.clients():
+                with viewer.locked():
+                    if viewer.lighting is not shown or viewer.closed.is_set():
+                        return
+                    pose, fov, shown = path.at(np.array([now]))[0]
+                    viewer.lighting = shown
+                viewer.place(client, pose, float(np.deg2rad(fov)))
+                time.sleep(0.05)
+            with viewer.locked():
+                if viewer.lighting is shown:
+                    viewer.set_lighting(before)
+        finally:
+            self._fly_button.disabled = False
 
     def _render(self) -> None:
         path, file = self._path(), self._file()

@@ -5,6 +5,7 @@ One thread serves all pages in turn, so pictures never queue up: a change while 
 
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -61,6 +62,8 @@ class _Page:
     needs_fine: bool = True
     rest_at: float = 0.0
     last: float = 0.0
+    failed: bool = False
+    """True if the last picture could not be rendered, which the page was told."""
 
 
 class PictureLoop:
@@ -130,7 +133,16 @@ class PictureLoop:
             time.sleep(max(0.0, min(soonest - time.monotonic(), seconds)))
 
     def _send(self, page: _Page, fine: bool) -> None:
-        client = page.client
+        try:
+            self._render(page.client, fine)
+            page.failed = False
+        except Exception as error:  # such as a file of the field that a build has replaced; the thread must go on
+            if not page.failed:
+                traceback.print_exc()
+                page.client.add_notification("No picture", str(error), auto_close_seconds=None, color="red")
+            page.failed = True
+
+    def _render(self, client: viser.ClientHandle, fine: bool) -> None:
         size = picture_size((client.camera.image_width, client.camera.image_height), FINE_AREA if fine else COARSE_AREA)
         if size is None:
             return

@@ -25,7 +25,9 @@ from twin.nerf.sun import relit
 from twin.types import Array, Array32
 
 _CAMERA = "view"  # name of the free camera in the model
-_MAX_COMPOSITORS = 3  # largest number that is kept: for coarse and fine pictures, and for a page that is being resized
+_MAX_COMPOSITORS = (
+    8  # largest number that is kept: for coarse and fine pictures of four pages; making one takes seconds
+)
 _MAX_RAYS = 4  # cameras (size and intrinsics) whose ray lengths are kept
 
 

@@ -1,7 +1,7 @@
 """The open pages of `twin view`: their cameras, shared lighting and robot, notices, and background jobs.
 
 All pages of a server show the same lighting, layers, robot and obstacles; each has its own camera. viser runs callbacks
-on many threads. Callbacks of controls hold the viewer's lock; an `InputError` in one of them is shown as a notice.
+on many threads. Callbacks of controls hold the viewer's lock; their `InputError` or `OSError` is shown as a notice.
 """
 
 import threading
@@ -87,6 +87,8 @@ class Viewer:
             if np.linalg.norm(client.camera.position - self._first[:3, 3]) > MOVED:
                 self.place(client, self._first, FOV)
             self.loop.add(client)
+            if client.client_id not in self.server.get_clients():  # it has closed meanwhile
+                self.loop.remove(client)
 
         async def disconnected(client: viser.ClientHandle) -> None:
             self.loop.remove(client)
@@ -122,11 +124,11 @@ class Viewer:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Holds the lock; an InputError within the block becomes a notice on all pages."""
+        """Holds the lock; wrong input, or a file that cannot be written, becomes a notice on all pages."""
         with self._lock:
             try:
                 yield
-            except InputError as error:
+            except (InputError, OSError) as error:
                 self.notify("That did not work", str(error), "red")
 
     def on_click(self, button: Any, work: Callable[[viser.GuiEvent], None]) -> None:
