@@ -240,8 +240,8 @@ def _write(out: Path, files: dict[str, bytes], head: dict[str, Any]) -> dict[str
     for name in files:
         if not unpack.PLACES.fullmatch(name):
             raise InputError(
-                f"{short_repr(name)} cannot be in a pack; rename it: letters, digits and _ . + - only, and at the "
-                "beginning no . + -"
+                f"{short_repr(name)} cannot be in a pack; rename it: letters, digits and _ . + - only, "
+                "and none of . + - at the beginning"
             )
     total = sum(map(len, files.values()))
     if total > unpack.MAX_TOTAL:

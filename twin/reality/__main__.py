@@ -19,6 +19,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from twin import commands
@@ -141,11 +142,6 @@ def scene_toml(plan: FilmingPlan, name: str, spec: PlaceSpec | None = None, road
     return "\n".join(lines)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs `twin reality`; returns the exit status, see `twin.command_line`."""
-    return commands.main("reality", arguments)
-
-
 def _check_lightings(names: list[str], among: Iterable[str]) -> None:
     for name in names:
         if name not in among:
@@ -237,6 +233,8 @@ def scene_task(given: str, scene: Path | None, place: int, length: float = 0.0) 
     cameras = Cameras.load(require_stage(root, "metric"))
     return read_task(Path(given), align_rigid(cameras.camera_to_world, matched_poses(truth, cameras)))
 
+
+main = partial(commands.main, "reality")
 
 if __name__ == "__main__":
     sys.exit(main())

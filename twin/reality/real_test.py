@@ -243,7 +243,7 @@ def run(
         _check_setup(setup, table, out.with_name(f"{out.stem}_setup.json"))
         _check_policy_digests(loaded, policies, out.with_name(f"{out.stem}_policies.json"))
         done = recorded_trials(table, out)
-        known = {(*_key(one), one.seed) for one in done}
+        known = {(one.policy, one.task, one.lighting, one.seed) for one in done}
         for policy in {one.name: one for one in loaded}.values():
             test = RealTest(task_for(policy, task, setup.place, setup.length), setup, policy.size)
             for lighting in dict.fromkeys(lightings):
@@ -294,10 +294,6 @@ def _write_film(frames: Sequence[Image], path: Path) -> None:
     plan = FilmingPlan(width=width, height=height, fps=10, crf=23)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_video((one.repeat(_FILM_SCALE, 0).repeat(_FILM_SCALE, 1) for one in frames), plan, path)
-
-
-def _key(trial: Trial) -> tuple[str, str, str]:
-    return trial.policy, trial.task, trial.lighting
 
 
 def _check_policy_digests(policies: Sequence[Policy], paths: Sequence[Path], record: Path) -> None:

@@ -101,7 +101,7 @@ class Pilot:
         self._pinhole, self._clock, self._steady = pinhole or policy.camera, clock, steady
         self._rectifier: Rectifier | None = None
         self.no_camera = "no camera_info, so pictures cannot be rectified"
-        """Cause of stops before the first valid camera."""
+        """Cause of the stop while there is no valid camera."""
         self._offset: int | None = None  # clock − steady [ns]
         self._pressed = 0
         self._is_held = False
