@@ -480,7 +480,7 @@ def upright(frame: av.VideoFrame) -> Image:
     transfer = hdr_transfer(frame)
     image = hdr_to_sdr(frame, transfer) if transfer else np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
     # `frame.side_data` would keep the container in the frame, a cycle: many large frames would wait for the collector.
-    side = SideDataContainer(frame).get(SideData.DISPLAYMATRIX)  # type: ignore[call-overload]
+    side = SideDataContainer(frame).get(SideData.DISPLAYMATRIX)  # type: ignore[call-arg]
     if side is None:
         return image
     matrix = np.frombuffer(bytes(side), np.int32, 9).reshape(3, 3)[:2, :2] / 65536.0
