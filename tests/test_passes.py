@@ -7,12 +7,12 @@ from routes import KINDS, draw_filming, measure
 from twin.geometry.passes import (
     SPACING,
     find_passes,
+    moving,
     path_directions,
     path_inliers,
     path_jumps,
     path_length,
     path_outliers,
-    remove_stationary,
     smooth_path,
 )
 from twin.geometry.route import distance_to_route, filmed_route
@@ -84,7 +84,7 @@ def test_standing_and_rocking_are_removed_from_the_path():
 def test_a_closed_loop_keeps_its_return():
     angle = np.linspace(0, 2 * np.pi, 60)
     circle = 5 * np.stack([np.cos(angle), np.sin(angle)], -1)
-    assert len(remove_stationary(circle)) > 50
+    assert len(moving(circle)) > 50
     assert path_length(smooth_path(_lifted(circle))) == pytest.approx(10 * np.pi, rel=0.02)
 
 

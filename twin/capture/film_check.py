@@ -112,8 +112,7 @@ def _samples(path: Path, skip: Literal["NONKEY", "DEFAULT"]) -> tuple[av.VideoFr
                 first = first or frame
                 if number % every == 0:
                     image = upright(frame)
-                    size = fitted_size(image.shape[1], image.shape[0], _WIDTH)
-                    small.append(np.asarray(resize(image, *size), np.uint8))
+                    small.append(resize(image, *fitted_size(image.shape[1], image.shape[0], _WIDTH)))
                 if len(small) == 2 * _SAMPLES:
                     small, every = small[::2], 2 * every
     return first, small

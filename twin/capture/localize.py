@@ -116,7 +116,7 @@ def candidate_lenses(size: tuple[int, int], exif: PhotoExif, scene: SceneDir) ->
 
 
 def _write_gray(path: Path, image: Image, size: tuple[int, int]) -> None:
-    write_image(path, cv2.cvtColor(np.asarray(resize(image, *size), np.uint8), cv2.COLOR_RGB2GRAY))
+    write_image(path, cv2.cvtColor(resize(image, *size), cv2.COLOR_RGB2GRAY))
 
 
 # ---- photos, in the worker

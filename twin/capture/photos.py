@@ -185,7 +185,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
                 "put images of another aspect ratio into a source of their own"
             )
         if shape != size:
-            image = np.asarray(resize(image, *size), np.uint8)
+            image = resize(image, *size)
         digest = hashlib.sha256(image.tobytes()).digest()
         if digest in seen:
             duplicates += 1

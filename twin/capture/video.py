@@ -275,10 +275,9 @@ def read_film(
         count.size = (image.shape[1], image.shape[0])
         size = fitted_size(*count.size, config.max_size)
         if size != count.size:
-            image = np.asarray(resize(image, *size), np.uint8)
+            image = resize(image, *size)
         height = max(1, round(size[1] * FLOW_WIDTH / size[0]))
-        small_rgb = np.asarray(resize(image, FLOW_WIDTH, height), np.uint8)
-        small = np.asarray(cv2.cvtColor(small_rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+        small = np.asarray(cv2.cvtColor(resize(image, FLOW_WIDTH, height), cv2.COLOR_RGB2GRAY), np.uint8)
         mask = mask_of(candidate.index, *size)
         small_mask = None
         if mask is not None:
@@ -506,5 +505,5 @@ def _sharpness_image(frame: av.VideoFrame) -> Image:
     if frame.format.name in _LUMA_FIRST:  # the first plane is the brightness: no conversion needed
         plane = frame.planes[0]
         luma = np.frombuffer(bytes(plane), np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
-        return np.asarray(resize(luma, width, height), np.uint8)
+        return resize(luma, width, height)
     return np.asarray(frame.reformat(width, height, "gray", interpolation="AREA").to_ndarray(), np.uint8)

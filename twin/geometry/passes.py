@@ -188,7 +188,7 @@ def _retraces(path: Array) -> list[tuple[int, int, str]]:
 def _frame_stations(xy: Array, path: Array) -> Array:
     """Arc length [m] of frames (n, 2) along their own path; it never decreases, even where the path crosses itself."""
     total = path_length(path)
-    kept = _moving(xy)
+    kept = moving(xy)
     raw = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy[kept], axis=0), axis=1))])
     return np.interp(np.arange(len(xy)), kept, raw * (total / max(float(raw[-1]), 1e-9)))
 
@@ -208,7 +208,8 @@ def smooth_path(positions: Array) -> Array:
 
     If the camera stands still, the path is one point, shape (1, 2).
     """
-    xy = remove_stationary(positions[path_inliers(positions)][:, :2])
+    xy = positions[path_inliers(positions)][:, :2]
+    xy = xy[moving(xy)]
     if len(xy) < 2:
         return xy[:1]
     dense = resample(xy, curved=len(xy) > 4)
@@ -226,17 +227,12 @@ def path_inliers(positions: Array) -> NDArray[np.bool_]:
     return np.linalg.norm(positions - typical, axis=1) <= 2.5 * step + 0.3
 
 
-def remove_stationary(xy: Array) -> Array:
-    """Removes stops, and small motions to and fro, from a path in order of time, (n, 2) → (k, 2).
+def moving(xy: Array) -> list[int]:
+    """Indices of the points that remain of a path (n, 2) in order of time without stops and small motions to and fro.
 
     After each kept point, the points within `_STATIONARY_RADIUS` of it are skipped, up to the path's last exit from
     that disc. A return after the path was `_DEPARTURE_RADIUS` away is another pass and is kept.
     """
-    return xy[_moving(xy)]
-
-
-def _moving(xy: Array) -> list[int]:
-    """Indices of the points that `remove_stationary` keeps."""
     kept, i = [0], 0
     while True:
         distance = np.linalg.norm(xy[i:] - xy[i], axis=1)
