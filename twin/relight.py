@@ -101,12 +101,12 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     from twin.nerf.sun_fit import AirFit, TracedPhoto
 
     height, width = photo.shape[:2]
-    v, u = np.mgrid[:height, :width] + 0.5
-    cameras = CameraArrays(np.asarray(camera_to_world)[None], np.asarray(intrinsics)[None], field.device)
-    pixel = np.stack([u.ravel(), v.ravel()], -1)
-    features, harmonics, depth, _ = field.trace(cameras, np.zeros(len(pixel), int), pixel)
-    rays = unproject(pixel_grid(width, height), np.asarray(intrinsics))
-    distance = depth.cpu().numpy().reshape(height, width) * np.linalg.norm(rays, axis=-1).astype(np.float32)
+    pose, grid = np.asarray(camera_to_world), pixel_grid(width, height)
+    cameras = CameraArrays(pose[None], np.asarray(intrinsics)[None], field.device)
+    features, harmonics, z, _ = field.trace(cameras, np.zeros(height * width, int), grid.reshape(-1, 2))
+    depth, rays = z.cpu().numpy().reshape(height, width), unproject(grid, np.asarray(intrinsics))
+    traced = TracedPhoto(photo.astype(np.float32), depth, rays, pose, features, harmonics)
+    distance = traced.distance
     distances = torch.as_tensor(distance.ravel(), device=field.device)
     colors = torch.as_tensor(photo.reshape(-1, 3).astype(np.float32), device=field.device)
 
@@ -139,11 +139,10 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     fitted = render(embedding, fog)
     every = np.ones((height, width), bool)
     whole = zip((*masks, every), (*halves[is_foggy], (embedding, fog)), strict=True)
-    depths = depth.cpu().numpy().reshape(height, width)
     return PhotoFit(
         *(nearest, embedding, fog, (photo, fitted, filmed[nearest])),
         *(psnr(filmed[nearest], photo), psnr(fitted, photo), foggy if is_foggy else clear, clear),
-        TracedPhoto(photo.astype(np.float32), depths, rays, np.asarray(camera_to_world), features, harmonics),
+        traced,
         tuple(AirFit(np.flatnonzero(h), *one) for h, one in whole),
     )
 

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from twin.errors import InputError
+from twin.geometry.cameras import pixel_grid
 from twin.nerf import network
 from twin.nerf.baked import BakedField, BakedSection
 from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
@@ -118,11 +119,11 @@ def _surface_positions(
             i = int(frames[k])
             width = min(_VIEW_WIDTH, int(pixels.width[i]))
             height = max(1, round(width * pixels.height[i] / pixels.width[i]))
-            v, u = (np.mgrid[:height, :width] + 0.5) * (pixels.width[i] / width)
+            pixel = (pixel_grid(width, height) * (pixels.width[i] / width)).reshape(-1, 2)
             n = width * height
             with section.workspace(n, _SAMPLES) as ws:
                 ws.camera.fill_(i)
-                ws.pixel.copy_(torch.as_tensor(np.stack([u.ravel(), v.ravel()], -1).astype(np.float32)))
+                ws.pixel.copy_(torch.as_tensor(pixel.astype(np.float32)))
                 section.cast(ws, cameras, 0, n)
                 section.sample(ws, 0, n, 0.02)
                 section.query(ws, 0, n * _SAMPLES)

@@ -6,16 +6,13 @@ lighting. A long road has several sections (`road.py`), which are read from disk
 """
 
 import copy
-import itertools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,20 +22,16 @@ from twin.errors import InputError, short_repr
 from twin.files import check_shapes, load_tensors, read_json, require_text, wrap_read_errors, write_json
 from twin.geometry.cameras import PosedCameras, intrinsics_for_size
 from twin.nerf.appearance_prior import Probes
-from twin.nerf.brick_layout import BrickLayout, brick_indices, check_arrays, check_networks, density_codes, stored_skips
+from twin.nerf.brick_layout import BrickLayout, check_arrays, check_networks
 from twin.nerf.fog import Fog
-from twin.nerf.kernels import march as kernels
-from twin.nerf.kernels import surface_detail as detail_kernels
-from twin.nerf.kernels.bricks import BLOCKS, Bricks, Bytes
-from twin.nerf.kernels.color_head import HARMONICS, Vec8, color_head_kernel
-from twin.nerf.kernels.color_head import LANES as HEAD_LANES
-from twin.nerf.kernels.composite import CHANNELS, Channels
+from twin.nerf.kernels.composite import CHANNELS
 from twin.nerf.lightings import Lightings
+from twin.nerf.render_target import CameraBatch, RenderedImages, RenderKernels, RenderTarget, SectionOnDevice
 from twin.nerf.rendering import Rendering
 from twin.nerf.road import RoadSections, undivided_road
 from twin.nerf.sun import Sun, Sunlight
-from twin.nerf.surface_features import Detail, detail_grid
-from twin.runtime import available_cores, bar
+from twin.nerf.surface_features import Detail
+from twin.runtime import available_cores
 from twin.types import Array32
 from twin.warp_runtime import wp
 
@@ -75,51 +68,6 @@ class BakedSection:
         return arrays
 
 
-class _SectionOnDevice:
-    """Bricks and detail as the kernels read them."""
-
-    def __init__(self, section: BakedSection, device: str):
-        layout, arrays = section.layout, section.arrays
-
-        on_device = partial(_on_device, device=device)
-        b: Any = Bricks()
-        near_index, far_index = brick_indices(layout, arrays["near"], arrays["far"])
-        near_index, near_skips = stored_skips(near_index, arrays["near_leap"])
-        far_index, far_skips = stored_skips(far_index, arrays["far_leap"])
-        b.near_index, b.far_index = on_device(near_index.ravel(), wp.int32), on_device(far_index.ravel(), wp.int32)
-        b.skips = on_device(np.concatenate([near_skips, far_skips]).ravel(), wp.uint8)
-        b.near_blocks = wp.vec3i(*(BLOCKS * n for n in layout.near_shape))
-        b.far_blocks = wp.vec3i(*(BLOCKS * n for n in layout.far_shape))
-        b.densities = on_device(density_codes(arrays["features"][..., 0]), wp.uint8)
-        b.features = on_device(arrays["features"].reshape(-1, CHANNELS), Bytes)
-        b.low, b.step = Channels(*arrays["low"].tolist()), Channels(*arrays["step"].tolist())
-        b.center = wp.vec3f(*layout.centre)
-        b.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
-        b.near_cell, b.far_cell = layout.near_cell, layout.far_cell
-        b.unit, b.near_plane = layout.density_unit, layout.near_plane
-        self.bricks = b
-        detail = Detail.of_arrays(arrays)
-        stored: Any = detail_kernels.DetailBytes()
-        stored.texels = wp.array(detail.texels, dtype=Bytes, device=device)
-        stored.vertices = wp.array(detail.vertices, dtype=Bytes, device=device)
-        stored.texel_step, stored.vertex_step = (
-            Channels(*step.tolist()) for step in (detail.texel_step, detail.vertex_step)
-        )
-        self.detail = detail_grid(detail, device), stored
-        self.has_detail = bool(len(detail.tiles) or len(detail.vertices))
-        self.targets: WeakKeyDictionary[BakedField, OrderedDict[tuple, _RenderTarget]] = WeakKeyDictionary()
-        """Render targets of every field object that shares this section; they are dropped with it."""
-
-
-def _on_device(array: NDArray, dtype: Any, device: str) -> Any:
-    """A copy of an array on a device."""
-    if device == "cpu":  # NumPy allocates large arrays on huge pages, where random reads cost less
-        own = np.empty(array.shape, array.dtype)
-        own[...] = array
-        return wp.array(own, dtype=dtype, device=device, copy=False)
-    return wp.array(np.ascontiguousarray(array), dtype=dtype, device=device)
-
-
 class BakedField:
     """Density and color of a place under every lighting it was filmed in, ready to render."""
 
@@ -144,40 +92,15 @@ class BakedField:
         self.sections, self.road = tuple(sections), road or undivided_road()
         self.lightings_by_name, self.about, self.device = lightings, about or {}, device
         self.networks = networks
-        p = self.network
         if "probes.features" in networks:
-            probes = Probes(networks["probes.features"], networks["probes.harmonics"], p)
+            probes = Probes(networks["probes.features"], networks["probes.harmonics"], self.network)
             self.lightings_by_name = replace(lightings, probes=probes)
         self._lock = threading.Lock()
-        self._resident: OrderedDict[int, _SectionOnDevice] = OrderedDict()
+        self._resident: OrderedDict[int, SectionOnDevice] = OrderedDict()
         self._resident_lock = threading.Lock()
-        on_device = partial(_on_device, device=device)
         if len(self.sections) == 1:
             self._section(0, 1)
-
-        self._march = kernels.march_kernel(kernels.LANES[device])
-        self._color_head, weights = color_head_kernel(
-            HEAD_LANES[device], p["head.1"].shape[0], p["backdrop.0"].shape[1]
-        )
-        rows = CHANNELS - 1 + HARMONICS
-        w: Any = weights()
-
-        def as_vec8(matrix: NDArray) -> Any:
-            """Packs a matrix (units, m) as vectors of eight units: array (units / 8, m), flat."""
-            return on_device(matrix.reshape(len(matrix) // 8, 8, -1).transpose(0, 2, 1).reshape(-1, 8), Vec8)
-
-        w.head_0, w.head_1, w.head_2 = as_vec8(p["head.0"][:rows].T), as_vec8(p["head.1"].T), as_vec8(p["head.2"])
-        w.head_1_bias, w.head_2_bias = as_vec8(p["head.1.bias"]), wp.vec3f(*p["head.2.bias"].tolist())
-        for name in ("backdrop.0", "backdrop.0.bias", "backdrop.1"):
-            setattr(w, name.replace(".", "_"), on_device(p[name].ravel(), wp.float32))
-        self._weights = w
-        self._first_bias = p["head.0.bias"], p["head.0"][rows:]
-        needed = kernels.cone_march, self._march, detail_kernels.add_detail, self._color_head
-        # Loaded here, so that no two threads load them at once.
-        with bar("compiling the renderer (first use only)", len(needed), "part", after=1.0) as progress:
-            for kernel in needed:
-                kernel.module.load(wp.get_device(device))
-                progress.update()
+        self._kernels = RenderKernels(self.network, device)
         self._threads = available_cores()
         self._pool = ThreadPoolExecutor(self._threads) if device == "cpu" and self._threads > 1 else None
 
@@ -324,19 +247,19 @@ class BakedField:
         lighting: str | NDArray | Sequence[str | NDArray],
         size: tuple[int, int] | None = None,
         stop: NDArray | None = None,
-    ) -> "_Views":
+    ) -> CameraBatch:
         intrinsics, size = intrinsics_for_size(cameras, size)
         pose = np.asarray(cameras.camera_to_world, np.float64)
-        return _Views(pose, intrinsics, size, self.head_biases(lighting, len(pose)), stop)
+        return CameraBatch(pose, intrinsics, size, self.head_biases(lighting, len(pose)), stop)
 
-    def _shares(self, views: "_Views", blended: bool = True) -> NDArray[np.float64]:
+    def _shares(self, views: CameraBatch, blended: bool = True) -> NDArray[np.float64]:
         """Shares of the sections in the pictures, shape (n, sections); if not blended, 1 for the nearest section."""
         if len(self.sections) == 1:
             return np.ones((len(views.pose), 1))
         positions = views.pose[:, :3, 3]
         return self.road.shares(positions) if blended else np.eye(len(self.sections))[self.road.nearest(positions)]
 
-    def _rendered(self, views: "_Views", shares: NDArray[np.float64], features: bool = False) -> "_Images":
+    def _rendered(self, views: CameraBatch, shares: NDArray[np.float64], features: bool = False) -> RenderedImages:
         """Renders views by the sections that have a share in them; `features` needs shares that are 0 or 1."""
         needed = np.flatnonzero(shares.any(0)).tolist()
         if len(needed) == 1:
@@ -352,7 +275,7 @@ class BakedField:
             padded = np.append(rows, np.repeat(rows[-1:], count - len(rows)))
             parts[k] = rows, self._render(k, views.subset(padded), len(needed)).images(features)
         n, (width, height) = len(shares), views.size
-        out = _Images(
+        out = RenderedImages(
             Rendering(*(np.zeros((n, height, width, *channels), np.float32) for channels in ((3,), (), ()))),
             np.zeros((n, CHANNELS, height, width), np.float32) if features else None,
         )
@@ -372,7 +295,7 @@ class BakedField:
             total.rgb[...] /= np.maximum(total.opacity, 1e-6)[..., None]
         return out
 
-    def _section(self, k: int, count: int) -> tuple[_SectionOnDevice, "OrderedDict[tuple, _RenderTarget]"]:
+    def _section(self, k: int, count: int) -> tuple[SectionOnDevice, OrderedDict[tuple, RenderTarget]]:
         """Section k on the device, and this object's render targets of it.
 
         If more than `_MAX_RESIDENT` sections are in memory, and more than the `count` that this call needs, the least
@@ -380,19 +303,21 @@ class BakedField:
         """
         with self._resident_lock:
             if k not in self._resident:
-                self._resident[k] = _SectionOnDevice(self.sections[k], self.device)
+                self._resident[k] = SectionOnDevice(self.sections[k].layout, self.sections[k].arrays, self.device)
             self._resident.move_to_end(k)
             if len(self._resident) > max(_MAX_RESIDENT, count):
                 self._resident.popitem(last=False)
             section = self._resident[k]
             return section, section.targets.setdefault(self, OrderedDict())
 
-    def _render(self, k: int, views: "_Views", count: int = 1) -> "_RenderTarget":
+    def _render(self, k: int, views: CameraBatch, count: int = 1) -> RenderTarget:
         """Renders views by section k alone; the call needs `count` sections."""
         section, targets = self._section(k, count)
         key = len(views.pose), *views.size, views.stop is not None
         if key not in targets:
-            targets[key] = _RenderTarget(self, section, *key)
+            # More bands than cores keep all cores busy, as bands with sky finish sooner.
+            bands = 3 * self._threads if self._pool else 1
+            targets[key] = RenderTarget(self._kernels, section, bands, *key)
         targets.move_to_end(key)
         if len(targets) > _MAX_TARGETS:
             targets.popitem(last=False)
@@ -413,7 +338,7 @@ class BakedField:
         ).astype(np.float32)
         if len(vectors) not in (1, n):
             raise InputError(f"{len(vectors)} lightings for {n} cameras; expected one, or one per camera")
-        bias, matrix = self._first_bias
+        bias, matrix = self._kernels.first_bias
         # One product per vector: BLAS may sum a matrix product in another order for another number of vectors, and an
         # image must not depend on the other images.
         return np.broadcast_to(bias + np.stack([vector @ matrix for vector in vectors]), (n, len(bias)))
@@ -490,112 +415,3 @@ def stored_layouts(head: dict[str, Any]) -> list[BrickLayout]:
         fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in one.items()}
         layouts.append(BrickLayout(**fields))
     return layouts
-
-
-@dataclass(frozen=True)
-class _Views:
-    """n cameras to render."""
-
-    pose: NDArray[np.float64]
-    """Camera to world, shape (n, 4, 4)."""
-    intrinsics: NDArray[np.float64]
-    """Shape (n, 4)."""
-    size: tuple[int, int]
-    """Width, height [px]."""
-    bias: Array32
-    """See `BakedField.head_biases`."""
-    stop: NDArray | None
-    """See `BakedField.render`."""
-
-    def subset(self, rows: NDArray[np.int64]) -> "_Views":
-        stop = None if self.stop is None else self.stop[rows]
-        return _Views(self.pose[rows], self.intrinsics[rows], self.size, self.bias[rows], stop)
-
-
-class _RenderTarget:
-    """Buffers for images of one size, and recorded launches that render them in horizontal bands, in parallel."""
-
-    def __init__(self, field: BakedField, section: _SectionOnDevice, n: int, width: int, height: int, stopped: bool):
-        self.shape, device = (n, height, width), field.device
-        # The arrays live as long as the launches that read them. A reference to the section itself would be circular,
-        # and a dropped section would stay in memory until the next garbage collection.
-        self.arrays = section.bricks, section.detail
-        across, down, pixels = -(-width // kernels.TILE), -(-height // kernels.TILE), width * height
-
-        def new(shape: tuple[int, ...], dtype: Any = wp.float32) -> Any:
-            return wp.zeros(shape, dtype=dtype, device=device)
-
-        image: Any = kernels.ImageBuffers()
-        image.rotation, image.position = new((n,), wp.mat33f), new((n,), wp.vec3f)
-        image.intrinsics = new((n,), wp.vec4f)
-        image.stop = new((n, pixels) if stopped else (0, 0))
-        image.width, image.height, image.across = width, height, across
-        self.image, self.bias = image, new((n, len(field._first_bias[0]) // 8), Vec8)
-        self.depth, self.opacity, self.rgb = new((n, pixels)), new((n, pixels)), new((n, pixels), wp.vec3f)
-        self.features = new((n, CHANNELS, pixels))
-        start = new((n, across * down))
-        # More bands than cores keep all cores busy, as bands with sky finish sooner.
-        bands = 3 * field._threads if field._pool else 1
-        edges = np.unique(np.linspace(0, down, bands + 1).round().astype(int)).tolist()
-        self.bands = range(len(edges) - 1)
-        self.launches = []
-        for first, last in itertools.pairwise(edges):
-            recorded = partial(wp.launch, device=device, record_cmd=True)
-            tiles = (last - first) * across
-            top, bottom = first * kernels.TILE * width, min(last * kernels.TILE, height) * width
-            packets = tiles * kernels.TILE**2 // kernels.LANES[device]
-            runs = -(-(bottom - top) // HEAD_LANES[device])
-            self.launches.append(
-                [
-                    recorded(kernels.cone_march, (n, tiles), [section.bricks, image, first * across], [start]),
-                    recorded(
-                        *(field._march, (n, packets), [section.bricks, image, first * across, start]),
-                        [self.features, self.depth],
-                    ),
-                    *(
-                        [
-                            recorded(
-                                *(detail_kernels.add_detail, (n, -(-(bottom - top) // detail_kernels.RUN))),
-                                [*section.detail, image, top, bottom, self.depth],
-                                [self.features],
-                            )
-                        ]
-                        if section.has_detail
-                        else []
-                    ),
-                    recorded(
-                        *(field._color_head, (n, runs), [field._weights, self.bias, image, top, bottom, self.features]),
-                        [self.depth, self.rgb, self.opacity],
-                    ),
-                ]
-            )
-
-    def set_cameras(self, views: _Views) -> None:
-        image = self.image
-        image.rotation.assign(views.pose[:, :3, :3].astype(np.float32))
-        image.position.assign(views.pose[:, :3, 3].astype(np.float32))
-        image.intrinsics.assign(views.intrinsics.astype(np.float32))
-        self.bias.assign(np.ascontiguousarray(views.bias, np.float32).reshape(len(views.bias), -1, 8))
-        if views.stop is not None:
-            image.stop.assign(np.asarray(views.stop, np.float32).reshape(image.stop.shape))
-
-    def render_band(self, band: int) -> None:
-        for launch in self.launches[band]:
-            launch.launch()
-
-    def images(self, features: bool) -> "_Images":
-        """Copies of the images, as the buffers are reused; with or without features."""
-        n, height, width = self.shape
-        rendering = Rendering(
-            self.rgb.numpy().reshape(*self.shape, 3).copy(),
-            self.depth.numpy().reshape(self.shape).copy(),
-            self.opacity.numpy().reshape(self.shape).copy(),
-        )
-        return _Images(rendering, self.features.numpy().reshape(n, -1, height, width).copy() if features else None)
-
-
-@dataclass(frozen=True)
-class _Images:
-    rendering: Rendering
-    features: Array32 | None
-    """Opacity (channel 0) and composited features, shape (n, CHANNELS, height, width)."""

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from twin.geometry.cameras import Cameras, nearest_frame, unproject
+from twin.geometry.cameras import Cameras, nearest_frame, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, ssim
 from twin.nerf import network
 from twin.nerf.appearance import fit_appearance
@@ -46,15 +46,15 @@ def score_frame(
     height, width = mask.shape
     camera = cameras.select(np.array([i]))
     start = field.embedding(cameras.lightings[i])
-    v, u = np.mgrid[:height, :width] + 0.5
+    grid = pixel_grid(width, height)
     arrays = CameraArrays(camera.camera_to_world, intrinsics[None], field.device)
     # The trained field is slow to render, so if a baked one is given, the trained one renders only some rows.
     rows = slice(None) if baked is None else slice(min(_ROW_STEP, height) // 2, None, _ROW_STEP)
-    pixel = np.stack([u[rows].ravel(), v[rows].ravel()], -1)
+    pixel = grid[rows].reshape(-1, 2)
     features, harmonics, _, _ = field.trace(arrays, np.zeros(len(pixel), int), pixel)
     if baked is not None:
         trained = field.color(features, harmonics, start).reshape(image[rows].shape)
-        rays = unproject(np.stack([u.ravel(), v.ravel()], -1), intrinsics) @ camera.camera_to_world[0, :3, :3].T
+        rays = unproject(grid.reshape(-1, 2), intrinsics) @ camera.camera_to_world[0, :3, :3].T
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         harmonics = network.spherical_harmonics(torch.as_tensor(rays.astype(np.float32), device=field.device))
         composited = baked.render_features(camera, start, (width, height))[1][0].reshape(-1, height * width).T
@@ -162,9 +162,7 @@ _MAX_POSES = 60  # poses of all lightings together, evenly spaced over each ligh
 _WIDTH = 96  # [px] longer side of the images
 
 
-def cross_lighting(
-    field: RenderableField, cameras: Cameras, max_poses: int = _MAX_POSES, width: int = _WIDTH
-) -> dict[str, Any] | None:
+def cross_lighting(field: RenderableField, cameras: Cameras, max_poses: int = _MAX_POSES) -> dict[str, Any] | None:
     """Renders training poses under every lighting, not only their own; None with fewer than two lightings.
 
     Only the mean color of an image is used (RGB in [0, 1], over unmasked pixels). No film shows a pose under two
@@ -190,7 +188,7 @@ def cross_lighting(
 
     @cache
     def filmed(i: int) -> Array:
-        image, mask, _ = load_frame(trained, i, width)
+        image, mask, _ = load_frame(trained, i, _WIDTH)
         return mean_color(image / 255.0, mask)
 
     poses = []
@@ -202,7 +200,7 @@ def cross_lighting(
     shown = np.empty((len(poses), len(lightings), 3))
     moves = 0.0
     for row, i in enumerate(track(poses, "poses under every lighting", unit="pose")):
-        mask = load_frame(trained, i, width)[1]
+        mask = load_frame(trained, i, _WIDTH)[1]
         views = [field.render(trained.select(np.array([i])), name, mask.shape[::-1]) for name in lightings]
         shown[row] = [mean_color(view.rgb[0], mask) for view in views]
         moves = max(moves, float(np.ptp([view.depth[0] for view in views], axis=0).max()))

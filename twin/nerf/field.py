@@ -20,7 +20,7 @@ from safetensors.torch import save as to_bytes
 
 from twin.errors import InputError, short_repr
 from twin.files import check_shapes, read_json, regular_file, require_text, wrap_read_errors, write_json
-from twin.geometry.cameras import PosedCameras, intrinsics_for_size
+from twin.geometry.cameras import PosedCameras, intrinsics_for_size, pixel_grid
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
 from twin.nerf.brick_layout import check_networks
@@ -201,19 +201,19 @@ class FieldSection:
         return result
 
     def trace(
-        self, cameras: CameraArrays, camera: NDArray, pixel: NDArray, samples: int, rays: NDArray[np.int64], out: Traced
+        self, cameras: CameraArrays, camera: NDArray, pixel: NDArray, rays: NDArray[np.int64], out: Traced
     ) -> None:
         """Traces the rays with the indices `rays` and writes their results into `out`, see `RadianceField.trace`."""
 
         def march(rows: slice) -> None:
             index = rays[rows]
             k = len(index)
-            with self.workspace(_RENDER_RAYS, samples) as ws:
+            with self.workspace(_RENDER_RAYS, _RENDER_SAMPLES) as ws:
                 ws.camera[:k] = torch.as_tensor(camera[index].astype(np.int32), device=self.device)
                 ws.pixel[:k] = torch.as_tensor(pixel[index].astype(np.float32), device=self.device)
                 self.cast(ws, cameras, 0, k)
                 self.sample(ws, 0, k, _RENDER_UNIFORM_WEIGHT)
-                self.query(ws, 0, k * samples)
+                self.query(ws, 0, k * _RENDER_SAMPLES)
                 self.composite(ws, 0, k)
                 at = torch.as_tensor(index, device=self.device)
                 features, harmonics, depth, opacity = out
@@ -287,7 +287,7 @@ class RadianceField:
         """See `Lightings.added`."""
         self.appearance = self.appearance.added(more, stale)
 
-    def trace(self, cameras: CameraArrays, camera: NDArray, pixel: NDArray, samples: int = _RENDER_SAMPLES) -> Traced:
+    def trace(self, cameras: CameraArrays, camera: NDArray, pixel: NDArray) -> Traced:
         """Traces n rays, given by camera index (n,) and pixel (n, 2) [px]; the result does not depend on the lighting.
 
         Every camera is rendered by its nearest section alone.
@@ -304,7 +304,7 @@ class RadianceField:
         )
         mine = self.road.nearest(cameras.position.numpy().astype(np.float64))[camera]
         for k, section in enumerate(self.sections):
-            section.trace(cameras, camera, pixel, samples, np.flatnonzero(mine == k), out)
+            section.trace(cameras, camera, pixel, np.flatnonzero(mine == k), out)
         return out
 
     def color(self, features: torch.Tensor, harmonics: torch.Tensor, embedding: NDArray) -> NDArray[np.float32]:
@@ -324,8 +324,7 @@ class RadianceField:
         intrinsics, (width, height) = intrinsics_for_size(cameras, size)
         n = len(intrinsics)
         arrays = CameraArrays(cameras.camera_to_world, intrinsics, self.device)
-        v, u = np.mgrid[:height, :width] + 0.5
-        pixel = np.tile(np.stack([u.ravel(), v.ravel()], -1), (n, 1))
+        pixel = np.tile(pixel_grid(width, height).reshape(-1, 2), (n, 1))
         features, harmonics, depth, opacity = self.trace(arrays, np.repeat(np.arange(n), width * height), pixel)
         return Rendering(
             self.color(features, harmonics, vector).reshape(n, height, width, 3),

@@ -147,7 +147,6 @@ def fit_jointly(
     start: Array32,
     sun: Sun,
     fog: Fog,
-    steps: int = _STEPS,
 ) -> tuple[Array32, Sun, Fog]:
     """Fits embedding (dim,), coefficients and, if there is fog, the fog, by gradient descent from a linear fit.
 
@@ -168,8 +167,8 @@ def fit_jointly(
         fitted += [log_extinction, airlight]
         rates += [_EXTINCTION_RATE, _AIRLIGHT_RATE]
     optimizer = torch.optim.Adam([{"params": [p], "lr": rate} for p, rate in zip(fitted, rates, strict=True)])
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1.0 - step / steps)
-    for _ in range(steps):
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1.0 - step / _STEPS)
+    for _ in range(_STEPS):
         rgb = network.head(parameters, features, harmonics, embedding)
         rgb = rgb * (terms @ coefficients).clamp(MIN_GAIN, MAX_GAIN)
         if fog.extinction:
@@ -236,8 +235,6 @@ class SunFit:
     embedding: Array32
     """Appearance embedding under which the sun's gain applies, shape (dim,)."""
     fog: Fog
-    base: str
-    """Lighting from which the embedding started; empty for the embedding fitted without a sun."""
     picture: Array32
     """The field in this light, from the photo's pose, shape (h, w, 3)."""
     psnr_other_half: float
@@ -252,7 +249,7 @@ def fit_sun(
     halves: Sequence[AirFit],
     whole: AirFit,
     casters: ShadowCasters,
-    toward: Array | None = None,
+    toward: Array | None,
 ) -> SunFit:
     """Fits a sun to a photo.
 
@@ -269,7 +266,6 @@ def fit_sun(
     """
     shape, seen = traced.photo.shape, SeenSurfaces.of(traced.depth, traced.rays, traced.camera_to_world)
     colors, distances = traced.photo.reshape(-1, 3).astype(np.float32), traced.distance.ravel()
-    names = [*field.lightings, ""]
     filmed = [field.embedding(name) for name in field.lightings]
 
     def color(rows: NDArray, embedding: Array32) -> Array32:
@@ -319,4 +315,4 @@ def fit_sun(
     embedding, sun, fog = found
     one, other = (fits[base][0].toward for fits in solved)
     disagreement = float(np.rad2deg(np.arccos(np.clip(one @ other, -1.0, 1.0))))
-    return SunFit(sun, embedding, fog, names[base], picture(*found), scores[base], disagreement)
+    return SunFit(sun, embedding, fog, picture(*found), scores[base], disagreement)

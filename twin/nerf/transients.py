@@ -20,7 +20,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
 
-from twin.geometry.cameras import project, unproject
+from twin.geometry.cameras import pixel_grid, project, unproject
 from twin.geometry.images import resize
 from twin.nerf.buffers import parallel
 from twin.nerf.dataset import TrainingPixels
@@ -66,8 +66,7 @@ def cell_size(pixels: TrainingPixels, count: int = _GRID_CELLS) -> int:
 
 def cell_centers(width: int, height: int, side: int) -> Array:
     """Centers (u, v) of a frame's whole cells [px], shape (rows, columns, 2)."""
-    v, u = np.mgrid[: height // side, : width // side]
-    return (np.stack([u, v], -1) + 0.5) * side
+    return pixel_grid(width // side, height // side) * side
 
 
 def frame_cells(pixels: TrainingPixels, i: int, side: int, depth: Array32) -> Cells:
