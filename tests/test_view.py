@@ -459,27 +459,14 @@ def test_the_scripted_driver_reaches_the_goal_of_its_task(drive):
     drive.driving.choose(KEYS_DRIVER)
 
 
-def test_a_start_on_an_obstacle_is_refused(drive):
-    driving = drive.driving
-    driving.choose(KEYS_DRIVER)
-    x, y, _ = drive.facts[-1].base_to_world[:3, 3]
-    driving.reset()
-    x, y = drive.facts[-1].base_to_world[:2, 3]
-    driving.obstacles.put(driving.obstacles.free("box"), x, y, 0.0)
-    with pytest.raises(InputError, match="touches"):
-        driving.reset()
-    driving.obstacles.standing.clear()
-    driving.reset()
-
-
-def test_a_failed_start_is_tried_again(drive):
+def test_a_start_on_an_obstacle_is_refused_and_can_be_tried_again(drive):
     driving = drive.driving
     driving.choose(SCRIPTED_DRIVER)
     driving.reset()
     x, y = drive.facts[-1].base_to_world[:2, 3]
     driving.choose(KEYS_DRIVER)
     driving.obstacles.put(driving.obstacles.free("car"), x, y, 0.0)
-    for begin in (lambda: driving.choose(SCRIPTED_DRIVER), driving.start):
+    for begin in (lambda: driving.choose(SCRIPTED_DRIVER), driving.start, driving.reset):
         with pytest.raises(InputError, match="touches"):
             begin()
         assert not driving.running

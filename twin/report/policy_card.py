@@ -9,7 +9,6 @@ import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from twin.errors import InputError
 from twin.evaluation.forecasting import Candidate, Forecast
 from twin.evaluation.statistics import CONFIDENCE, rate_summary
 from twin.evaluation.training_curves import validated_digests
@@ -36,7 +35,7 @@ def write_policy_cards(scene: SceneDir, runs: Iterable[str]) -> list[Path]:
     written = []
     for run in dict.fromkeys(runs):
         folder = scene.root / "runs" / run
-        if not _is_run(folder):
+        if not exists(folder / JSON):
             continue
         # If the run was trained further after its validation, the results belong to an earlier policy and are left out.
         same = digest_file(folder / JSON) == digests.get(run)
@@ -96,13 +95,6 @@ def card(policy: Policy, folder: Path, cells: Sequence[Cell], known: Sequence[Ca
             "",
         ]
     )
-
-
-def _is_run(folder: Path) -> bool:
-    try:
-        return exists(folder / JSON)
-    except InputError:  # tables may contain names that are not valid file names
-        return False
 
 
 def _front_matter(policy: Policy, cells: Sequence[Cell]) -> str:

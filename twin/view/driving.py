@@ -22,7 +22,6 @@ from twin.config_file import load_config
 from twin.env.drivers import Driver, PolicyDriver, RouteDriver
 from twin.env.episode_lighting import EpisodeLighting
 from twin.env.obstacles import EpisodeObstacles, ObstacleMotion, ground_height, obstacle_pose, place
-from twin.env.physics import camera_pose
 from twin.env.route_segments import RouteSegment, find_task
 from twin.env.suite import DriveEnvironment, EnvFactory
 from twin.env.task import DrivePhysics, DriveTask
@@ -60,8 +59,6 @@ class DriveFacts:
     time: float
     """[s]"""
     base_to_world: Array
-    camera_to_world: Array
-    """Pose of the robot's camera, OpenCV axes."""
     image: Image
     """The robot's picture, shape (h, w, 3)."""
     command: Array
@@ -373,7 +370,6 @@ class Driving:
             DriveFacts(
                 time=float(physics.time()),
                 base_to_world=physics.base_to_world,
-                camera_to_world=camera_pose(physics.data.ptr, physics.model.ptr.camera("front").id),
                 image=self._step.observation["pixels"][-1],
                 command=command,
                 speed=physics.speed,

@@ -61,13 +61,11 @@ class FilmPanel:
             axis = camera_pose_of(client)[:3, 2]
             away = np.linalg.norm(client.camera.position - pose[:3, 3]) > MOVED
             if away or np.linalg.norm(axis - pose[:3, 2]) > _TURNED:
-                self._compare.value = False
+                self.end()
 
     def end(self) -> None:
         """Ends the comparison."""
-        if self._compare.value:
-            self._compare.value = False
-            self._changed()
+        self._compare.value = False  # calls `_changed`
 
     def _source_changed(self) -> None:
         self._frame.max = max(1, len(self._frames(self._source.value)) - 1)
@@ -114,10 +112,6 @@ class FilmPanel:
         if index is None:
             return
         with self._viewer.locked():
-            source = self._cameras.sources[index]
-            if self._source.value != source:
-                self._source.value = source
-                self._frame.max = max(1, len(self._frames(source)) - 1)
-            self._frame.value = int(np.flatnonzero(self._frames(source) == index)[0])
+            self._source.value = self._cameras.sources[index]
+            self._frame.value = int(np.flatnonzero(self._frames(self._source.value) == index)[0])
             self._compare.value = True
-            self._changed()

@@ -8,6 +8,7 @@ import copy
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -28,7 +29,6 @@ _CAMERA = "view"  # name of the free camera in the model
 _MAX_COMPOSITORS = (
     8  # largest number that is kept: for coarse and fine pictures of four pages; making one takes seconds
 )
-_MAX_RAYS = 4  # cameras (size and intrinsics) whose ray lengths are kept
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,6 @@ class ScenePicture:
         self.field = field
         self._model: mujoco.MjModel | None = None
         self._compositors: OrderedDict[tuple[int, int, float], Compositor] = OrderedDict()
-        self._rays: OrderedDict[tuple[int, int, bytes], Array32] = OrderedDict()
         self._lock = threading.Lock()
 
     def add_objects(self, world: World, obstacles: tuple[ObstacleConfig, ...]) -> None:
@@ -103,7 +102,9 @@ class ScenePicture:
             else:
                 out = self._render_objects(camera, lighting, objects)
             if lighting.fog is not None and lighting.fog.extinction:
-                out.rgb[0] = lighting.fog.apply(out.rgb[0], out.depth[0] * self._ray_lengths(camera))
+                out.rgb[0] = lighting.fog.apply(
+                    out.rgb[0], out.depth[0] * _ray_lengths(camera.size, tuple(camera.intrinsics))
+                )
         return out
 
     def _render_objects(self, camera: FreeCamera, lighting: EpisodeLighting, objects: ObjectState) -> Rendering:
@@ -127,12 +128,9 @@ class ScenePicture:
         self._compositors.move_to_end(key)
         return self._compositors[key]
 
-    def _ray_lengths(self, camera: FreeCamera) -> Array32:
-        """Length of each pixel's ray up to z-depth 1, shape (height, width)."""
-        key = (*camera.size, camera.intrinsics.tobytes())
-        if key not in self._rays:
-            rays = unproject(pixel_grid(*camera.size), camera.intrinsics)
-            self._rays[key] = np.linalg.norm(rays, axis=-1).astype(np.float32)
-            if len(self._rays) > _MAX_RAYS:
-                self._rays.popitem(last=False)
-        return self._rays[key]
+
+@lru_cache(4)
+def _ray_lengths(size: tuple[int, int], intrinsics: tuple[float, ...]) -> Array32:
+    """Length of each pixel's ray up to z-depth 1, shape (height, width)."""
+    rays = unproject(pixel_grid(*size), np.array(intrinsics))
+    return np.linalg.norm(rays, axis=-1).astype(np.float32)
