@@ -60,7 +60,7 @@ def export(
     """Writes the given files and folders; returns a summary line for each. Colors do not include a lighting's fog.
 
     Raises:
-            InputError: nothing to write, the scene is not built, it is a pack and frames are wanted, the lighting or
+        InputError: nothing to write, the scene is not built, it is a pack and frames are wanted, the lighting or
             task is unknown, an output folder does not exist, or a folder to write is there already.
     """
     files, folders = [one for one in (usd_file, glb, ply) if one], [one for one in (nerfstudio, colmap) if one]
