@@ -193,7 +193,7 @@ def _fitted_pinhole(lens: Lens) -> Lens:
 
     if lens.camera.is_undistorted() or _max_displacement(lens, zoomed(1.0)) < _NEGLIGIBLE_DISTORTION:
         return zoomed(1.0)
-    border = _border(lens)
+    border = border_pixels(lens)
     low, high = 0.5, _MAX_ZOOM
     if not _fits_inside(lens, border, zoomed(high)):
         raise InputError(
@@ -211,7 +211,8 @@ def raw_pixels(lens: Lens, rays: Array) -> Array:
     return np.asarray(lens.camera.img_from_cam(rays))
 
 
-def _border(lens: Lens) -> Array:
+def border_pixels(lens: Lens) -> Array:
+    """Pixels along the border of a lens's images, shape (n, 2)."""
     u, v = np.linspace(0.5, lens.width - 0.5, 65), np.linspace(0.5, lens.height - 0.5, 65)
     rows = [np.stack([u, np.full_like(u, y)], 1) for y in (v[0], v[-1])]
     columns = [np.stack([np.full_like(v, x), v], 1) for x in (u[0], u[-1])]
@@ -226,6 +227,6 @@ def _fits_inside(lens: Lens, pixels: Array, pinhole: Lens) -> bool:
 def _max_displacement(lens: Lens, pinhole: Lens) -> float:
     """Largest displacement of a pixel by the distortion [px]."""
     grid = pixel_grid(lens.width, lens.height)[:: max(lens.height // 20, 1), :: max(lens.width // 20, 1)]
-    pixels = np.concatenate([grid.reshape(-1, 2), _border(lens)])
+    pixels = np.concatenate([grid.reshape(-1, 2), border_pixels(lens)])
     moved = raw_pixels(lens, unproject(pixels, pinhole.intrinsics)) - pixels
     return float(np.abs(moved).max()) if np.all(np.isfinite(moved)) else np.inf

@@ -24,7 +24,7 @@ import pycolmap
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from twin.capture.camera_models import Lens, PixelMap, raw_pixels
+from twin.capture.camera_models import Lens, PixelMap, border_pixels, raw_pixels
 from twin.capture.mapping import registered_poses
 from twin.capture.matching import Matcher
 from twin.capture.worker import send_message
@@ -42,14 +42,15 @@ _REWEIGHTINGS = 6
 _MAX_ROUNDS, _SETTLED = 8, 0.1  # [px]
 _MAX_SKEW = 0.05  # [rad] a larger skew is not believed: in 30 ms a hand turns a camera by 0.01 rad
 _SLOW = 5.0  # [frames] standard deviation of the Gaussian that separates the slow part of the skews
+_MAX_ZOOMS = 10  # most steps to the focal length of corrected images; two or three are needed
 _NODE_PIXELS = 8  # [px] distance of the pixels at which pixel maps are computed
 _MIN_GAIN = 0.02  # see `_gain`
 # Standard deviations of an observation [px], and of a skew [rad] or shift [focal lengths] a priori. The prior keeps
 # small what the points of a frame do not determine.
 _NOISE, _PRIOR = 0.4, 0.01
 
-Effect = Literal["rows", "columns", "shift"]
-"""A rolling shutter that reads rows or columns, or stabilization."""
+Effect = Literal["zoom", "rows", "columns", "shift"]
+"""A change of focal length, as by autofocus, a rolling shutter that reads rows or columns, or stabilization."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,8 @@ class _Frame:
         """The linear dependence of the reprojection errors on pose and effects.
 
         Returns a matrix (n, 2, m) and errors (n, 2) [px] for n points: errors − matrix @ x are the errors after a small
-        change x of translation, rotation, and skew or shift for each effect, to first order.
+        change x of translation, rotation, and of what each effect changes, to first order: the logarithm of the focal
+        length (1), skew (3) or shift (2).
         """
         points2d = self._image.points2D
         seen = [k for k, point in enumerate(points2d) if point.has_point3D()]
@@ -113,7 +115,9 @@ class _Frame:
         by_rotation = jacobian @ np.stack([np.cross(unit, x) for unit in np.eye(3)], 2)
         parts = [jacobian, by_rotation]
         for effect in effects:
-            if effect == "shift":
+            if effect == "zoom":
+                parts.append(focal * (x[:, :2] / x[:, 2:])[..., None])
+            elif effect == "shift":
                 parts.append(np.broadcast_to(focal * np.eye(2), (len(x), 2, 2)))
             else:
                 parts.append(-self._shares(_axis(effect))[seen, None, None] * by_rotation)
@@ -203,11 +207,11 @@ def _axis(shutter: Effect) -> int:
 def _effects(frames: list[_Frame]) -> tuple[Effect | None, bool]:
     """The kind of a film's rolling shutter, None without one, and whether the film is stabilized."""
     both: tuple[Effect, Effect] = ("rows", "columns")
-    equations = [frame.equations(*both, "shift") for frame in frames]
-    columns = {"pose": [*range(6)], "rows": [6, 7, 8], "columns": [9, 10, 11], "shift": [12, 13]}
+    equations = [frame.equations("zoom", *both, "shift") for frame in frames]
+    columns = {"rows": [7, 8, 9], "columns": [10, 11, 12], "shift": [13, 14]}
 
     def gain(*effects: Effect) -> float:
-        used = [column for effect in ("pose", *effects) for column in columns[effect]]
+        used = [*range(7), *(column for effect in effects for column in columns[effect])]  # pose, zoom and effects
         return _gain([(matrix[:, :, used], error) for matrix, error in equations], len(columns[effects[-1]]))
 
     gains = [gain(effect) for effect in both]
@@ -275,13 +279,16 @@ def corrected_map(lens: Lens, pinhole: Lens, skew: Array, axis: int) -> PixelMap
 
 def corrected_pinhole(lens: Lens, pinhole: Lens, shutter: RollingShutter) -> Lens:
     """The pinhole lens of a film's corrected images; its focal length keeps all their pixels inside the raw frames."""
-    size = np.array([lens.width, lens.height], float)
-    border = np.array([[x, y] for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0)]) * size
-    rays = unproject(border, pinhole.intrinsics)
-    raw = np.stack([_raw_pixels(lens, rays, skew, shutter.axis) for skew in shutter.skews.values()])
-    outside = max(float(np.max([-raw, raw - size])), 0.0)
-    factor = 1.0 / (1.0 - 2.0 * outside / float(size.min()))
-    return pinhole.with_intrinsics(pinhole.intrinsics * [factor, factor, 1.0, 1.0])
+    size, border = np.array([lens.width, lens.height], float), border_pixels(lens)
+    for _ in range(_MAX_ZOOMS):
+        rays = unproject(border, pinhole.intrinsics)
+        raw = np.stack([_raw_pixels(lens, rays, skew, shutter.axis) for skew in shutter.skews.values()])
+        outside = float(np.max([-raw, raw - size]))
+        if outside <= 0.0:
+            break
+        factor = 1.0 + 2.0 * (outside + 0.1) / float(size.min())
+        pinhole = pinhole.with_intrinsics(pinhole.intrinsics * [factor, factor, 1.0, 1.0])
+    return pinhole
 
 
 def _raw_pixels(lens: Lens, rays: Array, skew: Array, axis: int) -> Array:

@@ -129,17 +129,16 @@ def probe(path: Path) -> FilmTiming:
     Raises InputError: not a video, or too damaged to have a readable packet.
     """
     times: list[float] = []
-    discarded = 0  # frames before or after the part that an edit list shows, as in a trimmed film
     regular_file(path)
     try:
         with open_film(path) as (container, stream):
             with contextlib.suppress(av.error.FFmpegError):  # the packets before the end of a truncated file suffice
                 for packet in container.demux(stream):
                     stamp = packet.pts if packet.pts is not None else packet.dts
-                    discarded += packet.is_discard
                     if stamp is not None and not packet.is_discard:
                         times.append(float(stamp * packet.time_base))
-            declared = stream.frames - discarded
+            # Without the frames outside the part that an edit list shows, as in a trimmed film.
+            declared = sum(not entry.is_discard for entry in stream.index_entries) if stream.frames else 0
             rate = float(stream.average_rate or 25)
     except InputError:
         raise

@@ -12,6 +12,7 @@ is randomized less when a photo of the day is available.
 """
 
 from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -171,7 +172,11 @@ class RandomizationSample:
         return replace(self, extinction=0.0, airlight=1.0, sunlight=sun, shade=shade)
 
     def record(self) -> dict[str, Any]:
-        """The values for the episode's record, JSON-able."""
+        """The values for the episode's record, JSON-able; a new dict at each call."""
+        return dict(self._record)
+
+    @cached_property
+    def _record(self) -> dict[str, Any]:  # `asdict` takes 0.1 ms, and every step returns a record
         return asdict(self)
 
 

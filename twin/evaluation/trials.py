@@ -141,7 +141,8 @@ def recorded_trials(table: Path, out: Path) -> list[Trial]:
     """
     known = read_trials(table) if table.exists() else []
     explained = {cell.key: cell for cell in tally(known)}
-    for key, (trials, _) in (read_counts(out) if out.exists() else {}).items():
+    counts = read_counts(out) if _has_rows(out) else {}
+    for key, (trials, _) in counts.items():
         mine = explained[key].trials if key in explained else 0
         if trials > mine:
             raise InputError(
@@ -163,7 +164,7 @@ def write_real_trials(
     Cells that are already in `out` keep their `twin_lighting` and `SETUP_COLUMNS`. For other cells, `setup`, if given,
     returns the values of `SETUP_COLUMNS` for a lighting's name.
     """
-    recorded = _rows(out, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS) if out.exists() else ()
+    recorded = _rows(out, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS) if _has_rows(out) else ()
     known = {(row["policy"], row.get("task", ""), row["lighting"]): row for _, row in recorded}
     rows = []
     for c in tally(trials):
@@ -283,6 +284,11 @@ def _name_hint(name: str, valid: Sequence[str]) -> str:
     if near:
         return f"did you mean {near[0]!r}?"
     return f"expected one of {', '.join(valid[:8])}{', ...' if len(valid) > 8 else ''}"
+
+
+def _has_rows(path: Path) -> bool:
+    """True if a table exists and has more than a header."""
+    return path.exists() and len(_table_text(path).splitlines()) > 1
 
 
 def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterable[tuple[str, dict[str, str]]]:

@@ -38,7 +38,7 @@ from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass
 from twin.reality.lighting import LIGHTINGS, WEATHER
 from twin.reality.place_objects import KnownPlace
-from twin.reality.place_sampling import draw
+from twin.reality.place_sampling import check_length, draw
 from twin.reality.place_spec import PlaceSpec, tasks
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_test import Setup
@@ -155,6 +155,7 @@ def command(options: argparse.Namespace) -> None:
             raise InputError(f"--length {options.length:g}: expected {_LENGTHS[0]:g} to {_LENGTHS[1]:g} m")
         if options.place == 0:
             raise InputError("--length: the demo's street has its length; give a --place from 1 on")
+        check_length(options.place, options.length)
     if options.command == "film":
         plan = TINY if options.tiny else FilmingPlan()
         if options.place:

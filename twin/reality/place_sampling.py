@@ -38,6 +38,14 @@ T = TypeVar("T")
 MAX_FRAMES = 420  # upper bound of the number of frames in all films of a place together
 
 
+def check_length(number: int, length: float) -> None:
+    """Raises InputError: a length [m] for `draw` below that of the place's road."""
+    if length < (sampled := draw(number).line.length):
+        raise InputError(
+            f"--length {length:g}: the road of place {number} has {sampled:g} m; give more, or leave --length out"
+        )
+
+
 def draw(number: int, length: float = 0.0) -> PlaceSpec:
     """The description of the place with a number, always the same.
 

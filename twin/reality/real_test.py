@@ -29,7 +29,7 @@ from twin.learn.policy import JSON, Policy, load_policy
 from twin.reality import REALITY_VERSION
 from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import day_number, weather, weather_index
-from twin.reality.place_sampling import draw
+from twin.reality.place_sampling import check_length
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_camera import TRAINED as camera_ranges
 from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of
@@ -64,11 +64,8 @@ class Setup:
     def __post_init__(self) -> None:
         """Raises InputError: no such robot or camera, or a length below that of the place's road."""
         draw_robot(self.robot), draw_camera(self.camera)
-        if self.length and self.place and self.length < (sampled := draw(self.place).line.length):
-            raise InputError(
-                f"--length {self.length:g}: the road of place {self.place} has {sampled:g} m; give more, or leave "
-                "--length out"
-            )
+        if self.length and self.place:
+            check_length(self.place, self.length)
 
     @property
     def outside(self) -> list[str]:

@@ -93,7 +93,7 @@ class Truth:
         Raises:
             InputError: the files are damaged, or this version of the code builds another place than the one filmed.
         """
-        with wrap_read_errors(folder, "film again: python -m twin.reality film"):
+        with wrap_read_errors(folder, "film again: twin reality film"):
             head = read_json(folder / "truth.json")
             data = load_arrays(folder / "truth.npz")
             keys = ("times", "camera_to_world", "depth_frames", "depth")
