@@ -54,7 +54,7 @@ class AnalyticField:
     boxes: tuple[Box, ...] = ()
     posts: tuple[Post, ...] = ()
     amplitude: float = 0.05
-    """Of the ground's undulation [m]."""
+    """Amplitude of the ground's undulation [m]."""
     slope: float = 0.0
     """Rise of the ground along x."""
     depth_noise: float = 0.0

@@ -1,4 +1,4 @@
-"""What tests of several files ask for."""
+"""Fixtures and options that tests of several files use."""
 
 from pathlib import Path
 

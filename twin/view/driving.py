@@ -139,7 +139,7 @@ def station_and_lateral(route: Array, xy: Array) -> tuple[float, float]:
     length = float(arc_lengths(route)[-1])
 
     def offset(s: Any) -> tuple[Any, Any]:
-        """How far the point is ahead and to the left of the route's point at station s [m]."""
+        """Distances [m] of the point ahead and to the left of the route's point at station s."""
         heading = heading_at(route, s)
         x, y = (xy - point_at(route[:, :2], s)).T
         beyond = s - np.clip(s, 0.0, length)
