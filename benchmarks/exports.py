@@ -53,9 +53,10 @@ class MeshDrawing:
     def draw(self, eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Colors (k, 3) in [0, 255] along rays (k, 3), and the mask of those that hit."""
         n = len(rays)
-        unit = wp.array((rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32), dtype=wp.vec3)
+        unit = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+        directions = wp.array(unit, dtype=wp.vec3, device="cpu")
         face, u, v = (wp.zeros(n, dtype=kind, device="cpu") for kind in (int, float, float))
-        wp.launch(_hit, n, [self._hits.id, wp.vec3(*eye), unit], [face, u, v], device="cpu")
+        wp.launch(_hit, n, [self._hits.id, wp.vec3(*eye), directions], [face, u, v], device="cpu")
         hit = face.numpy() >= 0
         corner = self._mesh.faces[face.numpy()[hit]]
         a, b = u.numpy()[hit], v.numpy()[hit]

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from devices import DEVICES
 
 from twin import runtime
 from twin.errors import InputError
@@ -210,6 +211,20 @@ def test_image_does_not_depend_on_other_lightings_of_the_batch():
         for i in range(n):
             alone = field.render(Viewpoints.of(camera_at(), K, SIZE), lights[i : i + 1])
             assert np.array_equal(alone.rgb[0], together.rgb[i])
+
+
+def test_a_gpu_renders_what_a_cpu_renders():
+    if "cuda" not in DEVICES:
+        pytest.skip("no CUDA device")
+    field = baked(wall(1.0, 2.0))
+    poses = np.concatenate([camera_at(), camera_at((-3.0, 1.0, 0.5)), camera_at((-2.0, -1.0, 0.0))])
+    views = Viewpoints.of(poses, np.tile(K, (3, 1)), SIZE)
+    on_gpu = BakedField(field.sections, field.lightings_by_name, field.networks, "cuda")
+    a, b = field.render(views, "day"), on_gpu.render(views, "day")
+    for one, other in ((a.rgb, b.rgb), (a.opacity, b.opacity)):
+        assert np.abs(one - other).mean() < 1e-3
+    assert np.median(np.abs(a.depth / b.depth - 1.0)) < 1e-3
+    assert np.array_equal(on_gpu.render(views, "day").rgb, b.rgb)
 
 
 def test_each_camera_can_have_its_own_lighting():

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from devices import DEVICES
 from test_fit import CONFIG, HEIGHT, WIDTH, K, floor_points, make_cameras
 
 from twin.errors import InputError
@@ -186,10 +187,11 @@ def _level_of(detail: Detail, hits: np.ndarray, level: int) -> np.ndarray:
     return out
 
 
-def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path):
+@pytest.mark.parametrize("device", DEVICES)
+def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path, device):
     cameras = make_cameras(tmp_path)
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, *_ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
+    field, *_ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device=device)
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     plain, _ = bake(field, pixels, seed=1, steps=60, max_bricks=1500)
     view = Viewpoints.of(cameras.camera_to_world[2:3], K, (WIDTH, HEIGHT))
@@ -200,14 +202,15 @@ def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path):
         facts = fit_detail(fields[-1], field.appearance, pixels, seed=0, passes=30.0)
         assert facts["pixels"] > 100 and facts["psnr_after"] > facts["psnr_before"] + 0.2
     after, again = (f.render(view, "day") for f in fields)
-    assert np.array_equal(after.rgb, again.rgb)
+    # On a GPU, the order of sums changes from run to run.
+    assert np.array_equal(after.rgb, again.rgb) if device == "cpu" else np.abs(after.rgb - again.rgb).max() < 0.05
     assert np.array_equal(after.depth, before.depth) and np.array_equal(after.opacity, before.opacity)
     assert np.abs(after.rgb - before.rgb).max() > 0.02
     # Where rays end before the ground nothing is added.
     stop = np.full(before.depth.shape, 0.6)
     assert np.array_equal(fields[0].render(view, "day", stop=stop).rgb, plain.render(view, "day", stop=stop).rgb)
     fields[0].save(tmp_path)
-    assert np.array_equal(BakedField.load(tmp_path).render(view, "day").rgb, after.rgb)
+    assert np.array_equal(BakedField.load(tmp_path, device).render(view, "day").rgb, after.rgb)
     # A file that a kernel would read beyond its ends is refused.
     texels, tiles = fields[0].sections[0].arrays["detail.texels"], fields[0].sections[0].arrays["detail.tiles"]
     for name, value in (
@@ -225,4 +228,4 @@ def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path):
         with pytest.raises(InputError, match="build the scene again"):
             BakedField.load(tmp_path)
     plain.save(tmp_path)  # as earlier versions wrote them, without detail
-    assert np.array_equal(BakedField.load(tmp_path).render(view, "day").rgb, before.rgb)
+    assert np.array_equal(BakedField.load(tmp_path, device).render(view, "day").rgb, before.rgb)

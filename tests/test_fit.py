@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from devices import DEVICES
 
 from twin.config import NerfConfig, SceneConfig, SourceConfig
 from twin.errors import InputError
@@ -212,9 +213,10 @@ def test_another_seed_gives_another_field(cameras):
     assert not torch.equal(a.field.sections[0].table, b.field.sections[0].table)
 
 
-def test_training_learns_the_floor_and_both_lightings(cameras):
+@pytest.mark.parametrize("device", DEVICES)
+def test_training_learns_the_floor_and_both_lightings(cameras, device):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, metrics, *_ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
+    field, metrics, *_ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device=device)
     metrics |= evaluate(field, cameras, WIDTH)
     assert metrics["n"] == {"day": 1, "night": 1}
     assert metrics["train_psnr"] > 17.0
@@ -235,7 +237,7 @@ def test_training_learns_the_floor_and_both_lightings(cameras):
     one = CameraArrays(cameras.camera_to_world[i : i + 1], K[None], field.device)
     pixels = np.stack([column.ravel() + 0.5 for column in np.mgrid[:HEIGHT, :WIDTH][::-1]], -1)
     features, harmonics, _, _ = field.trace(one, np.zeros(len(pixels), int), pixels)
-    colors = torch.as_tensor(picture.reshape(-1, 3).astype(np.float32))
+    colors = torch.as_tensor(picture.reshape(-1, 3).astype(np.float32), device=device)
     fitted, _ = fit_appearance(field.parameters, features, harmonics, colors, field.embedding("day"))
     seen = field.render(Viewpoints.of(cameras.camera_to_world[i : i + 1], K, (WIDTH, HEIGHT)), fitted).rgb[0]
     assert abs(seen.mean() - picture.mean()) < 0.25 * abs(result.rgb[0].mean() - picture.mean())
@@ -263,9 +265,10 @@ def bricks(facts) -> int:
     return facts["bricks_near"] + facts["bricks_far"]
 
 
-def test_baked_field_renders_like_the_field(cameras, monkeypatch):
+@pytest.mark.parametrize("device", DEVICES)
+def test_baked_field_renders_like_the_field(cameras, device, monkeypatch):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, *_ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device="cpu")
+    field, *_ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device=device)
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     baked, facts = bake(field, pixels, seed=1, steps=60, max_bricks=1500)
     again, _ = bake(field, pixels, seed=1, steps=60, max_bricks=1500)
@@ -284,9 +287,11 @@ def test_baked_field_renders_like_the_field(cameras, monkeypatch):
         assert psnr(other.rgb[0], one.rgb[0]) > 25.0
         lower = (one.depth < 20.0) & (one.opacity > 0.9)
         assert np.median(np.abs(other.depth / one.depth - 1.0)[lower]) < 0.05
-        assert np.array_equal(other.rgb, again.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), name).rgb)
+        repeated = again.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), name)
+        # On a GPU, the order of sums changes from run to run.
+        assert np.array_equal(other.rgb, repeated.rgb) if device == "cpu" else psnr(other.rgb, repeated.rgb) > 30.0
     probes, day = baked.lightings_by_name.probes, field.embedding("day")
-    rays = torch.from_numpy(probes.features), torch.from_numpy(probes.harmonics)
+    rays = [torch.from_numpy(array).to(device) for array in (probes.features, probes.harmonics)]
     assert np.allclose(probes.picture(day), field.color(*rays, day), atol=1e-5)
     assert np.ptp(probes.picture(day).mean(1)) > 0.1
     drawn = baked.sample_lighting(np.random.default_rng(0))

@@ -1,4 +1,7 @@
-"""Environments stepped by mujoco_warp agree with those stepped by MuJoCo; tested on the CPU device."""
+"""Environments stepped by mujoco_warp agree with those stepped by MuJoCo, on the CPU and on a GPU if there is one.
+
+Without a GPU, the option `device` is set to "cuda" where it selects the code, and the arrays stay on the CPU.
+"""
 
 from dataclasses import replace
 
@@ -6,6 +9,7 @@ import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
+from devices import DEVICES
 from tiny_twin import tiny_twin
 
 import twin
@@ -19,6 +23,8 @@ from twin.env.task import control
 from twin.env.vector_env_gpu import GpuVectorEnv
 from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError
+from twin.nerf.baked import BakedField
+from twin.nerf.buffers import load_training_kernels
 from twin.robot import HuskyParams
 
 WALKER = ObstacleConfig("walker", "pedestrian", station=6.0, lateral=-1.5, to=(6.0, 1.5), speed=1.0)
@@ -34,12 +40,17 @@ def scene(tmp_path_factory):
     return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin"), robot=HuskyParams(servo_lag=0.05)))
 
 
+def load_field(scene, device_name: str) -> BakedField:
+    return BakedField.load(scene.scene.stage("field"), device_name)
+
+
 @pytest.mark.slow
-def test_gpu_physics_agrees_with_mujoco(scene):
+@pytest.mark.parametrize("device_name", DEVICES)
+def test_gpu_physics_agrees_with_mujoco(scene, device_name):
     """Different robots under different commands, step by step and all at once."""
     stage = EnvFactory.open(scene, "bend", OPTIONS)
     stage = replace(stage, world=replace(stage.world, robot=replace(stage.world.robot, camera_latency=0.07)))
-    plain, device = LocalVectorEnv(stage, [1, 2, 3]), GpuVectorEnv(stage, [1, 2, 3], "cpu")
+    plain, device = LocalVectorEnv(stage, [1, 2, 3]), GpuVectorEnv(stage, [1, 2, 3], device_name)
     for envs in (plain, device):
         envs.begin(range(3))
     rng = np.random.default_rng(0)
@@ -89,14 +100,15 @@ def test_gpu_physics_agrees_with_mujoco(scene):
     plain.close(), device.close()
 
 
+@pytest.mark.parametrize("device_name", DEVICES)
 @pytest.mark.parametrize("obstacles", [(), (WALKER,)])
-def test_gpu_observations_agree_with_the_cpu(scene, obstacles):
+def test_gpu_observations_agree_with_the_cpu(scene, obstacles, device_name):
     """Images of the field alone, and images with obstacles, without access to the physics in between."""
     stage = EnvFactory.open(scene, "bend", {"obstacles": obstacles, "lighting": "day", **SMALL})
     stage = replace(stage, world=replace(stage.world, robot=replace(stage.world.robot, camera_latency=0.07)))
     plain = LocalVectorEnv(stage, [1, 2])
-    stage = replace(stage, options=replace(stage.options, device="cuda"))  # the field stays on the CPU
-    device = GpuVectorEnv(stage, [1, 2], "cpu")
+    stage = replace(stage, options=replace(stage.options, device="cuda"), field=load_field(scene, device_name))
+    device = GpuVectorEnv(stage, [1, 2], device_name)
     assert type(device.pixels) is (PixelObserver if obstacles else GpuPixelObserver)
     before = None
     for envs in (plain, device):
@@ -112,11 +124,12 @@ def test_gpu_observations_agree_with_the_cpu(scene, obstacles):
     plain.close(), device.close()
 
 
-def test_gpu_overflow_and_divergence_raise(scene):
-    envs = GpuVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], "cpu")
+@pytest.mark.parametrize("device_name", DEVICES)
+def test_gpu_overflow_and_divergence_raise(scene, device_name):
+    envs = GpuVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], device_name)
     envs.begin([0])  # the other environment keeps the model's initial state
     device = envs._simulation
-    device._advance = lambda: None
+    device._advance, device._graph = lambda: None, None
     device._data.overflow.assign([0, int(mjw.OverflowType.NEFC)])
     device._upload = lambda: None
     envs.step(np.zeros((1, 2)), [0])
@@ -130,10 +143,11 @@ def test_gpu_overflow_and_divergence_raise(scene):
     envs.close()
 
 
-def test_gpu_contact_ends_the_episode(scene):
+@pytest.mark.parametrize("device_name", DEVICES)
+def test_gpu_contact_ends_the_episode(scene, device_name):
     wall = ObstacleConfig("in_the_way", "box", station=1.5, lateral=0.0)
     stage = EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": (wall,)})
-    envs = GpuVectorEnv(stage, [4, 5], "cpu")
+    envs = GpuVectorEnv(stage, [4, 5], device_name)
     envs.begin(range(2))
     for _ in range(30):
         out = envs.step(np.array([[1.0, 0.0], [-1.0, 0.0]]))
@@ -147,14 +161,15 @@ def test_gpu_contact_ends_the_episode(scene):
     envs.close()
 
 
+@pytest.mark.parametrize("device_name", DEVICES)
 @pytest.mark.parametrize("latency", [0.0, 0.1])
-def test_gpu_frame_stacks_equal_those_on_the_host(scene, latency, monkeypatch):
+def test_gpu_frame_stacks_equal_those_on_the_host(scene, latency, device_name, monkeypatch):
     """Also across episode ends, for subsets of environments, and as a tensor that shares memory."""
     stage = EnvFactory.open(
         scene, "bend", {"obstacles": (), "lighting": ("day", "night"), "lighting_drift": True, **SMALL}
     )
     robot = replace(stage.world.robot, camera_latency=latency)
-    stage = replace(stage, world=replace(stage.world, robot=robot))
+    stage = replace(stage, world=replace(stage.world, robot=robot), field=load_field(scene, device_name))
     parts = [stage.make_env(seed) for seed in range(3)]
     monkeypatch.setattr(stage.trust, "offset", lambda poses: np.zeros(len(poses)))  # so that the picture decides
     host, device = stage.make_observer(parts), GpuPixelObserver(stage.field, stage.trust, stage.options, parts)
@@ -171,9 +186,22 @@ def test_gpu_frame_stacks_equal_those_on_the_host(scene, latency, monkeypatch):
         np.testing.assert_array_equal(device.stacks, host.stacks)
         np.testing.assert_allclose(device.trust, host.trust, atol=1e-5)
         assert device.info(0)["lighting"] == host.info(0)["lighting"]
-        np.testing.assert_array_equal(device.tensor().numpy(), host.stacks.reshape(3, -1, 18, 32))
+        np.testing.assert_array_equal(device.tensor().cpu().numpy(), host.stacks.reshape(3, -1, 18, 32))
         assert before is None or not np.array_equal(before, host.stacks)
         before = device.stacks
+
+
+def test_physics_starts_while_torch_shares_its_stream(scene):
+    """A field that was trained in this process has made torch's stream Warp's, which a CUDA graph cannot record."""
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    load_training_kernels("cuda")
+    envs = GpuVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], "cuda")
+    envs.begin(range(2))
+    for _ in range(5):
+        envs.step(np.array([[1.0, 0.0], [1.0, 0.0]]))
+    assert all(physics.speed > 0.1 for physics in envs.physics)
+    envs.close()
 
 
 def test_gpu_observer_is_used_only_without_objects(scene):

@@ -213,14 +213,18 @@ class GpuPixelObserver(PixelObserver):
             self.lightings[i].at(time)  # type: ignore[union-attr]
             for i, time in zip(which, times.tolist(), strict=True)
         ]
-        views = Viewpoints.of(poses, self._intrinsics, self.options.size)
+        # The number of environments that begin an episode changes from step to step; rounded up to a power of two, it
+        # has few render targets.
+        count = min(1 << (len(which) - 1).bit_length(), len(self.envs)) - len(which)
+        views = Viewpoints.of(np.append(poses, np.repeat(poses[-1:], count, 0), 0), self._intrinsics, self.options.size)
+        embeddings += embeddings[-1:] * count
         lower, device = height // 2 * width, self._field.device
         below = wp.zeros((len(which), 2), dtype=float, device=device)
         index = wp.array(list(which), dtype=int, device=device)
 
         def push(rgb: Any, opacity: Any) -> None:
             inputs = [rgb, opacity, index, int(fill), lower, SKY_OPACITY]
-            wp.launch(_push_frames, rgb.shape, inputs, [self._stacks, below], device=device)
+            wp.launch(_push_frames, (len(which), rgb.shape[1]), inputs, [self._stacks, below], device=device)
 
         self._field.render_on_device(views, embeddings, push)
         mean_opacity, sky_share = below.numpy().T / (width * height - lower)

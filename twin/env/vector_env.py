@@ -206,7 +206,8 @@ class _Child:
                 stdout=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(),),
                 process_group=0,  # Ctrl-C reaches only the parent, which can then save its state
-                env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": str(share)},
+                # It renders on the CPU; seeing no GPU, it takes none of its memory.
+                env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": str(share), "CUDA_VISIBLE_DEVICES": ""},
             )
 
     def send(self, message: bytes) -> None:

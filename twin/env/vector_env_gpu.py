@@ -128,6 +128,7 @@ class GpuSimulation:
         self._randomized = {
             name: np.stack([getattr(env.robot.model, name) for env in envs]) for name in _RANDOMIZED_FIELDS
         }
+        self._uploaded = False  # True once `begin` has uploaded the randomized fields
         self._camera, self._actuators = model.camera("front").id, robot.actuators
         with wp.ScopedDevice(device):
             self._model = mjw.put_model(model, batch_sizes=dict.fromkeys(_RANDOMIZED_FIELDS, n))
@@ -147,9 +148,11 @@ class GpuSimulation:
             self._graph: Any = None
             if device != "cpu":
                 # The CUDA graph is captured now, while nothing else uses the GPU; the first run compiles the kernels.
-                self._advance()
-                with wp.ScopedCapture() as capture:
+                # torch's default stream, which training a field makes Warp's, cannot be captured.
+                with wp.ScopedStream(wp.Stream(device), sync_enter=True, sync_exit=True):
                     self._advance()
+                    with wp.ScopedCapture() as capture:
+                        self._advance()
                 self._graph = capture.graph
 
     def begin(self, which: Indices) -> None:
@@ -158,7 +161,10 @@ class GpuSimulation:
             return
         robots = [self._envs[i].robot for i in which]
         for name, values in self._randomized.items():
-            values[which] = [getattr(robot.model, name) for robot in robots]
+            new = np.stack([getattr(robot.model, name) for robot in robots])
+            if self._uploaded and np.array_equal(values[which], new):
+                continue  # the arrays of all environments are uploaded, which takes long
+            values[which] = new
             array = getattr(self._model, name)
             # In Warp's arrays, a vector or quaternion is one element.
             array.assign(values.reshape(array.shape + getattr(array.dtype, "_shape_", ())))
@@ -168,6 +174,7 @@ class GpuSimulation:
         for values, array, new in zip(self._mocap, self._mocap_on_device, mocap, strict=True):
             values[:, which] = new
             array.assign(values.astype(np.float32))
+        self._uploaded = True
         self._snapshot_times[:, which] = np.inf
         if len(self._snapshot_times):
             self._snapshot_times[-1, which] = 0.0

@@ -17,7 +17,15 @@ from twin.geometry.cameras import pixel_grid
 from twin.nerf import network
 from twin.nerf.baked import BakedField, BakedSection
 from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
-from twin.nerf.buffers import CameraArrays, Workspace, in_batches, parallel, single_threaded_torch, warp_view
+from twin.nerf.buffers import (
+    CameraArrays,
+    Workspace,
+    in_batches,
+    parallel,
+    shard_count,
+    single_threaded_torch,
+    warp_view,
+)
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.field import QUERY_POINTS, FieldSection, RadianceField
 from twin.nerf.kernels import bricks as kernels
@@ -25,7 +33,6 @@ from twin.nerf.kernels import composite as volume
 from twin.runtime import bar
 from twin.warp_runtime import wp
 
-_SHARDS = 4
 _RAYS = 4096  # rays per step of fine-tuning
 _VIEWS = 64  # greatest number of training views, evenly spaced, in which surfaces are searched
 _VIEW_WIDTH = 112  # [px] width of these views
@@ -219,32 +226,35 @@ class _FineTuner:
         self.gradient, self.second = torch.zeros_like(values), torch.zeros(*values.shape[:2], 2, device=device)
         self.w_values, self.w_gradient = warp_view(values, volume.Channels), warp_view(self.gradient, volume.Channels)
         self.w_second = warp_view(self.second, wp.vec2f)
-        self.rays = -(-_RAYS // _SHARDS) * _SHARDS
+        self.shards = shard_count(device)
+        self.rays = -(-_RAYS // self.shards) * self.shards
         self.ws = Workspace(section.layout, self.rays, _SAMPLES, device, training=True)
         self.cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, device)
 
     def run(self) -> float:
         """Tunes the values in place; returns the PSNR [dB] over the last tenth of the batches."""
         rng = np.random.default_rng([self.seed, 5])
-        errors = []
+        errors: list[torch.Tensor] = []
         with bar("fine-tuning", self.steps, "step") as progress, single_threaded_torch():
             for step in range(self.steps):
-                batch = self.pixels.batch(rng, _SHARDS, 0, self.rays // _SHARDS, 0)
+                batch = self.pixels.batch(rng, self.shards, 0, self.rays // self.shards, 0)
                 self.ws.camera.copy_(torch.from_numpy(batch.frame))
                 self.ws.pixel.copy_(torch.from_numpy(batch.pixel))
                 self.ws.targets.zero_()
                 color = torch.from_numpy(batch.color).to(self.field.device)
                 decay = 0.05 ** (step / self.steps)
 
-                squared = parallel(partial(self._backward, color=color, step=step), range(_SHARDS), self.field.device)
-                errors.append(sum(squared) / _SHARDS)
-                parallel(partial(self._update, rate=decay, step=step), range(_SHARDS), self.field.device)
+                backward = partial(self._backward, color=color, step=step)
+                squared = parallel(backward, range(self.shards), self.field.device)
+                errors.append(torch.stack(squared))
+                parallel(partial(self._update, rate=decay, step=step), range(self.shards), self.field.device)
                 progress.update()
-        return float(-10 * np.log10(np.mean(errors[-max(1, self.steps // 10) :])))
+        last = torch.stack(errors[-max(1, self.steps // 10) :]).tolist()
+        return float(-10 * np.log10(np.mean([sum(shards) / self.shards for shards in last])))
 
-    def _backward(self, shard: int, color: torch.Tensor, step: int) -> float:
+    def _backward(self, shard: int, color: torch.Tensor, step: int) -> torch.Tensor:
         f, s, ws = self.field, self.section, self.ws
-        count = self.rays // _SHARDS
+        count = self.rays // self.shards
         start = shard * count
         rays, samples = slice(start, start + count), slice(start * _SAMPLES, (start + count) * _SAMPLES)
         s.cast(ws, self.cameras, start, count)
@@ -262,33 +272,28 @@ class _FineTuner:
         features = network.ray_features(f.parameters, composited, harmonics)
         embedding = f.appearance.of_frames(ws.camera[rays].long())
         error = network.head(f.parameters, features, harmonics, embedding) - color[rays]
-        loss = torch.nn.functional.smooth_l1_loss(error, torch.zeros_like(error), beta=0.1) / _SHARDS
+        loss = torch.nn.functional.smooth_l1_loss(error, torch.zeros_like(error), beta=0.1) / self.shards
         (gradient,) = torch.autograd.grad(loss, [composited])
         with torch.no_grad():
             ws.composited_grad[rays] = gradient
             ws.inverse_grad[rays] = 0.0
             s.composite_backward(ws, start, count)
-        return float((error.detach() ** 2).mean())
+        return (error.detach() ** 2).mean()
 
     def _update(self, part: int, rate: float, step: int) -> None:
-        gradients = [self.ws.w_positions, self.index, self.ws.w_outputs_grad, part, _SHARDS]
+        gradients = [self.ws.w_positions, self.index, self.ws.w_outputs_grad, part, self.shards]
         wp.launch(
             kernels.interpolate_backward,
             self.rays * _SAMPLES,
             [*gradients, self.w_gradient],
             device=self.field.device,
         )
-        t = step + 1
-        wp.launch(
-            kernels.adam_step,
-            self.rays * _SAMPLES,
-            [
-                *gradients,
-                volume.Channels(_RATES[0] * rate, *[_RATES[1] * rate] * (volume.CHANNELS - 1)),
-                *(1.0 / (1.0 - 0.99**t), self.w_values, self.w_gradient, self.w_second),
-            ],
-            device=self.field.device,
-        )
+        rates = volume.Channels(_RATES[0] * rate, *[_RATES[1] * rate] * (volume.CHANNELS - 1))
+        adam = [rates, 1.0 / (1.0 - 0.99 ** (step + 1)), self.w_values, self.w_gradient, self.w_second]
+        if self.field.device == "cpu":
+            wp.launch(kernels.adam_step, self.rays * _SAMPLES, [*gradients, *adam], device="cpu")
+        else:
+            wp.launch(kernels.adam_step_everywhere, self.w_values.shape, adam, device=self.field.device)
 
 
 def _probes(field: RadianceField, pixels: TrainingPixels, seed: int) -> dict[str, NDArray]:

@@ -4,7 +4,7 @@ The terms are defined in `kernels/space.py` and `kernels/sampler.py`.
 
 Warp runs a CPU launch on one thread. As Warp and torch release the interpreter lock while they compute, two Python
 threads keep two cores busy. A batch is divided into a fixed number of *shards*, whose results are summed in order. So
-results do not depend on the number of cores.
+results do not depend on the number of cores. On CUDA there is one shard: a launch uses the whole GPU.
 """
 
 import threading
@@ -40,6 +40,11 @@ def resolve_device(device: str | None) -> str:
     if device == "cuda" and not has_cuda:
         raise InputError("device cuda: no CUDA device is visible to torch and warp; use --device cpu")
     return device or ("cuda" if has_cuda else "cpu")
+
+
+def shard_count(device: str) -> int:
+    """Number of shards of a batch."""
+    return 4 if device == "cpu" else 1
 
 
 def parallel(work: Callable[[int], T], items: Iterable[int], device: str) -> list[T]:

@@ -18,7 +18,7 @@ from twin.geometry.cameras import pixel_grid, unproject
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
 from twin.nerf.baked import BakedField
-from twin.nerf.buffers import parallel, single_threaded_torch, warp_view
+from twin.nerf.buffers import parallel, shard_count, single_threaded_torch, warp_view
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import surface_detail as kernels
@@ -38,7 +38,6 @@ _MIN_SEEN = 8  # least number of rendered points that determine a height
 _MIN_OPACITY = 0.98  # rays of greater opacity show a surface and nothing behind it
 _MIN_HITS = 24  # least number of training pixels in a stored tile
 _MAX_HITS = 8_000_000  # approximate upper limit of the training pixels used, which take 0.5 GB
-_SHARDS = 4
 _RAYS = 16384  # rays per step
 _RATE, _FINAL_RATE = 0.04, 0.05  # initial learning rate, and the final one as a share of it
 _CLIPPED_SHARE = 2e-4  # share of values clipped by the range of a byte
@@ -213,6 +212,7 @@ class _DetailFitter:
 
     def __init__(self, baked: BakedField, appearance: Appearance, detail: Detail, pixels: SurfacePixels):
         self.detail, self.pixels, self.device = detail, pixels, baked.device
+        self.shards = shard_count(self.device)
         self.parameters = {name: torch.from_numpy(value).to(self.device) for name, value in baked.network.items()}
         with torch.no_grad():
             self.embeddings = appearance.of_frames(torch.arange(len(appearance.frames), device=self.device))
@@ -236,24 +236,24 @@ class _DetailFitter:
         """Fits the detail; returns the PSNR [dB] of the first and of the last tenth of the batches."""
         n = len(self.pixels.hits)
         count = min(_RAYS, n)
-        errors = []
+        errors: list[torch.Tensor] = []
         with bar("fitting detail", steps, "step") as progress, single_threaded_torch():
             for step in range(steps):
                 start = step * count % (n - count + 1)
                 rows = slice(start, start + count)
                 self.hits[:count] = torch.from_numpy(self.pixels.hits[rows])
                 rate = _RATE * _FINAL_RATE ** (step / steps)
-                squared = parallel(partial(self._backward, rows=rows), range(_SHARDS), self.device)
-                parallel(partial(self._update, count=count, rate=rate, step=step), range(_SHARDS), self.device)
-                errors.append(sum(squared) / count / 3)
+                squared = parallel(partial(self._backward, rows=rows), range(self.shards), self.device)
+                parallel(partial(self._update, count=count, rate=rate, step=step), range(self.shards), self.device)
+                errors.append(torch.stack(squared))
                 progress.update()
-        some = max(1, steps // 10)
-        return float(-10 * np.log10(np.mean(errors[:some]))), float(-10 * np.log10(np.mean(errors[-some:])))
+        some, means = max(1, steps // 10), [sum(shards) / count / 3 for shards in torch.stack(errors).tolist()]
+        return float(-10 * np.log10(np.mean(means[:some]))), float(-10 * np.log10(np.mean(means[-some:])))
 
-    def _backward(self, shard: int, rows: slice) -> float:
+    def _backward(self, shard: int, rows: slice) -> torch.Tensor:
         """Writes the loss gradient of a shard's added features; returns the shard's sum of squared errors."""
         count = rows.stop - rows.start
-        low, high = shard * count // _SHARDS, (shard + 1) * count // _SHARDS
+        low, high = shard * count // self.shards, (shard + 1) * count // self.shards
         mine = slice(rows.start + low, rows.start + high)
 
         def batch(array: NDArray) -> torch.Tensor:
@@ -273,23 +273,23 @@ class _DetailFitter:
         error = rgb - batch(self.pixels.color).float() / 255.0
         loss = torch.nn.functional.smooth_l1_loss(error, torch.zeros_like(error), beta=0.1, reduction="sum") / count
         (self.added_grad[low:high, 1:],) = torch.autograd.grad(loss, [added])
-        return float((error.detach() ** 2).sum())
+        return (error.detach() ** 2).sum()
 
     def _update(self, part: int, count: int, rate: float, step: int) -> None:
         wp.launch(
             kernels.interpolate_detail_backward,
             count,
-            [self.w_hits, self.grid, self.w_added_grad, part, _SHARDS],
+            [self.w_hits, self.grid, self.w_added_grad, part, self.shards],
             [self.texels[1], self.vertices[1]],
             device=self.device,
         )
-        wp.launch(
-            kernels.adam_step_detail,
-            count,
-            [self.w_hits, self.grid, part, _SHARDS, rate, 1.0 / (1.0 - 0.99 ** (step + 1))],
-            [*self.texels, *self.vertices],
-            device=self.device,
-        )
+        rates = [rate, 1.0 / (1.0 - 0.99 ** (step + 1))]
+        if self.device == "cpu":
+            hits = [self.w_hits, self.grid, part, self.shards]
+            wp.launch(kernels.adam_step_detail, count, [*hits, *rates, *self.texels, *self.vertices], device="cpu")
+        else:
+            for table in (self.texels, self.vertices):
+                wp.launch(kernels.adam_step_everywhere, table[0].shape[0], [*rates, *table], device=self.device)
 
     def quantized(self) -> Detail:
         """The detail as the renderer reads it: bytes, with the coarser levels added to every texel."""

@@ -183,7 +183,8 @@ class RenderTarget:
                 ),
             ]
             if section.has_detail:
-                dim, inputs = (n, -(-(bottom - top) // detail_kernels.RUN)), [image, top, bottom, self.depth]
+                run = detail_kernels.RUN[device]
+                dim, inputs = (n, -(-(bottom - top) // run)), [image, top, bottom, run, self.depth]
                 launches.append(recorded(detail_kernels.add_detail, dim, [*section.detail, *inputs], [self.features]))
             inputs = [compiled.weights, self.bias, image, top, bottom, self.features]
             outputs = [self.depth, self.rgb, self.opacity]

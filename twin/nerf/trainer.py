@@ -32,6 +32,7 @@ from twin.nerf.buffers import (
     near_box_of_cameras,
     parallel,
     resolve_device,
+    shard_count,
     single_threaded_torch,
     warp_view,
 )
@@ -89,13 +90,12 @@ def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
 
 # ---- training
 
-_SHARDS = 4  # shards per batch, see `buffers.py`
 _CELL_PIXELS = 2.0  # projected side of the finest hash cell at the distance of near surfaces [px of a training frame]
 _GROWTH_RANGE = (1.3, 2.2)  # limits of the factor between the cells per axis of consecutive hash levels
 _HIDDEN = 64  # units per hidden layer
 _MIN_NEAR_PLANE = 1e-3  # [m] losses divide by distances along rays, so no sample may be at a camera
 _TRIPLE_SHARE = 0.3  # share of the rays that come in triples, for the plane loss
-_FREE_POINTS = 256  # free points per shard and step
+_FREE_POINTS = 1024  # free points per step
 _NETWORK_RATE = 1e-2  # initial learning rate of networks and embeddings
 _FINAL_RATE = 0.03  # final learning rates, as a share of the initial ones
 _RISE, _FALL = 0.3, 0.1  # step of an opacity grid cell toward a more or a less opaque sample [share of the difference]
@@ -143,8 +143,11 @@ class Trainer:
         appearance = initial_appearance(lightings, train.names, frame_lighting, config.appearance_dim, seed)
         self.field = untrained_field(layouts, appearance, seed, device, self.road)
         self.rng = np.random.default_rng([seed, 2])
-        self.rays = -(-config.rays // _SHARDS) * _SHARDS
-        self.ws = Workspace(layouts[0], self.rays, config.samples, device, _SHARDS * _FREE_POINTS, training=True)
+        self.shards = shard_count(device)
+        self.free_points = _FREE_POINTS // self.shards
+        """Free points per shard and step."""
+        self.rays = -(-config.rays // self.shards) * self.shards
+        self.ws = Workspace(layouts[0], self.rays, config.samples, device, _FREE_POINTS, training=True)
         self.free = self.road.segments(free_segments(train, config.near_plane))
         """Segments of each section, see `free_segments`."""
         self.refinement: PoseRefinement | None = None
@@ -209,31 +212,35 @@ class Trainer:
         warm = min(1.0, (self.steps_done + 1) / (_WARM_UP * self.road.count))
         return warm * math.exp(math.log(_FINAL_RATE) * self.steps_done / self.steps)
 
-    def step(self) -> float:
-        """Runs one training step and returns the mean squared error of its colors."""
+    def step(self) -> torch.Tensor:
+        """Runs one training step; returns the mean squared error of the colors of each shard, on the device.
+
+        Reading them at once would stop a GPU until the host has prepared the next step.
+        """
         if self.config.transients and self.steps_done == int(_MOVERS_SHARE * self.steps):
             movers = mover_masks(self.pixels, self._cell_depths())
             self.moving = sum(float(mask.sum()) for mask in movers) / len(self.pixels.colors)
             self._exclude(movers)
         ws, device = self.ws, self.device
         section = self.steps_done % self.road.count
-        per_shard = self.rays // _SHARDS
+        per_shard = self.rays // self.shards
         supervised = int(per_shard * self.config.sightings)
         triples = int(per_shard * _TRIPLE_SHARE) // 3
-        batch = self.parts[section].batch(self.rng, _SHARDS, triples, per_shard - supervised - 3 * triples, supervised)
+        singles = per_shard - supervised - 3 * triples
+        batch = self.parts[section].batch(self.rng, self.shards, triples, singles, supervised)
         ws.camera.copy_(torch.from_numpy(batch.frame))
         ws.pixel.copy_(torch.from_numpy(batch.pixel))
         ws.targets.copy_(torch.from_numpy(batch.distance))
         color = torch.from_numpy(batch.color).to(device)
-        free = self._free_points(section, _SHARDS * _FREE_POINTS)
+        free = self._free_points(section, _FREE_POINTS)
         if free is not None:
             ws.positions[self.rays * ws.samples :].copy_(free)
 
         results = parallel(
-            lambda shard: self._shard(section, shard, color, triples, free is not None), range(_SHARDS), device
+            lambda shard: self._shard(section, shard, color, triples, free is not None), range(self.shards), device
         )
         rate = self.rate()
-        parallel(lambda task: self._update(section, task, rate), range(self.config.levels + 2), device)
+        self._update(section, rate)
         for tensor, *gradients in zip(self.torch_parameters.values(), *(r[1] for r in results), strict=True):
             tensor.grad = torch.stack(gradients).sum(0) if len(gradients) > 1 else gradients[0]
         for group in self.optimizer.param_groups:
@@ -242,18 +249,18 @@ class Trainer:
         if self._refines:
             self.refinement.step(rate * self.frame_rate)  # type: ignore[union-attr]
         self.steps_done += 1
-        return sum(r[0] for r in results) / _SHARDS
+        return torch.stack([r[0] for r in results])
 
     def _shard(
         self, section: int, shard: int, color: torch.Tensor, triples: int, free: bool
-    ) -> tuple[float, list[torch.Tensor]]:
+    ) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Runs a shard; returns its mean squared error, and its gradients in the order of `torch_parameters`."""
-        f, s, ws = self.field, self.field.sections[section], self.ws
-        count = self.rays // _SHARDS
+        f, s, ws, shards = self.field, self.field.sections[section], self.ws, self.shards
+        count = self.rays // shards
         start = shard * count
         rays = slice(start, start + count)
         samples = slice(start * ws.samples, (start + count) * ws.samples)
-        first_free = self.rays * ws.samples + shard * _FREE_POINTS
+        first_free = self.rays * ws.samples + shard * self.free_points
         explore = max(0.0, 1.0 - self.steps_done / (_EXPLORATION_SHARE * self.steps + 1))
 
         s.cast(ws, self.arrays, start, count)
@@ -269,12 +276,12 @@ class Trainer:
         rgb = network.head(f.parameters, features, harmonics, f.appearance.of_frames(frame))
         error = rgb - color[rays]
         # Terms are divided by the number of shards: the losses of all shards then sum to the mean over the batch.
-        loss = torch.nn.functional.smooth_l1_loss(rgb, color[rays], beta=0.1) / _SHARDS
-        loss = loss + _RESIDUAL * (residuals[frame] ** 2).mean() / _SHARDS
-        loss = loss + horizon_loss(composited[:, 0], ws.directions[rays, 2]) / _SHARDS
+        loss = torch.nn.functional.smooth_l1_loss(rgb, color[rays], beta=0.1) / shards
+        loss = loss + _RESIDUAL * (residuals[frame] ** 2).mean() / shards
+        loss = loss + horizon_loss(composited[:, 0], ws.directions[rays, 2]) / shards
         inverse_depth = (ws.inverse_distance[rays] / ws.cosines[rays]).requires_grad_(True)
         if triples:
-            loss = loss + _PLANE / _SHARDS * plane_loss(inverse_depth[: 3 * triples], color[rays][: 3 * triples])
+            loss = loss + _PLANE / shards * plane_loss(inverse_depth[: 3 * triples], color[rays][: 3 * triples])
         learned = [t for n, t in self.torch_parameters.items() if not n.startswith("trunk")]
         gradients = torch.autograd.grad(loss, [composited, inverse_depth, *learned], allow_unused=True)
         with torch.no_grad():
@@ -298,7 +305,7 @@ class Trainer:
                 [ws.w_densities],
                 device=self.device,
             )
-            return float((error**2).mean()), [first, second, *gradients[2:]]
+            return (error.detach() ** 2).mean(), [first, second, *gradients[2:]]
 
     def _exclude(self, masks: list[NDArray[np.bool_]]) -> None:
         """Excludes marked pixels from training, in addition to earlier ones."""
@@ -340,44 +347,59 @@ class Trainer:
         With respect to raw density, the gradient saturates at high density.
         """
         ws, layout = self.ws, section.layout
-        section.query(ws, start, _FREE_POINTS)
-        rows = slice(start, start + _FREE_POINTS)
+        section.query(ws, start, self.free_points)
+        rows = slice(start, start + self.free_points)
         density = torch.exp(ws.outputs[rows, 0].clamp(max=volume.RAW_LIMIT)) * layout.density_unit
         depth = density * layout.near_box.scale
-        ws.outputs_grad[rows, 0] = _FREE / (_SHARDS * _FREE_POINTS) * depth / (1.0 + depth)
+        ws.outputs_grad[rows, 0] = _FREE / _FREE_POINTS * depth / (1.0 + depth)
         return self._trunk_backward(rows)
 
-    def _update(self, section: int, task: int, rate: float) -> None:
-        """Accumulates the gradient of hash level `task` and takes an Adam step on that level.
+    def _update(self, section: int, rate: float) -> None:
+        """Accumulates the gradients of the hash tables, takes an Adam step, and updates the opacity grids.
 
-        The last two tasks instead update the opacity grids, each one half of the cells.
+        On a CPU, hash levels and two halves of the grids' cells are tasks that run in parallel.
         """
-        s, ws, moments = self.field.sections[section], self.ws, self.moments[section]
         levels = self.config.levels
-        if task >= levels:
-            wp.launch(
-                sampler.update_grids,
-                self.rays * ws.samples,
-                [
-                    *(ws.w_positions, ws.w_densities, _RISE, _FALL, task - levels, 2, s.w_grids),
-                ],
-                device=self.device,
-            )
+        if self.device != "cpu":
+            self._update_levels(section, 0, levels, rate)
+            self._update_grids(section, 0, 1)
             return
+
+        def work(task: int) -> None:
+            if task < levels:
+                self._update_levels(section, task, 1, rate)
+            else:
+                self._update_grids(section, task - levels, 2)
+
+        parallel(work, range(levels + 2), self.device)
+
+    def _update_levels(self, section: int, first: int, count: int, rate: float) -> None:
+        """Accumulates the gradients of `count` hash levels from `first` on, and takes an Adam step on them."""
+        s, ws, moments = self.field.sections[section], self.ws, self.moments[section]
         t = self.steps_done // self.road.count + 1
         wp.launch(
             hashgrid.encode_backward,
-            (1, ws.features.shape[0]),
-            [ws.w_positions, s.w_levels, task, ws.w_features_grad, moments[0]],
+            (count, ws.features.shape[0]),
+            [ws.w_positions, s.w_levels, first, ws.w_features_grad, moments[0]],
             device=self.device,
         )
         wp.launch(
             hashgrid.adam_step,
-            (1, s.table.shape[1]),
+            (count, s.table.shape[1]),
             [
-                *(task, self.config.learning_rate * rate / (1.0 - 0.9**t), 1.0 / (1.0 - 0.99**t)),
+                *(first, self.config.learning_rate * rate / (1.0 - 0.9**t), 1.0 / (1.0 - 0.99**t)),
                 *(s.w_table, *moments),
             ],
+            device=self.device,
+        )
+
+    def _update_grids(self, section: int, part: int, parts: int) -> None:
+        """Updates one of `parts` parts of the cells of a section's opacity grids."""
+        s, ws = self.field.sections[section], self.ws
+        wp.launch(
+            sampler.update_grids,
+            self.rays * ws.samples,
+            [ws.w_positions, ws.w_densities, _RISE, _FALL, part, parts, s.w_grids],
             device=self.device,
         )
 
@@ -435,13 +457,17 @@ def train_field(
     curve: list[list[float]] = []
     began = time.perf_counter()
     mean = 0.0
+    pending: list[torch.Tensor] = []
     with bar("training", trainer.steps, "step") as progress, single_threaded_torch():
         while not trainer.done:
-            error = trainer.step()
-            if not math.isfinite(error):
-                raise InputError(f"training diverged at step {trainer.steps_done}; lower nerf.learning_rate")
-            mean = error if trainer.steps_done == 1 else 0.98 * mean + 0.02 * error
+            pending.append(trainer.step())
             if trainer.steps_done % 20 == 0 or trainer.done:
+                for k, shards in enumerate(torch.stack(pending).tolist(), trainer.steps_done - len(pending) + 1):
+                    error = sum(shards) / len(shards)
+                    if not math.isfinite(error):
+                        raise InputError(f"training diverged at step {k}; lower nerf.learning_rate")
+                    mean = error if k == 1 else 0.98 * mean + 0.02 * error
+                pending.clear()
                 progress.set_postfix_str(f"PSNR {-10 * math.log10(mean):.2f} dB", refresh=False)
                 curve.append([trainer.steps_done, round(-10 * math.log10(mean), 3)])
             progress.update()

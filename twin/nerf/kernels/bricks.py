@@ -159,6 +159,44 @@ def interpolate_backward(
             wp.atomic_add(gradient, position.slot, position.corner + corner_offset(n), g * corner_weight(position, n))
 
 
+@wp.func
+def adam_sample(
+    slot: wp.int32,
+    at: wp.int32,
+    rates: Channels,
+    second_correction: wp.float32,
+    values: wp.array2d(dtype=Channels),
+    gradient: wp.array2d(dtype=Channels),
+    second: wp.array2d(dtype=wp.vec2f),
+):
+    """Adam step of one sample, if it has a gradient."""
+    g = gradient[slot, at]
+    if wp.dot(g, g) > 0.0:
+        own = g[0] * g[0]
+        v = second[slot, at] * 0.99 + wp.vec2f(own, (wp.dot(g, g) - own) / float(CHANNELS - 1)) * 0.01
+        second[slot, at] = v
+        value = values[slot, at]
+        value[0] = value[0] - rates[0] * g[0] / (wp.sqrt(v[0] * second_correction) + 1.0e-15)
+        scale = 1.0 / (wp.sqrt(v[1] * second_correction) + 1.0e-15)
+        for c in range(1, CHANNELS):
+            value[c] = value[c] - rates[c] * g[c] * scale
+        values[slot, at] = value
+        gradient[slot, at] = Channels()
+
+
+@wp.kernel(enable_backward=False)
+def adam_step_everywhere(
+    rates: Channels,
+    second_correction: wp.float32,
+    values: wp.array2d(dtype=Channels),
+    gradient: wp.array2d(dtype=Channels),
+    second: wp.array2d(dtype=wp.vec2f),
+):
+    """`adam_step` for a GPU: one thread per stored sample."""
+    slot, at = wp.tid()
+    adam_sample(slot, at, rates, second_correction, values, gradient, second)
+
+
 @wp.kernel(enable_backward=False)
 def adam_step(
     positions: wp.array(dtype=wp.vec3f),
@@ -175,8 +213,8 @@ def adam_step(
     """Takes an Adam step (Kingma and Ba 2015) on samples with a gradient and clears the gradient; β = (0, 0.99).
 
     To save memory there is no momentum, and a sample's features share one second moment. Visits the positions of
-    `interpolate_backward`, as most samples get no gradient. On CUDA, two threads may reach a sample at once: it may
-    then take two steps.
+    `interpolate_backward`, as most samples get no gradient. Many positions share a sample, so this kernel is for one
+    thread; `adam_step_everywhere` is for a GPU.
     """
     i = wp.tid()
     g = outputs_grad[i]
@@ -185,18 +223,6 @@ def adam_step(
     position = locate(positions[i], index)
     if position.slot < 0 or position.slot % parts != part:
         return
-    slot = position.slot
     for n in range(8):
-        at = position.corner + corner_offset(n)
-        g = gradient[slot, at]
-        if wp.dot(g, g) > 0.0:
-            own = g[0] * g[0]
-            v = second[slot, at] * 0.99 + wp.vec2f(own, (wp.dot(g, g) - own) / float(CHANNELS - 1)) * 0.01
-            second[slot, at] = v
-            value = values[slot, at]
-            value[0] = value[0] - rates[0] * g[0] / (wp.sqrt(v[0] * second_correction) + 1.0e-15)
-            scale = 1.0 / (wp.sqrt(v[1] * second_correction) + 1.0e-15)
-            for c in range(1, CHANNELS):
-                value[c] = value[c] - rates[c] * g[c] * scale
-            values[slot, at] = value
-            gradient[slot, at] = Channels()
+        corner = position.corner + corner_offset(n)
+        adam_sample(position.slot, corner, rates, second_correction, values, gradient, second)

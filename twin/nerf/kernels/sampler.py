@@ -196,7 +196,8 @@ def update_grids(
 ):
     """Moves sampled cells towards the opacity of their samples, at the rate `rise` upwards and `fall` downwards.
 
-    Launched once per `part` of the cells, so that parts can run in parallel and each cell gets its samples in order.
+    Launched once per `part` of the cells, so that parts can run in parallel and each cell gets its samples in order. On
+    a GPU, of samples that reach a cell at once, only one counts.
     """
     i = wp.tid()
     g = positions[i]

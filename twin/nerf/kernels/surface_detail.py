@@ -36,8 +36,8 @@ _TOLERANCE, _TOLERANCE_PER_METER = 0.08, 0.01  # [m], [m/m] a surface this close
 _MAX_STRETCH = 4.0  # if a pixel's projection to the ground is longer than this times its width, the footprint grows
 _PRIME_Y = wp.uint32(2654435761)
 _PRIME_Z = wp.uint32(805459861)
-RUN = 16
-"""Neighboring pixels per thread when rendering."""
+RUN = {"cpu": 16, "cuda": 1}
+"""Neighboring pixels per thread when rendering, by device."""
 _ZERO = 128.0  # byte of the value 0
 _MIN_GRADIENT = 1.0e-22  # rays with a smaller squared norm of the gradient are skipped
 
@@ -316,7 +316,8 @@ def adam_step_detail(
 ):
     """Takes an Adam step (Kingma and Ba 2015) on the rows with a gradient and clears the gradient; β = (0, 0.99).
 
-    To save memory there is no momentum, and the features of a row share one second moment.
+    To save memory there is no momentum, and the features of a row share one second moment. Many hits share a row, so
+    this kernel is for one thread; `adam_step_everywhere` is for a GPU.
     """
     i = wp.tid()
     hit = hits[i]
@@ -339,6 +340,18 @@ def adam_step_detail(
             row = vertex_row(grid, x + (n & 1), y + ((n >> 1) & 1), z + (n >> 2))
             if (row // 8) % parts == part:
                 adam_row(row, rate, second_correction, vertices, vertices_grad, vertices_second)
+
+
+@wp.kernel(enable_backward=False)
+def adam_step_everywhere(
+    rate: wp.float32,
+    second_correction: wp.float32,
+    values: wp.array(dtype=Channels),
+    gradient: wp.array(dtype=Channels),
+    second: wp.array(dtype=wp.float32),
+):
+    """`adam_step_detail` for a GPU: one thread per row."""
+    adam_row(wp.tid(), rate, second_correction, values, gradient, second)
 
 
 @wp.kernel(enable_backward=False)
@@ -423,18 +436,19 @@ def add_detail(
     image: ImageBuffers,
     first: wp.int32,
     last: wp.int32,
+    pixels_per_thread: wp.int32,
     depth: wp.array2d(dtype=wp.float32),
     features: wp.array3d(dtype=wp.float32),
 ):
-    """Adds detail to the features of runs of `RUN` pixels, from `first` up to `last`, of every camera."""
+    """Adds detail to the features of runs of pixels, from `first` up to `last`, of every camera."""
     camera, run = wp.tid()
     k = image.intrinsics[camera]
     rotation = image.rotation[camera]
     position = image.position[camera]
     per_pixel = 1.0 / k[0]
     pixels = image.width * image.height
-    for j in range(RUN):
-        pixel = first + run * RUN + j
+    for j in range(pixels_per_thread):
+        pixel = first + run * pixels_per_thread + j
         if pixel < last:
             z = depth[camera, pixel]
             if z > 0.0 and z * per_pixel < MAX_FOOTPRINT * grid.coarsest:
