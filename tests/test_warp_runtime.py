@@ -18,6 +18,7 @@ def test_no_cuda_warning():
 def test_other_lines_are_passed_on(capfd):
     with warp_runtime._without_the_warning():
         os.write(2, b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver. No GPU.\nsomething else\n")
+        os.write(2, b"Warp CUDA error 100: no CUDA-capable device is detected (in function init_cuda_driver)\n")
     assert capfd.readouterr().err == "something else\n"
 
 

@@ -34,7 +34,7 @@ _MAX_COACD_FACES = 400  # larger meshes are decimated for CoACD, which is slow w
 # Results are checked, so a coarser search than CoACD's defaults suffices.
 _SEARCH = {"resolution": 100, "mcts_nodes": 5, "mcts_iterations": 10, "mcts_max_depth": 2}
 _TIME_LIMIT = 120.0  # [s] per piece; far more than a piece needs, so that a slow machine does not change the result
-_PROCESSES = 2
+_MAX_PROCESSES = 16  # of 150 MB each
 _MAX_HULL_VERTICES = 32
 _SAMPLE_SPACING = 0.06  # [m] between test points on surfaces
 _MAX_UNCOVERED = 0.08
@@ -248,9 +248,10 @@ def _run_coacd(
     pending = [job for job in jobs if not job[1].exists()]
     for source, _, piece in pending:
         np.savez(source, vertices=piece.vertices, faces=piece.faces, bound=bound, seed=seed)
-    with runtime.bar("convex parts", len(pending), "piece") as bar, ThreadPoolExecutor(_PROCESSES) as pool:
-        # Interleaved, so that both children get large and small pieces.
-        queues = [[job[:2] for job in pending[k::_PROCESSES]] for k in range(_PROCESSES)]
+    count = max(1, min(runtime.available_cores(), _MAX_PROCESSES, len(pending)))
+    with runtime.bar("convex parts", len(pending), "piece") as bar, ThreadPoolExecutor(count) as pool:
+        # Interleaved, so that every child gets large and small pieces.
+        queues = [[job[:2] for job in pending[k::count]] for k in range(count)]
         stopped = threading.Event()
         try:
             list(pool.map(lambda queue: _run_children(queue, bar, stopped), queues))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from twin import runtime
 from twin.env.controller import SubstepSchedules, VectorController
 from twin.env.observation import GpuPixelObserver
 from twin.env.obstacles import ObstacleMotion
@@ -147,6 +148,7 @@ class GpuSimulation:
             self._upload()
             self._graph: Any = None
             if device != "cpu":
+                runtime.log_line("preparing physics on the GPU; the first time on a machine, this takes minutes")
                 # The CUDA graph is captured now, while nothing else uses the GPU; the first run compiles the kernels.
                 # torch's default stream, which training a field makes Warp's, cannot be captured.
                 with wp.ScopedStream(wp.Stream(device), sync_enter=True, sync_exit=True):

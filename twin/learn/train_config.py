@@ -161,7 +161,7 @@ class TrainConfig:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "cpu": {},
-    # Pictures have the full resolution, as in arXiv 2403.15791. Not measured on a GPU yet.
+    # Pictures have the full resolution, as in arXiv 2403.15791. No training with this preset was run to its end yet.
     "gpu": {
         "pool": 1,
         "convolutions": ((32, 8, 4), (64, 4, 2), (64, 3, 1)),
