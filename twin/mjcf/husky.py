@@ -54,7 +54,7 @@ _COLLISION_BOXES = (  # full size, center in the base [m]
 # 2.5 mm is a compromise: with 3 mm, a wheel sinks in by 1.6 mm and touches the facets of a height field ahead of it,
 # which shakes the camera by 0.9 m/s² instead of 0.5 m/s²; with 1 mm, a scrubbing wheel flutters at a friction of 1.0.
 _WHEEL_SOLIMP = (0.0, 0.95, 0.0025, 0.5, 2.5)
-_WHEEL_SOLREF = (0.02, 2.0)  # twice the critical damping, which reduces shaking on a height field by 1/8
+_WHEEL_SOLREF = (0.02, 2.0)  # twice the critical damping, which reduces shaking on a height field by 1/6
 _IMU_POSITION = (0.19, 0.0, 0.149)  # in the base [m]
 
 ROBOT_VISUAL_GROUP, ROBOT_COLLISION_GROUP = 1, 4

@@ -58,7 +58,7 @@ _MAX_BEND = 0.5  # upper limit of the relative second difference of inverse dept
 _HORIZON_SINE = 0.03  # a ray is neither above nor below the horizon if its sine of elevation is between ± this
 # Weights of the loss terms beside the color error.
 _DISTORTION = 0.005
-_DEPTH, _DEPTH_REACH = 0.25, 0.5  # a weight of 1.0 costs 0.6 dB of PSNR, as errors of stereo blur near surfaces
+_DEPTH, _DEPTH_REACH = 0.25, 0.5  # with 1.0, stereo's errors blur: it costs 0.3 dB, near the camera 0.6 to 0.8 dB
 _PLANE = 0.01
 _FREE = 1e-3
 _SKY, _GROUND = 1e-2, 1e-2
