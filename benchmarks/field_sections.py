@@ -234,8 +234,8 @@ def gpu(bench: Bench) -> Figures:
     found |= {f"gpu.fox.{key}": value for key, value in row.items()}
     if bench.scene is None:
         return found
-    place, views = baked_path(bench), route_views(bench)
-    with np.load(views) as data:
+    place = baked_path(bench)
+    with np.load(route_views(bench)) as data:
         poses, k = data["poses"], data["intrinsics"]
     poses = poses[np.linspace(0, len(poses) - 1, bench.pick(256, 4)).round().astype(int)]
     on_gpu, on_cpu = load_baked(place, "cuda"), load_baked(place, "cpu")

@@ -207,6 +207,22 @@ def test_training_is_bit_equal_on_any_number_of_cores(cameras, monkeypatch):
     assert first.sections[0].table.abs().max() > 0.011  # it did move
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_training_that_diverges_is_one_line_before_the_field_is_used(cameras, device, monkeypatch):
+    """Movers are searched at step 9, between two reports of the error."""
+    step = Trainer.step
+
+    def poisoned(self):
+        if self.steps_done == 5:
+            self.field.parameters["trunk.0"].fill_(float("nan"))
+        return step(self)
+
+    monkeypatch.setattr(Trainer, "step", poisoned)
+    config = replace(CONFIG, steps=30, transients=True, refine_cameras=True)
+    with pytest.raises(InputError, match=r"diverged at step [67]; lower nerf\.learning_rate"):
+        train_field(cameras, SparsePoints.empty(), config, device=device)
+
+
 def test_another_seed_gives_another_field(cameras):
     a = Trainer(cameras, SparsePoints.empty(), CONFIG, 1, "cpu")
     b = Trainer(cameras, SparsePoints.empty(), CONFIG, 2, "cpu")

@@ -214,7 +214,7 @@ class GpuPixelObserver(PixelObserver):
             for i, time in zip(which, times.tolist(), strict=True)
         ]
         # The number of environments that begin an episode changes from step to step; rounded up to a power of two, it
-        # has few render targets.
+        # needs fewer render targets.
         count = min(1 << (len(which) - 1).bit_length(), len(self.envs)) - len(which)
         views = Viewpoints.of(np.append(poses, np.repeat(poses[-1:], count, 0), 0), self._intrinsics, self.options.size)
         embeddings += embeddings[-1:] * count

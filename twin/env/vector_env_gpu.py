@@ -2,7 +2,7 @@
 
 The host starts episodes one by one. After each step, reward and termination are computed for all environments together.
 Images of the radiance field alone, without obstacles, weather or camera noise, stay on the device (`GpuPixelObserver`).
-Tests run this code on the CPU, where it is slower than MuJoCo.
+Tests run this code on the CPU, where it is slower than MuJoCo, and on a GPU if there is one.
 """
 
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"

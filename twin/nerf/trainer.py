@@ -176,6 +176,8 @@ class Trainer:
         """For each section, the hash table's gradient, and Adam's first and second moment of it."""
         self.steps = config.steps * self.road.count
         """Number of steps; the sections take turns."""
+        self.movers_step = int(_MOVERS_SHARE * self.steps)
+        """Number of steps after which movers are searched."""
         self.steps_done = 0
 
     def _layout(self, cameras: Cameras) -> Layout:
@@ -217,7 +219,7 @@ class Trainer:
 
         Reading them at once would stop a GPU until the host has prepared the next step.
         """
-        if self.config.transients and self.steps_done == int(_MOVERS_SHARE * self.steps):
+        if self.config.transients and self.steps_done == self.movers_step:
             movers = mover_masks(self.pixels, self._cell_depths())
             self.moving = sum(float(mask.sum()) for mask in movers) / len(self.pixels.colors)
             self._exclude(movers)
@@ -453,7 +455,8 @@ def train_field(
     `camera_height` [m] is the constant height of the camera above the ground, 0 if it is not constant; for `device` see
     `buffers.resolve_device`. Raises InputError if training diverges.
     """
-    trainer = Trainer(cameras, points, config, seed, resolve_device(device), camera_height=camera_height)
+    device = resolve_device(device)
+    trainer = Trainer(cameras, points, config, seed, device, camera_height=camera_height)
     curve: list[list[float]] = []
     began = time.perf_counter()
     mean = 0.0
@@ -461,13 +464,16 @@ def train_field(
     with bar("training", trainer.steps, "step") as progress, single_threaded_torch():
         while not trainer.done:
             pending.append(trainer.step())
-            if trainer.steps_done % 20 == 0 or trainer.done:
+            report = trainer.steps_done % 20 == 0 or trainer.done
+            # A GPU is asked seldom, but before the field is used to find movers.
+            if device == "cpu" or report or trainer.steps_done == trainer.movers_step:
                 for k, shards in enumerate(torch.stack(pending).tolist(), trainer.steps_done - len(pending) + 1):
                     error = sum(shards) / len(shards)
                     if not math.isfinite(error):
                         raise InputError(f"training diverged at step {k}; lower nerf.learning_rate")
                     mean = error if k == 1 else 0.98 * mean + 0.02 * error
                 pending.clear()
+            if report:
                 progress.set_postfix_str(f"PSNR {-10 * math.log10(mean):.2f} dB", refresh=False)
                 curve.append([trainer.steps_done, round(-10 * math.log10(mean), 3)])
             progress.update()

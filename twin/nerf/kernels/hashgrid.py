@@ -2,8 +2,8 @@
 
 *Grid position*: see `kernels/space.py`. *Level*: one of several grids of vertices, from coarse to fine. *Table*:
 features of all levels, equally many rows each, `FEATURES` floats per row. A level with no more vertices than rows is
-stored densely, others are hashed. The trainer launches the backward pass once per level, so that a CPU adds the
-sums of each level in a fixed order.
+stored densely, others are hashed. On a CPU, the trainer launches the backward pass once per level, so that the
+sums of each level are added in a fixed order.
 """
 
 # Warp evaluates annotations, so they contain calls, which mypy does not accept.

@@ -196,8 +196,8 @@ def update_grids(
 ):
     """Moves sampled cells towards the opacity of their samples, at the rate `rise` upwards and `fall` downwards.
 
-    Launched once per `part` of the cells, so that parts can run in parallel and each cell gets its samples in order. On
-    a GPU, of samples that reach a cell at once, only one counts.
+    Launched once per `part` of the cells, so that parts can run in parallel and each cell gets its samples in order. If
+    several threads of a GPU update a cell at the same time, one of them wins.
     """
     i = wp.tid()
     g = positions[i]
