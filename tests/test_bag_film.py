@@ -83,6 +83,15 @@ def test_frames_calibration_and_positions_come_from_the_bag(tmp_path: Path, stor
     assert np.allclose(capture.odometry[:, 2], 0.6)  # the lens above base_link
 
 
+def test_fixes_are_interpolated_across_180_degrees(tmp_path: Path) -> None:
+    contents = read_contents(write(tmp_path / "drive", whole()))
+    second = contents.stamps[0] + np.array([0, 1, 2, 3]) * 1_000_000_000
+    fixes = np.array([[-16.8, 179.99998, 3.0], [-16.8, -179.99998, 3.0], [np.nan] * 3, [-16.8, 179.99996, 3.0]])
+    across = replace(contents, fix_times=second, fixes=fixes).fixes_at(np.array([0.0, 0.25, 0.75, 1.0, 1.5]))
+    np.testing.assert_allclose(across[:4, 1], [179.99998, 179.99999, -179.99999, -179.99998], atol=1e-9)
+    assert np.isnan(across[4]).all()
+
+
 def test_a_folder_named_like_a_bag_of_ros_1(tmp_path: Path) -> None:
     assert read_contents(write(tmp_path / "drive.bag", whole())).size == (WIDTH, HEIGHT)
 

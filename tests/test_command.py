@@ -86,6 +86,13 @@ def test_an_unknown_lighting_of_reality_is_one_line(tmp_path, capsys):
         assert told.startswith("error: no lighting 'noon'") and told.count("\n") == 1
 
 
+def test_a_lighting_given_twice_is_filmed_once(tmp_path, monkeypatch):
+    plans = []
+    monkeypatch.setattr("twin.reality.__main__.film", lambda plan, *given, **more: plans.append(plan))
+    assert main(["reality", "film", "--lightings", "sun", "night", "sun", "--out", str(tmp_path / "out")]) == 0
+    assert [plan.lightings for plan in plans] == [("sun", "night")]
+
+
 def test_training_in_a_scene_that_is_not_built_leaves_no_files(tmp_path, capsys):
     (tmp_path / "scene.toml").write_text('name = "bare"\n[[source]]\npath = "a.mp4"\n')
     assert main(["train", str(tmp_path), "--run", "first"]) == 2

@@ -165,6 +165,13 @@ def test_corridor_is_cleared_and_the_rest_stays():
     assert sum(map(_volume, by[1])) == pytest.approx(_volume(parts[1]) - 2.0 * 0.3 * 1.6, rel=0.04)
 
 
+@pytest.mark.parametrize("count", [2, 4, 5])
+def test_the_corridor_reaches_the_end_of_its_line(count):
+    line = np.column_stack([np.arange(float(count)), np.zeros(count)])
+    ends = line[[0, -1]] + np.array([[-1.0, 0.0], [1.0, 0.0]])
+    np.testing.assert_allclose(Corridor((line,), 1.0).distance(ends, 9.0), 1.0)
+
+
 def test_a_part_beside_a_bend_loses_only_its_corner():
     route = right_turn(length=40.0, straight=15.0, step=0.25)
     part = _box((15, -3.0, -0.1), (18, -1.6, 1.0))

@@ -11,7 +11,7 @@ import pytest
 from twin.capture import metric
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.capture.gravity import find_road, up_from_ground
-from twin.capture.scale import Scale, combine_scales, local_east_north_up
+from twin.capture.scale import Scale, combine_scales, local_east_north_up, scale_from_marker
 from twin.config import DistanceConfig, MarkerConfig, MetricConfig, SceneConfig
 from twin.errors import InputError
 from twin.files import read_json
@@ -266,6 +266,8 @@ def test_east_north_up_of_a_known_place() -> None:
     enu = local_east_north_up(np.array([[55.7, 13.2, 10.0], [55.7 + 1 / 60, 13.2, 10.0], [55.7, 13.2, 17.0]]))
     np.testing.assert_allclose(enu[1, :2], [0.0, 1855.8], atol=0.6)
     np.testing.assert_allclose(enu[2], [0.0, 0.0, 7.0], atol=1e-6)
+    across = local_east_north_up(np.array([[0.0, 180.0 - 5e-5, 0.0], [0.0, 5e-5 - 180.0, 0.0]]))
+    np.testing.assert_allclose(across[1, :2], [11.132, 0.0], atol=1e-3)  # no jump at ±180°
 
 
 def test_gps_gives_metres_and_east(tmp_path: Path) -> None:
@@ -358,6 +360,21 @@ def test_a_marker_gives_metres(tmp_path: Path) -> None:
     assert metrics["marker_frames"] >= 10
     with pytest.raises(InputError, match="number 8 was found in 0 frames"):
         world.run(tmp_path / "out", marker=MarkerConfig("DICT_4X4_50", 8, side))
+
+
+def test_a_marker_from_one_pose_is_refused(tmp_path: Path) -> None:
+    """As when the camera stands still: the corners cannot be triangulated."""
+    film = np.tile(_path(turn=False, count=1, pitch=0.05), (3, 1, 1))
+    pattern = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 48)
+    points = _points(_path(turn=False, count=12, pitch=0.05), np.random.default_rng(0))
+    world = _world(tmp_path / "s", [film], points, _similarity(4), posed=True)
+    for i, pose in enumerate(film):
+        image = _paint_marker(pose, np.array([4.0, 0.3, 1.4]), 0.4, pattern)
+        write_image(world.scene.stage("cameras") / "images" / f"film0/{i:06d}.png", image)
+    cameras = Cameras.load(world.scene.stage("cameras"))
+    cameras = dataclasses.replace(cameras, camera_to_world=np.tile(np.eye(4), (3, 1, 1)))
+    with pytest.raises(InputError, match=r"metric\.marker: seen from one direction only"):
+        scale_from_marker(cameras, MarkerConfig("DICT_4X4_50", 7, 0.4))
 
 
 def test_metric_poses_are_taken_as_they_are(tmp_path: Path) -> None:

@@ -4,8 +4,11 @@ import io
 import json
 import multiprocessing
 import resource
+import signal
 import stat
 import struct
+import subprocess
+import sys
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -30,6 +33,7 @@ from twin.nerf.fog import Fog
 from twin.nerf.lightings import AddedLighting
 from twin.nerf.road import RoadSections
 from twin.pack import pack, rounded
+from twin.runtime import exclusive_lock
 from twin.scene import SceneDir, stage_result, write_stamp
 from twin.unpack import decode_differences, encode_differences, open_scene
 
@@ -286,6 +290,33 @@ def test_two_processes_open_a_pack_at_once(packed, cache):
     assert a == b and [path.name for path in cache.iterdir()] == [Path(a).name]
     before = (Path(a) / "scene.toml").stat().st_mtime_ns
     assert _open(str(packed)) == a and (Path(a) / "scene.toml").stat().st_mtime_ns == before
+
+
+_KILLED = """
+import os, signal, sys
+from pathlib import Path
+from twin import unpack
+unpack._check_contents = lambda *given: os.kill(os.getpid(), signal.SIGKILL)
+unpack.open_scene(Path(sys.argv[1]))
+"""
+
+
+def test_what_a_killed_process_left_in_the_cache_is_removed(packed, cache):
+    killed = subprocess.run([sys.executable, "-c", _KILLED, str(packed)])
+    assert killed.returncode == -signal.SIGKILL
+    assert any((one / "scene.toml").exists() for one in cache.iterdir())
+    used = cache / ".other-0123.abcd0123.partial"  # of another process, which still runs
+    used.mkdir()
+    with exclusive_lock(used.with_suffix(".lock"), "a pack is being unpacked"):
+        folder = open_scene(packed)
+        assert {one.name for one in cache.iterdir()} == {folder.name, used.name, f"{used.stem}.lock"}
+
+
+def test_what_a_killed_process_left_in_an_empty_folder_is_removed(packed, tmp_path):
+    left = tmp_path / "mine" / ".mine.abcd0123.partial" / "build"
+    left.mkdir(parents=True)
+    unpack.unpack(packed, tmp_path / "mine")
+    assert not left.parent.exists() and (tmp_path / "mine" / unpack.PACK_JSON).exists()
 
 
 # ---- hostile packs

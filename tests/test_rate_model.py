@@ -6,6 +6,7 @@ from intervals import KINDS, Shape, simulate
 from scipy import integrate, stats
 
 from twin.evaluation.agreement import unit_counts
+from twin.evaluation.forecasting import _rates_over_days
 from twin.evaluation.rate_model import RateModel
 from twin.evaluation.statistics import wilson
 from twin.evaluation.trials import Cell
@@ -97,6 +98,18 @@ def test_cells_are_shrunk_towards_their_policy() -> None:
     means = RateModel.fit([[5, 0, 5, 5], [0, 0, 0, 5]], np.full((2, 4), 5), shared_days=False).cell_means()
     assert means[0, 1] < 0.5 < means[0, 0] and means[0, 1] > means[1, 0]
     assert means[1, 3] < means[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("won", "trials", "road"),
+    [([[50] * 4] * 8 + [[0] * 4], 50, False), ([[50] * 5] * 3 + [[49] * 5], 50, True), ([[5, 5], [0, 0]], 5, True)],
+)
+def test_a_rate_lies_in_its_interval(won: list[list[int]], trials: int, road: bool) -> None:
+    rows = [[Cell(f"p{i}", "t", f"d{k}", trials, n) for k, n in enumerate(row)] for i, row in enumerate(won)]
+    model = zip(*RateModel.fit(won, np.full(np.shape(won), trials), road=road).interval(), strict=True)
+    for one, row, (low, high) in zip(_rates_over_days(rows, road), won, model, strict=True):
+        assert one.value == pytest.approx(np.mean(row) / trials) and one.low <= one.value <= one.high
+        assert one.low <= low and one.high >= high  # the interval is only widened
 
 
 def test_padding_changes_nothing_and_wrong_counts_are_refused() -> None:

@@ -1,6 +1,8 @@
 """Sun of an added lighting: shadow map, gain, fit to a photo, position from time and place, and pictures in it."""
 
 import json
+import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from twin import runtime
 from twin.assets.ground import Ground
 from twin.assets.shadow_casters import rough_triangles, shadow_casters
 from twin.assets.views import Views
+from twin.capture.capture_data import Capture
 from twin.env.domain_randomization import RandomizationSample, Ranges
 from twin.env.irradiance import IrradianceEstimator
 from twin.env.suite import EnvFactory
@@ -98,6 +101,34 @@ def test_rough_triangles_are_surfaces_above_the_mesh():
     near, far = (np.abs(corners[..., 0] - x).max(1) < 1e-3 for x in (10.0, 20.0))
     assert near.any() and far.any() and (near | far).all()  # nothing spans the gap
     assert corners[near].mean(1)[:, 2].min() > 2.5 and corners[far].mean(1)[:, 2].min() > 1.0
+
+
+def test_memory_of_a_shadow_map_is_bounded(monkeypatch):
+    """A map computed in batches equals the map computed at once."""
+    casters, toward = ShadowCasters(*_mesh(), *_mesh()), direction(30.0, 40.0)
+    tracemalloc.start()
+    try:
+        made = casters.seen_from(toward, texel=0.01)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert made.height.size > 400_000 and peak < 20 << 20
+    monkeypatch.setattr("twin.geometry.shadow_map._BATCH", 1 << 30)
+    np.testing.assert_array_equal(casters.seen_from(toward, texel=0.01).height, made.height)
+
+
+def test_surfaces_far_from_each_other_are_seen():
+    """Two plates 3 km apart under a low sun, and rays over 5 km."""
+    plate = np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [50.0, 50.0, 0.0], [0.0, 50.0, 0.0]])
+    vertices, faces = np.concatenate([plate, plate + np.array([3000.0, 0.0, 0.0])]), np.array([[0, 1, 2], [0, 2, 3]])
+    shadows = ShadowCasters(vertices, np.concatenate([faces, faces + 4])).seen_from(direction(0.0, 20.0), texel=1.0)
+    for x in (25.0, 3025.0):
+        points = np.array([[x, 25.0, -2.0], [x, 25.0, 0.0]])
+        np.testing.assert_allclose(shadows.visibility(points, np.eye(3)[[2, 2]]), [0.0, 1.0], atol=1e-3)
+    surface = Surface(plate, faces)
+    above = np.array([[20.0, 20.0, 5000.0]])
+    assert surface.cast(above, np.array([[0.0, 0.0, -2.0]])) == pytest.approx(2500.0)
+    assert surface.distance(above) == pytest.approx(5000.0)
 
 
 def test_shadow_map_survives_its_file():
@@ -392,3 +423,18 @@ def test_options_give_the_sun(tmp_path):
     timed = find_sun(scene, None, "2003-10-17T12:30:30-07:00", "39.742476,-105.1786", 90.0)
     assert timed is not None and timed.toward is not None
     assert angles(timed.toward) == pytest.approx((255.66, 39.89), abs=0.1)
+
+
+def test_the_place_is_found_on_both_sides_of_180_degrees(tmp_path):
+    scene = filmed_corridor(tmp_path / "corridor")
+    capture = Capture.load(scene.stage("capture"))
+    longitude = np.where(np.arange(len(capture.names)) % 2, 179.9999, -179.9999)
+    gps = np.column_stack([np.full(len(longitude), -16.8), longitude, np.zeros(len(longitude))])
+    assert len(gps) % 2 == 0  # else the median is one of them
+    replace(capture, gps=gps).save(scene.stage("capture"))
+    for stage in ("capture", "metric"):
+        write_stamp(scene.stage(stage), stage)
+    noon = "2026-06-01T12:00+12:00"
+    sun = find_sun(scene, None, noon, None, 90.0)
+    assert sun is not None and sun.toward is not None
+    np.testing.assert_allclose(sun.toward, sun_direction(parse_time(noon), -16.8, 180.0, 90.0), atol=1e-5)

@@ -87,6 +87,19 @@ def test_a_policy_trained_again_is_driven_anew(scene):
     shutil.rmtree(again)
 
 
+def test_the_rounds_of_a_search_open_the_scene_once(fresh, monkeypatch):
+    opened, real = [], policy_evaluation.load_scene
+    monkeypatch.setattr(policy_evaluation, "load_scene", lambda path: opened.append(path) or real(path))
+    policies = {"ahead": str(fresh / "runs" / "ahead")}
+    search = validate.Campaign(load_scene(fresh), "ahead", fresh / "validation" / "worst.csv", policies, False, 1, None)
+    rounds = [search.drive([("ahead", "drawn_0", seeds)], "search") for seeds in ([0], [0], [1, 2])]
+    assert len(opened) == 1
+    seeds = [trial.seed for trials in rounds for trial in trials]
+    (alone,) = campaign([chunk(fresh, [0, 1, 2], "drawn_0")])
+    assert len(opened) == 2  # files may have changed since
+    assert seeds == [0, 0, 1, 2] and [t.steps for t in rounds[0] + rounds[2]] == [one.steps for one in alone]
+
+
 def test_sampled_lightings_do_not_depend_on_earlier_ones(scene):
     def light(numbers):
         stage = EnvFactory.open(load_scene(scene), "ahead", {"size": (32, 18)})

@@ -32,8 +32,10 @@ from twin.files import parse_toml
 from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.images import write_image
 from twin.geometry.poses import look_at
+from twin.geometry.shadow_map import OrthographicShadowMap
 from twin.loading import Twin
 from twin.nerf.fog import Fog
+from twin.nerf.sun import Sun
 from twin.report import build_report as report_page
 from twin.report.video_layout import to_uint8
 from twin.report.video_writer import read_frames
@@ -225,7 +227,8 @@ _VIEW = {"time": 0.0, "camera_to_world": np.eye(4).tolist(), "fov": 60.0, "light
         ([_VIEW], "1 views; expected 2"),
         ([_VIEW, _VIEW], "increasing"),
         ([_VIEW, {**_VIEW, "time": 1.0, "lighting": "noon"}], "'noon': unknown"),
-        ([_VIEW, {**_VIEW, "time": 1.0, "lighting": [1.0]}], "expected a name, or 4 numbers"),
+        ([_VIEW, {**_VIEW, "time": 1.0, "lighting": [1.0]}], "expected a name, 4 numbers"),
+        ([_VIEW, {**_VIEW, "time": 1.0, "lighting": {"from": "day", "to": "night", "share": 2.0}}], "share 2.0 is not"),
         ([_VIEW, {**_VIEW, "time": 1.0, "fov": 179.0}], "fov 179"),
         ([_VIEW, {**_VIEW, "time": 1.0, "camera_to_world": (2.0 * np.eye(4)).tolist()}], "no rotation"),
         ([_VIEW, {**_VIEW, "time": 1.0, "camera_to_world": [[1.0]]}], "4×4"),
@@ -569,6 +572,34 @@ def test_a_flight_ends_in_the_lighting_of_before_or_in_the_one_chosen_meanwhile(
     _wait(lambda: not panel._fly_button.disabled)
     assert viewer.lighting is night
     viewer.set_lighting(before)
+
+
+def test_a_view_added_in_flight_keeps_fog_and_sun(page, field, tmp_path, monkeypatch):
+    viewer, panel, client = page.viewer, page._path, _Client()
+    client.camera.position, client.camera.wxyz, client.camera.fov = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 1.0
+    map_of_nothing = OrthographicShadowMap(np.array([0.0, 0.6, 0.8]), np.zeros(2), 0.15, np.zeros((4, 4), np.float32))
+    field, photo = viewer.field, {"photo": field.embedding("night")}
+    suns = {"photo": Sun(map_of_nothing, np.ones((6, 3), np.float32))}
+    more = field.lightings_by_name.added(photo, (), {"photo": Fog(0.2, (1.0, 0.0, 0.5))}, suns)
+    monkeypatch.setattr(field, "lightings_by_name", more)
+    monkeypatch.setattr(viewer, "clients", lambda: [client])
+    monkeypatch.setattr(viewer, "place", lambda *given: None)
+    monkeypatch.setattr(panel, "_root", tmp_path)
+    (start, fov, day), (end, _, _) = _views(field, 0.5)
+    monkeypatch.setattr(panel, "_keys", [(start, fov, day), (end, fov, named_lighting(field, "photo"))])
+    click = SimpleNamespace(client=client)
+    panel._fly(click)
+    _wait(lambda: viewer.lighting.name == "day → photo")
+    with viewer.locked():
+        panel._add_view(click)
+    added = panel._keys[-1][2]
+    _wait(lambda: not panel._fly_button.disabled)
+    assert 0.0 < added.fog.extinction < 0.2 and 0.0 < added.sunlight[0][1] < 1.0
+    panel._save()
+    panel._load()
+    again = panel._keys[-1][2]
+    np.testing.assert_array_equal(again.start, added.start)
+    assert (again.fog, again.sunlight) == (added.fog, added.sunlight)
 
 
 def test_a_path_that_cannot_be_shown_or_saved_is_a_notice(page, field, notices, monkeypatch):

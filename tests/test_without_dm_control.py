@@ -3,11 +3,18 @@
 import subprocess
 import sys
 
-_WITHOUT = "import sys; sys.modules['dm_control'] = None; sys.modules['dm_control.rl'] = None; "
+import pytest
+
+_LOAD = "import twin\ntry: twin.load('x')\nexcept twin.InputError as e: print(e)"
+_PYTHON_3_13 = """
+import collections, sys, twin
+sys.version_info = collections.namedtuple("V", "major minor micro releaselevel serial")(3, 13, 0, "final", 0)
+"""
 
 
-def _run(code: str) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, "-c", _WITHOUT + code], capture_output=True, text=True)
+def _run(code: str, missing: str = "dm_control") -> subprocess.CompletedProcess:
+    without = f"import sys; sys.modules[{missing!r}] = None; "
+    return subprocess.run([sys.executable, "-c", without + code], capture_output=True, text=True)
 
 
 def test_scenes_are_built_without_dm_control():
@@ -15,6 +22,13 @@ def test_scenes_are_built_without_dm_control():
     assert done.returncode == 0, done.stderr
 
 
-def test_driving_without_dm_control_names_the_cure():
-    done = _run("import twin\ntry: twin.load('x')\nexcept twin.InputError as e: print(e)")
-    assert "needs dm_control, which installs on Python 3.11 and 3.12" in done.stdout, done.stderr
+@pytest.mark.parametrize("missing", ["dm_control", "absl"])
+def test_driving_names_the_missing_module_and_the_cure(missing):
+    done = _run(_LOAD, missing)
+    assert f"driving in a scene needs {missing}; install twin again" in done.stdout, done.stderr
+    assert "Python" not in done.stdout
+
+
+def test_driving_on_python_3_13_names_the_versions():
+    done = _run(_PYTHON_3_13 + _LOAD)
+    assert "needs dm_control, which installs on Python 3.11 and 3.12; this is Python 3.13" in done.stdout, done.stderr

@@ -216,7 +216,7 @@ def find_sun(
     moment = parse_time(time)
     if heading is not None and not np.isfinite(heading):
         raise InputError(f"--heading {heading}: expected the compass angle of the scene's x axis in degrees")
-    from twin.capture.capture_data import Capture
+    from twin.capture.capture_data import Capture, nearest_longitudes
     from twin.capture.scale import local_east_north_up
     from twin.geometry.cameras import Cameras
 
@@ -225,8 +225,9 @@ def find_sun(
     if location is not None:
         place = _two_numbers("--location", location, "latitude and longitude in degrees, such as 48.14,11.58")
     elif known.any():
-        latitude, longitude = np.median(capture.gps[known, :2], axis=0).tolist()
-        place = latitude, longitude
+        latitude, longitude = capture.gps[known, :2].T
+        middle = np.median(nearest_longitudes(longitude, float(longitude[0])), keepdims=True)
+        place = float(np.median(latitude)), float(nearest_longitudes(middle)[0])
     else:
         raise InputError("--time needs --location LAT,LON, since no frame of the scene has a GPS position")
     if heading is None:

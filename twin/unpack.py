@@ -12,17 +12,20 @@ the declared one, or a wrong digest. Then nothing remains on the disk.
 """
 
 import argparse
+import contextlib
+import glob
 import hashlib
 import json
 import math
 import os
 import re
+import secrets
 import shutil
 import stat
 import struct
 import sys
-import tempfile
 import zipfile
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,6 +39,7 @@ from twin.errors import InputError, short_repr
 from twin.files import digest_file, exists, is_file, parse_json, read_json, require_text, wrap_read_errors
 from twin.geometry.cameras import Cameras
 from twin.mjcf.world import SCENE_XML
+from twin.runtime import exclusive_lock
 from twin.scene import PACK_JSON, STAGES, SceneDir
 
 SUFFIX = ".twin"
@@ -70,6 +74,7 @@ _XML_PATHS = (
     *("fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"),
 )
 _XML_REFUSED = ("include", "plugin", "extension", "model", "attach")  # elements that load other files or code
+_PARTIAL, _TOKEN = ".partial", 8  # suffix of a folder that is being filled, and the letters before it
 _HEADER = 8  # [bytes] of a safetensors file before its header; they contain the header's length
 
 
@@ -161,32 +166,56 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
             f"{path} has {zips[0]}, which may run code when it is loaded; if you trust its sender, twin unpack --trust"
         )
     is_there = exists(folder)
+    beside = folder if is_there else folder.parent
+    _remove_abandoned(beside, glob.escape(folder.name[:80]))
     if is_there and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder} exists; give a folder that does not")
-    beside = folder if is_there else folder.parent
     beside.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name[:80]}.", suffix=".partial", dir=beside))
     try:
-        with wrap_read_errors(path, _CURE), zipfile.ZipFile(path) as archive:
-            for name, facts in manifest["files"].items():
-                target = partial / name
-                target.parent.mkdir(parents=True, exist_ok=True)
-                _extract(archive, name, facts, target)
-        _check_contents(partial, path)
-        (partial / PACK_JSON).write_bytes(json.dumps(manifest, indent=1).encode())
-        if is_there:  # it may be the working folder, or a link, so it is filled
-            for one in list(partial.iterdir()):
-                one.rename(folder / one.name)
-            partial.rmdir()
-        else:
-            partial.chmod(0o755)
-            partial.rename(folder)
-    except BaseException as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        if isinstance(error, InputError) and isinstance(error.__cause__, OSError):
+        with _partial_folder(beside, folder.name[:80]) as partial:
+            with wrap_read_errors(path, _CURE), zipfile.ZipFile(path) as archive:
+                for name, facts in manifest["files"].items():
+                    target = partial / name
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    _extract(archive, name, facts, target)
+            _check_contents(partial, path)
+            (partial / PACK_JSON).write_bytes(json.dumps(manifest, indent=1).encode())
+            if is_there:  # it may be the working folder, or a link, so it is filled
+                for one in list(partial.iterdir()):
+                    one.rename(folder / one.name)
+            else:
+                partial.chmod(0o755)
+                partial.rename(folder)
+    except InputError as error:
+        if isinstance(error.__cause__, OSError):
             raise error.__cause__ from None  # such as a full disk: the pack is not damaged
         raise
     return manifest
+
+
+@contextlib.contextmanager
+def _partial_folder(beside: Path, name: str) -> Iterator[Path]:
+    """Yields a new folder in `beside`, which is removed at the end unless it was renamed.
+
+    A lock tells other processes that it is in use, see `_remove_abandoned`.
+    """
+    partial = beside / f".{name}.{secrets.token_hex(_TOKEN // 2)}{_PARTIAL}"
+    with exclusive_lock(partial.with_suffix(".lock"), f"{partial} is being written"):
+        try:
+            partial.mkdir(0o700)
+            yield partial
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+def _remove_abandoned(beside: Path, name: str) -> None:
+    """Removes folders in `beside` that killed processes left; `name` is a pattern for `glob`."""
+    for left in beside.glob(f".{name}.{'?' * _TOKEN}{_PARTIAL}"):
+        with (
+            contextlib.suppress(InputError),  # a process holds the lock
+            exclusive_lock(left.with_suffix(".lock"), f"{left} is being written"),
+        ):
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
@@ -297,6 +326,7 @@ def open_scene(path: Path) -> Path:
         return path
     folder = _cache() / f"{pack.stem[:60]}-{digest_file(pack)[:32]}"
     if not (folder / PACK_JSON).exists():
+        _remove_abandoned(folder.parent, "*")
         try:
             unpack(pack, folder)
         except (InputError, OSError):

@@ -69,6 +69,7 @@ class Campaign:
         self._scene, self.task, self.path = str(twin.scene.root.resolve()), task, path
         self._sources, self._trust, self._processes, self._ray = sources, trust, processes, ray
         self._done = {t.key: t for t in _read_table(path)}
+        self._fresh = True
 
     def drive(self, wanted: Sequence[tuple[str, str, Iterable[int]]], what: str) -> list[Trial]:
         """Returns the trials of each (policy, lighting, seeds) in order; first drives those missing in the table."""
@@ -95,7 +96,8 @@ class Campaign:
     def _campaign(self, chunks: list[EpisodeChunk]) -> Iterator[list[EpisodeResult]]:
         if self._ray and chunks:
             return campaign_on_ray(chunks, self._ray)
-        return campaign(chunks, self._processes)
+        fresh, self._fresh = self._fresh, self._fresh and not chunks  # later rounds keep what the first one loads
+        return campaign(chunks, self._processes, fresh)
 
     def _append(self, trials: Sequence[Trial]) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)

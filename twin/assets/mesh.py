@@ -29,7 +29,7 @@ from twin.config import MeshConfig, SceneConfig
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.images import write_image
 from twin.geometry.passes import path_length
-from twin.geometry.route import BRANCH, distance_to_route, filmed_branches, filmed_route, route_metrics
+from twin.geometry.route import BRANCH, distance_to_route, every_second, filmed_branches, filmed_route, route_metrics
 from twin.nerf.baked import BakedField
 from twin.scene import SceneDir
 from twin.types import Array
@@ -87,7 +87,7 @@ def build_assets(
         corridor = solids.Corridor(lines, config.mjcf.half_width + config.mjcf.corridor_margin)
         others = {f"{BRANCH}{name}": np.column_stack([line, ground.at(line)]) for name, line in branches.items()}
         np.savez(out / "route.npz", xy=route, z=ground.at(route), **others)  # type: ignore[arg-type]
-        path = np.concatenate([line[::2] for line in lines])
+        path = np.concatenate([every_second(line) for line in lines])
     fused = _fuse_sections(views, ground, corridor, path, box, settings)
     clock.append(("fuse", time.perf_counter()))
     visual, visual_metrics = _visual_mesh(

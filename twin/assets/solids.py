@@ -21,7 +21,7 @@ from twin.assets.ground import Ground
 from twin.assets.tsdf import BLOCK, Volume, zero_level
 from twin.config import MeshConfig
 from twin.geometry.passes import SPACING
-from twin.geometry.route import distance_to_route
+from twin.geometry.route import distance_to_route, every_second
 from twin.types import Array
 
 HEADROOM = 1.5  # [m] height of the corridor above the ground
@@ -55,7 +55,7 @@ class Corridor:
 
     def distance(self, xy: Array, limit: float) -> Array:
         """Distance [m] of points (..., 2) from the nearest line, see `distance_to_route`; shape (...)."""
-        return np.min([distance_to_route(line[::2], xy, limit) for line in self.lines], 0)
+        return np.min([distance_to_route(every_second(line), xy, limit) for line in self.lines], 0)
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ from twin.capture.bag import (
     picture_topics,
 )
 from twin.capture.camera_models import Lens, checked_lens, same_aspect
+from twin.capture.capture_data import nearest_longitudes
 from twin.capture.video import Film, FilmStatistics, FilmTiming
 from twin.errors import InputError
 from twin.robot import BASE_HEIGHT, CAMERA_AHEAD
@@ -109,7 +110,13 @@ class BagContents:
 
     def fixes_at(self, times: Array) -> Array:
         """Interpolated fixes at times [s] after the first picture, shape (k, 3); NaN in gaps and outside the fixes."""
-        return _interpolated(times, self.stamps[0], self.fix_times, self.fixes, _MAX_FIX_GAP)
+        fixes = self.fixes.copy()
+        known = np.isfinite(fixes[:, 1])
+        if known.any():
+            fixes[:, 1] = nearest_longitudes(fixes[:, 1], float(fixes[known, 1][0]))
+        out = _interpolated(times, self.stamps[0], self.fix_times, fixes, _MAX_FIX_GAP)
+        out[:, 1] = nearest_longitudes(out[:, 1])
+        return out
 
     def odometry_at(self, times: Array) -> Array:
         """Lens positions by odometry at times [s] after the first picture, shape (k, 3); NaN as in `fixes_at`."""

@@ -23,6 +23,7 @@ from twin.types import Array, Image
 
 QUEUE_SIZE = 4  # images that may be decoded or encoded in the background at once; bounds the memory
 NO_GPS = (math.nan, math.nan, math.nan)
+_TURN = 360.0  # [°]
 _LOSSY_THRESHOLD = 63  # JPEG mask values up to this one count as 0, since compression changes zeros
 _ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "source_index": ((), "i"),
@@ -34,6 +35,11 @@ _ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "odometry": ((3,), "f"),
 }
 """Arrays of `Capture` that are stored: name → (shape per frame, `dtype.kind`)."""
+
+
+def nearest_longitudes(longitude: Array, to: float = 0.0) -> Array:
+    """Longitudes [°] shifted by whole turns to within 180° of the longitude `to`, so that they do not jump near it."""
+    return np.asarray(longitude - _TURN * np.round((longitude - to) / _TURN))
 
 
 # ---- the stored capture

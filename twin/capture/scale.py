@@ -393,7 +393,7 @@ def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
     square = np.array([_triangulate(np.array(corners)[:, k], poses, intrinsics) for k in range(4)])
     rays = square.mean(0) - poses[:, :3, 3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    if np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)) < _MIN_ANGLE:
+    if not np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)) >= _MIN_ANGLE:  # also if unknown
         raise InputError("metric.marker: seen from one direction only; film it while passing by")
     sides = np.linalg.norm(square - np.roll(square, 1, axis=0), axis=1)
     side = float(sides.mean())
@@ -406,7 +406,7 @@ def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
 
 
 def _triangulate(pixels: Array, camera_to_world: Array, intrinsics: Array) -> Array:
-    """Triangulates the point (3,) observed at `pixels` (n, 2), one per view.
+    """Triangulates the point (3,) observed at `pixels` (n, 2), one per view; NaN if equal poses do not determine it.
 
     A linear solution (Hartley & Zisserman 2004, sec. 12.2) is refined by Gauss-Newton on the reprojection error.
     """
@@ -414,6 +414,8 @@ def _triangulate(pixels: Array, camera_to_world: Array, intrinsics: Array) -> Ar
     rotation, translation = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
     fx, fy, cx, cy = intrinsics.T
     u, v = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
+    if np.ptp(camera_to_world[:, :3, 3], axis=0).max() == 0.0:
+        return np.full(3, np.nan)
     rows = [c[:, None] * world_to_camera[:, 2] - world_to_camera[:, k] for k, c in enumerate((u, v))]
     homogeneous = np.linalg.svd(np.concatenate(rows))[2][-1]
     point = homogeneous[:3] / homogeneous[3]

@@ -38,10 +38,13 @@ try:
         from dm_control.mujoco import wrapper
         from dm_control.rl import control
 except ModuleNotFoundError as error:
-    raise InputError(
-        f"{error}: driving in a scene needs dm_control, which installs on Python 3.11 and 3.12; this is Python "
-        f"{sys.version_info.major}.{sys.version_info.minor}"
-    ) from None
+    needed = f"{error}: driving in a scene needs"
+    if sys.version_info >= (3, 13):
+        python = f"{sys.version_info.major}.{sys.version_info.minor}"
+        raise InputError(
+            f"{needed} dm_control, which installs on Python 3.11 and 3.12; this is Python {python}"
+        ) from None
+    raise InputError(f"{needed} {(error.name or 'dm_control').split('.')[0]}; install twin again") from None
 
 EnvIndices = Sequence[int] | NDArray[np.int64]
 

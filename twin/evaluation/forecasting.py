@@ -310,7 +310,11 @@ def _sampled_rates(rows: Sequence[Sequence[Cell]], by_day: bool, rng: np.random.
 
 
 def _rates_over_days(rows: Sequence[Sequence[Cell]], road: bool = True) -> list[Estimate]:
-    """Mean rate of each policy's cells, with an interval over days, on the road or in the twin."""
+    """Mean rate of each policy's cells, with an interval over days, on the road or in the twin.
+
+    The model shrinks a policy's rate towards those of the others, and its rates end short of 0 and 1. So the mean may
+    lie outside the model's interval, which then is widened up to the mean.
+    """
     if not rows:
         return []
     low, high = RateModel.fit(*unit_counts(rows, True), road=road).interval()
@@ -321,7 +325,7 @@ def _rates_over_days(rows: Sequence[Sequence[Cell]], road: bool = True) -> list[
             few = f"too few for an interval: {len(row)} day, {MIN_RATE_DAYS} are needed"
             out.append(Estimate(value, n=trials, no_interval=few))
         else:
-            out.append(Estimate(value, float(low[i]), float(high[i]), trials))
+            out.append(Estimate(value, min(value, float(low[i])), max(value, float(high[i])), trials))
     return out
 
 

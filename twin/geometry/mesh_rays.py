@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from twin.types import Array
 from twin.warp_runtime import wp
 
-_FAR = 1.0e3  # [m] queries find no surface beyond this distance
+_FAR = 1.0e6  # [m] queries find no surface beyond this distance, which no place reaches; roads may be kilometers long
 
 
 @wp.kernel

@@ -195,6 +195,11 @@ def _check_no_fold(line: Array, table: str) -> None:
         )
 
 
+def every_second(line: Array) -> Array:
+    """Every second point of a polyline (m, 2), and its last one."""
+    return line[::2] if len(line) % 2 else np.concatenate([line[::2], line[-1:]])
+
+
 def distance_to_route(route: Array, xy: Array, up_to: float = np.inf) -> Array:
     """Distance [m] of points (..., 2) to a polyline (m, 2) including its end points, shape (...).
 

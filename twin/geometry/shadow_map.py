@@ -33,6 +33,7 @@ _RAMP = 0.2  # [m] height above the bias over which the shadow becomes full
 _LEAST_COSINE = wp.constant(0.1)  # lower bound of the cosine of incidence when a slope is computed
 _MAX_SIDE = 4096  # [texels] longest side of a map; larger places get larger texels
 _FULL = 65535  # largest value of a stored texel; 0: no surface
+_BATCH = 1 << 16  # number of rays that are cast at once; bounds the memory
 _START = 1.0  # [m] distance from the highest vertex to the plane from which rays are cast
 
 
@@ -186,13 +187,17 @@ class ShadowCasters:
         columns, rows = np.ceil((high - low) / texel).astype(int) + 1
         start = float(corners[:, 1, 2].max()) + _START
         u, v = low[0] + texel * np.arange(columns), low[1] + texel * np.arange(rows)
-        origins = (u[None, :, None] * right + v[:, None, None] * upward + start * toward).reshape(-1, 3)
-        rays = np.broadcast_to(-toward, (rows * columns, 3))
-        height = np.full(rows * columns, -np.inf)
-        for _, surface, bias in self._parts:
-            hit = surface.cast(origins, rays)
-            height = np.maximum(height, np.where(hit < 0.0, -np.inf, start - hit - bias))
-        return OrthographicShadowMap(toward, low, texel, height.reshape(rows, columns).astype(np.float32))
+        height = np.full((rows, columns), -np.inf, np.float32)
+        step = max(1, _BATCH // int(columns))
+        for first in range(0, int(rows), step):
+            band = slice(first, first + step)
+            origins = (u[None, :, None] * right + v[band, None, None] * upward + start * toward).reshape(-1, 3)
+            rays = np.broadcast_to(-toward, origins.shape)
+            for _, surface, bias in self._parts:
+                hit = surface.cast(origins, rays).reshape(-1, columns)
+                seen = np.where(hit < 0.0, -np.inf, start - hit - bias).astype(np.float32)
+                height[band] = np.maximum(height[band], seen)
+        return OrthographicShadowMap(toward, low, texel, height)
 
 
 def plane_axes(toward: Array) -> tuple[Array, Array]:

@@ -114,15 +114,18 @@ def run_episodes(
     return [done[number] for number in range(len(seeds))]
 
 
-def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1) -> Iterator[list[EpisodeResult]]:
+def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1, fresh: bool = True) -> Iterator[list[EpisodeResult]]:
     """Drives chunks on this machine, in several worker processes or in this one; yields the chunks' results in order.
 
-    The workers end with this process. Raises InputError: an error of `run_chunk`, or a worker ended, most likely
-    because memory ran out.
+    In this process, policies and scenes that an earlier call has loaded are loaded again, since their files may have
+    changed, unless `fresh` is false. The workers end with this process.
+
+    Raises InputError: an error of `run_chunk`, or a worker ended, most likely because memory ran out.
     """
     if processes == 1:
-        for cache in (_policy, _factory, _vector_env):  # files may have changed since an earlier campaign
-            cache.cache_clear()
+        if fresh:
+            for cache in (_policy, _factory, _vector_env):
+                cache.cache_clear()
         yield from map(run_chunk, chunks)
         return
     # Workers are spawned, since the threads of Warp and MuJoCo do not survive a fork.

@@ -162,7 +162,7 @@ def command(options: argparse.Namespace) -> None:
             plan = FilmingPlan.of(draw(options.place, options.length))
             plan = _tiny(plan) if options.tiny else plan
         _check_lightings(options.lightings or [], plan.lightings if options.place else LIGHTINGS)
-        plan = replace(plan, lightings=tuple(options.lightings)) if options.lightings else plan
+        plan = replace(plan, lightings=tuple(dict.fromkeys(options.lightings))) if options.lightings else plan
         if not 0.0 <= options.readout <= _MAX_READOUT:
             raise InputError(f"--readout {options.readout:g}: expected 0 to {_MAX_READOUT:g} s")
         if options.shake is not None and not 0.0 <= options.shake <= _MAX_SHAKE:

@@ -3,13 +3,13 @@
     {"format": 1, "views": [{"time": 0.0, "camera_to_world": [[...], ...], "fov": 60.0, "lighting": "sun"}, ...]}
 
 `time` [s] increases, `camera_to_world` is 4×4 with OpenCV axes in the scene's frame, `fov` [°] is the vertical angle of
-view, and `lighting` is a name or mixture as for `twin film`, or an embedding as a list of numbers; by default it is the
-first filmed lighting. Positions follow a cubic spline, and rotations a rotation spline; angle of view, lighting and fog
-are interpolated linearly.
+view, and `lighting` is a name or mixture as for `twin film`, an embedding as a list of numbers, or a mixture of two of
+these, {"from": ..., "to": ..., "share": 0.3}; by default it is the first filmed lighting. Positions follow a cubic
+spline, and rotations a rotation spline; angle of view, lighting and fog are interpolated linearly.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,15 @@ _CRF = 20
 _MAX_VIEWS, _MAX_DURATION = 1000, 3600.0  # [s]
 _MIN_FOV, _MAX_FOV = 5.0, 150.0  # [°]
 _CURE = "save the path again in twin view, or correct the file"
+
+
+@dataclass(frozen=True)
+class MixedLighting(EpisodeLighting):
+    """A lighting between two others, by which a path's file stores it: an embedding alone has neither fog nor sun."""
+
+    parts: tuple[EpisodeLighting, EpisodeLighting] = field(kw_only=True)
+    share: float = field(kw_only=True)
+    """Share of the way from the first part to the second one, between 0 and 1."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +123,8 @@ def mixed_lighting(one: EpisodeLighting, other: EpisodeLighting, share: float) -
         return other
     start = ((1.0 - share) * one.start + share * other.start).astype(np.float32)
     suns = mixed_sunlight(one.sunlight, other.sunlight, share)
-    return EpisodeLighting(f"{one.name} → {other.name}", start, fog=mixed(one.fog, other.fog, share), sunlight=suns)
+    fog, name = mixed(one.fog, other.fog, share), f"{one.name} → {other.name}"
+    return MixedLighting(name, start, fog=fog, sunlight=suns, parts=(one, other), share=share)
 
 
 def named_lighting(field: BakedField, name: str) -> EpisodeLighting:
@@ -123,14 +133,20 @@ def named_lighting(field: BakedField, name: str) -> EpisodeLighting:
 
 
 def _view_row(view: KeyView) -> dict[str, Any]:
-    # Only the name of a sampled lighting has a blank. The field does not know it, so its embedding is stored.
-    named = None if " " in view.lighting.name else view.lighting.name
     return {
         "time": view.time,
         "camera_to_world": view.camera_to_world.tolist(),
         "fov": view.fov,
-        "lighting": named or [float(x) for x in view.lighting.start],
+        "lighting": _lighting_row(view.lighting),
     }
+
+
+def _lighting_row(lighting: EpisodeLighting) -> Any:
+    if isinstance(lighting, MixedLighting):
+        one, other = lighting.parts
+        return {"from": _lighting_row(one), "to": _lighting_row(other), "share": lighting.share}
+    # Only the name of a sampled lighting has a blank. The field does not know it, so its embedding is stored.
+    return [float(x) for x in lighting.start] if " " in lighting.name else lighting.name
 
 
 def _parse_view(row: Any, number: int, field: BakedField) -> KeyView:
@@ -147,14 +163,23 @@ def _parse_view(row: Any, number: int, field: BakedField) -> KeyView:
         raise ValueError(
             f"view {number}: time {time}, fov {fov}; expected a finite time, and fov from {_MIN_FOV:g} to {_MAX_FOV:g}°"
         )
-    given = row.get("lighting", field.lightings[0])
+    return KeyView(time, pose, fov, _parse_lighting(row.get("lighting", field.lightings[0]), number, field))
+
+
+def _parse_lighting(given: Any, number: int, field: BakedField) -> EpisodeLighting:
     if isinstance(given, str):
-        return KeyView(time, pose, fov, named_lighting(field, given))
+        return named_lighting(field, given)
+    if isinstance(given, dict):
+        one, other = (_parse_lighting(given[key], number, field) for key in ("from", "to"))
+        share = float(given["share"])
+        if not 0.0 <= share <= 1.0:
+            raise ValueError(f"view {number}: the lighting's share {share} is not from 0 to 1")
+        return mixed_lighting(one, other, share)
     embedding = np.array(given, np.float32)
     dim = field.lightings_by_name.vectors.shape[1]
     if embedding.shape != (dim,) or not np.isfinite(embedding).all():
-        raise ValueError(f"view {number}: lighting {short_repr(given)}; expected a name, or {dim} numbers")
-    return KeyView(time, pose, fov, EpisodeLighting("sampled lighting", embedding))
+        raise ValueError(f"view {number}: lighting {short_repr(given)}; expected a name, {dim} numbers, or a mixture")
+    return EpisodeLighting("sampled lighting", embedding)
 
 
 def path_frames(path: CameraPath, fps: int) -> Array:
