@@ -92,6 +92,9 @@ def test_gpu_physics_agrees_with_mujoco(scene, device_name):
         envs.begin([])
         for _ in range(2):
             envs.step(np.array([[-1.0, 0.0], [1.0, 0.2]]), [0, 2])
+    # The device has the robot that was sampled for the new episode.
+    friction = np.stack([physics.robot.model.geom_friction for physics in device.physics])
+    np.testing.assert_allclose(device._simulation._model.geom_friction.numpy(), friction, rtol=1e-6)
     for i in (0, 2):
         one, other = plain.physics[i], device.physics[i]
         np.testing.assert_allclose(one.planar_pose, other.planar_pose, atol=6e-3)
