@@ -17,6 +17,7 @@ import pytest
 
 from twin.capture import mapping, sfm, worker
 from twin.capture.capture_data import Capture, SourceInfo
+from twin.capture.matching import Matcher, open_database
 from twin.config import CamerasConfig, SceneConfig
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, SparsePoints, pixel_grid, unproject
@@ -200,9 +201,15 @@ def test_a_lighting_without_any_placed_film_is_refused(tmp_path: Path) -> None:
 
 
 def _model(
-    street: Street, places: list[float], groups: list[tuple[int, ...]]
+    street: Street,
+    places: list[float],
+    groups: list[tuple[int, ...]],
+    at: dict[tuple[int, ...], list[float]] | None = None,
 ) -> tuple[pycolmap.Reconstruction, object]:
-    """A model of frames at places x along a line, with one point for each group of frames; and its matcher."""
+    """A model of frames at places x along a line, with one point for each group of frames; and its matcher.
+
+    The points of a group are 5 m before the line unless `at` says where they are.
+    """
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 260.0, *SIZE))
     points = pycolmap.Point2DList([pycolmap.Point2D(np.array([float(k), 1.0])) for k in range(len(groups))])
@@ -213,7 +220,7 @@ def _model(
         track = pycolmap.Track()
         for frame in group:
             track.add_element(frame + 1, k)
-        model.add_point3D(np.zeros(3), track)
+        model.add_point3D(np.array((at or {}).get(group, [3.0, 0.0, 5.0])), track)
     capture = Capture.load(street.scene.stage("capture"))
     ids = {k + 1: k for k in range(len(places))}
     return model, SimpleNamespace(frame_of=lambda: ids, image_ids=np.arange(1, len(places) + 1), capture=capture)
@@ -234,9 +241,14 @@ def test_a_frame_thrown_far_off_is_not_coherent_although_it_shares_points(street
     assert mapping.coherent_frames(*_model(street, [0.0, 1, 2, 3, 4, 5, 6, 16], groups)) == set(range(8))  # a gap
 
 
-def test_masked_parts_have_no_features(street: Street, tmp_path: Path) -> None:
-    from twin.capture.matching import open_database
+def test_a_piece_that_shrank_is_not_coherent_although_it_lies_beside_the_others(street: Street) -> None:
+    every, shrunk = tuple(range(8)), (5, 6, 7)
+    groups, places = [every] * 20 + [shrunk] * 20, [0.0, 1, 2, 3, 4, 4, 4.001, 4.002]
+    assert mapping.coherent_frames(*_model(street, places, groups, {shrunk: [4.001, 0.0, 0.005]})) == set(range(5))
+    assert mapping.coherent_frames(*_model(street, places, groups, {shrunk: [4.001, 0.0, 0.5]})) == set(range(8))
 
+
+def test_masked_parts_have_no_features(street: Street, tmp_path: Path) -> None:
     capture = Capture.load(street.scene.stage("capture"))
     matcher = open_database(capture, street.scene.stage("capture"), tmp_path, False, 2, 0)
     matcher.extract(500, 1280)
@@ -257,27 +269,72 @@ def test_given_poses_are_kept(tmp_path: Path) -> None:
     assert np.median(np.abs(points.xyz[points.xyz[:, 2] < 0.3, 2])) < 0.05
 
 
-def test_a_misplaced_frame_is_registered_anew(street: Street, tmp_path: Path) -> None:
-    from twin.capture.matching import open_database
-
+def _mapper(street: Street, folder: Path) -> tuple[Matcher, mapping.Mapper]:
     stage = street.scene.stage("capture")
-    matcher = open_database(Capture.load(stage), stage, tmp_path, False, 2, 0)
+    matcher = open_database(Capture.load(stage), stage, folder, False, 2, 0)
     matcher.extract(1500, 1280)
     sfm._match(matcher, np.random.default_rng(0))
-    mapper = mapping.Mapper(matcher, {"mapper": "global", "min_registered": 0.6, "free_focal": False}, tmp_path)
+    return matcher, mapping.Mapper(matcher, {"mapper": "global", "min_registered": 0.6, "free_focal": False}, folder)
+
+
+def _move(model: pycolmap.Reconstruction, matcher: Matcher, frames: list[int], distance: float) -> None:
+    """Moves frames diagonally, and leaves their points where they are."""
+    known, poses = mapping.registered_poses(model, matcher)
+    for k in frames:
+        image = model.images[int(matcher.image_ids[k])]
+        pose = poses[known == k][0].copy()
+        pose[:3, 3] += pose[:3, :3] @ np.full(3, distance)
+        model.frames[image.frame_id].set_cam_from_world(image.camera_id, pycolmap.Rigid3d(inverse_pose(pose)[:3]))
+
+
+def _errors(street: Street, matcher: Matcher, model: pycolmap.Reconstruction) -> np.ndarray:
+    """Position errors of the registered frames [m] after alignment by a similarity."""
+    frames, poses = mapping.registered_poses(model, matcher)
+    true = np.array([street.truth[matcher.capture.names[i]] for i in frames])[:, :3, 3]
+    return np.linalg.norm(umeyama(poses[:, :3, 3], true).points(poses[:, :3, 3]) - true, axis=1)
+
+
+def test_a_torn_model_is_repeated_without_far_points(
+    street: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matcher, mapper = _mapper(street, tmp_path)
+    databases, mapped = [], mapper._global
+
+    def torn_at_first(database: Path) -> pycolmap.Reconstruction | None:
+        databases.append(database)
+        model = mapped(database)
+        if database == matcher.database and model is not None:
+            _move(model, matcher, list(range(6)), 1000.0)
+        return model
+
+    monkeypatch.setattr(mapper, "_global", torn_at_first)
+    summary: dict = {}
+    model = mapper.best(summary)
+    assert summary["mapper"] == "global, near points first" and len(databases) == 2
+    errors = _errors(street, matcher, model)
+    assert len(errors) == len(matcher.frames) and errors.max() < 0.03
+    with pycolmap.Database.open(databases[1]) as near, pycolmap.Database.open(matcher.database) as every:
+        kept, before = (np.sum(one.read_two_view_geometry_num_inliers()[1]) for one in (near, every))
+        first, second = (int(matcher.image_ids[k]) for k in (0, 1))
+        matches = near.read_two_view_geometry(first, second).inlier_matches
+        pixels = [near.read_keypoints(i)[matches[:, k], :2] for k, i in enumerate((first, second))]
+    assert 0.2 * before < kept < 0.9 * before
+    poses = [street.truth[matcher.capture.names[k]] for k in (0, 1)]
+    rays = [unproject(one, INTRINSICS) @ pose[:3, :3].T for one, pose in zip(pixels, poses, strict=True)]
+    rays = [one / np.linalg.norm(one, axis=1, keepdims=True) for one in rays]
+    assert np.degrees(np.arccos((rays[0] * rays[1]).sum(1))).min() > 0.6  # of 0.8°: the model's rotations are not exact
+    assert np.mean([len(point.track.elements) for point in model.points3D.values()]) > 3.0
+
+
+def test_a_misplaced_frame_is_registered_anew(street: Street, tmp_path: Path) -> None:
+    matcher, mapper = _mapper(street, tmp_path)
     model = mapper.best({})
     frames, poses = mapping.registered_poses(model, matcher)
-    step = mapping.median_step(poses, frames, matcher)
-    image = model.images[int(matcher.image_ids[5])]
-    moved = np.linalg.inv(poses[5] @ np.block([[np.eye(3), np.full((3, 1), 2 * step)], [np.zeros((1, 3)), 1.0]]))
-    model.frames[image.frame_id].set_cam_from_world(image.camera_id, pycolmap.Rigid3d(moved[:3]))
+    _move(model, matcher, [5], 2 * mapping.median_step(poses, frames, matcher))
     summary: dict = {"outliers": [], "registered_anew": []}
     repaired = mapper.without_outliers(model, 0.3, summary)
     assert summary == {"outliers": [], "registered_anew": [matcher.capture.names[5]]}
-    frames, poses = mapping.registered_poses(repaired, matcher)
-    true = np.array([street.truth[matcher.capture.names[i]] for i in frames])
-    fit = umeyama(poses[:, :3, 3], true[:, :3, 3])
-    assert np.linalg.norm(fit.points(poses[5, :3, 3]) - true[5, :3, 3]) < 0.03
+    assert _errors(street, matcher, repaired)[5] < 0.03
 
 
 def _capture_of(root: Path, images: list[np.ndarray]) -> Street:

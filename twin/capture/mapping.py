@@ -1,13 +1,14 @@
 """Maps the frames of linked films with COLMAP, and keeps the part of the result that holds together.
 
 A *model* is a COLMAP reconstruction. Global mapping (Pan et al. 2024) is tried first, since the incremental mapper gets
-stuck on forward motion. Global mapping sometimes tears a film apart, for example if distant frames match by the same
-skyline. The pieces of a torn model share no points, so it is recognized, and other attempts follow. Frames off the path
-of their neighbors are removed and registered once more against all others, and left out if they are again off the path.
+stuck on forward motion. On a road with little texture, global mapping may tear a film apart: the long tracks of points
+on the skyline, which constrain rotations alone, outnumber the short tracks of near points. The pieces of a torn model
+share no points or differ in scale, so it is recognized. Its rotations are still good; with them, the matches of far
+points are found, and global mapping is repeated without these. Frames off the path of their neighbors are removed and
+registered once more against all others, and left out if they are again off the path.
 """
 
 import shutil
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from twin.capture.camera_models import camera_to_world
-from twin.capture.matching import SEQUENCE_STEPS, Matcher, Pair, near_pairs
+from twin.capture.matching import Matcher, near_pairs
 from twin.capture.worker import send_message
 from twin.errors import InputError
 from twin.geometry.passes import path_outliers
@@ -31,8 +32,14 @@ _NEAR_PAIRS = 4  # largest number of near pairs per frame
 # The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
 _REMAPPING_FRACTION = 0.05
 _SHARED_POINTS = 15  # points in common that connect two frames of a model
-_MAX_STEPS = 60.0  # [median steps between frames] largest distance between two connected frames
+# The nearest points of a frame measure its scale: in sound models the distance between two frames with common points is
+# up to 22 times the distance of the nearest points; between pieces of a torn model it is 10³ to 10⁷ times.
+_NEAREST_FRACTION = 0.1  # fraction of a frame's points that are nearer than its nearest points are said to be
+_MAX_DISTANCE = 60.0  # [distance of the nearest points] largest distance between two connected frames
 _COHERENT_FRACTION = 0.95  # a model is torn if its largest connected part has a smaller fraction of its frames
+_GLOBAL, _NEAR_POINTS, _INCREMENTAL = "global", "global, near points first", "incremental"  # attempts
+_MIN_MATCHES = 15  # least number of matches of a pair
+_FAR_ANGLE = np.radians(0.8)  # [rad] matches with less parallax are those of far points
 _TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
 _MIN_ANGLE = 0.5  # [°] smallest angle between two rays to a point
@@ -84,25 +91,26 @@ def coherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> set[int
 def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArray[np.int64], csr_matrix]:
     """Registered frames (n,), and a matrix (n, n) that is True for connected pairs.
 
-    Two frames are connected if they share 15 points or more, and lie near each other: frames that were thrown far off
-    the path still share points that are even farther away.
+    Two frames are connected if they share 15 points or more, lie near each other, and have the same scale. Frames that
+    were thrown far off the path still share points that are even farther away; a piece that shrank lies on one spot.
     """
     frames, poses = registered_poses(model, matcher)
     row = {int(matcher.image_ids[i]): k for k, i in enumerate(frames)}
-    seen = [
-        (row[element.image_id], k)
-        for k, point in enumerate(model.points3D.values())
-        for element in point.track.elements
-    ]
+    points = list(model.points3D.values())
+    seen = [(row[element.image_id], k) for k, point in enumerate(points) for element in point.track.elements]
     if not seen:
         return frames, csr_matrix((len(frames), len(frames)), dtype=bool)
     frame, point = np.unique(np.array(seen), axis=0).T
-    views = csr_matrix((np.ones(len(frame), np.int32), (frame, point)), shape=(len(frames), int(point.max()) + 1))
+    views = csr_matrix((np.ones(len(frame), np.int32), (frame, point)), shape=(len(frames), len(points)))
     shared = (views @ views.T >= _SHARED_POINTS).tocoo()
-    distance = np.linalg.norm(poses[shared.row, :3, 3] - poses[shared.col, :3, 3], axis=1)
-    step = median_step(poses, frames, matcher)
-    near = distance <= (_MAX_STEPS * step if step else np.inf)  # no step: no source has two frames
-    kept = shared.row[near], shared.col[near]
+    distance = np.linalg.norm(np.array([point.xyz for point in points])[point] - poses[frame, :3, 3], axis=1)
+    per_frame = np.split(distance, np.searchsorted(frame, np.arange(1, len(frames))))
+    nearest = np.array([np.quantile(one, _NEAREST_FRACTION) if len(one) else np.inf for one in per_frame])
+    first, second = shared.row, shared.col
+    apart = np.linalg.norm(poses[first, :3, 3] - poses[second, :3, 3], axis=1)
+    largest = np.max([apart, nearest[first], nearest[second]], axis=0)
+    near = largest <= _MAX_DISTANCE * np.minimum(nearest[first], nearest[second])
+    kept = first[near], second[near]
     return frames, csr_matrix((np.ones(len(kept[0]), bool), kept), shape=(len(frames), len(frames)))
 
 
@@ -129,10 +137,10 @@ class Mapper:
         matcher, needed = self._matcher, self._min_registered * len(self._matcher.frames)
         best: pycolmap.Reconstruction | None = None
         kept: set[int] = set()
-        for name, attempt in self._attempts():
-            if best is not None and name == "incremental" and len(kept) >= needed:
+        for name in self._attempts():
+            if best is not None and name == _INCREMENTAL and len(kept) >= needed:
                 break  # slow, and rarely better than a torn model of global mapping
-            model = attempt()
+            model = self._attempt(name, best)
             if model is None:
                 continue
             coherent = coherent_frames(model, matcher)
@@ -145,26 +153,56 @@ class Mapper:
                 f"registered 0 of {len(matcher.frames)} frames; film slower, sideways rather than only forward, with "
                 "texture in view"
             )
-        if len(kept) >= MIN_FRAMES:  # otherwise the frames have too few points to tell
-            _deregister(best, matcher, sorted(set(registered_poses(best, matcher)[0].tolist()) - kept))
-        return best
+        _deregister(best, matcher, _incoherent_frames(best, matcher))
+        return self._with_all_points(best) if summary["mapper"] == _NEAR_POINTS else best
 
-    def _attempts(self) -> Iterator[tuple[str, Callable[[], pycolmap.Reconstruction | None]]]:
+    def _attempts(self) -> list[str]:
+        attempts = []
         if self._kind in ("auto", "global"):
-            yield "global", lambda: self._global(self._matcher.database)
-            if far := self._loops():
-                yield "global, without loops", lambda: self._global(self._without(far))
+            attempts += [_GLOBAL, _NEAR_POINTS, _NEAR_POINTS]  # each time with the best rotations so far
         if self._kind in ("auto", "incremental"):
-            yield "incremental", self._incremental
+            attempts.append(_INCREMENTAL)
+        return attempts
 
-    def _loops(self) -> list[Pair]:
-        """Verified pairs of frames that are far from each other in the same film."""
-        source = self._matcher.capture.source_index
-        pairs = self._matcher.verified()
-        return [(i, j) for i, j in pairs if source[i] == source[j] and abs(i - j) > SEQUENCE_STEPS[-1]]
+    def _attempt(self, name: str, before: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
+        if name == _INCREMENTAL:
+            return self._incremental()
+        if name == _GLOBAL:
+            return self._global(self._matcher.database)
+        return None if before is None else self._global(self._without_far_points(before))
 
-    def _without(self, pairs: list[Pair]) -> Path:
-        return self._matcher.copied_without(pairs, fresh_folder(self._work, "fewer_pairs"))
+    def _without_far_points(self, model: pycolmap.Reconstruction) -> Path:
+        """A copy of the database without the matches of far points, told by a model's rotations and intrinsics."""
+        path = self._matcher.copied_without([], fresh_folder(self._work, "near_points"))
+        with pycolmap.Database.open(path) as database:
+            rays = {}
+            for image in model.images.values():
+                if image.has_pose:
+                    pixels = database.read_keypoints(image.image_id)[:, :2]
+                    directions = np.ones((len(pixels), 3))
+                    directions[:, :2] = model.cameras[image.camera_id].cam_from_img(pixels)
+                    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+                    rays[image.image_id] = directions @ image.cam_from_world().rotation.matrix()
+            for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
+                pair, matches = pycolmap.pair_id_to_image_pair(pair_id), geometry.inlier_matches
+                if not len(matches) or not rays.keys() >= set(pair):
+                    continue
+                first, second = (rays[image_id][matches[:, k]] for k, image_id in enumerate(pair))
+                near = np.linalg.norm(first - second, axis=1) > _FAR_ANGLE
+                database.delete_two_view_geometry(*pair)
+                if near.sum() >= _MIN_MATCHES:
+                    geometry.inlier_matches = matches[near]
+                    database.write_two_view_geometry(*pair, geometry)
+            for camera_id, camera in model.cameras.items():
+                if camera_id not in self._fixed:
+                    database.update_camera(camera)
+        return path
+
+    def _with_all_points(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        """The model with points triangulated from all matches."""
+        folder, options = fresh_folder(self._work, "all_points"), self._incremental_options()
+        matcher = self._matcher
+        return pycolmap.triangulate_points(model, matcher.database, matcher.images, folder, True, options, False)
 
     def _global(self, database: Path) -> pycolmap.Reconstruction | None:
         matcher = self._matcher
@@ -239,7 +277,7 @@ class Mapper:
             return model
         _deregister(model, matcher, off)
         model = self._register_missing(model)
-        off_again = _off_path_frames(model, matcher, limit)
+        off_again = sorted({*_off_path_frames(model, matcher, limit), *_incoherent_frames(model, matcher)})
         _deregister(model, matcher, off_again)
         dropped = set(off) - set(registered_poses(model, matcher)[0].tolist()) | set(off_again)
         summary["outliers"] += sorted(names[i] for i in dropped)
@@ -277,6 +315,13 @@ def _off_path_frames(model: pycolmap.Reconstruction, matcher: Matcher, limit: fl
     for s in np.unique(source):
         off += frames[source == s][path_outliers(poses[source == s], limit)].tolist()
     return off
+
+
+def _incoherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> list[int]:
+    """Registered frames outside of the largest connected part, if there are points enough to tell."""
+    coherent = coherent_frames(model, matcher)
+    registered = set(registered_poses(model, matcher)[0].tolist())
+    return sorted(registered - coherent) if len(coherent) >= MIN_FRAMES else []
 
 
 def _deregister(model: pycolmap.Reconstruction, matcher: Matcher, frames: list[int]) -> None:
