@@ -227,12 +227,14 @@ def _model(
 
 
 def test_a_torn_model_is_recognized(street: Street) -> None:
-    """Two pieces with too few common points are not coherent; the larger one is kept."""
-    groups = [tuple(range(5))] * 20 + [(5, 6, 7)] * 20 + [(4, 5)] * 10
-    assert mapping.coherent_frames(*_model(street, [0.0, 1, 2, 3, 4, 5, 6, 7], groups)) == {0, 1, 2, 3, 4}
-    assert mapping.coherent_frames(*_model(street, [0.0, 1, 2, 3, 4, 5, 6, 7], [*groups, *[(4, 5)] * 5])) == set(
-        range(8)
-    )
+    """Two pieces without enough common points that fix their scale are not coherent; the larger one is kept."""
+    places, pieces, link = [0.0, 1, 2, 3, 4, 5, 6, 7], [tuple(range(5))] * 20 + [(5, 6, 7)] * 20, (4, 5, 6)
+    assert mapping.coherent_frames(*_model(street, places, [*pieces, *[link] * 10])) == set(range(5))
+    assert mapping.coherent_frames(*_model(street, places, [*pieces, *[link] * 15])) == set(range(8))
+    # Points seen by two frames alone fix no scale, nor do points on the skyline.
+    assert mapping.coherent_frames(*_model(street, places, [*pieces, *[(4, 5)] * 15])) == set(range(5))
+    far = {link: [0.0, 0.0, 300.0]}
+    assert mapping.coherent_frames(*_model(street, places, [*pieces, *[link] * 15], far)) == set(range(5))
 
 
 def test_a_frame_thrown_far_off_is_not_coherent_although_it_shares_points(street: Street) -> None:

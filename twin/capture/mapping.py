@@ -8,6 +8,7 @@ points are found, and global mapping is repeated without these. Frames off the p
 registered once more against all others, and left out if they are again off the path.
 """
 
+import itertools
 import shutil
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ _NEAR_PAIRS = 4  # largest number of near pairs per frame
 # The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
 _REMAPPING_FRACTION = 0.05
 _SHARED_POINTS = 15  # points in common that connect two frames of a model
+_FEW_POINTS = 3  # the same for a frame that was registered against a coherent model, and so has its scale
 # The nearest points of a frame measure its scale: in sound models the distance between two frames with common points is
 # up to 22 times the distance of the nearest points; between pieces of a torn model it is 10³ to 10⁷ times.
 _NEAREST_FRACTION = 0.1  # fraction of a frame's points that are nearer than its nearest points are said to be
@@ -79,39 +81,50 @@ def reconstruct(matcher: Matcher, job: dict[str, Any], work: Path, summary: dict
     return model
 
 
-def coherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> set[int]:
+def coherent_frames(model: pycolmap.Reconstruction, matcher: Matcher, least: int = _SHARED_POINTS) -> set[int]:
     """Registered frames of the largest connected part of a model, see `connections`."""
-    frames, connected = connections(model, matcher)
+    frames, connected = connections(model, matcher, least)
     if not connected.nnz:
         return set()
     part = connected_components(connected, directed=False)[1]
     return set(frames[part == np.bincount(part).argmax()].tolist())
 
 
-def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArray[np.int64], csr_matrix]:
+def connections(
+    model: pycolmap.Reconstruction, matcher: Matcher, least: int = _SHARED_POINTS
+) -> tuple[NDArray[np.int64], csr_matrix]:
     """Registered frames (n,), and a matrix (n, n) that is True for connected pairs.
 
-    Two frames are connected if they share 15 points or more, lie near each other, and have the same scale. Frames that
-    were thrown far off the path still share points that are even farther away; a piece that shrank lies on one spot.
+    Two frames are connected if they share points that fix the scale of one to that of the other: `least` points that a
+    third frame sees, too, and that the two see from different directions. In addition the frames must lie near each
+    other and have about the same scale: frames that were thrown far off the path may share points that are even farther
+    away, and a piece that shrank lies on one spot.
     """
     frames, poses = registered_poses(model, matcher)
     row = {int(matcher.image_ids[i]): k for k, i in enumerate(frames)}
-    points = list(model.points3D.values())
+    points = [point for point in model.points3D.values() if point.track.length() > 2]
     seen = [(row[element.image_id], k) for k, point in enumerate(points) for element in point.track.elements]
     if not seen:
         return frames, csr_matrix((len(frames), len(frames)), dtype=bool)
     frame, point = np.unique(np.array(seen), axis=0).T
+    offset = np.array([point.xyz for point in points])[point] - poses[frame, :3, 3]
+    distance = np.linalg.norm(offset, axis=1)
+    begin = np.searchsorted(frame, np.arange(len(frames) + 1))
+    mine = [slice(*ends) for ends in itertools.pairwise(begin)]
+    nearest = [np.quantile(distance[one], _NEAREST_FRACTION) if one.stop > one.start else np.inf for one in mine]
+    ray = offset / np.maximum(distance, 1e-12)[:, None]
     views = csr_matrix((np.ones(len(frame), np.int32), (frame, point)), shape=(len(frames), len(points)))
-    shared = (views @ views.T >= _SHARED_POINTS).tocoo()
-    distance = np.linalg.norm(np.array([point.xyz for point in points])[point] - poses[frame, :3, 3], axis=1)
-    per_frame = np.split(distance, np.searchsorted(frame, np.arange(1, len(frames))))
-    nearest = np.array([np.quantile(one, _NEAREST_FRACTION) if len(one) else np.inf for one in per_frame])
-    first, second = shared.row, shared.col
-    apart = np.linalg.norm(poses[first, :3, 3] - poses[second, :3, 3], axis=1)
-    largest = np.max([apart, nearest[first], nearest[second]], axis=0)
-    near = largest <= _MAX_DISTANCE * np.minimum(nearest[first], nearest[second])
-    kept = first[near], second[near]
-    return frames, csr_matrix((np.ones(len(kept[0]), bool), kept), shape=(len(frames), len(frames)))
+    connected = []
+    for i, j in np.argwhere(np.triu((views @ views.T).toarray() >= least, 1)):
+        apart = np.linalg.norm(poses[i, :3, 3] - poses[j, :3, 3])
+        if max(apart, nearest[i], nearest[j]) > _MAX_DISTANCE * min(nearest[i], nearest[j]):
+            continue
+        _, first, second = np.intersect1d(point[mine[i]], point[mine[j]], assume_unique=True, return_indices=True)
+        parallax = np.linalg.norm(ray[mine[i]][first] - ray[mine[j]][second], axis=1)
+        if np.count_nonzero(parallax > _FAR_ANGLE) >= least:
+            connected += [(i, j), (j, i)]
+    pairs = np.array(connected, np.int64).reshape(-1, 2).T
+    return frames, csr_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), shape=(len(frames), len(frames)))
 
 
 class Mapper:
@@ -277,7 +290,7 @@ class Mapper:
             return model
         _deregister(model, matcher, off)
         model = self._register_missing(model)
-        off_again = sorted({*_off_path_frames(model, matcher, limit), *_incoherent_frames(model, matcher)})
+        off_again = sorted({*_off_path_frames(model, matcher, limit), *_incoherent_frames(model, matcher, _FEW_POINTS)})
         _deregister(model, matcher, off_again)
         dropped = set(off) - set(registered_poses(model, matcher)[0].tolist()) | set(off_again)
         summary["outliers"] += sorted(names[i] for i in dropped)
@@ -317,9 +330,9 @@ def _off_path_frames(model: pycolmap.Reconstruction, matcher: Matcher, limit: fl
     return off
 
 
-def _incoherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> list[int]:
+def _incoherent_frames(model: pycolmap.Reconstruction, matcher: Matcher, least: int = _SHARED_POINTS) -> list[int]:
     """Registered frames outside of the largest connected part, if there are points enough to tell."""
-    coherent = coherent_frames(model, matcher)
+    coherent = coherent_frames(model, matcher, least)
     registered = set(registered_poses(model, matcher)[0].tolist())
     return sorted(registered - coherent) if len(coherent) >= MIN_FRAMES else []
 
