@@ -44,7 +44,10 @@ def forecast(monkeypatch):
 def test_the_protocol_takes_places_that_nobody_looked_at(forecast):
     protocol = forecast.protocol.read_protocol()
     assert tuple(protocol.setups) == SETUPS and protocol.setups["varied"] == ()
-    assert min(protocol.places) >= 100 and len(protocol.places) >= 6
+    before = [forecast.protocol.read_protocol(path) for path in FOLDER.glob("results/*/protocol.toml")]
+    assert before and {one.version for one in before} == set(range(1, protocol.version))
+    used = [place for one in before for place in one.places]
+    assert min(protocol.places) > max(used) and min(used) >= 100 and len(protocol.places) >= 6
     days = [day for place in protocol.places for day in protocol.days_of(place)]
     assert len(set(days)) == len(days) == 10 * len(protocol.places)
     assert protocol.options_of("one_light", ["low_sun", "night"]) == ["--lighting", "low_sun"]
@@ -55,10 +58,10 @@ def test_the_protocol_takes_places_that_nobody_looked_at(forecast):
     [
         ("\ntrials = 5", "\ntrials = 4", "trials = 4; expected 5 or more"),
         ("days = 10", "days = 11", "expected 1 to 10, the days of a place"),
-        ("places = [100, 101,", "places = [100, 100,", "expected different numbers"),
+        ("places = [106, 107,", "places = [106, 106,", "expected different numbers"),
         ("short = [", "varied = [", "Cannot overwrite a value"),
-        ("version = 1", "version = 1\nday = 3", "unexpected keyword argument 'day'"),
-        ("version = 1", "", "missing 1 required positional argument: 'version'"),
+        ("version = 2", "version = 2\nday = 3", "unexpected keyword argument 'day'"),
+        ("version = 2", "", "missing 1 required positional argument: 'version'"),
     ],
 )
 def test_a_protocol_that_cannot_be_scored_is_refused(forecast, tmp_path, old, new, words):
@@ -151,22 +154,22 @@ def filmed(monkeypatch, forecast):
 
 def _place(forecast, tmp_path, run, name="a"):
     protocol = forecast.protocol.read_protocol()
-    return forecast.command.PlaceRun(protocol, 100, tmp_path / name, tmp_path / f"results_{name}", run, 1)
+    return forecast.command.PlaceRun(protocol, 106, tmp_path / name, tmp_path / f"results_{name}", run, 1)
 
 
 def test_a_place_that_cannot_be_built_is_recorded_as_failed_and_not_run_again(forecast, tmp_path, capsys):
     protocol = forecast.protocol.read_protocol()
     run = StandIn(forecast)
     run.must = lambda *arguments, cores=1: _fails_at(run, "twin.build", arguments, forecast.command.Refused)
-    place = forecast.command.PlaceRun(protocol, 100, tmp_path / "work", tmp_path / "results", run, 1)
+    place = forecast.command.PlaceRun(protocol, 106, tmp_path / "work", tmp_path / "results", run, 1)
     with pytest.raises(InputError, match="no reconstructed point"):
         forecast.command.run_place(place, None)
     failure = {"step": "build", "message": "no reconstructed point"}
-    assert read_json(tmp_path / "results" / "version_1" / "place_100" / "failure.json") == failure
+    assert read_json(tmp_path / "results" / "version_2" / "place_106" / "failure.json") == failure
     forecast.command.run_place(place, None)
     assert run.calls == ["film"]
     found = forecast.place_scores.score(protocol, tmp_path / "results")
-    assert found["places"]["100"] == "failed: build: no reconstructed point"
+    assert found["places"]["106"] == "failed: build: no reconstructed point"
     assert "failed: build: no reconstructed point" in forecast.place_scores.tables(protocol, found)
 
 
@@ -176,11 +179,21 @@ def _fails_at(run, command, arguments, kind):
     assert run(*arguments) == 0
 
 
+def test_a_full_disk_leaves_the_place_unfinished(forecast, tmp_path, monkeypatch):
+    monkeypatch.setattr(forecast.command.shutil, "disk_usage", lambda _: SimpleNamespace(free=2**30))
+    place = forecast.command.PlaceRun(
+        forecast.protocol.read_protocol(), 106, tmp_path / "work", tmp_path / "results", StandIn(forecast), 1
+    )
+    with pytest.raises(InputError, match=r"1\.0 GiB are free \(need 8 GiB\)"):
+        forecast.command.run_place(place, None)
+    assert not (place.record / "failure.json").exists()
+
+
 def test_a_command_that_is_killed_leaves_the_place_unfinished(forecast, tmp_path):
     run = StandIn(forecast)
     run.must = lambda *arguments, cores=1: _fails_at(run, "twin.build", arguments, InputError)
     place = forecast.command.PlaceRun(
-        forecast.protocol.read_protocol(), 100, tmp_path / "work", tmp_path / "results", run, 1
+        forecast.protocol.read_protocol(), 106, tmp_path / "work", tmp_path / "results", run, 1
     )
     with pytest.raises(InputError):
         forecast.command.run_place(place, None)
@@ -200,11 +213,11 @@ def test_policies_are_frozen_before_anything_drives_and_a_repeat_changes_nothing
     assert max(i for i, call in enumerate(run.calls) if call == "train") < run.calls.index("validate")
     assert max(i for i, call in enumerate(run.calls) if call == "validate") < run.calls.index("drive")
     assert set(read_json(one.record / "policies.json")) == set(SETUPS)
-    assert read_json(one.record / "place.json")["setup"] == {"robot": "100"}
+    assert read_json(one.record / "place.json")["setup"] == {"robot": "106"}
     before = {path.name: path.read_bytes() for path in one.record.iterdir()}
     forecast.command.run_place(one, None)
     assert before == {path.name: path.read_bytes() for path in one.record.iterdir()}
-    record = forecast.place_record.read_place(one.record, 100, SETUPS, one.days)
+    record = forecast.place_record.read_place(one.record, 106, SETUPS, one.days)
     assert record.real.shape == (6, 10, 2) and record.real[0].tolist() == [[5, 5]] * 10
     assert record.twin[1].tolist() == [[2, 5]] * 10 and record.held_out.tolist() == [[20, 20]] + [[10, 20]] * 5
 
@@ -227,7 +240,7 @@ def test_an_experiment_stopped_at_every_command_ends_with_the_same_record(foreca
 def test_a_day_whose_photo_cannot_be_placed_is_left_to_the_held_out_lightings(forecast, filmed, tmp_path):
     one = _place(forecast, tmp_path, StandIn(forecast, unplaced=("day_1003",)))
     forecast.command.run_place(one, None)
-    record = forecast.place_record.read_place(one.record, 100, SETUPS, one.days)
+    record = forecast.place_record.read_place(one.record, 106, SETUPS, one.days)
     assert record.twin[1, 2].tolist() == [10, 20] and record.twin[1, 3].tolist() == [2, 5]
 
 
@@ -321,9 +334,9 @@ def test_few_places_have_no_intervals_and_what_is_incomplete_is_named(forecast, 
     empty = forecast.place_scores.score(protocol, tmp_path)
     assert set(empty["places"].values()) == {"not begun"} and "ranking" not in empty
     _records(forecast, protocol, tmp_path, lambda rate, _: rate, places=2)
-    (tmp_path / protocol.name / "place_103").mkdir()
+    (tmp_path / protocol.name / "place_109").mkdir()
     found = forecast.place_scores.score(protocol, tmp_path)
-    assert [found["places"][str(n)] for n in (100, 101, 102, 103)] == ["complete", "complete", "not begun", "begun"]
+    assert [found["places"][str(n)] for n in (106, 107, 108, 109)] == ["complete", "complete", "not begun", "begun"]
     best = found["ranking"][forecast.place_scores.TWIN]
     assert best["spearman_within"] == {"value": pytest.approx(1.0), "low": None, "high": None}
     assert found["met"]["log_score_better"] is None

@@ -14,8 +14,9 @@ import numpy as np
 import psutil
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
-from twin.capture import mapping, sfm, worker
+from twin.capture import mapping, near_points, sfm, worker
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.capture.matching import Matcher, open_database
 from twin.config import CamerasConfig, SceneConfig
@@ -317,15 +318,21 @@ def test_a_torn_model_is_repeated_without_far_points(
     assert len(errors) == len(matcher.frames) and errors.max() < 0.03
     with pycolmap.Database.open(databases[1]) as near, pycolmap.Database.open(matcher.database) as every:
         kept, before = (np.sum(one.read_two_view_geometry_num_inliers()[1]) for one in (near, every))
-        first, second = (int(matcher.image_ids[k]) for k in (0, 1))
-        matches = near.read_two_view_geometry(first, second).inlier_matches
-        pixels = [near.read_keypoints(i)[matches[:, k], :2] for k, i in enumerate((first, second))]
     assert 0.2 * before < kept < 0.9 * before
-    poses = [street.truth[matcher.capture.names[k]] for k in (0, 1)]
-    rays = [unproject(one, INTRINSICS) @ pose[:3, :3].T for one, pose in zip(pixels, poses, strict=True)]
-    rays = [one / np.linalg.norm(one, axis=1, keepdims=True) for one in rays]
-    assert np.degrees(np.arccos((rays[0] * rays[1]).sum(1))).min() > 0.6  # of 0.8°: the model's rotations are not exact
     assert np.mean([len(point.track.elements) for point in model.points3D.values()]) > 3.0
+
+
+def test_parallax_is_what_remains_without_the_common_rotation() -> None:
+    rng = np.random.default_rng(1)
+    first = rng.normal(size=(300, 3)) + [0.0, 0.0, 4.0]
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    turn = Rotation.from_rotvec([0.05, -0.1, 0.02])
+    angles = np.radians(np.where(np.arange(300) < 120, 0.0, rng.uniform(1.0, 6.0, 300)))
+    axes = np.cross(first, rng.normal(size=(300, 3)))
+    moved = Rotation.from_rotvec(axes / np.linalg.norm(axes, axis=1, keepdims=True) * angles[:, None]).apply(first)
+    found = near_points.parallax(first, turn.apply(moved), rng)
+    np.testing.assert_allclose(found, angles, atol=2e-3)
+    assert set(np.flatnonzero(found < near_points.FAR_ANGLE)) == set(range(120))
 
 
 def test_a_misplaced_frame_is_registered_anew(street: Street, tmp_path: Path) -> None:

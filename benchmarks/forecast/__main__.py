@@ -1,6 +1,6 @@
 """Forecast experiment: how well the twin predicts success on simulated roads at places not used in development.
 
-    python benchmarks/forecast WORK [--minutes 150] [--jobs 2] [--places 100 101] [--ray ADDRESS]
+    python benchmarks/forecast WORK [--minutes 150] [--jobs 2] [--places 106 107] [--ray ADDRESS]
     python benchmarks/forecast --tables                     only scores the recorded results, in seconds
 
 `protocol.toml` fixes every number in advance. `place_record.py` keeps every episode and trial in `results/`.
@@ -14,13 +14,14 @@
 - validate: drives every policy in the twin, under the lighting of each day and under held-out lightings.
 - drive: drives every policy in the simulated reality, on each day, on the task that the twin exported.
 
-WORK holds the scenes (1 GB a place). After a kill, or at the end of `--minutes`, the same command continues. A place of
-60 m takes about two hours on two cores. No recorded row is removed. A place that cannot be filmed, built or trained is
-recorded as failed, and the next place begins.
+WORK holds the scenes (5 GB a place). After a kill, or at the end of `--minutes`, the same command continues. A place of
+60 m takes seven to nine hours on two cores. No recorded row is removed. A place that cannot be filmed, built or trained
+is recorded as failed, and the next place begins.
 """
 
 import argparse
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -45,6 +46,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 from record import save
 
 RESULTS = Path(__file__).with_name("results")
+_DISK_OF_A_PLACE = 8 * 2**30  # [bytes] that must be free before a step
 _GRACE = 60.0  # [s] for a command to save its state
 
 
@@ -258,6 +260,7 @@ def run_place(one: PlaceRun, ray: str | None) -> None:
     try:
         for step, final in ((one.film, True), (one.build, True), (one.photos, False), (one.train, True)):
             try:
+                _check_disk(one.scene)
                 step()
             except Refused as error:
                 if final:
@@ -268,6 +271,14 @@ def run_place(one: PlaceRun, ray: str | None) -> None:
         one.drive()
     finally:
         one.write_record()
+
+
+def _check_disk(folder: Path) -> None:
+    """Raises InputError: a full disk would end a command as bad input does, and the place would count as failed."""
+    existing = next(parent for parent in folder.absolute().parents if parent.exists())
+    free = shutil.disk_usage(existing).free
+    if free < _DISK_OF_A_PLACE:
+        raise InputError(f"{existing}: {free / 2**30:.1f} GiB are free (need {_DISK_OF_A_PLACE / 2**30:.0f} GiB)")
 
 
 def main() -> int:

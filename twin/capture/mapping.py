@@ -3,13 +3,14 @@
 A *model* is a COLMAP reconstruction. Global mapping (Pan et al. 2024) is tried first, since the incremental mapper gets
 stuck on forward motion. On a road with little texture, global mapping may tear a film apart: the long tracks of points
 on the skyline, which constrain rotations alone, outnumber the short tracks of near points. The pieces of a torn model
-share no points or differ in scale, so it is recognized. Its rotations are still good; with them, the matches of far
-points are found, and global mapping is repeated without these. Frames off the path of their neighbors are removed and
-registered once more against all others, and left out if they are again off the path.
+share no points or differ in scale, so it is recognized, and global mapping is repeated without far points. Frames off
+the path of their neighbors are removed and registered once more against all others, and left out if they are again off
+the path.
 """
 
 import itertools
 import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 
 from twin.capture.camera_models import camera_to_world
 from twin.capture.matching import Matcher, near_pairs
+from twin.capture.near_points import FAR_ANGLE, remove_far_points
 from twin.capture.worker import send_message
 from twin.errors import InputError
 from twin.geometry.passes import path_outliers
@@ -39,9 +41,7 @@ _FEW_POINTS = 3  # the same for a frame that was registered against a coherent m
 _NEAREST_FRACTION = 0.1  # fraction of a frame's points that are nearer than its nearest points are said to be
 _MAX_DISTANCE = 60.0  # [distance of the nearest points] largest distance between two connected frames
 _COHERENT_FRACTION = 0.95  # a model is torn if its largest connected part has a smaller fraction of its frames
-_GLOBAL, _NEAR_POINTS, _INCREMENTAL = "global", "global, near points first", "incremental"  # attempts
-_MIN_MATCHES = 15  # least number of matches of a pair
-_FAR_ANGLE = np.radians(0.8)  # [rad] matches with less parallax are those of far points
+_NEAR_POINTS = "global, near points first"
 _TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
 _MIN_ANGLE = 0.5  # [°] smallest angle between two rays to a point
@@ -121,7 +121,7 @@ def connections(
             continue
         _, first, second = np.intersect1d(point[mine[i]], point[mine[j]], assume_unique=True, return_indices=True)
         parallax = np.linalg.norm(ray[mine[i]][first] - ray[mine[j]][second], axis=1)
-        if np.count_nonzero(parallax > _FAR_ANGLE) >= least:
+        if np.count_nonzero(parallax > FAR_ANGLE) >= least:
             connected += [(i, j), (j, i)]
     pairs = np.array(connected, np.int64).reshape(-1, 2).T
     return frames, csr_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), shape=(len(frames), len(frames)))
@@ -150,10 +150,10 @@ class Mapper:
         matcher, needed = self._matcher, self._min_registered * len(self._matcher.frames)
         best: pycolmap.Reconstruction | None = None
         kept: set[int] = set()
-        for name in self._attempts():
-            if best is not None and name == _INCREMENTAL and len(kept) >= needed:
+        for name, attempt in self._attempts():
+            if best is not None and name == "incremental" and len(kept) >= needed:
                 break  # slow, and rarely better than a torn model of global mapping
-            model = self._attempt(name, best)
+            model = attempt()
             if model is None:
                 continue
             coherent = coherent_frames(model, matcher)
@@ -169,47 +169,17 @@ class Mapper:
         _deregister(best, matcher, _incoherent_frames(best, matcher))
         return self._with_all_points(best) if summary["mapper"] == _NEAR_POINTS else best
 
-    def _attempts(self) -> list[str]:
-        attempts = []
+    def _attempts(self) -> Iterator[tuple[str, Callable[[], pycolmap.Reconstruction | None]]]:
         if self._kind in ("auto", "global"):
-            attempts += [_GLOBAL, _NEAR_POINTS, _NEAR_POINTS]  # each time with the best rotations so far
+            yield "global", lambda: self._global(self._matcher.database)
+            yield _NEAR_POINTS, self._near_points
         if self._kind in ("auto", "incremental"):
-            attempts.append(_INCREMENTAL)
-        return attempts
+            yield "incremental", self._incremental
 
-    def _attempt(self, name: str, before: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
-        if name == _INCREMENTAL:
-            return self._incremental()
-        if name == _GLOBAL:
-            return self._global(self._matcher.database)
-        return None if before is None else self._global(self._without_far_points(before))
-
-    def _without_far_points(self, model: pycolmap.Reconstruction) -> Path:
-        """A copy of the database without the matches of far points, told by a model's rotations and intrinsics."""
+    def _near_points(self) -> pycolmap.Reconstruction | None:
         path = self._matcher.copied_without([], fresh_folder(self._work, "near_points"))
-        with pycolmap.Database.open(path) as database:
-            rays = {}
-            for image in model.images.values():
-                if image.has_pose:
-                    pixels = database.read_keypoints(image.image_id)[:, :2]
-                    directions = np.ones((len(pixels), 3))
-                    directions[:, :2] = model.cameras[image.camera_id].cam_from_img(pixels)
-                    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-                    rays[image.image_id] = directions @ image.cam_from_world().rotation.matrix()
-            for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
-                pair, matches = pycolmap.pair_id_to_image_pair(pair_id), geometry.inlier_matches
-                if not len(matches) or not rays.keys() >= set(pair):
-                    continue
-                first, second = (rays[image_id][matches[:, k]] for k, image_id in enumerate(pair))
-                near = np.linalg.norm(first - second, axis=1) > _FAR_ANGLE
-                database.delete_two_view_geometry(*pair)
-                if near.sum() >= _MIN_MATCHES:
-                    geometry.inlier_matches = matches[near]
-                    database.write_two_view_geometry(*pair, geometry)
-            for camera_id, camera in model.cameras.items():
-                if camera_id not in self._fixed:
-                    database.update_camera(camera)
-        return path
+        remove_far_points(path, self._matcher.seed)
+        return self._global(path)
 
     def _with_all_points(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         """The model with points triangulated from all matches."""
