@@ -324,7 +324,7 @@ def test_a_torn_model_is_repeated_without_far_points(
 
 def test_parallax_is_what_remains_without_the_common_rotation() -> None:
     rng = np.random.default_rng(1)
-    first = rng.normal(size=(300, 3)) + [0.0, 0.0, 4.0]
+    first = rng.normal(size=(300, 3)) + np.array([0.0, 0.0, 4.0])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     turn = Rotation.from_rotvec([0.05, -0.1, 0.02])
     angles = np.radians(np.where(np.arange(300) < 120, 0.0, rng.uniform(1.0, 6.0, 300)))
