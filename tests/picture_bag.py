@@ -67,9 +67,10 @@ def write(path: Path, messages: Sequence[Recorded], mcap: bool = True) -> Path:
     """Writes a bag's folder, in MCAP or sqlite3."""
     plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
     with Writer(path, version=9, storage_plugin=plugin) as writer:
-        topics: dict[str, Any] = {}
+        topics: dict[tuple[str, str], Any] = {}
         for one in sorted(messages, key=lambda each: each.stamp):
-            if one.topic not in topics:
-                topics[one.topic] = writer.add_connection(one.topic, one.type, typestore=MESSAGES.store)
-            writer.write(topics[one.topic], one.stamp, MESSAGES.store.serialize_cdr(one.message, one.type))
+            key = one.topic, one.type
+            if key not in topics:
+                topics[key] = writer.add_connection(*key, typestore=MESSAGES.store)
+            writer.write(topics[key], one.stamp, MESSAGES.store.serialize_cdr(one.message, one.type))
     return path

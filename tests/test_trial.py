@@ -279,6 +279,24 @@ def test_a_topic_of_another_kind_is_refused(kind, topic, tmp_path):
         read_trial(bag, {kind: topic})
 
 
+def test_a_topic_that_was_published_twice_is_read_whole(tmp_path, capsys):
+    """By a node that was started again with messages of another type."""
+    stamps = [START + k * STEP for k in range(5)]
+    twist = [replace(one, type="geometry_msgs/msg/Twist", message=one.message.twist) for one in _twists(stamps[3:])]
+    messages = [camera_info((30.0, 30.0, 32.0, 18.0), (64, 36), START), image(np.zeros((36, 64, 3), np.uint8), START)]
+    messages += [*_twists(stamps[:3]), *twist, *(odometry(np.eye(4), stamp) for stamp in stamps)]
+    messages += [replace(odometry(np.eye(4), stamp), topic="/platform/odom") for stamp in stamps]
+    messages += [replace(odometry(np.eye(4), stamp), topic="/platform/odom/filtered") for stamp in stamps]
+    assert len(read_trial(write(tmp_path / "bag", messages)).commands) == 5
+    assert "poses /odom, commands /cmd_vel" in capsys.readouterr().err
+    some = [one for one in messages if one.topic != "/odom"]
+    assert read_trial(write(tmp_path / "some", some)).topics["poses"] == "/platform/odom/filtered"
+
+
+def _twists(stamps: list[int]) -> list[Recorded]:
+    return [command(0.5, 0.0, stamp) for stamp in stamps]
+
+
 def test_missing_and_foreign_files_are_refused_in_one_line(place, tmp_path):
     with pytest.raises(InputError, match="no such bag"):
         read_trial(tmp_path / "none")

@@ -202,7 +202,7 @@ def _topics(connections: list[Any], path: Path, topic: str) -> dict[str, str]:
     if fixes:
         topics["fixes"] = max(fixes, key=lambda name: fixes[name])
     if messages_by_topic(connections, TYPES["poses"]):
-        topics["odometry"] = choose_topics(connections, path, ("poses",))["poses"].topic
+        topics["odometry"] = choose_topics(connections, path, ("poses",))["poses"]
     static = [name for name in messages_by_topic(connections, (TRANSFORMS,)) if name.endswith("tf_static")]
     if static:
         topics["transforms"] = min(static, key=len)
