@@ -11,6 +11,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Twist, TwistStamped
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
@@ -29,10 +30,11 @@ class PolicyNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("twin_policy", **options)
+        fixed = ParameterDescriptor(read_only=True)  # a change while the node runs would have no effect
 
         def parameter(name: str, default: Any) -> Any:
             try:
-                return self.declare_parameter(name, default).value
+                return self.declare_parameter(name, default, fixed).value
             except Exception as error:  # another type than the default's, such as 1 for 1.0
                 raise ValueError(f"parameter {name}: {error}") from None
 
