@@ -146,6 +146,8 @@ def _wrap_errors(path: Path, cure: str) -> Iterator[None]:
             cure = "the recording was cut off: repair it by `mcap recover`, or " + cure
         elif "not indexed" in str(error):
             cure = "the recording was cut off: repair it by `rosbag reindex`, or " + cure
+        elif is_file(path.parent / METADATA):  # only there stands how the messages are compressed
+            cure = f"give the bag's folder, {path.parent}, or " + cure
         said = str(error).rstrip(".") or type(error).__name__
         raise InputError(f"{path}: not a readable bag: {said}; {cure}") from None
 

@@ -276,7 +276,7 @@ def _decoded(picture: Any, where: str) -> Image:
             _check_compressed(picture.data)
         return np.ascontiguousarray(picture.decode())
     except PictureError as error:
-        raise InputError(f"{where}: {error}; record raw or compressed pictures of 8 bits") from None
+        raise InputError(f"{where}: {error}; record raw pictures of 8 bits, JPEG or PNG") from None
 
 
 def _check_compressed(data: Any) -> None:
@@ -286,8 +286,10 @@ def _check_compressed(data: Any) -> None:
     try:
         with Pillow.open(BytesIO(bytes(data))) as head:
             width, height = head.size
-    except (UnidentifiedImageError, Pillow.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-        raise PictureError(f"{len(data)} bytes are neither a JPEG nor a PNG picture ({error})") from None
+    except UnidentifiedImageError:
+        raise PictureError(f"{len(data)} bytes are neither a JPEG nor a PNG picture") from None
+    except (Pillow.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
+        raise PictureError(f"damaged picture of {len(data)} bytes ({error})") from None
     if width * height > _MAX_PIXELS:
         raise PictureError(f"picture of {width} x {height} px; expected at most {_MAX_PIXELS:,} px")
 
