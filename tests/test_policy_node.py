@@ -162,6 +162,12 @@ def test_plain_twists_and_diagnostics(rig):
     status = r.published[-1][1].status[0]
     assert status.level == r.module.DiagnosticStatus.OK and status.message == "drives"
     assert {one.key: one.value for one in status.values}["used"] == "1"
+    r.wait(210)
+    r.show(1)
+    for level, message in (("WARN", "drives, 1 pictures lost since the last report"), ("OK", "drives")):
+        r.node._diagnose()
+        status = r.published[-1][1].status[0]
+        assert status.level == getattr(r.module.DiagnosticStatus, level) and status.message == message
 
 
 def test_compressed_pictures_and_bad_calibrations(rig):

@@ -240,8 +240,10 @@ def _taken(bag: BagContents) -> str:
             f"  camera on the robot: {bag.seat.height:.3f} m above the ground{ground}, {bag.seat.offset[0]:.3f} m "
             f"ahead, pitch {bag.seat.pitch:.1f}°, by {bag.topics['transforms']}"
         )
-    elif "transforms" in bag.topics:
-        lines.append(f"  camera on the robot: its frame is not connected to base_link on {bag.topics['transforms']}")
+    else:
+        static = bag.topics.get("transforms")
+        why = f"its frame is not connected to base_link on {static}" if static else "no /tf_static"
+        lines.append(f"  camera on the robot: {why}; its height is not known")
     return "\n".join(lines)
 
 
