@@ -19,7 +19,7 @@ from twin import trial
 from twin.commands import parser_of
 from twin.config import CAUSES
 from twin.errors import InputError
-from twin.evaluation.trials import Cell, read_results, read_trials
+from twin.evaluation.trials import Cell, Trial, read_results, read_trials
 from twin.learn.policy import Control, load_policy, save_policy
 from twin.learn.policy_network import Architecture
 from twin.report.bag_dataset import write_bag_dataset
@@ -96,6 +96,21 @@ def test_a_bag_of_an_episode_is_judged_as_the_episode_was(place, tmp_path, name,
     assert figures["pictures"]["psnr_median"] > 33.0 and figures["pictures"]["lighting"] == "day"
     film = video_info(scene / "trials" / "monday" / "trial.mp4")
     assert film["fps"] == 10.0 and film["frames"] >= steps
+
+
+@pytest.mark.parametrize("same", [0.3, 0.9])
+def test_a_trial_that_another_policy_drove_gets_a_caution(same):
+    figures = {
+        "seconds": 3.0,
+        "cross_track_max_m": 0.1,
+        "start": {"cross_track_m": 0.0, "heading_deg": 0.0},
+        "frame": {"located": 0},
+        "replay": {"after_2_s_m": None, "end_m": 0.1, "end_deg": 0.0},
+        "pictures": {"lighting": "day", "psnr_median": 30.0, "psnr_matched_median": 31.0, "trust_mean": 1.0},
+        "policy": {"commands": 30, "same": same, "yaw_rate_rms": 0.1},
+    }
+    text = trial.summary(Trial("first", "ahead", "day", 0, "goal", 3.0, 30), figures)
+    assert ("caution: was it first that drove?" in text) == (same < 0.5)
 
 
 def test_bags_become_a_dataset_with_what_the_robot_saw_and_was_told(place, tmp_path, capsys):
