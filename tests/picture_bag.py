@@ -7,7 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from twin.reality.robot_bag import BagMessages
 
@@ -63,13 +63,18 @@ def command(v: float, yaw_rate: float, stamp: int) -> Recorded:
     return Recorded(COMMANDS, "geometry_msgs/msg/TwistStamped", MESSAGES.command(v, yaw_rate, stamp), stamp)
 
 
-def write(path: Path, messages: Sequence[Recorded], mcap: bool = True) -> Path:
+def write(
+    path: Path, messages: Sequence[Recorded], mcap: bool = True, compression: CompressionMode = CompressionMode.NONE
+) -> Path:
     """Writes a bag's folder, in MCAP or sqlite3."""
     plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
-    with Writer(path, version=9, storage_plugin=plugin) as writer:
-        topics: dict[str, Any] = {}
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
+        topics: dict[tuple[str, str], Any] = {}
         for one in sorted(messages, key=lambda each: each.stamp):
-            if one.topic not in topics:
-                topics[one.topic] = writer.add_connection(one.topic, one.type, typestore=MESSAGES.store)
-            writer.write(topics[one.topic], one.stamp, MESSAGES.store.serialize_cdr(one.message, one.type))
+            key = one.topic, one.type
+            if key not in topics:
+                topics[key] = writer.add_connection(*key, typestore=MESSAGES.store)
+            writer.write(topics[key], one.stamp, MESSAGES.store.serialize_cdr(one.message, one.type))
     return path

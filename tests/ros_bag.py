@@ -15,12 +15,19 @@ _TOPICS = {
     "wheel odometry": ("/platform/odom", "nav_msgs/msg/Odometry"),
     "poses": ("/icp_odom", "nav_msgs/msg/Odometry"),
     "imu": ("/imu/data", "sensor_msgs/msg/Imu"),
+    "camera's imu": ("/camera/imu", "sensor_msgs/msg/Imu"),
+    "arm": ("/arm/joint_states", "sensor_msgs/msg/JointState"),
 }
+_OFTEN = ("camera's imu", "arm")
 
 
-def write_bag(path: Path, table: dict[str, NDArray], without: tuple[str, ...] = ()) -> Path:
-    """Writes a table of `twin.sysid.logs` as a bag; the wheels' poses stand still, so that a test notices if they are
-    used.
+def write_bag(
+    path: Path, table: dict[str, NDArray], without: tuple[str, ...] = (), poses: str = _TOPICS["poses"][0]
+) -> Path:
+    """Writes a table of `twin.sysid.logs` as a bag, with the `poses` on this topic.
+
+    The wheels' poses stand still, the camera's IMU has optical axes, and the arm has no wheels, so that a test notices
+    if they are used. Camera and arm write each message twice.
     """
     store = get_typestore(Stores.LATEST)
     t = store.types
@@ -42,9 +49,16 @@ def write_bag(path: Path, table: dict[str, NDArray], without: tuple[str, ...] = 
             t["geometry_msgs/msg/TwistWithCovariance"](twist, np.zeros(36)),
         )
 
+    def imu(header, x: float, y: float, z: float):
+        return t["sensor_msgs/msg/Imu"](header, turn(0.0), zero, vector(), zero, vector(x, y, z), zero)
+
+    def joints(header, names: list[str], speeds: list[float]):
+        none = np.zeros(0)
+        return t["sensor_msgs/msg/JointState"](header, names, np.zeros(len(names)), np.array(speeds), none)
+
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         topics = {
-            kind: writer.add_connection(topic, type_, typestore=store)
+            kind: writer.add_connection(poses if kind == "poses" else topic, type_, typestore=store)
             for kind, (topic, type_) in _TOPICS.items()
             if kind not in without
         }
@@ -63,25 +77,14 @@ def write_bag(path: Path, table: dict[str, NDArray], without: tuple[str, ...] = 
                     *(header, 0.0, 0.0, 0.0, (sides[1] + sides[0]) * WHEEL_RADIUS / 2),
                     (sides[1] - sides[0]) * WHEEL_RADIUS / (TRACK * 1.875),
                 ),
-                "imu": t["sensor_msgs/msg/Imu"](
-                    header,
-                    turn(0.0),
-                    zero,
-                    vector(),
-                    zero,
-                    vector(row["acceleration_x"], row["acceleration_y"], 9.81),
-                    zero,
-                ),
-                "wheels": t["sensor_msgs/msg/JointState"](
-                    header,
-                    [f"{name}_wheel_joint" for name in WHEELS],
-                    np.zeros(4),
-                    np.array([*sides, *sides]),
-                    np.zeros(0),
-                ),
+                "imu": imu(header, row["acceleration_x"], row["acceleration_y"], 9.81),
+                "camera's imu": imu(header, -row["acceleration_y"], -9.81, row["acceleration_x"]),
+                "wheels": joints(header, [f"{name}_wheel_joint" for name in WHEELS], [*sides, *sides]),
+                "arm": joints(header, ["shoulder"], [0.0]),
             }
             for kind, message in messages.items():
                 if kind in topics:
                     connection = topics[kind]
-                    writer.write(connection, stamp, store.serialize_cdr(message, connection.msgtype))
+                    for _ in range(2 if kind in _OFTEN else 1):
+                        writer.write(connection, stamp, store.serialize_cdr(message, connection.msgtype))
     return path

@@ -16,6 +16,7 @@ FIELDS = get_typestore(Stores.ROS2_JAZZY).fielddefs
 MESSAGES = {
     "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),
     "geometry_msgs": ("Twist", "TwistStamped"),
+    "rcl_interfaces": ("ParameterDescriptor",),
     "sensor_msgs": ("CameraInfo", "CompressedImage", "Image", "Joy"),
     "std_msgs": ("Bool",),
 }
@@ -60,17 +61,22 @@ class Node:
     def __init__(self, node_name: str) -> None:
         self.name, self.time = node_name, 0
         self.parameters: dict[str, Any] = {"use_sim_time": False}
+        self.descriptors: dict[str, Any] = {}
         self.published: list[tuple[str, Any]] = []
         self.subscriptions: dict[str, tuple[type, Any]] = {}
         self.timers: list[tuple[float, Any]] = []
         self.lines: list[str] = []
 
-    def declare_parameter(self, name: str, value: Any = None) -> Any:
+    def declare_parameter(self, name: str, value: Any = None, descriptor: Any = None) -> Any:
         assert name not in self.parameters
+        self.descriptors[name] = descriptor
         self.parameters[name] = self.overrides.get(name, value)
         if type(self.parameters[name]) is not type(value):  # rclpy's parameters keep the type of their default
             raise TypeError(f"Trying to set parameter '{name}' to '{self.parameters[name]}'")
         return SimpleNamespace(value=self.parameters[name])
+
+    def describe_parameter(self, name: str) -> Any:
+        return self.descriptors[name]
 
     def get_parameter(self, name: str) -> Any:
         return SimpleNamespace(value=self.parameters[name])

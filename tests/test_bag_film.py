@@ -22,6 +22,7 @@ from bag_of_film import (
 )
 from filmed_wall import HEIGHT, WIDTH, captured, refused, views
 from picture_bag import MESSAGES, TYPES, Recorded
+from rosbags.rosbag2 import CompressionMode
 from scipy.spatial.transform import Rotation
 from test_metric import _path, _points, _similarity, _world
 from test_pictures import _mosaic  # a mosaic of `SMOOTH`
@@ -260,6 +261,29 @@ def test_new_takes_what_the_bag_has_and_says_so(tmp_path: Path, capsys: pytest.C
     assert load_config(tmp_path / "other/scene.toml").source[0].topic == "/rear/image"
 
 
+def test_new_names_a_set_clock_and_the_other_files_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    late = pictures(views(SHIFTS), TIMES + np.where(TIMES < 2.0, 0.0, 1e8))
+    bag = write(tmp_path / "drive", [camera_info(PINHOLE), *late])
+    (file,) = bag.glob("*.mcap")
+    file.rename(bag / "drive_0.mcap")
+    (bag / "drive_1.mcap").write_bytes(b"")
+    assert new_main([str(tmp_path / "scene"), str(bag / "drive_0.mcap")]) == 0
+    said = capsys.readouterr().err
+    assert "drive_0.mcap: no picture for 100000000.1 s from 1.9 s on" in said
+    assert "only this one of the bag's 2 files is used; for all, give its folder" in said
+    assert "camera on the robot: no /tf_static; its height is not known" in said
+
+
+def test_a_compressed_file_of_a_bag_is_read_in_its_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    for mode in (CompressionMode.FILE, CompressionMode.MESSAGE):
+        bag = write(tmp_path / mode.name, whole(), compression=mode)
+        assert new_main([str(tmp_path / f"{mode.name} scene"), str(bag)]) == 0
+        (file,) = (one for one in bag.iterdir() if one.suffix != ".yaml")
+        capsys.readouterr()
+        assert new_main([str(tmp_path / "other"), str(file)]) == 2
+        assert "give the bag's folder" in capsys.readouterr().err
+
+
 # ---- bad bags
 
 
@@ -289,7 +313,7 @@ BAD = {
     "nothing": (list, r"no topic with pictures among none"),
     "an unknown encoding": (lambda: _encoded("mono16"), r"/camera/image: encoding 'mono16'; expected one of rgb8"),
     "rows too short": (lambda: _short(), r"/camera/image: rgb8 picture of 160 x 120 px with 100 bytes a row"),
-    "a rubbish JPEG": (lambda: _rubbish(), r"5 bytes are neither a JPEG nor a PNG"),
+    "a rubbish JPEG": (lambda: _rubbish(), r"5 bytes are neither a JPEG nor a PNG picture; record raw"),
     "an unknown camera model": (
         lambda: _modelled("omni"),
         r"camera_info: distortion model 'omni'; expected none, plumb_bob",

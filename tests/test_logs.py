@@ -44,6 +44,10 @@ BAD = {
         r"cmd_yaw_rate looks like degrees",
     ),
     "missing": (lambda t: {k: v for k, v in t.items() if k != "left_wheel_vel"}, r"no column left_wheel_vel among"),
+    "axes": (
+        lambda t: _bad(t, acceleration_y=t["acceleration_y"] - 9.81),
+        r"acceleration_y is 9\.8 m/s² \(median\); expected at most 3: the IMU's x must point forward",
+    ),
     "short": (lambda t: {k: v[:400] for k, v in t.items()}, r"windows of 2 s to fit to .*expected at least 20 and 10"),
     "ns": (
         lambda t: _bad(t, time=1.7e18 + 1e9 * t["time"]),

@@ -162,6 +162,12 @@ def test_plain_twists_and_diagnostics(rig):
     status = r.published[-1][1].status[0]
     assert status.level == r.module.DiagnosticStatus.OK and status.message == "drives"
     assert {one.key: one.value for one in status.values}["used"] == "1"
+    r.wait(210)
+    r.show(1)
+    for level, message in (("WARN", "drives, 1 pictures lost since the last report"), ("OK", "drives")):
+        r.node._diagnose()
+        status = r.published[-1][1].status[0]
+        assert status.level == getattr(r.module.DiagnosticStatus, level) and status.message == message
 
 
 def test_compressed_pictures_and_bad_calibrations(rig):
@@ -189,6 +195,11 @@ def test_bad_parameters_are_one_error(rig):
         rig(rest=1)  # an integer
     with pytest.raises(ValueError, match="watchdog_rate = "):
         rig(watchdog_rate=0.0)
+
+
+def test_a_running_node_refuses_other_parameters(rig):
+    node = rig().node
+    assert all(node.describe_parameter(name).read_only for name in ("timeout", "stamped", "deadman_button", "policy"))
 
 
 # ---- what the package says
@@ -222,6 +233,7 @@ def test_the_launch_file_requires_the_policy_and_nothing_else(monkeypatch):
     runpy.run_path(str(ROOT / "launch" / "twin_policy.launch.py"))["generate_launch_description"]()
     declared = sys.modules["launch.actions"].DeclareLaunchArgument.call_args_list
     assert [one.args[0] for one in declared if one.kwargs["default_value"] is None] == ["policy"]
+    assert ("/diagnostics", "diagnostics") in sys.modules["launch_ros.actions"].Node.call_args.kwargs["remappings"]
 
 
 def test_the_package_is_one_for_colcon():
@@ -230,7 +242,7 @@ def test_the_package_is_one_for_colcon():
     depends = {one.text for one in package.findall("exec_depend")}
     tree = ast.parse((ROOT / "twin_policy" / "node.py").read_text())
     froms = {node.module.split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    assert {name for name in froms if name == "rclpy" or name.endswith("_msgs")} <= depends
+    assert froms & {"rclpy", *ros_stand_ins.MESSAGES} <= depends
     assert (ROOT / "resource" / package.findtext("name")).exists()
 
 

@@ -32,7 +32,7 @@ def table(drive) -> dict[str, np.ndarray]:
 
 def test_wheel_speeds_of_the_wheels_odometry_are_those_of_the_joints(table, tmp_path: Path) -> None:
     joints = read_bag(write_bag(tmp_path / "joints", table))
-    odometry = read_bag(write_bag(tmp_path / "odometry", table, without=("wheels",)))
+    odometry = read_bag(write_bag(tmp_path / "odometry", table, without=("wheels", "arm")))
     for name in ("left_wheel_vel", "right_wheel_vel", "x", "cmd_v"):
         np.testing.assert_allclose(odometry[name], joints[name], atol=1e-9, err_msg=name)
 
@@ -49,6 +49,29 @@ def test_poses_of_the_wheels_are_refused_and_those_of_pictures_used(table, tmp_p
     found = read_bag(bag, FilmedPoses(times, poses))
     assert len(found["time"]) == ROWS and "20 poses in the built scene" in capsys.readouterr().err
     np.testing.assert_allclose(found["x"], np.minimum(np.floor((found["time"] + 1e-6) / 0.5), 19))
+
+
+def test_the_filter_of_wheels_and_imu_is_refused_unless_it_is_asked_for(table, tmp_path: Path, capsys) -> None:
+    bag = write_bag(tmp_path / "bag", table, poses="/odometry/filtered")
+    with pytest.raises(
+        InputError, match=r"no topic with poses .* other than wheel odometry .*--topic names their topic"
+    ):
+        read_bag(bag)
+    np.testing.assert_allclose(read_bag(bag, poses="/odometry/filtered")["x"], table["x"], atol=1e-9)
+    assert "poses /odometry/filtered, imu /imu/data" in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"no poses on topic /odom; expected one of /platform/odom and /odometry/"):
+        read_bag(bag, poses="/odom")
+
+
+def test_messages_that_are_not_finite_are_left_out(table, tmp_path: Path, capsys) -> None:
+    gap = {name: column.copy() for name, column in table.items()}
+    gap["x"][100:103] = np.nan
+    gap["acceleration_y"][7] = np.nan
+    found = read_bag(write_bag(tmp_path / "bag", gap))
+    assert len(found["time"]) == ROWS
+    np.testing.assert_allclose(found["x"][99:104], table["x"][[99, 99, 99, 99, 103]], atol=1e-9)
+    said = capsys.readouterr().err
+    assert "3 messages on /icp_odom left out: not finite" in said and "1 messages on /imu/data" in said
 
 
 def test_the_poses_of_pictures_are_those_of_the_base_below_the_cameras(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from twin import trial
 from twin.commands import parser_of
 from twin.config import CAUSES
 from twin.errors import InputError
-from twin.evaluation.trials import Cell, read_results, read_trials
+from twin.evaluation.trials import Cell, Trial, read_results, read_trials
 from twin.learn.policy import Control, load_policy, save_policy
 from twin.learn.policy_network import Architecture
 from twin.report.bag_dataset import write_bag_dataset
@@ -96,6 +96,21 @@ def test_a_bag_of_an_episode_is_judged_as_the_episode_was(place, tmp_path, name,
     assert figures["pictures"]["psnr_median"] > 33.0 and figures["pictures"]["lighting"] == "day"
     film = video_info(scene / "trials" / "monday" / "trial.mp4")
     assert film["fps"] == 10.0 and film["frames"] >= steps
+
+
+@pytest.mark.parametrize("same", [0.3, 0.9])
+def test_a_trial_that_another_policy_drove_gets_a_caution(same):
+    figures = {
+        "seconds": 3.0,
+        "cross_track_max_m": 0.1,
+        "start": {"cross_track_m": 0.0, "heading_deg": 0.0},
+        "frame": {"located": 0},
+        "replay": {"after_2_s_m": None, "end_m": 0.1, "end_deg": 0.0},
+        "pictures": {"lighting": "day", "psnr_median": 30.0, "psnr_matched_median": 31.0, "trust_mean": 1.0},
+        "policy": {"commands": 30, "same": same, "yaw_rate_rms": 0.1},
+    }
+    text = trial.summary(Trial("first", "ahead", "day", 0, "goal", 3.0, 30), figures)
+    assert ("caution: was it first that drove?" in text) == (same < 0.5)
 
 
 def test_bags_become_a_dataset_with_what_the_robot_saw_and_was_told(place, tmp_path, capsys):
@@ -277,6 +292,24 @@ def test_a_topic_of_another_kind_is_refused(kind, topic, tmp_path):
     assert len(read_trial(bag).poses) == 3
     with pytest.raises(InputError, match=rf"{topic} \({kind}\) has \w+/msg/\w+; expected \w+/msg/\w+"):
         read_trial(bag, {kind: topic})
+
+
+def test_a_topic_that_was_published_twice_is_read_whole(tmp_path, capsys):
+    """By a node that was started again with messages of another type."""
+    stamps = [START + k * STEP for k in range(5)]
+    twist = [replace(one, type="geometry_msgs/msg/Twist", message=one.message.twist) for one in _twists(stamps[3:])]
+    messages = [camera_info((30.0, 30.0, 32.0, 18.0), (64, 36), START), image(np.zeros((36, 64, 3), np.uint8), START)]
+    messages += [*_twists(stamps[:3]), *twist, *(odometry(np.eye(4), stamp) for stamp in stamps)]
+    messages += [replace(odometry(np.eye(4), stamp), topic="/platform/odom") for stamp in stamps]
+    messages += [replace(odometry(np.eye(4), stamp), topic="/platform/odom/filtered") for stamp in stamps]
+    assert len(read_trial(write(tmp_path / "bag", messages)).commands) == 5
+    assert "poses /odom, commands /cmd_vel" in capsys.readouterr().err
+    some = [one for one in messages if one.topic != "/odom"]
+    assert read_trial(write(tmp_path / "some", some)).topics["poses"] == "/platform/odom/filtered"
+
+
+def _twists(stamps: list[int]) -> list[Recorded]:
+    return [command(0.5, 0.0, stamp) for stamp in stamps]
 
 
 def test_missing_and_foreign_files_are_refused_in_one_line(place, tmp_path):

@@ -50,7 +50,7 @@ _INTRINSICS_FIELDS = ("camera_intrinsics", "camera_size")
 
 
 def align_to_log(
-    target: str, log: Path, out: Path | None = None, use_slope: bool = True
+    target: str, log: Path, out: Path | None = None, use_slope: bool = True, topic: str = ""
 ) -> tuple[Identification, Path]:
     """Fits a robot to a log; writes the results and returns their folder.
 
@@ -59,6 +59,7 @@ def align_to_log(
         log: See `twin.sysid.logs`.
         out: Folder for the results; by default that of the scene or the `robot.toml`.
         use_slope: Accounts for the ground's slope, which is estimated from the log's accelerations (if it has any).
+        topic: Topic of a bag's poses; empty: the best one that does not come from the wheels.
 
     Raises:
         InputError: the robot is unknown, the folder is not writable, or the log is unusable.
@@ -67,13 +68,15 @@ def align_to_log(
     folder = out or folder
     if folder is None:
         raise InputError(f"{target}: the published robot has no folder for its robot.toml; give one with --out")
-    windows = _windows(target, log)
+    windows = _windows(target, log, topic)
+    if not use_slope:
+        windows = replace(windows, acceleration=None)
     runtime.log_line(f"{log}: {len(windows)} time windows, {int(windows.fitting.sum())} to fit, the others held out")
     check_log(windows, str(log))
     pictures = folder / RESULT_FOLDER
     _check_writable(pictures)
     _check_writable(folder)
-    result = identify(windows, params, use_slope, runtime.log_line)
+    result = identify(windows, params, runtime.log_line)
 
     from twin.sysid.plots import write_plots
 
@@ -84,7 +87,7 @@ def align_to_log(
     return result, folder
 
 
-def _windows(target: str, log: Path) -> Windows:
+def _windows(target: str, log: Path, topic: str) -> Windows:
     """The time windows of a log. If it is a bag that the scene was built from, reconstructed poses can be used."""
     if not is_bag(log):
         return read_log(log)
@@ -92,7 +95,7 @@ def _windows(target: str, log: Path) -> Windows:
 
     scene = SceneDir(_scene_root(target))
     filmed = filmed_poses(scene, load_config(scene.config_file), log) if scene.config_file.exists() else None
-    return cut_windows(read_bag(log, filmed), str(log))
+    return cut_windows(read_bag(log, filmed, topic), str(log))
 
 
 def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalibration, Path]":
@@ -193,15 +196,15 @@ def command(options: argparse.Namespace) -> None:
     """Runs `twin align` with the options parsed by `twin.commands`."""
     if options.camera and not is_bag(options.log):
         raise InputError(f"{options.log} is no bag; leave out --camera, which is only for bags")
-    if options.topic and not options.camera:
-        raise InputError(f"--topic {options.topic}: expected --camera, too; for a log, leave it out")
+    if options.topic and not is_bag(options.log):
+        raise InputError(f"--topic {options.topic}: {options.log} is no bag; leave it out")
     if options.camera or options.log.suffix.lower() in _FILM_SUFFIXES:
         if options.out or options.level:
             raise InputError(f"{options.log} is taken as a film; leave out --out and --level, which are for logs")
         camera, folder = align_camera(options.robot, options.log, options.topic or "")
         identified, lines = camera.identified, "\n".join([camera.summary, "fitted:", *_fitted(camera.identified)])
     else:
-        result, folder = align_to_log(options.robot, options.log, options.out, not options.level)
+        result, folder = align_to_log(options.robot, options.log, options.out, not options.level, options.topic or "")
         identified, lines = result.identified, summary(result)
     overridden = sorted(set(_scene_robot_table(folder)) & set(identified))
     if not options.quiet:

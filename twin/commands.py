@@ -132,7 +132,7 @@ def _align(parser: argparse.ArgumentParser) -> None:
     add("robot", help="folder of a scene, a robot.toml, or `husky` (published values)")
     add("log", type=Path, help="a .csv, an .npz, a bag, or a film")
     add("--camera", action="store_true", help="fit the camera's pose to the bag's pictures")
-    add("--topic", help="topic of these pictures; default: that with the most pictures")
+    add("--topic", help="topic of the bag's poses; with --camera, of its pictures")
     add("--out", type=Path, help="folder for robot.toml and alignment/; default: that of the scene")
     add("--level", action="store_true", help="assume level ground and ignore the log's IMU")
     add("--quiet", action="store_true", help="no progress, no summary")

@@ -21,8 +21,9 @@ from pathlib import Path
 import numpy as np
 
 from twin import commands, runtime
+from twin.capture.bag import METADATA
 from twin.capture.bag_film import BagContents, CameraSeat, read_contents
-from twin.capture.film_check import FilmCheck, check_film
+from twin.capture.film_check import FilmCheck, check_film, timing_notes
 from twin.capture.formats import ImageSet, find_model, listed_files, read_colmap, read_transforms
 from twin.capture.frames import detect_kind
 from twin.capture.scale import local_east_north_up
@@ -128,6 +129,8 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
             check = check_film(film)
             found, mask = _mask_lines(check, inputs, path)
             notes += [f"{film.name}: {note}" for note in check.notes + found]
+        elif film in bags:
+            notes += [f"{film.name}: {note}" for note in timing_notes(bags[film].film().timing)]
         text += _SOURCE.format(path=path_text, topic=chosen, lighting=toml_string(lighting), mask=mask)
     seated = next((bag for bag in bags.values() if bag.seat), None)
     seat = _write_seat(root / ROBOT_TOML, seated) if seated else None
@@ -218,6 +221,9 @@ def _taken(bag: BagContents) -> str:
         f"{bag.encoding}, {rate:.1f} a second over {bag.duration:.1f} s",
         f"  calibration: {bag.lens_note}",
     ]
+    parts = [file for file in bag.path.parent.glob(f"*{bag.path.suffix}") if is_file(bag.path.parent / METADATA)]
+    if len(parts) > 1:
+        lines.append(f"  only this one of the bag's {len(parts)} files is used; for all, give its folder")
     if bag.other_pictures:
         others = join_names(bag.other_pictures)
         lines.append(f"  other pictures: {others}; choose by --topic, or by `topic` in scene.toml")
@@ -234,8 +240,10 @@ def _taken(bag: BagContents) -> str:
             f"  camera on the robot: {bag.seat.height:.3f} m above the ground{ground}, {bag.seat.offset[0]:.3f} m "
             f"ahead, pitch {bag.seat.pitch:.1f}°, by {bag.topics['transforms']}"
         )
-    elif "transforms" in bag.topics:
-        lines.append(f"  camera on the robot: its frame is not connected to base_link on {bag.topics['transforms']}")
+    else:
+        static = bag.topics.get("transforms")
+        why = f"its frame is not connected to base_link on {static}" if static else "no /tf_static"
+        lines.append(f"  camera on the robot: {why}; its height is not known")
     return "\n".join(lines)
 
 

@@ -47,6 +47,7 @@ from twin_policy import Limits, Pilot, Rectifier
 
 _ANSWER = 300_000_000  # [ns] longest time from a picture to the command that follows from it
 _SAME = 1e-3  # [m/s], [rad/s]; commands that differ by less count as equal
+_OWN = 0.5  # if the policy repeats a smaller share of the commands, another one or a person may have driven
 _START_OFFSET, _START_HEADING = 0.3, 10.0  # [m], [°] largest deviations from the route at a trial's start in the twin
 
 
@@ -260,6 +261,8 @@ def summary(row: Trial, figures: dict[str, Any]) -> str:
             f"the policy repeats {policy['same']:.0%} of {policy['commands']} recorded commands; yaw rates differ "
             f"by {policy['yaw_rate_rms']:.3f} rad/s rms"
         )
+        if policy["same"] < _OWN:
+            lines.append(f"caution: was it {row.policy} that drove? The trial is counted as its own")
     return "\n".join(lines)
 
 

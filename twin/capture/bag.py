@@ -22,6 +22,7 @@ Times are nanoseconds.
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -145,6 +146,8 @@ def _wrap_errors(path: Path, cure: str) -> Iterator[None]:
             cure = "the recording was cut off: repair it by `mcap recover`, or " + cure
         elif "not indexed" in str(error):
             cure = "the recording was cut off: repair it by `rosbag reindex`, or " + cure
+        elif is_file(path.parent / METADATA):  # only there stands how the messages are compressed
+            cure = f"give the bag's folder, {path.parent}, or " + cure
         said = str(error).rstrip(".") or type(error).__name__
         raise InputError(f"{path}: not a readable bag: {said}; {cure}") from None
 
@@ -197,30 +200,40 @@ def _common(one: str, other: str) -> int:
     return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
 
 
-def choose_topics(connections: Any, path: Path, kinds: Sequence[str] = tuple(TYPES)) -> dict[str, Any]:
-    """Maps each of `kinds`, keys of `TYPES`, to its best connection. Raises InputError if any but imu has none."""
+def choose_topics(connections: Iterable[Any], path: Path, kinds: Sequence[str] = tuple(TYPES)) -> dict[str, str]:
+    """Maps each of `kinds`, keys of `TYPES`, to its best topic. Raises InputError if any but imu has none."""
     chosen = {}
     for kind in kinds:
-        types = TYPES[kind]
-        found = [c for c in connections if c.msgtype in types and c.msgcount]
-        if kind == "commands":  # prefer the velocity controller's input to the multiplexer's inputs
-            found.sort(key=lambda c: (not c.topic.endswith("cmd_vel"), -c.msgcount))
-        elif kind == "poses":
-            found.sort(key=lambda c: (c.msgcount < MIN_POSES, is_from_wheels(c.topic), -c.msgcount))
-        else:
-            found.sort(key=lambda c: -c.msgcount)
-        if found:
-            chosen[kind] = found[0]
+        counts = messages_by_topic(connections, TYPES[kind])
+        if counts:
+            chosen[kind] = min(counts.items(), key=partial(_order, kind))[0]
         elif kind != "imu":
             raise InputError(
-                f"{path}: no topic with {kind} ({' or '.join(types)}) among {topic_names(connections)}; record it"
+                f"{path}: no topic with {kind} ({' or '.join(TYPES[kind])}) among {topic_names(connections)}; record it"
             )
     return chosen
 
 
+def _order(kind: str, counted: tuple[str, int]) -> tuple[int, ...]:
+    """Sort key of a topic of a kind, given with its number of messages; the best topic has the least."""
+    topic, count = counted
+    if kind == "commands":  # prefer the velocity controller's input to the multiplexer's inputs
+        return (not topic.endswith("cmd_vel"), -count)
+    if kind == "poses":  # the heading of filtered odometry is better than that of the wheels alone
+        return (count < MIN_POSES, is_from_wheels(topic) * (1 if "filtered" in topic else 2), -count)
+    if kind == "imu":  # a camera's IMU often has the camera's axes
+        return ("camera" in topic, -count)
+    return (-count,)
+
+
 def is_from_wheels(topic: str) -> bool:
-    """True for a topic whose name contains a word of `FROM_WHEELS`."""
-    return any(word in topic for word in FROM_WHEELS)
+    """True for a topic with a word of `FROM_WHEELS` in its name, and for a Husky's filter of wheels and IMU."""
+    return any(word in topic for word in FROM_WHEELS) or topic.endswith("odometry/filtered")
+
+
+def log_topics(path: Path, topics: dict[str, str]) -> None:
+    """Logs which topic of a bag is used for what."""
+    runtime.log_line(f"{path}: " + ", ".join(f"{kind} {topic}" for kind, topic in topics.items()))
 
 
 # ---- messages

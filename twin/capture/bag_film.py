@@ -202,7 +202,7 @@ def _topics(connections: list[Any], path: Path, topic: str) -> dict[str, str]:
     if fixes:
         topics["fixes"] = max(fixes, key=lambda name: fixes[name])
     if messages_by_topic(connections, TYPES["poses"]):
-        topics["odometry"] = choose_topics(connections, path, ("poses",))["poses"].topic
+        topics["odometry"] = choose_topics(connections, path, ("poses",))["poses"]
     static = [name for name in messages_by_topic(connections, (TRANSFORMS,)) if name.endswith("tf_static")]
     if static:
         topics["transforms"] = min(static, key=len)
@@ -276,7 +276,7 @@ def _decoded(picture: Any, where: str) -> Image:
             _check_compressed(picture.data)
         return np.ascontiguousarray(picture.decode())
     except PictureError as error:
-        raise InputError(f"{where}: {error}; record raw or compressed pictures of 8 bits") from None
+        raise InputError(f"{where}: {error}; record raw pictures of 8 bits, JPEG or PNG") from None
 
 
 def _check_compressed(data: Any) -> None:
@@ -286,8 +286,10 @@ def _check_compressed(data: Any) -> None:
     try:
         with Pillow.open(BytesIO(bytes(data))) as head:
             width, height = head.size
-    except (UnidentifiedImageError, Pillow.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-        raise PictureError(f"{len(data)} bytes are neither a JPEG nor a PNG picture ({error})") from None
+    except UnidentifiedImageError:
+        raise PictureError(f"{len(data)} bytes are neither a JPEG nor a PNG picture") from None
+    except (Pillow.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
+        raise PictureError(f"damaged picture of {len(data)} bytes ({error})") from None
     if width * height > _MAX_PIXELS:
         raise PictureError(f"picture of {width} x {height} px; expected at most {_MAX_PIXELS:,} px")
 

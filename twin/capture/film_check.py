@@ -48,7 +48,7 @@ class FilmCheck:
 def check_film(path: Path) -> FilmCheck:
     """Checks a film. Raises InputError: see `probe`."""
     timing = probe(path)
-    notes = _timing_notes(timing)
+    notes = timing_notes(timing)
     first, small = _samples(path, "NONKEY")
     if len(small) < MIN_FRAMES:
         first, small = _samples(path, "DEFAULT")
@@ -78,7 +78,8 @@ def check_film(path: Path) -> FilmCheck:
     return FilmCheck(notes + _picture_notes(small), static.note, mask)
 
 
-def _timing_notes(timing: FilmTiming) -> list[str]:
+def timing_notes(timing: FilmTiming) -> list[str]:
+    """Sentences on gaps and on a varying frame rate."""
     steps = np.diff(timing.times)
     if len(steps) < _MIN_TRUSTED:
         return []
@@ -90,9 +91,7 @@ def _timing_notes(timing: FilmTiming) -> list[str]:
             f"no picture for {steps[longest]:.1f} s from {at} on; film in one go, or cut the film at the gap into two"
         )
     if float(np.quantile(steps, 0.95)) > _UNEVEN * timing.interval:
-        notes.append(
-            "varying frame rate: frames are taken by their time stamps; better set a fixed rate in the camera app"
-        )
+        notes.append("varying frame rate: frames are taken by their time stamps; better set a fixed rate in the camera")
     return notes
 
 

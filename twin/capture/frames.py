@@ -69,6 +69,8 @@ def detect_kind(path: Path) -> str:
     folder = is_folder(path, "check `path` in scene.toml (it is relative to the scene folder)")
     if is_bag(path):
         return "bag"
+    if path.suffix == ".zstd" and is_file(path):
+        raise InputError(f"{path}: a compressed file of a bag; give the bag's folder")
     if not folder:
         return "transforms" if path.suffix.lower() == ".json" else "video"
     if find_model(path):

@@ -144,16 +144,11 @@ def _identified_drive_fields(fit: Fit, twist: bool) -> list[str]:
     ]
 
 
-def identify(
-    windows: Windows, params: HuskyParams, use_slope: bool = True, progress: Callable[[str], None] = lambda _: None
-) -> Identification:
+def identify(windows: Windows, params: HuskyParams, progress: Callable[[str], None] = lambda _: None) -> Identification:
     """Fits baseline, drivetrain, tires and ground to the windows for fitting, then predicts every window.
 
-    Args:
-        use_slope: True: estimates the ground's slope from accelerations; False: assumes level ground.
+    Without accelerations, the ground counts as level.
     """
-    if not use_slope:
-        windows = replace(windows, acceleration=None)
     icr = fit_icr(windows)
     progress("commands and wheel speeds")
     drivetrain, drive_fit = fit_drivetrain(windows, params)

@@ -430,6 +430,7 @@ _MIN_TURNS = 10  # least number of windows that turn by more than `_TURN`; a qua
 _TURN = 0.25  # [rad]
 
 _MOVING = 0.15  # [m/s] of wheels or robot: slower windows are not used to check units
+_MAX_ACCELERATION = 3.0  # [m/s²] in the median; more is gravity along an axis that should be level
 _DEGREE = np.pi / 180
 
 
@@ -447,6 +448,13 @@ def check_log(windows: Windows, where: str) -> None:
             f"{where}: {fitting} windows of {DURATION:.0f} s to fit to and {scoring} to score on; expected at least "
             f"{_MIN_WINDOWS} and {_MIN_WINDOWS // 2}; drive for {1.5 * _MIN_WINDOWS * DURATION / 60:.0f} min or more"
         )
+    if windows.acceleration is not None:
+        mean = np.abs(np.median(windows.acceleration, axis=(0, 1)))
+        if mean.max() > _MAX_ACCELERATION:
+            raise InputError(
+                f"{where}: {ACCELERATION[int(mean.argmax())]} is {mean.max():.1f} m/s² (median); expected at most "
+                f"{_MAX_ACCELERATION:g}: the IMU's x must point forward and y to the left; leave it out with --level"
+            )
     for ratio, expected, message, cures in _unit_ratios(windows):
         _check_ratio(ratio, expected, where, message, cures)
     turned = windows.poses[windows.fitting, -1, 2]

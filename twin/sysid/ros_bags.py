@@ -5,6 +5,8 @@ kinematics. Poses that come from the wheels are not used, since they hide the wh
 but a scene was built from its pictures, the poses are those of a robot at rest below the reconstructed cameras.
 """
 
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from twin.capture.bag import (
     choose_topics,
     is_bag,
     is_from_wheels,
+    log_topics,
     messages_by_topic,
     open_bag,
     topic_names,
@@ -30,7 +33,7 @@ from twin.capture.bag import (
 from twin.capture.bag_film import read_contents
 from twin.capture.frames import source_names
 from twin.config import SceneConfig
-from twin.errors import InputError
+from twin.errors import InputError, join_names
 from twin.files import digest_file
 from twin.geometry.cameras import Cameras
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
@@ -79,63 +82,80 @@ def _are_same(one: Path, other: Path) -> bool:
     return sizes[0] == sizes[1] and list(map(digest_file, first)) == list(map(digest_file, second))
 
 
-def read_bag(path: Path, filmed: FilmedPoses | None = None) -> dict[str, Array]:
-    """Reads a bag into the columns that `twin.sysid.logs` describes.
+def read_bag(path: Path, filmed: FilmedPoses | None = None, poses: str = "") -> dict[str, Array]:
+    """Reads a bag into the columns that `twin.sysid.logs` describes. Messages that are not finite are left out.
 
     Args:
         filmed: Poses to use if the bag has only poses that come from the wheels.
+        poses: Topic of the poses; empty: the best one that does not come from the wheels.
 
     Raises:
         InputError: rosbags is not installed, the bag is unreadable, a kind of message is missing, or the poses come
             from the wheels and `filmed` is None.
     """
     with open_bag(path, "record it anew or give a .csv") as bag:
-        kinds, values = _kinds(bag.connections, path, filmed)
-        chosen = choose_topics(bag.connections, path, [kind for kind in kinds if kind not in values])
-        functions = {kind: VALUES[kind] for kind in chosen}
-        if "wheels" in values:
-            chosen["wheels"], functions["wheels"] = values["wheels"], _wheels_of_odometry
-        rows: dict[str, list[tuple[float, ...]]] = {kind: [] for kind in chosen}
-        by_id = {connection.id: kind for kind, connection in chosen.items()}
+        uses = _uses(bag.connections, path, filmed, poses)
+        rows: dict[tuple[str, str], list[tuple[float, ...]]] = {use: [] for use in uses}
+        lost: Counter[str] = Counter()
         # The beginning is subtracted as an integer: as a float it would be rounded to 0.2 µs.
-        for connection, recorded, message in bag.messages(list(chosen.values())):
-            kind = by_id[connection.id]
-            numbers = functions[kind](message)
-            if numbers is not None:
-                rows[kind].append(((recorded - bag.begin) * 1e-9, *numbers))
-        if "poses" not in kinds and filmed is not None:
-            since = (filmed.times - bag.begin) * 1e-9
-            rows["poses"] = [(float(t), *pose) for t, pose in zip(since, filmed.poses.tolist(), strict=True)]
-    empty = [kind for kind, found in rows.items() if not found]
+        for connection, recorded, message in bag.messages(bag.on(*(topic for _, topic in uses))):
+            for (kind, topic), function in uses.items():
+                if topic == connection.topic and (numbers := function(message)) is not None:
+                    if np.isfinite(numbers).all():
+                        rows[kind, topic].append(((recorded - bag.begin) * 1e-9, *numbers))
+                    else:
+                        lost[topic] += 1
+        begin = bag.begin
+    for topic, count in lost.items():
+        runtime.log_line(f"{path}: {count} messages on {topic} left out: not finite")
+    # Of the topics with joint states, those of an arm have no wheels.
+    best = dict(sorted(rows, key=lambda use: len(rows[use])))
+    topics = {kind: best[kind] for kind in TYPES if kind in best}
+    log_topics(path, topics)
+    tables = {kind: rows[kind, topic] for kind, topic in topics.items()}
+    if "poses" not in topics and filmed is not None:
+        since = (filmed.times - begin) * 1e-9
+        tables["poses"] = [(float(t), *pose) for t, pose in zip(since, filmed.poses.tolist(), strict=True)]
+    empty = [kind for kind, found in tables.items() if not found]
     if empty:
         raise InputError(f"{path}: no usable message of {', '.join(empty)}; expected at least one; record these topics")
-    return _columns({kind: np.array(found) for kind, found in rows.items()})
+    return _columns({kind: np.array(found) for kind, found in tables.items()})
 
 
-def _kinds(connections: list[Any], path: Path, filmed: FilmedPoses | None) -> tuple[list[str], dict[str, Any]]:
-    """The kinds of topics to read, and the connection of the wheels' odometry if it replaces missing joint states."""
-    kinds, values = list(TYPES), {}
+def _uses(
+    connections: list[Any], path: Path, filmed: FilmedPoses | None, poses: str
+) -> dict[tuple[str, str], Callable[[Any], Any]]:
+    """Kind and topic of what is read → function that extracts a message's numbers.
+
+    All topics with joint states are read, and the wheels' odometry if there is none.
+    """
     counts = messages_by_topic(connections, TYPES["poses"])
-    if not any(count >= MIN_POSES and not is_from_wheels(name) for name, count in counts.items()):
-        if filmed is None:
-            raise InputError(
-                f"{path}: no topic with poses ({' or '.join(TYPES['poses'])}) other than wheel odometry "
-                f"among {topic_names(connections)}; record LiDAR, RTK or a total station, or build the scene from this "
-                "bag's pictures"
-            )
-        kinds.remove("poses")
+    if poses and poses not in counts:
+        raise InputError(f"{path}: no poses on topic {poses}; expected one of {join_names(counts, most=12)}")
+    topics = choose_topics(connections, path, [kind for kind in TYPES if kind not in ("wheels", "poses")])
+    if poses or any(count >= MIN_POSES and not is_from_wheels(name) for name, count in counts.items()):
+        topics["poses"] = poses or choose_topics(connections, path, ("poses",))["poses"]
+    elif filmed is None:
+        raise InputError(
+            f"{path}: no topic with poses ({' or '.join(TYPES['poses'])}) other than wheel odometry "
+            f"among {topic_names(connections)}; record LiDAR, RTK or a total station (--topic names their topic), or "
+            "build the scene from this bag's pictures"
+        )
+    else:
         runtime.log_line(f"{path}: {len(filmed.times)} poses in the built scene are taken from its pictures")
-    if not messages_by_topic(connections, TYPES["wheels"]):
-        from_wheels = messages_by_topic(connections, (ODOMETRY,))
-        names = [name for name in from_wheels if is_from_wheels(name)]
-        if names:
-            topic = max(names, key=lambda name: from_wheels[name])
-            values["wheels"] = next(one for one in connections if one.topic == topic and one.msgcount)
-            runtime.log_line(
-                f"{path}: no joint states; wheel speeds are computed from {topic} with Clearpath's multiplier "
-                f"{HuskyParams.separation_multiplier:g}"
-            )
-    return kinds, values
+    uses = {(kind, topic): VALUES[kind] for kind, topic in topics.items()}
+    joints = messages_by_topic(connections, TYPES["wheels"])
+    from_wheels = {k: n for k, n in messages_by_topic(connections, (ODOMETRY,)).items() if is_from_wheels(k)}
+    if not joints and from_wheels:
+        topic = max(from_wheels, key=lambda name: from_wheels[name])
+        runtime.log_line(
+            f"{path}: no joint states; wheel speeds are computed from {topic} with Clearpath's multiplier "
+            f"{HuskyParams.separation_multiplier:g}"
+        )
+        return uses | {("wheels", topic): _wheels_of_odometry}
+    return uses | {
+        ("wheels", topic): VALUES["wheels"] for topic in joints or choose_topics(connections, path, ["wheels"])
+    }
 
 
 def _wheels_of_odometry(message: Any) -> tuple[float, float]:

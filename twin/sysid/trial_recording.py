@@ -25,7 +25,9 @@ from twin.capture.bag import (
     choose_topics,
     fix_of,
     header_time,
+    log_topics,
     message_times,
+    messages_by_topic,
     open_bag,
     picture_of,
     topic_names,
@@ -151,17 +153,17 @@ def read_trial(path: Path, given: dict[str, str] | None = None) -> TrialRecordin
     if not path.exists():
         raise InputError(f"{path}: no such bag; expected the folder of a ROS 2 bag, or its .mcap or .db3 file")
     with open_bag(path) as bag:
-        chosen = _choose(bag.connections, path, given or {})
-        times: dict[str, list[tuple[int, int]]] = {kind: [] for kind in chosen}
-        values: dict[str, list[Any]] = {kind: [] for kind in chosen}
-        kinds = {connection.id: kind for kind, connection in chosen.items()}
-        for connection, recorded, message in bag.messages(list(chosen.values())):
-            kind = kinds[connection.id]
+        topics = _choose(bag.connections, path, given or {})
+        log_topics(path, topics)
+        times: dict[str, list[tuple[int, int]]] = {kind: [] for kind in topics}
+        values: dict[str, list[Any]] = {kind: [] for kind in topics}
+        kinds = {topic: kind for kind, topic in topics.items()}
+        for connection, recorded, message in bag.messages(bag.on(*kinds)):
+            kind = kinds[connection.topic]
             if kind == "camera" and values[kind]:
                 continue
             times[kind].append((header_time(message), recorded))
             values[kind].append(_value(kind, message))
-    topics = {kind: connection.topic for kind, connection in chosen.items()}
     for kind, topic in topics.items():
         if not values[kind]:
             raise InputError(f"{path}: no message on {topic} ({kind}); record it")
@@ -185,34 +187,29 @@ def read_trial(path: Path, given: dict[str, str] | None = None) -> TrialRecordin
     )
 
 
-def _choose(connections: Any, path: Path, given: dict[str, str]) -> dict[str, Any]:
-    """The connections of pictures, camera, poses and commands."""
-    filled = [one for one in connections if one.msgcount]
-    chosen: dict[str, Any] = {}
+def _choose(connections: Any, path: Path, given: dict[str, str]) -> dict[str, str]:
+    """The topics of pictures, camera, poses and commands."""
+    types = {one.topic: one.msgtype for one in connections if one.msgcount}
     for kind, topic in given.items():
-        found = [one for one in filled if one.topic == topic]
-        if not found:
+        if topic not in types:
             raise InputError(f"{path}: no topic {topic} ({kind}); there are {topic_names(connections)}")
-        if found[0].msgtype not in _TYPES[kind]:
+        if types[topic] not in _TYPES[kind]:
             expected = " or ".join(_TYPES[kind])
-            raise InputError(
-                f"{path}: {topic} ({kind}) has {found[0].msgtype}; expected {expected}; give another topic"
-            )
-        chosen[kind] = found[0]
+            raise InputError(f"{path}: {topic} ({kind}) has {types[topic]}; expected {expected}; give another topic")
+    chosen = dict(given)
     if "pictures" not in chosen:
-        topic = choose_pictures(filled, path)
-        chosen["pictures"] = next(one for one in filled if one.topic == topic)
+        chosen["pictures"] = choose_pictures(connections, path)
     if "camera" not in chosen:
-        info = choose_camera_info(filled, chosen["pictures"].topic)
+        info = choose_camera_info(connections, chosen["pictures"])
         if info is None:
             raise InputError(
                 f"{path}: no topic of {CAMERA_INFO} among {topic_names(connections)}; record the camera's camera_info"
             )
-        chosen["camera"] = next(one for one in filled if one.topic == info)
-    if "poses" not in chosen and not any(one.msgtype in TYPES["poses"] for one in filled):
-        fixes = [one for one in filled if one.msgtype == FIX]
+        chosen["camera"] = info
+    if "poses" not in chosen and not messages_by_topic(connections, TYPES["poses"]):
+        fixes = messages_by_topic(connections, (FIX,))
         if fixes:
-            chosen["poses"] = max(fixes, key=lambda one: one.msgcount)
+            chosen["poses"] = max(fixes, key=lambda topic: fixes[topic])
     missing = [kind for kind in ("poses", "commands") if kind not in chosen]
     return chosen | choose_topics(connections, path, missing)
 

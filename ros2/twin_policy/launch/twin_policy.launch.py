@@ -35,6 +35,7 @@ def generate_launch_description() -> LaunchDescription:
             ("camera_info", LaunchConfiguration("camera_info")),
             ("cmd_vel", LaunchConfiguration("cmd_vel")),
             ("joy", LaunchConfiguration("joy")),
+            ("/diagnostics", "diagnostics"),  # in the robot's namespace, where Clearpath's aggregator listens
         ],
         output="screen",
     )

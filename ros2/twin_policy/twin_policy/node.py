@@ -11,6 +11,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Twist, TwistStamped
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
@@ -29,10 +30,11 @@ class PolicyNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("twin_policy", **options)
+        fixed = ParameterDescriptor(read_only=True)  # a change while the node runs would have no effect
 
         def parameter(name: str, default: Any) -> Any:
             try:
-                return self.declare_parameter(name, default).value
+                return self.declare_parameter(name, default, fixed).value
             except Exception as error:  # another type than the default's, such as 1 for 1.0
                 raise ValueError(f"parameter {name}: {error}") from None
 
@@ -54,6 +56,7 @@ class PolicyNode(Node):
         self._button, self._said, self._released = int(parameter("deadman_button", -1)), "", self._steady()
         self._stamped = parameter("stamped", True)
         self._sent = 0  # stamp of the picture behind the last driving command [ns]
+        self._lost = 0  # pictures lost until the last diagnostics
         self._commands = self.create_publisher(TwistStamped if self._stamped else Twist, "cmd_vel", 1)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -124,9 +127,13 @@ class PolicyNode(Node):
     def _diagnose(self) -> None:
         pilot, command = self.pilot, self.pilot.command()
         level = DiagnosticStatus.OK if command.drives or command.cause == DEADMAN else DiagnosticStatus.ERROR
+        lost, self._lost = pilot.counts["lost"] - self._lost, pilot.counts["lost"]
+        if command.drives and lost:
+            level = DiagnosticStatus.WARN
         facts = {"policy": pilot.policy.name, "milliseconds": f"{1e3 * pilot.duration:.1f}", **pilot.counts}
         values = [KeyValue(key=key, value=str(value)) for key, value in facts.items()]
-        status = DiagnosticStatus(level=level, name="twin_policy", message=command.cause or "drives", values=values)
+        said = f"drives, {lost} pictures lost since the last report" if lost else "drives"
+        status = DiagnosticStatus(level=level, name="twin_policy", message=command.cause or said, values=values)
         array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
