@@ -196,6 +196,7 @@ def test_unusable_input_ends_with_one_line_and_status_2(scene, tmp_path, capsys)
         ([str(scene.root), photo, "--name", "../x"], "expected a name of letters"),
         ([str(tmp_path), photo, "--name", "x"], "no scene.toml"),
         ([str(scene.root), photo, "--name", "x", "--sun", "high"], "--sun high: expected azimuth and elevation"),
+        ([str(scene.root), photo, "--name", "x", "--sun", "-30,95"], "--sun -30,95: expected an azimuth"),
         ([str(scene.root), photo, "--name", "x", "--time", "noon"], "--time 'noon': expected date, time and offset"),
         ([str(scene.root), photo, "--name", "x", "--sun", "120,35"], "has no 4_mesh yet; run twin build"),
     ):
