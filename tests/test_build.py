@@ -69,6 +69,22 @@ def test_runs_once_then_only_what_a_change_touches(pipeline):
     assert _rerun(pipeline, "seed=5") == ["capture", "cameras", "field"]
 
 
+def test_a_stage_that_runs_again_says_why(pipeline, capsys):
+    """The first line of a build names the changes."""
+
+    def first(*overrides, force=()):
+        capsys.readouterr()
+        _rerun(pipeline, *overrides, force=force)
+        return capsys.readouterr().err.splitlines()[0].partition(": ")[2]
+
+    assert first() == "capture"
+    assert first("nerf.steps=7") == "field, again because of nerf.steps"
+    assert first("nerf.steps=7", force=("field",)) == "field, again because of --force"
+    assert first("nerf.steps=7", "seed=5") == "capture, again because of seed"
+    (pipeline.root / "input/a.txt").write_text("another film")
+    assert first("nerf.steps=7", "seed=5") == "capture, again because of input/a.txt"
+
+
 def test_settings_of_a_stage_are_in_its_key():
     """A setting changes the stage's own key, or that of an upstream stage."""
     sections = {f.name for f in verb.dataclasses.fields(SceneConfig)} - {"name", "seed"}
