@@ -175,6 +175,19 @@ def test_until_stops_after_its_stage_and_the_report_is_written(pipeline):
     assert written["peak_memory_bytes"] > 1e6 and written["seed"] == 0 and written["versions"]["numpy"]
 
 
+def test_until_keeps_later_stages_in_the_report_if_they_are_up_to_date(pipeline):
+    """Without a change, `--until` loses no numbers; after a change, numbers of stale stages are left out."""
+    verb.build(pipeline.root)
+    assert list(verb.build(pipeline.root, until="capture")["stages"]) == ["capture", "cameras", "field"]
+    stale = verb.build(pipeline.root, until="capture", overrides=("cameras.features=9",))
+    assert list(stale["stages"]) == ["capture"] and pipeline.ran == ["capture", "cameras", "field"]
+
+
+def test_a_stage_forced_beyond_the_last_one_is_refused(pipeline):
+    with pytest.raises(verb.InputError, match="--force field with --until cameras"):
+        verb.build(pipeline.root, until="cameras", force=("field",))
+
+
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES])
 def test_a_full_or_read_only_disk_is_one_line_and_loses_nothing(pipeline, capsys, code):
     _rerun(pipeline)

@@ -45,12 +45,13 @@ def scene(tmp_path_factory) -> SceneDir:
     return scene
 
 
-def test_fit_finds_the_lighting_of_a_photo():
+def test_fit_finds_the_lighting_of_a_photo(capsys):
     field, pose = small_field(), pose_at(0.0)
     hidden = field.embedding("night") + np.random.default_rng(1).normal(0.0, 0.8, 8).astype(np.float32)
     small = (64, 48)
     photo = field.render(Viewpoints.of(pose[None], K / 5, small), hidden).rgb[0]
     relit = fit_photo(field, photo, pose, K / 5)
+    assert "5/5" in capsys.readouterr().err  # the progress bar
     assert relit.psnr_nearest == pytest.approx(max(psnr(p, photo) for p in _filmed(field, pose, small)), abs=1e-3)
     assert relit.psnr_fitted > relit.psnr_nearest + 10.0
     assert relit.psnr_nearest < relit.psnr_other_half <= relit.psnr_fitted + 0.5
@@ -196,7 +197,6 @@ def test_unusable_input_ends_with_one_line_and_status_2(scene, tmp_path, capsys)
         ([str(scene.root), photo, "--name", "../x"], "expected a name of letters"),
         ([str(tmp_path), photo, "--name", "x"], "no scene.toml"),
         ([str(scene.root), photo, "--name", "x", "--sun", "high"], "--sun high: expected azimuth and elevation"),
-        ([str(scene.root), photo, "--name", "x", "--sun", "-30,95"], "--sun -30,95: expected an azimuth"),
         ([str(scene.root), photo, "--name", "x", "--time", "noon"], "--time 'noon': expected date, time and offset"),
         ([str(scene.root), photo, "--name", "x", "--sun", "120,35"], "has no 4_mesh yet; run twin build"),
     ):

@@ -78,7 +78,7 @@ def build(
 
     Args:
         root: The folder with `scene.toml`.
-        until: Last stage to run; None = all.
+        until: Last stage to run; None = all. The report also has the later stages that are up to date.
         force: Stages to run again although they are up to date.
         overrides: `section.key=value` settings that take precedence over `scene.toml`.
         device: cpu or cuda, for the stages field and mesh; None: cuda if it is usable.
@@ -88,6 +88,9 @@ def build(
     """
     scene = SceneDir(root)
     config = load_config(scene.config_file, overrides)
+    names = [stage.name for stage in PIPELINE]
+    if late := [name for name in force if until and names.index(name) > names.index(until)]:
+        raise InputError(f"--force {late[0]} with --until {until}, which ends before; leave one of them out")
     if device:
         from twin.nerf.buffers import resolve_device
 
@@ -100,19 +103,21 @@ def build(
         recover_stages(scene)
         stamps: dict[str, Stamp] = {}
         skipped: dict[str, bool] = {}
+        finished = False
         for stage in PIPELINE:
             depends = _depends(stage, config, inputs, stamps)
             stamp = Stamp.load(scene.stage(stage.name))
             forced = stage.name in force
-            skipped[stage.name] = stamp is not None and not forced and stamp.key == digest_json(depends)
-            if stamp is None or not skipped[stage.name]:
+            current = stamp is not None and not forced and stamp.key == digest_json(depends)
+            if stamp is None or not current:
+                if finished:
+                    break
                 done = {name: it.seconds for name, it in stamps.items() if not skipped[name]}
                 changes = ["--force"] if forced else stamp and _changes(depends, stamp.depends)
                 _announce(stage, done, until, f", again because of {join_names(changes, 4)}" if changes else "")
                 stamp = _run(stage, scene, config, depends, device)
-            stamps[stage.name] = stamp
-            if stage.name == until:
-                break
+            stamps[stage.name], skipped[stage.name] = stamp, current
+            finished = finished or stage.name == until
         report = _report(config, stamps, skipped)
         publish(scene, report)
     return report
