@@ -69,6 +69,22 @@ def test_runs_once_then_only_what_a_change_touches(pipeline):
     assert _rerun(pipeline, "seed=5") == ["capture", "cameras", "field"]
 
 
+def test_a_stage_that_runs_again_says_why(pipeline, capsys):
+    """The first line of a build names the changes."""
+
+    def first(*overrides, force=()):
+        capsys.readouterr()
+        _rerun(pipeline, *overrides, force=force)
+        return capsys.readouterr().err.splitlines()[0].partition(": ")[2]
+
+    assert first() == "capture"
+    assert first("nerf.steps=7") == "field, again because of nerf.steps"
+    assert first("nerf.steps=7", force=("field",)) == "field, again because of --force"
+    assert first("nerf.steps=7", "seed=5") == "capture, again because of seed"
+    (pipeline.root / "input/a.txt").write_text("another film")
+    assert first("nerf.steps=7", "seed=5") == "capture, again because of input/a.txt"
+
+
 def test_settings_of_a_stage_are_in_its_key():
     """A setting changes the stage's own key, or that of an upstream stage."""
     sections = {f.name for f in verb.dataclasses.fields(SceneConfig)} - {"name", "seed"}
@@ -157,6 +173,19 @@ def test_until_stops_after_its_stage_and_the_report_is_written(pipeline):
     written = json.loads(pipeline.scene.report_json.read_text())
     assert written == json.loads(json.dumps(report))
     assert written["peak_memory_bytes"] > 1e6 and written["seed"] == 0 and written["versions"]["numpy"]
+
+
+def test_until_keeps_later_stages_in_the_report_if_they_are_up_to_date(pipeline):
+    """Without a change, `--until` loses no numbers; after a change, numbers of stale stages are left out."""
+    verb.build(pipeline.root)
+    assert list(verb.build(pipeline.root, until="capture")["stages"]) == ["capture", "cameras", "field"]
+    stale = verb.build(pipeline.root, until="capture", overrides=("cameras.features=9",))
+    assert list(stale["stages"]) == ["capture"] and pipeline.ran == ["capture", "cameras", "field"]
+
+
+def test_a_stage_forced_beyond_the_last_one_is_refused(pipeline):
+    with pytest.raises(verb.InputError, match="--force field with --until cameras"):
+        verb.build(pipeline.root, until="cameras", force=("field",))
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES])

@@ -27,7 +27,7 @@ from twin.report import build_report as report_page
 from twin.report import build_sections, build_topics
 from twin.report import html as report_html
 from twin.report.build_report import page, write_page
-from twin.report.build_sections import SECTIONS, cautions, headline_sections, sections
+from twin.report.build_sections import SECTIONS, cautions, headline_sections, mjcf_section, sections
 from twin.report.build_topics import truth_section
 from twin.report.html import (
     NOT_MEASURED,
@@ -304,6 +304,13 @@ def no_charts() -> Iterator[None]:
 
 def header_of(html: str) -> str:
     return read(html[html.index("<header") : html.index("</header>")] + "</header>").text
+
+
+def test_a_start_without_parts_nearby_is_free() -> None:
+    """No distance is stored if no part is within range; the report lacks the key if it was not measured."""
+    shown = {stored: mjcf_section({"mjcf": {"spawn_clearance_m": stored}}).facts[-3].value for stored in (1.5, None)}
+    assert shown == {1.5: "1.50 m", None: "over 5 m"}
+    assert mjcf_section({"mjcf": {}}).facts[-3].value == NOT_MEASURED
 
 
 def test_nothing_wrong_gives_no_caution() -> None:

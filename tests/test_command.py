@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from twin.__main__ import main
-from twin.commands import VERBS
+from twin.commands import VERBS, parser_of
 
 
 def test_help_lists_every_verb(capsys):
@@ -21,6 +21,13 @@ def test_an_unknown_verb_is_one_line(capsys):
     told = capsys.readouterr()
     assert told.out == "" and told.err.startswith("error: no verb 'biuld'; expected one of new, build")
     assert told.err.count("\n") == 1
+
+
+def test_a_value_may_begin_with_a_minus():
+    options = parser_of("relight").parse_args(
+        ["scene", "photo.jpg", "--name", "x", "--sun", "-30,20", "--location", "-33.9,18.4", "--heading", "-5"]
+    )
+    assert (options.sun, options.location, options.heading) == ("-30,20", "-33.9,18.4", -5.0)
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -202,7 +202,10 @@ def test_a_task_file_has_the_scenes_line_and_rules(scene, out) -> None:
         (["--glb", "absent/a.glb"], "there is no folder absent"),
         (["--ply", "a.ply"], "no scene.toml"),
         (["--usd", "a.obj"], "expected a file ending in .usdz"),
-        (["--usd", "folder"], "is a folder; give a file"),
+        (["--glb", "a.gltf"], "a.gltf: expected a file ending in .glb"),
+        (["--ply", "a.spz"], "a.spz: expected a file ending in .ply"),
+        (["--colmap", "a", "--lighting", "night"], "--lighting night: only --usd, --glb and --ply have a lighting"),
+        (["--usd", "folder.usd"], "is a folder; give a file"),
         (["--colmap", "folder"], "is there already"),
         (["--nerfstudio", "file"], "is there already"),
         (["--task-file", "a.json"], "--task and --task-file belong together"),
@@ -211,12 +214,13 @@ def test_a_task_file_has_the_scenes_line_and_rules(scene, out) -> None:
 )
 def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, words) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "folder").mkdir()
+    for name in ("folder", "folder.usd"):
+        (tmp_path / name).mkdir()
     (tmp_path / "file").write_text("")
     assert main(["nowhere", *arguments]) == 2
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder", "folder.usd"]
 
 
 def test_an_unknown_lighting_is_refused(scene, tmp_path, capsys) -> None:

@@ -43,7 +43,9 @@ def _uncommented(text: str, line: str) -> str:
     return text.replace(line, line.removeprefix("# "), 1)
 
 
-@pytest.mark.parametrize("arguments", [["absent.mp4"], ["text.mp4"], ["day.mp4", "--camera-height", "-1"]])
+@pytest.mark.parametrize(
+    "arguments", [["absent.mp4"], ["text.mp4"], ["day.mp4", "./day.mp4"], ["day.mp4", "--camera-height", "-1"]]
+)
 def test_new_refuses_unusable_films(
     tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -45,12 +45,13 @@ def scene(tmp_path_factory) -> SceneDir:
     return scene
 
 
-def test_fit_finds_the_lighting_of_a_photo():
+def test_fit_finds_the_lighting_of_a_photo(capsys):
     field, pose = small_field(), pose_at(0.0)
     hidden = field.embedding("night") + np.random.default_rng(1).normal(0.0, 0.8, 8).astype(np.float32)
     small = (64, 48)
     photo = field.render(Viewpoints.of(pose[None], K / 5, small), hidden).rgb[0]
     relit = fit_photo(field, photo, pose, K / 5)
+    assert "5/5" in capsys.readouterr().err  # the progress bar
     assert relit.psnr_nearest == pytest.approx(max(psnr(p, photo) for p in _filmed(field, pose, small)), abs=1e-3)
     assert relit.psnr_fitted > relit.psnr_nearest + 10.0
     assert relit.psnr_nearest < relit.psnr_other_half <= relit.psnr_fitted + 0.5

@@ -8,6 +8,7 @@ A stage writes `build/<folder>.partial`, which is renamed at the end. `twin.scen
 import argparse
 import dataclasses
 import importlib
+import json
 import os
 import sys
 import time
@@ -19,7 +20,7 @@ from typing import Any
 from twin import commands, runtime
 from twin.config import MetricConfig, NerfConfig, RouteConfig, SceneConfig
 from twin.config_file import load_config
-from twin.errors import InputError
+from twin.errors import InputError, join_names
 from twin.files import digest_file, digest_json, is_folder, is_link, remove, write_json
 from twin.runtime import PeakMemory, exclusive_lock
 from twin.scene import SceneDir, Stamp, commit_stage, package_versions, recover_stages, replace_file, write_stamp
@@ -77,7 +78,7 @@ def build(
 
     Args:
         root: The folder with `scene.toml`.
-        until: Last stage to run; None = all.
+        until: Last stage to run; None = all. The report also has the later stages that are up to date.
         force: Stages to run again although they are up to date.
         overrides: `section.key=value` settings that take precedence over `scene.toml`.
         device: cpu or cuda, for the stages field and mesh; None: cuda if it is usable.
@@ -87,6 +88,9 @@ def build(
     """
     scene = SceneDir(root)
     config = load_config(scene.config_file, overrides)
+    names = [stage.name for stage in PIPELINE]
+    if late := [name for name in force if until and names.index(name) > names.index(until)]:
+        raise InputError(f"--force {late[0]} with --until {until}, which ends before; leave one of them out")
     if device:
         from twin.nerf.buffers import resolve_device
 
@@ -99,24 +103,45 @@ def build(
         recover_stages(scene)
         stamps: dict[str, Stamp] = {}
         skipped: dict[str, bool] = {}
+        finished = False
         for stage in PIPELINE:
             depends = _depends(stage, config, inputs, stamps)
-            stamp = None if stage.name in force else Stamp.load(scene.stage(stage.name))
-            skipped[stage.name] = stamp is not None and stamp.key == digest_json(depends)
-            if stamp is None or not skipped[stage.name]:
+            stamp = Stamp.load(scene.stage(stage.name))
+            forced = stage.name in force
+            current = stamp is not None and not forced and stamp.key == digest_json(depends)
+            if stamp is None or not current:
+                if finished:
+                    break
                 done = {name: it.seconds for name, it in stamps.items() if not skipped[name]}
-                _announce(stage, done, until)
+                changes = ["--force"] if forced else stamp and _changes(depends, stamp.depends)
+                _announce(stage, done, until, f", again because of {join_names(changes, 4)}" if changes else "")
                 stamp = _run(stage, scene, config, depends, device)
-            stamps[stage.name] = stamp
-            if stage.name == until:
-                break
+            stamps[stage.name], skipped[stage.name] = stamp, current
+            finished = finished or stage.name == until
         report = _report(config, stamps, skipped)
         publish(scene, report)
     return report
 
 
-def _announce(stage: Stage, done: dict[str, float], until: str | None) -> None:
-    """Logs that a stage begins and, once the speed of the build is known, the remaining time of the build.
+def _changes(depends: dict[str, Any], before: dict[str, Any]) -> list[str]:
+    """The settings, input files and other things by which the dependencies of a stage differ from earlier ones."""
+    now = json.loads(json.dumps(depends))  # as read from a stamp: with lists in place of tuples
+
+    def changed(a: Any, b: Any, name: str) -> list[str]:
+        if a == b or not isinstance(a, dict) or not isinstance(b, dict):
+            return [name] if a != b else []
+        return [
+            one for key in (a | b) for one in changed(a.get(key), b.get(key), f"{name}.{key}" if name else str(key))
+        ]
+
+    found = ["a newer version of twin"] if now["version"] != before["version"] else []
+    found += changed(now["config"], before["config"], "") + changed(now["inputs"], before["inputs"], "")
+    found += [f"new results of {name}" for name in changed(now["upstream"], before["upstream"], "")]
+    return [*found, "seed"] if now["seed"] != before["seed"] else found
+
+
+def _announce(stage: Stage, done: dict[str, float], until: str | None, why: str) -> None:
+    """Logs that a stage begins, why, and, once the speed of the build is known, the remaining time of the build.
 
     `done` has the durations [s] of the earlier stages that this build has run.
     """
@@ -128,7 +153,7 @@ def _announce(stage: Stage, done: dict[str, float], until: str | None) -> None:
     expected = [pace * _TYPICAL[name] for name in names[number:]]
     runtime.set_stage(runtime.BuildStage(number + 1, len(names), expected[0], sum(expected[1:])))
     left = f", about {max(1, round(sum(expected) / 60))} min left" if typical > _LEAST_TIMED else ""
-    runtime.log_line(f"stage {number + 1} of {len(names)}: {stage.name}{left}")
+    runtime.log_line(f"stage {number + 1} of {len(names)}: {stage.name}{why}{left}")
 
 
 def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:

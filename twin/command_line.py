@@ -13,6 +13,7 @@ import contextlib
 import errno
 import io
 import os
+import re
 import signal
 import sys
 import textwrap
@@ -40,6 +41,11 @@ _CURES = {
 
 class Parser(argparse.ArgumentParser):
     """An argument parser that prints errors as one line."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        # argparse takes only single negative numbers as values; here, `--location -33.9,18.4` is one, too.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
         if action.option_strings and action.nargs is None and arg_strings == ["--"]:

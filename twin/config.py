@@ -18,6 +18,8 @@ RESERVED_LIGHTINGS = (TRAINING, HELD_OUT, ANY)
 RANDOMIZED = "+randomised"
 """Suffix of randomized conditions in tables, see `Condition`; the name of a lighting must not end with it."""
 
+MAX_CAMERA_HEIGHT = 100.0  # [m]
+
 CAUSES = ("goal", "collision", "out_of_bounds", "timeout", "rollover", "stuck")
 """Causes that end an episode or trial, in the order of tables. If several apply at once, the code that ends the
 episode picks one."""
@@ -109,7 +111,7 @@ class SourceConfig:
     camera: CalibrationConfig | None = None
     """Known intrinsics, held fixed; for a bag, by default those of its camera_info. Calibrate the camera if possible,
     since forward motion biases self-calibration."""
-    camera_height: Annotated[float, Range(0)] = 0.0
+    camera_height: Annotated[float, Range(0, MAX_CAMERA_HEIGHT)] = 0.0
     """Height of this source's lens above the ground [m], if sources differ; 0 = `metric.camera_height`."""
     keep: tuple[tuple[float, ...], ...] = ()
     """Segments of this film that are used, instead of those in `capture.keep`."""
@@ -187,7 +189,7 @@ class MarkerConfig:
 class MetricConfig:
     """Sources of the metric scale: one, or several to be compared and combined."""
 
-    camera_height: Annotated[float, Range(0)] = 0.0
+    camera_height: Annotated[float, Range(0, MAX_CAMERA_HEIGHT)] = 0.0
     """Lens above the ground [m], for a camera carried at constant height. 0 = not given."""
     camera_height_tolerance: Annotated[float, Range(0, 1)] = 0.01
     """Standard deviation of the error of `camera_height` [m]."""

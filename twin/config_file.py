@@ -54,18 +54,19 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> SceneConfig:
         raise InputError(f"no scene.toml at {path}; write one, or run twin new SCENE VIDEO...")
     for override in overrides:
         _apply_override(table, override)
+    where = f"{path}{''.join(f' with --set {override}' for override in overrides)}"
     if isinstance(table.get("robot", {}), dict):
-        table["robot"] = merge_robot(read_robot(path.parent / ROBOT_TOML), table.get("robot", {}), str(path))
+        table["robot"] = merge_robot(read_robot(path.parent / ROBOT_TOML), table.get("robot", {}), where)
     nerf = table.get("nerf", {})
     if isinstance(nerf, dict) and isinstance(nerf.get("quality"), str):
-        _check_choice(nerf["quality"], tuple(QUALITIES), f"{path}: nerf.quality")
+        _check_choice(nerf["quality"], tuple(QUALITIES), f"{where}: nerf.quality")
         table["nerf"] = QUALITIES[nerf["quality"]] | nerf
-    config = parse_table(SceneConfig, table, str(path))
+    config = parse_table(SceneConfig, table, where)
     folder = path.resolve().parent.name
     try:
         _check(config, folder)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(f"{where}: {error}") from None
     return config if config.name else dataclasses.replace(config, name=folder)
 
 

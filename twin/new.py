@@ -28,7 +28,7 @@ from twin.capture.formats import ImageSet, find_model, listed_files, read_colmap
 from twin.capture.frames import detect_kind
 from twin.capture.scale import local_east_north_up
 from twin.capture.video import probe
-from twin.config import RANDOMIZED, RESERVED_LIGHTINGS
+from twin.config import MAX_CAMERA_HEIGHT, RANDOMIZED, RESERVED_LIGHTINGS
 from twin.config_file import ROBOT_TOML, parse_table
 from twin.errors import InputError, join_names
 from twin.files import digest_file, exists, is_file, read_toml, toml_string, write_text
@@ -94,18 +94,20 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
         topic: Topic of the pictures in bags; empty: the topic with most pictures.
 
     Raises:
-        InputError: a scene exists already, a film is unreadable, images of a posed image set are missing, or the height
-            is invalid.
+        InputError: a scene exists already, a film is unreadable or given twice, images of a posed image set are
+            missing, or the height is invalid.
     """
     scene = SceneDir(root)
     if scene.config_file.exists():
         raise InputError(f"{scene.config_file}: a scene is here already; edit it, or choose another folder")
-    if camera_height is not None and not 0.01 <= camera_height <= 100.0:
+    if camera_height is not None and not 0.01 <= camera_height <= MAX_CAMERA_HEIGHT:
         raise InputError(f"--camera-height {camera_height:g}: expected meters above the ground, such as 1.2")
     bags: dict[Path, BagContents] = {}
-    for film in films:
+    for k, film in enumerate(films):
         if not film.exists():
             raise InputError(f"{film}: no such film; give the path of a video file or an image folder")
+        if any(film.samefile(other) for other in films[:k]):
+            raise InputError(f"{film} is given twice; each film is one lighting, so give it once")
         kind = detect_kind(film)
         if kind == "video":
             probe(film)

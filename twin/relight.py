@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import commands
+from twin import commands, runtime
 from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
@@ -113,10 +113,14 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     def render(embedding: NDArray, fog: Fog = _CLEAR) -> NDArray:
         return fog.apply(field.color(features, harmonics, embedding).reshape(photo.shape), distance)
 
+    progress = runtime.bar("lighting", 5, "fit")
+
     def fit(pixels: NDArray, start: NDArray, with_fog: bool) -> tuple[NDArray, Fog]:
         some = torch.as_tensor(pixels[:: max(1, len(pixels) // _RAYS)], device=field.device)
         rays = field.parameters, features[some], harmonics[some], colors[some]
-        return fit_appearance(*rays, start, _STEPS, distances[some] if with_fog else None)
+        found = fit_appearance(*rays, start, _STEPS, distances[some] if with_fog else None)
+        progress.update()
+        return found
 
     filmed = {name: render(field.embedding(name)) for name in field.lightings}
     nearest = max(filmed, key=lambda name: psnr(filmed[name], photo))
@@ -128,7 +132,7 @@ def fit_photo(field, photo: NDArray, camera_to_world: NDArray, intrinsics: NDArr
     start = starts[int(np.argmin([((one - photo.reshape(-1, 3)[some]) ** 2).mean() for one in renders]))]
     left = np.broadcast_to(np.arange(width) < width // 2, (height, width))
     masks = (left, ~left)
-    with single_threaded_torch():
+    with single_threaded_torch(), progress:
         halves = [[fit(np.flatnonzero(h), start, with_fog) for h in masks] for with_fog in (False, True)]
         clear, foggy = (
             float(np.mean([psnr(render(*one), photo, ~h) for one, h in zip(fits, masks, strict=True)]))

@@ -35,7 +35,7 @@ from twin.mjcf.world import SCENE_XML
 from twin.scene import PACK_JSON, require_stage
 
 _MEGABYTE = 1e6
-_USD_SUFFIXES = (".usdz", ".usd", ".usdc")
+_SUFFIXES = (".usdz", ".usd", ".usdc"), (".glb",), (".ply",)  # of --usd, --glb and --ply
 
 
 def command(given: argparse.Namespace) -> None:
@@ -61,7 +61,8 @@ def export(
 
     Raises:
         InputError: nothing to write, the scene is not built, it is a pack and frames are wanted, the lighting or
-            task is unknown, an output folder does not exist, or a folder to write is there already.
+            task is unknown, a lighting is given for files that have none, a file has another suffix than its format,
+            an output folder does not exist, or a folder to write is there already.
     """
     files, folders = [one for one in (usd_file, glb, ply) if one], [one for one in (nerfstudio, colmap) if one]
     task_files = [task_file] if task_file else []
@@ -69,6 +70,11 @@ def export(
         raise InputError("nothing to write; give --usd, --glb, --ply, --nerfstudio, --colmap or --task-file")
     if (task_file is None) != (task is None):
         raise InputError("--task and --task-file belong together; give both, such as --task straight --task-file FILE")
+    if lighting and not files:
+        raise InputError(f"--lighting {lighting}: only --usd, --glb and --ply have a lighting; leave it out")
+    for file, suffixes in zip((usd_file, glb, ply), _SUFFIXES, strict=True):
+        if file is not None and file.suffix.lower() not in suffixes:
+            raise InputError(f"{file}: expected a file ending in {', '.join(suffixes)}")
     for path in (*files, *task_files):
         require_parent(path)
         if path.is_dir():
@@ -76,8 +82,6 @@ def export(
     for path in folders:
         require_absent(path)
     if usd_file is not None:
-        if usd_file.suffix.lower() not in _USD_SUFFIXES:
-            raise InputError(f"{usd_file}: expected a file ending in {', '.join(_USD_SUFFIXES)}")
         _require_usd()
     twin = load_scene(scene)
     lines = _field_files(twin, lighting, usd_file, glb, ply) if files else []

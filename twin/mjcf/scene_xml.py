@@ -399,7 +399,7 @@ def face_texture(colors: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.float64
 _COMPARED_STEPS = 200
 _MAX_DEVIATION = 0.002  # [m] largest distance between the robot bases of the compiled model and of the copy
 _XML_PRECISION = 1e-5  # further allowed deviation [fraction of the coordinates], since the XML keeps six digits
-_CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
+CLEARANCE_RANGE = 5.0  # [m] search radius for parts around the spawn
 
 
 def check_portable(folder: Path, built: mujoco.MjModel) -> dict[str, Any]:
@@ -457,11 +457,11 @@ def _spawn_clearance(model: mujoco.MjModel, data: mujoco.MjData) -> float | None
     robot = np.flatnonzero(_robot_geoms(model) & (model.geom_contype > 0))
     parts = np.flatnonzero(model.geom_group == PART_GROUP)
     center = data.body("base_link").xpos
-    near = parts[np.linalg.norm(data.geom_xpos[parts] - center, axis=1) < model.geom_rbound[parts] + _CLEARANCE_RANGE]
+    near = parts[np.linalg.norm(data.geom_xpos[parts] - center, axis=1) < model.geom_rbound[parts] + CLEARANCE_RANGE]
     pairs = [(int(a), int(b)) for a in robot for b in near]
-    distances = [mujoco.mj_geomDistance(model, data, a, b, _CLEARANCE_RANGE, None) for a, b in pairs]
-    nearest = min(distances, default=_CLEARANCE_RANGE)
-    return float(nearest) if nearest < _CLEARANCE_RANGE else None
+    distances = [mujoco.mj_geomDistance(model, data, a, b, CLEARANCE_RANGE, None) for a, b in pairs]
+    nearest = min(distances, default=CLEARANCE_RANGE)
+    return float(nearest) if nearest < CLEARANCE_RANGE else None
 
 
 def _reset_to_spawn(model: mujoco.MjModel) -> mujoco.MjData:

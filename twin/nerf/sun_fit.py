@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from twin import runtime
 from twin.geometry.images import psnr
 from twin.geometry.shadow_map import TEXEL, OrthographicShadowMap, ShadowCasters, angles, direction
 from twin.nerf import network
@@ -300,10 +301,10 @@ def fit_sun(
         gain = np.clip(seen.terms(sun.shadows) @ sun.coefficients, MIN_GAIN, MAX_GAIN)
         return np.clip(fog.apply((rgb * gain).reshape(shape), traced.distance), 0.0, 1.0)
 
-    solved = [solve(half) for half in halves]
+    solved = [solve(half) for half in runtime.track(halves, "sun’s direction", unit="half")]
     order = np.argsort(np.mean([[fit.error for fit, _ in one] for one in solved], 0))
     scores = {}
-    for k in {*order[:_BASES].tolist(), len(filmed)}:
+    for k in runtime.track({*order[:_BASES].tolist(), len(filmed)}, "sun", unit="fit"):
         each = []
         for half, fits in zip(halves, solved, strict=True):
             rest = np.ones(len(colors), bool)

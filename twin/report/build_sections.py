@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from twin.errors import join_names
+from twin.mjcf.scene_xml import CLEARANCE_RANGE
 from twin.report.build_topics import costs_section, geometry_section, truth_section
 from twin.report.html import (
     NOT_MEASURED,
@@ -350,8 +351,11 @@ def mjcf_section(report: dict[str, Any]) -> Section:
             ("mjcf.route_length_m", "route", "{:.1f} m", _route_choice(report)),
             ("mjcf.turn_deg", "turn", "{:+.0f}°", "from the first heading to the last; right is negative"),
             ("mjcf.half_width_m", "corridor", "± {:.2f} m", "kept free of convex parts"),
-            ("mjcf.spawn_clearance_m", "free at the start", "{:.2f} m", "robot to the nearest part"),
         )
+        free = number(pick(report, "mjcf.spawn_clearance_m"), "{:.2f} m")
+        if free == NOT_MEASURED and "spawn_clearance_m" in (pick(report, "mjcf") or {}):
+            free = f"over {CLEARANCE_RANGE:g} m"  # None: no part within that range
+        route.append(Fact("free at the start", free, "robot to the nearest part"))
     size = as_number(pick(report, "mjcf.assets_bytes"))
     facts = [
         *route,

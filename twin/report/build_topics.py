@@ -37,12 +37,15 @@ def geometry_section(report: dict[str, Any]) -> Section:
     )
     beyond = ". The largest difference is {:.3f} m, more than {:g} m."
     unfilmed = (
-        "Collision geometry in the corridor is not visible where no film shows it from two directions; the field’s "
-        "depth there is not determined and may differ from build to build" + beyond
+        "No film shows some of the corridor, usually its first meters, from two directions. The field’s depth there is "
+        "not determined, may differ from build to build, and differs from collision geometry" + beyond
     )
     leak = "Something in the corridor is visible but has no collision geometry" + beyond
     ghost = "Collision geometry in the corridor is not visible" + beyond
-    earlier = "start the drive a little further along, or start to film a little earlier."
+    earlier = (
+        "film from a few meters before the start; without a new film, let tasks start further along ([[task]] with "
+        "start = 3.0, for example), which avoids these meters but leaves this caution."
+    )
     apart = "Visual and collision geometry differ by {:.3f} m in the median, more than {:g} m."
     cautions = cautions_above(
         found,
