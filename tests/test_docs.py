@@ -24,9 +24,9 @@ ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(page for page in (ROOT / "docs").glob("*.md") if page.name != "benchmarks.md")])
 _IN_THE_SCENE = {
     "--episodes 20": "--episodes 2",
-    '"right_turn"': '"bend"',
+    '"right_turn"': '"ahead"',
     '"straight"': '"ahead"',
-    "--task right_turn": "--task bend",
+    "--task right_turn": "--task ahead",
     '"night"': '"day"',
     "--lighting night": "--lighting day",
     "obstacles=3": "obstacles=1",
@@ -92,7 +92,7 @@ def test_short_commands_run(demo, monkeypatch):
             if words[:2] == ["twin", "film"]:
                 given = _adapted(" ".join(words[1:])).split()
                 if "--policy" in given:
-                    given += ["--task", "bend"]
+                    given += ["--task", "ahead"]
                 from twin.__main__ import main
 
                 assert main([*given, "--quiet"]) == 0, words
