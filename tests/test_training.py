@@ -215,7 +215,7 @@ def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     head = json.loads((tmp_path / "state" / "state.json").read_text())
     assert (head["steps"], head["replay"]["pos"]) == (120, 30)
     seen = []
-    run(twin.load_scene(scene), tmp_path, SHORT, lambda steps, recent: seen.append(steps))
+    run(twin.load_scene(scene), tmp_path, SHORT, lambda steps, recent: seen.append(steps), processes=1)
     assert seen[0] == 124 and seen[-1] == SHORT.steps
     checkpoints = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert checkpoints == ["000000080", "000000160", "000000240"]
