@@ -24,9 +24,11 @@ ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(page for page in (ROOT / "docs").glob("*.md") if page.name != "benchmarks.md")])
 _IN_THE_SCENE = {
     "--episodes 20": "--episodes 2",
-    '"right_turn"': '"ahead"',
+    '"right_turn"': '"bend"',
     '"straight"': '"ahead"',
-    "--task right_turn": "--task ahead",
+    "--task right_turn --lighting held-out": "--task ahead --lighting held-out",
+    "--task right_turn --lerobot": "--task ahead --lerobot",
+    "--task right_turn": "--task bend",
     '"night"': '"day"',
     "--lighting night": "--lighting day",
     "obstacles=3": "obstacles=1",

@@ -28,14 +28,14 @@ def example(name: str):
 
 def test_ppo_learns_and_is_evaluated(scene, tmp_path, capsys):
     root, out = str(scene), tmp_path / "ppo.zip"
-    options = ["--task", "ahead", "--steps", "32", "--worlds", "2", "--rollout", "16", "--out", str(out)]
+    options = ["--task", "ahead", "--steps", "64", "--worlds", "2", "--rollout", "32", "--out", str(out)]
     example("ppo").main([root, *options])
     assert "return under held-out lightings" in capsys.readouterr().out and out.exists()
 
 
 def test_sac_learns(scene, tmp_path, capsys):
     root, out = str(scene), tmp_path / "sac.safetensors"
-    options = ["--task", "ahead", "--steps", "60", "--warmup", "50", "--batch", "8", "--out", str(out)]
+    options = ["--task", "ahead", "--steps", "120", "--warmup", "100", "--batch", "8", "--out", str(out)]
     example("sac").main([root, *options])
     assert " after " in capsys.readouterr().out and out.exists()
 
