@@ -191,7 +191,7 @@ LOW = replace(ASKEW, camera_height=1.1)
 @pytest.fixture(scope="module")
 def filmed():
     """Frames of a robot's camera in the corridor, and its true poses."""
-    poses = drive(LOW, lambda xy: np.zeros(len(xy)), length=7.0, count=28, weave=0.3)
+    poses = drive(LOW, lambda xy: np.zeros(len(xy)), length=7.0, count=20, weave=0.3)
     return [picture(pose) for pose in poses], poses
 
 
@@ -241,7 +241,7 @@ def film(filmed, tmp_path_factory):
 def test_a_camera_is_aligned_by_its_film(scene, film):
     known = HuskyParams(camera_intrinsics=tuple(K), camera_size=(320, 240), camera_offset=LOW.camera_offset)
     aligned, frames = calibrate_camera(film, scene, known)
-    assert len(frames) == aligned.frames >= 26
+    assert len(frames) == aligned.frames >= 19
     assert "camera_intrinsics" not in aligned.identified  # as it was given
     for name, limit in {"height": 0.02, "yaw": 0.4, "pitch": 0.3, "roll": 0.3}.items():
         value, error = aligned.identified[f"camera_{name}"]

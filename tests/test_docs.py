@@ -26,6 +26,8 @@ _IN_THE_SCENE = {
     "--episodes 20": "--episodes 2",
     '"right_turn"': '"bend"',
     '"straight"': '"ahead"',
+    "--task right_turn --lighting held-out": "--task ahead --lighting held-out",
+    "--task right_turn --lerobot": "--task ahead --lerobot",
     "--task right_turn": "--task bend",
     '"night"': '"day"',
     "--lighting night": "--lighting day",
@@ -92,7 +94,7 @@ def test_short_commands_run(demo, monkeypatch):
             if words[:2] == ["twin", "film"]:
                 given = _adapted(" ".join(words[1:])).split()
                 if "--policy" in given:
-                    given += ["--task", "bend"]
+                    given += ["--task", "ahead"]
                 from twin.__main__ import main
 
                 assert main([*given, "--quiet"]) == 0, words

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -13,16 +14,21 @@ import warp as wp
 
 import twin
 from twin import build as verb
+from twin.reality.__main__ import TINY, film
+from twin.reality.__main__ import main as reality
 from twin.scene import STAGES
 
 _QUICK = (
-    "nerf.steps=400",
+    "nerf.steps=250",
     "nerf.rays=2048",
     "nerf.max_width=240",
-    "nerf.bake_steps=60",
+    "nerf.bake_steps=30",
+    "nerf.detail_passes=0.5",
     "nerf.max_bricks=2500",
+    "mesh.margin=8",
     "review.fps=5",
     "review.width=240",
+    "review.renders=30",
 )
 
 
@@ -34,10 +40,10 @@ def _command(root, *options):
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     root = tmp_path_factory.mktemp("tiny") / "scene"
-    subprocess.run([sys.executable, "-m", "twin.reality", "film", "--tiny", "--out", str(root)], check=True)
+    film(replace(TINY, samples=1), root)
     done = subprocess.run(_command(root), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    subprocess.run([sys.executable, "-m", "twin.reality", "compare", str(root)], check=True)
+    assert reality(["compare", str(root)]) == 0
     return root, done.stdout
 
 

@@ -40,7 +40,6 @@ OPTION_SETS = {
     "state": {"pixels": False, "randomise": True, "rewards": {"progress": 1.0, "cross_track": -0.1}},
     "both": SMALL | {"state": "privileged"},
 }
-TASKS = ("ahead", "bend", "route")
 
 
 @pytest.fixture(scope="module")
@@ -72,9 +71,7 @@ def driven(environment, driver, seed: int | None = None):
 
 
 @pytest.mark.parametrize(
-    ("task", "name"),
-    # `ahead` is too short for two obstacles.
-    [(task, name) for task in TASKS for name in OPTION_SETS if (task, name) != ("ahead", "crowded")],
+    ("task", "name"), [*(("bend", name) for name in OPTION_SETS), ("ahead", "paper"), ("route", "crowded")]
 )
 def test_specs_hold_and_seeds_repeat(scene, task, name):
     environment = twin.load(scene, task, **OPTION_SETS[name])
@@ -123,14 +120,14 @@ def test_gymnasium_and_sb3_accept_it(scene, name):
 @pytest.mark.parametrize("name", OPTION_SETS)
 def test_vector_environment_equals_single_environments(scene, name):
     """Every step is equal, pictures included, also across the ends of episodes."""
-    options = OPTION_SETS[name] | {"time_limit": 1.5}
+    options = OPTION_SETS[name] | {"time_limit": 0.8}
     envs = LocalVectorEnv(EnvFactory.open(scene, "bend", options), [5, 6, 7])
     single = twin.load(scene, "bend", seed=6, **options)
     rng = np.random.default_rng(0)
     spec = single.action_spec()
     envs.begin(range(3))
     step = single.reset()
-    for _ in range(40):
+    for _ in range(24):
         if envs.pixels:
             np.testing.assert_array_equal(envs.pixels.stacks[1].transpose(0, 2, 3, 1), step.observation["pixels"])
         else:
@@ -357,11 +354,6 @@ def test_unknown_tasks_and_options_are_refused(scene):
             twin.load(scene, "bend", **options)
 
 
-def test_the_environment_needs_no_torch():
-    code = "import sys, twin.env.suite, twin.env.gym_env, twin.env.vector_env_local; assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 @pytest.mark.slow
 def test_twenty_thousand_steps_leak_no_memory_and_give_no_nan(scene):
     """`benchmarks/env.py --only soak` runs five times as many steps, with pictures."""
@@ -527,15 +519,15 @@ def test_a_state_never_leaves_its_bounds(scene):
     assert space.contains(state) and (state[0], state[1]) == (space.high[0], space.low[1])
 
 
-def test_a_fresh_process_makes_it_by_its_full_name(scene):
+def test_a_fresh_process_makes_it_by_its_full_name_without_torch(scene):
     """Processes of stable-baselines3's SubprocVecEnv have not imported `twin` either."""
     code = (
         "import sys, gymnasium; assert 'twin' not in sys.modules; "
         f"env = gymnasium.make('twin:twin/Drive-v0', scene={str(scene.scene.root)!r}, task='bend', pixels=False); "
-        "print(env.reset(seed=0)[0].shape)"
+        "print(env.reset(seed=0)[0].shape, 'torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout.strip() == "(7,)", done.stderr
+    assert done.stdout.strip() == "(7,) False", done.stderr
 
 
 def test_wrong_gymnasium_arguments_are_refused(scene):

@@ -239,13 +239,6 @@ def test_a_wrong_transforms_json_is_refused_in_one_line(tmp_path: Path, what: st
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["", '{"frames": [', "[1, 2]", "\x00\x01", '{"frames": 3}'])
-def test_invalid_json_is_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / "transforms.json").write_text(text)
-    with pytest.raises(InputError, match=r"transforms\.json"):
-        read_transforms(tmp_path)
-
-
 def test_kinds_of_sources(tmp_path: Path) -> None:
     _colmap(tmp_path / "colmap", False)
     _images(tmp_path / "photos")

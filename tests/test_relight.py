@@ -1,7 +1,7 @@
 """Lighting of a photo: the fit, the file, its field, and the errors of `twin.relight`."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -253,12 +253,9 @@ def test_lighting_of_format_1_is_stale(scene):
 
 
 def test_fog_of_a_hazy_photo_is_stored_and_printed(scene, monkeypatch, capsys):
-    air = Fog(0.03, (0.9, 0.8, 0.7))
-
-    def hazy(field, photo, camera_to_world, intrinsics):
-        return replace(fit_photo(field, photo, camera_to_world, intrinsics), fog=air, psnr_clear_other_half=12.34)
-
-    monkeypatch.setattr("twin.relight.fit_photo", hazy)
+    air, image = Fog(0.03, (0.9, 0.8, 0.7)), np.zeros((*SIZE[::-1], 3), np.float32)
+    relit = PhotoFit("day", np.zeros(8, np.float32), air, (image, image, image), 16.3, 25.3, 24.0, 12.34)
+    monkeypatch.setattr("twin.relight.fit_photo", lambda *_: relit)
     assert main([str(scene.root), str(scene.root / "photo.png"), "--name", "hazy"]) == 0
     assert "visibility 100 m; without fog those halves have 12.3 dB" in capsys.readouterr().out
     assert added_lightings(scene, 8)[2]["hazy"] == air

@@ -24,9 +24,9 @@ from twin.errors import InputError
 from twin.evaluation.training_curves import read_episodes
 from twin.evaluation.trials import csv_text
 from twin.files import write_json
+from twin.learn import selection
 from twin.learn.policy import load_policy
 from twin.learn.sb3_env import DriveVecEnv
-from twin.learn.selection import FRESH_EPISODES
 from twin.learn.train_config import TrainConfig
 from twin.learn.training import TRAINING_EPISODE_COLUMNS, _keep_rows, check_same
 from twin.runtime import exclusive_lock
@@ -101,30 +101,48 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
     return rows(folder / "log.csv") if (folder / "log.csv").exists() else []
 
 
-def test_another_config_is_refused(scene, tmp_path):
+def test_a_run_is_resumed_with_its_configuration_and_road_alone(scene, tmp_path):
     from twin.learn.training import train as run
 
-    built = twin.load_scene(scene)
-    run(built, tmp_path, replace(SHORT, steps=8))
+    built, toml = twin.load_scene(scene), scene / "scene.toml"
+    run(built, tmp_path, replace(SHORT, steps=8), processes=1)
+    before = {
+        path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and "tensorboard" not in path.parts
+    }
+    for steps in (8, 4):  # it is finished
+        run(built, tmp_path, replace(SHORT, steps=steps), processes=1)
     with pytest.raises(InputError, match=r"gamma = 0\.97"):
-        run(built, tmp_path, replace(SHORT, gamma=0.9))
-    run(built, tmp_path, replace(SHORT, steps=16))
+        run(built, tmp_path, replace(SHORT, gamma=0.9), processes=1)
+    text = toml.read_text()
+    try:
+        toml.write_text(text + '\n[[obstacle]]\nkind = "cone"\nstation = 2.0\n')
+        with pytest.raises(InputError, match="obstacles were changed"):
+            run(built, tmp_path, replace(SHORT, steps=16), processes=1)
+    finally:
+        toml.write_text(text)
+    assert before == {path: path.read_bytes() for path in before}
+    run(built, tmp_path, replace(SHORT, steps=16), processes=1)
     assert json.loads((tmp_path / "state" / "state.json").read_text())["steps"] == 16
 
 
-def test_the_verb_trains_and_refuses_a_changed_configuration(scene, capsys):
-    common = [str(scene), "--task", "ahead", "--quiet", "--worlds", "2"]
-    assert train.main([*common, "--run", "one", "--steps", "4", "--observe", "simulator"]) == 0
+def test_the_verb_trains_and_refuses_what_it_cannot_begin_or_resume(scene, capsys, monkeypatch):
+    for name, value in (("_BATCHES", (2,)), ("_TEST_EPISODES", 2), ("_FINALISTS", 1), ("FRESH_EPISODES", 3)):
+        monkeypatch.setattr(selection, name, value)
+    common = [str(scene), "--run", "one", "--quiet", "--worlds", "2", "--processes", "1", "--steps", "4"]
+    assert train.main([*common, "--task", "strait"]) == 2
+    assert train.main([*common, "--task", "ahead", "--lighting", "dusk"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("error: ") == 2 and "dusk" in told
+    assert not (scene / "runs/one/config.json").exists()
+    assert train.main([*common, "--task", "ahead", "--observe", "simulator"]) == 0
     assert (scene / "runs/one/success.png").exists()
     trained = load_policy(scene / "runs/one").trained
     assert trained["observe"] == "simulator"
     assert trained["camera"] == list(twin.load_scene(scene).world().intrinsics)
     choice = json.loads((scene / "runs/one/choice.json").read_text())
-    assert choice["steps"] == 4 and choice["chosen"]["trials"] == FRESH_EPISODES
-    assert train.main([*common, "--run", "one", "--steps", "4", "--lighting", "day"]) == 2
+    assert choice["steps"] == 4 and choice["chosen"]["trials"] == 3
+    assert train.main([*common, "--task", "ahead", "--lighting", "day"]) == 2
     assert "error: " in capsys.readouterr().err
-    assert train.main([*common, "--run", "two", "--lighting", "dusk"]) == 2
-    assert "dusk" in capsys.readouterr().err
 
 
 def test_two_trainings_of_one_run_do_not_mix(scene, capsys):
@@ -132,35 +150,6 @@ def test_two_trainings_of_one_run_do_not_mix(scene, capsys):
         assert train.main([str(scene), "--task", "ahead", "--run", "locked", "--quiet", "--steps", "4"]) == 2
     assert "locked is being trained by process" in capsys.readouterr().err
     assert not (scene / "runs/locked").exists()
-
-
-def test_a_finished_run_is_unchanged(scene, tmp_path):
-    from twin.learn.training import train as run
-
-    built = twin.load_scene(scene)
-    run(built, tmp_path, replace(SHORT, steps=8))
-    before = {
-        path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and "tensorboard" not in path.parts
-    }
-    for steps in (8, 4):
-        run(built, tmp_path, replace(SHORT, steps=steps))
-    assert before == {path: path.read_bytes() for path in before}
-
-
-def test_a_run_that_cannot_begin_writes_no_config(scene, capsys):
-    common = [str(scene), "--run", "typo", "--quiet", "--worlds", "2", "--steps", "4"]
-    assert train.main([*common, "--task", "strait"]) == 2
-    assert train.main([*common, "--task", "ahead", "--lighting", "dusk"]) == 2
-    assert not (scene / "runs/typo/config.json").exists()
-    assert train.main([*common, "--task", "ahead"]) == 0
-    assert capsys.readouterr().err.count("error: ") == 2
-
-
-def test_the_last_policy_is_a_checkpoint(scene, tmp_path):
-    from twin.learn.training import train as run
-
-    run(twin.load_scene(scene), tmp_path, replace(SHORT, steps=80, checkpoints=2))
-    assert [path.name for path in sorted((tmp_path / "checkpoints").iterdir())] == ["000000040", "000000080"]
 
 
 @pytest.mark.slow
@@ -186,20 +175,6 @@ def test_resumptions_have_episodes_of_their_own(scene, tmp_path, monkeypatch):
         range(1_000_000_000, 1_900_000_000),
     ]
     assert not any(seed in few for seed in worlds for few in others)
-
-
-def test_a_changed_road_is_another_run(scene, tmp_path):
-    from twin.learn.training import train as run
-
-    built, toml = twin.load_scene(scene), scene / "scene.toml"
-    run(built, tmp_path, replace(SHORT, steps=8))
-    text = toml.read_text()
-    try:
-        toml.write_text(text + '\n[[obstacle]]\nkind = "cone"\nstation = 2.0\n')
-        with pytest.raises(InputError, match="obstacles were changed"):
-            run(built, tmp_path, replace(SHORT, steps=16))
-    finally:
-        toml.write_text(text)
 
 
 _WRONG: list[tuple[str, object]] = [
@@ -240,8 +215,10 @@ def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     head = json.loads((tmp_path / "state" / "state.json").read_text())
     assert (head["steps"], head["replay"]["pos"]) == (120, 30)
     seen = []
-    run(twin.load_scene(scene), tmp_path, SHORT, lambda steps, recent: seen.append(steps))
+    run(twin.load_scene(scene), tmp_path, SHORT, lambda steps, recent: seen.append(steps), processes=1)
     assert seen[0] == 124 and seen[-1] == SHORT.steps
+    checkpoints = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    assert checkpoints == ["000000080", "000000160", "000000240"]
 
 
 def test_the_goal_is_worth_surviving_for_ever():

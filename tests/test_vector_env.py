@@ -29,11 +29,14 @@ def scene(tmp_path_factory):
     return twin.load_scene(tiny_twin(tmp_path_factory.mktemp("twin")))
 
 
-@pytest.fixture
-def spread(scene):
+def _spread(scene):
     envs = ProcessVectorEnv(scene, "bend", {"pixels": False}, [1, 2, 3], 2)
     yield envs
     envs.close()
+
+
+spread = pytest.fixture(_spread, name="spread")
+shared = pytest.fixture(_spread, name="shared", scope="module")  # for tests that leave it usable
 
 
 @pytest.mark.parametrize("options", [PICTURES, STATES], ids=["pictures", "states"])
@@ -68,18 +71,18 @@ def test_processes_change_no_result(scene, options):
         envs.close()
 
 
-def test_attributes_of_tasks_are_read_and_set_in_children(spread):
-    spread.begin(range(3))
-    before = spread.get(2, "time_limit")
-    spread.set(2, "time_limit", before + 1.0)
-    assert spread.get(2, "time_limit") == before + 1.0 and spread.get(1, "time_limit") == before
-    assert spread.call(0, "action_spec", None) is not None
+def test_attributes_of_tasks_are_read_and_set_in_children(shared):
+    shared.begin(range(3))
+    before = shared.get(2, "time_limit")
+    shared.set(2, "time_limit", before + 1.0)
+    assert shared.get(2, "time_limit") == before + 1.0 and shared.get(1, "time_limit") == before
+    assert shared.call(0, "action_spec", None) is not None
     with pytest.raises(AttributeError, match="no attribute 'colour'"):
-        spread.get(0, "colour")
-    spread.set(1, "episode_seed", 77)
-    assert spread.info(1)["episode_seed"] == 77 and spread.get(-1, "time_limit") == before + 1.0  # and it goes on
+        shared.get(0, "colour")
+    shared.set(1, "episode_seed", 77)
+    assert shared.info(1)["episode_seed"] == 77 and shared.get(-1, "time_limit") == before + 1.0  # and it goes on
     with pytest.raises(IndexError):
-        spread.step(np.zeros((1, spread.action_size)), [3])
+        shared.step(np.zeros((1, shared.action_size)), [3])
 
 
 def test_seeds_of_gymnasium_are_numbers_or_one_per_environment(scene):
@@ -102,21 +105,21 @@ class _Foreign:
     """A class that no child process can import, since it belongs to this process's `__main__`."""
 
 
-def test_unpicklable_requests_and_replies_raise(spread, monkeypatch):
+def test_unpicklable_requests_and_replies_raise(shared, monkeypatch):
     monkeypatch.setattr(_Foreign, "__module__", "__main__")
     monkeypatch.setattr(sys.modules["__main__"], "_Foreign", _Foreign, raising=False)
     with pytest.raises(AttributeError, match="_Foreign"):
-        spread.set(0, "time_limit", _Foreign())
-    spread.begin(range(3))  # and it goes on
+        shared.set(0, "time_limit", _Foreign())
+    shared.begin(range(3))  # and it goes on
 
 
 def test_input_errors_pass_to_the_parent(scene):
     with pytest.raises(InputError, match="nowhere"):
-        ProcessVectorEnv(scene, "nowhere", {"pixels": False}, [1, 2], 2)
+        ProcessVectorEnv(scene, "nowhere", {"pixels": False}, [1, 2], 1)
     with pytest.raises(InputError, match="processes = 0"):
         make_vector_env(scene, "bend", {}, [1, 2], 0)
     with pytest.raises(InputError, match="did you mean 'lighting'"):
-        ProcessVectorEnv(scene, "bend", {"lightning": "day"}, [1, 2], 2)
+        ProcessVectorEnv(scene, "bend", {"lightning": "day"}, [1, 2], 1)
 
 
 def test_a_process_that_dies_is_an_error_with_a_cure(spread):
@@ -143,13 +146,13 @@ def test_interrupted_step_closes_the_environment(spread):
     spread.close()
 
 
-def test_children_ignore_interrupts(spread):
+def test_children_ignore_interrupts(shared):
     """A parent that saves its state on Ctrl-C or SIGTERM still needs the environments."""
-    spread.begin(range(3))
-    for child in spread._children:
+    shared.begin(range(3))
+    for child in shared._children:
         assert os.getpgid(child.process.pid) != os.getpgid(0)
         os.kill(child.process.pid, signal.SIGTERM)
-    assert np.isfinite(spread.step(np.zeros((3, spread.action_size))).reward).all()
+    assert np.isfinite(shared.step(np.zeros((3, shared.action_size))).reward).all()
 
 
 def test_children_end_with_their_parent(scene):
@@ -187,7 +190,7 @@ def test_close_does_not_wait_for_inherited_sockets(spread):
 
 
 def test_children_end_when_the_environment_is_deleted(scene):
-    envs = ProcessVectorEnv(scene, "bend", {"pixels": False}, [1, 2], 2)
+    envs = ProcessVectorEnv(scene, "bend", {"pixels": False}, [1, 2], 1)
     processes = [child.process for child in envs._children]
     del envs
     gc.collect()

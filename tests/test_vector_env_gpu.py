@@ -148,12 +148,14 @@ def test_gpu_overflow_and_divergence_raise(scene, device_name):
 
 @pytest.mark.parametrize("device_name", DEVICES)
 def test_gpu_contact_ends_the_episode(scene, device_name):
-    wall = ObstacleConfig("in_the_way", "box", station=1.5, lateral=0.0)
+    wall = ObstacleConfig("in_the_way", "box", station=0.95, lateral=0.0)
     stage = EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": (wall,)})
     envs = GpuVectorEnv(stage, [4, 5], device_name)
     envs.begin(range(2))
+    actions = np.array([[1.0, 0.0], [-1.0, 0.0]])
+    assert not envs.step(actions).over.any()
     for _ in range(30):
-        out = envs.step(np.array([[1.0, 0.0], [-1.0, 0.0]]))
+        out = envs.step(actions)
         if out.over.any():
             break
     assert out.terminated.tolist() == [True, False]
