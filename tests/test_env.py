@@ -106,7 +106,7 @@ def test_gymnasium_and_sb3_accept_it(scene, name):
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", "The environment .* is different from the unwrapped version")
         warnings.filterwarnings("ignore", "The minimal resolution for an image is 36x36.*")
-        check_env(environment.unwrapped, skip_render_check=name == "state")
+        check_env(environment.unwrapped)
         sb3_check_env(environment.unwrapped, skip_render_check=True)
     _, info = environment.reset(seed=1)
     for _ in range(3):
@@ -114,7 +114,7 @@ def test_gymnasium_and_sb3_accept_it(scene, name):
     wanted = {"cause", "is_success", "progress", "cross_track", "randomisation"}
     assert wanted | (set() if name == "state" else {"lighting", "trust"}) <= set(info)
     json.dumps(info)
-    assert name == "state" or environment.render().shape == (18, 32, 3)
+    assert environment.render().shape == ((360, 640, 3) if name == "state" else (18, 32, 3))
 
 
 @pytest.mark.parametrize("name", OPTION_SETS)
@@ -192,6 +192,9 @@ def test_vector_environments_reset_in_the_same_step(scene):
     assert info["final_info"]["cause"].tolist() == ["timeout", "timeout"] and info["final_obs"][0].shape == (12, 18, 32)
     assert (info["cause"] == "").all() and not np.array_equal(info["final_obs"][0], out[0])
     many.close()
+    for call in (many.reset, lambda: many.step(np.zeros((2, 2)))):
+        with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="is closed; make a new one"):
+            call()
     vectors = DriveVecEnv(scene, "bend", 2, seed=1, **options)
     np.testing.assert_array_equal(vectors.reset(), first)
     for _ in range(5):
@@ -539,7 +542,7 @@ def test_wrong_gymnasium_arguments_are_refused(scene):
         ({"render_view": "above"}, "render_view = 'above'; expected 'robot' or 'chase'"),
         ({"render_size": (640,)}, r"render_size = \(640,\); expected \(width, height\), whole numbers from 8 to 4096"),
         ({"render_size": (640, 3.5)}, "render_size"),
-        ({"render_size": (64, 36), "pixels": False}, "render_size = .* with pixels=False: no field is loaded"),
+        ({"render_view": "robot", "pixels": False}, "render_view = 'robot' with pixels=False: no field is loaded"),
     ):
         with pytest.raises(InputError, match=words):
             DriveEnv(scene, "bend", "rgb_array", **options)
@@ -548,6 +551,8 @@ def test_wrong_gymnasium_arguments_are_refused(scene):
     environment = DriveEnv(scene, "bend", pixels=False, time_limit=0.1)
     with pytest.raises(gymnasium.error.ResetNeeded, match="step before reset"):
         environment.step(environment.action_space.sample())
+    with pytest.raises(InputError, match="expected none: give them"):
+        environment.reset(options={"lighting": "night"})
     environment.reset()
     assert environment.step(environment.action_space.sample())[3]
     with pytest.raises(gymnasium.error.ResetNeeded, match="after the end of an episode"):

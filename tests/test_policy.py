@@ -261,24 +261,45 @@ def test_a_callable_is_a_policy(tmp_path, monkeypatch):
             load_policy(name)
 
 
-def test_an_sb3_zip_needs_trust(tmp_path):
+def sb3_model(algorithm: str = "SAC", images=None, low: float = -1.0, **settings):
+    """An untrained model of stable-baselines3 for pictures of 64 × 36 px."""
     sb3 = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
     import gymnasium
 
     class Road(gymnasium.Env):
-        observation_space = gymnasium.spaces.Box(0, 255, (12, 36, 64), np.uint8)
-        action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+        observation_space = images or gymnasium.spaces.Box(0, 255, (12, 36, 64), np.uint8)
+        action_space = gymnasium.spaces.Box(low, 1, (2,), np.float32)
 
-    model = sb3.SAC("CnnPolicy", Road(), buffer_size=1, policy_kwargs={"net_arch": [8]})
-    model.save(tmp_path / "theirs.zip")
+    kind = "MultiInputPolicy" if images else "CnnPolicy"
+    return getattr(sb3, algorithm)(kind, Road(), policy_kwargs={"net_arch": [8]}, **settings)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings"),
+    [("SAC", {"buffer_size": 1}), ("TD3", {"buffer_size": 1}), ("PPO", {}), ("PPO", {"use_sde": True})],
+)
+def test_an_sb3_zip_needs_trust(tmp_path, algorithm, settings):
+    (model := sb3_model(algorithm, **settings)).save(tmp_path / "theirs.zip")
     with pytest.raises(InputError, match="--trust"):
         load_policy(tmp_path / "theirs.zip")
     policy = load_policy(tmp_path / "theirs.zip", trust=True)
     stacks = np.random.default_rng(0).integers(0, 256, (2, 12, 36, 64), np.uint8)
     np.testing.assert_allclose(policy.actions(stacks), model.predict(stacks, deterministic=True)[0], atol=1e-6)
+
+
+def test_an_sb3_zip_that_does_not_fit_is_refused(tmp_path):
+    spaces = pytest.importorskip("gymnasium").spaces
+    images = spaces.Dict({"pixels": spaces.Box(0, 255, (12, 36, 64), np.uint8), "state": spaces.Box(-1, 1, (2,))})
     (tmp_path / "no.zip").write_bytes(b"PK nothing")
-    with pytest.raises(InputError, match="not a SAC"):
-        load_policy(tmp_path / "no.zip", trust=True)
+    sb3_model("PPO", images).save(tmp_path / "odometry.zip")
+    sb3_model("PPO", low=0.0).save(tmp_path / "rescaled.zip")
+    for name, message in (
+        ("no", "not a model"),
+        ("odometry", "expected pictures alone"),
+        ("rescaled", "range of twin"),
+    ):
+        with pytest.raises(InputError, match=message):
+            load_policy(tmp_path / f"{name}.zip", trust=True)
 
 
 def test_pictures_that_do_not_fit_are_refused(folder):

@@ -10,6 +10,7 @@ from twin.evaluation.forecasting import make_forecast
 from twin.evaluation.statistics import wilson
 from twin.evaluation.trials import EPISODE_COLUMNS, Cell, read_trials, tally
 from twin.files import digest_file, write_json
+from twin.forecast import forecast
 from twin.learn.policy import Control, save_policy
 from twin.learn.policy_network import Architecture
 from twin.report.policy_card import write_policy_cards
@@ -70,6 +71,13 @@ def test_a_validated_and_driven_policy_has_its_rates(scene):
     assert 'value: 0.9000, name: "success of 10 episodes (0.65 to 0.98)"' in front
     name = next(line for line in front.splitlines() if line.startswith("- name:")).removeprefix("- name: ")
     assert json.loads(name) == "first"
+
+
+def test_a_forecast_has_the_final_test_of_a_training(scene):
+    (scene.root / "runs/first/episodes.csv").write_text("step,success\n" + "9,0\n" * 20)
+    validate(scene, {"held-out": "g" * 9 + "x"})
+    (candidate,) = forecast(scene.root).candidates
+    assert (candidate.trained.value, candidate.trained.n) == (17 / 20, 20)
 
 
 def test_a_policy_that_was_trained_further_is_not_validated(scene):

@@ -30,8 +30,10 @@ TWIN = [
     Cell("simulator", "straight", "sun", 100, 20),
     Cell("simulator", "right_turn", "sun", 100, 10),
     Cell("simulator", "right_turn", "night", 100, 10),
+    Cell("varied", "straight", "dawn+randomised", 100, 70),
 ]
 HEADER = "policy,lighting,trials,successes\n"
+DAYS = HEADER.replace("\n", ",twin_lighting\n")
 
 
 def write(folder: Path, text: str) -> Path:
@@ -118,7 +120,13 @@ def test_results_find_their_cell(tmp_path: Path) -> None:
         (HEADER + "nerf,sun,10\n", "line 2: 3 fields; expected 4"),
         (HEADER, "has a header and no rows"),
         ("", "is empty; its first line must be policy,lighting,trials,successes[,task][,twin_lighting]"),
-        ("policy;lighting;trials;successes\n", "no column policy; expected policy,lighting"),
+        ("policy;lighting;trials;successes\n", "separated by ';', not by commas; expected policy,lighting"),
+        ("policy\tlighting\ttrials\tsuccesses\n", "are separated by '\\t', not"),
+        ("policy,lighting,trials,successes,\n", "column 5 has no name; delete it"),
+        (HEADER + "nerf,sun,10,5\n" + HEADER, "line 3 repeats the header; delete it"),
+        (HEADER + 'nerf,sun,10,5\nnerf,"sun,10,5\nnerf,sun,10,5\n', "line 3: 2 fields; expected 4"),
+        (DAYS + "nerf,monday,10,5,sun\nnerf,Monday,10,5,sun\n", "'Monday' is 'monday' above; write the two alike"),
+        (HEADER + "varied,dawn,10,5\n", "lighting 'dawn' is not in the twin; did you mean 'dawn+randomised'?"),
         ("policy,lighting,trials\nnerf,sun,10\n", "no column successes"),
         ("policy,lighting,trials,successes,note\n", "unknown column 'note'"),
         (HEADER.replace("lighting", "policy,lighting"), "column 'policy' appears twice"),

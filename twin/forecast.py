@@ -42,9 +42,9 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
     twin = tally(read_trials(scene.episodes_csv))
     cells = read_results(real, twin) if real else []
     trained = {
-        (policy, row["task"]): Estimate(row["rate"], row["low"], row["high"], row["trials"])
+        (policy, row["task"]): Estimate(best["rate"], best["low"], best["high"], best["trials"])
         for policy, row in training_summaries(root, {cell.policy for cell in twin}).items()
-        if row["trials"]
+        if (best := row["test"] or row)["trials"]  # as on the validation page
     }
     result = make_forecast(root.resolve().name, twin, cells, seed, trained)
     result.save(scene.forecast)

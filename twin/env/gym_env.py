@@ -23,7 +23,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.error import ResetNeeded
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -84,19 +84,25 @@ def _check_render_mode(render_mode: str | None) -> str | None:
     return render_mode
 
 
-def _check_view(size: Any, view: str, pixels: bool) -> tuple[int, int] | None:
-    """Returns the size of rendered pictures; None if `render` returns the observation's own images."""
+def _check_view(size: Any, view: str | None, pixels: bool) -> tuple[str, tuple[int, int] | None]:
+    """Returns view and size of rendered pictures; no size if `render` returns the observation's own images."""
+    if view is None:
+        view = ROBOT if pixels else CHASE
     if view not in (ROBOT, CHASE):
         raise InputError(f"render_view = {short_repr(view)}; expected {ROBOT!r} or {CHASE!r}")
-    if size is None:
-        return _RENDER_SIZE if view == CHASE else None
-    check_option("render_size", size, IMAGE_SIZE)
     if view == ROBOT and not pixels:
         raise InputError(
-            f"render_size = {short_repr(size)} with pixels=False: no field is loaded; expected pixels=True, or "
-            f"render_view={CHASE!r}"
+            f"render_view = {view!r} with pixels=False: no field is loaded; expected pixels=True, or {CHASE!r}"
         )
-    return int(size[0]), int(size[1])
+    if size is None:
+        return view, _RENDER_SIZE if view == CHASE else None
+    check_option("render_size", size, IMAGE_SIZE)
+    return view, (int(size[0]), int(size[1]))
+
+
+def _check_reset_options(options: dict[str, Any] | None) -> None:
+    if options:
+        raise InputError(f"options of reset = {short_repr(options)}; expected none: give them to gymnasium.make")
 
 
 class DriveEnv(gymnasium.Env):
@@ -110,7 +116,7 @@ class DriveEnv(gymnasium.Env):
         task: str = "right_turn",
         render_mode: str | None = None,
         render_size: tuple[int, int] | None = None,
-        render_view: str = ROBOT,
+        render_view: str | None = None,
         **options: Any,
     ) -> None:
         """
@@ -120,13 +126,13 @@ class DriveEnv(gymnasium.Env):
             render_mode: None or rgb_array.
             render_size: Width and height of the pictures of `render` [px]; None: the size of the observed images, or
                 640 × 360 for the chase view.
-            render_view: `robot` shows the view of the robot's camera. `chase` shows MuJoCo's picture of the scene from
-                behind the robot, with collision parts, as in the videos of `twin film`.
+            render_view: `robot`, the default with pixels, shows the view of the robot's camera. `chase`, the default
+                without, shows MuJoCo's picture of the scene from behind the robot, with collision parts, as in the
+                videos of `twin film`.
             options: See `twin.env.options.Options`.
         """
         self.render_mode = _check_render_mode(render_mode)
-        self._render_size = _check_view(render_size, render_view, parse_options(options).pixels)
-        self._render_view = render_view
+        self._render_view, self._render_size = _check_view(render_size, render_view, parse_options(options).pixels)
         self._large: PixelObserver | None = None
         self._scene: SceneCamera | None = None
         self._chase: ChaseCamera | None = None
@@ -136,6 +142,7 @@ class DriveEnv(gymnasium.Env):
         self.observation_space, self.action_space = make_spaces(self.vector_env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        _check_reset_options(options)
         super().reset(seed=seed)
         if seed is not None:
             self.vector_env.seed(0, seed)
@@ -160,7 +167,7 @@ class DriveEnv(gymnasium.Env):
     def render(self) -> NDArray | None:
         """A picture, uint8 (height, width, 3).
 
-        By default, it is the newest image of the observation, or None without pixels. With `render_size`, the same view
+        By default, it is the newest image of the observation. With `render_size`, the same view
         is rendered at that size, with the episode's lighting, obstacles and weather, but without camera noise. The
         chase view shows the robot's present pose, even if the camera has a latency. Rendering has no effect on
         observations or random numbers.
@@ -168,8 +175,8 @@ class DriveEnv(gymnasium.Env):
         if self.render_mode is None:
             return None
         if self._render_size is None:
-            pixels = self.vector_env.pixels
-            return pixels.stacks[0, -1].transpose(1, 2, 0).copy() if pixels else None
+            assert self.vector_env.pixels
+            return self.vector_env.pixels.stacks[0, -1].transpose(1, 2, 0).copy()
         if not self._started:
             raise ResetNeeded("render before reset; call reset() first")
         envs = self._local
@@ -221,6 +228,8 @@ class DriveVectorEnv(VectorEnv):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Resets all environments; if `seed` is one number, environment i gets `seed` + i."""
+        self._check_open()
+        _check_reset_options(options)
         if seed is None or isinstance(seed, int | np.integer):
             seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
         elif len(seeds := list(seed)) != self.num_envs:
@@ -233,6 +242,7 @@ class DriveVectorEnv(VectorEnv):
         return observations(self.vector_env), self._infos(range(self.num_envs))
 
     def step(self, actions: NDArray) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
+        self._check_open()
         if not self._started:
             raise ResetNeeded("step before reset; call reset() first")
         out = self.vector_env.step(np.asarray(actions))
@@ -256,6 +266,10 @@ class DriveVectorEnv(VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         self.vector_env.close()
+
+    def _check_open(self) -> None:
+        if self.closed:
+            raise ClosedEnvironmentError("the vector environment is closed; make a new one")
 
     def _infos(self, which: Sequence[int]) -> dict[str, Any]:
         infos: dict[str, Any] = {}

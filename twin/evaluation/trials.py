@@ -217,7 +217,7 @@ def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
     if not path.exists():
         raise InputError(f"{path} does not exist; write one, with the columns {','.join(RESULT_COLUMNS)}")
     cells: dict[tuple[str, str, str], Cell] = {}
-    known = {cell.key for cell in twin}
+    known, spelled = {cell.key for cell in twin}, dict[str, str]()
     for where, row in _rows(path, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS):
         policy, task = _policy_and_task(where, row, twin)
         trials, successes = _parse_int(where, row, "trials"), _parse_int(where, row, "successes")
@@ -233,6 +233,10 @@ def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
                 f"{where}: policy {policy!r}, lighting {cell.lighting!r}, task {task!r} is there twice; "
                 "replace the two lines by one with their sums"
             )
+        # A forecast counts days by their names, so a day written in two ways would make intervals too narrow.
+        alike = spelled.setdefault(cell.lighting.casefold(), cell.lighting)
+        if alike != cell.lighting:
+            raise InputError(f"{where}: lighting {cell.lighting!r} is {alike!r} above; write the two alike")
         cells[cell.key] = cell
     return list(cells.values())
 
@@ -280,7 +284,7 @@ def _unknown_lighting(cell: Cell, known: set[tuple[str, str, str]]) -> str:
 
 def _name_hint(name: str, valid: Sequence[str]) -> str:
     """End of an error message: "did you mean ...?", or the valid names."""
-    near = difflib.get_close_matches(name, valid, n=1)
+    near = [one for one in valid if one.startswith(f"{name}+")] or difflib.get_close_matches(name, valid, n=1)
     if near:
         return f"did you mean {near[0]!r}?"
     return f"expected one of {', '.join(valid[:8])}{', ...' if len(valid) > 8 else ''}"
@@ -304,20 +308,25 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
         twice = [name for name, times in Counter(header).items() if times > 1]
         faults = [
             *(f"no column {name}" for name in missing),
+            *(f"column {header.index(name) + 1} has no name; delete it" for name in unknown if not name),
             *(f"unknown column {name!r}" for name in unknown),
             *(f"column {name!r} appears twice" for name in twice),
         ]
+        if len(header) == 1 and (other := next((one for one in ";\t" if one in header[0]), "")):
+            faults = [f"its columns are separated by {other!r}, not by commas"]
         if faults:
             raise InputError(f"{path}: header {','.join(header)!r}: {faults[0]}; expected {wanted}")
-        count = 0
+        count, end = 0, reader.line_num
         for fields in reader:
+            where, end = f"{path} line {end + 1}", reader.line_num  # the first line of a row that has several
             if not any(field.strip() for field in fields):
                 continue
             count += 1
-            where = f"{path} line {reader.line_num}"
             if len(fields) != len(header):
                 raise InputError(f"{where}: {len(fields)} fields; expected {len(header)}, as in the header")
             row = {name: field.strip() for name, field in zip(header, fields, strict=True)}
+            if list(row.values()) == header:
+                raise InputError(f"{where} repeats the header; delete it")
             for name in ("policy", "lighting"):
                 if not row[name]:
                     raise InputError(f"{where}: no {name}; expected a name")

@@ -171,7 +171,8 @@ def load_policy(source: str | Path, trust: bool = False) -> Policy:
     - an ONNX file with one input, uint8 or float32 (n, 3 · stack, height, width) with values 0 to 255, and one output
       (n, 1 or 2) with values in [-1, 1];
     - `module:function`: the user's own function, which receives one stack, uint8 (3 · stack, height, width);
-    - a zip file of stable-baselines3; `trust` must be True, since loading the file runs code from it.
+    - a zip file of any algorithm of stable-baselines3 that sees pictures; `trust` must be True, since loading the file
+      runs code from it.
 
     Raises InputError: there is no such policy, or it is damaged or has another format.
     """
@@ -300,22 +301,31 @@ def _from_callable(name: str) -> Policy:
 
 def _from_zip(path: Path) -> Policy:
     try:
-        from stable_baselines3 import SAC
+        from stable_baselines3.common.save_util import load_from_zip_file
     except ImportError:
         raise InputError(f"{path}: needs stable-baselines3; pip install 'twin[learn]'") from None
     try:
-        model = SAC.load(path, device="cpu")
+        # Only the network: a model's `load` also allocates its replay buffer, and needs the algorithm's class.
+        data, weights, _ = load_from_zip_file(path, device="cpu")
+        pictures, range_ = data["observation_space"], data["action_space"]
+        settings = {name: value for name, value in data["policy_kwargs"].items() if name != "device"}
+        settings |= {"use_sde": True} if data["use_sde"] else {}
+        network = data["policy_class"](pictures, range_, lambda _: 0.0, **settings)
+        network.load_state_dict(weights["policy"])
     except Exception as error:  # damaged zips and pickles raise many kinds of errors
-        raise InputError(f"{path}: not a SAC model of stable-baselines3: {type(error).__name__}: {error}") from None
-    shape, actions = model.observation_space.shape, model.action_space.shape
+        raise InputError(f"{path}: not a model of stable-baselines3: {type(error).__name__}: {error}") from None
+    shape, actions = pictures.shape, range_.shape
     if shape is None or len(shape) != 3 or shape[0] % 3 or actions not in ((1,), (2,)):
         raise InputError(
-            f"{path}: input {shape}, output {actions}; expected (3 · stack, height, width), and 1 or 2 numbers"
+            f"{path}: observes {pictures}, acts in {range_}; expected pictures alone, (3 · stack, height, width), and "
+            "1 or 2 numbers"
         )
+    if (range_.low != -1.0).any() or (range_.high != 1.0).any():
+        raise InputError(f"{path}: acts in {range_}; expected -1 to 1, the range of twin's environments")
     control = Control(STEERING if actions == (1,) else TWIST)
 
     def act(stacks: Image) -> Array32:
-        return model.predict(stacks, deterministic=True)[0]
+        return network.predict(stacks, deterministic=True)[0]
 
     return Policy(path.stem, act, control, (shape[2], shape[1]), shape[0] // 3)
 
