@@ -14,9 +14,11 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+import viser
 from chromium import Chromium, find_chromium
 from films import video_info
 from tiny_twin import tiny_twin
+from viser._messages import GuiUpdateMessage
 from websockets.exceptions import InvalidStatus
 from websockets.http11 import Headers, Request
 from websockets.sync.client import connect
@@ -161,6 +163,24 @@ def test_the_server_itself_asks_for_the_token(capsys):
     finally:
         served.stop()
     assert capsys.readouterr().out == ""
+
+
+def test_a_page_waiting_for_messages_is_woken_on_its_own_thread_only():
+    served = open_server("127.0.0.1", 0, "test")
+    try:
+        server = served.viser._websock_server
+        with connect(f"ws://127.0.0.1:{served.port}", subprotocols=[f"viser-v{viser.__version__}"]):
+            _wait(lambda: server._client_state_from_id)
+            (page,) = server._client_state_from_id.values()
+            for buffer in (server._broadcast_buffer, page.message_buffer):
+                _wait(lambda: buffer.message_event._waiters)  # noqa: B023
+                buffer.message_event.set()
+                assert not buffer.message_event.is_set()
+                sent = buffer.message_counter
+                buffer.push(GuiUpdateMessage("none", {}))
+                _wait(lambda: min(buffer.generator_cursors.values()) >= sent)  # noqa: B023
+    finally:
+        served.stop()
 
 
 def test_keys_count_only_while_they_are_reported(monkeypatch):
