@@ -2,6 +2,9 @@
 
 import json
 import shlex
+import shutil
+import subprocess
+import sys
 import threading
 import time
 import urllib.error
@@ -32,14 +35,13 @@ from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
 from twin.files import parse_toml
 from twin.geometry.cameras import Cameras, Viewpoints
-from twin.geometry.images import write_image
+from twin.geometry.images import to_uint8, write_image
 from twin.geometry.poses import look_at
 from twin.geometry.shadow_map import OrthographicShadowMap
 from twin.loading import Twin
 from twin.nerf.fog import Fog
 from twin.nerf.sun import Sun
 from twin.report import build_report as report_page
-from twin.report.video_layout import to_uint8
 from twin.report.video_writer import read_frames
 from twin.scene import write_stamp
 from twin.view import scene_picture
@@ -47,7 +49,7 @@ from twin.view.__main__ import load_driving, open_page
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_times
 from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, PlacedObstacles, station_and_lateral
 from twin.view.guarded_server import Gate, HeldKeys, open_server
-from twin.view.layers import _trust_map, clicked_frame
+from twin.view.layers import _trust_map, clicked_frame, scene_layers
 from twin.view.lighting_panel import slider_lighting
 from twin.view.path_panel import PathPanel
 from twin.view.picture_loop import COARSE_AREA, FilmedFrame, PictureLoop, Shot, add_film, film_camera, picture_size
@@ -536,6 +538,39 @@ def test_obstacles_of_the_page_may_be_copied_to_scene_toml(scene):
 
 
 # ---- pages, without a browser
+
+
+def test_without_dm_control_a_scene_is_shown_and_the_page_says_why_it_cannot_be_driven(root):
+    code = f"""
+import sys
+from pathlib import Path
+sys.modules["dm_control"] = None
+from twin.loading import load_scene
+from twin.view.__main__ import load_driving, open_page
+page = open_page(load_scene(Path({str(root)!r})), port=0)
+load_driving(page)
+print(page._drive_note.content)
+page.viewer.close()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "driving in a scene needs dm_control" in done.stdout, done.stderr
+
+
+def test_the_first_picture_waits_for_no_import_that_only_other_parts_need():
+    slow = {"av", "dm_control", "matplotlib", "mujoco_warp", "scipy", "skimage", "torch", "trimesh"}
+    code = f"import sys, twin.view.page, twin.view.camera_path; print({slow} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "set()\n", done.stderr
+
+
+def test_a_damaged_layer_is_a_notice_when_it_is_shown(scene, field, tmp_path):
+    copied = tmp_path / "scene"
+    shutil.copytree(scene.scene.root, copied)
+    (copied / "build" / "4_mesh" / "ground.npz").write_bytes(b"")
+    layers = scene_layers(None, twin.load_scene(copied), field)
+    ground = next(layer for layer in layers if layer.name == "ground")
+    with pytest.raises(InputError, match="damaged"):
+        ground.show(True)
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,6 @@ class LightingPanel:
                 "Relight by a photo",
                 mime_type="image/*",
                 hint="a photo of the place, from near the filmed path; or drop it on the page",
-                icon=viser.Icon.PHOTO_UP,
                 order=12.0,
             )
             self._upload = upload
