@@ -44,7 +44,6 @@ from twin.nerf.sun import Sun
 from twin.report import build_report as report_page
 from twin.report.video_writer import read_frames
 from twin.scene import write_stamp
-from twin.view import scene_picture
 from twin.view.__main__ import load_driving, open_page
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_times
 from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, PlacedObstacles, station_and_lateral
@@ -683,7 +682,7 @@ def test_results_of_a_pack_are_written_to_the_working_folder(page, field, tmp_pa
 
 def test_pages_of_four_sizes_keep_their_compositors(scene, field, monkeypatch):
     made = []
-    monkeypatch.setattr(scene_picture, "Compositor", lambda *given, **more: made.append(given))
+    monkeypatch.setattr("twin.env.compositor.Compositor", lambda *given, **more: made.append(given))
     picture = ScenePicture(field)
     picture.add_objects(scene.world(), ())
     for _ in range(2):
@@ -736,7 +735,11 @@ def test_a_photo_replaces_no_lighting_but_the_named_one(page, notices, monkeypat
     panel._name.value = "day"
     panel._photo_given("image.jpg", b"")
     panel._name.value, panel._upload.disabled = "", False
-    assert given == ["day_2", "new_year", "day"]
+    panel._photo_given("image.jpg", b"")
+    panel._photo_given("image.jpg", b"")  # while the first is being fitted
+    panel._pending.clear()
+    panel._upload.disabled = False
+    assert given == ["day_2", "new_year", "day", "image", "image_2"]
 
 
 def test_a_damaged_lighting_takes_no_other_away(page, field):
