@@ -240,6 +240,9 @@ def test_drive_films_a_pack_by_its_name(packed, tmp_path, monkeypatch, capsys):
     assert film.name.startswith("tiny_ahead_") and film.stat().st_size > 10_000
     assert main(["drive", "tiny", "--view", "--out", "a.mp4"]) == 2
     assert "leave out one of them" in capsys.readouterr().err
+    for wrong in ("drive.avi", "."):
+        assert main(["drive", "tiny", "--out", wrong]) == 2
+        assert f"--out {wrong}: expected the name of an .mp4 file" in capsys.readouterr().err
     assert main(["drive", "nowhere"]) == 2
     assert "no nowhere.twin here or in scenes/" in capsys.readouterr().err
 

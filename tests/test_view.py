@@ -44,6 +44,7 @@ from twin.nerf.sun import Sun
 from twin.report import build_report as report_page
 from twin.report.video_writer import read_frames
 from twin.scene import write_stamp
+from twin.view import guarded_server
 from twin.view.__main__ import load_driving, open_page
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_times
 from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, PlacedObstacles, station_and_lateral
@@ -545,6 +546,7 @@ import sys
 from pathlib import Path
 sys.modules["dm_control"] = None
 from twin.loading import load_scene
+from twin.view import guarded_server
 from twin.view.__main__ import load_driving, open_page
 page = open_page(load_scene(Path({str(root)!r})), port=0)
 load_driving(page)
@@ -600,6 +602,21 @@ class _Client:
 
     def add_notification(self, title, body, **how):
         self.notices.append(body)
+
+
+def test_an_early_visitor_reads_that_the_scene_is_being_loaded(scene, monkeypatch):
+    servers, early, opened = [], [], guarded_server.open_server
+
+    def sent() -> str:
+        return repr(servers[0].viser._websock_server._broadcast_buffer.message_from_id)
+
+    monkeypatch.setattr(guarded_server, "open_server", lambda *given: servers.append(opened(*given)) or servers[0])
+    page = open_page(scene, port=0, announce=lambda url: early.append(sent()))
+    try:
+        assert "The scene is being loaded" in early[0] and "dark_mode=True" in early[0]
+        assert "The scene is being loaded" not in sent()
+    finally:
+        page.viewer.close()
 
 
 def _views(field, apart: float) -> list:

@@ -61,10 +61,7 @@ class Viewer:
         camera.up = (0.0, 0.0, 1.0)
         camera.fov = FOV
         self.loop = PictureLoop(self.picture, shot)
-        gui = self.server.gui
-        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(255, 193, 7))
-        gui.main_panel.dock_right()
-        self._status = gui.add_markdown("")
+        self._status = self.server.gui.add_markdown("")
         self._show_status()
 
     def _show_status(self) -> None:
