@@ -42,7 +42,8 @@ _COUNT = """
 window.pictures = 0;
 const source = Object.getOwnPropertyDescriptor(HTMLImageElement.prototype, "src");
 Object.defineProperty(HTMLImageElement.prototype, "src", {...source, set(value) {
-  if (value.startsWith("blob:")) this.addEventListener("load", () => { window.pictures += 1; window.width = this.naturalWidth; }, {once: true});
+  if (value.startsWith("blob:"))
+    this.addEventListener("load", () => { window.pictures += 1; window.width = this.naturalWidth; }, {once: true});
   source.set.call(this, value); }});
 """
 _EVENTS_PER_S = 25.0

@@ -32,7 +32,7 @@ _PART_COLOR, _EDGE_COLOR = (255, 87, 51), (200, 60, 40)
 
 def wxyz_of(rotation: Array) -> Array:
     """Quaternion w, x, y, z of a rotation matrix (3, 3)."""
-    return viser.transforms.SO3.from_matrix(rotation).wxyz
+    return viser.transforms.SO3.from_matrix(rotation).wxyz.astype(np.float64)
 
 
 @dataclass
