@@ -36,12 +36,14 @@ TARGETS = {
 """Figure → comparison and target."""
 
 _SIZE = (960, 540)  # of the page [px]; the panel leaves 640×540 of it to the picture
-# Counts images of the picture only: a script sets their property `src`. Images of the panel have an attribute `src`.
+# Counts images of the picture only: a script sets their property `src` to a blob. Images of the panel have an attribute
+# `src`, and viser's own images are no blobs.
 _COUNT = """
 window.pictures = 0;
 const source = Object.getOwnPropertyDescriptor(HTMLImageElement.prototype, "src");
 Object.defineProperty(HTMLImageElement.prototype, "src", {...source, set(value) {
-  this.addEventListener("load", () => { window.pictures += 1; window.width = this.naturalWidth; }, {once: true});
+  if (value.startsWith("blob:"))
+    this.addEventListener("load", () => { window.pictures += 1; window.width = this.naturalWidth; }, {once: true});
   source.set.call(this, value); }});
 """
 _EVENTS_PER_S = 25.0

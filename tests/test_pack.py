@@ -1,5 +1,6 @@
 """Packs: one drives as the built scene, bit for bit; what is private stays behind; hostile ones get one line."""
 
+import contextlib
 import io
 import json
 import multiprocessing
@@ -12,6 +13,7 @@ import sys
 import tracemalloc
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
 
 import twin
-from twin import unpack
+from twin import runtime, unpack
 from twin.__main__ import main
 from twin.capture.capture_data import NO_GPS, Capture, SourceInfo
 from twin.drive import chosen_policy, chosen_task
@@ -178,6 +180,20 @@ def test_the_same_scene_gives_the_same_pack(root, packed, tmp_path):
     assert again.read_bytes() == packed.read_bytes()
 
 
+def test_progress_is_counted_in_bytes(root, tmp_path, monkeypatch):
+    shown, totals = [], []
+
+    def bar(what, total, unit, after):
+        totals.append((total, unit))
+        return contextlib.nullcontext(SimpleNamespace(update=shown.append))
+
+    monkeypatch.setattr(runtime, "bar", bar)
+    monkeypatch.setattr("twin.pack._CHUNK", 1000)
+    _, manifest = pack(root, tmp_path / "place.twin")
+    assert totals == [(sum(one["bytes"] for one in manifest["files"].values()), "B")]
+    assert sum(shown) == totals[0][0] and max(shown) == 1000
+
+
 def test_what_is_private_stays_behind(root, packed):
     with zipfile.ZipFile(packed) as archive:
         names = archive.namelist()
@@ -224,6 +240,9 @@ def test_drive_films_a_pack_by_its_name(packed, tmp_path, monkeypatch, capsys):
     assert film.name.startswith("tiny_ahead_") and film.stat().st_size > 10_000
     assert main(["drive", "tiny", "--view", "--out", "a.mp4"]) == 2
     assert "leave out one of them" in capsys.readouterr().err
+    for wrong in ("drive.avi", "."):
+        assert main(["drive", "tiny", "--out", wrong]) == 2
+        assert f"--out {wrong}: expected the name of an .mp4 file" in capsys.readouterr().err
     assert main(["drive", "nowhere"]) == 2
     assert "no nowhere.twin here or in scenes/" in capsys.readouterr().err
 

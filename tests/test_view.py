@@ -2,6 +2,9 @@
 
 import json
 import shlex
+import shutil
+import subprocess
+import sys
 import threading
 import time
 import urllib.error
@@ -14,9 +17,11 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+import viser
 from chromium import Chromium, find_chromium
 from films import video_info
 from tiny_twin import tiny_twin
+from viser._messages import GuiUpdateMessage
 from websockets.exceptions import InvalidStatus
 from websockets.http11 import Headers, Request
 from websockets.sync.client import connect
@@ -30,22 +35,21 @@ from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
 from twin.files import parse_toml
 from twin.geometry.cameras import Cameras, Viewpoints
-from twin.geometry.images import write_image
+from twin.geometry.images import to_uint8, write_image
 from twin.geometry.poses import look_at
 from twin.geometry.shadow_map import OrthographicShadowMap
 from twin.loading import Twin
 from twin.nerf.fog import Fog
 from twin.nerf.sun import Sun
 from twin.report import build_report as report_page
-from twin.report.video_layout import to_uint8
 from twin.report.video_writer import read_frames
 from twin.scene import write_stamp
-from twin.view import scene_picture
+from twin.view import guarded_server
 from twin.view.__main__ import load_driving, open_page
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_times
 from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, PlacedObstacles, station_and_lateral
 from twin.view.guarded_server import Gate, HeldKeys, open_server
-from twin.view.layers import _trust_map, clicked_frame
+from twin.view.layers import _trust_map, clicked_frame, scene_layers
 from twin.view.lighting_panel import slider_lighting
 from twin.view.path_panel import PathPanel
 from twin.view.picture_loop import COARSE_AREA, FilmedFrame, PictureLoop, Shot, add_film, film_camera, picture_size
@@ -161,6 +165,24 @@ def test_the_server_itself_asks_for_the_token(capsys):
     finally:
         served.stop()
     assert capsys.readouterr().out == ""
+
+
+def test_a_page_waiting_for_messages_is_woken_on_its_own_thread_only():
+    served = open_server("127.0.0.1", 0, "test")
+    try:
+        server = served.viser._websock_server
+        with connect(f"ws://127.0.0.1:{served.port}", subprotocols=[f"viser-v{viser.__version__}"]):
+            _wait(lambda: server._client_state_from_id)
+            (page,) = server._client_state_from_id.values()
+            for buffer in (server._broadcast_buffer, page.message_buffer):
+                _wait(lambda: buffer.message_event._waiters)  # noqa: B023
+                buffer.message_event.set()
+                assert not buffer.message_event.is_set()
+                sent = buffer.message_counter
+                buffer.push(GuiUpdateMessage("none", {}))
+                _wait(lambda: min(buffer.generator_cursors.values()) >= sent)  # noqa: B023
+    finally:
+        served.stop()
 
 
 def test_keys_count_only_while_they_are_reported(monkeypatch):
@@ -518,6 +540,40 @@ def test_obstacles_of_the_page_may_be_copied_to_scene_toml(scene):
 # ---- pages, without a browser
 
 
+def test_without_dm_control_a_scene_is_shown_and_the_page_says_why_it_cannot_be_driven(root):
+    code = f"""
+import sys
+from pathlib import Path
+sys.modules["dm_control"] = None
+from twin.loading import load_scene
+from twin.view import guarded_server
+from twin.view.__main__ import load_driving, open_page
+page = open_page(load_scene(Path({str(root)!r})), port=0)
+load_driving(page)
+print(page._drive_note.content)
+page.viewer.close()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "driving in a scene needs dm_control" in done.stdout, done.stderr
+
+
+def test_the_first_picture_waits_for_no_import_that_only_other_parts_need():
+    slow = {"av", "dm_control", "matplotlib", "mujoco_warp", "scipy", "skimage", "torch", "trimesh"}
+    code = f"import sys, twin.view.page, twin.view.camera_path; print({slow} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "set()\n", done.stderr
+
+
+def test_a_damaged_layer_is_a_notice_when_it_is_shown(scene, field, tmp_path):
+    copied = tmp_path / "scene"
+    shutil.copytree(scene.scene.root, copied)
+    (copied / "build" / "4_mesh" / "ground.npz").write_bytes(b"")
+    layers = scene_layers(None, twin.load_scene(copied), field)
+    ground = next(layer for layer in layers if layer.name == "ground")
+    with pytest.raises(InputError, match="damaged"):
+        ground.show(True)
+
+
 @pytest.fixture(scope="module")
 def page(scene):
     page = open_page(scene, port=0)
@@ -546,6 +602,21 @@ class _Client:
 
     def add_notification(self, title, body, **how):
         self.notices.append(body)
+
+
+def test_an_early_visitor_reads_that_the_scene_is_being_loaded(scene, monkeypatch):
+    servers, early, opened = [], [], guarded_server.open_server
+
+    def sent() -> str:
+        return repr(servers[0].viser._websock_server._broadcast_buffer.message_from_id)
+
+    monkeypatch.setattr(guarded_server, "open_server", lambda *given: servers.append(opened(*given)) or servers[0])
+    page = open_page(scene, port=0, announce=lambda url: early.append(sent()))
+    try:
+        assert "The scene is being loaded" in early[0] and "dark_mode=True" in early[0]
+        assert "The scene is being loaded" not in sent()
+    finally:
+        page.viewer.close()
 
 
 def _views(field, apart: float) -> list:
@@ -628,7 +699,7 @@ def test_results_of_a_pack_are_written_to_the_working_folder(page, field, tmp_pa
 
 def test_pages_of_four_sizes_keep_their_compositors(scene, field, monkeypatch):
     made = []
-    monkeypatch.setattr(scene_picture, "Compositor", lambda *given, **more: made.append(given))
+    monkeypatch.setattr("twin.env.compositor.Compositor", lambda *given, **more: made.append(given))
     picture = ScenePicture(field)
     picture.add_objects(scene.world(), ())
     for _ in range(2):
@@ -681,7 +752,11 @@ def test_a_photo_replaces_no_lighting_but_the_named_one(page, notices, monkeypat
     panel._name.value = "day"
     panel._photo_given("image.jpg", b"")
     panel._name.value, panel._upload.disabled = "", False
-    assert given == ["day_2", "new_year", "day"]
+    panel._photo_given("image.jpg", b"")
+    panel._photo_given("image.jpg", b"")  # while the first is being fitted
+    panel._pending.clear()
+    panel._upload.disabled = False
+    assert given == ["day_2", "new_year", "day", "image", "image_2"]
 
 
 def test_a_damaged_lighting_takes_no_other_away(page, field):

@@ -64,9 +64,11 @@ def film(
         options: See `twin.env.options.Options`; by default those of the policy.
 
     Raises:
-        InputError: the scene, task, policy or an option is unknown, the seed is negative, or rerun-sdk is needed but
-            not installed.
+        InputError: the scene, task, policy or an option is unknown, the seed is negative, `out` is no mp4, or
+            rerun-sdk is needed but not installed.
     """
+    if out and (out.suffix.lower() != ".mp4" or out.is_dir()):
+        raise InputError(f"--out {out}: expected the name of an .mp4 file")
     if rerun:
         require_rerun()
         require_parent(rerun)

@@ -47,6 +47,7 @@ LEVELS = 256
 _ZERO = 128  # byte that stands for 0 in the detail; rounding gives values at multiples of the step from it
 _FINER = 4  # step of features / step of density; density is rounded less because it determines surfaces
 _VERTEX_STEP = 2  # step of the hash grid's vertices / step of features
+_CHUNK = 1 << 20  # [bytes] written between two updates of the progress bar
 _PACKED = {"metric": ("cameras.json", "cameras.npz"), "field": ("baked.json", "baked.safetensors")}
 _IS_BAKED = re.compile(r"/baked(_\d+)?\.safetensors$")
 _MESH = ("ground.npz", "parts.npz", "visual.npz")
@@ -264,16 +265,19 @@ def _write(out: Path, files: dict[str, bytes], head: dict[str, Any]) -> dict[str
     with (
         atomic_path(out) as partial,
         zipfile.ZipFile(partial, "w") as archive,
-        runtime.bar("pack", len(files), "file", after=1.0) as progress,
+        runtime.bar("pack", total, "B", after=1.0) as progress,
     ):
         archive.writestr(_entry(unpack.README), text.encode())
         archive.writestr(_entry(unpack.MANIFEST), json_bytes(manifest))
         for name in facts:
             content = files[name]
-            archive.writestr(
-                _entry(name), unpack.encode_differences(content) if coded[name] == unpack.DIFFERENCES else content
-            )
-            progress.update()
+            if coded[name] == unpack.DIFFERENCES:
+                content = unpack.encode_differences(content)
+            entry = _entry(name)
+            entry.file_size = len(content)  # known before its content, as the zip's header needs it
+            with archive.open(entry, "w") as packed:
+                for start in range(0, len(content), _CHUNK):
+                    progress.update(packed.write(content[start : start + _CHUNK]))
     return manifest
 
 

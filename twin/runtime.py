@@ -82,12 +82,11 @@ def bar(what: str, total: int, unit: str = "it", after: float = 0.0) -> tqdm:
     """A progress bar, which is also a context manager.
 
     In a terminal it is redrawn in place; in a log file it writes a line every 10 s; with `set_quiet`, nothing is shown.
-    It appears after `after` [s], so that work which is usually fast shows no bar.
+    It appears after `after` [s], so that work which is usually fast shows no bar. Bytes (unit "B") are shown as MB.
     """
-    every = 0.1 if sys.stderr.isatty() else 10.0
-    return _Bar(
-        total=total, desc=f"  {what}", unit=unit, disable=_quiet, mininterval=every, dynamic_ncols=True, delay=after
-    )
+    every, scaled = 0.1 if sys.stderr.isatty() else 10.0, unit == "B"
+    look = {"mininterval": every, "dynamic_ncols": True, "delay": after, "unit": unit, "unit_scale": scaled}
+    return _Bar(total=total, desc=f"  {what}", disable=_quiet, **look)
 
 
 def track(items: Iterable[T], what: str, total: int | None = None, unit: str = "it") -> Iterator[T]:

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
-from skimage.metrics import structural_similarity
 
 from twin.errors import InputError
 from twin.files import read_bytes, regular_file, write_bytes
@@ -31,6 +30,11 @@ _HEIF = "HEIF"  # Pillow's name of HEIF and HEIC
 _CURE = "replace or remove it"
 warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # Pillow warns from MAX_PIXELS / 2 on
 warnings.filterwarnings("ignore", module="PIL")  # about flawed headers, whose values count as unknown
+
+
+def to_uint8(rgb: NDArray) -> NDArray[np.uint8]:
+    """Colors in [0, 1] as bytes; NaN is 0."""
+    return (np.clip(np.nan_to_num(rgb), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -148,5 +152,7 @@ def psnr(image: NDArray, reference: NDArray, mask: NDArray | None = None) -> flo
 
 def ssim(image: NDArray, reference: NDArray) -> float:
     """Structural similarity (Wang et al. 2004, Gaussian window σ = 1.5) of float RGB images in [0, 1]."""
+    from skimage.metrics import structural_similarity  # slow to import
+
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     return float(structural_similarity(image, reference, channel_axis=-1, data_range=1.0, **window))

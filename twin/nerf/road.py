@@ -13,9 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save as to_bytes
-from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.spatial import cKDTree
-from scipy.spatial.distance import pdist, squareform
 
 from twin.files import check_shapes, load_tensors, wrap_read_errors
 from twin.types import Array
@@ -70,7 +67,7 @@ class RoadSections:
 
     @cached_property
     def _trees(self) -> list[Any]:
-        return [cKDTree(self.points[self.section == k]) for k in range(self.count)]
+        return [_tree(self.points[self.section == k]) for k in range(self.count)]
 
     def distances(self, positions: Array) -> Array:
         """Distance of positions (n, 3) [m] from the nearest filmed position of each section, shape (n, count)."""
@@ -114,6 +111,9 @@ def divide_road(positions: Array, length: float) -> RoadSections:
     The centers are those of k-medians: bends, crossings and films in both directions need no special treatment, and
     frames that were placed far off the road move no center.
     """
+    from scipy.sparse.csgraph import minimum_spanning_tree  # slow to import, as the next
+    from scipy.spatial.distance import pdist, squareform
+
     anchors = _thinned(positions, _ANCHOR_SPACING)
     steps = minimum_spanning_tree(squareform(pdist(anchors))).data
     filmed = float(steps[steps < _JUMP].sum())
@@ -121,10 +121,17 @@ def divide_road(positions: Array, length: float) -> RoadSections:
     if count < 2:
         return RoadSections(positions, np.zeros(len(positions), np.int64))
     centers = _centers(_far_apart(anchors, count), _thinned(positions, _CENTER_SPACING))
-    section = cKDTree(centers).query(positions)[1]
+    section = _tree(centers).query(positions)[1]
     enough = np.bincount(section, minlength=count) >= _MIN_FRAMES
-    section = cKDTree(centers[enough]).query(positions)[1]
+    section = _tree(centers[enough]).query(positions)[1]
     return RoadSections(positions, np.unique(section, return_inverse=True)[1])
+
+
+def _tree(points: Array) -> Any:
+    """A k-d tree of points (n, 3)."""
+    from scipy.spatial import cKDTree  # slow to import
+
+    return cKDTree(points)
 
 
 def _thinned(positions: Array, spacing: float) -> Array:
@@ -138,7 +145,7 @@ def _thinned(positions: Array, spacing: float) -> Array:
 
 def _far_apart(points: Array, count: int) -> Array:
     """`count` points that are far from each other, of those points (n, 3) that have another one nearby."""
-    points = points[cKDTree(points).query(points, k=2)[0][:, 1] < _JUMP]
+    points = points[_tree(points).query(points, k=2)[0][:, 1] < _JUMP]
     chosen = [int(np.linalg.norm(points - np.median(points, 0), axis=1).argmax())]
     gap = np.full(len(points), np.inf)
     for _ in range(count - 1):
@@ -150,7 +157,7 @@ def _far_apart(points: Array, count: int) -> Array:
 def _centers(centers: Array, points: Array) -> Array:
     """Centers of k-medians clusters of points (n, 3), from first centers (count, 3)."""
     for _ in range(_ROUNDS):
-        nearest = cKDTree(centers).query(points)[1]
+        nearest = _tree(centers).query(points)[1]
         own = [points[nearest == k] for k in range(len(centers))]
         moved = np.array([np.median(part, 0) if len(part) else old for part, old in zip(own, centers, strict=True)])
         if np.array_equal(moved, centers):

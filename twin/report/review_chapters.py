@@ -21,7 +21,7 @@ from twin.env.drivers import RecordedDrive
 from twin.errors import join_names
 from twin.files import write_bytes
 from twin.geometry.cameras import Cameras, Viewpoints, nearest_frame
-from twin.geometry.images import psnr, read_image, resize
+from twin.geometry.images import psnr, read_image, resize, to_uint8
 from twin.mjcf.world import World, arc_lengths
 from twin.nerf.rendering import RenderableField, Rendering
 from twin.report.video_layout import (
@@ -50,7 +50,6 @@ from twin.report.video_layout import (
     scale_bar,
     side_by_side,
     titled_panel,
-    to_uint8,
 )
 from twin.report.video_writer import VideoWriter, even, frame_indices
 from twin.robot import CAMERA_SIZE

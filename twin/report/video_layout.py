@@ -21,7 +21,7 @@ from PIL import ImageDraw, ImageFont
 from scipy.spatial import ConvexHull, QhullError
 
 from twin.assets.ground import Ground
-from twin.geometry.images import resize
+from twin.geometry.images import resize, to_uint8
 from twin.report.video_writer import even
 from twin.types import Array, Image
 
@@ -101,11 +101,6 @@ def draw_label(
     under = canvas[top : top + h, left : left + w]
     under[:] = (under * 0.3 + np.array(BACKGROUND) * 0.7).astype(np.uint8)
     draw_text(canvas, text, left + 7, top + 3, size, color, bold)
-
-
-def to_uint8(rgb: NDArray) -> Image:
-    """Colors in [0, 1] as bytes; NaN is 0."""
-    return (np.clip(np.nan_to_num(rgb), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def colored(name: str, shares: NDArray) -> Image:

@@ -122,6 +122,10 @@ def open_page(
         require_stage(twin.scene, stage)
     server = open_server(host, port, "twin view")
     try:
+        gui = server.viser.gui
+        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(255, 193, 7))
+        gui.main_panel.dock_right()
+        loading = gui.add_markdown("The scene is being loaded ...")
         announce(server.url)
         # The browser loads the page during the rest.
         from twin.view.camera_path import named_lighting
@@ -129,7 +133,9 @@ def open_page(
 
         field = twin.field()
         shown: EpisodeLighting = named_lighting(field, lighting or field.lightings[0])
-        return Page(twin, field, server, shown)
+        page = Page(twin, field, server, shown)
+        loading.remove()
+        return page
     except BaseException:
         server.stop()
         raise

@@ -14,17 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline, PchipInterpolator
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from twin.env.episode_lighting import EpisodeLighting
 from twin.errors import short_repr
 from twin.files import json_bytes, read_json, wrap_read_errors, write_bytes
+from twin.geometry.images import to_uint8
 from twin.nerf.baked import BakedField
 from twin.nerf.fog import mixed
 from twin.nerf.sun import mixed_sunlight
-from twin.report.video_layout import to_uint8
-from twin.report.video_writer import VideoWriter
 from twin.types import Array
 from twin.view.scene_picture import FreeCamera, ScenePicture
 
@@ -78,6 +75,9 @@ class CameraPath:
 
     def at(self, times: Array) -> list[tuple[Array, float, EpisodeLighting]]:
         """Pose (4, 4), vertical angle of view [°] and lighting at times after the start [s], shape (k,)."""
+        from scipy.interpolate import CubicSpline, PchipInterpolator  # slow to import, as the next
+        from scipy.spatial.transform import Rotation, RotationSpline
+
         knots = np.array([view.time for view in self.views]) - self.views[0].time
         poses = np.array([view.camera_to_world for view in self.views])
         t = np.clip(times, 0.0, knots[-1])
@@ -199,6 +199,8 @@ def write_path_film(
 
     `on_frame` is called with the numbers of frames written and in total; if it raises, nothing is written.
     """
+    from twin.report.video_writer import VideoWriter
+
     views = path.at(path_frames(path, fps))
     with VideoWriter(out, size, fps, _CRF) as writer:
         for k, (pose, fov, lighting) in enumerate(views):

@@ -37,7 +37,7 @@ class DrivePanel:
         with folders[0]:
             self._driver = gui.add_dropdown("driver", driving.drivers)
             viewer.on_update(self._driver, self._choose_driver)
-            self._run_button = gui.add_button("Start driving", icon=viser.Icon.PLAYER_PLAY)
+            self._run_button = gui.add_button("Start driving")
             viewer.on_click(self._run_button, lambda event: self._toggle_drive())
             viewer.on_click(gui.add_button("Back to the start"), lambda event: self._restart())
             self._behind = gui.add_checkbox("follow the robot", True)
@@ -48,7 +48,7 @@ class DrivePanel:
             )
         with folders[1]:
             self._kind = gui.add_dropdown("kind", OBSTACLE_KINDS)
-            add = gui.add_button("Add in front of the camera", icon=viser.Icon.PLUS)
+            add = gui.add_button("Add in front of the camera")
             viewer.on_click(add, self._add_obstacle)
             viewer.on_click(gui.add_button("Remove all"), lambda event: self._remove_obstacles())
             self._obstacle_text = gui.add_markdown("")
@@ -83,7 +83,6 @@ class DrivePanel:
         by_keys = running and self._driving.driver == KEYS_DRIVER
         self._viewer.guarded.set_driving(by_keys)
         self._run_button.label = "Stop" if running else "Start driving"
-        self._run_button.icon = viser.Icon.PLAYER_STOP if running else viser.Icon.PLAYER_PLAY
         if by_keys:
             text = "W ahead, S back, A and D turn. If the keys do nothing, click the picture."
             self._viewer.notify("W A S D", text, seconds=6.0)

@@ -14,7 +14,6 @@ from typing import Any
 
 import dm_env
 import numpy as np
-from dm_control.rl.control import PhysicsError
 from scipy.optimize import brentq
 
 from twin.config import OBSTACLE_KINDS, ObstacleConfig
@@ -24,7 +23,7 @@ from twin.env.episode_lighting import EpisodeLighting
 from twin.env.obstacles import EpisodeObstacles, ObstacleMotion, ground_height, obstacle_pose, place
 from twin.env.route_segments import RouteSegment, find_task
 from twin.env.suite import DriveEnvironment, EnvFactory
-from twin.env.task import DrivePhysics, DriveTask
+from twin.env.task import DrivePhysics, DriveTask, control
 from twin.errors import InputError
 from twin.files import toml_value
 from twin.loading import Twin
@@ -355,7 +354,7 @@ class Driving:
         action = np.asarray(driver(environment, self._step), float)
         try:
             self._step = environment.step(action)
-        except PhysicsError:  # the simulation diverged, as in a violent collision
+        except control.PhysicsError:  # the simulation diverged, as in a violent collision
             self.reset()
             return
         if self._step.last():

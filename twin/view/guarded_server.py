@@ -8,6 +8,7 @@ sites whose names point here cannot read it (DNS rebinding). A handshake must co
 *Token.* If the server is bound to any other address, each request needs the token: the first one in its address, later
 ones as a cookie. Without TLS both can be read on the network.
 *Script.* The page contains `page.js`, which reports held keys to the socket `/keys` and uploads dropped photos.
+*Threads.* viser wakes its pages' senders from any thread, which asyncio does not allow; here only from their own.
 """
 
 import asyncio
@@ -23,6 +24,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,8 @@ from urllib.parse import parse_qs, urlsplit
 
 import viser
 import websockets.asyncio.server
+from viser.infra import _infra
+from viser.infra._async_message_buffer import AsyncMessageBuffer
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -48,6 +52,26 @@ _PORTS = 50  # number of ports to try, from the given one on
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 
 Check = Callable[[ServerConnection, Request], Response | None]
+
+
+class _LoopEvent(asyncio.Event):
+    """An event that can be set only on a loop's thread."""
+
+    def set(self) -> None:
+        with contextlib.suppress(RuntimeError):
+            asyncio.get_running_loop()
+            super().set()
+
+
+@dataclass
+class _MessageBuffer(AsyncMessageBuffer):
+    """A buffer that several threads may fill.
+
+    viser's sets its event on the thread that sends a message, and then again on the loop. The first may raise "deque
+    mutated during iteration", or coincide with the beginning of a wait, which then never ends.
+    """
+
+    message_event: asyncio.Event = field(default_factory=_LoopEvent)
 
 
 class HeldKeys:
@@ -184,6 +208,7 @@ def open_server(host: str, port: int, label: str) -> GuardedServer:
 
         return guarded_handler, guarded_check
 
+    _infra.AsyncMessageBuffer = _MessageBuffer  # type: ignore[misc]
     before = set(threading.enumerate())
     with _silent(), _wrapped_serve(wrap):
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)

@@ -5,21 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import trimesh
 import viser
-from matplotlib import colormaps
-from scipy.interpolate import RegularGridInterpolator
-from scipy.spatial.transform import Rotation
 
-from twin.assets.ground import Ground
-from twin.errors import InputError
 from twin.files import load_arrays
 from twin.geometry.cameras import Cameras, unproject
 from twin.loading import Twin
-from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import World, corridor_edges, heading_at, point_at
 from twin.nerf.baked import BakedField
-from twin.report.review_video import trust_grid
 from twin.scene import require_stage
 from twin.types import Array
 
@@ -40,7 +32,7 @@ _PART_COLOR, _EDGE_COLOR = (255, 87, 51), (200, 60, 40)
 
 def wxyz_of(rotation: Array) -> Array:
     """Quaternion w, x, y, z of a rotation matrix (3, 3)."""
-    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+    return viser.transforms.SO3.from_matrix(rotation).wxyz.astype(np.float64)
 
 
 @dataclass
@@ -61,11 +53,11 @@ class Layer:
 
 
 def scene_layers(scene: viser.SceneApi, twin: Twin, field: BakedField) -> list[Layer]:
-    """The layers that a built scene has; `field` is for the trust map."""
+    """The layers that a built scene has; a damaged one is an error when it is shown. `field` is for the trust map."""
     cameras = twin.cameras()
     out = [Layer(FILMED_CAMERAS, "click one to see its frame", lambda path: _frustums(scene, path, cameras))]
-    if _has(twin, "mesh"):
-        mesh = twin.scene.stage("mesh")
+    mesh = twin.scene.stage("mesh")
+    if (mesh / "stamp.json").exists():
         out += [
             Layer("mesh", "the filmed surface, as twin exports it", lambda path: [_visual_mesh(scene, path, twin)]),
             Layer("ground", "the height field that the wheels roll on", lambda path: [_ground(scene, path, twin)]),
@@ -73,12 +65,15 @@ def scene_layers(scene: viser.SceneApi, twin: Twin, field: BakedField) -> list[L
         if (mesh / "parts.npz").exists():
             text = "the convex parts that the robot collides with"
             out.append(Layer("convex parts", text, lambda path: _parts(scene, path, twin)))
-    if twin.scene.has_route and _has(twin, "mjcf"):
-        world = twin.world()
-        lines = [world.along(branch) for branch in ("", *world.branches)]
+    if twin.scene.has_route:
 
         def drawn(draw: Callable[..., viser.SceneNodeHandle]) -> Callable[[str], list[viser.SceneNodeHandle]]:
-            return lambda path: [draw(scene, f"{path}/{k}", line) for k, line in enumerate(lines)]
+            def add(path: str) -> list[viser.SceneNodeHandle]:
+                world = twin.world()
+                branches = ("", *world.branches)
+                return [draw(scene, f"{path}/{k}", world.along(branch)) for k, branch in enumerate(branches)]
+
+            return add
 
         out += [
             Layer("route", "the line to be driven, and its branches", drawn(_route)),
@@ -86,18 +81,10 @@ def scene_layers(scene: viser.SceneApi, twin: Twin, field: BakedField) -> list[L
             Layer(
                 "trust map",
                 "dark where the robot's pictures are unreliable: far from filmed cameras, or at holes in the field",
-                lambda path: [_trust_map(scene, path, twin, world, cameras, field)],
+                lambda path: [_trust_map(scene, path, twin, twin.world(), cameras, field)],
             ),
         ]
     return out
-
-
-def _has(twin: Twin, stage: str) -> bool:
-    try:
-        require_stage(twin.scene, stage)
-    except InputError:
-        return False
-    return True
 
 
 def _frustums(scene: viser.SceneApi, path: str, cameras: Cameras) -> list[viser.SceneNodeHandle]:
@@ -132,20 +119,26 @@ def clicked_frame(cameras: Cameras, origin: Array, direction: Array) -> int | No
 
 
 def _visual_mesh(scene: viser.SceneApi, path: str, twin: Twin) -> viser.SceneNodeHandle:
-    mesh = load_arrays(twin.scene.stage("mesh") / "visual.npz")
+    import trimesh  # slow to import, as other imports within the functions of this file
+
+    mesh = load_arrays(require_stage(twin.scene, "mesh") / "visual.npz")
     linear = (255.0 * (mesh["colors"] / 255.0) ** _GAMMA + 0.5).astype(np.uint8)  # glTF stores linear colors
     surface = trimesh.Trimesh(mesh["vertices"], mesh["faces"], vertex_colors=linear, process=False)
     return scene.add_mesh_trimesh(path, surface, **_NO_SHADOWS)
 
 
 def _ground(scene: viser.SceneApi, path: str, twin: Twin) -> viser.SceneNodeHandle:
-    vertices, faces = Ground.load(twin.scene.stage("mesh")).triangles(_GROUND_CELL, _GROUND_FACES)
+    from twin.assets.ground import Ground
+
+    vertices, faces = Ground.load(require_stage(twin.scene, "mesh")).triangles(_GROUND_CELL, _GROUND_FACES)
     lifted = vertices + _UP
     return scene.add_mesh_simple(path, lifted, faces, color=_GROUND_COLOR, wireframe=True, **_NO_SHADOWS)
 
 
 def _parts(scene: viser.SceneApi, path: str, twin: Twin) -> list[viser.SceneNodeHandle]:
-    parts = Parts.load(twin.scene.stage("mesh") / "parts.npz")
+    from twin.mjcf.scene_xml import Parts
+
+    parts = Parts.load(require_stage(twin.scene, "mesh") / "parts.npz")
     if not parts.vertices:
         return []
     offsets = np.cumsum([0, *(len(one) for one in parts.vertices[:-1])])
@@ -176,6 +169,12 @@ def _corridor(scene: viser.SceneApi, path: str, world: World) -> viser.SceneNode
 def _trust_map(
     scene: viser.SceneApi, path: str, twin: Twin, world: World, cameras: Cameras, field: BakedField
 ) -> viser.SceneNodeHandle:
+    from matplotlib import colormaps
+    from scipy.interpolate import RegularGridInterpolator
+
+    from twin.assets.ground import Ground
+    from twin.report.review_video import trust_grid
+
     s, offsets, trust = trust_grid(field, cameras, world)
     aside = np.arange(offsets[0], offsets[-1] + 1e-6, _TRUST_STEP).clip(max=offsets[-1])
     along, aside = np.meshgrid(np.arange(0.0, s[-1], _TRUST_STEP), aside)
@@ -184,7 +183,7 @@ def _trust_map(
     left = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], -1)
     points = point_at(world.route, along) + aside[..., None] * left
     # Beside the route the ground may be higher or lower than the route.
-    points[..., 2] = Ground.load(twin.scene.stage("mesh")).at(points[..., :2])
+    points[..., 2] = Ground.load(require_stage(twin.scene, "mesh")).at(points[..., :2])
     colors = (255.0 * colormaps["viridis"](trust.ravel())[:, :3]).astype(np.uint8)
     lifted = points.reshape(-1, 3) + _UP
     return scene.add_point_cloud(path, lifted, colors, point_size=0.08, point_shape="circle", point_shading="flat")

@@ -29,6 +29,7 @@ class LightingPanel:
     def __init__(self, viewer: Viewer) -> None:
         self._viewer, self._field = viewer, viewer.field
         self._rng, self._sampled = np.random.default_rng(), 0
+        self._pending: set[str] = set()  # names of photos that are being fitted; more may be dropped meanwhile
         gui = viewer.server.gui
         self._folder = gui.add_folder("Lighting")
         with self._folder:
@@ -41,7 +42,6 @@ class LightingPanel:
                 "Relight by a photo",
                 mime_type="image/*",
                 hint="a photo of the place, from near the filmed path; or drop it on the page",
-                icon=viser.Icon.PHOTO_UP,
                 order=12.0,
             )
             self._upload = upload
@@ -84,6 +84,7 @@ class LightingPanel:
             lighting = self._name.value.strip() or self._unused_name(Path(name).stem)
             check_name(lighting, "name")
             self._upload.disabled = True
+            self._pending.add(lighting)
             text = f"{name}: finding its camera pose and fitting its lighting; this takes about a minute."
             self._viewer.notify("Relighting", text)
             self._viewer.submit(self._relight, lighting, Path(name).suffix, content)
@@ -91,8 +92,9 @@ class LightingPanel:
     def _unused_name(self, stem: str) -> str:
         """A name made from a photo's; numbered if it exists, as phones upload every photo as "image.jpg"."""
         stem, folder = "".join(c if c.isalnum() else "_" for c in stem), self._viewer.twin.scene.lightings
+        taken = {*self._field.lightings, *self._pending}
         names = (f"{stem}_{k}" if k > 1 else stem for k in itertools.count(1))
-        return next(one for one in names if one not in self._field.lightings and not exists(folder / f"{one}.json"))
+        return next(one for one in names if one not in taken and not exists(folder / f"{one}.json"))
 
     def _relight(self, name: str, suffix: str, content: bytes) -> None:
         """Adds a photo's lighting by `twin relight` in another process, which frees its large memory when it ends."""
@@ -115,7 +117,8 @@ class LightingPanel:
                 self.choose(name)
                 self._viewer.notify(f"Lighting {name} added", done.stdout.strip().splitlines()[1], "green")
         finally:
-            self._upload.disabled = False
+            self._pending.discard(name)
+            self._upload.disabled = bool(self._pending)
 
     def _reload(self) -> None:
         """Reloads the lightings that photos have added to the scene."""

@@ -1,14 +1,12 @@
 """The page of `twin view`: its tabs Look, Drive, Film and Path, and the content of its picture."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import viser
 
 from twin.env.episode_lighting import EpisodeLighting
 from twin.loading import Twin
 from twin.nerf.baked import BakedField
-from twin.view.drive_panel import DrivePanel
-from twin.view.driving import DriveFacts, Driving
 from twin.view.film_panel import FilmPanel
 from twin.view.guarded_server import GuardedServer
 from twin.view.layers import FILMED_CAMERAS, scene_layers
@@ -16,6 +14,10 @@ from twin.view.lighting_panel import LightingPanel
 from twin.view.path_panel import PathPanel
 from twin.view.picture_loop import Shot
 from twin.view.viewer import Viewer, camera_pose_of
+
+if TYPE_CHECKING:
+    from twin.view.drive_panel import DrivePanel
+    from twin.view.driving import DriveFacts, Driving
 
 
 class Page:
@@ -25,15 +27,15 @@ class Page:
         self.viewer = Viewer(twin, field, server, lighting, self.shot)
         self._drive: DrivePanel | None = None
         tabs = self.viewer.server.gui.add_tab_group()
-        with tabs.add_tab("Look", viser.Icon.SUN):
+        with tabs.add_tab("Look"):
             self.lightings = LightingPanel(self.viewer)
             self._build_layers()
-        self._drive_tab = tabs.add_tab("Drive", viser.Icon.STEERING_WHEEL)
+        self._drive_tab = tabs.add_tab("Drive")
         with self._drive_tab:
             self._drive_note = self.viewer.server.gui.add_markdown("The robot is being loaded ...")
-        with tabs.add_tab("Film", viser.Icon.MOVIE):
+        with tabs.add_tab("Film"):
             self.film = FilmPanel(self.viewer, self.lightings)
-        with tabs.add_tab("Path", viser.Icon.ROUTE):
+        with tabs.add_tab("Path"):
             self._path = PathPanel(self.viewer)
         self.viewer.serve(self._moved)
 
@@ -68,8 +70,10 @@ class Page:
         has_layers = has_handles or bool(self._path.nodes) or any(box.value for box in self._layer_boxes)
         return Shot(camera_pose_of(client), client.camera.fov, viewer.lighting, objects, has_layers, film)
 
-    def add_driving(self, driving: Driving) -> None:
+    def add_driving(self, driving: "Driving") -> None:
         """Shows the robot, and the controls that drive it."""
+        from twin.view.drive_panel import DrivePanel  # needs dm_control, and is slow to import
+
         viewer = self.viewer
         viewer.picture.add_objects(driving.world, driving.obstacles.pool)
         self._drive_note.visible = False
@@ -84,7 +88,7 @@ class Page:
         """Shows why the scene cannot be driven."""
         self._drive_note.content = why
 
-    def drove(self, facts: DriveFacts) -> None:
+    def drove(self, facts: "DriveFacts") -> None:
         """Shows the state of the drive after a control step or a reset; called on several threads."""
         if self._drive is not None:
             self._drive.drove(facts)

@@ -14,7 +14,7 @@ import numpy as np
 import viser
 
 from twin.env.episode_lighting import EpisodeLighting
-from twin.report.video_layout import draw_label, to_uint8
+from twin.geometry.images import to_uint8
 from twin.types import Array, Image
 from twin.view.scene_picture import FreeCamera, ObjectState, ScenePicture
 
@@ -191,6 +191,8 @@ def film_camera(film: FilmedFrame, size: tuple[int, int]) -> FreeCamera:
 
 def add_film(image: Image, film: FilmedFrame, camera: FreeCamera) -> None:
     """Draws the frame over the left part of a picture of `film_camera`, in place."""
+    from twin.report.video_layout import draw_label  # slow to import
+
     (width, height), (rows, columns) = camera.size, film.image.shape[:2]
     scale = camera.intrinsics[0] / film.intrinsics[0]
     left, top = (round(float(n)) for n in (width - scale * columns, height - scale * rows))

@@ -9,21 +9,22 @@ import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from twin.config import ObstacleConfig
-from twin.env.compositor import Compositor
 from twin.env.episode_lighting import EpisodeLighting
-from twin.env.obstacles import add_obstacles
-from twin.env.suite import episode_spec
 from twin.geometry.cameras import Viewpoints, opencv_to_mujoco, pixel_grid, unproject
 from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
 from twin.nerf.rendering import Rendering
 from twin.nerf.sun import relit
 from twin.types import Array, Array32
+
+if TYPE_CHECKING:
+    from twin.env.compositor import Compositor
 
 _CAMERA = "view"  # name of the free camera in the model
 _MAX_COMPOSITORS = (
@@ -79,6 +80,9 @@ class ScenePicture:
 
     def add_objects(self, world: World, obstacles: tuple[ObstacleConfig, ...]) -> None:
         """Adds the robot of a world, and obstacles, to the pictures; an `ObjectState` lists obstacles in this order."""
+        from twin.env.obstacles import add_obstacles  # slow to import, as the next, which needs dm_control
+        from twin.env.suite import episode_spec
+
         spec = episode_spec(world, 0.0, 0.0, 0.0)  # convex parts are not drawn
         add_obstacles(spec, obstacles, world)
         spec.worldbody.add_camera(name=_CAMERA)
@@ -116,7 +120,9 @@ class ScenePicture:
         data.cam_xpos[number], data.cam_xmat[number] = pose[:3, 3], pose[:3, :3].ravel()
         return compositor.render([data], lighting.start, sunlight=[lighting.sunlight])
 
-    def _compositor(self, camera: FreeCamera) -> Compositor:
+    def _compositor(self, camera: FreeCamera) -> "Compositor":
+        from twin.env.compositor import Compositor
+
         key = (*camera.size, round(camera.fov, 4))
         if key not in self._compositors:
             model = copy.copy(self._model)

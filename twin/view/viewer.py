@@ -8,22 +8,24 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
 
 from twin.env.episode_lighting import EpisodeLighting
-from twin.env.mujoco_renderer import ChaseCamera
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras
 from twin.loading import Twin
 from twin.nerf.baked import BakedField
 from twin.types import Array
-from twin.view.driving import Driving
 from twin.view.guarded_server import GuardedServer
 from twin.view.picture_loop import PictureLoop, Shot
 from twin.view.scene_picture import ScenePicture
+
+if TYPE_CHECKING:
+    from twin.env.mujoco_renderer import ChaseCamera
+    from twin.view.driving import Driving
 
 FOV = float(np.deg2rad(60.0))
 """Vertical angle of view of a new page's camera [rad]."""
@@ -59,10 +61,7 @@ class Viewer:
         camera.up = (0.0, 0.0, 1.0)
         camera.fov = FOV
         self.loop = PictureLoop(self.picture, shot)
-        gui = self.server.gui
-        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(255, 193, 7))
-        gui.main_panel.dock_right()
-        self._status = gui.add_markdown("")
+        self._status = self.server.gui.add_markdown("")
         self._show_status()
 
     def _show_status(self) -> None:
@@ -111,6 +110,8 @@ class Viewer:
 
     def follow(self, base_to_world: Array) -> None:
         """Moves the cameras of all pages behind the robot, with smoothing, which `stop_following` resets."""
+        from twin.env.mujoco_renderer import ChaseCamera  # slow to import
+
         if self._chase is None:
             self._chase = ChaseCamera(base_to_world)
         pose = self._chase.follow(base_to_world)
