@@ -41,6 +41,7 @@ _FEW_POINTS = 3  # the same for a frame that was registered against a coherent m
 _NEAREST_FRACTION = 0.1  # fraction of a frame's points that are nearer than its nearest points are said to be
 _MAX_DISTANCE = 60.0  # [distance of the nearest points] largest distance between two connected frames
 _COHERENT_FRACTION = 0.95  # a model is torn if its largest connected part has a smaller fraction of its frames
+_MOST_INCREMENTAL = 300  # frames; incremental mapping of more takes longer than a torn model is worth
 _NEAR_POINTS = "global, near points first"
 _TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
@@ -151,8 +152,8 @@ class Mapper:
         best: pycolmap.Reconstruction | None = None
         kept: set[int] = set()
         for name, attempt in self._attempts():
-            if best is not None and name == "incremental" and len(kept) >= needed:
-                break  # slow, and rarely better than a torn model of global mapping
+            if name == "incremental" and len(kept) >= needed and len(matcher.frames) > _MOST_INCREMENTAL:
+                break
             model = attempt()
             if model is None:
                 continue

@@ -307,6 +307,8 @@ def _from_zip(path: Path) -> Policy:
     try:
         # Only the network: a model's `load` also allocates its replay buffer, and needs the algorithm's class.
         data, weights, _ = load_from_zip_file(path, device="cpu")
+        if data is None:
+            raise ValueError("no description of the model")
         pictures, range_ = data["observation_space"], data["action_space"]
         settings = {name: value for name, value in data["policy_kwargs"].items() if name != "device"}
         settings |= {"use_sde": True} if data["use_sde"] else {}
