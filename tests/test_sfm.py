@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import psutil
@@ -207,7 +208,7 @@ def _model(
     places: list[float],
     groups: list[tuple[int, ...]],
     at: dict[tuple[int, ...], list[float]] | None = None,
-) -> tuple[pycolmap.Reconstruction, object]:
+) -> tuple[pycolmap.Reconstruction, Any]:
     """A model of frames at places x along a line, with one point for each group of frames; and its matcher.
 
     The points of a group are 5 m before the line unless `at` says where they are.
@@ -225,7 +226,13 @@ def _model(
         model.add_point3D(np.array((at or {}).get(group, [3.0, 0.0, 5.0])), track)
     capture = Capture.load(street.scene.stage("capture"))
     ids = {k + 1: k for k in range(len(places))}
-    return model, SimpleNamespace(frame_of=lambda: ids, image_ids=np.arange(1, len(places) + 1), capture=capture)
+    matcher = SimpleNamespace(
+        frame_of=lambda: ids,
+        image_ids=np.arange(1, len(places) + 1),
+        capture=capture,
+        verified=lambda: {(k, k + 1): 60 for k in range(len(places) - 1)},
+    )
+    return model, matcher
 
 
 def test_a_torn_model_is_recognized(street: Street) -> None:
@@ -250,6 +257,14 @@ def test_a_piece_that_shrank_is_not_coherent_although_it_lies_beside_the_others(
     groups, places = [every] * 20 + [shrunk] * 20, [0.0, 1, 2, 3, 4, 4, 4.001, 4.002]
     assert mapping.coherent_frames(*_model(street, places, groups, {shrunk: [4.001, 0.0, 0.005]})) == set(range(5))
     assert mapping.coherent_frames(*_model(street, places, groups, {shrunk: [4.001, 0.0, 0.5]})) == set(range(8))
+
+
+def test_a_film_is_cut_where_the_model_contradicts_the_matches_of_successive_frames(street: Street) -> None:
+    groups = [tuple(range(5))] * 20 + [(5, 6, 7)] * 20 + [(3, 6, 7)] * 15  # frames 4 and 5 share no point
+    model, matcher = _model(street, [0.0, 1, 2, 3, 4, 5, 6, 7], groups)
+    assert mapping.coherent_frames(model, matcher) == set(range(5))
+    matcher.verified = lambda: {}
+    assert mapping.coherent_frames(model, matcher) == set(range(8))
 
 
 def test_masked_parts_have_no_features(street: Street, tmp_path: Path) -> None:
@@ -298,29 +313,33 @@ def _errors(street: Street, matcher: Matcher, model: pycolmap.Reconstruction) ->
     return np.linalg.norm(umeyama(poses[:, :3, 3], true).points(poses[:, :3, 3]) - true, axis=1)
 
 
-def test_a_torn_model_is_repeated_without_far_points(
+def test_mapping_begins_without_far_points_and_is_repeated_with_them_if_torn(
     street: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     matcher, mapper = _mapper(street, tmp_path)
-    databases, mapped = [], mapper._global
+    summary: dict = {}
+    model = mapper.best(summary)
+    assert summary["mapper"] == "global, near points first"
+    errors = _errors(street, matcher, model)
+    assert len(errors) == len(matcher.frames) and errors.max() < 0.03
+    near_points.remove_far_points(matcher.copied_without([], mapping.fresh_folder(tmp_path, "copy")), 0)
+    with pycolmap.Database.open(tmp_path / "copy" / matcher.database.name) as near:
+        kept = np.sum(near.read_two_view_geometry_num_inliers()[1])
+    assert 0.2 < kept / sum(matcher.verified().values()) < 0.9
+    used, mapped = [], mapper._global
 
     def torn_at_first(database: Path) -> pycolmap.Reconstruction | None:
-        databases.append(database)
+        used.append(database == matcher.database)
         model = mapped(database)
-        if database == matcher.database and model is not None:
+        if not used[-1] and model is not None:
             _move(model, matcher, list(range(6)), 1000.0)
         return model
 
     monkeypatch.setattr(mapper, "_global", torn_at_first)
-    summary: dict = {}
     model = mapper.best(summary)
-    assert summary["mapper"] == "global, near points first" and len(databases) == 2
+    assert used == [False, True] and summary["mapper"] == "global"
     errors = _errors(street, matcher, model)
     assert len(errors) == len(matcher.frames) and errors.max() < 0.03
-    with pycolmap.Database.open(databases[1]) as near, pycolmap.Database.open(matcher.database) as every:
-        kept, before = (np.sum(one.read_two_view_geometry_num_inliers()[1]) for one in (near, every))
-    assert 0.2 * before < kept < 0.9 * before
-    assert np.mean([len(point.track.elements) for point in model.points3D.values()]) > 3.0
 
 
 def test_parallax_is_what_remains_without_the_common_rotation() -> None:

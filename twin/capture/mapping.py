@@ -1,11 +1,11 @@
 """Maps the frames of linked films with COLMAP, and keeps the part of the result that holds together.
 
 A *model* is a COLMAP reconstruction. Global mapping (Pan et al. 2024) is tried first, since the incremental mapper gets
-stuck on forward motion. On a road with little texture, global mapping may tear a film apart: the long tracks of points
-on the skyline, which constrain rotations alone, outnumber the short tracks of near points. The pieces of a torn model
-share no points or differ in scale, so it is recognized, and global mapping is repeated without far points. Frames off
-the path of their neighbors are removed and registered once more against all others, and left out if they are again off
-the path.
+stuck on forward motion. On a road with little texture, global mapping tears a film apart: the long tracks of points on
+the skyline, which constrain rotations alone, outnumber the short tracks of near points. So it begins without far points
+(`near_points.py`), and all points are triangulated afterwards. A model that is torn nevertheless is recognized, and
+other attempts follow. Frames off the path of their neighbors are removed and registered once more against all others,
+and left out if they are again off the path.
 """
 
 import itertools
@@ -35,7 +35,7 @@ _NEAR_PAIRS = 4  # largest number of near pairs per frame
 # The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
 _REMAPPING_FRACTION = 0.05
 _SHARED_POINTS = 15  # points in common that connect two frames of a model
-_FEW_POINTS = 3  # the same for a frame that was registered against a coherent model, and so has its scale
+_MANY_MATCHES = 40  # verified matches of two successive frames, which must then share points
 # The nearest points of a frame measure its scale: in sound models the distance between two frames with common points is
 # up to 22 times the distance of the nearest points; between pieces of a torn model it is 10³ to 10⁷ times.
 _NEAREST_FRACTION = 0.1  # fraction of a frame's points that are nearer than its nearest points are said to be
@@ -82,24 +82,23 @@ def reconstruct(matcher: Matcher, job: dict[str, Any], work: Path, summary: dict
     return model
 
 
-def coherent_frames(model: pycolmap.Reconstruction, matcher: Matcher, least: int = _SHARED_POINTS) -> set[int]:
+def coherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> set[int]:
     """Registered frames of the largest connected part of a model, see `connections`."""
-    frames, connected = connections(model, matcher, least)
+    frames, connected = connections(model, matcher)
     if not connected.nnz:
         return set()
     part = connected_components(connected, directed=False)[1]
     return set(frames[part == np.bincount(part).argmax()].tolist())
 
 
-def connections(
-    model: pycolmap.Reconstruction, matcher: Matcher, least: int = _SHARED_POINTS
-) -> tuple[NDArray[np.int64], csr_matrix]:
+def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArray[np.int64], csr_matrix]:
     """Registered frames (n,), and a matrix (n, n) that is True for connected pairs.
 
-    Two frames are connected if they share points that fix the scale of one to that of the other: `least` points that a
+    Two frames are connected if they share points that fix the scale of one to that of the other: 15 points that a
     third frame sees, too, and that the two see from different directions. In addition the frames must lie near each
     other and have about the same scale: frames that were thrown far off the path may share points that are even farther
-    away, and a piece that shrank lies on one spot.
+    away, and a piece that shrank lies on one spot. A film is cut where two successive frames have many matches, but
+    share few points: the model contradicts these matches, so one of its sides is misplaced.
     """
     frames, poses = registered_poses(model, matcher)
     row = {int(matcher.image_ids[i]): k for k, i in enumerate(frames)}
@@ -115,14 +114,19 @@ def connections(
     nearest = [np.quantile(distance[one], _NEAREST_FRACTION) if one.stop > one.start else np.inf for one in mine]
     ray = offset / np.maximum(distance, 1e-12)[:, None]
     views = csr_matrix((np.ones(len(frame), np.int32), (frame, point)), shape=(len(frames), len(points)))
+    shared, source, verified = (views @ views.T).toarray(), matcher.capture.source_index[frames], matcher.verified()
+    many = [verified.get((int(a), int(b)), 0) >= _MANY_MATCHES for a, b in itertools.pairwise(frames)]
+    piece = np.cumsum([False, *(np.array(many, bool) & (shared.diagonal(1) < _SHARED_POINTS))])
     connected = []
-    for i, j in np.argwhere(np.triu((views @ views.T).toarray() >= least, 1)):
+    for i, j in np.argwhere(np.triu(shared >= _SHARED_POINTS, 1)):
+        if source[i] == source[j] and piece[i] != piece[j]:
+            continue
         apart = np.linalg.norm(poses[i, :3, 3] - poses[j, :3, 3])
         if max(apart, nearest[i], nearest[j]) > _MAX_DISTANCE * min(nearest[i], nearest[j]):
             continue
         _, first, second = np.intersect1d(point[mine[i]], point[mine[j]], assume_unique=True, return_indices=True)
         parallax = np.linalg.norm(ray[mine[i]][first] - ray[mine[j]][second], axis=1)
-        if np.count_nonzero(parallax > FAR_ANGLE) >= least:
+        if np.count_nonzero(parallax > FAR_ANGLE) >= _SHARED_POINTS:
             connected += [(i, j), (j, i)]
     pairs = np.array(connected, np.int64).reshape(-1, 2).T
     return frames, csr_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), shape=(len(frames), len(frames)))
@@ -172,8 +176,8 @@ class Mapper:
 
     def _attempts(self) -> Iterator[tuple[str, Callable[[], pycolmap.Reconstruction | None]]]:
         if self._kind in ("auto", "global"):
-            yield "global", lambda: self._global(self._matcher.database)
             yield _NEAR_POINTS, self._near_points
+            yield "global", lambda: self._global(self._matcher.database)
         if self._kind in ("auto", "incremental"):
             yield "incremental", self._incremental
 
@@ -261,7 +265,7 @@ class Mapper:
             return model
         _deregister(model, matcher, off)
         model = self._register_missing(model)
-        off_again = sorted({*_off_path_frames(model, matcher, limit), *_incoherent_frames(model, matcher, _FEW_POINTS)})
+        off_again = sorted({*_off_path_frames(model, matcher, limit), *_incoherent_frames(model, matcher)})
         _deregister(model, matcher, off_again)
         dropped = set(off) - set(registered_poses(model, matcher)[0].tolist()) | set(off_again)
         summary["outliers"] += sorted(names[i] for i in dropped)
@@ -301,9 +305,9 @@ def _off_path_frames(model: pycolmap.Reconstruction, matcher: Matcher, limit: fl
     return off
 
 
-def _incoherent_frames(model: pycolmap.Reconstruction, matcher: Matcher, least: int = _SHARED_POINTS) -> list[int]:
+def _incoherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> list[int]:
     """Registered frames outside of the largest connected part, if there are points enough to tell."""
-    coherent = coherent_frames(model, matcher, least)
+    coherent = coherent_frames(model, matcher)
     registered = set(registered_poses(model, matcher)[0].tolist())
     return sorted(registered - coherent) if len(coherent) >= MIN_FRAMES else []
 
