@@ -263,7 +263,7 @@ def test_a_film_is_cut_where_the_model_contradicts_the_matches_of_successive_fra
     groups = [tuple(range(5))] * 20 + [(5, 6, 7)] * 20 + [(3, 6, 7)] * 15  # frames 4 and 5 share no point
     model, matcher = _model(street, [0.0, 1, 2, 3, 4, 5, 6, 7], groups)
     assert mapping.coherent_frames(model, matcher) == set(range(5))
-    matcher.verified = lambda: {}
+    matcher.verified = dict
     assert mapping.coherent_frames(model, matcher) == set(range(8))
 
 
