@@ -1,11 +1,11 @@
 """Maps the frames of linked films with COLMAP, and keeps the part of the result that holds together.
 
 A *model* is a COLMAP reconstruction. Global mapping (Pan et al. 2024) is tried first, since the incremental mapper gets
-stuck on forward motion. On a road with little texture, global mapping tears a film apart: the long tracks of points on
-the skyline, which constrain rotations alone, outnumber the short tracks of near points. So it begins without far points
-(`near_points.py`), and all points are triangulated afterwards. A model that is torn nevertheless is recognized, and
-other attempts follow. Frames off the path of their neighbors are removed and registered once more against all others,
-and left out if they are again off the path.
+stuck on forward motion. On a road with little texture, global mapping may tear a film apart: the long tracks of points
+on the skyline, which constrain rotations alone, outnumber the short tracks of near points. The pieces of a torn model
+share no points that fix their scale, so it is recognized, and mapping is repeated without pairs of distant frames, and
+then without far points (`near_points.py`). Frames off the path of their neighbors are removed and registered once more
+against all others, and left out if they are again off the path.
 """
 
 import itertools
@@ -21,7 +21,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from twin.capture.camera_models import camera_to_world
-from twin.capture.matching import Matcher, near_pairs
+from twin.capture.matching import SEQUENCE_STEPS, Matcher, Pair, near_pairs
 from twin.capture.near_points import FAR_ANGLE, remove_far_points
 from twin.capture.worker import send_message
 from twin.errors import InputError
@@ -41,7 +41,6 @@ _MANY_MATCHES = 40  # verified matches of two successive frames, which must then
 _NEAREST_FRACTION = 0.1  # fraction of a frame's points that are nearer than its nearest points are said to be
 _MAX_DISTANCE = 60.0  # [distance of the nearest points] largest distance between two connected frames
 _COHERENT_FRACTION = 0.95  # a model is torn if its largest connected part has a smaller fraction of its frames
-_MOST_INCREMENTAL = 300  # frames; incremental mapping of more takes longer than a torn model is worth
 _NEAR_POINTS = "global, near points first"
 _TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
@@ -156,8 +155,8 @@ class Mapper:
         best: pycolmap.Reconstruction | None = None
         kept: set[int] = set()
         for name, attempt in self._attempts():
-            if name == "incremental" and len(kept) >= needed and len(matcher.frames) > _MOST_INCREMENTAL:
-                break
+            if best is not None and name == "incremental" and len(kept) >= needed:
+                break  # slow, and rarely better than a torn model of global mapping
             model = attempt()
             if model is None:
                 continue
@@ -176,10 +175,21 @@ class Mapper:
 
     def _attempts(self) -> Iterator[tuple[str, Callable[[], pycolmap.Reconstruction | None]]]:
         if self._kind in ("auto", "global"):
-            yield _NEAR_POINTS, self._near_points
             yield "global", lambda: self._global(self._matcher.database)
+            if far := self._loops():
+                yield "global, without loops", lambda: self._global(self._without(far))
+            yield _NEAR_POINTS, self._near_points
         if self._kind in ("auto", "incremental"):
             yield "incremental", self._incremental
+
+    def _loops(self) -> list[Pair]:
+        """Verified pairs of frames that are far from each other in the same film."""
+        source = self._matcher.capture.source_index
+        pairs = self._matcher.verified()
+        return [(i, j) for i, j in pairs if source[i] == source[j] and abs(i - j) > SEQUENCE_STEPS[-1]]
+
+    def _without(self, pairs: list[Pair]) -> Path:
+        return self._matcher.copied_without(pairs, fresh_folder(self._work, "fewer_pairs"))
 
     def _near_points(self) -> pycolmap.Reconstruction | None:
         path = self._matcher.copied_without([], fresh_folder(self._work, "near_points"))
