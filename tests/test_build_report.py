@@ -244,6 +244,7 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("capture", "capture.frames", 5, "Only 5 frames"),
     ("capture", "capture.sources", {"day": {"damaged": 4}}, "4 frame(s)"),
     ("cameras", "cameras.registered", 100, "60 of 160 frames could not be placed"),
+    ("cameras", "cameras.may_drift", ["noon"], "tore them apart: noon."),
     ("cameras", "cameras.reprojection_error_px", 2.5, "2.50 px"),
     ("cameras", "cameras.outliers", ["day/000001"], "day/000001"),
     ("cameras", "cameras.apart", ["day_back"], "day_back"),

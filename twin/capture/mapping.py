@@ -56,7 +56,8 @@ def reconstruct(matcher: Matcher, job: dict[str, Any], work: Path, summary: dict
         matcher: Its matches are complete but for near pairs, which are added.
         job: Settings of the stage, see `sfm.solve_mapping`.
         work: Folder for COLMAP's files.
-        summary: Gets the mapper's name and the numbers of near pairs and of frames left out.
+        summary: Gets the mapper's name, the number of near pairs, the frames left out, and the films whose scale may
+            drift, since all models of global mapping were torn.
 
     Raises:
         InputError: no frame could be registered.
@@ -171,6 +172,9 @@ class Mapper:
                 "texture in view"
             )
         _deregister(best, matcher, _incoherent_frames(best, matcher))
+        drifts = self._kind == "auto" and summary["mapper"] == "incremental"
+        sources = set(matcher.capture.source_index[matcher.frames].tolist()) if drifts else set()
+        summary["may_drift"] = [matcher.capture.sources[s].name for s in sorted(sources)]
         return self._with_all_points(best) if summary["mapper"] == _NEAR_POINTS else best
 
     def _attempts(self) -> Iterator[tuple[str, Callable[[], pycolmap.Reconstruction | None]]]:

@@ -169,7 +169,7 @@ def _metrics(capture: Capture, cameras: Cameras, points: SparsePoints, summary: 
     names = [source.name for source in capture.sources]
     of_source = np.array(cameras.sources)
     copied = ["pairs", "verified_pairs", "near_pairs", "outliers", "registered_anew", "mapper", "joined", "apart"]
-    copied += ["rolling_shutter_deg", "stabilized"]
+    copied += ["may_drift", "rolling_shutter_deg", "stabilized"]
     return {
         "registered": len(cameras),
         "total": len(capture.names),
@@ -319,7 +319,7 @@ def _reconstruct(
     if not solved:
         assert first is not None
         raise first
-    for name in ("near_pairs", "outliers", "registered_anew"):
+    for name in ("near_pairs", "outliers", "registered_anew", "may_drift"):
         summary[name] = sum((one[name] for one in found), summary[name])
     summary["mapper"] = found[0]["mapper"]
     summary["joined"] = [name for one, _ in solved[1:] for name in _source_names(capture, one.frames)]
@@ -338,7 +338,7 @@ def _reconstructed(
 
 
 def _new_summary() -> dict[str, Any]:
-    return {"near_pairs": 0, "outliers": [], "registered_anew": [], "joined": []}
+    return {"near_pairs": 0, "outliers": [], "registered_anew": [], "joined": [], "may_drift": []}
 
 
 def _is_one(solved: tuple[Matcher, pycolmap.Reconstruction], a: NDArray[np.int64], b: NDArray[np.int64]) -> bool:

@@ -104,6 +104,12 @@ def cameras_section(report: dict[str, Any]) -> Section:
         )
         cure = "remove them, or film again along the same path, with the road in view."
         cautions.append(Caution(what, cure))
+    if may_drift := cameras.get("may_drift"):
+        what = (
+            f"The scale may drift along these films, since most attempts tore them apart: {join_names(may_drift, 6)}."
+        )
+        cure = "look at the map: is the road as long as it is, and without jumps? Film with more frames per meter."
+        cautions.append(Caution(what, cure))
     if stabilized := cameras.get("stabilized"):
         films = join_names(stabilized, 6)
         what = f"Stabilization moves the picture in these films, which bends the reconstruction: {films}."
