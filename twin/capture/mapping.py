@@ -35,7 +35,7 @@ _NEAR_PAIRS = 4  # largest number of near pairs per frame
 # The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
 _REMAPPING_FRACTION = 0.05
 _SHARED_POINTS = 15  # points in common that connect two frames of a model
-_MANY_MATCHES = 40  # verified matches of two successive frames, which must then share points
+_MANY_MATCHES = 40  # matches of near points between two successive frames, a tenth of which the model must explain
 # The nearest points of a frame measure its scale: in sound models the distance between two frames with common points is
 # up to 22 times the distance of the nearest points; between pieces of a torn model it is 10³ to 10⁷ times.
 _NEAREST_FRACTION = 0.1  # fraction of a frame's points that are nearer than its nearest points are said to be
@@ -97,8 +97,8 @@ def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArr
     Two frames are connected if they share points that fix the scale of one to that of the other: 15 points that a
     third frame sees, too, and that the two see from different directions. In addition the frames must lie near each
     other and have about the same scale: frames that were thrown far off the path may share points that are even farther
-    away, and a piece that shrank lies on one spot. A film is cut where two successive frames have many matches, but
-    share few points: the model contradicts these matches, so one of its sides is misplaced.
+    away, and a piece that shrank lies on one spot. A film is cut where two successive frames have many
+    matches of near points, but share few of these: the model contradicts the matches, so one of its sides is misplaced.
     """
     frames, poses = registered_poses(model, matcher)
     row = {int(matcher.image_ids[i]): k for k, i in enumerate(frames)}
@@ -114,9 +114,17 @@ def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArr
     nearest = [np.quantile(distance[one], _NEAREST_FRACTION) if one.stop > one.start else np.inf for one in mine]
     ray = offset / np.maximum(distance, 1e-12)[:, None]
     views = csr_matrix((np.ones(len(frame), np.int32), (frame, point)), shape=(len(frames), len(points)))
-    shared, source, verified = (views @ views.T).toarray(), matcher.capture.source_index[frames], matcher.verified()
-    many = [verified.get((int(a), int(b)), 0) >= _MANY_MATCHES for a, b in itertools.pairwise(frames)]
-    piece = np.cumsum([False, *(np.array(many, bool) & (shared.diagonal(1) < _SHARED_POINTS))])
+    shared, source = (views @ views.T).toarray(), matcher.capture.source_index[frames]
+
+    def fixing(i: int, j: int) -> int:
+        """Number of common points that two frames see from different directions."""
+        _, first, second = np.intersect1d(point[mine[i]], point[mine[j]], assume_unique=True, return_indices=True)
+        angle = np.linalg.norm(ray[mine[i]][first] - ray[mine[j]][second], axis=1)
+        return int(np.count_nonzero(angle > FAR_ANGLE))
+
+    near = matcher.near_counts(list(itertools.pairwise(frames.tolist())))
+    cut = [n >= _MANY_MATCHES and fixing(k, k + 1) < min(_SHARED_POINTS, 0.1 * n) for k, n in enumerate(near)]
+    piece = np.cumsum([False, *cut])
     connected = []
     for i, j in np.argwhere(np.triu(shared >= _SHARED_POINTS, 1)):
         if source[i] == source[j] and piece[i] != piece[j]:
@@ -124,9 +132,7 @@ def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArr
         apart = np.linalg.norm(poses[i, :3, 3] - poses[j, :3, 3])
         if max(apart, nearest[i], nearest[j]) > _MAX_DISTANCE * min(nearest[i], nearest[j]):
             continue
-        _, first, second = np.intersect1d(point[mine[i]], point[mine[j]], assume_unique=True, return_indices=True)
-        parallax = np.linalg.norm(ray[mine[i]][first] - ray[mine[j]][second], axis=1)
-        if np.count_nonzero(parallax > FAR_ANGLE) >= _SHARED_POINTS:
+        if fixing(i, j) >= _SHARED_POINTS:
             connected += [(i, j), (j, i)]
     pairs = np.array(connected, np.int64).reshape(-1, 2).T
     return frames, csr_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), shape=(len(frames), len(frames)))
