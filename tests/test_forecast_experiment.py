@@ -238,7 +238,7 @@ def test_an_experiment_stopped_at_every_command_ends_with_the_same_record(foreca
 
 
 def test_a_day_whose_photo_cannot_be_placed_is_left_to_the_held_out_lightings(forecast, filmed, tmp_path):
-    one = _place(forecast, tmp_path, StandIn(forecast, unplaced=("day_1003",)))
+    one = _place(forecast, tmp_path, StandIn(forecast, unplaced=("day_1063",)))
     forecast.command.run_place(one, None)
     record = forecast.place_record.read_place(one.record, 106, SETUPS, one.days)
     assert record.twin[1, 2].tolist() == [10, 20] and record.twin[1, 3].tolist() == [2, 5]

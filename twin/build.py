@@ -43,7 +43,7 @@ class Stage:
 
 _MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")  # the mjcf settings that stage mesh reads
 PIPELINE = (
-    Stage("capture", "twin.capture.frames", 1, ("source", "capture"), ()),
+    Stage("capture", "twin.capture.frames", 2, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 4, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
     Stage("field", "twin.nerf.trainer", 5, ("nerf", "mjcf.route"), ("cameras", "metric")),
@@ -113,7 +113,7 @@ def build(
                 if finished:
                     break
                 done = {name: it.seconds for name, it in stamps.items() if not skipped[name]}
-                changes = ["--force"] if forced else stamp and _changes(depends, stamp.depends)
+                changes = ["--force"] if forced else stamp and stamp.depends and _changes(depends, stamp.depends)
                 _announce(stage, done, until, f", again because of {join_names(changes, 4)}" if changes else "")
                 stamp = _run(stage, scene, config, depends, device)
             stamps[stage.name], skipped[stage.name] = stamp, current

@@ -245,7 +245,7 @@ def _taken(bag: BagContents) -> str:
     else:
         static = bag.topics.get("transforms")
         why = f"its frame is not connected to base_link on {static}" if static else "no /tf_static"
-        lines.append(f"  camera on the robot: {why}; its height is not known")
+        lines.append(f"  camera on the robot: not found, {why}")
     return "\n".join(lines)
 
 

@@ -10,7 +10,7 @@ Topics are found by message type:
 - commands: geometry_msgs/Twist or TwistStamped
 - wheel speeds: sensor_msgs/JointState, with joints named like a Husky's wheels
 - poses: nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped; topics with a word of `FROM_WHEELS`
-  in their name are used only if no other topic has `MIN_POSES` messages
+  in their name, and a Husky's filter of wheels and IMU, are used only if no other topic has `MIN_POSES` messages
 - accelerations: sensor_msgs/Imu
 - pictures: sensor_msgs/Image or CompressedImage
 - calibration: the sensor_msgs/CameraInfo topic whose name has the longest common beginning with that of the pictures'

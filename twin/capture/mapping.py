@@ -73,8 +73,11 @@ def reconstruct(matcher: Matcher, job: dict[str, Any], work: Path, summary: dict
         fresh = len(matcher.verified()) - before
         if fresh > _REMAPPING_FRACTION * before:
             send_message(say=f"  {fresh} new verified pairs: reconstructing again")
-            again = mapper.best(summary)
-            model = again if again.num_reg_images() >= model.num_reg_images() else model
+            about: dict[str, Any] = {}
+            again = mapper.best(about)
+            if again.num_reg_images() >= model.num_reg_images():
+                model = again
+                summary |= about
     model = mapper.without_outliers(model, job["max_outlier"], summary)
     send_message(bar="refinement", total=1)
     mapper.refine(model)
@@ -122,7 +125,7 @@ def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArr
         angle = np.linalg.norm(ray[mine[i]][first] - ray[mine[j]][second], axis=1)
         return int(np.count_nonzero(angle > FAR_ANGLE))
 
-    near = matcher.near_counts(list(itertools.pairwise(frames.tolist())))
+    near = matcher.near_counts(list(itertools.pairwise(frames.tolist())), model)
     cut = [n >= _MANY_MATCHES and fixing(k, k + 1) < min(_SHARED_POINTS, 0.1 * n) for k, n in enumerate(near)]
     piece = np.cumsum([False, *cut])
     connected = []
@@ -285,7 +288,8 @@ class Mapper:
             return model
         _deregister(model, matcher, off)
         model = self._register_missing(model)
-        off_again = sorted({*_off_path_frames(model, matcher, limit), *_incoherent_frames(model, matcher)})
+        _deregister(model, matcher, _incoherent_frames(model, matcher))
+        off_again = _off_path_frames(model, matcher, limit)
         _deregister(model, matcher, off_again)
         dropped = set(off) - set(registered_poses(model, matcher)[0].tolist()) | set(off_again)
         summary["outliers"] += sorted(names[i] for i in dropped)

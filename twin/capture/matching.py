@@ -278,10 +278,10 @@ class Matcher:
         pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
         return {ordered_pair(frame_of[a], frame_of[b]): n for (a, b), n in zip(pairs, counts, strict=True) if n > 0}
 
-    def near_counts(self, pairs: Sequence[Pair]) -> list[int]:
-        """Number of verified matches of near points for each of the pairs, see `near_points.py`."""
+    def near_counts(self, pairs: Sequence[Pair], model: pycolmap.Reconstruction) -> list[int]:
+        """Number of verified matches of near points for each of the pairs, by the cameras of a model."""
         ids = [(int(self.image_ids[i]), int(self.image_ids[j])) for i, j in pairs]
-        return count_near_matches(self.database, ids, self.seed)
+        return count_near_matches(self.database, ids, self.seed, dict(model.cameras.items()))
 
     def linked_groups(self) -> list[NDArray[np.int64]]:
         """Groups of frames (k,) whose sources are linked, the largest first.

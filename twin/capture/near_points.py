@@ -32,21 +32,29 @@ def remove_far_points(path: Path, seed: int) -> None:
                 database.write_two_view_geometry(*pair, geometry)
 
 
-def count_near_matches(path: Path, pairs: Sequence[tuple[int, int]], seed: int) -> list[int]:
-    """Number of verified matches of near points for each pair of image ids in COLMAP's database."""
+def count_near_matches(
+    path: Path, pairs: Sequence[tuple[int, int]], seed: int, refined: dict[int, pycolmap.Camera]
+) -> list[int]:
+    """Number of verified matches of near points for each pair of image ids in COLMAP's database.
+
+    `refined` has cameras by their ids: with a wrong focal length, far points seem to move when the camera turns.
+    """
     wanted = {pycolmap.image_pair_to_pair_id(*pair) for pair in pairs}
     with pycolmap.Database.open(path) as database:
-        found = _near_matches(database, seed, wanted)
+        found = _near_matches(database, seed, wanted, refined)
         counts = {pycolmap.image_pair_to_pair_id(*pair): int(near.sum()) for pair, _, near in found}
     return [counts.get(pycolmap.image_pair_to_pair_id(*pair), 0) for pair in pairs]
 
 
 def _near_matches(
-    database: pycolmap.Database, seed: int, wanted: set[int] | None = None
+    database: pycolmap.Database,
+    seed: int,
+    wanted: set[int] | None = None,
+    refined: dict[int, pycolmap.Camera] | None = None,
 ) -> Iterator[tuple[tuple[int, int], pycolmap.TwoViewGeometry, NDArray[np.bool_]]]:
     """Image ids, geometry and mask of the near matches of the verified pairs; `wanted` holds COLMAP's pair ids."""
     rng = np.random.default_rng(seed)
-    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()} | (refined or {})
     rays = {
         image.image_id: _rays(cameras[image.camera_id], database.read_keypoints(image.image_id)[:, :2])
         for image in database.read_all_images()

@@ -235,7 +235,7 @@ def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
             )
         # A forecast counts days by their names, so a day written in two ways would make intervals too narrow.
         alike = spelled.setdefault(cell.lighting.casefold(), cell.lighting)
-        if alike != cell.lighting:
+        if alike != cell.lighting and not {alike, cell.lighting} <= {key[-1] for key in known}:
             raise InputError(f"{where}: lighting {cell.lighting!r} is {alike!r} above; write the two alike")
         cells[cell.key] = cell
     return list(cells.values())

@@ -109,6 +109,15 @@ def read_bag(path: Path, filmed: FilmedPoses | None = None, poses: str = "") -> 
     for topic, count in lost.items():
         runtime.log_line(f"{path}: {count} messages on {topic} left out: not finite")
     # Of the topics with joint states, those of an arm have no wheels.
+    computed = next((use for use in uses if uses[use] is _wheels_of_odometry), None)
+    if computed and any(rows[use] for use in uses if uses[use] is VALUES["wheels"]):
+        del rows[computed]
+    elif computed:
+        runtime.log_line(
+            f"{path}: no joint states of wheels; wheel speeds are computed from {computed[1]} with Clearpath's "
+            f"multiplier {HuskyParams.separation_multiplier:g}"
+        )
+    rows = {use: found for use, found in rows.items() if found or use[0] != "imu"}  # the IMU is optional
     best = dict(sorted(rows, key=lambda use: len(rows[use])))
     topics = {kind: best[kind] for kind in TYPES if kind in best}
     log_topics(path, topics)
@@ -127,7 +136,7 @@ def _uses(
 ) -> dict[tuple[str, str], Callable[[Any], Any]]:
     """Kind and topic of what is read → function that extracts a message's numbers.
 
-    All topics with joint states are read, and the wheels' odometry if there is none.
+    All topics with joint states are read, and the wheels' odometry.
     """
     counts = messages_by_topic(connections, TYPES["poses"])
     if poses and poses not in counts:
@@ -145,17 +154,14 @@ def _uses(
         runtime.log_line(f"{path}: {len(filmed.times)} poses in the built scene are taken from its pictures")
     uses = {(kind, topic): VALUES[kind] for kind, topic in topics.items()}
     joints = messages_by_topic(connections, TYPES["wheels"])
-    from_wheels = {k: n for k, n in messages_by_topic(connections, (ODOMETRY,)).items() if is_from_wheels(k)}
-    if not joints and from_wheels:
-        topic = max(from_wheels, key=lambda name: from_wheels[name])
-        runtime.log_line(
-            f"{path}: no joint states; wheel speeds are computed from {topic} with Clearpath's multiplier "
-            f"{HuskyParams.separation_multiplier:g}"
-        )
-        return uses | {("wheels", topic): _wheels_of_odometry}
-    return uses | {
-        ("wheels", topic): VALUES["wheels"] for topic in joints or choose_topics(connections, path, ["wheels"])
-    }
+    # A filter's yaw rate comes from the IMU, too.
+    odometry = messages_by_topic(connections, (ODOMETRY,))
+    from_wheels = {name: n for name, n in odometry.items() if is_from_wheels(name) and "filtered" not in name}
+    if from_wheels:
+        uses["wheels", max(from_wheels, key=lambda name: from_wheels[name])] = _wheels_of_odometry
+    elif not joints:
+        choose_topics(connections, path, ["wheels"])  # raises the error that names what is missing
+    return uses | {("wheels", topic): VALUES["wheels"] for topic in joints}
 
 
 def _wheels_of_odometry(message: Any) -> tuple[float, float]:

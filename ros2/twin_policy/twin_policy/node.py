@@ -30,11 +30,11 @@ class PolicyNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("twin_policy", **options)
-        fixed = ParameterDescriptor(read_only=True)  # a change while the node runs would have no effect
 
         def parameter(name: str, default: Any) -> Any:
+            # Read-only: a change while the node runs would have no effect. rclpy keeps and completes the descriptor.
             try:
-                return self.declare_parameter(name, default, fixed).value
+                return self.declare_parameter(name, default, ParameterDescriptor(read_only=True)).value
             except Exception as error:  # another type than the default's, such as 1 for 1.0
                 raise ValueError(f"parameter {name}: {error}") from None
 
