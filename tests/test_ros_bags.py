@@ -32,9 +32,17 @@ def table(drive) -> dict[str, np.ndarray]:
 
 def test_wheel_speeds_of_the_wheels_odometry_are_those_of_the_joints(table, tmp_path: Path) -> None:
     joints = read_bag(write_bag(tmp_path / "joints", table))
-    odometry = read_bag(write_bag(tmp_path / "odometry", table, without=("wheels", "arm")))
-    for name in ("left_wheel_vel", "right_wheel_vel", "x", "cmd_v"):
-        np.testing.assert_allclose(odometry[name], joints[name], atol=1e-9, err_msg=name)
+    for missing in (("wheels", "arm"), ("wheels",)):  # an arm's joint states say nothing about the wheels
+        odometry = read_bag(write_bag(tmp_path / "_".join(missing), table, without=missing))
+        for name in ("left_wheel_vel", "right_wheel_vel", "x", "cmd_v"):
+            np.testing.assert_allclose(odometry[name], joints[name], atol=1e-9, err_msg=name)
+
+
+def test_no_wheel_speeds_are_computed_from_a_filter_that_knows_the_imu(table, tmp_path: Path) -> None:
+    missing = ("wheels", "arm", "wheel odometry")
+    bag = write_bag(tmp_path / "bag", table, without=missing, poses="/odometry/filtered")
+    with pytest.raises(InputError, match="no topic with wheels"):
+        read_bag(bag, poses="/odometry/filtered")
 
 
 def test_poses_of_the_wheels_are_refused_and_those_of_pictures_used(table, tmp_path: Path, capsys) -> None:
@@ -72,6 +80,8 @@ def test_messages_that_are_not_finite_are_left_out(table, tmp_path: Path, capsys
     np.testing.assert_allclose(found["x"][99:104], table["x"][[99, 99, 99, 99, 103]], atol=1e-9)
     said = capsys.readouterr().err
     assert "3 messages on /icp_odom left out: not finite" in said and "1 messages on /imu/data" in said
+    gap["acceleration_y"][:] = np.nan  # the IMU is optional
+    assert len(read_bag(write_bag(tmp_path / "no_imu", gap, without=("camera's imu",)))["time"]) == ROWS
 
 
 def test_the_poses_of_pictures_are_those_of_the_base_below_the_cameras(tmp_path: Path) -> None:

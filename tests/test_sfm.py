@@ -332,11 +332,23 @@ def test_a_torn_model_is_repeated_without_far_points(
     summary: dict = {}
     model = mapper.best(summary)
     assert used[0] == matcher.database and summary["mapper"] == "global, near points first"
+    assert summary["may_drift"] == []
     errors = _errors(street, matcher, model)
     assert len(errors) == len(matcher.frames) and errors.max() < 0.03
     with pycolmap.Database.open(used[-1]) as near:
         kept = np.sum(near.read_two_view_geometry_num_inliers()[1])
     assert 0.2 < kept / sum(matcher.verified().values()) < 0.9
+
+
+def test_films_that_only_incremental_mapping_keeps_together_are_named(
+    street: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matcher, _ = _mapper(street, tmp_path)
+    job = {"mapper": "auto", "min_registered": 0.6, "free_focal": False}
+    summary = sfm._new_summary() | {"near_pairs": 0}
+    monkeypatch.setattr(mapping.Mapper, "_global", lambda *_: None)
+    mapping.reconstruct(matcher, job | {"max_outlier": 0.3}, tmp_path, summary)
+    assert summary["mapper"] == "incremental" and summary["may_drift"] == ["bright", "dim"]
 
 
 def test_parallax_is_what_remains_without_the_common_rotation() -> None:

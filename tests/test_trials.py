@@ -140,6 +140,12 @@ def test_wrong_results_are_refused(tmp_path: Path, text: str, message: str) -> N
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
+def test_lightings_of_the_twin_may_differ_in_case_alone(tmp_path: Path) -> None:
+    twin = [Cell("nerf", "straight", name, 10, 5) for name in ("Day", "day")]
+    rows = read_results(write(tmp_path, HEADER + "nerf,Day,10,5\nnerf,day,10,5\n"), twin)
+    assert [row.lighting for row in rows] == ["Day", "day"]
+
+
 def test_binary_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "results.csv"
     path.write_bytes(b"policy,lighting\xff\xfe\n")
