@@ -20,6 +20,7 @@ Times are nanoseconds.
 """
 
 import contextlib
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -31,7 +32,7 @@ from numpy.typing import NDArray
 
 from twin import runtime
 from twin.errors import InputError, join_names
-from twin.files import is_file
+from twin.files import is_file, read_text
 from twin.robot import WHEELS
 
 if TYPE_CHECKING:
@@ -135,6 +136,10 @@ def _check_chunks(reader: Any) -> None:
         raise ValueError(f"a chunk of {largest:,} bytes; expected at most {_MAX_CHUNK:,}")
 
 
+_COMPRESSED = re.compile(r"compression_mode: *['\"]?[A-Za-z]")
+"""Matches the text of a bag's `METADATA` if its messages or files are compressed, which nothing else says."""
+
+
 @contextmanager
 def _wrap_errors(path: Path, cure: str) -> Iterator[None]:
     try:
@@ -146,7 +151,7 @@ def _wrap_errors(path: Path, cure: str) -> Iterator[None]:
             cure = "the recording was cut off: repair it by `mcap recover`, or " + cure
         elif "not indexed" in str(error):
             cure = "the recording was cut off: repair it by `rosbag reindex`, or " + cure
-        elif is_file(path.parent / METADATA):  # only there stands how the messages are compressed
+        elif is_file(path.parent / METADATA) and _COMPRESSED.search(read_text(path.parent / METADATA)):
             cure = f"give the bag's folder, {path.parent}, or " + cure
         said = str(error).rstrip(".") or type(error).__name__
         raise InputError(f"{path}: not a readable bag: {said}; {cure}") from None
