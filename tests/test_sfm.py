@@ -230,7 +230,7 @@ def _model(
         frame_of=lambda: ids,
         image_ids=np.arange(1, len(places) + 1),
         capture=capture,
-        near_counts=lambda pairs, _: [60] * len(pairs),
+        verified=lambda: {(k, k + 1): 60 for k in range(len(places) - 1)},
     )
     return model, matcher
 
@@ -257,7 +257,6 @@ def test_a_piece_that_shrank_is_not_coherent_although_it_lies_beside_the_others(
     groups, places = [every] * 20 + [shrunk] * 20, [0.0, 1, 2, 3, 4, 4, 4.001, 4.002]
     assert mapping.coherent_frames(*_model(street, places, groups, {shrunk: [4.001, 0.0, 0.005]})) == set(range(5))
     model, matcher = _model(street, places, groups, {shrunk: [4.001, 0.0, 0.5]})
-    matcher.near_counts = lambda pairs, _: [0] * len(pairs)  # the camera stands still
     assert mapping.coherent_frames(model, matcher) == set(range(8))
 
 
@@ -265,7 +264,7 @@ def test_a_film_is_cut_where_the_model_contradicts_the_matches_of_successive_fra
     groups = [tuple(range(5))] * 20 + [(5, 6, 7)] * 20 + [(3, 6, 7)] * 15  # frames 4 and 5 share no point
     model, matcher = _model(street, [0.0, 1, 2, 3, 4, 5, 6, 7], groups)
     assert mapping.coherent_frames(model, matcher) == set(range(5))
-    matcher.near_counts = lambda pairs, _: [0] * len(pairs)
+    matcher.verified = dict
     assert mapping.coherent_frames(model, matcher) == set(range(8))
 
 

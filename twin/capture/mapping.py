@@ -35,7 +35,7 @@ _NEAR_PAIRS = 4  # largest number of near pairs per frame
 # The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
 _REMAPPING_FRACTION = 0.05
 _SHARED_POINTS = 15  # points in common that connect two frames of a model
-_MANY_MATCHES = 40  # matches of near points between two successive frames, a tenth of which the model must explain
+_MANY_MATCHES = 40  # verified matches of two successive frames, which must then share points
 # The nearest points of a frame measure its scale: in sound models the distance between two frames with common points is
 # up to 22 times the distance of the nearest points; between pieces of a torn model it is 10³ to 10⁷ times.
 _NEAREST_FRACTION = 0.1  # fraction of a frame's points that are nearer than its nearest points are said to be
@@ -101,7 +101,7 @@ def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArr
     third frame sees, too, and that the two see from different directions. In addition the frames must lie near each
     other and have about the same scale: frames that were thrown far off the path may share points that are even farther
     away, and a piece that shrank lies on one spot. A film is cut where two successive frames have many
-    matches of near points, but share few of these: the model contradicts the matches, so one of its sides is misplaced.
+    matches, but share few points: the model contradicts these matches, so one of its sides is misplaced.
     """
     frames, poses = registered_poses(model, matcher)
     row = {int(matcher.image_ids[i]): k for k, i in enumerate(frames)}
@@ -125,9 +125,9 @@ def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArr
         angle = np.linalg.norm(ray[mine[i]][first] - ray[mine[j]][second], axis=1)
         return int(np.count_nonzero(angle > FAR_ANGLE))
 
-    near = matcher.near_counts(list(itertools.pairwise(frames.tolist())), model)
-    cut = [n >= _MANY_MATCHES and fixing(k, k + 1) < min(_SHARED_POINTS, 0.1 * n) for k, n in enumerate(near)]
-    piece = np.cumsum([False, *cut])
+    verified = matcher.verified()
+    many = [verified.get(pair, 0) >= _MANY_MATCHES for pair in itertools.pairwise(frames.tolist())]
+    piece = np.cumsum([False, *(np.array(many, bool) & (shared.diagonal(1) < _SHARED_POINTS))])
     connected = []
     for i, j in np.argwhere(np.triu(shared >= _SHARED_POINTS, 1)):
         if source[i] == source[j] and piece[i] != piece[j]:

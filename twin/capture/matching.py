@@ -9,7 +9,6 @@ image. A camera is *known* (a given, fixed calibration), has a focal length *pri
 
 import itertools
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +20,6 @@ from scipy.sparse.csgraph import connected_components
 
 from twin.capture.camera_models import Lens
 from twin.capture.capture_data import Capture, SourceInfo
-from twin.capture.near_points import count_near_matches
 from twin.capture.worker import send_message
 from twin.errors import InputError
 from twin.geometry.images import write_image
@@ -277,11 +275,6 @@ class Matcher:
             pair_ids, counts = database.read_two_view_geometry_num_inliers()
         pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
         return {ordered_pair(frame_of[a], frame_of[b]): n for (a, b), n in zip(pairs, counts, strict=True) if n > 0}
-
-    def near_counts(self, pairs: Sequence[Pair], model: pycolmap.Reconstruction) -> list[int]:
-        """Number of verified matches of near points for each of the pairs, by the cameras of a model."""
-        ids = [(int(self.image_ids[i]), int(self.image_ids[j])) for i, j in pairs]
-        return count_near_matches(self.database, ids, self.seed, dict(model.cameras.items()))
 
     def linked_groups(self) -> list[NDArray[np.int64]]:
         """Groups of frames (k,) whose sources are linked, the largest first.

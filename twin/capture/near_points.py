@@ -5,7 +5,6 @@ not positions or scale. On a road with little texture their tracks are the longe
 best by cameras that stand still.
 """
 
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,46 +23,24 @@ _REFINEMENTS = 3
 
 def remove_far_points(path: Path, seed: int) -> None:
     """Removes the matches of far points from COLMAP's database, and pairs of frames with few others."""
+    rng = np.random.default_rng(seed)
     with pycolmap.Database.open(path) as database:
-        for pair, geometry, near in _near_matches(database, seed):
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        rays = {
+            image.image_id: _rays(cameras[image.camera_id], database.read_keypoints(image.image_id)[:, :2])
+            for image in database.read_all_images()
+        }
+        for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
+            matches = geometry.inlier_matches
+            if not len(matches):
+                continue
+            pair = pycolmap.pair_id_to_image_pair(pair_id)
+            first, second = (rays[image_id][matches[:, k]] for k, image_id in enumerate(pair))
+            near = parallax(first, second, rng) > FAR_ANGLE
             database.delete_two_view_geometry(*pair)
             if near.sum() >= _MIN_MATCHES:
-                geometry.inlier_matches = geometry.inlier_matches[near]
+                geometry.inlier_matches = matches[near]
                 database.write_two_view_geometry(*pair, geometry)
-
-
-def count_near_matches(
-    path: Path, pairs: Sequence[tuple[int, int]], seed: int, refined: dict[int, pycolmap.Camera]
-) -> list[int]:
-    """Number of verified matches of near points for each pair of image ids in COLMAP's database.
-
-    `refined` has cameras by their ids: with a wrong focal length, far points seem to move when the camera turns.
-    """
-    wanted = {pycolmap.image_pair_to_pair_id(*pair) for pair in pairs}
-    with pycolmap.Database.open(path) as database:
-        found = _near_matches(database, seed, wanted, refined)
-        counts = {pycolmap.image_pair_to_pair_id(*pair): int(near.sum()) for pair, _, near in found}
-    return [counts.get(pycolmap.image_pair_to_pair_id(*pair), 0) for pair in pairs]
-
-
-def _near_matches(
-    database: pycolmap.Database,
-    seed: int,
-    wanted: set[int] | None = None,
-    refined: dict[int, pycolmap.Camera] | None = None,
-) -> Iterator[tuple[tuple[int, int], pycolmap.TwoViewGeometry, NDArray[np.bool_]]]:
-    """Image ids, geometry and mask of the near matches of the verified pairs; `wanted` holds COLMAP's pair ids."""
-    rng = np.random.default_rng(seed)
-    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()} | (refined or {})
-    rays = {
-        image.image_id: _rays(cameras[image.camera_id], database.read_keypoints(image.image_id)[:, :2])
-        for image in database.read_all_images()
-    }
-    for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
-        matches, pair = geometry.inlier_matches, pycolmap.pair_id_to_image_pair(pair_id)
-        if len(matches) and (wanted is None or pair_id in wanted):
-            first, second = (rays[image_id][matches[:, k]] for k, image_id in enumerate(pair))
-            yield pair, geometry, parallax(first, second, rng) > FAR_ANGLE
 
 
 def _rays(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Array:
