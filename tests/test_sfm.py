@@ -344,7 +344,7 @@ def test_films_that_only_incremental_mapping_keeps_together_are_named(
 ) -> None:
     matcher, _ = _mapper(street, tmp_path)
     job = {"mapper": "auto", "min_registered": 0.6, "free_focal": False}
-    summary = sfm._new_summary() | {"near_pairs": 0}
+    summary = sfm._new_summary()
     monkeypatch.setattr(mapping.Mapper, "_global", lambda *_: None)
     mapping.reconstruct(matcher, job | {"max_outlier": 0.3}, tmp_path, summary)
     assert summary["mapper"] == "incremental" and summary["may_drift"] == ["bright", "dim"]
