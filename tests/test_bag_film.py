@@ -271,7 +271,7 @@ def test_new_names_a_set_clock_and_the_other_files_of_a_bag(tmp_path: Path, caps
     said = capsys.readouterr().err
     assert "drive_0.mcap: no picture for 100000000.1 s from 1.9 s on" in said
     assert "only this one of the bag's 2 files is used; for all, give its folder" in said
-    assert "camera on the robot: no /tf_static; its height is not known" in said
+    assert "camera on the robot: not found, no /tf_static" in said
 
 
 def test_a_compressed_file_of_a_bag_is_read_in_its_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
