@@ -1,11 +1,11 @@
 """Maps the frames of linked films with COLMAP, and keeps the part of the result that holds together.
 
-A *model* is a COLMAP reconstruction. Global mapping (Pan et al. 2024) is tried first, since the incremental mapper gets
-stuck on forward motion. On a road with little texture, global mapping may tear a film apart: the long tracks of points
-on the skyline, which constrain rotations alone, outnumber the short tracks of near points. The pieces of a torn model
-share no points that fix their scale, so it is recognized, and mapping is repeated without pairs of distant frames, and
-then without far points (`near_points.py`). Frames off the path of their neighbors are removed and registered once more
-against all others, and left out if they are again off the path.
+A *model* is a COLMAP reconstruction. Poses averaged from pairs of frames are tried first (`pose_averaging.py`), then
+COLMAP's global mapping (Pan et al. 2024), then incremental mapping, which gets stuck on forward motion. On a road with
+little texture, global mapping may tear a film apart: the long tracks of points on the skyline, which constrain
+rotations alone, outnumber the short tracks of near points. The pieces of a torn model share no points that fix their
+scale, so it is recognized. Frames off the path of their neighbors are removed and registered once more against all
+others, and left out if they are again off the path.
 """
 
 import itertools
@@ -22,10 +22,12 @@ from scipy.sparse.csgraph import connected_components
 
 from twin.capture.camera_models import camera_to_world
 from twin.capture.matching import SEQUENCE_STEPS, Matcher, Pair, near_pairs
-from twin.capture.near_points import FAR_ANGLE, remove_far_points
+from twin.capture.pair_geometry import pair_geometries
+from twin.capture.pose_averaging import averaged_poses
 from twin.capture.worker import send_message
 from twin.errors import InputError
 from twin.geometry.passes import path_outliers
+from twin.geometry.poses import inverse_pose
 from twin.types import Array
 
 MIN_FRAMES = 3
@@ -41,7 +43,8 @@ _MANY_MATCHES = 40  # verified matches of two successive frames, which must then
 _NEAREST_FRACTION = 0.1  # fraction of a frame's points that are nearer than its nearest points are said to be
 _MAX_DISTANCE = 60.0  # [distance of the nearest points] largest distance between two connected frames
 _COHERENT_FRACTION = 0.95  # a model is torn if its largest connected part has a smaller fraction of its frames
-_NEAR_POINTS = "global, near points first"
+_FAR_ANGLE = np.radians(0.8)  # points that two frames see from less different directions do not fix their scale
+_AVERAGINGS = 2  # bundle adjustments of averaged poses, each after a triangulation
 _TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
 _MIN_ANGLE = 0.5  # [°] smallest angle between two rays to a point
@@ -123,7 +126,7 @@ def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArr
         """Number of common points that two frames see from different directions."""
         _, first, second = np.intersect1d(point[mine[i]], point[mine[j]], assume_unique=True, return_indices=True)
         angle = np.linalg.norm(ray[mine[i]][first] - ray[mine[j]][second], axis=1)
-        return int(np.count_nonzero(angle > FAR_ANGLE))
+        return int(np.count_nonzero(angle > _FAR_ANGLE))
 
     verified = matcher.verified()
     many = [verified.get(pair, 0) >= _MANY_MATCHES for pair in itertools.pairwise(frames.tolist())]
@@ -184,14 +187,15 @@ class Mapper:
         drifts = self._kind == "auto" and summary["mapper"] == "incremental"
         sources = set(matcher.capture.source_index[matcher.frames].tolist()) if drifts else set()
         summary["may_drift"] = [matcher.capture.sources[s].name for s in sorted(sources)]
-        return self._with_all_points(best) if summary["mapper"] == _NEAR_POINTS else best
+        return best
 
     def _attempts(self) -> Iterator[tuple[str, Callable[[], pycolmap.Reconstruction | None]]]:
+        if self._kind in ("auto", "averaging"):
+            yield "averaging", self._averaging
         if self._kind in ("auto", "global"):
             yield "global", lambda: self._global(self._matcher.database)
             if far := self._loops():
                 yield "global, without loops", lambda: self._global(self._without(far))
-            yield _NEAR_POINTS, self._near_points
         if self._kind in ("auto", "incremental"):
             yield "incremental", self._incremental
 
@@ -204,16 +208,19 @@ class Mapper:
     def _without(self, pairs: list[Pair]) -> Path:
         return self._matcher.copied_without(pairs, fresh_folder(self._work, "fewer_pairs"))
 
-    def _near_points(self) -> pycolmap.Reconstruction | None:
-        path = self._matcher.copied_without([], fresh_folder(self._work, "near_points"))
-        remove_far_points(path, self._matcher.seed)
-        return self._global(path)
-
-    def _with_all_points(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """The model with points triangulated from all matches."""
-        folder, options = fresh_folder(self._work, "all_points"), self._incremental_options()
+    def _averaging(self) -> pycolmap.Reconstruction | None:
         matcher = self._matcher
-        return pycolmap.triangulate_points(model, matcher.database, matcher.images, folder, True, options, False)
+        pairs = pair_geometries(matcher.database, matcher.seed)
+        frames, poses = averaged_poses(pairs, matcher.frame_of(), matcher.capture.source_index)
+        if len(frames) < MIN_FRAMES:
+            return None
+        model = posed_model(matcher, frames, poses)
+        send_message(bar="points", total=_AVERAGINGS)
+        for _ in range(_AVERAGINGS):
+            model = triangulated(matcher, model, self._work)
+            self.refine(model)
+            send_message(step=1)
+        return model
 
     def _global(self, database: Path) -> pycolmap.Reconstruction | None:
         matcher = self._matcher
@@ -307,6 +314,26 @@ class Mapper:
         matcher = self._matcher
         again = _largest(pycolmap.incremental_mapping(matcher.database, matcher.images, target, options, source))
         return model if again is None else again
+
+
+def posed_model(matcher: Matcher, frames: NDArray[np.int64], poses: Array) -> pycolmap.Reconstruction:
+    """A model of frames (n,) with camera_to_world (n, 4, 4), without points."""
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(matcher.database) as database:
+        for camera in database.read_all_cameras():
+            model.add_camera_with_trivial_rig(camera)
+        for i, pose in zip(frames, poses, strict=True):
+            image = database.read_image(int(matcher.image_ids[i]))
+            fresh = pycolmap.Image(image.name, pycolmap.Point2DList(), image.camera_id, image.image_id)
+            model.add_image_with_trivial_frame(fresh, pycolmap.Rigid3d(inverse_pose(pose)[:3]))
+    return model
+
+
+def triangulated(matcher: Matcher, model: pycolmap.Reconstruction, work: Path) -> pycolmap.Reconstruction:
+    """The model with points triangulated anew from all verified matches, under its poses."""
+    options, folder = pycolmap.IncrementalPipelineOptions(), fresh_folder(work, "triangulated")
+    options.num_threads, options.random_seed = matcher.threads, matcher.seed
+    return pycolmap.triangulate_points(model, matcher.database, matcher.images, folder, True, options, False)
 
 
 def _largest(models: dict[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:

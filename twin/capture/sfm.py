@@ -26,8 +26,10 @@ from twin.capture.mapping import (
     coherent_frames,
     connections,
     fresh_folder,
+    posed_model,
     reconstruct,
     registered_poses,
+    triangulated,
 )
 from twin.capture.matching import (
     PROBE_INLIERS,
@@ -39,6 +41,7 @@ from twin.capture.matching import (
     probe_pairs,
     sequence_pairs,
 )
+from twin.capture.pair_geometry import estimate_focal_lengths
 from twin.capture.rolling_shutter import RollingShutter, correct_model, corrected_map, corrected_pinhole
 from twin.capture.worker import run_worker, send_message
 from twin.config import CamerasConfig, SceneConfig
@@ -46,7 +49,6 @@ from twin.errors import InputError
 from twin.files import read_json, write_json
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.images import decode_image
-from twin.geometry.poses import inverse_pose
 from twin.scene import SceneDir
 from twin.types import Array
 
@@ -266,18 +268,7 @@ def _triangulate(matcher: Matcher, given: Array, work: Path) -> pycolmap.Reconst
     """Triangulates points under the given, constant poses (n, 4, 4)."""
     near = near_pairs(given, np.arange(len(given)), set(), np.inf, _POSED_PAIRS)
     matcher.match(sequence_pairs(matcher.capture.source_index) | near, "matches")
-    model = pycolmap.Reconstruction()
-    with pycolmap.Database.open(matcher.database) as database:
-        for camera in database.read_all_cameras():
-            model.add_camera_with_trivial_rig(camera)
-        for i, image_id in enumerate(matcher.image_ids):
-            image = database.read_image(int(image_id))
-            fresh = pycolmap.Image(image.name, pycolmap.Point2DList(), image.camera_id, image.image_id)
-            model.add_image_with_trivial_frame(fresh, pycolmap.Rigid3d(inverse_pose(given[i])[:3]))
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed = matcher.threads, matcher.seed
-    folder = fresh_folder(work, "posed")
-    return pycolmap.triangulate_points(model, matcher.database, matcher.images, folder, True, options, False)
+    return triangulated(matcher, posed_model(matcher, np.arange(len(given)), given), work)
 
 
 def _reconstruct(
@@ -295,7 +286,7 @@ def _reconstruct(
             "no two frames show the same place; film slower with texture in view, or raise capture.fps for more overlap"
         )
     if not all(source.camera_params for source in capture.sources) or job["free_focal"]:
-        pycolmap.calibrate_view_graph(matcher.database)
+        estimate_focal_lengths(matcher.database, job["seed"])
     groups = matcher.linked_groups()
     if len(groups) == 1:
         return [(matcher, reconstruct(matcher, job, work, summary))]

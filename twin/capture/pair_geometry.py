@@ -1,0 +1,302 @@
+"""Relative poses of pairs of frames, and focal lengths, from verified matches.
+
+COLMAP's relative pose of a pair is often wrong by degrees on a road: the ground is one plane, which two poses explain
+equally well, and repeated patterns are matched one period off. Here all matches of a pair share a pose that minimizes
+their epipolar error under a Cauchy loss. Several starts are tried, since there are many local minima; one of them is
+the rotation on which most matches agree, that of points on the skyline.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from twin.capture.worker import send_message
+from twin.types import Array
+
+MIN_MATCHES = 15
+"""Least number of matches of a pair, and of those that fix its scale."""
+_PIXEL_ERROR = 0.5  # [px] standard deviation of the epipolar error of a right match
+_OUTLIER = 4.0  # [standard deviations] matches with a larger epipolar error are wrong
+_NEAR_ANGLE = np.radians(0.5)  # smallest angle between the rays to a point whose depth is used
+_MIN_COSINE = 0.2  # of the angle from the optical axis, in the size of a pixel
+_MIN_SINE = 0.02  # the epipolar error of rays nearer to the epipole is not magnified further
+_WIDE = 4.0  # the first steps use a loss that is wider by this factor
+_WIDE_STEPS, _STEPS = 5, 12  # largest number of Gauss–Newton steps
+_ROTATION_TRIALS, _TRANSLATION_TRIALS = 60, 120  # random pairs of matches that propose a rotation and a translation
+_SAME_ROTATION = np.radians(0.2)  # largest deviation of a far point from the rotation that most points share
+_FOCAL_PAIRS, _FOCAL_MATCHES = 24, 300  # largest numbers of pairs and of their matches that a focal length is fitted to
+_FOCAL_STEPS = 3  # [frames] largest distance of these pairs
+_FOCAL_GRID = np.geomspace(0.45, 2.2, 12)  # [longer side] first guesses
+_FOCAL_PRIOR = 0.5  # standard deviation of the logarithm of the focal length about COLMAP's guess
+
+
+@dataclass
+class PairGeometry:
+    """Matched features of two frames, and the pose of the second camera relative to the first.
+
+    A point x in the coordinates of the first camera is at rotation @ x + translation in those of the second. The unit
+    of length is the distance of the two cameras.
+    """
+
+    first: int  # COLMAP's ids of the two images
+    second: int
+    rotation: Array  # (3, 3)
+    translation: Array  # (3,), of length 1
+    features: NDArray[np.int64]  # (n, 2) numbers of the matched features that are near and in front of both cameras
+    depths: Array  # (n, 2) their distances from both cameras
+    depth_error: Array  # (n,) relative standard deviation of the depths
+    rotation_error: float  # [rad] standard deviation
+    direction_error: float  # [rad] standard deviation of the translation's direction
+    agreeing: float  # fraction of all matches that agree with the pose
+
+
+def pair_geometries(database: Path, seed: int) -> list[PairGeometry]:
+    """Geometry of all verified pairs of a database, with its cameras' present parameters."""
+    with pycolmap.Database.open(database) as opened:
+        cameras, camera_of = _cameras(opened)
+        points = {image_id: opened.read_keypoints(image_id)[:, :2].astype(np.float64) for image_id in camera_of}
+        found = zip(*opened.read_two_view_geometries(), strict=True)
+        verified = [
+            (pycolmap.pair_id_to_image_pair(pair_id), geometry)
+            for pair_id, geometry in found
+            if len(geometry.inlier_matches) >= MIN_MATCHES
+        ]
+    send_message(bar="relative poses", total=len(verified))
+    rays = {image_id: camera_rays(cameras[camera_of[image_id]], xy) for image_id, xy in points.items()}
+    out: list[PairGeometry] = []
+    for (first, second), geometry in verified:
+        send_message(step=1)
+        matches = geometry.inlier_matches.astype(np.int64)
+        two = cameras[camera_of[first]], cameras[camera_of[second]]
+        rng = np.random.default_rng([seed, first, second])
+        a, b = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
+        starts = [common_rotation(a, b, rng)]
+        if pycolmap.estimate_two_view_geometry_pose(two[0], points[first], two[1], points[second], geometry):
+            starts.append(geometry.cam2_from_cam1.rotation.matrix())
+        error = _errors(b, float(np.mean([1 / camera.mean_focal_length() for camera in two])))
+        rotation, translation = relative_pose(a, b, [*starts, np.eye(3)], error, rng)
+        out.append(_described(first, second, matches, a, b, rotation, translation, error))
+    return out
+
+
+def _cameras(database: pycolmap.Database) -> tuple[dict[int, pycolmap.Camera], dict[int, int]]:
+    """The cameras, and the camera of each image, by COLMAP's ids."""
+    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    return cameras, {image.image_id: image.camera_id for image in database.read_all_images()}
+
+
+def camera_rays(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Array:
+    """Unit directions (n, 3) of pixels (n, 2) in the camera's coordinates."""
+    directions = np.ones((len(pixels), 3))
+    directions[:, :2] = camera.cam_from_img(pixels)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _errors(rays: Array, pixel: float) -> Array:
+    """[rad] Standard deviations (n,) of the epipolar errors of right matches; `pixel` [rad] is a central pixel's size.
+
+    Pixels are smaller off the center. Without this, short focal lengths would seem to fit better.
+    """
+    return _PIXEL_ERROR * pixel * np.maximum(rays[:, 2], _MIN_COSINE)
+
+
+def _described(
+    first: int, second: int, matches: NDArray, a: Array, b: Array, rotation: Array, translation: Array, error: Array
+) -> PairGeometry:
+    residual, hessian = _epipolar(a, b, rotation, translation, error)[:2]
+    agrees = np.abs(residual) < _OUTLIER
+    turned = a @ rotation.T
+    cosine = (turned * b).sum(1)
+    angle = np.arctan2(np.linalg.norm(np.cross(turned, b), axis=1), cosine)
+    along_a, along_b = turned @ translation, b @ translation
+    depths = np.stack([cosine * along_b - along_a, along_b - cosine * along_a], 1)
+    depths /= np.maximum(np.sin(angle)[:, None] ** 2, 1e-12)
+    usable = agrees & (angle > _NEAR_ANGLE)
+    if (usable & (depths < 0).all(1)).sum() > (usable & (depths > 0).all(1)).sum():
+        depths, translation = -depths, -translation
+    near = usable & (depths > 0).all(1)
+    covariance = np.linalg.pinv(hessian)
+    rotation_error, direction_error = (
+        float(np.sqrt(np.trace(part))) for part in (covariance[:3, :3], covariance[3:, 3:])
+    )
+    depth_error = error[near] / angle[near]
+    kept = matches[near], depths[near], depth_error, rotation_error, direction_error, float(agrees.mean())
+    return PairGeometry(first, second, rotation, translation, *kept)
+
+
+# ---- relative pose
+
+
+def relative_pose(
+    a: Array, b: Array, rotations: Sequence[Array], error: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Rotation (3, 3) and direction of translation (3,), up to its sign, of the second camera relative to the first.
+
+    Args:
+        a: Unit rays (n, 3) of the matches in the first camera.
+        b: Those in the second camera.
+        rotations: Starts (3, 3).
+        error: [rad] Standard deviations (n,) of the epipolar errors of right matches.
+        rng: Draws matches.
+    """
+    found = []
+    for start in rotations:
+        wide = _minimized(a, b, start, _first_translation(a, b, start, error, rng), _WIDE * error, _WIDE_STEPS)
+        found.append(_minimized(a, b, wide[0], wide[1], error, _STEPS))
+    return min(found, key=lambda one: one[2])[:2]
+
+
+def common_rotation(a: Array, b: Array, rng: np.random.Generator) -> Array:
+    """The rotation (3, 3) on which most matched unit rays (n, 3) agree, by RANSAC (Fischler and Bolles 1981)."""
+    at = rng.integers(len(a), size=(_ROTATION_TRIALS, 2))
+    rotations = np.swapaxes(_triads(b[at]), 1, 2) @ _triads(a[at])
+    agree = np.linalg.norm(a @ np.swapaxes(rotations, 1, 2) - b, axis=2) < _SAME_ROTATION
+    chosen = agree[np.argmax(agree.sum(1))]
+    return Rotation.align_vectors(b[chosen], a[chosen])[0].as_matrix() if chosen.sum() > 1 else np.eye(3)
+
+
+def _triads(rays: Array) -> Array:
+    """Orthonormal axes (n, 3, 3), one per row, spanned by pairs of rays (n, 2, 3); zero if the two are parallel."""
+    normal = np.cross(rays[:, 0], rays[:, 1])
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return np.stack([rays[:, 0], normal, np.cross(rays[:, 0], normal)], 1)
+
+
+def _first_translation(a: Array, b: Array, rotation: Array, error: Array, rng: np.random.Generator) -> Array:
+    """The translation with the smallest epipolar errors, of the forward direction and those of random pairs of matches.
+
+    The translation lies in the plane of the two rays of each match, so two matches determine it.
+    """
+    turned = a @ rotation.T
+    normals = np.cross(turned, b)
+    at = rng.integers(len(a), size=(_TRANSLATION_TRIALS, 2))
+    proposed = np.concatenate([np.cross(normals[at[:, 0]], normals[at[:, 1]]), [[0.0, 0.0, 1.0]]])
+    length = np.linalg.norm(proposed, axis=1)
+    proposed = proposed[length > 1e-12] / length[length > 1e-12, None]
+    sine = np.sqrt(np.maximum(1 - (proposed @ turned.T) ** 2, _MIN_SINE**2))
+    costs = np.log1p((proposed @ normals.T / (_WIDE * error * sine)) ** 2).sum(1)
+    return proposed[np.argmin(costs)]
+
+
+def _epipolar(
+    a: Array, b: Array, rotation: Array, translation: Array, error: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Angles between the second rays and their epipolar planes, and the normal equations of a Gauss–Newton step.
+
+    The unknowns are a small rotation (3,), applied after the rotation, and shifts along two directions across the
+    translation: returns the residuals (n,) in standard deviations, the Hessian (5, 5), the gradient (5,)
+    and the directions (2, 3).
+    """
+    turned = a @ rotation.T
+    sine = (error * np.sqrt(np.maximum(1 - (turned @ translation) ** 2, _MIN_SINE**2)))[:, None]
+    across = np.linalg.svd(translation[None])[2][1:]
+    normals = np.cross(turned, b) / sine
+    residual = normals @ translation
+    jacobian = np.concatenate([np.cross(turned, np.cross(b, translation)) / sine, normals @ across.T], 1)
+    weighted = jacobian / (1 + residual**2)[:, None]
+    return residual, weighted.T @ jacobian, weighted.T @ residual, across
+
+
+def _minimized(
+    a: Array, b: Array, rotation: Array, translation: Array, error: Array, steps: int
+) -> tuple[Array, Array, float]:
+    """Rotation, translation and cost after a few steps of Levenberg and Marquardt's method under a Cauchy loss."""
+    damping = 1e-4
+    residual, hessian, gradient, across = _epipolar(a, b, rotation, translation, error)
+    cost = float(np.log1p(residual**2).sum())
+    for _ in range(steps):
+        step = -np.linalg.solve(hessian + np.diag(damping * np.diag(hessian) + 1e-12), gradient)
+        turned = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
+        moved = translation + step[3:] @ across
+        moved /= np.linalg.norm(moved)
+        terms = _epipolar(a, b, turned, moved, error)
+        fresh = float(np.log1p(terms[0] ** 2).sum())
+        if fresh >= cost:
+            damping *= 10
+            continue
+        converged = cost - fresh < 1e-6 * cost
+        rotation, translation, cost, damping = turned, moved, fresh, max(damping / 5, 1e-7)
+        _, hessian, gradient, across = terms
+        if converged:
+            break
+    return rotation, translation, cost
+
+
+# ---- focal lengths
+
+
+def estimate_focal_lengths(database: Path, seed: int) -> None:
+    """Fits the focal length and the first distortion parameter of each camera without a prior to pairs of near frames.
+
+    Images of a camera must have ids in the order of time. A camera keeps its parameters if no pair is usable.
+    """
+    with pycolmap.Database.open(database) as opened:
+        cameras, camera_of = _cameras(opened)
+        found = zip(*opened.read_two_view_geometries(), strict=True)
+        verified = [(pycolmap.pair_id_to_image_pair(pair_id), geometry.inlier_matches) for pair_id, geometry in found]
+        for camera in cameras.values():
+            if camera.has_prior_focal_length:
+                continue
+            send_message(bar=f"focal length of camera {camera.camera_id}", total=0)
+            near = [
+                (first, second, matches[:: 1 + len(matches) // _FOCAL_MATCHES])
+                for (first, second), matches in verified
+                if camera_of[first] == camera_of[second] == camera.camera_id
+                and abs(first - second) <= _FOCAL_STEPS
+                and len(matches) >= 2 * MIN_MATCHES
+            ]
+            chosen = near[:: 1 + len(near) // _FOCAL_PAIRS]
+            ids = sorted({image_id for first, second, _ in chosen for image_id in (first, second)})
+            points = {image_id: opened.read_keypoints(image_id)[:, :2].astype(np.float64) for image_id in ids}
+            pixels = [(points[first][m[:, 0]], points[second][m[:, 1]]) for first, second, m in chosen]
+            if pixels:
+                camera.params = _fitted_camera(camera, pixels, np.random.default_rng(seed))
+                opened.update_camera(camera)
+
+
+def _fitted_camera(camera: pycolmap.Camera, pixels: list[tuple[Array, Array]], rng: np.random.Generator) -> list[float]:
+    """Parameters of a camera that explain the matched pixels (n, 2) of pairs of its frames with the least cost."""
+    focals, distortion = list(camera.focal_length_idxs()), list(camera.extra_params_idxs())[:1]
+    guess, first = camera.mean_focal_length(), np.array(camera.params, np.float64)
+    poses: list[tuple[Array, Array]] = []
+
+    def changed(focal: float, distort: float) -> pycolmap.Camera:
+        params = first.copy()
+        params[focals] = focal
+        params[distortion] = distort
+        camera.params = params.tolist()
+        return camera
+
+    def cost(values: Array) -> float:
+        """Cost of the logarithm of the focal length, and of the distortion parameter, from the poses found before."""
+        focal = float(np.exp(values[0]))
+        one = changed(focal, float(values[1]))
+        total = 0.5 * ((values[0] - np.log(guess)) / _FOCAL_PRIOR) ** 2
+        for k, (p, q) in enumerate(pixels):
+            a, b = camera_rays(one, p), camera_rays(one, q)
+            if not np.isfinite(a).all() or not np.isfinite(b).all():
+                return np.inf
+            total += _minimized(a, b, *poses[k], _errors(b, 1 / focal), _WIDE_STEPS)[2]
+        return total
+
+    best = (np.inf, 0.0, poses)
+    for focal in max(camera.width, camera.height) * _FOCAL_GRID:
+        one = changed(float(focal), 0.0)
+        both = [(camera_rays(one, p), camera_rays(one, q)) for p, q in pixels]
+        poses = [
+            relative_pose(a, b, [common_rotation(a, b, rng), np.eye(3)], _errors(b, 1 / focal), rng) for a, b in both
+        ]
+        best = min(best, (cost(np.array([np.log(focal), 0.0])), float(np.log(focal)), poses), key=lambda one: one[0])
+    _, start, poses = best
+    simplex = [[start, 0.0], [start + 0.1, 0.0], [start, 0.05]]
+    options = {"initial_simplex": simplex, "xatol": 2e-3, "fatol": 0.1, "maxfev": 60}
+    found = (
+        minimize(cost, simplex[0], method="Nelder-Mead", options=options).x if distortion else np.array([start, 0.0])
+    )
+    return list(changed(float(np.exp(found[0])), float(found[1])).params)

@@ -1,0 +1,230 @@
+"""Camera poses of all frames from the relative poses of pairs.
+
+Rotations are averaged first. The unit of length of a pair is the distance of its two cameras. Two pairs with a common
+frame that see the same near points there have known relative units, so the units of all pairs follow, and then the
+positions (as in Cui and Tan 2015). Far points affect rotations alone. Each of the three steps solves equations of
+differences, x[first] − x[second] = value, under a Cauchy loss, and starts from the tree of the most reliable equations.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csr_matrix, diags, eye
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.sparse.linalg import spsolve
+from scipy.spatial.transform import Rotation
+
+from twin.capture.pair_geometry import MIN_MATCHES, PairGeometry
+from twin.types import Array
+
+_OUTLIER = 3.0  # [standard deviations] scale of the Cauchy loss
+_STEPS = 50  # largest number of steps of a solution
+_MIN_ROTATION_ERROR = np.radians(0.02)  # standard deviation of a pair's rotation, at least
+_MAX_ROTATION_RESIDUAL = np.radians(0.5)  # pairs that deviate more from the averaged rotations are left out
+_MIN_SCALE_ERROR = 0.004  # standard deviation of the logarithm of a ratio of units, at least
+_MIN_DIRECTION_ERROR = 0.015  # [rad] standard deviation of the direction between two cameras, at least
+_SHARED = 5  # least number of near points in common of two pairs
+_WRONG = 4.0  # [standard deviations] an equation with a larger residual is wrong
+_WRONG_FRACTION = 0.5  # a pair with a larger fraction of wrong equations is left out
+_OTHER_FILM_STEPS = (
+    10  # [frames] a pair of frames of two films is as reliable as one of frames so far apart in one film
+)
+
+
+@dataclass(frozen=True)
+class Differences:
+    """Equations x[first] − x[second] = value for unknowns x (n, ...)."""
+
+    first: NDArray[np.int64]  # (m,)
+    second: NDArray[np.int64]  # (m,)
+    value: Array  # (m, k)
+    error: Array  # (m,) standard deviation of a value
+    cost: Array  # (m,) unreliability; the first guess follows the tree with the smallest sum
+
+
+def averaged_poses(
+    pairs: list[PairGeometry], row_of: dict[int, int], film: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Array]:
+    """Frames (k,) whose poses are determined together, and their camera_to_world (k, 4, 4) in any unit of length.
+
+    Args:
+        pairs: Pairs with geometry.
+        row_of: Frame of each of COLMAP's images.
+        film: Film of each frame (n,), whose frames are in the order of time.
+    """
+    first = np.array([row_of[pair.first] for pair in pairs], np.int64)
+    second = np.array([row_of[pair.second] for pair in pairs], np.int64)
+    steps = np.where(film[first] == film[second], np.abs(first - second), _OTHER_FILM_STEPS)
+    cost = steps / np.array([max(len(pair.features), 1) * pair.agreeing**4 for pair in pairs])
+    rotations, residual = _average_rotations(pairs, first, second, cost, len(film))
+    usable = [
+        k
+        for k, pair in enumerate(pairs)
+        if residual[k] < max(_MAX_ROTATION_RESIDUAL, 3 * pair.rotation_error) and len(pair.features) >= MIN_MATCHES
+    ]
+    scaled, units = _units([pairs[k] for k in usable], len(usable))
+    kept = np.array(usable, np.int64)[scaled]
+    if not len(kept):
+        return np.zeros(0, np.int64), np.zeros((0, 4, 4))
+    units /= np.median(units)
+    directions = np.stack([-rotations[second[k]].T @ pairs[k].translation for k in kept])
+    errors = np.array([max(pairs[k].direction_error, _MIN_DIRECTION_ERROR) for k in kept]) * units
+    frames, positions, _ = solve_differences(
+        Differences(second[kept], first[kept], units[:, None] * directions, errors, cost[kept]), len(film)
+    )
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, :3, :3] = np.swapaxes(rotations[frames], 1, 2)
+    poses[:, :3, 3] = positions[frames]
+    return frames, poses
+
+
+def _average_rotations(
+    pairs: list[PairGeometry], first: NDArray[np.int64], second: NDArray[np.int64], cost: Array, count: int
+) -> tuple[Array, Array]:
+    """Rotations (count, 3, 3) from world to camera, and the deviation (m,) [rad] of each pair, infinite if unconnected.
+
+    Chatterjee and Govindu (2013).
+    """
+    relative = np.array([pair.rotation for pair in pairs])
+    rotations = np.tile(np.eye(3), (count, 1, 1))
+    reached = np.zeros(count, bool)
+    for k, known, fresh in _tree(first, second, cost, count):
+        turn = relative[k] if fresh == second[k] else relative[k].T
+        rotations[fresh] = turn @ rotations[known]
+        reached[[known, fresh]] = True
+    inside = reached[first] & reached[second]
+    error = np.array([max(pair.rotation_error, _MIN_ROTATION_ERROR) for pair in pairs])[inside]
+    a, b = first[inside], second[inside]
+    system = _matrix(b, a, count)
+
+    def deviations() -> Array:
+        """In world coordinates, (m, 3) [rad]."""
+        return Rotation.from_matrix(np.swapaxes(rotations[b], 1, 2) @ relative[inside] @ rotations[a]).as_rotvec()
+
+    for _ in range(_STEPS):
+        step = _weighted_step(system, deviations(), error)
+        rotations = rotations @ Rotation.from_rotvec(step).as_matrix()
+        if np.abs(step).max() < 1e-7:
+            break
+    residual = np.full(len(pairs), np.inf)
+    residual[inside] = np.linalg.norm(deviations(), axis=1)
+    return rotations, residual
+
+
+def _units(pairs: list[PairGeometry], count: int) -> tuple[NDArray[np.int64], Array]:
+    """Pairs (k,) whose units of length are known relative to each other, and these units (k,)."""
+    equations = _unit_equations(pairs)
+    if not equations:
+        return np.zeros(0, np.int64), np.zeros(0)
+    first, second = (np.array([one[k] for one in equations], np.int64) for k in (0, 1))
+    value, error, shared = (np.array([one[k] for one in equations], np.float64) for k in (2, 3, 4))
+    solved, logarithms, residual = solve_differences(
+        Differences(first, second, value[:, None], error, 1 / shared), count
+    )
+    wrong = (residual > _WRONG * error).astype(np.float64)
+    used = np.isfinite(residual)
+    ends = np.concatenate([first[used], second[used]])
+    bad = np.bincount(ends, np.tile(wrong[used], 2), minlength=count) / np.maximum(
+        np.bincount(ends, minlength=count), 1
+    )
+    good = solved[bad[solved] < _WRONG_FRACTION]
+    return good, np.exp(logarithms[good, 0])
+
+
+def _unit_equations(pairs: list[PairGeometry]) -> list[tuple[int, int, float, float, int]]:
+    """For pairs with near points in common: both pairs, the difference of the logarithms of their units, its standard
+    deviation, and the number of points."""
+    at: dict[int, list[tuple[int, int]]] = {}
+    for k, pair in enumerate(pairs):
+        at.setdefault(pair.first, []).append((k, 0))
+        at.setdefault(pair.second, []).append((k, 1))
+    equations: list[tuple[int, int, float, float, int]] = []
+    for views in at.values():
+        count = 1 + max(int(pairs[k].features[:, side].max()) for k, side in views)
+        depth = np.full((len(views), count), np.nan)
+        variance = np.full((len(views), count), np.nan)
+        for row, (k, side) in enumerate(views):
+            feature = pairs[k].features[:, side]
+            depth[row, feature] = np.log(pairs[k].depths[:, side])
+            variance[row, feature] = pairs[k].depth_error ** 2
+        known = np.isfinite(depth)
+        shared = known.astype(np.int32) @ known.T.astype(np.int32)
+        for i, j in np.argwhere(np.triu(shared >= _SHARED, 1)):
+            both = known[i] & known[j]
+            ratio, spread = depth[j, both] - depth[i, both], variance[i, both] + variance[j, both]
+            middle = _weighted_median(ratio, 1 / spread)
+            scatter = max(1.4826 * float(np.median(np.abs(ratio - middle))), float(1 / np.sqrt(np.mean(1 / spread))))
+            error = max(1.25 * scatter / np.sqrt(len(ratio)), _MIN_SCALE_ERROR)
+            equations.append((views[i][0], views[j][0], middle, error, len(ratio)))
+    return equations
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values)
+    cumulative = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+
+
+# ---- equations of differences
+
+
+def solve_differences(equations: Differences, count: int) -> tuple[NDArray[np.int64], Array, Array]:
+    """Solves for the unknowns that are connected by equations, if there are several parts for those of the largest.
+
+    Returns the solved unknowns' numbers (k,), all unknowns (count, ...), zero if not solved, and the residuals (m,),
+    NaN if not used.
+    """
+    first, second = equations.first, equations.second
+    solution = np.zeros((count, equations.value.shape[1]))
+    reached = np.zeros(count, bool)
+    for k, known, fresh in _tree(first, second, equations.cost, count):
+        solution[fresh] = solution[known] + (equations.value[k] if fresh == first[k] else -equations.value[k])
+        reached[[known, fresh]] = True
+    inside = reached[first] & reached[second]
+    system, value, error = (
+        _matrix(first[inside], second[inside], count),
+        equations.value[inside],
+        equations.error[inside],
+    )
+    for _ in range(_STEPS):
+        step = _weighted_step(system, value - system @ solution, error)
+        solution = solution + step
+        if np.abs(step).max() < 1e-8:
+            break
+    residual = np.full(len(first), np.nan)
+    residual[inside] = np.linalg.norm(value - system @ solution, axis=1)
+    return np.flatnonzero(reached), solution, residual
+
+
+def _tree(first: NDArray[np.int64], second: NDArray[np.int64], cost: Array, count: int) -> list[tuple[int, int, int]]:
+    """Edges of the cheapest tree of the largest connected part, from its root: edge, known node and fresh node."""
+    best: dict[tuple[int, int], int] = {}
+    for k in np.argsort(-cost).tolist():
+        ends = int(first[k]), int(second[k])
+        best[ends] = best[ends[::-1]] = k
+    chosen = sorted(set(best.values()))
+    if not chosen:
+        return []
+    graph = csr_matrix((cost[chosen], (first[chosen], second[chosen])), shape=(count, count))
+    part = connected_components(graph, directed=False)[1]
+    root = int(np.flatnonzero(part == np.bincount(part).argmax())[0])
+    order, before = breadth_first_order(minimum_spanning_tree(graph), root, directed=False)
+    return [(best[int(before[node]), int(node)], int(before[node]), int(node)) for node in order[1:]]
+
+
+def _matrix(plus: NDArray[np.int64], minus: NDArray[np.int64], count: int) -> csr_matrix:
+    row = np.arange(len(plus))
+    ones = np.ones(len(plus))
+    entries = np.concatenate([ones, -ones]), (np.tile(row, 2), np.concatenate([plus, minus]))
+    return coo_matrix(entries, shape=(len(plus), count)).tocsr()
+
+
+def _weighted_step(system: csr_matrix, residual: Array, error: Array) -> Array:
+    """Step (n, k) of iteratively reweighted least squares; zero for unknowns without an equation."""
+    relative = np.linalg.norm(residual, axis=1) / (_OUTLIER * error)
+    weight = 1 / (error**2 * (1 + relative**2))
+    normal = system.T @ diags(weight) @ system
+    free = 1e-9 * normal.diagonal().max()  # the mean of a part is undetermined
+    step = spsolve((normal + free * eye(system.shape[1])).tocsc(), system.T @ (weight[:, None] * residual))
+    return np.reshape(step, (system.shape[1], -1))
