@@ -22,7 +22,6 @@ from scipy.sparse.csgraph import connected_components
 
 from twin.capture.camera_models import camera_to_world
 from twin.capture.matching import SEQUENCE_STEPS, Matcher, Pair, near_pairs
-from twin.capture.pair_geometry import pair_geometries
 from twin.capture.pose_averaging import averaged_poses
 from twin.capture.worker import send_message
 from twin.errors import InputError
@@ -210,8 +209,7 @@ class Mapper:
 
     def _averaging(self) -> pycolmap.Reconstruction | None:
         matcher = self._matcher
-        pairs = pair_geometries(matcher.database, matcher.seed)
-        frames, poses = averaged_poses(pairs, matcher.frame_of(), matcher.capture.source_index)
+        frames, poses = averaged_poses(matcher.geometries(), matcher.frame_of(), matcher.capture.source_index)
         if len(frames) < MIN_FRAMES:
             return None
         model = posed_model(matcher, frames, poses)

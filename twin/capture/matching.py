@@ -9,7 +9,7 @@ image. A camera is *known* (a given, fixed calibration), has a focal length *pri
 
 import itertools
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,8 @@ from scipy.sparse.csgraph import connected_components
 
 from twin.capture.camera_models import Lens
 from twin.capture.capture_data import Capture, SourceInfo
+from twin.capture.pair_geometry import PairGeometry, pair_geometries
+from twin.capture.pose_averaging import consistent_pairs
 from twin.capture.worker import send_message
 from twin.errors import InputError
 from twin.geometry.images import write_image
@@ -34,9 +36,7 @@ Frames that are farther apart mostly match by what is infinitely far, which misl
 """
 PROBE_INLIERS = 25
 """Verified matches with which a pair counts as evidence of a common view; fewer than 20 occur by chance."""
-# Two sources are linked by 8 pairs with 40 verified matches each, or if half of their pairs are verified. Between films
-# in opposite directions, up to eight pairs with 25 to 37 matches were seen where house fronts repeat.
-_LINKING_PAIRS, _LINKING_INLIERS, _LINKING_FRACTION = 8, 40, 0.5
+_LINKING_PAIRS = 8  # pairs with a consistent rotation that link two sources; for short ones, half of their frames
 _WORDS = 32  # visual words of the VLAD descriptor
 _SAMPLES_PER_FRAME = 150
 _PROBES_PER_SOURCE = 20
@@ -210,6 +210,7 @@ class Matcher:
     seed: int
     tried: set[Pair]
     frames: NDArray[np.int64]  # indices of the frames that are to be reconstructed
+    known: dict[tuple[int, int], PairGeometry] = field(default_factory=dict)  # by database ids, see `geometries`
 
     def frame_of(self) -> dict[int, int]:
         """Database id → frame index."""
@@ -276,23 +277,24 @@ class Matcher:
         pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
         return {ordered_pair(frame_of[a], frame_of[b]): n for (a, b), n in zip(pairs, counts, strict=True) if n > 0}
 
+    def geometries(self) -> list[PairGeometry]:
+        """Geometry of all verified pairs. The cameras' parameters must not change after the first call."""
+        return pair_geometries(self.database, self.seed, self.known)
+
     def linked_groups(self) -> list[NDArray[np.int64]]:
         """Groups of frames (k,) whose sources are linked, the largest first.
 
-        Two sources are linked if many of their pairs are verified. A few are not enough: films that go in opposite
-        directions have no view in common, but a few of their pairs are verified by chance.
+        Two sources are linked if enough of their pairs agree on the rotation between them. Films that go in opposite
+        directions have no view in common, but many of their pairs may be verified by chance.
         """
         source, count = self.capture.source_index, len(self.capture.sources)
-        strong, verified, tried = (np.zeros((count, count)) for _ in range(3))
-        for i, j in self.tried:
-            tried[source[i], source[j]] += 1
-        for (i, j), inliers in self.verified().items():
-            verified[source[i], source[j]] += 1
-            strong[source[i], source[j]] += inliers >= _LINKING_INLIERS
+        consistent = np.zeros((count, count))
+        for i, j in consistent_pairs(self.geometries(), self.frame_of(), source):
+            consistent[source[i], source[j]] += 1
         frames = np.bincount(source, minlength=count)
         enough = np.minimum(_LINKING_PAIRS, np.minimum(frames, frames[:, None]) / 2)
-        linked = (strong >= enough) | (verified > _LINKING_FRACTION * np.maximum(tried, 1))
-        group = connected_components(csr_matrix(linked & (tried > 0)), directed=False)[1]
+        linked = csr_matrix(consistent + consistent.T >= enough)
+        group = connected_components(linked, directed=False)[1]
         groups = [np.flatnonzero(group[source] == k) for k in range(int(group.max()) + 1)]
         return sorted(groups, key=lambda one: (-len(one), int(one[0])))
 

@@ -56,8 +56,14 @@ class PairGeometry:
     agreeing: float  # fraction of all matches that agree with the pose
 
 
-def pair_geometries(database: Path, seed: int) -> list[PairGeometry]:
-    """Geometry of all verified pairs of a database, with its cameras' present parameters."""
+def pair_geometries(
+    database: Path, seed: int, known: dict[tuple[int, int], PairGeometry] | None = None
+) -> list[PairGeometry]:
+    """Geometry of all verified pairs of a database, with its cameras' parameters.
+
+    `known` has those of some pairs of images; it gets the others.
+    """
+    known = {} if known is None else known
     with pycolmap.Database.open(database) as opened:
         cameras, camera_of = _cameras(opened)
         points = {image_id: opened.read_keypoints(image_id)[:, :2].astype(np.float64) for image_id in camera_of}
@@ -67,22 +73,23 @@ def pair_geometries(database: Path, seed: int) -> list[PairGeometry]:
             for pair_id, geometry in found
             if len(geometry.inlier_matches) >= MIN_MATCHES
         ]
-    send_message(bar="relative poses", total=len(verified))
+    fresh = [(pair, geometry) for pair, geometry in verified if pair not in known]
+    send_message(bar="relative poses", total=len(fresh))
     rays = {image_id: camera_rays(cameras[camera_of[image_id]], xy) for image_id, xy in points.items()}
-    out: list[PairGeometry] = []
-    for (first, second), geometry in verified:
+    for (first, second), geometry in fresh:
         send_message(step=1)
         matches = geometry.inlier_matches.astype(np.int64)
         two = cameras[camera_of[first]], cameras[camera_of[second]]
         rng = np.random.default_rng([seed, first, second])
         a, b = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
         starts = [common_rotation(a, b, rng)]
-        if pycolmap.estimate_two_view_geometry_pose(two[0], points[first], two[1], points[second], geometry):
-            starts.append(geometry.cam2_from_cam1.rotation.matrix())
+        pycolmap.estimate_two_view_geometry_pose(two[0], points[first], two[1], points[second], geometry)
+        if pose := geometry.cam2_from_cam1:
+            starts.append(pose.rotation.matrix())
         error = _errors(b, float(np.mean([1 / camera.mean_focal_length() for camera in two])))
         rotation, translation = relative_pose(a, b, [*starts, np.eye(3)], error, rng)
-        out.append(_described(first, second, matches, a, b, rotation, translation, error))
-    return out
+        known[first, second] = _described(first, second, matches, a, b, rotation, translation, error)
+    return [known[pair] for pair, _ in verified]
 
 
 def _cameras(database: pycolmap.Database) -> tuple[dict[int, pycolmap.Camera], dict[int, int]]:

@@ -53,15 +53,12 @@ def averaged_poses(
         row_of: Frame of each of COLMAP's images.
         film: Film of each frame (n,), whose frames are in the order of time.
     """
-    first = np.array([row_of[pair.first] for pair in pairs], np.int64)
-    second = np.array([row_of[pair.second] for pair in pairs], np.int64)
-    steps = np.where(film[first] == film[second], np.abs(first - second), _OTHER_FILM_STEPS)
-    cost = steps / np.array([max(len(pair.features), 1) * pair.agreeing**4 for pair in pairs])
+    if not pairs:
+        return np.zeros(0, np.int64), np.zeros((0, 4, 4))
+    first, second, cost = _ends(pairs, row_of, film)
     rotations, residual = _average_rotations(pairs, first, second, cost, len(film))
     usable = [
-        k
-        for k, pair in enumerate(pairs)
-        if residual[k] < max(_MAX_ROTATION_RESIDUAL, 3 * pair.rotation_error) and len(pair.features) >= MIN_MATCHES
+        k for k, pair in enumerate(pairs) if _is_consistent(pair, residual[k]) and len(pair.features) >= MIN_MATCHES
     ]
     scaled, units = _units([pairs[k] for k in usable], len(usable))
     kept = np.array(usable, np.int64)[scaled]
@@ -79,37 +76,61 @@ def averaged_poses(
     return frames, poses
 
 
+def consistent_pairs(
+    pairs: list[PairGeometry], row_of: dict[int, int], film: NDArray[np.int64]
+) -> list[tuple[int, int]]:
+    """Frames of the pairs that agree with the averaged rotations; arguments as for `averaged_poses`."""
+    if not pairs:
+        return []
+    first, second, cost = _ends(pairs, row_of, film)
+    residual = _average_rotations(pairs, first, second, cost, len(film))[1]
+    return [
+        (int(i), int(j))
+        for pair, i, j, off in zip(pairs, first, second, residual, strict=True)
+        if _is_consistent(pair, float(off))
+    ]
+
+
+def _ends(
+    pairs: list[PairGeometry], row_of: dict[int, int], film: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Both frames of each pair, and its unreliability."""
+    first = np.array([row_of[pair.first] for pair in pairs], np.int64)
+    second = np.array([row_of[pair.second] for pair in pairs], np.int64)
+    steps = np.where(film[first] == film[second], np.abs(first - second), _OTHER_FILM_STEPS)
+    return first, second, steps / np.array([max(len(pair.features), 1) * pair.agreeing**4 for pair in pairs])
+
+
+def _is_consistent(pair: PairGeometry, residual: float) -> bool:
+    return residual < max(_MAX_ROTATION_RESIDUAL, 3 * pair.rotation_error)
+
+
 def _average_rotations(
     pairs: list[PairGeometry], first: NDArray[np.int64], second: NDArray[np.int64], cost: Array, count: int
 ) -> tuple[Array, Array]:
-    """Rotations (count, 3, 3) from world to camera, and the deviation (m,) [rad] of each pair, infinite if unconnected.
+    """Rotations (count, 3, 3) from world to camera, and the deviation (m,) [rad] of each pair.
 
-    Chatterjee and Govindu (2013).
+    Each connected part has its own world. Chatterjee and Govindu (2013).
     """
     relative = np.array([pair.rotation for pair in pairs])
     rotations = np.tile(np.eye(3), (count, 1, 1))
-    reached = np.zeros(count, bool)
-    for k, known, fresh in _tree(first, second, cost, count):
+    for k, known, fresh in _forest(first, second, cost, count)[0]:
         turn = relative[k] if fresh == second[k] else relative[k].T
         rotations[fresh] = turn @ rotations[known]
-        reached[[known, fresh]] = True
-    inside = reached[first] & reached[second]
-    error = np.array([max(pair.rotation_error, _MIN_ROTATION_ERROR) for pair in pairs])[inside]
-    a, b = first[inside], second[inside]
-    system = _matrix(b, a, count)
+    error = np.array([max(pair.rotation_error, _MIN_ROTATION_ERROR) for pair in pairs])
+    system = _matrix(second, first, count)
 
     def deviations() -> Array:
         """In world coordinates, (m, 3) [rad]."""
-        return Rotation.from_matrix(np.swapaxes(rotations[b], 1, 2) @ relative[inside] @ rotations[a]).as_rotvec()
+        turns = np.swapaxes(rotations[second], 1, 2) @ relative @ rotations[first]
+        return Rotation.from_matrix(turns).as_rotvec()
 
     for _ in range(_STEPS):
         step = _weighted_step(system, deviations(), error)
         rotations = rotations @ Rotation.from_rotvec(step).as_matrix()
         if np.abs(step).max() < 1e-7:
             break
-    residual = np.full(len(pairs), np.inf)
-    residual[inside] = np.linalg.norm(deviations(), axis=1)
-    return rotations, residual
+    return rotations, np.linalg.norm(deviations(), axis=1)
 
 
 def _units(pairs: list[PairGeometry], count: int) -> tuple[NDArray[np.int64], Array]:
@@ -172,21 +193,18 @@ def _weighted_median(values: Array, weights: Array) -> float:
 def solve_differences(equations: Differences, count: int) -> tuple[NDArray[np.int64], Array, Array]:
     """Solves for the unknowns that are connected by equations, if there are several parts for those of the largest.
 
-    Returns the solved unknowns' numbers (k,), all unknowns (count, ...), zero if not solved, and the residuals (m,),
+    Returns the solved unknowns' numbers (k,), all unknowns (count, ...), and the residuals (m,),
     NaN if not used.
     """
     first, second = equations.first, equations.second
     solution = np.zeros((count, equations.value.shape[1]))
-    reached = np.zeros(count, bool)
-    for k, known, fresh in _tree(first, second, equations.cost, count):
+    edges, part = _forest(first, second, equations.cost, count)
+    for k, known, fresh in edges:
         solution[fresh] = solution[known] + (equations.value[k] if fresh == first[k] else -equations.value[k])
-        reached[[known, fresh]] = True
-    inside = reached[first] & reached[second]
-    system, value, error = (
-        _matrix(first[inside], second[inside], count),
-        equations.value[inside],
-        equations.error[inside],
-    )
+    largest = part == np.bincount(part).argmax()
+    inside = largest[first]
+    system, value = _matrix(first[inside], second[inside], count), equations.value[inside]
+    error = equations.error[inside]
     for _ in range(_STEPS):
         step = _weighted_step(system, value - system @ solution, error)
         solution = solution + step
@@ -194,23 +212,28 @@ def solve_differences(equations: Differences, count: int) -> tuple[NDArray[np.in
             break
     residual = np.full(len(first), np.nan)
     residual[inside] = np.linalg.norm(value - system @ solution, axis=1)
-    return np.flatnonzero(reached), solution, residual
+    return np.flatnonzero(largest), solution, residual
 
 
-def _tree(first: NDArray[np.int64], second: NDArray[np.int64], cost: Array, count: int) -> list[tuple[int, int, int]]:
-    """Edges of the cheapest tree of the largest connected part, from its root: edge, known node and fresh node."""
+def _forest(
+    first: NDArray[np.int64], second: NDArray[np.int64], cost: Array, count: int
+) -> tuple[list[tuple[int, int, int]], NDArray[np.int64]]:
+    """The cheapest tree of each connected part, and the part of each node (count,).
+
+    Edges come in order from the roots: edge, known node and fresh node.
+    """
     best: dict[tuple[int, int], int] = {}
     for k in np.argsort(-cost).tolist():
         ends = int(first[k]), int(second[k])
         best[ends] = best[ends[::-1]] = k
     chosen = sorted(set(best.values()))
-    if not chosen:
-        return []
     graph = csr_matrix((cost[chosen], (first[chosen], second[chosen])), shape=(count, count))
-    part = connected_components(graph, directed=False)[1]
-    root = int(np.flatnonzero(part == np.bincount(part).argmax())[0])
-    order, before = breadth_first_order(minimum_spanning_tree(graph), root, directed=False)
-    return [(best[int(before[node]), int(node)], int(before[node]), int(node)) for node in order[1:]]
+    part = connected_components(graph, directed=False)[1].astype(np.int64)
+    trees, edges = minimum_spanning_tree(graph), []
+    for root in np.unique(part, return_index=True)[1].tolist():
+        order, before = breadth_first_order(trees, root, directed=False)
+        edges += [(best[int(before[node]), int(node)], int(before[node]), int(node)) for node in order[1:]]
+    return edges, part
 
 
 def _matrix(plus: NDArray[np.int64], minus: NDArray[np.int64], count: int) -> csr_matrix:
