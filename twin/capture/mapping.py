@@ -26,7 +26,7 @@ from twin.capture.pose_averaging import averaged_poses
 from twin.capture.worker import send_message
 from twin.errors import InputError
 from twin.geometry.passes import path_outliers
-from twin.geometry.poses import inverse_pose
+from twin.geometry.poses import inverse_pose, umeyama
 from twin.types import Array
 
 MIN_FRAMES = 3
@@ -44,6 +44,7 @@ _MAX_DISTANCE = 60.0  # [distance of the nearest points] largest distance betwee
 _COHERENT_FRACTION = 0.95  # a model is torn if its largest connected part has a smaller fraction of its frames
 _FAR_ANGLE = np.radians(0.8)  # points that two frames see from less different directions do not fix their scale
 _AVERAGINGS = 2  # bundle adjustments of averaged poses, each after a triangulation
+_AGREEMENT = 0.3  # [median steps between frames] largest distance between the positions of models that agree
 _TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
 _MIN_ANGLE = 0.5  # [°] smallest angle between two rays to a point
@@ -160,6 +161,8 @@ class Mapper:
     def best(self, summary: dict[str, Any]) -> pycolmap.Reconstruction:
         """The largest coherent model of a few attempts; the other frames are deregistered.
 
+        A model that was averaged is replaced by a larger one only if the two agree.
+
         Raises:
             InputError: no attempt gave a model.
         """
@@ -173,9 +176,12 @@ class Mapper:
             if model is None:
                 continue
             coherent = coherent_frames(model, matcher)
-            if best is None or len(coherent) > len(kept):
+            better = best is None or len(coherent) > len(kept)
+            if better and best is not None and summary["mapper"] == "averaging" and len(kept) >= needed:
+                better = _agree(best, model, sorted(kept & coherent), matcher)
+            if better:
                 best, kept, summary["mapper"] = model, coherent, name
-            if len(kept) >= max(needed, _COHERENT_FRACTION * best.num_reg_images()):
+            if len(kept) >= max(needed, _COHERENT_FRACTION * len(matcher.frames)):
                 break
         if best is None:
             raise InputError(
@@ -209,7 +215,8 @@ class Mapper:
 
     def _averaging(self) -> pycolmap.Reconstruction | None:
         matcher = self._matcher
-        frames, poses = averaged_poses(matcher.geometries(), matcher.frame_of(), matcher.capture.source_index)
+        films = matcher.capture.source_index
+        frames, poses = averaged_poses(matcher.geometries(), matcher.frame_of(), films, matcher.seed)
         if len(frames) < MIN_FRAMES:
             return None
         model = posed_model(matcher, frames, poses)
@@ -332,6 +339,20 @@ def triangulated(matcher: Matcher, model: pycolmap.Reconstruction, work: Path) -
     options, folder = pycolmap.IncrementalPipelineOptions(), fresh_folder(work, "triangulated")
     options.num_threads, options.random_seed = matcher.threads, matcher.seed
     return pycolmap.triangulate_points(model, matcher.database, matcher.images, folder, True, options, False)
+
+
+def _agree(
+    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, frames: list[int], matcher: Matcher
+) -> bool:
+    """True if two models have the same camera positions in common frames, but for their scale and coordinates."""
+    if len(frames) < MIN_FRAMES:
+        return False
+    known, poses = registered_poses(first, matcher)
+    others, others_poses = registered_poses(second, matcher)
+    mine, theirs = poses[np.isin(known, frames)], others_poses[np.isin(others, frames)]
+    offset = umeyama(theirs[:, :3, 3], mine[:, :3, 3]).points(theirs[:, :3, 3]) - mine[:, :3, 3]
+    step = median_step(mine, np.array(frames), matcher)
+    return bool(np.linalg.norm(offset, axis=1).max() < _AGREEMENT * step)
 
 
 def _largest(models: dict[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:

@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 from twin.capture.worker import send_message
 from twin.types import Array
 
-MIN_MATCHES = 15
-"""Least number of matches of a pair, and of those that fix its scale."""
+_MIN_MATCHES = 15  # least number of matches of a pair
 _PIXEL_ERROR = 0.5  # [px] standard deviation of the epipolar error of a right match
 _OUTLIER = 4.0  # [standard deviations] matches with a larger epipolar error are wrong
+_MUCH_WORSE = 1.1  # ratio of the costs of two poses of a pair
 _NEAR_ANGLE = np.radians(0.5)  # smallest angle between the rays to a point whose depth is used
 _MIN_COSINE = 0.2  # of the angle from the optical axis, in the size of a pixel
 _MIN_SINE = 0.02  # the epipolar error of rays nearer to the epipole is not magnified further
@@ -36,21 +36,33 @@ _FOCAL_GRID = np.geomspace(0.45, 2.2, 12)  # [longer side] first guesses
 _FOCAL_PRIOR = 0.5  # standard deviation of the logarithm of the focal length about COLMAP's guess
 
 
-@dataclass
+@dataclass(frozen=True)
+class PairMatches:
+    """Verified matches of two images."""
+
+    first: int  # COLMAP's ids of the images
+    second: int
+    features: NDArray[np.int64]  # (n, 2) numbers of the matched features
+    first_rays: Array  # (n, 3) unit directions in the coordinates of each camera
+    second_rays: Array
+    error: Array  # (n,) [rad] standard deviation of the epipolar error of a right match
+
+
+@dataclass(frozen=True)
 class PairGeometry:
-    """Matched features of two frames, and the pose of the second camera relative to the first.
+    """Pose of the second camera of a pair relative to the first, and its near points.
 
     A point x in the coordinates of the first camera is at rotation @ x + translation in those of the second. The unit
     of length is the distance of the two cameras.
     """
 
-    first: int  # COLMAP's ids of the two images
-    second: int
+    matches: PairMatches
     rotation: Array  # (3, 3)
     translation: Array  # (3,), of length 1
-    features: NDArray[np.int64]  # (n, 2) numbers of the matched features that are near and in front of both cameras
-    depths: Array  # (n, 2) their distances from both cameras
-    depth_error: Array  # (n,) relative standard deviation of the depths
+    cost: float  # Cauchy loss of all matches
+    features: NDArray[np.int64]  # (k, 2) those of the points that are near and in front of both cameras
+    depths: Array  # (k, 2) their distances from both cameras
+    depth_error: Array  # (k,) relative standard deviation of the depths
     rotation_error: float  # [rad] standard deviation
     direction_error: float  # [rad] standard deviation of the translation's direction
     agreeing: float  # fraction of all matches that agree with the pose
@@ -71,7 +83,7 @@ def pair_geometries(
         verified = [
             (pycolmap.pair_id_to_image_pair(pair_id), geometry)
             for pair_id, geometry in found
-            if len(geometry.inlier_matches) >= MIN_MATCHES
+            if len(geometry.inlier_matches) >= _MIN_MATCHES
         ]
     fresh = [(pair, geometry) for pair, geometry in verified if pair not in known]
     send_message(bar="relative poses", total=len(fresh))
@@ -82,14 +94,22 @@ def pair_geometries(
         two = cameras[camera_of[first]], cameras[camera_of[second]]
         rng = np.random.default_rng([seed, first, second])
         a, b = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
-        starts = [common_rotation(a, b, rng)]
+        pixel = float(np.mean([1 / camera.mean_focal_length() for camera in two]))
+        pair = PairMatches(first, second, matches, a, b, _errors(b, pixel))
+        starts = [np.eye(3), common_rotation(a, b, rng)]
         pycolmap.estimate_two_view_geometry_pose(two[0], points[first], two[1], points[second], geometry)
         if pose := geometry.cam2_from_cam1:
             starts.append(pose.rotation.matrix())
-        error = _errors(b, float(np.mean([1 / camera.mean_focal_length() for camera in two])))
-        rotation, translation = relative_pose(a, b, [*starts, np.eye(3)], error, rng)
-        known[first, second] = _described(first, second, matches, a, b, rotation, translation, error)
+        known[first, second] = _described(pair, *relative_pose(a, b, starts, pair.error, rng))
     return [known[pair] for pair, _ in verified]
+
+
+def with_rotation(pair: PairGeometry, rotation: Array, seed: int) -> PairGeometry | None:
+    """The geometry of a pair that has about the given rotation (3, 3); None if it explains the matches much worse."""
+    one = pair.matches
+    rng = np.random.default_rng([seed, one.first, one.second])
+    pose = relative_pose(one.first_rays, one.second_rays, [rotation], one.error, rng)
+    return _described(one, *pose) if pose[2] < _MUCH_WORSE * pair.cost else None
 
 
 def _cameras(database: pycolmap.Database) -> tuple[dict[int, pycolmap.Camera], dict[int, int]]:
@@ -113,9 +133,8 @@ def _errors(rays: Array, pixel: float) -> Array:
     return _PIXEL_ERROR * pixel * np.maximum(rays[:, 2], _MIN_COSINE)
 
 
-def _described(
-    first: int, second: int, matches: NDArray, a: Array, b: Array, rotation: Array, translation: Array, error: Array
-) -> PairGeometry:
+def _described(pair: PairMatches, rotation: Array, translation: Array, cost: float) -> PairGeometry:
+    a, b, error = pair.first_rays, pair.second_rays, pair.error
     residual, hessian = _epipolar(a, b, rotation, translation, error)[:2]
     agrees = np.abs(residual) < _OUTLIER
     turned = a @ rotation.T
@@ -133,8 +152,8 @@ def _described(
         float(np.sqrt(np.trace(part))) for part in (covariance[:3, :3], covariance[3:, 3:])
     )
     depth_error = error[near] / angle[near]
-    kept = matches[near], depths[near], depth_error, rotation_error, direction_error, float(agrees.mean())
-    return PairGeometry(first, second, rotation, translation, *kept)
+    kept = pair.features[near], depths[near], depth_error, rotation_error, direction_error, float(agrees.mean())
+    return PairGeometry(pair, rotation, translation, cost, *kept)
 
 
 # ---- relative pose
@@ -142,8 +161,9 @@ def _described(
 
 def relative_pose(
     a: Array, b: Array, rotations: Sequence[Array], error: Array, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Rotation (3, 3) and direction of translation (3,), up to its sign, of the second camera relative to the first.
+) -> tuple[Array, Array, float]:
+    """Pose of the second camera relative to the first: rotation (3, 3) and direction of the translation (3,), up to its
+    sign; and its cost.
 
     Args:
         a: Unit rays (n, 3) of the matches in the first camera.
@@ -156,7 +176,7 @@ def relative_pose(
     for start in rotations:
         wide = _minimized(a, b, start, _first_translation(a, b, start, error, rng), _WIDE * error, _WIDE_STEPS)
         found.append(_minimized(a, b, wide[0], wide[1], error, _STEPS))
-    return min(found, key=lambda one: one[2])[:2]
+    return min(found, key=lambda one: one[2])
 
 
 def common_rotation(a: Array, b: Array, rng: np.random.Generator) -> Array:
@@ -256,7 +276,7 @@ def estimate_focal_lengths(database: Path, seed: int) -> None:
                 for (first, second), matches in verified
                 if camera_of[first] == camera_of[second] == camera.camera_id
                 and abs(first - second) <= _FOCAL_STEPS
-                and len(matches) >= 2 * MIN_MATCHES
+                and len(matches) >= 2 * _MIN_MATCHES
             ]
             chosen = near[:: 1 + len(near) // _FOCAL_PAIRS]
             ids = sorted({image_id for first, second, _ in chosen for image_id in (first, second)})
@@ -271,7 +291,7 @@ def _fitted_camera(camera: pycolmap.Camera, pixels: list[tuple[Array, Array]], r
     """Parameters of a camera that explain the matched pixels (n, 2) of pairs of its frames with the least cost."""
     focals, distortion = list(camera.focal_length_idxs()), list(camera.extra_params_idxs())[:1]
     guess, first = camera.mean_focal_length(), np.array(camera.params, np.float64)
-    poses: list[tuple[Array, Array]] = []
+    poses: list[tuple[Array, Array, float]] = []
 
     def changed(focal: float, distort: float) -> pycolmap.Camera:
         params = first.copy()
@@ -289,7 +309,7 @@ def _fitted_camera(camera: pycolmap.Camera, pixels: list[tuple[Array, Array]], r
             a, b = camera_rays(one, p), camera_rays(one, q)
             if not np.isfinite(a).all() or not np.isfinite(b).all():
                 return np.inf
-            total += _minimized(a, b, *poses[k], _errors(b, 1 / focal), _WIDE_STEPS)[2]
+            total += _minimized(a, b, *poses[k][:2], _errors(b, 1 / focal), _WIDE_STEPS)[2]
         return total
 
     best = (np.inf, 0.0, poses)

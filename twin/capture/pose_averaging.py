@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from twin.capture.pair_geometry import MIN_MATCHES, PairGeometry
+from twin.capture.pair_geometry import PairGeometry, with_rotation
 from twin.types import Array
 
 _OUTLIER = 3.0  # [standard deviations] scale of the Cauchy loss
@@ -24,7 +24,8 @@ _MIN_ROTATION_ERROR = np.radians(0.02)  # standard deviation of a pair's rotatio
 _MAX_ROTATION_RESIDUAL = np.radians(0.5)  # pairs that deviate more from the averaged rotations are left out
 _MIN_SCALE_ERROR = 0.004  # standard deviation of the logarithm of a ratio of units, at least
 _MIN_DIRECTION_ERROR = 0.015  # [rad] standard deviation of the direction between two cameras, at least
-_SHARED = 5  # least number of near points in common of two pairs
+_MIN_NEAR = 8  # least number of near points of a pair whose unit of length is used
+_SHARED = 4  # least number of near points in common of two pairs
 _WRONG = 4.0  # [standard deviations] an equation with a larger residual is wrong
 _WRONG_FRACTION = 0.5  # a pair with a larger fraction of wrong equations is left out
 _OTHER_FILM_STEPS = (
@@ -44,7 +45,7 @@ class Differences:
 
 
 def averaged_poses(
-    pairs: list[PairGeometry], row_of: dict[int, int], film: NDArray[np.int64]
+    pairs: list[PairGeometry], row_of: dict[int, int], film: NDArray[np.int64], seed: int
 ) -> tuple[NDArray[np.int64], Array]:
     """Frames (k,) whose poses are determined together, and their camera_to_world (k, 4, 4) in any unit of length.
 
@@ -52,13 +53,20 @@ def averaged_poses(
         pairs: Pairs with geometry.
         row_of: Frame of each of COLMAP's images.
         film: Film of each frame (n,), whose frames are in the order of time.
+        seed: Chooses random matches.
     """
     if not pairs:
         return np.zeros(0, np.int64), np.zeros((0, 4, 4))
     first, second, cost = _ends(pairs, row_of, film)
     rotations, residual = _average_rotations(pairs, first, second, cost, len(film))
+    pairs = list(pairs)
+    for k, pair in enumerate(pairs):
+        if not _is_consistent(pair, residual[k]):  # two poses may explain the matches about equally well
+            pairs[k] = with_rotation(pair, rotations[second[k]] @ rotations[first[k]].T, seed) or pair
+    cost = _ends(pairs, row_of, film)[2]
+    rotations, residual = _average_rotations(pairs, first, second, cost, len(film))
     usable = [
-        k for k, pair in enumerate(pairs) if _is_consistent(pair, residual[k]) and len(pair.features) >= MIN_MATCHES
+        k for k, pair in enumerate(pairs) if _is_consistent(pair, residual[k]) and len(pair.features) >= _MIN_NEAR
     ]
     scaled, units = _units([pairs[k] for k in usable], len(usable))
     kept = np.array(usable, np.int64)[scaled]
@@ -95,8 +103,8 @@ def _ends(
     pairs: list[PairGeometry], row_of: dict[int, int], film: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Both frames of each pair, and its unreliability."""
-    first = np.array([row_of[pair.first] for pair in pairs], np.int64)
-    second = np.array([row_of[pair.second] for pair in pairs], np.int64)
+    first = np.array([row_of[pair.matches.first] for pair in pairs], np.int64)
+    second = np.array([row_of[pair.matches.second] for pair in pairs], np.int64)
     steps = np.where(film[first] == film[second], np.abs(first - second), _OTHER_FILM_STEPS)
     return first, second, steps / np.array([max(len(pair.features), 1) * pair.agreeing**4 for pair in pairs])
 
@@ -158,8 +166,8 @@ def _unit_equations(pairs: list[PairGeometry]) -> list[tuple[int, int, float, fl
     deviation, and the number of points."""
     at: dict[int, list[tuple[int, int]]] = {}
     for k, pair in enumerate(pairs):
-        at.setdefault(pair.first, []).append((k, 0))
-        at.setdefault(pair.second, []).append((k, 1))
+        at.setdefault(pair.matches.first, []).append((k, 0))
+        at.setdefault(pair.matches.second, []).append((k, 1))
     equations: list[tuple[int, int, float, float, int]] = []
     for views in at.values():
         count = 1 + max(int(pairs[k].features[:, side].max()) for k, side in views)
