@@ -25,14 +25,16 @@ _OUTLIER = 4.0  # [standard deviations] matches with a larger epipolar error are
 _MUCH_WORSE = 1.1  # ratio of the costs of two poses of a pair
 _NEAR_ANGLE = np.radians(0.5)  # smallest angle between the rays to a point whose depth is used
 _MIN_COSINE = 0.2  # of the angle from the optical axis, in the size of a pixel
-_MIN_SINE = 0.02  # the epipolar error of rays nearer to the epipole is not magnified further
+_EPIPOLE = 20.0  # [standard deviations] the epipolar error of rays nearer to the epipole is not magnified further
 _WIDE = 4.0  # the first steps use a loss that is wider by this factor
 _WIDE_STEPS, _STEPS = 5, 12  # largest number of Gauss–Newton steps
 _ROTATION_TRIALS, _TRANSLATION_TRIALS = 60, 120  # random pairs of matches that propose a rotation and a translation
 _SAME_ROTATION = np.radians(0.2)  # largest deviation of a far point from the rotation that most points share
 _FOCAL_PAIRS, _FOCAL_MATCHES = 24, 300  # largest numbers of pairs and of their matches that a focal length is fitted to
 _FOCAL_STEPS = 3  # [frames] largest distance of these pairs
-_FOCAL_GRID = np.geomspace(0.45, 2.2, 12)  # [longer side] first guesses
+_FOCAL_GRID = np.geomspace(0.3, 3.0, 16)  # [longer side] first guesses; the first and last limit the result
+_MAX_DISTORTION = 0.3  # largest absolute value of the first distortion parameter
+_DISTORTION_PRIOR = 0.1  # standard deviation of the first distortion parameter
 _FOCAL_PRIOR = 0.5  # standard deviation of the logarithm of the focal length about COLMAP's guess
 
 
@@ -206,7 +208,7 @@ def _first_translation(a: Array, b: Array, rotation: Array, error: Array, rng: n
     proposed = np.concatenate([np.cross(normals[at[:, 0]], normals[at[:, 1]]), [[0.0, 0.0, 1.0]]])
     length = np.linalg.norm(proposed, axis=1)
     proposed = proposed[length > 1e-12] / length[length > 1e-12, None]
-    sine = np.sqrt(np.maximum(1 - (proposed @ turned.T) ** 2, _MIN_SINE**2))
+    sine = np.sqrt(np.maximum(1 - (proposed @ turned.T) ** 2, (_EPIPOLE * error) ** 2))
     costs = np.log1p((proposed @ normals.T / (_WIDE * error * sine)) ** 2).sum(1)
     return proposed[np.argmin(costs)]
 
@@ -221,7 +223,7 @@ def _epipolar(
     and the directions (2, 3).
     """
     turned = a @ rotation.T
-    sine = (error * np.sqrt(np.maximum(1 - (turned @ translation) ** 2, _MIN_SINE**2)))[:, None]
+    sine = (error * np.sqrt(np.maximum(1 - (turned @ translation) ** 2, (_EPIPOLE * error) ** 2)))[:, None]
     across = np.linalg.svd(translation[None])[2][1:]
     normals = np.cross(turned, b) / sine
     residual = normals @ translation
@@ -290,7 +292,11 @@ def estimate_focal_lengths(database: Path, seed: int) -> None:
 def _fitted_camera(camera: pycolmap.Camera, pixels: list[tuple[Array, Array]], rng: np.random.Generator) -> list[float]:
     """Parameters of a camera that explain the matched pixels (n, 2) of pairs of its frames with the least cost."""
     focals, distortion = list(camera.focal_length_idxs()), list(camera.extra_params_idxs())[:1]
-    guess, first = camera.mean_focal_length(), np.array(camera.params, np.float64)
+    longer, guess, first = (
+        max(camera.width, camera.height),
+        camera.mean_focal_length(),
+        np.array(camera.params, np.float64),
+    )
     poses: list[tuple[Array, Array, float]] = []
 
     def changed(focal: float, distort: float) -> pycolmap.Camera:
@@ -303,8 +309,13 @@ def _fitted_camera(camera: pycolmap.Camera, pixels: list[tuple[Array, Array]], r
     def cost(values: Array) -> float:
         """Cost of the logarithm of the focal length, and of the distortion parameter, from the poses found before."""
         focal = float(np.exp(values[0]))
+        if (
+            not longer * _FOCAL_GRID[0] <= focal * 1.001 <= longer * _FOCAL_GRID[-1] * 1.002
+            or abs(values[1]) > _MAX_DISTORTION
+        ):
+            return np.inf
         one = changed(focal, float(values[1]))
-        total = 0.5 * ((values[0] - np.log(guess)) / _FOCAL_PRIOR) ** 2
+        total = 0.5 * ((values[0] - np.log(guess)) / _FOCAL_PRIOR) ** 2 + 0.5 * (values[1] / _DISTORTION_PRIOR) ** 2
         for k, (p, q) in enumerate(pixels):
             a, b = camera_rays(one, p), camera_rays(one, q)
             if not np.isfinite(a).all() or not np.isfinite(b).all():
@@ -313,7 +324,7 @@ def _fitted_camera(camera: pycolmap.Camera, pixels: list[tuple[Array, Array]], r
         return total
 
     best = (np.inf, 0.0, poses)
-    for focal in max(camera.width, camera.height) * _FOCAL_GRID:
+    for focal in longer * _FOCAL_GRID:
         one = changed(float(focal), 0.0)
         both = [(camera_rays(one, p), camera_rays(one, q)) for p, q in pixels]
         poses = [
