@@ -1,10 +1,12 @@
 """The pairs of frames that are matched, and the outliers of a path."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from twin.capture.matching import (
     SEQUENCE_STEPS,
@@ -15,6 +17,7 @@ from twin.capture.matching import (
     probe_pairs,
     sequence_pairs,
 )
+from twin.capture.pair_geometry import PairGeometry, PairMatches
 from twin.geometry.passes import path_outliers
 from twin.geometry.poses import look_at
 
@@ -121,18 +124,29 @@ def test_photos_in_no_order_have_no_outliers() -> None:
     assert not path_outliers(path[:4], 0.3).any()
 
 
-def test_sources_are_linked_by_many_verified_pairs_and_not_by_a_few() -> None:
-    """Films in opposite directions have some verified pairs by chance, with few matches."""
-    source = np.repeat([0, 1, 2], 20)
-    sources = tuple(SimpleNamespace(lighting=one) for one in ("day", "day", "night"))
-    tried = {(i, j) for i in range(60) for j in range(i + 1, 60) if source[i] != source[j]}
-    chance = {(i, 20 + i): 18 for i in range(15)} | {(i, 40 + i): 30 for i in range(3)}
-    verified = chance | {(20 + i, 40 + i): 60 for i in range(8)}
-    matcher = Matcher(
-        Path(), Path(), None, SimpleNamespace(source_index=source, sources=sources), source, 1, 0, tried, source
-    )
-    matcher.verified = lambda: verified  # type: ignore[method-assign]
+def test_sources_are_linked_by_pairs_that_agree_on_their_rotation_and_not_by_others() -> None:
+    """Films in opposite directions have many verified pairs by chance, each with another rotation."""
+    source, rng = np.repeat([0, 1, 2], 20), np.random.default_rng(0)
+    turns = Rotation.random(60, rng=rng)
+    sequence = [(i, i + 1) for i in range(59) if source[i] == source[i + 1]]
+    consistent = [(20 + i, 40 + i) for i in range(8)]
+    known = {pair: _geometry(pair, turns[pair[1]] * turns[pair[0]].inv()) for pair in sequence + consistent}
+    known |= {(i, 20 + i): _geometry((i, 20 + i), Rotation.random(rng=rng)) for i in range(20)}
+    capture = SimpleNamespace(source_index=source, sources=(None, None, None))
+    matcher = Matcher(Path(), Path(), None, capture, np.arange(60), 1, 0, set(), np.arange(60))  # type: ignore[arg-type]
+    matcher.geometries = lambda: list(known.values())  # type: ignore[method-assign]
     first, second = matcher.linked_groups()
     assert set(source[first]) == {1, 2} and set(source[second]) == {0}
-    verified |= {(i, 20 + j): 16 for i in range(20) for j in range(11)}  # more than half of the pairs
-    assert len(matcher.linked_groups()) == 1
+    vague = known[consistent[0]]
+    known[consistent[0]] = replace(vague, rotation_error=0.1)
+    assert len(matcher.linked_groups()) == 3
+
+
+def _geometry(pair: tuple[int, int], rotation: Rotation) -> PairGeometry:
+    """Geometry without points."""
+    none = np.zeros((0, 2), np.int64)
+    matches = PairMatches(*pair, none, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    forward = np.array([0.0, 0.0, 1.0])
+    return PairGeometry(
+        matches, rotation.as_matrix(), forward, 1.0, none, np.zeros((0, 2)), np.zeros(0), 1e-3, 1e-3, 1.0
+    )

@@ -15,9 +15,8 @@ import numpy as np
 import psutil
 import pycolmap
 import pytest
-from scipy.spatial.transform import Rotation
 
-from twin.capture import mapping, near_points, sfm, worker
+from twin.capture import mapping, sfm, worker
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.capture.matching import Matcher, open_database
 from twin.config import CamerasConfig, SceneConfig
@@ -238,8 +237,8 @@ def _model(
 def test_a_torn_model_is_recognized(street: Street) -> None:
     """Two pieces without enough common points that fix their scale are not coherent; the larger one is kept."""
     places, pieces, link = [0.0, 1, 2, 3, 4, 5, 6, 7], [tuple(range(5))] * 20 + [(5, 6, 7)] * 20, (4, 5, 6)
-    assert mapping.coherent_frames(*_model(street, places, [*pieces, *[link] * 10])) == set(range(5))
-    assert mapping.coherent_frames(*_model(street, places, [*pieces, *[link] * 15])) == set(range(8))
+    assert mapping.coherent_frames(*_model(street, places, [*pieces, *[link] * 5])) == set(range(5))
+    assert mapping.coherent_frames(*_model(street, places, [*pieces, *[link] * 8])) == set(range(8))
     # Points seen by two frames alone fix no scale, nor do points on the skyline.
     assert mapping.coherent_frames(*_model(street, places, [*pieces, *[(4, 5)] * 15])) == set(range(5))
     far = {link: [0.0, 0.0, 300.0]}
@@ -261,7 +260,7 @@ def test_a_piece_that_shrank_is_not_coherent_although_it_lies_beside_the_others(
 
 
 def test_a_film_is_cut_where_the_model_contradicts_the_matches_of_successive_frames(street: Street) -> None:
-    groups = [tuple(range(5))] * 20 + [(5, 6, 7)] * 20 + [(3, 6, 7)] * 15  # frames 4 and 5 share no point
+    groups = [tuple(range(5))] * 20 + [(5, 6, 7)] * 20 + [(3, 6, 7)] * 8  # frames 4 and 5 share no point
     model, matcher = _model(street, [0.0, 1, 2, 3, 4, 5, 6, 7], groups)
     assert mapping.coherent_frames(model, matcher) == set(range(5))
     matcher.verified = dict
@@ -314,29 +313,37 @@ def _errors(street: Street, matcher: Matcher, model: pycolmap.Reconstruction) ->
     return np.linalg.norm(umeyama(poses[:, :3, 3], true).points(poses[:, :3, 3]) - true, axis=1)
 
 
-def test_a_torn_model_is_repeated_without_far_points(
+def test_a_torn_averaged_model_is_replaced_by_one_that_agrees_with_its_sound_part(
     street: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     matcher, mapper = _mapper(street, tmp_path)
-    used, mapped = [], mapper._global
-
-    def torn_with_far_points(database: Path) -> pycolmap.Reconstruction | None:
-        used.append(database)
-        model = mapped(database)
-        if database.parent.name != "near_points" and model is not None:
-            _move(model, matcher, list(range(6)), 1000.0)
-        return model
-
-    monkeypatch.setattr(mapper, "_global", torn_with_far_points)
+    averaged = mapper._averaging()
+    assert averaged is not None and _errors(street, matcher, averaged).max() < 0.03
+    _move(averaged, matcher, list(range(6)), 1000.0)
+    monkeypatch.setattr(mapper, "_averaging", lambda: averaged)
     summary: dict = {}
     model = mapper.best(summary)
-    assert used[0] == matcher.database and summary["mapper"] == "global, near points first"
-    assert summary["may_drift"] == []
+    assert summary["mapper"] == "global" and summary["may_drift"] == []
     errors = _errors(street, matcher, model)
     assert len(errors) == len(matcher.frames) and errors.max() < 0.03
-    with pycolmap.Database.open(used[-1]) as near:
-        kept = np.sum(near.read_two_view_geometry_num_inliers()[1])
-    assert 0.2 < kept / sum(matcher.verified().values()) < 0.9
+
+
+def test_a_larger_model_that_contradicts_the_averaged_one_is_not_taken(
+    street: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matcher, mapper = _mapper(street, tmp_path)
+    whole = mapper._averaging()
+    averaged = mapper._averaging()
+    assert whole is not None and averaged is not None
+    mapping._deregister(averaged, matcher, matcher.frames[-2:].tolist())
+    monkeypatch.setattr(mapper, "_averaging", lambda: averaged)
+    monkeypatch.setattr(mapper, "_global", lambda _: whole)
+    summary: dict = {}
+    assert mapper.best(summary) is whole and summary["mapper"] == "global"
+    frames, poses = mapping.registered_poses(whole, matcher)
+    _move(whole, matcher, [int(frames[4])], mapping.median_step(poses, frames, matcher))
+    summary = {}
+    assert mapper.best(summary) is averaged and summary["mapper"] == "averaging"
 
 
 def test_films_that_only_incremental_mapping_keeps_together_are_named(
@@ -345,22 +352,10 @@ def test_films_that_only_incremental_mapping_keeps_together_are_named(
     matcher, _ = _mapper(street, tmp_path)
     job = {"mapper": "auto", "min_registered": 0.6, "free_focal": False}
     summary = sfm._new_summary()
-    monkeypatch.setattr(mapping.Mapper, "_global", lambda *_: None)
+    for attempt in ("_averaging", "_global"):
+        monkeypatch.setattr(mapping.Mapper, attempt, lambda *_: None)
     mapping.reconstruct(matcher, job | {"max_outlier": 0.3}, tmp_path, summary)
     assert summary["mapper"] == "incremental" and summary["may_drift"] == ["bright", "dim"]
-
-
-def test_parallax_is_what_remains_without_the_common_rotation() -> None:
-    rng = np.random.default_rng(1)
-    first = rng.normal(size=(300, 3)) + np.array([0.0, 0.0, 4.0])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    turn = Rotation.from_rotvec([0.05, -0.1, 0.02])
-    angles = np.radians(np.where(np.arange(300) < 120, 0.0, rng.uniform(1.0, 6.0, 300)))
-    axes = np.cross(first, rng.normal(size=(300, 3)))
-    moved = Rotation.from_rotvec(axes / np.linalg.norm(axes, axis=1, keepdims=True) * angles[:, None]).apply(first)
-    found = near_points.parallax(first, turn.apply(moved), rng)
-    np.testing.assert_allclose(found, angles, atol=2e-3)
-    assert set(np.flatnonzero(found < near_points.FAR_ANGLE)) == set(range(120))
 
 
 def test_a_misplaced_frame_is_registered_anew(street: Street, tmp_path: Path) -> None:

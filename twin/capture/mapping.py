@@ -35,7 +35,7 @@ _NEAR_STEPS = 3.0  # [median steps between frames] largest distance between the 
 _NEAR_PAIRS = 4  # largest number of near pairs per frame
 # The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
 _REMAPPING_FRACTION = 0.05
-_SHARED_POINTS = 15  # points in common that connect two frames of a model
+_SHARED_POINTS = 8  # points in common that connect two frames of a model
 _MANY_MATCHES = 40  # verified matches of two successive frames, which must then share points
 # The nearest points of a frame measure its scale: in sound models the distance between two frames with common points is
 # up to 22 times the distance of the nearest points; between pieces of a torn model it is 10³ to 10⁷ times.
@@ -100,7 +100,7 @@ def coherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> set[int
 def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArray[np.int64], csr_matrix]:
     """Registered frames (n,), and a matrix (n, n) that is True for connected pairs.
 
-    Two frames are connected if they share points that fix the scale of one to that of the other: 15 points that a
+    Two frames are connected if they share points that fix the scale of one to that of the other: eight points that a
     third frame sees, too, and that the two see from different directions. In addition the frames must lie near each
     other and have about the same scale: frames that were thrown far off the path may share points that are even farther
     away, and a piece that shrank lies on one spot. A film is cut where two successive frames have many

@@ -99,9 +99,9 @@ def pair_geometries(
         pixel = float(np.mean([1 / camera.mean_focal_length() for camera in two]))
         pair = PairMatches(first, second, matches, a, b, _errors(b, pixel))
         starts = [np.eye(3), common_rotation(a, b, rng)]
-        pycolmap.estimate_two_view_geometry_pose(two[0], points[first], two[1], points[second], geometry)
-        if pose := geometry.cam2_from_cam1:
-            starts.append(pose.rotation.matrix())
+        if pycolmap.estimate_two_view_geometry_pose(two[0], points[first], two[1], points[second], geometry):
+            assert geometry.cam2_from_cam1 is not None
+            starts.append(geometry.cam2_from_cam1.rotation.matrix())
         known[first, second] = _described(pair, *relative_pose(a, b, starts, pair.error, rng))
     return [known[pair] for pair, _ in verified]
 
@@ -187,7 +187,8 @@ def common_rotation(a: Array, b: Array, rng: np.random.Generator) -> Array:
     rotations = np.swapaxes(_triads(b[at]), 1, 2) @ _triads(a[at])
     agree = np.linalg.norm(a @ np.swapaxes(rotations, 1, 2) - b, axis=2) < _SAME_ROTATION
     chosen = agree[np.argmax(agree.sum(1))]
-    return Rotation.align_vectors(b[chosen], a[chosen])[0].as_matrix() if chosen.sum() > 1 else np.eye(3)
+    u, _, v = np.linalg.svd(b[chosen].T @ a[chosen])
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
 
 
 def _triads(rays: Array) -> Array:

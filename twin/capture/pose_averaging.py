@@ -87,7 +87,10 @@ def averaged_poses(
 def consistent_pairs(
     pairs: list[PairGeometry], row_of: dict[int, int], film: NDArray[np.int64]
 ) -> list[tuple[int, int]]:
-    """Frames of the pairs that agree with the averaged rotations; arguments as for `averaged_poses`."""
+    """Frames of the pairs whose rotations are certain and agree with the averaged ones.
+
+    Arguments as for `averaged_poses`.
+    """
     if not pairs:
         return []
     first, second, cost = _ends(pairs, row_of, film)
@@ -95,7 +98,7 @@ def consistent_pairs(
     return [
         (int(i), int(j))
         for pair, i, j, off in zip(pairs, first, second, residual, strict=True)
-        if _is_consistent(pair, float(off))
+        if max(pair.rotation_error, float(off)) < _MAX_ROTATION_RESIDUAL
     ]
 
 

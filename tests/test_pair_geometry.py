@@ -1,0 +1,208 @@
+"""Relative poses of pairs, focal lengths, and camera poses averaged from them, on a simulated film of a road."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from twin.capture.pair_geometry import PairGeometry, estimate_focal_lengths, pair_geometries, with_rotation
+from twin.capture.pose_averaging import Differences, averaged_poses, consistent_pairs, solve_differences
+from twin.geometry.poses import umeyama
+from twin.types import Array
+
+FRAMES, FOCAL, WIDTH, HEIGHT = 16, 500.0, 640, 360
+NOISE = 0.3  # [px]
+FEATURES = 1000  # keypoints per frame of the first kind; wrong ones follow them
+
+
+@dataclass(frozen=True)
+class Film:
+    database: Path
+    poses: Array  # (n, 4, 4) camera_to_world
+    pixels: Array  # (n, m, 2), NaN if not seen
+
+    def relative(self, i: int, j: int) -> tuple[Array, Array]:
+        """Rotation and direction of translation of frame j relative to frame i."""
+        change = np.linalg.inv(self.poses[j]) @ self.poses[i]
+        return change[:3, :3], change[:3, 3] / np.linalg.norm(change[:3, 3])
+
+    def error(self, frames: np.ndarray, poses: Array) -> float:
+        """Largest distance [m] from the true positions."""
+        found, true = poses[:, :3, 3], self.poses[frames, :3, 3]
+        return float(np.linalg.norm(umeyama(found, true).points(found) - true, axis=1).max())
+
+
+def _film(path: Path, wrong: bool = False) -> Film:
+    """A camera that shakes goes 1 m per frame round a bend over a plane, with a skyline; far points have long tracks.
+
+    A tenth of all matches are wrong. If `wrong`, frames 2 and 13 share 120 matches of a repeated pattern, too.
+    """
+    rng = np.random.default_rng(3)
+    ground = np.stack([rng.uniform(-6, 30, 6000), rng.uniform(-10, 12, 6000), np.zeros(6000)], 1)
+    bearing = rng.uniform(-np.pi, np.pi, 1500)
+    far = 400 * np.stack([np.cos(bearing), np.sin(bearing), rng.uniform(0.01, 0.15, 1500)], 1)
+    points = np.concatenate([ground, far])
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    heading, at = 0.0, np.array([0.0, 0.0, 1.0])
+    for k in range(FRAMES):
+        forward = np.array([np.cos(heading), np.sin(heading), -0.15])
+        axes = np.stack([np.cross(forward, [0, 0, 1]), [0.0, 0, 0], forward / np.linalg.norm(forward)], 1)
+        axes[:, 0] /= np.linalg.norm(axes[:, 0])
+        axes[:, 1] = np.cross(axes[:, 2], axes[:, 0])
+        poses[k, :3, :3] = axes @ Rotation.from_rotvec(rng.normal(0, 0.03, 3)).as_matrix()
+        poses[k, :3, 3] = at
+        at = at + np.array([np.cos(heading), np.sin(heading), 0.0])
+        heading += 0.04
+    pixels = np.full((FRAMES, len(points), 2), np.nan)
+    for k, pose in enumerate(poses):
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        xy = local[:, :2] / local[:, 2:] * FOCAL + [WIDTH / 2, HEIGHT / 2] + rng.normal(0, NOISE, (len(points), 2))
+        seen = (local[:, 2] > 1) & (xy >= 0).all(1) & (xy < [WIDTH, HEIGHT]).all(1)
+        seen[: len(ground)] &= local[: len(ground), 2] < 8
+        pixels[k, seen] = xy[seen]
+    _write(path, pixels, rng, wrong)
+    return Film(path, poses, pixels)
+
+
+def _write(path: Path, pixels: Array, rng: np.random.Generator, wrong: bool) -> None:
+    with pycolmap.Database.open(path) as database:
+        camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", FOCAL, WIDTH, HEIGHT)
+        database.write_camera(camera, use_camera_id=True)
+        pattern = rng.uniform([0, 0], [WIDTH, HEIGHT], (120, 2))
+        for k, xy in enumerate(pixels):
+            image = pycolmap.Image(f"{k}.png", pycolmap.Point2DList(), 1, k + 1)
+            database.write_image(image, use_image_id=True)
+            extra = pattern + np.array([5.0 * (k == 13), 0.0])
+            database.write_keypoints(k + 1, np.concatenate([np.nan_to_num(xy), extra]).astype(np.float32))
+        for i in range(FRAMES):
+            for j in range(i + 1, min(i + 4, FRAMES)):
+                _match(database, i, j, np.flatnonzero(np.isfinite(pixels[[i, j], :, 0]).all(0)), rng)
+        if wrong:
+            both = np.arange(pixels.shape[1], pixels.shape[1] + len(pattern), dtype=np.uint32)
+            database.write_two_view_geometry(3, 14, _geometry(np.stack([both, both], 1)))
+
+
+def _match(database: pycolmap.Database, i: int, j: int, seen: np.ndarray, rng: np.random.Generator) -> None:
+    matches = np.stack([seen, seen], 1).astype(np.uint32)
+    bad = rng.permutation(len(seen))[: len(seen) // 10]
+    matches[bad, 1] = rng.permutation(matches[bad, 1])
+    database.write_two_view_geometry(i + 1, j + 1, _geometry(matches))
+
+
+def _geometry(matches: np.ndarray) -> pycolmap.TwoViewGeometry:
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.config = pycolmap.TwoViewGeometryConfiguration.UNDEFINED
+    geometry.inlier_matches = matches
+    return geometry
+
+
+ROW = {k + 1: k for k in range(FRAMES)}
+ONE_FILM = np.zeros(FRAMES, np.int64)
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Film:
+    return _film(tmp_path_factory.mktemp("film") / "database.db")
+
+
+@pytest.fixture(scope="module")
+def pairs(film: Film) -> list[PairGeometry]:
+    return pair_geometries(film.database, 0)
+
+
+def test_relative_poses_are_right_in_spite_of_wrong_matches(film: Film, pairs: list[PairGeometry]) -> None:
+    assert len(pairs) == 3 * FRAMES - 6
+    for pair in pairs:
+        rotation, direction = film.relative(pair.matches.first - 1, pair.matches.second - 1)
+        assert np.degrees(Rotation.from_matrix(pair.rotation @ rotation.T).magnitude()) < 0.1
+        assert np.degrees(np.arccos(np.clip(pair.translation @ direction, -1, 1))) < 1.5
+        assert 0.8 < pair.agreeing < 0.95
+
+
+def test_depths_are_those_of_near_points_in_units_of_the_pair(film: Film, pairs: list[PairGeometry]) -> None:
+    pair = pairs[0]
+    i, j = pair.matches.first - 1, pair.matches.second - 1
+    unit = np.linalg.norm(film.poses[i, :3, 3] - film.poses[j, :3, 3])
+    ground = pair.features[:, 0] < 6000
+    assert ground.mean() > 0.95  # the skyline has no depth
+    depth = pair.depths[ground, 0] * unit
+    assert 1.0 < np.median(depth) < 8.0
+    pixel = film.pixels[i, pair.features[ground, 0]]
+    ray = np.c_[(pixel - [WIDTH / 2, HEIGHT / 2]) / FOCAL, np.ones(len(pixel))]
+    ray = ray / np.linalg.norm(ray, axis=1, keepdims=True) @ film.poses[i, :3, :3].T
+    height = film.poses[i, 2, 3] + ray[:, 2] * depth
+    assert np.median(np.abs(height)) < 0.03
+
+
+def test_poses_averaged_from_pairs_are_those_of_the_film(film: Film, pairs: list[PairGeometry]) -> None:
+    frames, poses = averaged_poses(pairs, ROW, ONE_FILM, 0)
+    assert frames.tolist() == list(range(FRAMES))
+    assert film.error(frames, poses) < 0.1
+
+
+def test_a_pair_of_a_repeated_pattern_does_not_bend_the_path(tmp_path: Path) -> None:
+    film = _film(tmp_path / "database.db", wrong=True)
+    pairs = pair_geometries(film.database, 0)
+    assert (3, 14) in {(pair.matches.first, pair.matches.second) for pair in pairs}
+    frames, poses = averaged_poses(pairs, ROW, ONE_FILM, 0)
+    assert film.error(frames, poses) < 0.1
+    assert (2, 13) not in consistent_pairs(pairs, ROW, ONE_FILM)
+
+
+def test_known_pairs_are_not_computed_again(film: Film, pairs: list[PairGeometry]) -> None:
+    known = {(pair.matches.first, pair.matches.second): pair for pair in pairs[:-1]}
+    again = pair_geometries(film.database, 0, known)
+    assert all(one is other for one, other in zip(again[:-1], pairs[:-1], strict=True))
+    assert len(known) == len(pairs)
+    np.testing.assert_array_equal(again[-1].rotation, pairs[-1].rotation)
+
+
+def test_another_pose_is_taken_only_if_it_explains_the_matches(film: Film, pairs: list[PairGeometry]) -> None:
+    near = with_rotation(pairs[0], pairs[0].rotation @ Rotation.from_rotvec([0.0, 0.01, 0.0]).as_matrix(), 0)
+    assert near is not None
+    np.testing.assert_allclose(near.rotation, pairs[0].rotation, atol=1e-3)
+    assert with_rotation(pairs[0], pairs[0].rotation @ Rotation.from_rotvec([0.0, 2.5, 0.0]).as_matrix(), 0) is None
+
+
+@pytest.mark.parametrize("guess", [250.0, 768.0])
+def test_the_focal_length_is_found_from_matches(film: Film, tmp_path: Path, guess: float) -> None:
+    path = tmp_path / "database.db"
+    path.write_bytes(film.database.read_bytes())
+    with pycolmap.Database.open(path) as database:
+        (camera,) = database.read_all_cameras()
+        camera.params, camera.has_prior_focal_length = [guess, WIDTH / 2, HEIGHT / 2, 0.0], False
+        database.update_camera(camera)
+    estimate_focal_lengths(path, 0)
+    with pycolmap.Database.open(path) as database:
+        (camera,) = database.read_all_cameras()
+    assert camera.params[0] == pytest.approx(FOCAL, rel=0.05) and abs(camera.params[3]) < 0.05
+
+
+def test_a_given_focal_length_is_kept(film: Film, tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    path.write_bytes(film.database.read_bytes())
+    with pycolmap.Database.open(path) as database:
+        (camera,) = database.read_all_cameras()
+        camera.params, camera.has_prior_focal_length = [700.0, WIDTH / 2, HEIGHT / 2, 0.0], True
+        database.update_camera(camera)
+    estimate_focal_lengths(path, 0)
+    with pycolmap.Database.open(path) as database:
+        assert database.read_all_cameras()[0].params[0] == 700.0
+
+
+def test_differences_are_solved_for_the_largest_part_and_outliers_have_no_effect() -> None:
+    first, second = np.array([1, 2, 3, 3, 5]), np.array([0, 1, 2, 0, 4])
+    value = np.array([[1.0], [1.0], [1.0], [50.0], [7.0]])
+    cost = np.array([1.0, 1.0, 1.0, 9.0, 1.0])
+    part, solution, residual = solve_differences(Differences(first, second, value, np.full(5, 0.1), cost), 6)
+    assert part.tolist() == [0, 1, 2, 3]
+    np.testing.assert_allclose(solution[1:4, 0] - solution[0, 0], [1.0, 2.0, 3.0], atol=0.02)
+    assert residual[3] == pytest.approx(47.0, abs=0.1) and np.isnan(residual[4])
+
+
+def test_without_pairs_no_frame_has_a_pose() -> None:
+    frames, poses = averaged_poses([], ROW, ONE_FILM, 0)
+    assert len(frames) == len(poses) == 0 and consistent_pairs([], ROW, ONE_FILM) == []
