@@ -293,7 +293,7 @@ def _mapper(street: Street, folder: Path) -> tuple[Matcher, mapping.Mapper]:
     matcher = open_database(Capture.load(stage), stage, folder, False, 2, 0)
     matcher.extract(1500, 1280)
     sfm._match(matcher, np.random.default_rng(0))
-    return matcher, mapping.Mapper(matcher, {"mapper": "global", "min_registered": 0.6, "free_focal": False}, folder)
+    return matcher, mapping.Mapper(matcher, {"mapper": "auto", "min_registered": 0.6, "free_focal": False}, folder)
 
 
 def _move(model: pycolmap.Reconstruction, matcher: Matcher, frames: list[int], distance: float) -> None:
@@ -341,7 +341,7 @@ def test_a_larger_model_that_contradicts_the_averaged_one_is_not_taken(
     summary: dict = {}
     assert mapper.best(summary) is whole and summary["mapper"] == "global"
     frames, poses = mapping.registered_poses(whole, matcher)
-    _move(whole, matcher, [int(frames[4])], mapping.median_step(poses, frames, matcher))
+    _move(whole, matcher, [int(frames[4])], 0.3 * mapping.median_step(poses, frames, matcher))
     summary = {}
     assert mapper.best(summary) is averaged and summary["mapper"] == "averaging"
 

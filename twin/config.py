@@ -27,7 +27,7 @@ TWIST, STEERING = "twist", "steering"
 """Kinds of actions of a policy: `twist` is speed and yaw rate, `steering` is the yaw rate at a fixed speed."""
 
 KINDS = ("auto", "video", "bag", "images", "colmap", "transforms")
-MAPPERS = ("auto", "global", "incremental")
+MAPPERS = ("auto", "averaging", "global", "incremental")
 UPS = ("ground", "cameras", "poses")
 CAMERA_MODELS = {
     "SIMPLE_PINHOLE": 3,
@@ -148,7 +148,7 @@ class CamerasConfig:
     max_feature_size: Annotated[int, Range(64, 100_000)] = 1280
     """Longer side of the image for feature detection [px]."""
     mapper: str = "auto"
-    """COLMAP's mapper: global, incremental or auto (global, then incremental if too few frames are registered)."""
+    """averaging (poses of pairs), COLMAP's global or incremental mapper; auto: in this order, until a model holds."""
     min_registered: Annotated[float, Range(0, 1)] = 0.6
     """Fraction of frames that must be registered; otherwise the stage fails."""
     max_outlier: Annotated[float, Range(0.001)] = 0.3
