@@ -2,7 +2,7 @@
 
     python benchmarks/cameras.py WORK --places 60 61 62
 
-WORK gets a scene per place; an existing film is used again. Errors are distances of camera centers from the true ones
+WORK gets a scene per place, filmed in the first of its lightings; an existing film is used again. Errors are distances of camera centers from the true ones
 after the similarity that fits best. A frame of a film that was left out counts as missing. With --json FILE, the table
 is written to a file, too.
 """
@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from twin.geometry.cameras import Cameras
 from twin.geometry.poses import umeyama
+from twin.reality.place_sampling import draw
 from twin.scene import SceneDir
 
 
@@ -65,7 +66,9 @@ def main() -> int:
     for place in given.places:
         folder = given.work / f"place_{place}"
         if not (folder / "scene.toml").exists() and (
-            error := _run("twin.reality", "film", "--place", place, "--out", folder)
+            error := _run(
+                *("twin.reality", "film", "--place", place, "--out", folder, "--lightings", draw(place).lights[0].name)
+            )
         ):
             print(f"place {place}: {error}", file=sys.stderr)
             return 1

@@ -44,7 +44,7 @@ class Stage:
 _MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")  # the mjcf settings that stage mesh reads
 PIPELINE = (
     Stage("capture", "twin.capture.frames", 2, ("source", "capture"), ()),
-    Stage("cameras", "twin.capture.sfm", 4, ("cameras",), ("capture",)),
+    Stage("cameras", "twin.capture.sfm", 5, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
     Stage("field", "twin.nerf.trainer", 5, ("nerf", "mjcf.route"), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 5, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
