@@ -2,9 +2,9 @@
 
     python benchmarks/cameras.py WORK --places 60 61 62
 
-WORK gets a scene per place, filmed in the first of its lightings; an existing film is used again. Errors are distances of camera centers from the true ones
-after the similarity that fits best. A frame of a film that was left out counts as missing. With --json FILE, the table
-is written to a file, too.
+WORK gets a scene per place, filmed in the first of its lightings; an existing film is used again. Errors are distances
+of camera centers from the true ones after the similarity that fits best. A frame of a film that was left out counts as
+missing. With --json FILE, the table is written to a file, too.
 """
 
 import argparse

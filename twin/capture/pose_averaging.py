@@ -109,7 +109,11 @@ def _ends(
     first = np.array([row_of[pair.matches.first] for pair in pairs], np.int64)
     second = np.array([row_of[pair.matches.second] for pair in pairs], np.int64)
     steps = np.where(film[first] == film[second], np.abs(first - second), _OTHER_FILM_STEPS)
-    return first, second, steps / np.array([max(len(pair.features), 1) * pair.agreeing**4 for pair in pairs])
+    return (
+        first,
+        second,
+        steps / np.array([max(len(pair.features), 1) * max(pair.agreeing, 0.1) ** 4 for pair in pairs]),
+    )
 
 
 def _is_consistent(pair: PairGeometry, residual: float) -> bool:
