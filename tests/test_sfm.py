@@ -341,7 +341,7 @@ def test_a_larger_model_that_contradicts_the_averaged_one_is_not_taken(
     summary: dict = {}
     assert mapper.best(summary) is whole and summary["mapper"] == "global"
     frames, poses = mapping.registered_poses(whole, matcher)
-    _move(whole, matcher, [int(frames[4])], 0.3 * mapping.median_step(poses, frames, matcher))
+    _move(whole, matcher, frames[::2].tolist(), 1.5 * mapping.median_step(poses, frames, matcher))
     summary = {}
     assert mapper.best(summary) is averaged and summary["mapper"] == "averaging"
 

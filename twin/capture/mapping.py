@@ -44,7 +44,9 @@ _MAX_DISTANCE = 60.0  # [distance of the nearest points] largest distance betwee
 _COHERENT_FRACTION = 0.95  # a model is torn if its largest connected part has a smaller fraction of its frames
 _FAR_ANGLE = np.radians(0.8)  # points that two frames see from less different directions do not fix their scale
 _AVERAGINGS = 2  # bundle adjustments of averaged poses, each after a triangulation
-_AGREEMENT = 0.3  # [median steps between frames] largest distance between the positions of models that agree
+# Four in five positions of models that agree are nearer to each other than the median step. Torn models are many steps
+# apart, sound ones with somewhat different focal lengths up to one step.
+_AGREEMENT, _AGREEING_FRACTION = 1.0, 0.8
 _TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
 _MIN_ANGLE = 0.5  # [°] smallest angle between two rays to a point
@@ -344,7 +346,7 @@ def triangulated(matcher: Matcher, model: pycolmap.Reconstruction, work: Path) -
 def _agree(
     first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, frames: list[int], matcher: Matcher
 ) -> bool:
-    """True if two models have the same camera positions in common frames, but for their scale and coordinates."""
+    """True if two models have about the same camera positions in common frames, but for scale and coordinates."""
     if len(frames) < MIN_FRAMES:
         return False
     known, poses = registered_poses(first, matcher)
@@ -352,7 +354,7 @@ def _agree(
     mine, theirs = poses[np.isin(known, frames)], others_poses[np.isin(others, frames)]
     offset = umeyama(theirs[:, :3, 3], mine[:, :3, 3]).points(theirs[:, :3, 3]) - mine[:, :3, 3]
     step = median_step(mine, np.array(frames), matcher)
-    return bool(np.linalg.norm(offset, axis=1).max() < _AGREEMENT * step)
+    return bool(np.quantile(np.linalg.norm(offset, axis=1), _AGREEING_FRACTION) < _AGREEMENT * step)
 
 
 def _largest(models: dict[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:

@@ -91,7 +91,8 @@ def pair_geometries(
     if fresh:
         send_message(bar="relative poses", total=len(fresh))
     rays = {image_id: camera_rays(cameras[camera_of[image_id]], xy) for image_id, xy in points.items()}
-    finite = {image_id: np.isfinite(one).all(1) for image_id, one in rays.items()}  # some lenses cannot be inverted
+    # Some lenses cannot be inverted everywhere.
+    finite = {image_id: np.isfinite(one.sum(1)) for image_id, one in rays.items()}
     for (first, second), geometry in fresh:
         send_message(step=1)
         matches = geometry.inlier_matches.astype(np.int64)
