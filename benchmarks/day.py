@@ -25,7 +25,7 @@ from twin.geometry.images import psnr, resize, write_image
 from twin.learn.policy import find_policy, load_policy
 from twin.loading import load_scene
 from twin.reality import recordings
-from twin.reality.centerline import RoadLine
+from twin.reality.campus_road import RoadLine
 from twin.reality.comparison import align_rigid, matched_poses
 from twin.reality.lighting import WEATHER
 from twin.reality.real_test import Setup

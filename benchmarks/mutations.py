@@ -49,7 +49,7 @@ MUTATIONS = (
     ),
     Mutation(
         "more than the largest number of trials is recommended",
-        "twin/evaluation/ranking.py",
+        "twin/evaluation/rate_model.py",
         "return high if high <= MAX_TRIALS else None",
         "return high",
         ("ranking",),

@@ -23,8 +23,7 @@ from record import record_parser, save
 
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
-from twin.env.obstacle_models import ObstacleModel, add_obstacle_geoms
-from twin.env.obstacles import add_obstacles, place
+from twin.env.obstacles import ObstacleModel, add_obstacle_geoms, add_obstacles, place
 from twin.env.physics import camera_pose
 from twin.geometry.cameras import Cameras, opencv_to_mujoco
 from twin.geometry.poses import Similarity

@@ -14,8 +14,8 @@ from twin.files import read_json
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, umeyama
-from twin.reality import centerline, comparison, filming, place, primitives
-from twin.reality.centerline import RoadLine
+from twin.reality import campus_road, comparison, filming, primitives
+from twin.reality.campus_road import RoadLine
 from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, matched_poses, measure, mesh_quality
 from twin.reality.lighting import LIGHTINGS, sky_cube_map
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, fingerprint
@@ -28,7 +28,7 @@ _IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 @pytest.fixture(scope="module")
 def campus():
-    return place.build()
+    return campus_road.build()
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_ground_is_gentle_but_not_flat():
     middle = road.ground_height(road.at(station))
     assert 0.06 < np.ptp(middle) < 0.3
     assert np.abs(np.gradient(middle, station)).max() < 0.05
-    across = centerline.cross_profile(np.linspace(-2.9, 2.9, 59))
+    across = campus_road.cross_profile(np.linspace(-2.9, 2.9, 59))
     assert across.max() - across.min() > 0.03  # crowned
     assert np.abs(np.diff(across)).max() < 0.005
 

@@ -39,7 +39,7 @@ from twin.geometry.images import to_uint8, write_image
 from twin.geometry.poses import look_at
 from twin.geometry.shadow_map import OrthographicShadowMap
 from twin.loading import Twin
-from twin.nerf.fog import Fog
+from twin.nerf.lightings import Fog
 from twin.nerf.sun import Sun
 from twin.report import build_report as report_page
 from twin.report.video_writer import read_frames

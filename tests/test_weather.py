@@ -21,8 +21,7 @@ from twin.env.suite import EnvFactory, fingerprint
 from twin.env.task import WEATHER, DriveTask
 from twin.env.weather import CastShadows, DirectionalRelighting, FogSample, Weather, _solid_shadows
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
-from twin.nerf.fog import Fog
-from twin.nerf.lightings import AddedLighting
+from twin.nerf.lightings import AddedLighting, Fog
 from twin.scene import SceneDir, stage_result
 
 SMALL = {"size": (32, 18)}

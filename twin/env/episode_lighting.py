@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from twin.config import ANY, HELD_OUT, RESERVED_LIGHTINGS, TRAINING
 from twin.errors import InputError
 from twin.nerf.baked import BakedField
-from twin.nerf.fog import Fog, mixed
+from twin.nerf.lightings import Fog, mixed_fog
 from twin.nerf.sun import Sunlight, mixed_sunlight
 from twin.types import Array32
 
@@ -66,7 +66,7 @@ class EpisodeLighting:
 
     def fog_at(self, time: float) -> Fog | None:
         """The fog after `time` [s]; None as for `fog`."""
-        return self.fog if self.end is None else mixed(self.fog, self.end_fog, self._share(time))
+        return self.fog if self.end is None else mixed_fog(self.fog, self.end_fog, self._share(time))
 
     def sunlight_at(self, time: float) -> Sunlight:
         """The suns after `time` [s]."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.env.domain_randomization import RandomizationSample
-from twin.nerf.fog import REACH, Fog
+from twin.nerf.lightings import FOG_REACH, Fog
 from twin.types import Array, Array32
 
 # ---- fog
@@ -18,7 +18,7 @@ _MIN_HORIZON_SHARE = 0.01  # fraction of pixels that must be beyond `_HORIZON_DI
 
 
 class FogSample:
-    """Fog sampled for one episode; see `nerf/fog.py` for the model.
+    """Fog sampled for one episode; see `nerf/lightings.py` for the model.
 
     The airlight has the color of the sky near the horizon in the episode's first picture.
     """
@@ -31,7 +31,7 @@ class FogSample:
     def apply(self, rgb: Array32, distance: Array32) -> Array32:
         """Adds the fog to a picture (height, width, 3); `distance` is along the rays [m], shape (height, width)."""
         if self._fog is None:
-            horizon = _horizon_color(rgb, np.minimum(distance, np.float32(REACH)))
+            horizon = _horizon_color(rgb, np.minimum(distance, np.float32(FOG_REACH)))
             red, green, blue = np.minimum(self._gain * horizon, np.float32(1.0)).tolist()
             self._fog = Fog(self._extinction, (red, green, blue))
         return self._fog.apply(rgb, distance)

@@ -13,10 +13,9 @@ import numpy as np
 from twin.env.suite import EnvFactory
 from twin.env.task import Motion, RewardAndTermination
 from twin.errors import InputError
-from twin.geometry.cameras import Viewpoints
+from twin.geometry.cameras import Rendering, Viewpoints
 from twin.geometry.images import psnr
 from twin.mjcf.world import heading_at, heading_error
-from twin.nerf.rendering import Rendering
 from twin.robot import PixelCamera
 from twin.types import Array, Image
 
@@ -125,7 +124,7 @@ class TrialViews:
     """PSNR [dB], shape (n,), with the mean and standard deviation of each color channel matched to the robot's picture,
     so global brightness, contrast and tint do not affect it."""
     trust: Array
-    """See `twin.env.trust`, shape (n,)."""
+    """See `twin.env.observation`, shape (n,)."""
 
 
 def view(

@@ -11,8 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from twin.nerf import network
-from twin.nerf.fog import REACH, Fog
-from twin.nerf.lightings import Lightings
+from twin.nerf.lightings import FOG_REACH, Fog, Lightings
 from twin.types import Array32
 
 
@@ -98,7 +97,7 @@ def fit_appearance(
     embedding = origin.clone().requires_grad_(True)
     fitted, rates = [embedding], [_RATE]
     if distances is not None:
-        distances = distances.clamp(max=REACH)
+        distances = distances.clamp(max=FOG_REACH)
         farthest = distances.topk(max(1, int(_FARTHEST_SHARE * len(distances)))).indices
         log_extinction = torch.tensor(math.log(_INITIAL_EXTINCTION), device=features.device, requires_grad=True)
         airlight = colors[farthest].mean(0).clone().requires_grad_(True)

@@ -16,7 +16,7 @@ from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid
 from twin.nerf import network
 from twin.nerf.baked import BakedField, BakedSection
-from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
+from twin.nerf.baked_arrays import BrickLayout, brick_indices, skip_distances
 from twin.nerf.buffers import (
     CameraArrays,
     Workspace,

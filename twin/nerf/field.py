@@ -20,10 +20,10 @@ from safetensors.torch import save as to_bytes
 
 from twin.errors import InputError, short_repr
 from twin.files import check_shapes, read_json, regular_file, require_text, wrap_read_errors, write_json
-from twin.geometry.cameras import PosedCameras, intrinsics_for_size, pixel_grid
+from twin.geometry.cameras import FAR, PosedCameras, Rendering, intrinsics_for_size, pixel_grid
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
-from twin.nerf.brick_layout import check_networks
+from twin.nerf.baked_arrays import check_networks
 from twin.nerf.buffers import (
     CameraArrays,
     Layout,
@@ -39,7 +39,6 @@ from twin.nerf.buffers import (
 from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import hashgrid, sampler, space
 from twin.nerf.kernels.color_head import HARMONICS
-from twin.nerf.rendering import FAR, Rendering
 from twin.nerf.road import RoadSections, undivided_road
 from twin.warp_runtime import wp
 

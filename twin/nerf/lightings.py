@@ -1,10 +1,14 @@
-"""Lightings by name, as NumPy arrays for rendering without torch, and lightings added to a built scene.
+"""Lightings by name, as NumPy arrays for rendering without torch, and lightings added to a built scene, with their fog.
 
 A lighting is requested by its name, by a frame (`day/000012`), or as a mixture `day:night:0.3`, 30 % of the way from
 day to night. Random lightings come from `appearance_prior.py`. `twin relight` fits a lighting to a photo and
 stores it in `<scene>/lightings/<name>.json`, outside `build/`, since users may delete `build/` at any time. An
 embedding is valid for one field only, so each file stores the content digest of its field stage; with any other build
 of the field, the lighting is *stale*.
+
+Fog is homogeneous and applied to an image by its depth (Koschmieder 1924). Over a distance d, it keeps a share
+exp(−extinction · d) of a surface's light; the rest of the color is the *airlight*, which the air scatters towards the
+camera. The meteorological visibility, at which fog keeps 5 %, is 3 / extinction.
 """
 
 from collections.abc import Mapping
@@ -19,11 +23,51 @@ from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
 from twin.files import read_json, wrap_read_errors, write_json
 from twin.nerf import appearance_prior
-from twin.nerf.fog import Fog, mixed
 from twin.nerf.sun import Sun, Sunlight, mixed_sunlight
 from twin.scene import SceneDir, stage_result
 from twin.scene import check_name as check_scene_name
 from twin.types import Array32
+
+# ---- fog
+
+FOG_REACH = 100.0
+"""Greatest distance [m] over which fog accumulates: fog lies low and does not hide the sky."""
+
+
+@dataclass(frozen=True)
+class Fog:
+    """Fog in addition to any in the film; none by default."""
+
+    extinction: float = 0.0
+    """[1/m]"""
+    airlight: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """RGB in [0, 1]."""
+
+    def apply(self, rgb: Array32, distance: Array32) -> Array32:
+        """Applies the fog to an image (..., 3) with distances along the rays [m], shape (...)."""
+        if not self.extinction:
+            return rgb
+        kept = np.exp(np.float32(-self.extinction) * np.minimum(distance, np.float32(FOG_REACH)))[..., None]
+        return kept * rgb + (np.float32(1.0) - kept) * np.asarray(self.airlight, np.float32)
+
+
+def mixed_fog(one: Fog | None, other: Fog | None, share: float) -> Fog | None:
+    """Interpolated fog, `share` of the way from `one` to `other`; None stands for no additional fog.
+
+    The airlights are weighted by the extinctions.
+    """
+    if one is None and other is None:
+        return None
+    a, b = one or Fog(), other or Fog()
+    mine, its = (1.0 - share) * a.extinction, share * b.extinction
+    total = mine + its
+    if not total:
+        return Fog()
+    red, green, blue = (mine * np.array(a.airlight) + its * np.array(b.airlight)) / total
+    return Fog(total, (float(red), float(green), float(blue)))
+
+
+# ---- lightings of a field
 
 
 @dataclass(frozen=True)
@@ -75,7 +119,7 @@ class Lightings:
         if lighting in self.fogs:
             return self.fogs[lighting]
         mixture = None if lighting in self.names else _mixture(lighting)
-        return mixed(self.fog(mixture[0]), self.fog(mixture[1]), mixture[2]) if mixture else None
+        return mixed_fog(self.fog(mixture[0]), self.fog(mixture[1]), mixture[2]) if mixture else None
 
     def sunlight(self, lighting: str) -> Sunlight:
         """Suns of an added lighting or of a mixture with one; empty: the light of the film alone.

@@ -18,7 +18,7 @@ from twin import runtime
 from twin.geometry.images import psnr
 from twin.geometry.shadow_map import TEXEL, OrthographicShadowMap, ShadowCasters, angles, direction
 from twin.nerf import network
-from twin.nerf.fog import REACH, Fog
+from twin.nerf.lightings import FOG_REACH, Fog
 from twin.nerf.sun import MAX_GAIN, MIN_GAIN, TERMS, SeenSurfaces, Sun
 from twin.types import Array, Array32
 
@@ -122,7 +122,7 @@ def fit_direction(problem: SunProblem, shadows: OrthographicShadowMap, fog: Fog)
 
 def _kept(fog: Fog, distances: NDArray) -> NDArray:
     """Fraction of light that the fog keeps."""
-    return np.exp(-fog.extinction * np.minimum(distances, REACH))
+    return np.exp(-fog.extinction * np.minimum(distances, FOG_REACH))
 
 
 def _solve(columns: NDArray, target: NDArray) -> NDArray:
@@ -157,7 +157,7 @@ def fit_jointly(
     device = features.device
     terms = torch.as_tensor(problem.seen.terms(sun.shadows), device=device)
     colors = torch.as_tensor(problem.colors, device=device)
-    distances = torch.as_tensor(problem.distances, device=device).clamp(max=REACH)
+    distances = torch.as_tensor(problem.distances, device=device).clamp(max=FOG_REACH)
     origin = torch.as_tensor(start, device=device)
     embedding = origin.clone().requires_grad_(True)
     coefficients = torch.tensor(sun.coefficients, device=device, requires_grad=True)

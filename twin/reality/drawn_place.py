@@ -13,16 +13,15 @@ import numpy as np
 
 from twin.reality import SEED, primitives
 from twin.reality import street_furniture as furniture
-from twin.reality.boundaries import BAY, add_boundary, thickness
 from twin.reality.drawn_lighting import place_lightings, place_sky
 from twin.reality.drawn_road import MOUTH_REACH, DrawnRoad
 from twin.reality.drawn_textures import DRAWN_CELLS, drawn_textures
 from twin.reality.houses import House, add_house
 from twin.reality.place_objects import Atlas, GroundLayout, KnownPlace, PlaceObject
 from twin.reality.place_sampling import draw
-from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, PlaceSpec, Rgb
-from twin.reality.place_streams import stream
+from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, PlaceSpec, Rgb, stream
 from twin.reality.plants import add_bare_tree, add_conifer, add_crowned_tree, add_shrub, add_tufts
+from twin.reality.street_furniture import BAY, add_boundary, thickness
 from twin.types import Array
 
 _STEP = 0.5  # [m] between vertices along the road

@@ -24,8 +24,8 @@ from twin.reality.lighting import Lighting, apply_haze
 from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.place_spec import PassSpec, PlaceSpec
 from twin.reality.rasterizer import PlaceRenderer
-from twin.reality.stretches import StretchRenderer, is_long
 from twin.reality.traffic import Mover, movers
+from twin.reality.true_world import StretchRenderer, is_long
 from twin.runtime import track
 from twin.types import Array, Array32
 from twin.warp_runtime import wp

@@ -1,7 +1,7 @@
 """Data of a place: its objects with their collision shapes, its textures and its lightings.
 
 The kind of an object is `ground` (driven or walked on), `obstacle` (solid), `foliage` (not solid) or `detail` (grass
-and wires, which comparisons with the truth ignore). Stations and laterals are defined in `centerline.py`.
+and wires, which comparisons with the truth ignore). Stations and laterals are defined in `campus_road.py`.
 """
 
 from collections.abc import Callable, Mapping
@@ -78,7 +78,7 @@ class GroundLayout:
     """Texture of the land → its x and y range [m]."""
     field: tuple[tuple[float, float], tuple[float, float]]
     """Lowest and highest (x, y) [m] of the area around the driven line. In randomly sampled places (number ≥ 1), the
-    rasterizer casts shadows only in this area (`trial_place.shadow_range`)."""
+    rasterizer casts shadows only in this area (`true_world.shadow_range`)."""
     wet: tuple[str, ...]
     """Textures that rain darkens."""
 

@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from twin.errors import InputError
 from twin.files import load_arrays, read_json, wrap_read_errors, write_json
-from twin.reality import SEED
-from twin.reality import place as places
-from twin.reality.centerline import RoadLine
+from twin.reality import SEED, campus_road
+from twin.reality.campus_road import RoadLine
 from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import CAMERA_HEIGHT
@@ -123,7 +122,7 @@ class Truth:
     def place(self) -> KnownPlace:
         """The rebuilt place."""
         if isinstance(self.route, RoadLine):
-            return places.build(self.route)
+            return campus_road.build(self.route)
         return build_number(self.number, length=self.road_length)
 
     def ground_height(self, xy: Array) -> Array:

@@ -3,7 +3,7 @@
 *Packet*: neighboring rays, eight to a row, that march together, one per *lane*. Loops over lanes have no branches, so
 the compiler vectorizes them; on CUDA, where the hardware runs threads in parallel, a packet has one lane. *Tile*: 8 × 8
 pixels; space is empty along its rays up to the distance *start* [m]. *Skip distance* of a block: its distance [blocks]
-in the maximum norm from the nearest occupied block, see `brick_layout.skip_distances`. `bricks.py` defines bricks,
+in the maximum norm from the nearest occupied block, see `baked_arrays.skip_distances`. `bricks.py` defines bricks,
 blocks and grids; `space.py` defines positions.
 """
 
