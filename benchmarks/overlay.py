@@ -30,10 +30,9 @@ from twin.geometry.poses import Similarity
 from twin.loading import load_scene
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.reality import true_world as reality
-from twin.reality.comparison import align_rigid, matched_poses
 from twin.reality.filming import sensor_image
 from twin.reality.lighting import LIGHTINGS
-from twin.reality.truth import Truth
+from twin.reality.truth import Truth, align_rigid, matched_poses
 
 SIZE = (160, 90)
 KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")

@@ -24,12 +24,11 @@ from twin.nerf.baked import BakedField
 from twin.nerf.lightings import Fog
 from twin.nerf.sun import Sunlight, relit
 from twin.reality import recordings
-from twin.reality.comparison import align_rigid, matched_poses
 from twin.reality.lighting import Lighting, weather
 from twin.reality.real_camera import draw_camera, intrinsics_of
 from twin.reality.real_test import Setup
 from twin.reality.road_task import place_on_test_day
-from twin.reality.truth import Truth
+from twin.reality.truth import Truth, align_rigid, matched_poses
 from twin.relight import PhotoFit, SunSource, fit_photo, shadow_casters, with_sun
 
 SIZE = (240, 135)  # [px]

@@ -102,7 +102,7 @@ def test_the_real_test_runs_without_the_twin():
         "import sys\n"
         "from twin.learn.policy import Control, Policy\n"
         "import numpy as np\n"
-        "from twin.reality import real_test, recordings, robot_bag\n"
+        "from twin.reality import real_test, recordings\n"
         "class Grey:\n"
         "    def __call__(self, pose):\n"
         "        return np.full((90, 160, 3), 0.4, np.float32), np.full((90, 160), 5.0, np.float32)\n"

@@ -14,11 +14,23 @@ from twin.files import read_json
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, umeyama
-from twin.reality import campus_road, comparison, filming, primitives
+from twin.reality import campus_road, filming, primitives
+from twin.reality import truth as truth_module
 from twin.reality.campus_road import RoadLine
-from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, matched_poses, measure, mesh_quality
 from twin.reality.lighting import LIGHTINGS, sky_cube_map
-from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, fingerprint
+from twin.reality.truth import (
+    HALF_WIDTH,
+    TrueFilm,
+    Truth,
+    align_rigid,
+    camera_errors,
+    compare,
+    fingerprint,
+    intrudes,
+    matched_poses,
+    measure,
+    mesh_quality,
+)
 from twin.scene import SceneDir
 
 DEMO = Path(__file__).parent.parent / "scenes" / "demo"
@@ -268,7 +280,7 @@ def test_a_place_without_leaves_is_measured(truth, campus, tmp_path):
     save_visual(scene, truth, {"ground"})
     bare = replace(truth)
     vars(bare)["place"] = replace(campus, objects=[one for one in campus.objects if one.kind != "foliage"])
-    found = comparison._surface_errors(scene.stage("mesh"), bare, _IDENTITY, truth.films["sun"].camera_to_world[:4])
+    found = truth_module._surface_errors(scene.stage("mesh"), bare, _IDENTITY, truth.films["sun"].camera_to_world[:4])
     assert found["mesh_completeness_10cm_ground"] == 1.0 and "mesh_completeness_10cm_foliage" not in found
 
 

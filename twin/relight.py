@@ -405,12 +405,6 @@ def command(options: argparse.Namespace) -> None:
         print(f"look at {SceneDir(options.scene).lightings / f'{options.name}.png'}")
 
 
-main = partial(commands.main, "relight")
-
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 # ---- surfaces that cast shadows
 #
 # The mesh ends 2 m above `mesh.max_height` and at `mesh.margin` beside the route, but houses and trees beyond it cast
@@ -460,3 +454,9 @@ def rough_triangles(views: Views, ground: Ground, mesh_vertices: Array) -> tuple
         all_faces.append(index.reshape(-1, 3) + count)
         count += len(used)
     return np.concatenate(all_vertices), np.concatenate(all_faces)
+
+
+main = partial(commands.main, "relight")
+
+if __name__ == "__main__":
+    sys.exit(main())

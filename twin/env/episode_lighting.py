@@ -94,7 +94,7 @@ class LightingSets:
     """Training and held-out lightings of one field: disjoint sets, which are the same for all seeds.
 
     The distance of two lightings is the rms difference of the colors that they give to the field's *probes* (rays with
-    stored features, see `nerf/appearance_prior.py`). The first anchors are the filmed lightings; they belong to the
+    stored features, see `nerf/lightings.py`). The first anchors are the filmed lightings; they belong to the
     training set. More are chosen one by one from random lightings of a fixed seed, each as far as possible from all
     anchors before it. Every second one of these, from the first on, belongs to the held-out set. A lighting belongs to
     the set of its nearest anchor, or to no set if an anchor of the other set is nearly as near. All anchors of a set

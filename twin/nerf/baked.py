@@ -21,10 +21,9 @@ from safetensors.numpy import save as to_bytes
 from twin.errors import InputError, short_repr
 from twin.files import check_shapes, load_tensors, read_json, require_text, wrap_read_errors, write_json
 from twin.geometry.cameras import PosedCameras, Rendering, intrinsics_for_size
-from twin.nerf.appearance_prior import Probes
 from twin.nerf.baked_arrays import BrickLayout, Detail, check_arrays, check_networks
 from twin.nerf.kernels.composite import CHANNELS
-from twin.nerf.lightings import Fog, Lightings
+from twin.nerf.lightings import Fog, Lightings, Probes
 from twin.nerf.render_target import CameraBatch, RenderedImages, RenderKernels, RenderTarget, SectionOnDevice
 from twin.nerf.road import RoadSections, undivided_road
 from twin.nerf.sun import Sun, Sunlight
@@ -81,7 +80,7 @@ class BakedField:
         Args:
             sections: Sections in the order of `road`.
             lightings: Appearance embeddings by name.
-            networks: `network.*`, and for random lightings `probes.*` (see `appearance_prior.Probes`).
+            networks: `network.*`, and for random lightings `probes.*` (see `lightings.Probes`).
             device: `cpu` or `cuda`.
             about: JSON-able metadata stored with the field.
             road: Determines the sections that render a camera; None: a road of one section.

@@ -31,10 +31,9 @@ from twin.geometry.cameras import Cameras
 from twin.loading import load_scene
 from twin.reality import campus_road, real_test, recordings
 from twin.reality.campus_road import RoadLine
-from twin.reality.comparison import align_rigid, compare, matched_poses
 from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
-from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass
+from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass, parked_cars
 from twin.reality.lighting import LIGHTINGS, WEATHER
 from twin.reality.place_objects import KnownPlace
 from twin.reality.place_sampling import check_length, draw
@@ -42,8 +41,7 @@ from twin.reality.place_spec import PlaceSpec, tasks
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_test import Setup
 from twin.reality.road_task import RoadTask, read_task
-from twin.reality.traffic import parked_cars
-from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth
+from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, align_rigid, compare, matched_poses
 from twin.scene import SceneDir, require_stage
 
 TINY = FilmingPlan(
