@@ -13,9 +13,11 @@ from twin.reality.houses import House
 from twin.reality.place_objects import CELLS, GroundLayout
 from twin.reality.place_spec import BoundarySpec, HousesSpec, PlaceSpec, Rgb, SectionSpec, SurfaceSpec, stream
 from twin.reality.textures import (
+    CHIPS,
     AtlasColors,
+    add_cracks,
+    add_patch,
     blend,
-    crack,
     fbm,
     grains,
     gully,
@@ -27,8 +29,6 @@ from twin.reality.textures import (
     to_uint8,
 )
 from twin.types import Array32
-
-_CHIPS = np.array([[0.55, 0.54, 0.52], [0.22, 0.22, 0.22], [0.47, 0.43, 0.39], [0.17, 0.17, 0.18]], np.float32)
 
 
 def road(
@@ -57,7 +57,7 @@ def road(
             _asphalt(rng, image, surface, length, lateral, pixel)
         case "concrete":
             _slab_field(rng, image, surface.unit, pixel, 0.06, (0.16, 0.15, 0.13), 0.016)
-            grains(rng, image, 0.05, _CHIPS)
+            grains(rng, image, 0.05, CHIPS)
         case "pavers":
             bond, spread = int(style.integers(0, 3)), float(style.uniform(0.06, 0.22))
             _slab_field(rng, image, surface.unit, pixel, spread, (0.2, 0.19, 0.15), 0.012, bond)
@@ -85,8 +85,8 @@ def _asphalt(
     rng: np.random.Generator, image: Array32, surface: SurfaceSpec, length: float, lateral: NDArray, pixel: float
 ) -> None:
     columns = image.shape[1]
-    grains(rng, image, 0.16 * surface.coarseness, _CHIPS)
-    speckle(rng, image, int(length * 40 * surface.coarseness), (0.5, 1.6), _CHIPS)
+    grains(rng, image, 0.16 * surface.coarseness, CHIPS)
+    speckle(rng, image, int(length * 40 * surface.coarseness), (0.5, 1.6), CHIPS)
     dark = tuple(0.75 * c for c in surface.tone)
     for track in (-0.75, 0.75):  # polished by wheels
         wander = track + 0.10 * fbm(rng, (1, columns), 8.0 / pixel, 200.0)
@@ -179,19 +179,8 @@ def _repair(rng: np.random.Generator, image: Array32, surface: SurfaceSpec, leng
         if c1 - c0 < 8 or r1 - r0 < 8:
             continue
         tone = np.array(surface.tone) * rng.uniform(0.6, 1.25)
-        part = tinted((float(tone[0]), float(tone[1]), float(tone[2])), fbm(rng, (r1 - r0, c1 - c0), 30, 2.0), 0.14)
-        grains(rng, part, rng.uniform(0.05, 0.2), _CHIPS)
-        image[r0:r1, c0:c1] = 0.25 * image[r0:r1, c0:c1] + 0.75 * part
-        seam = np.zeros((r1 - r0, c1 - c0), np.float32)
-        cv2.rectangle(seam, (1, 1), (c1 - c0 - 2, r1 - r0 - 2), 1.0, int(rng.integers(2, 4)))
-        worn = np.clip(0.6 + 0.4 * fbm(rng, seam.shape, 40, 3.0), 0.0, 0.9)
-        blend(image[r0:r1, c0:c1], (0.12, 0.12, 0.125), seam * worn)
-    mask = np.zeros((rows, columns), np.float32)
-    for _ in range(int(length * surface.cracks)):
-        start = np.array([rng.uniform(0, columns), rng.uniform(0, rows)])
-        heading = (np.pi / 2 if rng.random() < 0.45 else 0.0) + rng.normal(0, 0.25) + rng.integers(0, 2) * np.pi
-        crack(rng, mask, start, heading, rng.uniform(40, 330), rng.uniform(0.8, 2.2))
-    blend(image, (0.10, 0.10, 0.10), 0.7 * cv2.GaussianBlur(mask, (3, 3), 0.6))
+        add_patch(rng, image[r0:r1, c0:c1], (float(tone[0]), float(tone[1]), float(tone[2])))
+    add_cracks(rng, image, int(length * surface.cracks), (0.8, 2.2), (0.10, 0.10, 0.10), 0.7)
 
 
 def _mark(
@@ -298,7 +287,7 @@ def paving(
     warm = float(style.uniform(-0.04, 0.10))
     image = tinted((level * (1 + warm), level, level * (1 - warm)), fbm(rng, shape, 60, 1.5), 0.10)
     if kind == "asphalt":
-        grains(rng, image, 0.14, _CHIPS)
+        grains(rng, image, 0.14, CHIPS)
     elif kind == "slabs":
         unit = (float(style.uniform(0.3, 0.8)), float(style.uniform(0.3, 0.9)))
         _slab_field(rng, image, unit, pixel, 0.09, (0.19, 0.2, 0.14), 0.022, int(style.integers(0, 3)))

@@ -524,21 +524,3 @@ class Solids:
             return False
         u, v = ct * ahead + st * aside, ct * aside - st * ahead
         return abs(u) <= a + long * abs(ct) + wide * abs(st) and abs(v) <= b + long * abs(st) + wide * abs(ct)
-
-
-def follow(line: Array, pose: tuple[float, float, float], station: float, speed: float, most: float) -> float:
-    """Yaw rate [rad/s] that steers the base towards a line, by pure pursuit.
-
-    Args:
-        line: Points (x, y) of the line [m], shape (m, 2).
-        pose: x, y [m], yaw [rad] of the base.
-        station: Station of the nearest point of the line [m].
-        speed: Speed of the robot [m/s].
-        most: Bound of the yaw rate [rad/s].
-    """
-    ahead = 0.6 + 0.6 * speed
-    knots = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
-    x, y = (float(np.interp(station + ahead, knots, line[:, k])) for k in (0, 1))
-    bearing = atan2(y - pose[1], x - pose[0]) - pose[2]
-    rate = 2.0 * speed * sin(bearing) / max(hypot(x - pose[0], y - pose[1]), 0.2)
-    return copysign(min(abs(rate), most), rate)

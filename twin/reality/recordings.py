@@ -9,6 +9,7 @@ import contextlib
 import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from math import atan2, copysign, hypot, sin
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import Lighting, weather, weather_index
 from twin.reality.place_objects import DrivenLine
 from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of, native_size
-from twin.reality.real_robot import RealRobot, draw_robot, follow
+from twin.reality.real_robot import RealRobot, draw_robot
 from twin.reality.real_test import RealTest, Setup
 from twin.reality.road_task import place_on_test_day, task_of_place
 from twin.reality.true_world import rasterizer_of
@@ -378,3 +379,21 @@ class BagMessages:
     def _twist(self, v: float, yaw_rate: float) -> Any:
         vector = self.types["geometry_msgs/msg/Vector3"]
         return self.types["geometry_msgs/msg/Twist"](vector(v, 0.0, 0.0), vector(0.0, 0.0, yaw_rate))
+
+
+def follow(line: Array, pose: tuple[float, float, float], station: float, speed: float, most: float) -> float:
+    """Yaw rate [rad/s] that steers the base towards a line, by pure pursuit.
+
+    Args:
+        line: Points (x, y) of the line [m], shape (m, 2).
+        pose: x, y [m], yaw [rad] of the base.
+        station: Station of the nearest point of the line [m].
+        speed: Speed of the robot [m/s].
+        most: Bound of the yaw rate [rad/s].
+    """
+    ahead = 0.6 + 0.6 * speed
+    knots = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
+    x, y = (float(np.interp(station + ahead, knots, line[:, k])) for k in (0, 1))
+    bearing = atan2(y - pose[1], x - pose[0]) - pose[2]
+    rate = 2.0 * speed * sin(bearing) / max(hypot(x - pose[0], y - pose[1]), 0.2)
+    return copysign(min(abs(rate), most), rate)

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from twin.reality.place_objects import ATLAS_CELL
 from twin.types import Array32
 
+CHIPS = np.array([[0.55, 0.54, 0.52], [0.22, 0.22, 0.22], [0.47, 0.43, 0.39], [0.17, 0.17, 0.18]], np.float32)
+"""Colors of the stones in asphalt and concrete."""
+
 
 def fbm(rng: np.random.Generator, shape: tuple[int, int], coarsest: float, finest: float = 1.0, gain: float = 0.7):
     """Fractal noise with zero mean and unit standard deviation: octaves from `coarsest` to `finest` pixels."""
@@ -89,6 +92,36 @@ def crack(rng: np.random.Generator, mask: NDArray, start: NDArray, heading: floa
             crack(rng, mask, point, heading + rng.choice([-1, 1]) * rng.uniform(0.5, 1.2), length * 0.35, width * 0.7)
 
 
+def add_cracks(
+    rng: np.random.Generator,
+    image: NDArray,
+    count: int,
+    widths: tuple[float, float],
+    color: tuple[float, float, float],
+    weight: float,
+) -> None:
+    """Draws cracks along and across a road into its image, in place; `widths` is their range [px]."""
+    rows, columns = image.shape[:2]
+    mask = np.zeros((rows, columns), np.float32)
+    for _ in range(count):
+        start = np.array([rng.uniform(0, columns), rng.uniform(0, rows)])
+        heading = (np.pi / 2 if rng.random() < 0.45 else 0.0) + rng.normal(0, 0.25) + rng.integers(0, 2) * np.pi
+        crack(rng, mask, start, heading, rng.uniform(40, 330), rng.uniform(*widths))
+    blend(image, color, weight * cv2.GaussianBlur(mask, (3, 3), 0.6))
+
+
+def add_patch(rng: np.random.Generator, part: NDArray, tone: tuple[float, float, float]) -> None:
+    """Turns a part of a road's image into a repaired patch of another tone with a tarred seam, in place."""
+    rows, columns = part.shape[:2]
+    fresh = tinted(tone, fbm(rng, (rows, columns), 30, 2.0), 0.14)
+    grains(rng, fresh, rng.uniform(0.05, 0.2), CHIPS)
+    part[:] = 0.25 * part + 0.75 * fresh
+    seam = np.zeros((rows, columns), np.float32)
+    cv2.rectangle(seam, (1, 1), (columns - 2, rows - 2), 1.0, int(rng.integers(2, 4)))
+    worn = np.clip(0.6 + 0.4 * fbm(rng, seam.shape, 40, 3.0), 0.0, 0.9)
+    blend(part, (0.12, 0.12, 0.125), seam * worn)
+
+
 def road(rng: np.random.Generator, length: float, half_width: float, pixel: float) -> Array32:
     """Asphalt with rows across the road (row 0 at the left edge) and columns along it. Lengths and `pixel` [m].
 
@@ -100,9 +133,8 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
     image = tinted(
         (0.37, 0.37, 0.375), fbm(rng, shape, 3.0 / pixel, 2.0), 0.13, 0.5 * fbm(rng, shape, 6.0 / pixel, 40.0)
     )
-    chips = np.array([[0.55, 0.54, 0.52], [0.22, 0.22, 0.22], [0.47, 0.43, 0.39], [0.17, 0.17, 0.18]], np.float32)
-    grains(rng, image, 0.16, chips)
-    speckle(rng, image, int(length * 45), (0.5, 1.6), chips)
+    grains(rng, image, 0.16, CHIPS)
+    speckle(rng, image, int(length * 45), (0.5, 1.6), CHIPS)
     for track in (-1.95, -0.75, 0.75, 1.95):  # polished by wheels
         wander = track + 0.08 * fbm(rng, (1, columns), 8.0 / pixel, 200.0)
         blend(image, (0.27, 0.27, 0.275), 0.33 * np.exp(-0.5 * ((lateral - wander) / 0.22) ** 2))
@@ -116,20 +148,8 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
         if c1 - c0 < 8 or r1 - r0 < 8:
             continue
         level = rng.uniform(0.19, 0.48)
-        part = tinted((level, level, level * 1.02), fbm(rng, (r1 - r0, c1 - c0), 30, 2.0), 0.14)
-        grains(rng, part, rng.uniform(0.05, 0.2), chips)
-        image[r0:r1, c0:c1] = 0.25 * image[r0:r1, c0:c1] + 0.75 * part
-        seam = np.zeros((r1 - r0, c1 - c0), np.float32)
-        cv2.rectangle(seam, (1, 1), (c1 - c0 - 2, r1 - r0 - 2), 1.0, int(rng.integers(2, 4)))
-        worn = np.clip(0.6 + 0.4 * fbm(rng, seam.shape, 40, 3.0), 0.0, 0.9)
-        blend(image[r0:r1, c0:c1], (0.12, 0.12, 0.125), seam * worn)
-    cracks = np.zeros(shape, np.float32)
-    for _ in range(int(length * 1.1)):
-        start = np.array([rng.uniform(0, columns), rng.uniform(0, rows)])
-        across = rng.random() < 0.45
-        heading = (np.pi / 2 if across else 0.0) + rng.normal(0, 0.25) + rng.integers(0, 2) * np.pi
-        crack(rng, cracks, start, heading, rng.uniform(40, 330), rng.uniform(1.0, 3.0))
-    blend(image, (0.08, 0.08, 0.085), 0.85 * cv2.GaussianBlur(cracks, (3, 3), 0.6))
+        add_patch(rng, image[r0:r1, c0:c1], (level, level, level * 1.02))
+    add_cracks(rng, image, int(length * 1.1), (1.0, 3.0), (0.08, 0.08, 0.085), 0.85)
     for _ in range(int(length / 1.8)):  # drips of oil, spilt water, chewing gum
         center = [int(rng.uniform(0, columns)), int(rng.uniform(0, rows))]
         size = int(rng.uniform(3, 26))
