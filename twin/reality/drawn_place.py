@@ -272,10 +272,6 @@ def _overlap(a: Array, b: Array) -> bool:
     return True
 
 
-def _spot(place: KnownPlace, station: float, lateral: float) -> Array:
-    return place.route.at(station, lateral)
-
-
 def _edge(spec: PlaceSpec, side: int) -> float:
     """Distance of the curb's outer edge from the driven line on a side (1 = left) [m]."""
     return (spec.section.left if side > 0 else spec.section.right) + spec.section.kerb_width
@@ -314,7 +310,7 @@ def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tup
             color = houses.colors[int(rng.integers(len(houses.colors)))]
             tiles = houses.roof_colors[int(rng.integers(len(houses.roof_colors)))]
             house = House(
-                _spot(place, station, side * away), yaw, width, depth, storeys, roof, houses.pitch, houses.window
+                place.route.at(station, side * away), yaw, width, depth, storeys, roof, houses.pitch, houses.window
             )
             if len(out) < most and site.take(house.center, (width / 2 + 0.3, depth / 2 + 0.3), yaw, 0.6, 0.6):
                 name = f"house_{len(out)}"
@@ -336,7 +332,7 @@ def _add_lamps(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
         away = max(_edge(spec, side) + 0.45, FREE_HALF_WIDTH + 0.35)
         for shift in (0.0, 3.0, -3.0):
             at = float(station + shift), side * away
-            if site.take(_spot(place, *at), (0.12, 0.12), 0.0):
+            if site.take(place.route.at(*at), (0.12, 0.12), 0.0):
                 break
         else:
             continue
@@ -368,7 +364,7 @@ def _add_boundaries(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
             if boundary.kind == "bollards":
                 at, half = station, (0.12, 0.12)
             # Neighboring pieces touch, hence the negative gap.
-            if wanted[k // 4] and site.take(_spot(place, at, lateral), half, place.heading(at), 0.1, -0.05):
+            if wanted[k // 4] and site.take(place.route.at(at, lateral), half, place.heading(at), 0.1, -0.05):
                 runs[-1].append(station)
             elif runs[-1]:
                 runs.append([])
@@ -387,7 +383,7 @@ def _add_poles(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
     feet = []
     for k, station in enumerate(np.arange(first + rng.uniform(0, 10), last, rng.uniform(20.0, 30.0))):
         at = float(station), side * away
-        if site.take(_spot(place, *at), (0.16, 0.16), 0.0):
+        if site.take(place.route.at(*at), (0.16, 0.16), 0.0):
             furniture.add_post(place, f"pole_{k}", *at, height, 0.13, "pole")
             feet.append(at)
     if len(feet) > 1:
@@ -413,7 +409,7 @@ def _moved(
     if other_day is None:
         return at
     moved = at[0] + float(other_day.uniform(-1.5, 1.5)), at[1]
-    free = site.take(_spot(place, *moved), (radius, radius), place.heading(moved[0]), gap=-0.9 * radius)
+    free = site.take(place.route.at(*moved), (radius, radius), place.heading(moved[0]), gap=-0.9 * radius)
     return moved if free else at
 
 
@@ -428,10 +424,10 @@ def _add_cars(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np.rand
             turn, lateral = turn + np.pi / 2, float(lateral + np.sign(lateral) * 1.6)
         length, width = furniture.vehicle_size(kind)
         yaw = place.heading(station) + turn
-        if site.take(_spot(place, station, lateral), (length / 2, width / 2), yaw):
+        if site.take(place.route.at(station, lateral), (length / 2, width / 2), yaw):
             if other_day is not None:
                 shifted = station + float(other_day.uniform(-1.5, 1.5))
-                if site.take(_spot(place, shifted, lateral), (length / 2, width / 2), yaw, gap=-1.7):
+                if site.take(place.route.at(shifted, lateral), (length / 2, width / 2), yaw, gap=-1.7):
                     station = shifted
             furniture.add_vehicle(place, k, station, lateral, turn, kind, skin)
 
@@ -442,7 +438,7 @@ def _add_furniture(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np
     def each(index: int, amount: float, near: float, far: float, radius: float, add: Callable[..., None]) -> None:
         rng = stream(spec.number, "furniture", 2, index)
         for k, at in enumerate(_scatter(rng, spec, amount, near, far)):
-            if site.take(_spot(place, *at), (radius, radius), place.heading(at[0])):
+            if site.take(place.route.at(*at), (radius, radius), place.heading(at[0])):
                 add(k, at, rng)
 
     def sign(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
@@ -463,27 +459,28 @@ def _add_furniture(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np
 
         return add
 
-    def bench(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
-        furniture.add_bench(place, k, *at)
-
-    def bollard(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
-        furniture.add_post(place, f"bollard_{k}", *at, float(rng.uniform(0.7, 1.1)), 0.07, "dark")
-
     def cabinet(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
         size = float(rng.uniform(0.5, 1.1)), float(rng.uniform(0.3, 0.5)), float(rng.uniform(0.8, 1.4))
         furniture.add_cabinet(place, k, *at, size)
 
-    def stone(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
-        furniture.add_stone(place, k, *at, float(rng.uniform(0.25, 0.65)))
+    def bollard(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+        furniture.add_post(place, f"bollard_{k}", *at, float(rng.uniform(0.7, 1.1)), 0.07, "dark")
 
     each(0, f.signs, 0.25, 1.2, 0.35, sign)
     each(1, f.bins, 0.5, 2.5, 0.35, small("bin"))
-    each(2, f.benches, 0.7, 2.8, 0.9, bench)
+    each(2, f.benches, 0.7, 2.8, 0.9, lambda k, at, rng: furniture.add_bench(place, k, *at))
     each(3, f.bollards, 0.2, 0.6, 0.12, bollard)
     each(4, f.cones, 0.3, 1.2, 0.3, small("cone"))
     each(5, f.crates, 1.0, 4.0, 0.75, small("crate"))
     each(6, f.cabinets, 0.6, 3.0, 0.6, cabinet)
-    each(7, f.stones, 0.5, 6.0, 0.6, stone)
+    each(
+        7,
+        f.stones,
+        0.5,
+        6.0,
+        0.6,
+        lambda k, at, rng: furniture.add_stone(place, k, *at, float(rng.uniform(0.25, 0.65))),
+    )
 
 
 def _add_trees(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
@@ -507,7 +504,7 @@ def _add_trees(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
         crown, low = height * float(rng.uniform(0.22, 0.36)), float(rng.uniform(0.7, 1.8))
         radius = {"shrub": 0.5 * low}.get(kind, 0.35)
         clear = {"conifer": 0.9, "shrub": 0.5 * low}.get(kind, 0.4)
-        if not site.take(_spot(place, *at), (radius, radius), 0.0, clear, 0.3):
+        if not site.take(place.route.at(*at), (radius, radius), 0.0, clear, 0.3):
             continue
         if kind == "conifer":
             add_conifer(place, k, at, 1.25 * height, skin)
