@@ -29,8 +29,8 @@ from twin.reality.__main__ import main
 from twin.reality.campus_road import RoadLine
 from twin.reality.lighting import LIGHTINGS, WEATHER, weather, weather_index
 from twin.reality.real_camera import native_size
-from twin.reality.recordings import follow
 from twin.reality.real_test import RealTest, Setup, task_for
+from twin.reality.recordings import follow
 from twin.reality.road_task import CAMPUS_TASKS, parse_task, place_on_test_day, task_of_place, true_route
 from twin.runtime import exclusive_lock
 from twin.sysid.logs import read_log
