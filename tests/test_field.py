@@ -22,8 +22,7 @@ from twin.nerf.buffers import (
     near_box_of_cameras,
 )
 from twin.nerf.field import FieldSection, RadianceField, untrained_field
-from twin.nerf.kernels import composite as volume
-from twin.nerf.kernels import hashgrid
+from twin.nerf.kernels import hashgrid, volume
 from twin.nerf.kernels.space import contract_points
 
 LAYOUT = Layout(

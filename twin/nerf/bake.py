@@ -29,7 +29,7 @@ from twin.nerf.buffers import (
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.field import QUERY_POINTS, FieldSection, RadianceField
 from twin.nerf.kernels import bricks as kernels
-from twin.nerf.kernels import composite as volume
+from twin.nerf.kernels import volume
 from twin.runtime import bar
 from twin.warp_runtime import wp
 

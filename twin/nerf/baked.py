@@ -22,7 +22,7 @@ from twin.errors import InputError, short_repr
 from twin.files import check_shapes, load_tensors, read_json, require_text, wrap_read_errors, write_json
 from twin.geometry.cameras import PosedCameras, Rendering, intrinsics_for_size
 from twin.nerf.baked_arrays import BrickLayout, Detail, check_arrays, check_networks
-from twin.nerf.kernels.composite import CHANNELS
+from twin.nerf.kernels.volume import CHANNELS
 from twin.nerf.lightings import Fog, Lightings, Probes
 from twin.nerf.render_target import CameraBatch, RenderedImages, RenderKernels, RenderTarget, SectionOnDevice
 from twin.nerf.road import RoadSections, undivided_road

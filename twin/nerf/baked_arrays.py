@@ -16,7 +16,7 @@ from twin.files import check_shapes
 from twin.nerf.kernels import surface_detail
 from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, HALF_CORNERS
 from twin.nerf.kernels.color_head import HARMONICS
-from twin.nerf.kernels.composite import CHANNELS
+from twin.nerf.kernels.volume import CHANNELS
 from twin.types import Array32
 from twin.warp_runtime import wp
 

@@ -21,8 +21,8 @@ from twin.nerf.baked import BakedField
 from twin.nerf.baked_arrays import Detail, detail_grid
 from twin.nerf.buffers import parallel, shard_count, single_threaded_torch, warp_view
 from twin.nerf.dataset import TrainingPixels
-from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import surface_detail as kernels
+from twin.nerf.kernels import volume
 from twin.runtime import bar
 from twin.warp_runtime import wp
 

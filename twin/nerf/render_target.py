@@ -20,7 +20,7 @@ from twin.nerf.kernels import surface_detail as detail_kernels
 from twin.nerf.kernels.bricks import BLOCKS, Bricks, Bytes
 from twin.nerf.kernels.color_head import HARMONICS, Vec8, color_head_kernel
 from twin.nerf.kernels.color_head import LANES as HEAD_LANES
-from twin.nerf.kernels.composite import CHANNELS, Channels
+from twin.nerf.kernels.volume import CHANNELS, Channels
 from twin.runtime import bar
 from twin.types import Array32
 from twin.warp_runtime import wp

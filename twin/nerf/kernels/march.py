@@ -15,8 +15,8 @@ from functools import cache
 from typing import Any
 
 from twin.nerf.kernels.bricks import BLOCKS, CORNERS, DENSITIES, HALF_CORNERS, SAMPLES, Bricks, Bytes
-from twin.nerf.kernels.composite import CHANNELS, RAW_LIMIT, Channels
 from twin.nerf.kernels.space import grid_position, max_norm
+from twin.nerf.kernels.volume import CHANNELS, RAW_LIMIT, Channels
 from twin.warp_runtime import wp
 
 TILE = 8
