@@ -432,10 +432,14 @@ def _add_cars(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np.rand
             furniture.add_vehicle(place, k, station, lateral, turn, kind, skin)
 
 
+_Adder = Callable[[int, tuple[float, float], np.random.Generator], None]
+"""Adds object k at a station and lateral [m]; the generator samples its other properties."""
+
+
 def _add_furniture(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np.random.Generator | None) -> None:
     f = spec.furniture
 
-    def each(index: int, amount: float, near: float, far: float, radius: float, add: Callable[..., None]) -> None:
+    def each(index: int, amount: float, near: float, far: float, radius: float, add: _Adder) -> None:
         rng = stream(spec.number, "furniture", 2, index)
         for k, at in enumerate(_scatter(rng, spec, amount, near, far)):
             if site.take(place.route.at(*at), (radius, radius), place.heading(at[0])):
@@ -447,7 +451,7 @@ def _add_furniture(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np
         turn = float(rng.normal(0.0, 0.25)) + np.pi * (rng.random() < 0.25)
         furniture.add_sign(place, int(rng.integers(0, 6)) + 8 * k, *at, turn, (wide, low, high))
 
-    def small(kind: str) -> Callable[..., None]:
+    def small(kind: str) -> _Adder:
         def add(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
             at = _moved(other_day, place, site, at, 0.4)
             if kind == "bin":
