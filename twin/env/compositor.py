@@ -22,7 +22,7 @@ from twin.env.obstacles import OBSTACLE_GROUP, stored_route
 from twin.env.weather import Weather
 from twin.errors import InputError
 from twin.geometry.cameras import Rendering, Viewpoints, opencv_to_mujoco, pixel_grid, unproject
-from twin.mjcf.husky import ROBOT_VISUAL_GROUP, camera_mount_geoms
+from twin.mjcf.husky_visuals import ROBOT_VISUAL_GROUP, camera_mount_geoms
 from twin.nerf.baked import BakedField
 from twin.nerf.sun import Sunlight, relit
 from twin.runtime import available_cores

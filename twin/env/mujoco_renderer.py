@@ -23,7 +23,8 @@ from twin.env.physics import camera_pose
 from twin.env.weather import Weather
 from twin.geometry.cameras import FAR, Rendering, opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.poses import look_at
-from twin.mjcf.husky import ROBOT_COLLISION_GROUP, camera_mount_geoms
+from twin.mjcf.husky import ROBOT_COLLISION_GROUP
+from twin.mjcf.husky_visuals import camera_mount_geoms
 from twin.mjcf.world import GROUND_GROUP, World
 from twin.runtime import available_cores, log_line
 from twin.types import Array, Array32, Image

@@ -23,6 +23,7 @@ from twin.config_file import check_obstacles
 from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
 from twin.mjcf import husky
+from twin.mjcf.husky_visuals import add_visuals
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.types import Array
 
@@ -184,7 +185,7 @@ def _husky(shape: ObstacleModel, color: Color) -> None:
     wheels = {}
     for name, center in zip(husky.WHEELS, husky.wheel_centers(), strict=True):
         wheels[name] = base.add_body(name=name, pos=center)
-    husky.add_visuals(spec, base, wheels, husky.HuskyParams())
+    add_visuals(spec, base, wheels, husky.HuskyParams())
     for geom in spec.geoms:
         geom.group = shape.group
     shape.body.add_frame().attach_body(base, f"{shape.body.name}_", "")
