@@ -159,7 +159,7 @@ class SunSource:
     toward: Array | None
     """Unit vector towards the sun in the scene, shape (3,); None: it is searched in the photo."""
     origin: str
-    """Where the direction comes from."""
+    """Source of the direction."""
 
 
 def with_sun(field, relit: PhotoFit, casters: ShadowCasters, source: SunSource) -> PhotoFit:

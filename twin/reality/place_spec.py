@@ -283,7 +283,7 @@ class PassSpec:
 
 @dataclass(frozen=True)
 class FilmSpec:
-    """How the place is filmed."""
+    """Films of the place, and the camera's settings."""
 
     carrier: str
     """`phone` (held by hand), `cart`, `mast` (of a robot)."""
