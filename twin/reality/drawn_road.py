@@ -1,4 +1,4 @@
-"""The road of a sampled place: the driven line, which is sampled here, and the height of the ground on and around it.
+"""The road of a sampled place: samples of the driven line, height of the ground on and around it, meshes of both.
 
 In plan, the line consists of straights and bends. A *lengthened* line begins with the sampled one and goes on with
 further elements of the same kinds. Along the line, the height follows the sampled grades and a slight unevenness;
@@ -12,6 +12,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from twin.reality import primitives
+from twin.reality.place_objects import KnownPlace, PlaceObject
 from twin.reality.place_spec import (
     GRADE_STEP,
     LONGEST_DRAWN,
@@ -216,6 +218,115 @@ def _advance(point: Array, heading: float, curvature: float, length: float) -> A
     half = 0.5 * curvature * length
     chord = length * float(np.sinc(half / np.pi))
     return point + chord * np.array([np.cos(heading + half), np.sin(heading + half)])
+
+
+# ---- meshes
+
+STEP = 0.5  # [m] between vertices along the road
+_LAND_STEP = 1.5  # [m] between vertices of the land
+_LAND_MARGIN = 48.0  # [m] width of the land around the road
+_TILE = 72.0  # [m] side of the square tiles of a long road's land, a multiple of `_LAND_STEP`
+
+
+def land_boxes(line: Array, tiled: bool) -> dict[str, tuple[float, float, float, float]]:
+    """Textures of the land and their x and y ranges [m]: one for all, or one per square tile near the line (n, 2)."""
+    (x0, y0), (x1, y1) = (line.min(0) - _LAND_MARGIN).tolist(), (line.max(0) + _LAND_MARGIN).tolist()
+    if not tiled:
+        return {"land": (x0, x1, y0, y1)}
+    out: dict[str, tuple[float, float, float, float]] = {}
+    for x in np.arange(x0, x1, _TILE).tolist():
+        for y in np.arange(y0, y1, _TILE).tolist():
+            away = np.abs(line - (x + 0.5 * _TILE, y + 0.5 * _TILE)) - 0.5 * _TILE
+            if np.hypot(*np.maximum(away, 0.0).T).min() < _LAND_MARGIN:
+                out[f"land_{len(out)}"] = (x, x + _TILE, y, y + _TILE)
+    return out
+
+
+def add_road(place: KnownPlace, road: DrawnRoad, stations: Array, suffix: str) -> None:
+    """Adds road, curbs and verges along consecutive stations; `suffix` ends the names of objects and textures."""
+    section = road.section
+
+    def strip(name: str, texture: str, laterals: Array, lifts: Array | None = None, gaps: int = 0) -> None:
+        """Adds a mesh strip along the road with vertices at `laterals` [m], left first.
+
+        It lies on the ground, or `lifts` [m] above the driven line. `gaps` (1 = left, −1 = right) leaves gaps for the
+        side roads on that side.
+        """
+        xy = road.at(stations[None], laterals[:, None])
+        z = road.ground_height(xy)
+        if lifts is not None:
+            z = road.profile(stations)[None] + lifts
+        v = (laterals[0] - laterals) / (laterals[0] - laterals[-1]) if np.ptp(laterals) > 0 else np.zeros(len(laterals))
+        u = (stations - stations[0]) / (stations[-1] - stations[0])
+        uv = np.stack(np.broadcast_arrays(u[None], v[:, None]), -1)
+        part = primitives.grid(np.concatenate([xy, z[..., None]], -1), uv)
+        if gaps:
+            middle = stations[(part.faces % len(stations))].mean(1)
+            keep = np.ones(len(part.faces), bool)
+            for mouth in road.mouths(gaps):
+                keep &= np.abs(middle - mouth.station) > 0.5 * mouth.width
+            part = primitives.MeshPart(part.vertices, part.faces[keep], part.uv)
+        place.objects.append(PlaceObject(f"{name}{suffix}", "ground", part, f"{texture}{suffix}"))
+
+    inner = 1e-6  # keeps the vertices at the road's edges on the road
+    strip("road", "road", np.linspace(section.left - inner, -section.right + inner, 15))
+    for sign, name, edge, side in (
+        (1, "left", section.left, section.sides[0]),
+        (-1, "right", section.right, section.sides[1]),
+    ):
+        outer = edge + section.kerb_width
+        if section.kerb_height > 0.0:
+            low = road.cross_profile(stations, sign * edge)
+            high = road.cross_profile(stations, sign * (edge + 0.03))
+            profile = [
+                (edge, low - 0.02),
+                (edge + 0.015, high - 0.15 * (high - low)),
+                (edge + 0.03, high),
+                (outer, road.cross_profile(stations, sign * (outer + inner))),
+            ]
+            profile = profile[::-1] if sign > 0 else profile
+            laterals, lifts = np.array([sign * p[0] for p in profile]), np.stack([p[1] for p in profile])
+            strip(f"kerb_{name}", "kerb", laterals, lifts)
+        across = sign * np.linspace(outer + inner, outer + side.width, 9)
+        strip(f"verge_{name}", f"verge_{name}", np.sort(across)[::-1], gaps=sign)
+
+
+def add_side_roads(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
+    """Adds side roads; `stations` are those of the vertices along the road."""
+    section = road.section
+    for k, mouth in enumerate(road.line.mouths):
+        edge = section.left if mouth.side > 0 else section.right
+        reach = edge + section.kerb_width + np.arange(0.0, MOUTH_REACH, 0.5)
+        first = stations[np.argmax(stations + STEP / 2 > mouth.station - mouth.width / 2)]
+        inside = stations[(stations >= first - STEP) & (stations <= mouth.station + mouth.width / 2 + STEP)]
+        xy = road.at(inside[None], mouth.side * reach[:, None])
+        z = road.ground_height(xy) + 0.01
+        u = (reach - reach[0]) / np.ptp(reach)
+        v = (inside - inside[0]) / np.ptp(inside)
+        uv = np.stack(np.broadcast_arrays(0.03 + 0.3 * (k % 3) + 0.25 * u[:, None], v[None]), -1)
+        order = slice(None, None, -1) if mouth.side > 0 else slice(None)
+        points = np.concatenate([xy, z[..., None]], -1)[order]
+        part = primitives.grid(points, uv[order])
+        place.objects.append(PlaceObject(f"side_road_{k}", "ground", part, "side_road"))
+
+
+def add_land(place: KnownPlace, road: DrawnRoad, name: str, box: tuple[float, float, float, float]) -> None:
+    """Adds land in an x and y range [m], lowered under road, verges and side roads."""
+    section = road.section
+    x0, x1, y0, y1 = box
+    x, y = np.meshgrid(np.arange(x0, x1 + 0.1, _LAND_STEP), np.arange(y1, y0 - 0.1, -_LAND_STEP))
+    xy = np.stack([x, y], -1)
+    station, lateral = road.project(xy)
+    away = road.edges(lateral) - section.kerb_width
+    width = np.where(lateral > 0.0, section.sides[0].width, section.sides[1].width)
+    along = (station > road.start - 2.0) & (station < road.end + 2.0)
+    sunk = np.where(along & (away < width - 1.6), 0.5, np.where(along & (away < width + 1.6), 0.12, 0.0))
+    for mouth in road.line.mouths:
+        near = (np.abs(station - mouth.station) < mouth.width / 2 + 1.6) & (lateral * mouth.side > 0.0)
+        sunk = np.where(near & (away < MOUTH_REACH), 0.3, sunk)
+    points = np.concatenate([xy, (road.ground_height(xy) - sunk)[..., None]], -1)
+    uv = np.clip(np.stack([(x - x0) / (x1 - x0), (y1 - y) / (y1 - y0)], -1), 0.0, 1.0)
+    place.objects.append(PlaceObject(name, "ground", primitives.grid(points, uv), name))
 
 
 # ---- samples of the line
