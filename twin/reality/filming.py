@@ -1,4 +1,4 @@
-"""Films of the simulated reality: trajectory of the camera, exposure, sensor noise and video encoding.
+"""Films of the simulated reality: trajectory of the camera, traffic, exposure, sensor noise and video encoding.
 
 A *film* is a sequence of frames at a fixed rate under one lighting; the true pose of every frame is known. Every film
 has its own speed, lateral wander and shake, so that no two films share a viewpoint.
@@ -362,7 +362,8 @@ def depth_maps(
 
 # ---- traffic
 #
-# Only the films have traffic; truth and real test have none. A twin should therefore contain none.
+# Walkers, moving cars, and parked cars that are absent in the last lighting. Only the films have traffic; truth and real
+# test have none. A twin should therefore contain none.
 
 _WALKERS, _CARS, _PARKED = 3, 2, 4  # walkers and moving cars per film; parked cars
 _WALKING_SPEED, _CAR_SPEED = (1.1, 1.7), (4.0, 8.0)  # ranges [m/s]
