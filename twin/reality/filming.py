@@ -362,7 +362,7 @@ def depth_maps(
 
 # ---- traffic
 #
-# Walkers, moving cars, and parked cars that are absent in the last lighting. Only the films have traffic; truth and real
+# Walkers, moving cars, and parked cars that are absent in the last lighting. Only films have traffic; truth and real
 # test have none. A twin should therefore contain none.
 
 _WALKERS, _CARS, _PARKED = 3, 2, 4  # walkers and moving cars per film; parked cars
