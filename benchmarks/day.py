@@ -19,7 +19,7 @@ from record import record_parser, save
 
 from twin.env.domain_randomization import EVALUATION_RANGES, KNOWN_WEATHER_FRACTION, RandomizationSample
 from twin.env.mujoco_renderer import camera_intrinsics
-from twin.env.weather import Weather
+from twin.env.picture_effects import Weather
 from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
 from twin.learn.policy import find_policy, load_policy

@@ -63,7 +63,7 @@ MUTATIONS = (
     ),
     Mutation(
         "cast shadows lie on the side of the sun",
-        "twin/env/weather.py",
+        "twin/env/picture_effects.py",
         "flat = points[..., :2] - points",
         "flat = points[..., :2] + points",
         ("weather",),

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from twin.assets.gaussians import Gaussians
 from twin.config import ObstacleConfig
-from twin.env.camera_noise import CameraNoise
 from twin.env.obstacles import OBSTACLE_GROUP, add_obstacles, place
 from twin.env.physics import camera_pose
-from twin.env.weather import Weather
+from twin.env.picture_effects import CameraNoise, Weather
 from twin.geometry.cameras import FAR, Rendering, opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.mjcf.husky import ROBOT_COLLISION_GROUP
