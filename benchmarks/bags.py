@@ -30,9 +30,8 @@ from twin.files import digest_file, remove, toml_string, write_text
 from twin.geometry.cameras import Cameras
 from twin.geometry.poses import inverse_pose
 from twin.new import new_scene
-from twin.reality.comparison import camera_errors, compare, matched_poses
-from twin.reality.robot_bag import BagMessages
-from twin.reality.truth import Truth
+from twin.reality.recordings import BagMessages
+from twin.reality.truth import Truth, camera_errors, compare, matched_poses
 from twin.robot import CAMERA_AHEAD
 from twin.scene import SceneDir
 

@@ -19,17 +19,16 @@ from record import record_parser, save
 
 from twin.env.domain_randomization import EVALUATION_RANGES, KNOWN_WEATHER_FRACTION, RandomizationSample
 from twin.env.mujoco_renderer import camera_intrinsics
-from twin.env.weather import Weather
+from twin.env.picture_effects import Weather
 from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
 from twin.learn.policy import find_policy, load_policy
 from twin.loading import load_scene
 from twin.reality import recordings
-from twin.reality.centerline import RoadLine
-from twin.reality.comparison import align_rigid, matched_poses
+from twin.reality.campus_road import RoadLine
 from twin.reality.lighting import WEATHER
 from twin.reality.real_test import Setup
-from twin.reality.truth import Truth
+from twin.reality.truth import Truth, align_rigid, matched_poses
 from twin.runtime import track
 
 STATIONS = (4.0, 10.0, 17.0, 24.0, 31.0, 37.0, 42.0, 48.0, 54.0)  # [m]; the lightings come from photos at the first one

@@ -283,9 +283,8 @@ def trust(scene: Path) -> dict[str, Any]:
     from twin.geometry.cameras import Viewpoints
     from twin.loading import load_scene
     from twin.mjcf.world import arc_lengths
-    from twin.reality.comparison import align_rigid, matched_poses
     from twin.reality.lighting import LIGHTINGS
-    from twin.reality.truth import Truth
+    from twin.reality.truth import Truth, align_rigid, matched_poses
 
     opened = load_scene(scene)
     world, field, score = opened.world(), opened.field(), Trust(opened.cameras())

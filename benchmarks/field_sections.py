@@ -196,8 +196,7 @@ def _first_frame(bench: Bench, place: Path, views: Path) -> Figures:
 
 def depth(bench: Bench) -> Figures:
     """Error of rendered depth against the known truth up to 10 m, at the true camera poses."""
-    from twin.reality.comparison import align_rigid, depth_errors, matched_poses
-    from twin.reality.truth import Truth
+    from twin.reality.truth import Truth, align_rigid, depth_errors, matched_poses
 
     scene = SceneDir(bench.scene)
     if not (scene.truth / "truth.npz").exists():

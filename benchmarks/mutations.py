@@ -49,7 +49,7 @@ MUTATIONS = (
     ),
     Mutation(
         "more than the largest number of trials is recommended",
-        "twin/evaluation/ranking.py",
+        "twin/evaluation/rate_model.py",
         "return high if high <= MAX_TRIALS else None",
         "return high",
         ("ranking",),
@@ -63,7 +63,7 @@ MUTATIONS = (
     ),
     Mutation(
         "cast shadows lie on the side of the sun",
-        "twin/env/weather.py",
+        "twin/env/picture_effects.py",
         "flat = points[..., :2] - points",
         "flat = points[..., :2] + points",
         ("weather",),

@@ -23,18 +23,16 @@ from record import record_parser, save
 
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
-from twin.env.obstacle_models import ObstacleModel, add_obstacle_geoms
-from twin.env.obstacles import add_obstacles, place
+from twin.env.obstacles import ObstacleModel, add_obstacle_geoms, add_obstacles, place
 from twin.env.physics import camera_pose
 from twin.geometry.cameras import Cameras, opencv_to_mujoco
 from twin.geometry.poses import Similarity
 from twin.loading import load_scene
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.reality import true_world as reality
-from twin.reality.comparison import align_rigid, matched_poses
 from twin.reality.filming import sensor_image
 from twin.reality.lighting import LIGHTINGS
-from twin.reality.truth import Truth
+from twin.reality.truth import Truth, align_rigid, matched_poses
 
 SIZE = (160, 90)
 KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")

@@ -1,7 +1,7 @@
 """Benchmark of the simulated real test: speed of its rasterizer, difference from the film's renderer, error of a route.
 
     python benchmarks/reality.py [--scene BUILT_SCENE_WITH_TRUTH] [--json FILE] [--pictures FOLDER]
-    python benchmarks/reality.py --sheet docs/places.jpg
+    python benchmarks/reality.py --sheet docs/campus.jpg
 
 Rasterized pictures of 160×90, without the sensor model, are compared with frames that the film's renderer draws in the
 film's size and that are then reduced to 160×90. The poses lie on the film's path, at the height of a robot's camera.
@@ -24,15 +24,13 @@ from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.images import psnr, write_image
 from twin.loading import load_scene
 from twin.mjcf.world import nearest_on_route
-from twin.reality import filming, true_world
-from twin.reality import place as places
-from twin.reality.comparison import align_rigid, matched_poses
+from twin.reality import campus_road, filming, true_world
 from twin.reality.drawn_place import build
 from twin.reality.lighting import apply_haze
 from twin.reality.place_sampling import draw
 from twin.reality.rasterizer import Rasterizer
-from twin.reality.trial_place import true_route
-from twin.reality.truth import Truth
+from twin.reality.road_task import true_route
+from twin.reality.truth import Truth, align_rigid, matched_poses
 from twin.runtime import track
 
 _LIGHTINGS = ("sun", "overcast", "night")
@@ -42,7 +40,7 @@ _LOWER = 0.6  # [m] by which the robot's camera is lower than the film's camera
 
 def pictures(folder: Path | None) -> Iterator[tuple[str, float]]:
     """Names and values of the figures of each lighting."""
-    place, large = places.build(), filming.FilmingPlan()
+    place, large = campus_road.build(), filming.FilmingPlan()
     small = replace(large, width=160, height=90)
     for lighting in _LIGHTINGS:
         raster = Rasterizer(true_world.world_spec(lighting, place).compile(), small.intrinsics, (160, 90))

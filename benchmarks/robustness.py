@@ -51,7 +51,7 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
     from tiny_twin import tiny_twin
 
     from twin.config import TRAINING
-    from twin.env.camera_noise import CameraOptions
+    from twin.env.picture_effects import CameraOptions
     from twin.env.suite import EnvFactory
     from twin.env.vector_env_local import LocalVectorEnv
 

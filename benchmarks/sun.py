@@ -16,22 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 from record import record_parser, save
 
-from twin.assets.shadow_casters import shadow_casters
 from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, write_image
-from twin.geometry.shadow_map import ShadowCasters, angles
+from twin.geometry.mesh_rays import ShadowCasters, angles
 from twin.loading import load_scene
 from twin.nerf.baked import BakedField
-from twin.nerf.fog import Fog
+from twin.nerf.lightings import Fog
 from twin.nerf.sun import Sunlight, relit
 from twin.reality import recordings
-from twin.reality.comparison import align_rigid, matched_poses
 from twin.reality.lighting import Lighting, weather
 from twin.reality.real_camera import draw_camera, intrinsics_of
 from twin.reality.real_test import Setup
-from twin.reality.trial_place import place_on_test_day
-from twin.reality.truth import Truth
-from twin.relight import PhotoFit, SunSource, fit_photo, with_sun
+from twin.reality.road_task import place_on_test_day
+from twin.reality.truth import Truth, align_rigid, matched_poses
+from twin.relight import PhotoFit, SunSource, fit_photo, shadow_casters, with_sun
 
 SIZE = (240, 135)  # [px]
 STATIONS = 6  # the photo is taken at the first one

@@ -27,8 +27,7 @@ from twin.geometry.images import write_image
 from twin.nerf.baked import BakedField
 from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
-from twin.reality.comparison import align_rigid, corridor, load_parts, matched_poses
-from twin.reality.truth import Truth
+from twin.reality.truth import Truth, align_rigid, corridor, load_parts, matched_poses
 from twin.scene import SceneDir
 
 _GHOST_HEIGHT = 0.10  # [m] above the true ground

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from twin.reality.robot_bag import BagMessages
+from twin.reality.recordings import BagMessages
 
 START = 1_700_000_000_000_000_000  # [ns]
 MESSAGES = BagMessages()

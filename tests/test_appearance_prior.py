@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from twin.errors import InputError
-from twin.nerf import appearance_prior
-from twin.nerf.appearance_prior import AppearancePrior, Probes, picture_statistics
-from twin.nerf.lightings import Lightings
+from twin.nerf import lightings as lightings_module
+from twin.nerf.lightings import AppearancePrior, Lightings, Probes, picture_statistics
 
 _LIFT = 20.0  # keeps the rectifiers of the made-up head open, so that it is linear
 
@@ -110,7 +109,7 @@ def test_sampling_fails_with_a_reason(monkeypatch):
     mine = lightings(DAY_AND_DUSK)
     monkeypatch.setattr(AppearancePrior, "violations", lambda self, embedding: ["brightness 9 (filmed: 0 to 1)"])
     with pytest.raises(
-        InputError, match=rf"among {appearance_prior._MAX_TRIES} sampled; the last has brightness 9 .*nerf\.steps"
+        InputError, match=rf"among {lightings_module._MAX_TRIES} sampled; the last has brightness 9 .*nerf\.steps"
     ):
         mine.sample(np.random.default_rng(0))
 

@@ -9,13 +9,12 @@ from devices import DEVICES
 
 from twin import runtime
 from twin.errors import InputError
-from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
+from twin.geometry.cameras import FAR, Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.nerf.baked import BakedField, BakedSection
-from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
+from twin.nerf.baked_arrays import BrickLayout, brick_indices, skip_distances
 from twin.nerf.kernels import bricks
 from twin.nerf.lightings import Lightings
-from twin.nerf.rendering import FAR
 
 SIZE = (40, 24)
 K = np.array([30.0, 30.0, 20.0, 12.0])

@@ -19,12 +19,12 @@ from twin.capture.camera_models import Lens
 from twin.capture.localize import _LocalizedFrame, _shared_focal, register_film
 from twin.config_file import merge_robot, read_robot
 from twin.errors import InputError
+from twin.geometry.cameras import Rendering
 from twin.geometry.images import read_image
 from twin.geometry.poses import rotation_angle
 from twin.mjcf import husky
 from twin.mjcf.scene_xml import rest_pose
 from twin.mjcf.world import World
-from twin.nerf.rendering import Rendering
 from twin.robot import BASE_HEIGHT, HuskyParams
 from twin.scene import write_stamp
 from twin.sysid.camera_extrinsics import (

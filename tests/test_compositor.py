@@ -6,11 +6,11 @@ import pytest
 from test_baked import LOW, baked, wall
 
 from twin.config import ObstacleConfig
-from twin.env.camera_noise import CameraNoise, CameraOptions, soft_clip
 from twin.env.compositor import Compositor, ObjectRenderer
 from twin.env.mujoco_renderer import camera_intrinsics
 from twin.env.obstacles import add_obstacles
 from twin.env.physics import camera_pose
+from twin.env.picture_effects import CameraNoise, CameraOptions, soft_clip
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints
 from twin.mjcf.husky import ZED2, PixelCamera, add_husky
@@ -215,7 +215,7 @@ def test_a_perfect_camera_changes_nothing_and_the_same_seed_repeats(box):
 
 
 def test_a_turning_camera_smears_along_its_turn():
-    from twin.env.camera_noise import motion_blur
+    from twin.env.picture_effects import motion_blur
     from twin.geometry.cameras import pixel_grid, unproject
 
     rays = unproject(pixel_grid(*SIZE), K)

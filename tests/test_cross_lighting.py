@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from test_review import CheckeredField, make_cameras
 
-from twin.geometry.cameras import PosedCameras
+from twin.geometry.cameras import PosedCameras, Rendering
 from twin.nerf.evaluate import cross_lighting, mean_color
-from twin.nerf.rendering import Rendering
 from twin.runtime import set_quiet
 
 

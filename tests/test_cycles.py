@@ -13,8 +13,7 @@ import pytest
 from twin.errors import InputError
 from twin.evaluation.trials import Trial
 from twin.geometry.poses import look_at
-from twin.reality import place as places
-from twin.reality import true_world
+from twin.reality import campus_road, true_world
 from twin.reality.lighting import weather
 from twin.reality.rasterizer import Rasterizer
 
@@ -43,7 +42,7 @@ def _trial(policy, day, seed, success):
 def test_the_sky_has_every_direction_where_the_rasterizer_has_it(cycles):
     """The sky above the ground, seen in four directions."""
     light = weather("day_3")
-    place = places.build()
+    place = campus_road.build()
     ground = [one for one in place.objects if one.kind == "ground"]
     spec = true_world.world_spec(replace(light, occlusion=0.0), replace(place, objects=ground))
     sky = cycles.renderer.sky_picture(place.sky(light))
@@ -85,7 +84,7 @@ def test_trials_are_compared_with_the_recorded_ones_of_the_same_start(cycles):
 
 
 def test_an_interpreter_without_bpy_is_reported(cycles):
-    place = places.build()
+    place = campus_road.build()
     with pytest.raises(InputError, match="give a Python interpreter that can import bpy"):
         cycles.renderer.CyclesRenderer(Path("/nowhere/python"), weather("day_3"), place, INTRINSICS, SIZE)
     renderer = cycles.renderer.CyclesRenderer(Path(sys.executable), weather("day_3"), place, INTRINSICS, SIZE)
@@ -96,7 +95,7 @@ def test_an_interpreter_without_bpy_is_reported(cycles):
 
 @pytest.mark.skipif(not PYTHON.is_file(), reason="TWIN_BPY_PYTHON names no interpreter with bpy")
 def test_cycles_and_the_rasterizer_see_the_same_place(cycles):
-    place, light = places.build(), weather("day_3")
+    place, light = campus_road.build(), weather("day_3")
     rasterizer = Rasterizer(true_world.world_spec(light, place).compile(), INTRINSICS, SIZE)
     renderer = cycles.renderer.CyclesRenderer(PYTHON, light, place, INTRINSICS, SIZE)
     for x in (2.0, 12.0):

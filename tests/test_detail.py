@@ -12,11 +12,11 @@ from twin.geometry.cameras import SparsePoints, Viewpoints
 from twin.geometry.poses import look_at
 from twin.nerf.bake import bake
 from twin.nerf.baked import BakedField, BakedSection
+from twin.nerf.baked_arrays import Detail, detail_grid
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.detail import fit_detail
 from twin.nerf.kernels import surface_detail as kernels
-from twin.nerf.kernels.composite import CHANNELS, Channels
-from twin.nerf.surface_features import Detail, detail_grid
+from twin.nerf.kernels.volume import CHANNELS, Channels
 from twin.nerf.trainer import train_field
 from twin.runtime import set_quiet
 from twin.warp_runtime import wp

@@ -26,10 +26,9 @@ from twin.env.trust import Trust
 from twin.env.vector_env import make_vector_env
 from twin.errors import InputError
 from twin.film import main
-from twin.geometry.cameras import Viewpoints
+from twin.geometry.cameras import Rendering, Viewpoints
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
-from twin.nerf.rendering import Rendering
 from twin.report.video_writer import read_frames
 from twin.robot import TRACK, HuskyParams
 

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from twin.errors import InputError
-from twin.geometry.cameras import Viewpoints
+from twin.geometry.cameras import FAR, Viewpoints
 from twin.geometry.poses import look_at
 from twin.nerf import network
 from twin.nerf.appearance import initial_appearance
@@ -22,10 +22,8 @@ from twin.nerf.buffers import (
     near_box_of_cameras,
 )
 from twin.nerf.field import FieldSection, RadianceField, untrained_field
-from twin.nerf.kernels import composite as volume
-from twin.nerf.kernels import hashgrid
+from twin.nerf.kernels import hashgrid, volume
 from twin.nerf.kernels.space import contract_points
-from twin.nerf.rendering import FAR
 
 LAYOUT = Layout(
     (1.0, -2.0, 0.5), (8.0, 6.0, 2.0), 0.3, levels=3, growth=2.0, log2_table=11, hidden=16, appearance_dim=32

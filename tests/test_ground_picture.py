@@ -4,10 +4,9 @@ import numpy as np
 from test_fit import HEIGHT, WIDTH, K
 
 from twin.assets.ground import Ground
-from twin.assets.ground_picture import ground_picture
-from twin.geometry.cameras import Cameras
+from twin.assets.mesh import ground_picture
+from twin.geometry.cameras import Cameras, Rendering
 from twin.geometry.poses import look_at
-from twin.nerf.rendering import Rendering
 from twin.runtime import set_quiet
 
 

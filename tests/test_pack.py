@@ -31,8 +31,7 @@ from twin.errors import InputError
 from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.poses import look_at
 from twin.nerf.baked import BakedField, BakedSection
-from twin.nerf.fog import Fog
-from twin.nerf.lightings import AddedLighting
+from twin.nerf.lightings import AddedLighting, Fog
 from twin.nerf.road import RoadSections
 from twin.pack import pack, rounded
 from twin.runtime import exclusive_lock

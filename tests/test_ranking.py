@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.evaluation import ranking
-from twin.evaluation.ranking import (
+from twin.evaluation import rate_model
+from twin.evaluation.rate_model import (
     MARGIN,
     MAX_TRIALS,
     SETTLED_PROBABILITY,
@@ -109,7 +109,7 @@ def test_no_more_trials_than_the_maximum_are_needed(needed: float, monkeypatch: 
         assert more < 2 * MAX_TRIALS, "tried in vain"
         return RankingConfidence(float(more >= needed), 0.0)
 
-    monkeypatch.setattr(ranking, "expected_confidence", confidence)
+    monkeypatch.setattr(rate_model, "expected_confidence", confidence)
     assert trials_needed(of((5, 10), (6, 10)), "winner", 0) == (needed if needed <= MAX_TRIALS else None)
 
 

@@ -12,8 +12,7 @@ import warp as wp
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import psnr
 from twin.geometry.mesh_rays import Surface
-from twin.reality import filming, true_world
-from twin.reality import place as places
+from twin.reality import campus_road, filming, true_world
 from twin.reality.rasterizer import SAMPLES, Rasterizer, ShadowMap, flatten, render_shadow_map, sun_visibility
 
 PLAN = replace(filming.FilmingPlan(), width=160, height=90)
@@ -21,7 +20,7 @@ PLAN = replace(filming.FilmingPlan(), width=160, height=90)
 
 @pytest.fixture(scope="module")
 def campus():
-    return places.build()
+    return campus_road.build()
 
 
 @pytest.fixture(scope="module")

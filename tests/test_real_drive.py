@@ -17,23 +17,21 @@ import pytest
 from twin.config import MjcfConfig
 from twin.env.options import parse_options
 from twin.env.route_segments import STANDARD_TASKS, find_task
-from twin.env.task_file import task_table
+from twin.env.task import task_table
 from twin.errors import InputError
 from twin.evaluation.trials import SETUP_COLUMNS, Cell, read_results, read_trials, write_real_trials
 from twin.geometry.images import read_image
 from twin.learn.policy import Control, Policy, load_policy, save_policy
 from twin.learn.policy_network import Architecture
 from twin.mjcf.world import World, arc_lengths, point_at
-from twin.reality import place as places
-from twin.reality import real_test, recordings, trial_place
+from twin.reality import campus_road, real_test, recordings, true_world
 from twin.reality.__main__ import main
-from twin.reality.centerline import RoadLine
+from twin.reality.campus_road import RoadLine
 from twin.reality.lighting import LIGHTINGS, WEATHER, weather, weather_index
 from twin.reality.real_camera import native_size
-from twin.reality.real_robot import follow
 from twin.reality.real_test import RealTest, Setup, task_for
-from twin.reality.road_task import CAMPUS_TASKS, parse_task, task_of_place
-from twin.reality.trial_place import place_on_test_day, true_route
+from twin.reality.recordings import follow
+from twin.reality.road_task import CAMPUS_TASKS, parse_task, place_on_test_day, task_of_place, true_route
 from twin.runtime import exclusive_lock
 from twin.sysid.logs import read_log
 
@@ -104,7 +102,7 @@ def test_the_real_test_runs_without_the_twin():
         "import sys\n"
         "from twin.learn.policy import Control, Policy\n"
         "import numpy as np\n"
-        "from twin.reality import real_test, recordings, robot_bag\n"
+        "from twin.reality import real_test, recordings\n"
         "class Grey:\n"
         "    def __call__(self, pose):\n"
         "        return np.full((90, 160, 3), 0.4, np.float32), np.full((90, 160), 5.0, np.float32)\n"
@@ -139,7 +137,7 @@ def test_tasks_are_the_twins():
             assert same, (name, field)
     assert set(STANDARD_TASKS) < set(CAMPUS_TASKS)
     assert arc_lengths(line)[-1] == pytest.approx(60.0, abs=1.0)
-    assert np.abs(places.build().route.project(line[:, :2])[1]).max() < 0.35
+    assert np.abs(campus_road.build().route.project(line[:, :2])[1]).max() < 0.35
 
 
 def test_the_corridor_is_free_and_a_drive_along_it_arrives():
@@ -181,7 +179,7 @@ def test_a_robot_that_drives_into_a_house_has_touched_it():
 
 
 def test_small_things_have_moved_and_nothing_else():
-    filmed, later = places.build(), places.build(displaced=True)
+    filmed, later = campus_road.build(), campus_road.build(displaced=True)
     assert [obj.name for obj in filmed.objects] == [obj.name for obj in later.objects]
     for before, after in zip(filmed.objects, later.objects, strict=True):
         moved = not np.array_equal(before.part.vertices, after.part.vertices)
@@ -394,8 +392,8 @@ class Recorder:
 
 def test_the_robots_film_goes_down_the_road(tmp_path, monkeypatch):
     """The robot weaves and stays on the road, the film has the camera's full size, and no other file is written."""
-    monkeypatch.setattr(trial_place, "Rasterizer", Recorder)
-    monkeypatch.setattr(trial_place.true_world, "world_spec", lambda light, place: mujoco.MjSpec())
+    monkeypatch.setattr(true_world, "Rasterizer", Recorder)
+    monkeypatch.setattr(true_world, "world_spec", lambda light, place: mujoco.MjSpec())
     monkeypatch.setattr(recordings, "_FPS", 1)
     path = tmp_path / "robot.mp4"
     assert main(["onboard", "--out", str(path)]) == 0
@@ -410,10 +408,8 @@ def test_the_robots_film_goes_down_the_road(tmp_path, monkeypatch):
 
 def test_a_photo_is_of_the_weather_asked_for(tmp_path, monkeypatch, capsys):
     lights: list = []
-    monkeypatch.setattr(trial_place, "Rasterizer", Recorder)
-    monkeypatch.setattr(
-        trial_place.true_world, "world_spec", lambda light, place: lights.append(light) or mujoco.MjSpec()
-    )
+    monkeypatch.setattr(true_world, "Rasterizer", Recorder)
+    monkeypatch.setattr(true_world, "world_spec", lambda light, place: lights.append(light) or mujoco.MjSpec())
     path = tmp_path / "photos" / "haze.png"
     assert main(["photo", "--lighting", "haze", "--out", str(path)]) == 0
     assert lights == [WEATHER["haze"]] and read_image(path).shape == (*native_size()[::-1], 3)

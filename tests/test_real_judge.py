@@ -10,13 +10,11 @@ import pytest
 from twin.config import CAUSES
 from twin.env.options import parse_options
 from twin.env.route_segments import RouteSegment
-from twin.env.task import Motion, RewardAndTermination
-from twin.env.task_file import write_task
+from twin.env.task import Motion, RewardAndTermination, write_task
 from twin.errors import InputError
 from twin.geometry.poses import Similarity
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
-from twin.reality.real_judge import RealJudge
-from twin.reality.road_task import RoadTask, read_task
+from twin.reality.road_task import RealJudge, RoadTask, read_task
 
 PATHS, STEP, SPEED = 1000, 0.2, 1.0
 OPTIONS = parse_options({"pixels": False, "control_timestep": STEP})

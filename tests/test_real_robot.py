@@ -8,8 +8,8 @@ import pytest
 
 from twin.env.domain_randomization import Ranges
 from twin.errors import InputError
-from twin.reality.place_objects import Solid
-from twin.reality.real_robot import FOOTPRINT, RANGES, TRAINED, HiddenRobot, RealRobot, Solids, draw_robot
+from twin.reality.place_objects import Solid, Solids
+from twin.reality.real_robot import FOOTPRINT, RANGES, TRAINED, HiddenRobot, RealRobot, draw_robot
 from twin.robot import TRACK, WHEEL_RADIUS, WHEELBASE, HuskyParams
 
 STILL = replace(HiddenRobot(), shake=0.0)
@@ -205,7 +205,7 @@ def test_a_touch_is_an_overlap_of_footprint_and_solid():
         kind, yaw = ("box" if k % 2 else "cylinder"), float(rng.uniform(-np.pi, np.pi))
         solid = Solid(kind, np.append(rng.uniform(-1.5, 1.5, 2), 0.3), half, yaw)
         pose = (*rng.uniform(-0.5, 0.5, 2).tolist(), float(rng.uniform(-np.pi, np.pi)))
-        found = Solids(SimpleNamespace(objects=[SimpleNamespace(solids=[solid])])).hit(*pose, 0.03, 0.4)
+        found = Solids(SimpleNamespace(objects=[SimpleNamespace(solids=[solid])]), FOOTPRINT).hit(*pose, 0.03, 0.4)
         c, s = np.cos(pose[2]), np.sin(pose[2])
         off = points @ np.array([[c, s], [-s, c]]) + pose[:2] - solid.center[:2]
         c, s = np.cos(yaw), np.sin(yaw)
@@ -217,9 +217,8 @@ def test_a_touch_is_an_overlap_of_footprint_and_solid():
 
 
 def test_what_lies_flat_or_hangs_high_is_not_touched():
-    one = Solids(
-        SimpleNamespace(objects=[SimpleNamespace(solids=[Solid("box", np.array([0, 0, 1.0]), np.full(3, 0.2))])])
-    )
+    solid = Solid("box", np.array([0, 0, 1.0]), np.full(3, 0.2))
+    one = Solids(SimpleNamespace(objects=[SimpleNamespace(solids=[solid])]), FOOTPRINT)
     assert not one.hit(0.0, 0.0, 0.0, 0.03, 0.4) and one.hit(0.0, 0.0, 0.0, 0.7, 1.1)
 
 

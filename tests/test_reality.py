@@ -14,11 +14,23 @@ from twin.files import read_json
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, umeyama
-from twin.reality import centerline, comparison, filming, place, primitives
-from twin.reality.centerline import RoadLine
-from twin.reality.comparison import align_rigid, camera_errors, compare, intrudes, matched_poses, measure, mesh_quality
+from twin.reality import campus_road, filming, primitives
+from twin.reality import truth as truth_module
+from twin.reality.campus_road import RoadLine
 from twin.reality.lighting import LIGHTINGS, sky_cube_map
-from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, fingerprint
+from twin.reality.truth import (
+    HALF_WIDTH,
+    TrueFilm,
+    Truth,
+    align_rigid,
+    camera_errors,
+    compare,
+    fingerprint,
+    intrudes,
+    matched_poses,
+    measure,
+    mesh_quality,
+)
 from twin.scene import SceneDir
 
 DEMO = Path(__file__).parent.parent / "scenes" / "demo"
@@ -28,7 +40,7 @@ _IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 @pytest.fixture(scope="module")
 def campus():
-    return place.build()
+    return campus_road.build()
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +86,7 @@ def test_ground_is_gentle_but_not_flat():
     middle = road.ground_height(road.at(station))
     assert 0.06 < np.ptp(middle) < 0.3
     assert np.abs(np.gradient(middle, station)).max() < 0.05
-    across = centerline.cross_profile(np.linspace(-2.9, 2.9, 59))
+    across = campus_road.cross_profile(np.linspace(-2.9, 2.9, 59))
     assert across.max() - across.min() > 0.03  # crowned
     assert np.abs(np.diff(across)).max() < 0.005
 
@@ -268,7 +280,7 @@ def test_a_place_without_leaves_is_measured(truth, campus, tmp_path):
     save_visual(scene, truth, {"ground"})
     bare = replace(truth)
     vars(bare)["place"] = replace(campus, objects=[one for one in campus.objects if one.kind != "foliage"])
-    found = comparison._surface_errors(scene.stage("mesh"), bare, _IDENTITY, truth.films["sun"].camera_to_world[:4])
+    found = truth_module._surface_errors(scene.stage("mesh"), bare, _IDENTITY, truth.films["sun"].camera_to_world[:4])
     assert found["mesh_completeness_10cm_ground"] == 1.0 and "mesh_completeness_10cm_foliage" not in found
 
 

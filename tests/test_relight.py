@@ -17,8 +17,7 @@ from twin.geometry.images import psnr, read_image, write_image
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.buffers import Layout
 from twin.nerf.field import RadianceField, untrained_field
-from twin.nerf.fog import Fog, mixed
-from twin.nerf.lightings import AddedLighting, Lightings, added_lightings, check_name
+from twin.nerf.lightings import AddedLighting, Fog, Lightings, added_lightings, check_name, mixed_fog
 from twin.relight import PhotoFit, comparison, fit_photo, main, summary
 from twin.report import video_layout
 from twin.report.video_layout import draw_label
@@ -109,7 +108,7 @@ def test_fog_equals_its_closed_form_and_mixes():
     assert mine.fog("filmed:a:0.5") == Fog(0.01, (1.0, 1.0, 1.0))
     between = mine.fog("a:b:0.25")
     assert between and between.extinction == pytest.approx(0.03) and between.airlight == pytest.approx((0.5,) * 3)
-    assert mixed(Fog(), None, 0.5) == Fog() and mixed(None, None, 0.5) is None
+    assert mixed_fog(Fog(), None, 0.5) == Fog() and mixed_fog(None, None, 0.5) is None
     for share in ("x", "3"):
         with pytest.raises(InputError, match="a:b:"):
             mine.fog(f"a:b:{share}")

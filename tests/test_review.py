@@ -11,8 +11,10 @@ from films import video_info
 from twin.config import ReviewConfig, SceneConfig, SourceConfig
 from twin.files import read_json
 from twin.geometry.cameras import (
+    FAR,
     Cameras,
     PosedCameras,
+    Rendering,
     Viewpoints,
     intrinsics_for_size,
     nearest_frame,
@@ -21,7 +23,6 @@ from twin.geometry.cameras import (
 )
 from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
-from twin.nerf.rendering import FAR, Rendering
 from twin.report.review_chapters import (
     Studio,
     appearance_of_frame,

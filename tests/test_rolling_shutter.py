@@ -17,9 +17,9 @@ from twin.files import read_json
 from twin.geometry.cameras import Cameras
 from twin.reality.__main__ import film as film_place
 from twin.reality.__main__ import main as reality
-from twin.reality.comparison import align_rigid, matched_poses
 from twin.reality.filming import FilmingPlan
 from twin.reality.place_sampling import draw
+from twin.reality.truth import align_rigid, matched_poses
 from twin.scene import SceneDir
 from twin.types import Array
 

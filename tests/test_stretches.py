@@ -15,7 +15,7 @@ from twin.reality.drawn_place import build
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.place_sampling import MAX_FRAMES, draw
 from twin.reality.place_spec import GRADE_STEP, LONGEST_DRAWN, RUN_IN, RUN_OUT
-from twin.reality.stretches import StretchRenderer, is_long, near_stretch
+from twin.reality.true_world import StretchRenderer, is_long, near_stretch
 from twin.reality.truth import TrueFilm, Truth
 
 PLACE, LENGTH = 12, 160.0
@@ -95,8 +95,8 @@ def test_parts_of_road_and_land_meet(place):
 
 
 def test_a_stretch_has_what_is_near_and_sharp_textures_there(place, monkeypatch):
-    monkeypatch.setattr("twin.reality.stretches._SIGHT", 50.0)
-    monkeypatch.setattr("twin.reality.stretches._SHARP", 20.0)
+    monkeypatch.setattr("twin.reality.true_world._SIGHT", 50.0)
+    monkeypatch.setattr("twin.reality.true_world._SHARP", 20.0)
     part, whole = near_stretch(place, 0.0, 10.0), place.textures()
     kept = {obj.name for obj in part.objects}
     last = f"road_{sum(name.startswith('road') for name in place.layout.bands) - 1}"

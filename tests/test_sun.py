@@ -13,26 +13,33 @@ from tiny_world import BOX_FACES, box
 import twin
 from twin import runtime
 from twin.assets.ground import Ground
-from twin.assets.shadow_casters import rough_triangles, shadow_casters
 from twin.assets.views import Views
 from twin.capture.capture_data import Capture
 from twin.env.domain_randomization import RandomizationSample, Ranges
 from twin.env.irradiance import IrradianceEstimator
+from twin.env.picture_effects import Weather
 from twin.env.suite import EnvFactory
-from twin.env.weather import Weather
 from twin.errors import InputError
 from twin.files import load_arrays
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
-from twin.geometry.mesh_rays import Surface
+from twin.geometry.mesh_rays import OrthographicShadowMap, ShadowCasters, Surface, angles, direction
 from twin.geometry.poses import look_at
-from twin.geometry.shadow_map import OrthographicShadowMap, ShadowCasters, angles, direction
-from twin.geometry.solar import heading_from_gps, parse_time, sun_angles, sun_direction
-from twin.nerf.fog import Fog
-from twin.nerf.lightings import AddedLighting
-from twin.nerf.sun import TERMS, SeenSurfaces, Sun, main_sun, mixed_sunlight, relit
+from twin.nerf.lightings import AddedLighting, Fog
+from twin.nerf.sun import (
+    TERMS,
+    SeenSurfaces,
+    Sun,
+    heading_from_gps,
+    main_sun,
+    mixed_sunlight,
+    parse_time,
+    relit,
+    sun_angles,
+    sun_direction,
+)
 from twin.nerf.sun_fit import SunProblem, fit_direction, search_directions
 from twin.pack import pack
-from twin.relight import find_sun
+from twin.relight import find_sun, rough_triangles, shadow_casters
 from twin.scene import SceneDir, stage_result, write_stamp
 from twin.view.camera_path import mixed_lighting, named_lighting
 from twin.view.scene_picture import FreeCamera, ScenePicture
@@ -113,7 +120,7 @@ def test_memory_of_a_shadow_map_is_bounded(monkeypatch):
     finally:
         tracemalloc.stop()
     assert made.height.size > 400_000 and peak < 20 << 20
-    monkeypatch.setattr("twin.geometry.shadow_map._BATCH", 1 << 30)
+    monkeypatch.setattr("twin.geometry.mesh_rays._BATCH", 1 << 30)
     np.testing.assert_array_equal(casters.seen_from(toward, texel=0.01).height, made.height)
 
 

@@ -380,7 +380,7 @@ def test_headers_of_another_clock_are_replaced_by_times_of_recording(place, tmp_
 @pytest.mark.slow
 def test_the_played_robots_bag_has_what_its_pilot_saw(tmp_path, monkeypatch):
     """The pilot drives on JPEG pictures; the recorded commands are the policy's for the recorded pictures."""
-    from twin.reality.robot_bag import write_robot_bag
+    from twin.reality.recordings import write_robot_bag
     from twin_policy import Limits, OnnxPolicy, Pilot
 
     weights = some_weights(SMALL)
@@ -400,7 +400,7 @@ def test_the_played_robots_bag_has_what_its_pilot_saw(tmp_path, monkeypatch):
     np.testing.assert_array_equal(given, found.commands)
     with pytest.raises(InputError, match="exists; give another --out"):
         write_robot_bag(tmp_path / "bag", None, "straight", "haze")
-    monkeypatch.setattr("twin.reality.robot_bag.cv2.imencode", _interrupt)
+    monkeypatch.setattr("twin.reality.recordings.cv2.imencode", _interrupt)
     with pytest.raises(KeyboardInterrupt):
         write_robot_bag(tmp_path / "cut", None, "straight", "haze")
     assert not (tmp_path / "cut").exists()

@@ -15,9 +15,9 @@ from tiny_twin import tiny_twin
 import twin
 from twin import runtime
 from twin.config import ObstacleConfig
-from twin.env.camera_noise import CameraOptions
 from twin.env.domain_randomization import Ranges
 from twin.env.observation import GpuPixelObserver, PixelObserver
+from twin.env.picture_effects import CameraOptions
 from twin.env.suite import EnvFactory
 from twin.env.task import control
 from twin.env.vector_env_gpu import GpuVectorEnv

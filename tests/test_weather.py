@@ -17,12 +17,11 @@ from twin.env.domain_randomization import (
     condition_options,
 )
 from twin.env.episode_lighting import LightingSets, sample_lighting
+from twin.env.picture_effects import CastShadows, DirectionalRelighting, FogSample, Weather, _solid_shadows
 from twin.env.suite import EnvFactory, fingerprint
 from twin.env.task import WEATHER, DriveTask
-from twin.env.weather import CastShadows, DirectionalRelighting, FogSample, Weather, _solid_shadows
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
-from twin.nerf.fog import Fog
-from twin.nerf.lightings import AddedLighting
+from twin.nerf.lightings import AddedLighting, Fog
 from twin.scene import SceneDir, stage_result
 
 SMALL = {"size": (32, 18)}

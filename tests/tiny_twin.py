@@ -10,7 +10,7 @@ from tiny_world import tiny_config, tiny_ground, tiny_scene
 
 from twin.mjcf.scene_xml import run
 from twin.nerf.baked import BakedField
-from twin.nerf.brick_layout import BrickLayout, skip_distances
+from twin.nerf.baked_arrays import BrickLayout, skip_distances
 from twin.nerf.lightings import Lightings
 from twin.robot import HuskyParams
 from twin.scene import write_stamp

@@ -9,6 +9,7 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from twin.command_line import HelpFormatter, Parser, run
 from twin.config import HELD_OUT, QUALITIES, Condition
@@ -414,18 +415,20 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     )
     commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
 
-    def add(name: str, text: str) -> argparse.ArgumentParser:
-        return commands.add_parser(name, help=text, description=text, formatter_class=HelpFormatter)
+    def command(name: str, text: str) -> tuple[argparse.ArgumentParser, Callable[..., Any]]:
+        """A command's parser, and the function that adds an option to it."""
+        parser = commands.add_parser(name, help=text, description=text, formatter_class=HelpFormatter)
+        return parser, parser.add_argument
 
-    def place(command: argparse.ArgumentParser) -> None:
-        command.add_argument(
+    def place(one: argparse.ArgumentParser) -> None:
+        one.add_argument(
             "--place",
             type=int,
             default=0,
             metavar="NUMBER",
             help="0: the demo's street; from 1: sampled places (1 to 49 are for development)",
         )
-        command.add_argument(
+        one.add_argument(
             "--length",
             type=float,
             default=0.0,
@@ -433,75 +436,69 @@ def _reality(parser: argparse.ArgumentParser) -> None:
             help="lengthen a sampled place's road to this, 20 to 2000; 0: as sampled",
         )
 
-    def robot(command: argparse.ArgumentParser, camera: bool = True) -> None:
-        place(command)
-        command.add_argument("--robot", type=int, default=0, metavar="NUMBER", help="number of the simulated robot")
+    def robot(one: argparse.ArgumentParser, camera: bool = True) -> None:
+        place(one)
+        one.add_argument("--robot", type=int, default=0, metavar="NUMBER", help="number of the simulated robot")
         if camera:
-            command.add_argument(
-                "--camera", type=int, default=0, metavar="NUMBER", help="number of that robot's camera"
-            )
+            one.add_argument("--camera", type=int, default=0, metavar="NUMBER", help="number of that robot's camera")
 
-    def one_weather(command: argparse.ArgumentParser) -> None:
-        either = command.add_mutually_exclusive_group(required=True)
+    def one_weather(one: argparse.ArgumentParser) -> None:
+        either = one.add_mutually_exclusive_group(required=True)
         either.add_argument("--lighting", metavar="NAME", help="a designed weather")
         either.add_argument("--day", type=int, nargs=1, metavar="NUMBER", help="number of a random day, from 1")
 
-    command = add("film", "film the place into a scene folder")
-    command.add_argument("--out", type=Path, required=True, help="scene folder to write")
-    place(command)
-    command.add_argument(
-        "--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; for a sampled place, its own"
-    )
-    command.add_argument("--tiny", action="store_true", help="only 12 m in 320x180 px under two lightings, for tests")
-    command.add_argument(
+    one, add = command("film", "film the place into a scene folder")
+    add("--out", type=Path, required=True, help="scene folder to write")
+    place(one)
+    add("--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; for a sampled place, its own")
+    add("--tiny", action="store_true", help="only 12 m in 320x180 px under two lightings, for tests")
+    add(
         "--traffic",
         action="store_true",
         help="walkers and cars move through the films, and parked cars have left in the last lighting",
     )
-    command.add_argument("--readout", type=float, default=0.0, metavar="SECONDS", help="rolling shutter; 0: none")
-    command.add_argument("--shake", type=float, metavar="FACTOR", help="shake of the camera; 1: as on a cart")
-    command = add("compare", "compare a build of a filmed place with its truth, and show it in the build's report")
-    command.add_argument("scene", type=Path, help="folder of a built scene")
-    command = add("drive", "the real test: drive policy files in weather that was not filmed")
-    command.add_argument("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
-    command.add_argument(
+    add("--readout", type=float, default=0.0, metavar="SECONDS", help="rolling shutter; 0: none")
+    add("--shake", type=float, metavar="FACTOR", help="shake of the camera; 1: as on a cart")
+    _, add = command("compare", "compare a build of a filmed place with its truth, and show it in the build's report")
+    add("scene", type=Path, help="folder of a built scene")
+    one, add = command("drive", "the real test: drive policy files in weather that was not filmed")
+    add("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
+    add(
         "--task",
         required=True,
         help="{straight,right_turn}; a sampled place names its own; or a .json of twin export --task-file",
     )
-    command.add_argument("--scene", type=Path, help="the built scene from which the .json was exported")
-    robot(command)
-    command.add_argument("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
-    command.add_argument("--lightings", nargs="+", metavar="NAME", help="designed weathers (default: all)")
-    command.add_argument("--day", type=int, nargs="+", metavar="NUMBER", help="numbers of random days, from 1")
-    command.add_argument(
+    add("--scene", type=Path, help="the built scene from which the .json was exported")
+    robot(one)
+    add("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
+    add("--lightings", nargs="+", metavar="NAME", help="designed weathers (default: all)")
+    add("--day", type=int, nargs="+", metavar="NUMBER", help="numbers of random days, from 1")
+    add(
         "--out",
         type=Path,
         required=True,
         help="real.csv, with a table of trials beside it; only one command at a time may write it",
     )
-    command.add_argument(
-        "--twin-lighting", default=str(Condition(HELD_OUT, True)), help="the twin's lighting to compare with"
-    )
-    command.add_argument("--films", type=Path, help="folder for a film of every trial driven now, as the robot saw it")
-    command = add("log", "a drive log of the place's Husky, for twin align")
-    command.add_argument("--out", type=Path, required=True, help="drive.csv")
-    command.add_argument("--duration", type=float, default=300.0, help="length of the drive [s]")
-    robot(command, camera=False)
-    command = add("onboard", "a film by the place's Husky, for twin align")
-    command.add_argument("--out", type=Path, required=True, help="robot.mp4")
-    robot(command)
-    command = add("bag", "a ROS 2 bag of one trial of the place's Husky, for twin trial")
-    command.add_argument("--out", type=Path, required=True, help="folder of the bag")
-    command.add_argument("--policy", type=Path, help="policy folder; default: the robot follows the route")
-    command.add_argument("--task", default="straight", help="{straight,right_turn}; a sampled place names its own")
-    one_weather(command)
-    command.add_argument("--seed", type=int, default=0, help="seed of start, camera and noise")
-    robot(command)
-    command = add("photo", "a photo by the Husky's camera in the weather of a trial, for twin relight")
-    one_weather(command)
-    command.add_argument("--out", type=Path, required=True, help="photo.png")
-    robot(command)
+    add("--twin-lighting", default=str(Condition(HELD_OUT, True)), help="the twin's lighting to compare with")
+    add("--films", type=Path, help="folder for a film of every trial driven now, as the robot saw it")
+    one, add = command("log", "a drive log of the place's Husky, for twin align")
+    add("--out", type=Path, required=True, help="drive.csv")
+    add("--duration", type=float, default=300.0, help="length of the drive [s]")
+    robot(one, camera=False)
+    one, add = command("onboard", "a film by the place's Husky, for twin align")
+    add("--out", type=Path, required=True, help="robot.mp4")
+    robot(one)
+    one, add = command("bag", "a ROS 2 bag of one trial of the place's Husky, for twin trial")
+    add("--out", type=Path, required=True, help="folder of the bag")
+    add("--policy", type=Path, help="policy folder; default: the robot follows the route")
+    add("--task", default="straight", help="{straight,right_turn}; a sampled place names its own")
+    one_weather(one)
+    add("--seed", type=int, default=0, help="seed of start, camera and noise")
+    robot(one)
+    one, add = command("photo", "a photo by the Husky's camera in the weather of a trial, for twin relight")
+    one_weather(one)
+    add("--out", type=Path, required=True, help="photo.png")
+    robot(one)
 
 
 VERBS = {

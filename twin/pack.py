@@ -9,7 +9,7 @@ Private data are left out: comments and paths of `scene.toml`, photos, dependenc
 positions. `twin.unpack` describes the format.
 
 Driving in a pack gives the same results as in the scene, bit for bit: only those samples of the radiance field are
-replaced that no ray reads (`brick_layout.samples_read`). With `--levels` below 256, the field's features are rounded to
+replaced that no ray reads (`baked_arrays.samples_read`). With `--levels` below 256, the field's features are rounded to
 that number of values, which makes the pack smaller and changes the field.
 """
 
@@ -37,7 +37,7 @@ from twin.files import atomic_path, digest_json, json_bytes, load_tensors, read_
 from twin.learn.policy import JSON, ONNX, WEIGHTS, find_policy, load_policy
 from twin.loading import Twin, load_scene
 from twin.nerf.baked import section_file, stored_layouts
-from twin.nerf.brick_layout import BrickLayout, samples_read
+from twin.nerf.baked_arrays import BrickLayout, samples_read
 from twin.nerf.lightings import lighting_files
 from twin.nerf.road import ROAD_FILE
 from twin.scene import STAGES, SceneDir, Stamp, package_versions, require_stage, stage_result

@@ -34,7 +34,7 @@ from twin.reality.filming import FilmingPlan
 from twin.reality.lighting import weather
 from twin.reality.place_sampling import draw
 from twin.reality.real_test import RealTest, Setup, load_policy_file, task_for
-from twin.reality.trial_place import place_on_test_day
+from twin.reality.road_task import place_on_test_day
 
 sys.path.append(str(Path(__file__).parents[1]))
 sys.path.append(str(Path(__file__).parents[1] / "forecast"))

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import runtime
-from twin.geometry.cameras import Cameras, pixel_grid, scaled_intrinsics, unproject
-from twin.nerf.rendering import RenderableField
+from twin.geometry.cameras import Cameras, RenderableField, pixel_grid, scaled_intrinsics, unproject
 from twin.types import Array
 
 _BATCH = 8

@@ -15,17 +15,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.env.camera_noise import CameraNoise, soft_clip
 from twin.env.irradiance import BOX_CORNERS, ContactShadows, Irradiance, IrradianceEstimator
 from twin.env.mujoco_renderer import FRONT_CAMERA, RayCaster, camera_intrinsics, camera_poses, mujoco_rays
-from twin.env.obstacle_models import OBSTACLE_GROUP
-from twin.env.obstacles import stored_route
-from twin.env.weather import Weather
+from twin.env.obstacles import OBSTACLE_GROUP, stored_route
+from twin.env.picture_effects import CameraNoise, Weather, soft_clip
 from twin.errors import InputError
-from twin.geometry.cameras import Viewpoints, opencv_to_mujoco, pixel_grid, unproject
-from twin.mjcf.husky import ROBOT_VISUAL_GROUP, camera_mount_geoms
+from twin.geometry.cameras import Rendering, Viewpoints, opencv_to_mujoco, pixel_grid, unproject
+from twin.mjcf.husky_visuals import ROBOT_VISUAL_GROUP, camera_mount_geoms
 from twin.nerf.baked import BakedField
-from twin.nerf.rendering import Rendering
 from twin.nerf.sun import Sunlight, relit
 from twin.runtime import available_cores
 from twin.types import Array, Array32

@@ -3,7 +3,7 @@
 The randomized quantities are:
 
 - robot: tire friction, payload, latency, camera pose and wheels;
-- pictures: fog, directional relighting and cast shadows (see `weather.py`);
+- pictures: fog, directional relighting and cast shadows (see `picture_effects.py`);
 - place: distractor objects beside the corridor.
 
 `Ranges` contains the bounds, a `RandomizationSample` the values of one episode. Each value is uniform in its range and

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from twin.config import ANY, HELD_OUT, RESERVED_LIGHTINGS, TRAINING
 from twin.errors import InputError
 from twin.nerf.baked import BakedField
-from twin.nerf.fog import Fog, mixed
+from twin.nerf.lightings import Fog, mixed_fog
 from twin.nerf.sun import Sunlight, mixed_sunlight
 from twin.types import Array32
 
@@ -66,7 +66,7 @@ class EpisodeLighting:
 
     def fog_at(self, time: float) -> Fog | None:
         """The fog after `time` [s]; None as for `fog`."""
-        return self.fog if self.end is None else mixed(self.fog, self.end_fog, self._share(time))
+        return self.fog if self.end is None else mixed_fog(self.fog, self.end_fog, self._share(time))
 
     def sunlight_at(self, time: float) -> Sunlight:
         """The suns after `time` [s]."""
@@ -94,7 +94,7 @@ class LightingSets:
     """Training and held-out lightings of one field: disjoint sets, which are the same for all seeds.
 
     The distance of two lightings is the rms difference of the colors that they give to the field's *probes* (rays with
-    stored features, see `nerf/appearance_prior.py`). The first anchors are the filmed lightings; they belong to the
+    stored features, see `nerf/lightings.py`). The first anchors are the filmed lightings; they belong to the
     training set. More are chosen one by one from random lightings of a fixed seed, each as far as possible from all
     anchors before it. Every second one of these, from the first on, belongs to the held-out set. A lighting belongs to
     the set of its nearest anchor, or to no set if an anchor of the other set is nearly as near. All anchors of a set

@@ -28,9 +28,9 @@ from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.mjcf.world import arc_lengths, heading_at, point_at
-from twin.nerf.appearance_prior import Probes
 from twin.nerf.baked import BakedField
 from twin.nerf.kernels.color_head import harmonics_of
+from twin.nerf.lightings import Probes
 from twin.nerf.sun import Sunlight, main_sun
 from twin.types import Array
 

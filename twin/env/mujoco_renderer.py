@@ -17,16 +17,14 @@ from numpy.typing import NDArray
 
 from twin.assets.gaussians import Gaussians
 from twin.config import ObstacleConfig
-from twin.env.camera_noise import CameraNoise
-from twin.env.obstacle_models import OBSTACLE_GROUP
-from twin.env.obstacles import add_obstacles, place
+from twin.env.obstacles import OBSTACLE_GROUP, add_obstacles, place
 from twin.env.physics import camera_pose
-from twin.env.weather import Weather
-from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
+from twin.env.picture_effects import CameraNoise, Weather
+from twin.geometry.cameras import FAR, Rendering, opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.poses import look_at
-from twin.mjcf.husky import ROBOT_COLLISION_GROUP, camera_mount_geoms
+from twin.mjcf.husky import ROBOT_COLLISION_GROUP
+from twin.mjcf.husky_visuals import camera_mount_geoms
 from twin.mjcf.world import GROUND_GROUP, World
-from twin.nerf.rendering import FAR, Rendering
 from twin.runtime import available_cores, log_line
 from twin.types import Array, Array32, Image
 from twin.warp_runtime import wp

@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.config import Condition
-from twin.env.camera_noise import CameraNoise
 from twin.env.compositor import Compositor
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
 from twin.env.mujoco_renderer import FRONT_CAMERA, SceneRenderer, camera_intrinsics
 from twin.env.options import Options
+from twin.env.picture_effects import CameraNoise, Weather
 from twin.env.task import CAMERA, LIGHTING, WEATHER, DrivePhysics, DriveTask
 from twin.env.trust import SKY_OPACITY, Trust
-from twin.env.weather import Weather
 from twin.geometry.cameras import Viewpoints
 from twin.nerf.baked import BakedField
 from twin.nerf.sun import main_sun

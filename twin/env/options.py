@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from twin.config import STEERING, TRAINING, TWIST, ObstacleConfig
-from twin.env.camera_noise import CameraOptions
 from twin.env.controller import COMMAND_TIMEOUT
 from twin.env.domain_randomization import Ranges
+from twin.env.picture_effects import CameraOptions
 from twin.errors import InputError, short_repr
 from twin.mjcf.husky import TIMESTEP
 from twin.types import Array

@@ -13,8 +13,7 @@ their optical axes;
 import numpy as np
 from scipy.spatial import cKDTree
 
-from twin.geometry.cameras import PosedCameras
-from twin.nerf.rendering import Rendering
+from twin.geometry.cameras import PosedCameras, Rendering
 from twin.types import Array
 
 SKY_OPACITY = 0.5

@@ -16,7 +16,6 @@ import numpy as np
 
 from twin.config_file import parse_table
 from twin.errors import InputError, join_names
-from twin.evaluation import ranking
 from twin.evaluation.agreement import (
     DEPENDENT,
     Agreement,
@@ -29,7 +28,17 @@ from twin.evaluation.agreement import (
     unit_counts,
 )
 from twin.evaluation.jackknife import training_of
-from twin.evaluation.rate_model import MIN_RATE_DAYS, RateModel
+from twin.evaluation.rate_model import (
+    MARGIN,
+    MIN_RATE_DAYS,
+    SAMPLES,
+    SETTLED_PROBABILITY,
+    RateModel,
+    expected_confidence,
+    rank_interval,
+    rank_probabilities,
+    trials_needed,
+)
 from twin.evaluation.statistics import (
     CONFIDENCE,
     MIN_POLICIES,
@@ -93,7 +102,7 @@ class LeftOutLighting:
 
 @dataclass(frozen=True)
 class TrialAllocation:
-    """Further real trials that would settle the ranking of a task's policies; see `ranking.py`."""
+    """Further real trials that would settle the ranking of a task's policies; see `rate_model.py`."""
 
     task: str
     policies: int
@@ -106,7 +115,7 @@ class TrialAllocation:
     """See `RankingConfidence.order`."""
     more_for_winner: int | None = None
     """Further trials per policy until `RankingConfidence.winner` reaches `Forecast.sure`; None: more than
-    `ranking.MAX_TRIALS`."""
+    `rate_model.MAX_TRIALS`."""
     more_for_order: int | None = None
     """The same for `RankingConfidence.order`."""
 
@@ -126,10 +135,10 @@ class Forecast:
     left_out: tuple[LeftOutLighting, ...]
     plans: tuple[TrialAllocation, ...]
     confidence: float = CONFIDENCE
-    draws: int = ranking.SAMPLES
+    draws: int = SAMPLES
     seed: int = 0
-    sure: float = ranking.SETTLED_PROBABILITY
-    margin: float = ranking.MARGIN
+    sure: float = SETTLED_PROBABILITY
+    margin: float = MARGIN
 
     def candidates_of(self, task: str) -> list[Candidate]:
         return [c for c in self.candidates if c.task == task]
@@ -241,11 +250,11 @@ def _candidates(
     driven = [[c for c in real if c.policy == p] for p in policies]
     rng = np.random.default_rng([seed, 1])
     by_day = bool(real) and len(lightings) > 1
-    ranks = ranking.rank_probabilities(_sampled_rates(cells, by_day, rng))
+    ranks = rank_probabilities(_sampled_rates(cells, by_day, rng))
     with_real = [i for i, mine in enumerate(driven) if mine]
     real_ranks: dict[int, Array] = {}
     if len(with_real) > 1:
-        each = ranking.rank_probabilities(_sampled_rates([driven[i] for i in with_real], True, rng))
+        each = rank_probabilities(_sampled_rates([driven[i] for i in with_real], True, rng))
         real_ranks = dict(zip(with_real, each, strict=True))
     twin_rates = _rates_over_days(cells, road=False) if by_day else [_mean_rate(mine) for mine in cells]
     real_rates = dict(zip(with_real, _rates_over_days([driven[i] for i in with_real]), strict=True))
@@ -258,7 +267,7 @@ def _candidates(
                 task=task,
                 lightings=tuple(c.lighting for c in cells[i]),
                 twin=twin_rates[i],
-                twin_rank=Estimate(*ranking.rank_interval(ranks[i]), len(policies)),
+                twin_rank=Estimate(*rank_interval(ranks[i]), len(policies)),
                 twin_ranks=tuple(float(p) for p in ranks[i]),
                 real=real_rates.get(i, Estimate(missing="not driven on the road")),
                 real_ranks=tuple(float(p) for p in real_ranks.get(i, ())),
@@ -306,7 +315,7 @@ def _sampled_rates(rows: Sequence[Sequence[Cell]], by_day: bool, rng: np.random.
 
     Effects of a day on all policies are not modeled, since they hardly change ranks.
     """
-    return RateModel.fit(*unit_counts(rows, by_day), shared_days=False).sample(rng, ranking.SAMPLES)
+    return RateModel.fit(*unit_counts(rows, by_day), shared_days=False).sample(rng, SAMPLES)
 
 
 def _rates_over_days(rows: Sequence[Sequence[Cell]], road: bool = True) -> list[Estimate]:
@@ -366,6 +375,6 @@ def _allocation(task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int
     rows = [[c for c in cells if c.policy == policy] for policy in policies]
     by_day = on_road or (bool(real) and len({c.lighting for c in twin}) > 1)  # as in `_candidates`
     rates = _sampled_rates(rows, by_day, np.random.default_rng([seed, 3]))
-    now = ranking.expected_confidence(rates, 0, seed, on_road)
-    more = [ranking.trials_needed(rates, what, seed, on_road) for what in ("winner", "order")]
+    now = expected_confidence(rates, 0, seed, on_road)
+    more = [trials_needed(rates, what, seed, on_road) for what in ("winner", "order")]
     return TrialAllocation(task, len(policies), basis, now.winner, now.order, *more)

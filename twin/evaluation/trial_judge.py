@@ -13,10 +13,9 @@ import numpy as np
 from twin.env.suite import EnvFactory
 from twin.env.task import Motion, RewardAndTermination
 from twin.errors import InputError
-from twin.geometry.cameras import Viewpoints
+from twin.geometry.cameras import Rendering, Viewpoints
 from twin.geometry.images import psnr
 from twin.mjcf.world import heading_at, heading_error
-from twin.nerf.rendering import Rendering
 from twin.robot import PixelCamera
 from twin.types import Array, Image
 

@@ -6,7 +6,7 @@
     twin export scenes/demo --task straight --task-file straight.json
 
 `camera_formats` writes frames and cameras, `gltf` the mesh, and `usd` all of the place; `twin.assets.gaussians` makes
-the splats, and `twin.env.task_file` the task files.
+the splats, and `twin.env.task` the task files.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from twin.assets.views import render_views
 from twin.config_file import load_config
 from twin.env.options import Options
 from twin.env.route_segments import find_task
-from twin.env.task_file import write_task
+from twin.env.task import write_task
 from twin.errors import InputError
 from twin.export import gltf
 from twin.export.camera_formats import write_colmap, write_nerfstudio

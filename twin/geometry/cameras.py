@@ -1,4 +1,4 @@
-"""Posed pinhole cameras, sparse points and projection.
+"""Posed pinhole cameras, sparse points, projection, and what a renderer returns for cameras.
 
 OpenCV axes: x right, y down, z forward. Pixel (0, 0) is the *corner* of the top-left pixel, whose center is (0.5, 0.5)
 as in COLMAP. *Depth* is the z coordinate in the camera frame, *distance* is measured along the ray. World
@@ -233,3 +233,30 @@ class SparsePoints:
             if k and not (points.point.min() >= 0 and points.point.max() < m and points.frame.min() >= 0):
                 raise ValueError(f"an observation has a point index outside 0 to {m - 1}, or a negative frame index")
         return points
+
+
+# ---- renderings
+
+FAR = 1.0e4
+"""z-depth of the background [m]."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """n rendered views of one size."""
+
+    rgb: NDArray[np.float32]
+    """Color in [0, 1], shape (n, height, width, 3)."""
+    depth: NDArray[np.float32]
+    """z-depth [m] at which half the light is blocked, `FAR` where less is blocked; shape (n, height, width)."""
+    opacity: NDArray[np.float32]
+    """Share of the light that is blocked, in [0, 1], shape (n, height, width)."""
+
+
+class RenderableField(Protocol):
+    """Interface shared by `RadianceField` and `BakedField`."""
+
+    @property
+    def lightings(self) -> tuple[str, ...]: ...
+
+    def render(self, cameras: PosedCameras, lighting: str, size: tuple[int, int]) -> Rendering: ...

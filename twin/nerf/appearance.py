@@ -5,14 +5,14 @@ such as exposure. `lightings.py` looks embeddings up by name.
 """
 
 import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from twin.nerf import network
-from twin.nerf.fog import REACH, Fog
-from twin.nerf.lightings import Lightings
+from twin.nerf.lightings import FOG_REACH, Fog, Lightings
 from twin.types import Array32
 
 
@@ -79,6 +79,54 @@ _MAX_EXTINCTION = 0.1  # [1/m], a visibility of 30 m; a photo that needs more wa
 _FARTHEST_SHARE = 0.25  # share of the rays, the farthest ones, whose mean color initializes the airlight
 
 
+class FogFit:
+    """Fog that is fitted to colors of rays by gradient descent, see `descend`."""
+
+    def __init__(self, extinction: float, airlight: torch.Tensor, distances: torch.Tensor) -> None:
+        """Starts at an extinction [1/m] and an airlight (3,); `distances` along the rays [m], shape (n,)."""
+        self._log_extinction = torch.tensor(math.log(extinction), device=distances.device, requires_grad=True)
+        self._airlight = airlight.requires_grad_(True)
+        self._distances = distances
+        self.parameters = [self._log_extinction, self._airlight]
+
+    def apply(self, rgb: torch.Tensor) -> torch.Tensor:
+        """Colors (n, 3) in the fog."""
+        kept = torch.exp(-torch.exp(self._log_extinction) * self._distances)[:, None]
+        return kept * rgb + (1.0 - kept) * self._airlight
+
+    def bound(self) -> None:
+        """Limits the parameters."""
+        self._log_extinction.clamp_(max=math.log(_MAX_EXTINCTION))
+        self._airlight.clamp_(0.0, 1.0)
+
+    def result(self) -> Fog:
+        """The fog fitted so far."""
+        red, green, blue = self._airlight.tolist()
+        return Fog(float(self._log_extinction.detach().exp()), (red, green, blue))
+
+
+def descend(
+    fitted: Sequence[tuple[torch.Tensor, float]],
+    steps: int,
+    loss: Callable[[], torch.Tensor],
+    bound: Callable[[], None],
+) -> None:
+    """Minimizes a loss over tensors, each with its initial learning rate, by Adam.
+
+    The rates fall linearly to zero. `bound` is called after each step, without recording gradients.
+    """
+    tensors = [tensor for tensor, _ in fitted]
+    optimizer = torch.optim.Adam([{"params": [tensor], "lr": rate} for tensor, rate in fitted])
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1.0 - step / steps)
+    for _ in range(steps):
+        for tensor, gradient in zip(tensors, torch.autograd.grad(loss(), tensors), strict=True):
+            tensor.grad = gradient
+        optimizer.step()
+        schedule.step()
+        with torch.no_grad():
+            bound()
+
+
 def fit_appearance(
     parameters: dict[str, torch.Tensor],
     features: torch.Tensor,
@@ -96,32 +144,17 @@ def fit_appearance(
     """
     origin = torch.as_tensor(start, device=features.device)
     embedding = origin.clone().requires_grad_(True)
-    fitted, rates = [embedding], [_RATE]
+    fitted, fog = [(embedding, _RATE)], None
     if distances is not None:
-        distances = distances.clamp(max=REACH)
+        distances = distances.clamp(max=FOG_REACH)
         farthest = distances.topk(max(1, int(_FARTHEST_SHARE * len(distances)))).indices
-        log_extinction = torch.tensor(math.log(_INITIAL_EXTINCTION), device=features.device, requires_grad=True)
-        airlight = colors[farthest].mean(0).clone().requires_grad_(True)
-        fitted += [log_extinction, airlight]
-        rates += [_EXTINCTION_RATE, _AIRLIGHT_RATE]
-    optimizer = torch.optim.Adam([{"params": [p], "lr": rate} for p, rate in zip(fitted, rates, strict=True)])
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1.0 - step / steps)
-    for _ in range(steps):
+        fog = FogFit(_INITIAL_EXTINCTION, colors[farthest].mean(0).clone(), distances)
+        fitted += zip(fog.parameters, (_EXTINCTION_RATE, _AIRLIGHT_RATE), strict=True)
+
+    def loss() -> torch.Tensor:
         rgb = network.head(parameters, features, harmonics, embedding)
-        if distances is not None:
-            kept = torch.exp(-torch.exp(log_extinction) * distances)[:, None]
-            rgb = kept * rgb + (1.0 - kept) * airlight
-        loss = ((rgb - colors) ** 2).mean() + _PRIOR * ((embedding - origin) ** 2).mean()
-        for parameter, gradient in zip(fitted, torch.autograd.grad(loss, fitted), strict=True):
-            parameter.grad = gradient
-        optimizer.step()
-        schedule.step()
-        if distances is not None:
-            with torch.no_grad():
-                log_extinction.clamp_(max=math.log(_MAX_EXTINCTION))
-                airlight.clamp_(0.0, 1.0)
-    fog = Fog()
-    if distances is not None:
-        red, green, blue = airlight.tolist()
-        fog = Fog(float(log_extinction.detach().exp()), (red, green, blue))
-    return embedding.detach().cpu().numpy(), fog
+        rgb = fog.apply(rgb) if fog else rgb
+        return ((rgb - colors) ** 2).mean() + _PRIOR * ((embedding - origin) ** 2).mean()
+
+    descend(fitted, steps, loss, fog.bound if fog else lambda: None)
+    return embedding.detach().cpu().numpy(), fog.result() if fog else Fog()

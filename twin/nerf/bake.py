@@ -16,7 +16,7 @@ from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid
 from twin.nerf import network
 from twin.nerf.baked import BakedField, BakedSection
-from twin.nerf.brick_layout import BrickLayout, brick_indices, skip_distances
+from twin.nerf.baked_arrays import BrickLayout, brick_indices, skip_distances
 from twin.nerf.buffers import (
     CameraArrays,
     Workspace,
@@ -29,7 +29,7 @@ from twin.nerf.buffers import (
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.field import QUERY_POINTS, FieldSection, RadianceField
 from twin.nerf.kernels import bricks as kernels
-from twin.nerf.kernels import composite as volume
+from twin.nerf.kernels import volume
 from twin.runtime import bar
 from twin.warp_runtime import wp
 
@@ -47,7 +47,7 @@ _EMPTY_RAW_DENSITY = -8.0  # raw density outside all bricks
 _RAW_RANGE = (-6.0, 12.0)  # raw densities that a byte covers
 _CLIPPED_SHARE = 2e-4  # share of feature values clipped at each end of a byte's range
 _RATES = (0.05, 0.02)  # learning rates of raw density and features
-_PROBES = 1024  # rays for the prior of random lightings, see `appearance_prior.py`
+_PROBES = 1024  # rays for the prior of random lightings, see `lightings.py`
 
 
 def bake(
@@ -297,7 +297,7 @@ class _FineTuner:
 
 
 def _probes(field: RadianceField, pixels: TrainingPixels, seed: int) -> dict[str, NDArray]:
-    """Random rays through the training frames, as arrays of `appearance_prior.Probes`."""
+    """Random rays through the training frames, as arrays of `lightings.Probes`."""
     rng = np.random.default_rng([seed, 6])
     frame = np.linspace(0, len(pixels.cameras) - 1, _PROBES).round().astype(int)
     pixel = rng.random((_PROBES, 2)) * np.stack([pixels.width, pixels.height], 1)[frame]

@@ -1,6 +1,6 @@
 """Baked field: density and features of a trained radiance field in sparse 8-bit bricks. Renders without torch.
 
-`kernels/bricks.py` defines the bricks, `brick_layout.py` their layout. The two per-ray networks, head and background
+`kernels/bricks.py` defines the bricks, `baked_arrays.py` all arrays. The two per-ray networks, head and background
 (`network.py`), are stored beside them. A lighting is one vector, so one baked field renders the place under every
 lighting. A long road has several sections (`road.py`), which are read from disk when a camera needs them.
 """
@@ -20,17 +20,13 @@ from safetensors.numpy import save as to_bytes
 
 from twin.errors import InputError, short_repr
 from twin.files import check_shapes, load_tensors, read_json, require_text, wrap_read_errors, write_json
-from twin.geometry.cameras import PosedCameras, intrinsics_for_size
-from twin.nerf.appearance_prior import Probes
-from twin.nerf.brick_layout import BrickLayout, check_arrays, check_networks
-from twin.nerf.fog import Fog
-from twin.nerf.kernels.composite import CHANNELS
-from twin.nerf.lightings import Lightings
+from twin.geometry.cameras import PosedCameras, Rendering, intrinsics_for_size
+from twin.nerf.baked_arrays import BrickLayout, Detail, check_arrays, check_networks
+from twin.nerf.kernels.volume import CHANNELS
+from twin.nerf.lightings import Fog, Lightings, Probes
 from twin.nerf.render_target import CameraBatch, RenderedImages, RenderKernels, RenderTarget, SectionOnDevice
-from twin.nerf.rendering import Rendering
 from twin.nerf.road import RoadSections, undivided_road
 from twin.nerf.sun import Sun, Sunlight
-from twin.nerf.surface_features import Detail
 from twin.runtime import available_cores
 from twin.types import Array32
 from twin.warp_runtime import wp
@@ -51,7 +47,7 @@ class BakedSection:
             layout: Sizes and bounds.
             arrays: `near` and `far` (the stored bricks in their grids, (s, 3)), `features` (s, 729, CHANNELS) bytes,
                 near bricks first, `low` and `step` (CHANNELS,) of the quantization, `near_leap` and `far_leap` (see
-                `brick_layout.skip_distances`), and those of `Detail.arrays`.
+                `baked_arrays.skip_distances`), and those of `Detail.arrays`.
             file: A file with these arrays, if they are not given.
         """
         self.layout, self._arrays, self._file = layout, arrays, file
@@ -84,7 +80,7 @@ class BakedField:
         Args:
             sections: Sections in the order of `road`.
             lightings: Appearance embeddings by name.
-            networks: `network.*`, and for random lightings `probes.*` (see `appearance_prior.Probes`).
+            networks: `network.*`, and for random lightings `probes.*` (see `lightings.Probes`).
             device: `cpu` or `cuda`.
             about: JSON-able metadata stored with the field.
             road: Determines the sections that render a camera; None: a road of one section.

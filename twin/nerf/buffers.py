@@ -1,6 +1,6 @@
 """Devices, threads, layout and arrays of a radiance field.
 
-The terms are defined in `kernels/space.py` and `kernels/sampler.py`.
+The terms are defined in `kernels/space.py` and `kernels/volume.py`.
 
 Warp runs a CPU launch on one thread. As Warp and torch release the interpreter lock while they compute, two Python
 threads keep two cores busy. A batch is divided into a fixed number of *shards*, whose results are summed in order. So
@@ -18,8 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from twin.errors import InputError, short_repr
-from twin.nerf.kernels import composite as volume
-from twin.nerf.kernels import hashgrid, space
+from twin.nerf.kernels import hashgrid, space, volume
 from twin.runtime import available_cores
 from twin.warp_runtime import wp
 
@@ -86,7 +85,7 @@ def in_batches(work: Callable[[slice], None], n: int, size: int, device: str) ->
 
 def load_training_kernels(device: str) -> None:
     """Compiles or loads the training kernels once, before several threads would each compile their own copy."""
-    for module in ("space", "sampler", "hashgrid", "composite"):
+    for module in ("space", "hashgrid", "volume"):
         wp.load_module(f"twin.nerf.kernels.{module}", device=device)
     if device == "cuda":  # torch and Warp exchange arrays without synchronizing, so they must share a stream
         wp.set_stream(wp.stream_from_torch(torch.cuda.current_stream()), device)

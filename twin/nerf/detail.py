@@ -18,11 +18,11 @@ from twin.geometry.cameras import pixel_grid, unproject
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
 from twin.nerf.baked import BakedField
+from twin.nerf.baked_arrays import Detail, detail_grid
 from twin.nerf.buffers import parallel, shard_count, single_threaded_torch, warp_view
 from twin.nerf.dataset import TrainingPixels
-from twin.nerf.kernels import composite as volume
 from twin.nerf.kernels import surface_detail as kernels
-from twin.nerf.surface_features import Detail, detail_grid
+from twin.nerf.kernels import volume
 from twin.runtime import bar
 from twin.warp_runtime import wp
 

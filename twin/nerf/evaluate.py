@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from twin.geometry.cameras import Cameras, nearest_frame, pixel_grid, unproject
+from twin.geometry.cameras import Cameras, RenderableField, nearest_frame, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, ssim
 from twin.nerf import network
 from twin.nerf.appearance import fit_appearance
@@ -22,7 +22,6 @@ from twin.nerf.baked import BakedField
 from twin.nerf.buffers import CameraArrays, single_threaded_torch
 from twin.nerf.dataset import load_frame
 from twin.nerf.field import RadianceField
-from twin.nerf.rendering import RenderableField
 from twin.runtime import track
 from twin.types import Array
 

@@ -20,10 +20,10 @@ from safetensors.torch import save as to_bytes
 
 from twin.errors import InputError, short_repr
 from twin.files import check_shapes, read_json, regular_file, require_text, wrap_read_errors, write_json
-from twin.geometry.cameras import PosedCameras, intrinsics_for_size, pixel_grid
+from twin.geometry.cameras import FAR, PosedCameras, Rendering, intrinsics_for_size, pixel_grid
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
-from twin.nerf.brick_layout import check_networks
+from twin.nerf.baked_arrays import check_networks
 from twin.nerf.buffers import (
     CameraArrays,
     Layout,
@@ -36,10 +36,8 @@ from twin.nerf.buffers import (
     resolve_device,
     warp_view,
 )
-from twin.nerf.kernels import composite as volume
-from twin.nerf.kernels import hashgrid, sampler, space
+from twin.nerf.kernels import hashgrid, space, volume
 from twin.nerf.kernels.color_head import HARMONICS
-from twin.nerf.rendering import FAR, Rendering
 from twin.nerf.road import RoadSections, undivided_road
 from twin.warp_runtime import wp
 
@@ -49,7 +47,7 @@ QUERY_POINTS = 65536
 _RENDER_RAYS = 4096  # rays per batch when rendering
 _RENDER_SAMPLES = 24  # samples per ray when rendering
 _HEAD_RAYS = 8192  # rays per batch of the head
-_RENDER_UNIFORM_WEIGHT = 0.02  # `floor` of `sampler.sample_rays` when rendering
+_RENDER_UNIFORM_WEIGHT = 0.02  # `floor` of `volume.sample_rays` when rendering
 _MAX_SEED = 2**31 - 1  # kernels take 32-bit signed seeds
 
 
@@ -75,7 +73,7 @@ class FieldSection:
         Args:
             layout: Sizes and bounds.
             table: Hash tables, shape (levels, 2**log2_table, FEATURES).
-            grids: Near and far opacity grid, see `kernels/sampler.py`.
+            grids: Near and far opacity grid, see `kernels/volume.py`.
             parameters: Weights of the networks, which all sections share; see `network.initial_parameters`.
         """
         self.layout, self.table, self.grids, self.parameters = layout, table, grids, parameters
@@ -87,7 +85,7 @@ class FieldSection:
         self.w_levels.cells = wp.array(cells, dtype=wp.vec3f, device=self.device)
         self.w_levels.shapes = wp.array(level_shapes(cells, layout.log2_table), dtype=wp.vec4i, device=self.device)
         self.w_levels.mask = wp.uint32(2**layout.log2_table - 1)
-        self.w_grids: Any = sampler.OpacityGrids()
+        self.w_grids: Any = volume.OpacityGrids()
         self.w_grids.near, self.w_grids.far = (warp_view(grid, wp.float32) for grid in grids)
         cells_of_grids: Any = opacity_grid_sizes(layout.near_box)
         (_, self.w_grids.near_cell), (_, self.w_grids.far_cell) = cells_of_grids
@@ -111,10 +109,10 @@ class FieldSection:
     def sample(
         self, ws: Workspace, start: int, count: int, floor: float, target_mass: float = 0.0, seed: int | None = None
     ) -> None:
-        """Rays → samples, see `sampler.sample_rays`: jittered, or at the middles of the strata if `seed` is None."""
+        """Rays → samples, see `volume.sample_rays`: jittered, or at the middles of the strata if `seed` is None."""
         jitter = -1 if seed is None else seed & _MAX_SEED
         wp.launch(
-            sampler.sample_rays,
+            volume.sample_rays,
             count,
             [
                 *(ws.w_rays, ws.w_targets, self.contraction, self.w_grids),

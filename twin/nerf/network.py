@@ -8,7 +8,7 @@ ray, the ray's direction and an appearance embedding to a color. So samples do n
 import torch
 
 from twin.nerf.kernels.color_head import HARMONICS, harmonics_of
-from twin.nerf.kernels.composite import CHANNELS
+from twin.nerf.kernels.volume import CHANNELS
 
 
 def initial_parameters(inputs: int, hidden: int, appearance_dim: int, seed: int) -> dict[str, torch.Tensor]:

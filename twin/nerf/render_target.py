@@ -13,15 +13,14 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.nerf.brick_layout import BrickLayout, brick_indices, density_codes, stored_skips
+from twin.geometry.cameras import Rendering
+from twin.nerf.baked_arrays import BrickLayout, Detail, brick_indices, density_codes, detail_grid, stored_skips
 from twin.nerf.kernels import march as kernels
 from twin.nerf.kernels import surface_detail as detail_kernels
 from twin.nerf.kernels.bricks import BLOCKS, Bricks, Bytes
 from twin.nerf.kernels.color_head import HARMONICS, Vec8, color_head_kernel
 from twin.nerf.kernels.color_head import LANES as HEAD_LANES
-from twin.nerf.kernels.composite import CHANNELS, Channels
-from twin.nerf.rendering import Rendering
-from twin.nerf.surface_features import Detail, detail_grid
+from twin.nerf.kernels.volume import CHANNELS, Channels
 from twin.runtime import bar
 from twin.types import Array32
 from twin.warp_runtime import wp

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from twin import runtime
 from twin.geometry.images import psnr
-from twin.geometry.shadow_map import TEXEL, OrthographicShadowMap, ShadowCasters, angles, direction
+from twin.geometry.mesh_rays import TEXEL, OrthographicShadowMap, ShadowCasters, angles, direction
 from twin.nerf import network
-from twin.nerf.fog import REACH, Fog
+from twin.nerf.appearance import FogFit, descend
+from twin.nerf.lightings import FOG_REACH, Fog
 from twin.nerf.sun import MAX_GAIN, MIN_GAIN, TERMS, SeenSurfaces, Sun
 from twin.types import Array, Array32
 
@@ -41,7 +42,6 @@ _RAYS, _SEARCH_RAYS = 6_000, 2_500  # pixels of the joint fits and of the search
 _EMBEDDING_RATE, _COEFFICIENT_RATE = 0.03, 0.03  # learning rates
 _EXTINCTION_RATE, _AIRLIGHT_RATE = 0.1, 0.03  # learning rates of the logarithm of extinction and of the airlight
 _PRIOR = 1e-2  # weight of the squared distance from the initial embedding
-_MAX_EXTINCTION = 0.1  # [1/m]
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def fit_direction(problem: SunProblem, shadows: OrthographicShadowMap, fog: Fog)
 
 def _kept(fog: Fog, distances: NDArray) -> NDArray:
     """Fraction of light that the fog keeps."""
-    return np.exp(-fog.extinction * np.minimum(distances, REACH))
+    return np.exp(-fog.extinction * np.minimum(distances, FOG_REACH))
 
 
 def _solve(columns: NDArray, target: NDArray) -> NDArray:
@@ -157,38 +157,29 @@ def fit_jointly(
     device = features.device
     terms = torch.as_tensor(problem.seen.terms(sun.shadows), device=device)
     colors = torch.as_tensor(problem.colors, device=device)
-    distances = torch.as_tensor(problem.distances, device=device).clamp(max=REACH)
+    distances = torch.as_tensor(problem.distances, device=device).clamp(max=FOG_REACH)
     origin = torch.as_tensor(start, device=device)
     embedding = origin.clone().requires_grad_(True)
     coefficients = torch.tensor(sun.coefficients, device=device, requires_grad=True)
-    fitted, rates = [embedding, coefficients], [_EMBEDDING_RATE, _COEFFICIENT_RATE]
+    fitted, fit = [(embedding, _EMBEDDING_RATE), (coefficients, _COEFFICIENT_RATE)], None
     if fog.extinction:
-        log_extinction = torch.tensor(math.log(fog.extinction), device=device, requires_grad=True)
-        airlight = torch.tensor(fog.airlight, device=device, requires_grad=True)
-        fitted += [log_extinction, airlight]
-        rates += [_EXTINCTION_RATE, _AIRLIGHT_RATE]
-    optimizer = torch.optim.Adam([{"params": [p], "lr": rate} for p, rate in zip(fitted, rates, strict=True)])
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1.0 - step / _STEPS)
-    for _ in range(_STEPS):
+        fit = FogFit(fog.extinction, torch.tensor(fog.airlight, device=device), distances)
+        fitted += zip(fit.parameters, (_EXTINCTION_RATE, _AIRLIGHT_RATE), strict=True)
+
+    def loss() -> torch.Tensor:
         rgb = network.head(parameters, features, harmonics, embedding)
         rgb = rgb * (terms @ coefficients).clamp(MIN_GAIN, MAX_GAIN)
-        if fog.extinction:
-            kept = torch.exp(-torch.exp(log_extinction) * distances)[:, None]
-            rgb = kept * rgb + (1.0 - kept) * airlight
-        loss = ((rgb.clamp(max=1.0) - colors) ** 2).mean() + _PRIOR * ((embedding - origin) ** 2).mean()
-        for parameter, gradient in zip(fitted, torch.autograd.grad(loss, fitted), strict=True):
-            parameter.grad = gradient
-        optimizer.step()
-        schedule.step()
-        with torch.no_grad():
-            coefficients[_LIGHT] = coefficients[_LIGHT].clamp(min=0.0)
-            if fog.extinction:
-                log_extinction.clamp_(max=math.log(_MAX_EXTINCTION))
-                airlight.clamp_(0.0, 1.0)
-    if fog.extinction:
-        red, green, blue = airlight.tolist()
-        fog = Fog(float(log_extinction.detach().exp()), (red, green, blue))
-    return embedding.detach().cpu().numpy(), Sun(sun.shadows, coefficients.detach().cpu().numpy()), fog
+        rgb = fit.apply(rgb) if fit else rgb
+        return ((rgb.clamp(max=1.0) - colors) ** 2).mean() + _PRIOR * ((embedding - origin) ** 2).mean()
+
+    def bound() -> None:
+        coefficients[_LIGHT] = coefficients[_LIGHT].clamp(min=0.0)
+        if fit:
+            fit.bound()
+
+    descend(fitted, _STEPS, loss, bound)
+    found = Sun(sun.shadows, coefficients.detach().cpu().numpy())
+    return embedding.detach().cpu().numpy(), found, fit.result() if fit else fog
 
 
 # ---- fit to a photo

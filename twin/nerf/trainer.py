@@ -40,8 +40,7 @@ from twin.nerf.dataset import TrainingPixels
 from twin.nerf.detail import fit_detail
 from twin.nerf.evaluate import cross_lighting, evaluate
 from twin.nerf.field import FieldSection, RadianceField, untrained_field
-from twin.nerf.kernels import composite as volume
-from twin.nerf.kernels import hashgrid, sampler
+from twin.nerf.kernels import hashgrid, volume
 from twin.nerf.pose_refinement import PoseRefinement
 from twin.nerf.road import divide_road
 from twin.nerf.stereo import stereo_depths
@@ -51,7 +50,7 @@ from twin.runtime import bar
 from twin.scene import SceneDir
 from twin.warp_runtime import wp
 
-# ---- losses; those of distortion and depth are in `kernels/composite.py`
+# ---- losses; those of distortion and depth are in `kernels/volume.py`
 
 _EDGE_SHARPNESS = 10.0  # a color contrast of 1/10 divides the plane loss by e
 _MAX_BEND = 0.5  # upper limit of the relative second difference of inverse depth: a larger one is a depth edge
@@ -399,7 +398,7 @@ class Trainer:
         """Updates one of `parts` parts of the cells of a section's opacity grids."""
         s, ws = self.field.sections[section], self.ws
         wp.launch(
-            sampler.update_grids,
+            volume.update_grids,
             self.rays * ws.samples,
             [ws.w_positions, ws.w_densities, _RISE, _FALL, part, parts, s.w_grids],
             device=self.device,

@@ -1,7 +1,7 @@
 """The simulated reality: generated places, filmed like real ones, in which policies drive in the *real test*.
 
 Place 0, the campus road, is designed; the others are random. The rest of `twin` imports nothing from this package.
-Only `comparison.py`, `twin reality drive` with a task file, benchmarks and tests read a scene's folder `truth`.
+Only `truth.measure`, `twin reality drive` with a task file, benchmarks and tests read a scene's folder `truth`.
 """
 
 SEED = 20  # seed of all that is random in this world: places, textures, skies, films, robots, cameras; not of trials

@@ -29,13 +29,11 @@ from twin.evaluation.trials import cells_csv, tally
 from twin.files import toml_string, write_text
 from twin.geometry.cameras import Cameras
 from twin.loading import load_scene
-from twin.reality import place as places
-from twin.reality import real_test, recordings
-from twin.reality.centerline import RoadLine
-from twin.reality.comparison import align_rigid, compare, matched_poses
+from twin.reality import campus_road, real_test, recordings
+from twin.reality.campus_road import RoadLine
 from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
-from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass
+from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass, parked_cars
 from twin.reality.lighting import LIGHTINGS, WEATHER
 from twin.reality.place_objects import KnownPlace
 from twin.reality.place_sampling import check_length, draw
@@ -43,8 +41,7 @@ from twin.reality.place_spec import PlaceSpec, tasks
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_test import Setup
 from twin.reality.road_task import RoadTask, read_task
-from twin.reality.traffic import parked_cars
-from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth
+from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, align_rigid, compare, matched_poses
 from twin.scene import SceneDir, require_stage
 
 TINY = FilmingPlan(
@@ -83,7 +80,7 @@ def film(
     if out.is_dir() and any(out.iterdir()) and not (out / "truth").is_dir():
         raise InputError(f"{out} is not empty and has no truth/, so this command did not write it; give another --out")
     (out / "input").mkdir(parents=True, exist_ok=True)
-    place = build_number(number, length=length) if number else places.build()
+    place = build_number(number, length=length) if number else campus_road.build()
     parked = parked_cars(place, plan.start, plan.length) if traffic else []
     films, lightings = {}, {}
     for lighting in plan.lightings:
@@ -187,7 +184,7 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
     elif options.command == "onboard":
         recordings.write_film(options.out, setup)
     elif options.command == "bag":
-        from twin.reality.robot_bag import write_robot_bag
+        from twin.reality.recordings import write_robot_bag
 
         (lighting,) = days or [options.lighting]
         trial = write_robot_bag(options.out, options.policy, options.task, lighting, options.seed, setup)

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from twin.reality import SEED
 from twin.reality.lighting import LIGHTINGS, Lighting, daylight, sky_cube_map
-from twin.reality.place_spec import HorizonSpec, LightSpec, PlaceSpec, Rgb
-from twin.reality.place_streams import stream
+from twin.reality.place_spec import HorizonSpec, LightSpec, PlaceSpec, Rgb, stream
 from twin.reality.textures import fbm
 from twin.types import Array
 

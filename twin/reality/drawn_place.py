@@ -11,27 +11,22 @@ from math import hypot
 
 import numpy as np
 
-from twin.reality import SEED, primitives
+from twin.reality import SEED
 from twin.reality import street_furniture as furniture
-from twin.reality.boundaries import BAY, add_boundary, thickness
 from twin.reality.drawn_lighting import place_lightings, place_sky
-from twin.reality.drawn_road import MOUTH_REACH, DrawnRoad
+from twin.reality.drawn_road import STEP, DrawnRoad, add_land, add_road, add_side_roads, land_boxes
 from twin.reality.drawn_textures import DRAWN_CELLS, drawn_textures
 from twin.reality.houses import House, add_house
-from twin.reality.place_objects import Atlas, GroundLayout, KnownPlace, PlaceObject
+from twin.reality.place_objects import Atlas, GroundLayout, KnownPlace
 from twin.reality.place_sampling import draw
-from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, PlaceSpec, Rgb
-from twin.reality.place_streams import stream
+from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, PlaceSpec, Rgb, stream
 from twin.reality.plants import add_bare_tree, add_conifer, add_crowned_tree, add_shrub, add_tufts
+from twin.reality.street_furniture import BAY, add_boundary, thickness
 from twin.types import Array
 
-_STEP = 0.5  # [m] between vertices along the road
-_LAND_STEP = 1.5  # [m] between vertices of the land
-_LAND_MARGIN = 48.0  # [m] width of the land around the road
 _FIELD_MARGIN = 14.0  # [m] from the driven line to the edges of `GroundLayout.field`
 _MIN_GAP = 0.35  # [m] between footprints
 _PART_LENGTH = 90.0  # [m] mean length of the parts of a long road; each part has textures of its own
-_TILE = 72.0  # [m] side of the square tiles of a long road's land, a multiple of `_LAND_STEP`
 _LONGEST_REACH = 113.0  # [m] longest reach, see `_reach`, of a road that was not lengthened
 
 
@@ -43,7 +38,7 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
         displaced: True for the day of the trials: cones, bins, crates and cars have moved since the film.
     """
     road = DrawnRoad(spec)
-    stations = np.arange(road.start, road.end + _STEP / 2, _STEP)
+    stations = np.arange(road.start, road.end + STEP / 2, STEP)
     parts = max(1, round((stations[-1] - stations[0]) / _PART_LENGTH))
     ends = np.linspace(0, len(stations) - 1, parts + 1).round().astype(int).tolist()
     driven = road.at(np.linspace(0.0, spec.line.length, 200))
@@ -56,7 +51,7 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
         "verge_right": (right, right - section.sides[1].width),
     }
     names_of_parts = [f"_{k}" if k else "" for k in range(parts)]
-    lands = _lands(road.at(stations), tiled=parts > 1)
+    lands = land_boxes(road.at(stations), tiled=parts > 1)
     layout = GroundLayout(
         bands={
             f"{name}{part}": (float(stations[first]), float(stations[last]), *laterals)
@@ -83,10 +78,10 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
         atlas=Atlas(DRAWN_CELLS),
     )
     for part, first, last in zip(names_of_parts, ends, ends[1:], strict=False):
-        _add_road(place, road, stations[first : last + 1], part)
-    _add_side_roads(place, road, stations)
+        add_road(place, road, stations[first : last + 1], part)
+    add_side_roads(place, road, stations)
     for name, box in lands.items():
-        _add_land(place, road, name, box)
+        add_land(place, road, name, box)
     site = Site(road)
     names.update(_add_houses(place, spec, site))
     _add_lamps(place, spec, site)
@@ -103,110 +98,6 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
 def build_number(number: int, displaced: bool = False, length: float = 0.0) -> KnownPlace:
     """Builds the place with a number, 1 or more; `length` [m] as for `draw`."""
     return build(draw(number, length), displaced)
-
-
-# ---- ground
-
-
-def _lands(line: Array, tiled: bool) -> dict[str, tuple[float, float, float, float]]:
-    """Textures of the land and their x and y ranges [m]: one for all, or one per square tile near the line (n, 2)."""
-    (x0, y0), (x1, y1) = (line.min(0) - _LAND_MARGIN).tolist(), (line.max(0) + _LAND_MARGIN).tolist()
-    if not tiled:
-        return {"land": (x0, x1, y0, y1)}
-    out: dict[str, tuple[float, float, float, float]] = {}
-    for x in np.arange(x0, x1, _TILE).tolist():
-        for y in np.arange(y0, y1, _TILE).tolist():
-            away = np.abs(line - (x + 0.5 * _TILE, y + 0.5 * _TILE)) - 0.5 * _TILE
-            if np.hypot(*np.maximum(away, 0.0).T).min() < _LAND_MARGIN:
-                out[f"land_{len(out)}"] = (x, x + _TILE, y, y + _TILE)
-    return out
-
-
-def _add_road(place: KnownPlace, road: DrawnRoad, stations: Array, suffix: str) -> None:
-    """Adds road, curbs and verges along consecutive stations; `suffix` ends the names of objects and textures."""
-    section = road.section
-
-    def strip(name: str, texture: str, laterals: Array, lifts: Array | None = None, gaps: int = 0) -> None:
-        """Adds a mesh strip along the road with vertices at `laterals` [m], left first.
-
-        It lies on the ground, or `lifts` [m] above the driven line. `gaps` (1 = left, −1 = right) leaves gaps for the
-        side roads on that side.
-        """
-        xy = road.at(stations[None], laterals[:, None])
-        z = road.ground_height(xy)
-        if lifts is not None:
-            z = road.profile(stations)[None] + lifts
-        v = (laterals[0] - laterals) / (laterals[0] - laterals[-1]) if np.ptp(laterals) > 0 else np.zeros(len(laterals))
-        u = (stations - stations[0]) / (stations[-1] - stations[0])
-        uv = np.stack(np.broadcast_arrays(u[None], v[:, None]), -1)
-        part = primitives.grid(np.concatenate([xy, z[..., None]], -1), uv)
-        if gaps:
-            middle = stations[(part.faces % len(stations))].mean(1)
-            keep = np.ones(len(part.faces), bool)
-            for mouth in road.mouths(gaps):
-                keep &= np.abs(middle - mouth.station) > 0.5 * mouth.width
-            part = primitives.MeshPart(part.vertices, part.faces[keep], part.uv)
-        place.objects.append(PlaceObject(f"{name}{suffix}", "ground", part, f"{texture}{suffix}"))
-
-    inner = 1e-6  # keeps the vertices at the road's edges on the road
-    strip("road", "road", np.linspace(section.left - inner, -section.right + inner, 15))
-    for sign, name, edge, side in (
-        (1, "left", section.left, section.sides[0]),
-        (-1, "right", section.right, section.sides[1]),
-    ):
-        outer = edge + section.kerb_width
-        if section.kerb_height > 0.0:
-            low = road.cross_profile(stations, sign * edge)
-            high = road.cross_profile(stations, sign * (edge + 0.03))
-            profile = [
-                (edge, low - 0.02),
-                (edge + 0.015, high - 0.15 * (high - low)),
-                (edge + 0.03, high),
-                (outer, road.cross_profile(stations, sign * (outer + inner))),
-            ]
-            profile = profile[::-1] if sign > 0 else profile
-            laterals, lifts = np.array([sign * p[0] for p in profile]), np.stack([p[1] for p in profile])
-            strip(f"kerb_{name}", "kerb", laterals, lifts)
-        across = sign * np.linspace(outer + inner, outer + side.width, 9)
-        strip(f"verge_{name}", f"verge_{name}", np.sort(across)[::-1], gaps=sign)
-
-
-def _add_side_roads(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
-    """Adds side roads; `stations` are those of the vertices along the road."""
-    section = road.section
-    for k, mouth in enumerate(road.line.mouths):
-        edge = section.left if mouth.side > 0 else section.right
-        reach = edge + section.kerb_width + np.arange(0.0, MOUTH_REACH, 0.5)
-        first = stations[np.argmax(stations + _STEP / 2 > mouth.station - mouth.width / 2)]
-        inside = stations[(stations >= first - _STEP) & (stations <= mouth.station + mouth.width / 2 + _STEP)]
-        xy = road.at(inside[None], mouth.side * reach[:, None])
-        z = road.ground_height(xy) + 0.01
-        u = (reach - reach[0]) / np.ptp(reach)
-        v = (inside - inside[0]) / np.ptp(inside)
-        uv = np.stack(np.broadcast_arrays(0.03 + 0.3 * (k % 3) + 0.25 * u[:, None], v[None]), -1)
-        order = slice(None, None, -1) if mouth.side > 0 else slice(None)
-        points = np.concatenate([xy, z[..., None]], -1)[order]
-        part = primitives.grid(points, uv[order])
-        place.objects.append(PlaceObject(f"side_road_{k}", "ground", part, "side_road"))
-
-
-def _add_land(place: KnownPlace, road: DrawnRoad, name: str, box: tuple[float, float, float, float]) -> None:
-    """Adds land in an x and y range [m], lowered under road, verges and side roads."""
-    section = road.section
-    x0, x1, y0, y1 = box
-    x, y = np.meshgrid(np.arange(x0, x1 + 0.1, _LAND_STEP), np.arange(y1, y0 - 0.1, -_LAND_STEP))
-    xy = np.stack([x, y], -1)
-    station, lateral = road.project(xy)
-    away = road.edges(lateral) - section.kerb_width
-    width = np.where(lateral > 0.0, section.sides[0].width, section.sides[1].width)
-    along = (station > road.start - 2.0) & (station < road.end + 2.0)
-    sunk = np.where(along & (away < width - 1.6), 0.5, np.where(along & (away < width + 1.6), 0.12, 0.0))
-    for mouth in road.line.mouths:
-        near = (np.abs(station - mouth.station) < mouth.width / 2 + 1.6) & (lateral * mouth.side > 0.0)
-        sunk = np.where(near & (away < MOUTH_REACH), 0.3, sunk)
-    points = np.concatenate([xy, (road.ground_height(xy) - sunk)[..., None]], -1)
-    uv = np.clip(np.stack([(x - x0) / (x1 - x0), (y1 - y) / (y1 - y0)], -1), 0.0, 1.0)
-    place.objects.append(PlaceObject(name, "ground", primitives.grid(points, uv), name))
 
 
 # ---- placement
@@ -273,10 +164,6 @@ def _overlap(a: Array, b: Array) -> bool:
     return True
 
 
-def _spot(place: KnownPlace, station: float, lateral: float) -> Array:
-    return place.route.at(station, lateral)
-
-
 def _edge(spec: PlaceSpec, side: int) -> float:
     """Distance of the curb's outer edge from the driven line on a side (1 = left) [m]."""
     return (spec.section.left if side > 0 else spec.section.right) + spec.section.kerb_width
@@ -315,7 +202,7 @@ def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tup
             color = houses.colors[int(rng.integers(len(houses.colors)))]
             tiles = houses.roof_colors[int(rng.integers(len(houses.roof_colors)))]
             house = House(
-                _spot(place, station, side * away), yaw, width, depth, storeys, roof, houses.pitch, houses.window
+                place.route.at(station, side * away), yaw, width, depth, storeys, roof, houses.pitch, houses.window
             )
             if len(out) < most and site.take(house.center, (width / 2 + 0.3, depth / 2 + 0.3), yaw, 0.6, 0.6):
                 name = f"house_{len(out)}"
@@ -337,7 +224,7 @@ def _add_lamps(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
         away = max(_edge(spec, side) + 0.45, FREE_HALF_WIDTH + 0.35)
         for shift in (0.0, 3.0, -3.0):
             at = float(station + shift), side * away
-            if site.take(_spot(place, *at), (0.12, 0.12), 0.0):
+            if site.take(place.route.at(*at), (0.12, 0.12), 0.0):
                 break
         else:
             continue
@@ -369,7 +256,7 @@ def _add_boundaries(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
             if boundary.kind == "bollards":
                 at, half = station, (0.12, 0.12)
             # Neighboring pieces touch, hence the negative gap.
-            if wanted[k // 4] and site.take(_spot(place, at, lateral), half, place.heading(at), 0.1, -0.05):
+            if wanted[k // 4] and site.take(place.route.at(at, lateral), half, place.heading(at), 0.1, -0.05):
                 runs[-1].append(station)
             elif runs[-1]:
                 runs.append([])
@@ -388,7 +275,7 @@ def _add_poles(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
     feet = []
     for k, station in enumerate(np.arange(first + rng.uniform(0, 10), last, rng.uniform(20.0, 30.0))):
         at = float(station), side * away
-        if site.take(_spot(place, *at), (0.16, 0.16), 0.0):
+        if site.take(place.route.at(*at), (0.16, 0.16), 0.0):
             furniture.add_post(place, f"pole_{k}", *at, height, 0.13, "pole")
             feet.append(at)
     if len(feet) > 1:
@@ -414,7 +301,7 @@ def _moved(
     if other_day is None:
         return at
     moved = at[0] + float(other_day.uniform(-1.5, 1.5)), at[1]
-    free = site.take(_spot(place, *moved), (radius, radius), place.heading(moved[0]), gap=-0.9 * radius)
+    free = site.take(place.route.at(*moved), (radius, radius), place.heading(moved[0]), gap=-0.9 * radius)
     return moved if free else at
 
 
@@ -429,21 +316,25 @@ def _add_cars(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np.rand
             turn, lateral = turn + np.pi / 2, float(lateral + np.sign(lateral) * 1.6)
         length, width = furniture.vehicle_size(kind)
         yaw = place.heading(station) + turn
-        if site.take(_spot(place, station, lateral), (length / 2, width / 2), yaw):
+        if site.take(place.route.at(station, lateral), (length / 2, width / 2), yaw):
             if other_day is not None:
                 shifted = station + float(other_day.uniform(-1.5, 1.5))
-                if site.take(_spot(place, shifted, lateral), (length / 2, width / 2), yaw, gap=-1.7):
+                if site.take(place.route.at(shifted, lateral), (length / 2, width / 2), yaw, gap=-1.7):
                     station = shifted
             furniture.add_vehicle(place, k, station, lateral, turn, kind, skin)
+
+
+_Adder = Callable[[int, tuple[float, float], np.random.Generator], None]
+"""Adds object k at a station and lateral [m]; the generator samples its other properties."""
 
 
 def _add_furniture(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np.random.Generator | None) -> None:
     f = spec.furniture
 
-    def each(index: int, amount: float, near: float, far: float, radius: float, add: Callable[..., None]) -> None:
+    def each(index: int, amount: float, near: float, far: float, radius: float, add: _Adder) -> None:
         rng = stream(spec.number, "furniture", 2, index)
         for k, at in enumerate(_scatter(rng, spec, amount, near, far)):
-            if site.take(_spot(place, *at), (radius, radius), place.heading(at[0])):
+            if site.take(place.route.at(*at), (radius, radius), place.heading(at[0])):
                 add(k, at, rng)
 
     def sign(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
@@ -452,7 +343,7 @@ def _add_furniture(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np
         turn = float(rng.normal(0.0, 0.25)) + np.pi * (rng.random() < 0.25)
         furniture.add_sign(place, int(rng.integers(0, 6)) + 8 * k, *at, turn, (wide, low, high))
 
-    def small(kind: str) -> Callable[..., None]:
+    def small(kind: str) -> _Adder:
         def add(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
             at = _moved(other_day, place, site, at, 0.4)
             if kind == "bin":
@@ -464,27 +355,28 @@ def _add_furniture(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np
 
         return add
 
-    def bench(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
-        furniture.add_bench(place, k, *at)
-
-    def bollard(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
-        furniture.add_post(place, f"bollard_{k}", *at, float(rng.uniform(0.7, 1.1)), 0.07, "dark")
-
     def cabinet(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
         size = float(rng.uniform(0.5, 1.1)), float(rng.uniform(0.3, 0.5)), float(rng.uniform(0.8, 1.4))
         furniture.add_cabinet(place, k, *at, size)
 
-    def stone(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
-        furniture.add_stone(place, k, *at, float(rng.uniform(0.25, 0.65)))
+    def bollard(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+        furniture.add_post(place, f"bollard_{k}", *at, float(rng.uniform(0.7, 1.1)), 0.07, "dark")
 
     each(0, f.signs, 0.25, 1.2, 0.35, sign)
     each(1, f.bins, 0.5, 2.5, 0.35, small("bin"))
-    each(2, f.benches, 0.7, 2.8, 0.9, bench)
+    each(2, f.benches, 0.7, 2.8, 0.9, lambda k, at, rng: furniture.add_bench(place, k, *at))
     each(3, f.bollards, 0.2, 0.6, 0.12, bollard)
     each(4, f.cones, 0.3, 1.2, 0.3, small("cone"))
     each(5, f.crates, 1.0, 4.0, 0.75, small("crate"))
     each(6, f.cabinets, 0.6, 3.0, 0.6, cabinet)
-    each(7, f.stones, 0.5, 6.0, 0.6, stone)
+    each(
+        7,
+        f.stones,
+        0.5,
+        6.0,
+        0.6,
+        lambda k, at, rng: furniture.add_stone(place, k, *at, float(rng.uniform(0.25, 0.65))),
+    )
 
 
 def _add_trees(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
@@ -508,7 +400,7 @@ def _add_trees(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
         crown, low = height * float(rng.uniform(0.22, 0.36)), float(rng.uniform(0.7, 1.8))
         radius = {"shrub": 0.5 * low}.get(kind, 0.35)
         clear = {"conifer": 0.9, "shrub": 0.5 * low}.get(kind, 0.4)
-        if not site.take(_spot(place, *at), (radius, radius), 0.0, clear, 0.3):
+        if not site.take(place.route.at(*at), (radius, radius), 0.0, clear, 0.3):
             continue
         if kind == "conifer":
             add_conifer(place, k, at, 1.25 * height, skin)

@@ -1,18 +1,31 @@
-"""The road of a place sampled by `place_sampling.py`: the driven line in plan, and the height of the ground on and
-around it.
+"""The road of a sampled place: samples of the driven line, height of the ground on and around it, meshes of both.
 
-Along the line, the height follows the sampled grades and a slight unevenness; across the line, it follows the sampled
-cross section. On the verge, the ground blends into open land, whose height is a weighted mean of the heights of the
-whole line, plus swells.
+In plan, the line consists of straights and bends. A *lengthened* line begins with the sampled one and goes on with
+further elements of the same kinds. Along the line, the height follows the sampled grades and a slight unevenness;
+across the line, it follows the sampled cross section. On the verge, the ground blends into open land, whose height is a
+weighted mean of the heights of the whole line, plus swells.
 """
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twin.reality.place_spec import GRADE_STEP, RUN_IN, RUN_OUT, Mouth, PlaceSpec
-from twin.reality.place_streams import stream
+from twin.reality import primitives
+from twin.reality.place_objects import KnownPlace, PlaceObject
+from twin.reality.place_spec import (
+    GRADE_STEP,
+    LONGEST_DRAWN,
+    RUN_IN,
+    RUN_OUT,
+    LineSpec,
+    Mouth,
+    Piece,
+    PlaceSpec,
+    SectionSpec,
+    stream,
+)
 from twin.types import Array
 
 _CROWN_ROUNDING = 0.3  # [m] half width of the rounding of a crown
@@ -205,3 +218,273 @@ def _advance(point: Array, heading: float, curvature: float, length: float) -> A
     half = 0.5 * curvature * length
     chord = length * float(np.sinc(half / np.pi))
     return point + chord * np.array([np.cos(heading + half), np.sin(heading + half)])
+
+
+# ---- meshes
+
+STEP = 0.5  # [m] between vertices along the road
+_LAND_STEP = 1.5  # [m] between vertices of the land
+_LAND_MARGIN = 48.0  # [m] width of the land around the road
+_TILE = 72.0  # [m] side of the square tiles of a long road's land, a multiple of `_LAND_STEP`
+
+
+def land_boxes(line: Array, tiled: bool) -> dict[str, tuple[float, float, float, float]]:
+    """Textures of the land and their x and y ranges [m]: one for all, or one per square tile near the line (n, 2)."""
+    (x0, y0), (x1, y1) = (line.min(0) - _LAND_MARGIN).tolist(), (line.max(0) + _LAND_MARGIN).tolist()
+    if not tiled:
+        return {"land": (x0, x1, y0, y1)}
+    out: dict[str, tuple[float, float, float, float]] = {}
+    for x in np.arange(x0, x1, _TILE).tolist():
+        for y in np.arange(y0, y1, _TILE).tolist():
+            away = np.abs(line - (x + 0.5 * _TILE, y + 0.5 * _TILE)) - 0.5 * _TILE
+            if np.hypot(*np.maximum(away, 0.0).T).min() < _LAND_MARGIN:
+                out[f"land_{len(out)}"] = (x, x + _TILE, y, y + _TILE)
+    return out
+
+
+def add_road(place: KnownPlace, road: DrawnRoad, stations: Array, suffix: str) -> None:
+    """Adds road, curbs and verges along consecutive stations; `suffix` ends the names of objects and textures."""
+    section = road.section
+
+    def strip(name: str, texture: str, laterals: Array, lifts: Array | None = None, gaps: int = 0) -> None:
+        """Adds a mesh strip along the road with vertices at `laterals` [m], left first.
+
+        It lies on the ground, or `lifts` [m] above the driven line. `gaps` (1 = left, −1 = right) leaves gaps for the
+        side roads on that side.
+        """
+        xy = road.at(stations[None], laterals[:, None])
+        z = road.ground_height(xy)
+        if lifts is not None:
+            z = road.profile(stations)[None] + lifts
+        v = (laterals[0] - laterals) / (laterals[0] - laterals[-1]) if np.ptp(laterals) > 0 else np.zeros(len(laterals))
+        u = (stations - stations[0]) / (stations[-1] - stations[0])
+        uv = np.stack(np.broadcast_arrays(u[None], v[:, None]), -1)
+        part = primitives.grid(np.concatenate([xy, z[..., None]], -1), uv)
+        if gaps:
+            middle = stations[(part.faces % len(stations))].mean(1)
+            keep = np.ones(len(part.faces), bool)
+            for mouth in road.mouths(gaps):
+                keep &= np.abs(middle - mouth.station) > 0.5 * mouth.width
+            part = primitives.MeshPart(part.vertices, part.faces[keep], part.uv)
+        place.objects.append(PlaceObject(f"{name}{suffix}", "ground", part, f"{texture}{suffix}"))
+
+    inner = 1e-6  # keeps the vertices at the road's edges on the road
+    strip("road", "road", np.linspace(section.left - inner, -section.right + inner, 15))
+    for sign, name, edge, side in (
+        (1, "left", section.left, section.sides[0]),
+        (-1, "right", section.right, section.sides[1]),
+    ):
+        outer = edge + section.kerb_width
+        if section.kerb_height > 0.0:
+            low = road.cross_profile(stations, sign * edge)
+            high = road.cross_profile(stations, sign * (edge + 0.03))
+            profile = [
+                (edge, low - 0.02),
+                (edge + 0.015, high - 0.15 * (high - low)),
+                (edge + 0.03, high),
+                (outer, road.cross_profile(stations, sign * (outer + inner))),
+            ]
+            profile = profile[::-1] if sign > 0 else profile
+            laterals, lifts = np.array([sign * p[0] for p in profile]), np.stack([p[1] for p in profile])
+            strip(f"kerb_{name}", "kerb", laterals, lifts)
+        across = sign * np.linspace(outer + inner, outer + side.width, 9)
+        strip(f"verge_{name}", f"verge_{name}", np.sort(across)[::-1], gaps=sign)
+
+
+def add_side_roads(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
+    """Adds side roads; `stations` are those of the vertices along the road."""
+    section = road.section
+    for k, mouth in enumerate(road.line.mouths):
+        edge = section.left if mouth.side > 0 else section.right
+        reach = edge + section.kerb_width + np.arange(0.0, MOUTH_REACH, 0.5)
+        first = stations[np.argmax(stations + STEP / 2 > mouth.station - mouth.width / 2)]
+        inside = stations[(stations >= first - STEP) & (stations <= mouth.station + mouth.width / 2 + STEP)]
+        xy = road.at(inside[None], mouth.side * reach[:, None])
+        z = road.ground_height(xy) + 0.01
+        u = (reach - reach[0]) / np.ptp(reach)
+        v = (inside - inside[0]) / np.ptp(inside)
+        uv = np.stack(np.broadcast_arrays(0.03 + 0.3 * (k % 3) + 0.25 * u[:, None], v[None]), -1)
+        order = slice(None, None, -1) if mouth.side > 0 else slice(None)
+        points = np.concatenate([xy, z[..., None]], -1)[order]
+        part = primitives.grid(points, uv[order])
+        place.objects.append(PlaceObject(f"side_road_{k}", "ground", part, "side_road"))
+
+
+def add_land(place: KnownPlace, road: DrawnRoad, name: str, box: tuple[float, float, float, float]) -> None:
+    """Adds land in an x and y range [m], lowered under road, verges and side roads."""
+    section = road.section
+    x0, x1, y0, y1 = box
+    x, y = np.meshgrid(np.arange(x0, x1 + 0.1, _LAND_STEP), np.arange(y1, y0 - 0.1, -_LAND_STEP))
+    xy = np.stack([x, y], -1)
+    station, lateral = road.project(xy)
+    away = road.edges(lateral) - section.kerb_width
+    width = np.where(lateral > 0.0, section.sides[0].width, section.sides[1].width)
+    along = (station > road.start - 2.0) & (station < road.end + 2.0)
+    sunk = np.where(along & (away < width - 1.6), 0.5, np.where(along & (away < width + 1.6), 0.12, 0.0))
+    for mouth in road.line.mouths:
+        near = (np.abs(station - mouth.station) < mouth.width / 2 + 1.6) & (lateral * mouth.side > 0.0)
+        sunk = np.where(near & (away < MOUTH_REACH), 0.3, sunk)
+    points = np.concatenate([xy, (road.ground_height(xy) - sunk)[..., None]], -1)
+    uv = np.clip(np.stack([(x - x0) / (x1 - x0), (y1 - y) / (y1 - y0)], -1), 0.0, 1.0)
+    place.objects.append(PlaceObject(name, "ground", primitives.grid(points, uv), name))
+
+
+# ---- samples of the line
+
+_SEPARATION = 28.0  # [m] least distance in plan of points that are more than twice this far apart along the line
+_LONG_SEPARATION = 30.0  # [m] the same between a point of the lengthening and any other
+# Headings this close to one direction make 60 m along the line at least 30 m in plan, hence `_LONG_SEPARATION`.
+_HEADING_BOUND = float(np.deg2rad(58.0))  # [rad]
+_BEND_ROOM = 2.0  # [m] least distance from a verge's outer edge to the center of a bend of the lengthening
+_MOUTH_ROOM = 30.0  # [m] from the road's edge; there, a side road of the lengthening is far from the rest of the road
+
+
+def sample_line(rng: np.random.Generator, setting: str, section: SectionSpec) -> LineSpec:
+    """Samples the driven line of a place with a setting and a cross section."""
+    length = float(rng.uniform(42.0, LONGEST_DRAWN))
+    while True:  # until no part of the line comes near another
+        pieces = _pieces(rng, setting, section, length + RUN_OUT)
+        if _keeps_clear(pieces):
+            break
+    hilly = rng.random() < 0.65
+    count = int(np.ceil((length + RUN_OUT) / GRADE_STEP)) + 1
+    steepest = float(rng.uniform(0.02, 0.08)) * hilly
+    base = rng.normal(0.0, 1.0, count) + rng.normal(0.0, 1.2)
+    grades = steepest * np.clip(base / 1.5, -1.0, 1.0)
+    bumps = float(rng.uniform(0.003, 0.012))
+    mouths: list[Mouth] = []
+    stations = np.cumsum([0.0, *(piece.length for piece in pieces)])
+    for piece, start in zip(pieces, stations, strict=False):
+        width, side = float(rng.uniform(2.8, 6.0)), int(rng.choice([-1, 1]))
+        offset, wanted = float(rng.uniform(0.0, 1.0)), rng.random() < (0.25 if setting in ("forest", "field") else 0.5)
+        room = min(piece.length, length - float(start)) - width - 4.0
+        if piece.curvature == 0.0 and wanted and room > 0.0 and len(mouths) < 2:
+            mouths.append(Mouth(round(float(start) + 2.0 + width / 2 + offset * room, 2), side, width))
+    relief = float(rng.uniform(0.0, 0.35 if setting in ("town", "works") else 1.4))
+    return LineSpec(pieces, round(length, 2), tuple(grades.tolist()), bumps, tuple(mouths), relief)
+
+
+def _pieces(rng: np.random.Generator, setting: str, section: SectionSpec, length: float) -> tuple[Piece, ...]:
+    """Straights and bends of a total length of at least `length` [m]; bends in a row turn to alternate sides."""
+    pieces: list[Piece] = []
+    bendy = {"town": 0.6, "works": 0.6}.get(setting, 1.0)
+    straight = rng.random() < 0.75
+    left = bool(rng.random() < 0.5)
+    total = 0.0
+    while total < length:
+        if straight:
+            piece = Piece(float(rng.uniform(6.0, 34.0)), 0.0)
+        else:
+            least = max(6.0, (section.left if left else section.right) + section.kerb_width + 2.2)
+            radius = float(np.exp(rng.uniform(np.log(least), np.log(40.0))))
+            angle = np.deg2rad(rng.uniform(20.0, 100.0)) * bendy
+            piece = Piece(min(radius * float(angle), 45.0), (1.0 if left else -1.0) / radius)
+        last = straight
+        straight = rng.random() < 0.55 if not last else False  # no two straights in a row
+        if not last:
+            left = not left if not straight else bool(rng.random() < 0.5)
+        pieces.append(piece)
+        total += piece.length
+    return tuple(pieces)
+
+
+def lengthen(rng: np.random.Generator, line: LineSpec, setting: str, section: SectionSpec, length: float) -> LineSpec:
+    """The line, lengthened to `length` [m].
+
+    `section` is the section that the line's tightest bends leave; further bends leave it, too.
+    """
+    while True:  # until no part of the line comes near another
+        pieces = _further(rng, line.pieces, setting, section, length + RUN_OUT)
+        if _keeps_clear((Piece(RUN_IN, 0.0), *pieces), _LONG_SEPARATION, len(line.pieces) + 1):
+            break
+    count = int(np.ceil((length + RUN_OUT) / GRADE_STEP)) + 1 - len(line.grades)
+    steepest = max(map(abs, line.grades))
+    grades = steepest * np.clip(rng.normal(0.0, 1.0, max(count, 0)) / 1.5, -1.0, 1.0)
+    xy = _points(pieces)[0]
+    mouths = list(line.mouths)
+    starts = np.cumsum([0.0, *(piece.length for piece in pieces)]).tolist()
+    begins = np.cumsum([0, *(_point_count(piece) for piece in pieces)]).tolist()
+    for n in range(len(line.pieces), len(pieces)):
+        piece, start = pieces[n], starts[n]
+        width, side = float(rng.uniform(2.8, 6.0)), int(rng.choice([-1, 1]))
+        offset, wanted = float(rng.uniform(0.0, 1.0)), rng.random() < (0.25 if setting in ("forest", "field") else 0.5)
+        room = min(piece.length, length - start) - width - 4.0
+        if piece.curvature != 0.0 or not wanted or room <= 0.0:
+            continue
+        mouth = Mouth(round(start + 2.0 + width / 2 + offset * room, 2), side, width)
+        begin = xy[begins[n] - 1]
+        ahead = (xy[begins[n]] - begin) / np.linalg.norm(xy[begins[n]] - begin)
+        reach = (section.left if side > 0 else section.right) + _MOUTH_ROOM
+        end = begin + (mouth.station - start) * ahead + side * reach * np.array([-ahead[1], ahead[0]])
+        if np.linalg.norm(xy - end, axis=1).min() > 0.5 * reach:
+            mouths.append(mouth)
+    return replace(
+        line, pieces=pieces, length=round(length, 2), grades=(*line.grades, *grades.tolist()), mouths=tuple(mouths)
+    )
+
+
+def _further(
+    rng: np.random.Generator, pieces: tuple[Piece, ...], setting: str, section: SectionSpec, length: float
+) -> tuple[Piece, ...]:
+    """The pieces and further ones, up to a total length of at least `length` [m].
+
+    The headings of the further pieces stay near the direction from the line's start to the end of `pieces`, so the line
+    does not come back.
+    """
+    xy, heading = _points(pieces)
+    away = xy[-1] - xy[0]
+    off = float(np.angle(np.exp(1j * (heading - np.arctan2(away[1], away[0])))))  # heading from that direction [rad]
+    bendy = {"town": 0.6, "works": 0.6}.get(setting, 1.0)
+    out, total = list(pieces), sum(piece.length for piece in pieces)
+    straight = pieces[-1].curvature != 0.0 and rng.random() < 0.55
+    left = pieces[-1].curvature < 0.0 if pieces[-1].curvature else bool(rng.random() < 0.5)
+    while total < length:
+        if straight:
+            out.append(Piece(float(rng.uniform(6.0, 34.0)), 0.0))
+            straight, left = False, bool(rng.random() < 0.5)
+        else:
+            angle = float(np.deg2rad(rng.uniform(20.0, 100.0))) * bendy
+            if abs(off + (angle if left else -angle)) > _HEADING_BOUND:
+                left = off < 0.0
+                angle = min(angle, _HEADING_BOUND + abs(off))
+            k = 0 if left else 1
+            edge = (section.left, section.right)[k] + section.kerb_width
+            least = max(6.0, edge + 2.2, edge + section.sides[k].width + _BEND_ROOM)
+            radius = float(np.exp(rng.uniform(np.log(least), np.log(40.0))))
+            angle = min(angle, 45.0 / radius)
+            out.append(Piece(radius * angle, (1.0 if left else -1.0) / radius))
+            off += angle if left else -angle
+            straight, left = bool(rng.random() < 0.55), not left
+        total += out[-1].length
+    return tuple(out)
+
+
+def _keeps_clear(pieces: tuple[Piece, ...], separation: float = _SEPARATION, first: int = 0) -> bool:
+    """True if points more than 2 `separation` [m] apart along the line are more than `separation` apart in plan.
+
+    Pairs of points on the pieces before number `first` are not examined.
+    """
+    xy, _ = _points(pieces)
+    old = sum(_point_count(piece) for piece in pieces[:first])
+    for k in range(old, len(xy)):
+        before = xy[: max(0, k - int(2.0 * separation))]
+        if len(before) and np.linalg.norm(before - xy[k], axis=1).min() <= separation:
+            return False
+    return True
+
+
+def _point_count(piece: Piece) -> int:
+    return max(1, round(piece.length))
+
+
+def _points(pieces: tuple[Piece, ...]) -> tuple[Array, float]:
+    """Points along the pieces about 1 m apart, from the end of the first meter on [m], and the last heading [rad]."""
+    heading, point, points = 0.0, np.zeros(2), []
+    for piece in pieces:
+        count = _point_count(piece)
+        for _ in range(count):
+            heading += 0.5 * piece.curvature * piece.length / count
+            point = point + piece.length / count * np.array([np.cos(heading), np.sin(heading)])
+            heading += 0.5 * piece.curvature * piece.length / count
+            points.append(point)
+    return np.array(points), heading

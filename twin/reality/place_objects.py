@@ -1,11 +1,12 @@
 """Data of a place: its objects with their collision shapes, its textures and its lightings.
 
 The kind of an object is `ground` (driven or walked on), `obstacle` (solid), `foliage` (not solid) or `detail` (grass
-and wires, which comparisons with the truth ignore). Stations and laterals are defined in `centerline.py`.
+and wires, which comparisons with the truth ignore). Stations and laterals are defined in `campus_road.py`.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from math import cos, hypot, sin
 from typing import Any, Protocol
 
 import numpy as np
@@ -78,7 +79,7 @@ class GroundLayout:
     """Texture of the land → its x and y range [m]."""
     field: tuple[tuple[float, float], tuple[float, float]]
     """Lowest and highest (x, y) [m] of the area around the driven line. In randomly sampled places (number ≥ 1), the
-    rasterizer casts shadows only in this area (`trial_place.shadow_range`)."""
+    rasterizer casts shadows only in this area (`true_world.shadow_range`)."""
     wet: tuple[str, ...]
     """Textures that rain darkens."""
 
@@ -153,3 +154,45 @@ def up(height: float) -> Array:
 def vertical_quad(left: Array, right: Array, low: float, high: float) -> MeshPart:
     """A vertical rectangle between two points (x, y) [m] and two heights [m]."""
     return primitives.quad(np.array([[*left, high], [*left, low], [*right, low], [*right, high]]))
+
+
+class Solids:
+    """The solid objects of a place, tested against a robot's footprint by separating axes."""
+
+    def __init__(self, place: KnownPlace, footprint: tuple[float, float]) -> None:
+        """`footprint` is length and width [m]."""
+        self._footprint = footprint
+        solids = [one for obj in place.objects for one in obj.solids]
+        self._center = np.array([one.center for one in solids]).reshape(-1, 3)
+        self._half = np.array([one.half for one in solids]).reshape(-1, 3)
+        self._round = np.array([one.kind == "cylinder" for one in solids], bool)
+        # A cylinder's half sizes are its radius, half its height and 0.
+        self._up = np.where(self._round, self._half[:, 1], self._half[:, 2])
+        self._reach = np.where(self._round, self._half[:, 0], np.hypot(self._half[:, 0], self._half[:, 1]))
+        self._reach += 0.5 * hypot(*footprint)
+        self._yaw = np.array([one.yaw for one in solids])
+
+    def hit(self, x: float, y: float, yaw: float, low: float, high: float) -> bool:
+        """True if the footprint at a pose [m], [rad] overlaps an object between two heights [m]."""
+        off = self._center[:, :2] - (x, y)
+        near = np.flatnonzero(
+            (np.hypot(off[:, 0], off[:, 1]) < self._reach)
+            & (self._center[:, 2] - self._up < high)
+            & (self._center[:, 2] + self._up > low)
+        )
+        return any(self._overlaps(int(i), off[i], yaw) for i in near)
+
+    def _overlaps(self, i: int, off: Array, yaw: float) -> bool:
+        long, wide = 0.5 * self._footprint[0], 0.5 * self._footprint[1]
+        c, s = cos(yaw), sin(yaw)
+        ahead, aside = float(c * off[0] + s * off[1]), float(c * off[1] - s * off[0])
+        if self._round[i]:
+            return hypot(max(abs(ahead) - long, 0.0), max(abs(aside) - wide, 0.0)) < self._half[i, 0]
+        # The separating axes of two rectangles are the axes of both.
+        turn = float(self._yaw[i]) - yaw
+        ct, st = cos(turn), sin(turn)
+        a, b = float(self._half[i, 0]), float(self._half[i, 1])
+        if abs(ahead) > long + a * abs(ct) + b * abs(st) or abs(aside) > wide + a * abs(st) + b * abs(ct):
+            return False
+        u, v = ct * ahead + st * aside, ct * aside - st * ahead
+        return abs(u) <= a + long * abs(ct) + wide * abs(st) and abs(v) <= b + long * abs(st) + wide * abs(ct)

@@ -1,8 +1,8 @@
 """Samples the descriptions of places, with the place's number as seed.
 
-`draw(number)` returns the description of a place from number 1 on; place 0 is the campus road, designed in `place.py`.
-Every aspect of a place, such as the surface or the trees, has its own random stream, see `place_streams.py`. The line
-is sampled in `line_sampling.py`. The *setting*, such as `village`, sets probabilities and ranges of all aspects.
+`draw(number)` returns the description of a place from number 1 on; place 0 is designed, see `campus_road.py`. Every
+aspect of a place, such as the surface or the trees, has its own random stream, see `place_spec.stream`. The line is
+sampled in `drawn_road.py`. The *setting*, such as `village`, sets probabilities and ranges of all aspects.
 """
 
 import colorsys
@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from twin.errors import InputError
-from twin.reality.line_sampling import lengthen, sample_line
+from twin.reality.drawn_road import lengthen, sample_line
 from twin.reality.place_spec import (
     SETTINGS,
     BoundarySpec,
@@ -30,8 +30,8 @@ from twin.reality.place_spec import (
     Side,
     SurfaceSpec,
     TreesSpec,
+    stream,
 )
-from twin.reality.place_streams import stream
 
 T = TypeVar("T")
 

@@ -1,13 +1,15 @@
-"""Descriptions of randomly sampled places: plain numbers and names, which `place_sampling.py` samples.
+"""Descriptions of randomly sampled places: plain numbers and names, which `place_sampling.py` samples; random streams.
 
 `drawn_place.py` builds a place from its description. The *driven line* is the line that the first film and the
-robot's tasks follow; the road need not be symmetrical about it. Stations and laterals are those of `centerline.py`.
+robot's tasks follow; the road need not be symmetrical about it. Stations and laterals are those of `campus_road.py`.
 """
 
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+
+from twin.reality import SEED
 
 Rgb = tuple[float, float, float]
 
@@ -281,7 +283,7 @@ class PassSpec:
 
 @dataclass(frozen=True)
 class FilmSpec:
-    """How the place is filmed."""
+    """Films of the place, and the camera's settings."""
 
     carrier: str
     """`phone` (held by hand), `cart`, `mast` (of a robot)."""
@@ -363,3 +365,20 @@ def tasks(line: LineSpec) -> dict[str, tuple[float, float]]:
     if steep:
         add("slope", steep[0] - 10.0, steep[0] + 10.0, 12.0)
     return found | {"whole": (0.0, round(end, 2))}
+
+
+# ---- random streams
+
+_ASPECTS = (
+    *("setting", "line", "section", "surface", "markings", "houses", "boundaries", "trees", "furniture", "cars"),
+    *("lamps", "horizon", "weather", "film", "longer"),
+)
+"""The aspects by index; new ones go to the end."""
+
+
+def stream(number: int, aspect: str, *more: int) -> np.random.Generator:
+    """A random generator of one aspect of a place; `more` distinguishes those of the same aspect.
+
+    Each aspect has its own, so one more random value in an aspect does not change the random values of the others.
+    """
+    return np.random.default_rng([SEED, 100, number, _ASPECTS.index(aspect), *more])

@@ -149,10 +149,8 @@ def _mip_levels(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], NDArray[np.in
 # ---- shadow map
 
 ShadowRange = tuple[tuple[float, float, float], tuple[float, float, float]]
-SHADOW_RANGE: ShadowRange = (
-    (-14.0, -66.0, -1.0),
-    (66.0, 24.0, 6.0),
-)  # [m] box that the shadow map covers on the campus road; points outside it are lit
+SHADOW_RANGE: ShadowRange = ((-14.0, -66.0, -1.0), (66.0, 24.0, 6.0))
+"""Box that the shadow map covers on the campus road [m]; points outside it are lit."""
 _SHADOW_TEXEL = 0.03  # [m]
 _FAR = 1.0e6  # [m]
 _MAX_BIAS = 12.0  # [texels] bound of the bias against self-shadowing
@@ -170,27 +168,21 @@ class ShadowMap:
     depth: wp.array2d[float]
 
 
+@wp.func
+def _shadow_texel(shadows: ShadowMap, point: wp.vec3):
+    """Column and row of a point in the shadow map [texels], and 0."""
+    o = shadows.left_bottom
+    return wp.vec3(wp.dot(point, shadows.right) - o[0], wp.dot(point, shadows.up) - o[1], 0.0) / _SHADOW_TEXEL
+
+
 @wp.kernel
 def _rasterize_shadow(corners: wp.array2d[wp.vec3], shadows: ShadowMap):
     i = wp.tid()
-    o = shadows.left_bottom
-    a = (
-        wp.vec3(wp.dot(corners[i, 0], shadows.right) - o[0], wp.dot(corners[i, 0], shadows.up) - o[1], 0.0)
-        / _SHADOW_TEXEL
-    )
-    b = (
-        wp.vec3(wp.dot(corners[i, 1], shadows.right) - o[0], wp.dot(corners[i, 1], shadows.up) - o[1], 0.0)
-        / _SHADOW_TEXEL
-    )
-    c = (
-        wp.vec3(wp.dot(corners[i, 2], shadows.right) - o[0], wp.dot(corners[i, 2], shadows.up) - o[1], 0.0)
-        / _SHADOW_TEXEL
-    )
-    da, db, dc = (
-        wp.dot(corners[i, 0], shadows.ray),
-        wp.dot(corners[i, 1], shadows.ray),
-        wp.dot(corners[i, 2], shadows.ray),
-    )
+    a = _shadow_texel(shadows, corners[i, 0])
+    b = _shadow_texel(shadows, corners[i, 1])
+    c = _shadow_texel(shadows, corners[i, 2])
+    da, db = wp.dot(corners[i, 0], shadows.ray), wp.dot(corners[i, 1], shadows.ray)
+    dc = wp.dot(corners[i, 2], shadows.ray)
     area = wp.cross(b - a, c - a)[2]
     if area == 0.0:
         return
@@ -303,10 +295,8 @@ def _rasterize(
     if a[2] < _NEAR and b[2] < _NEAR and c[2] < _NEAR:
         return
     # Box around the part of the triangle beyond the near plane; sample k lies at k + 0.5.
-    box = wp.vec4(_UNBOUNDED, _UNBOUNDED, -_UNBOUNDED, -_UNBOUNDED)
-    box = _extend_box_by_edge(
-        _extend_box_by_edge(_extend_box_by_edge(box, a, b, intrinsics), b, c, intrinsics), c, a, intrinsics
-    )
+    box = _extend_box_by_edge(wp.vec4(_UNBOUNDED, _UNBOUNDED, -_UNBOUNDED, -_UNBOUNDED), a, b, intrinsics)
+    box = _extend_box_by_edge(_extend_box_by_edge(box, b, c, intrinsics), c, a, intrinsics)
     if box[2] < 0.5 or box[3] < 0.5 or box[0] > float(width) - 0.5 or box[1] > float(height) - 0.5:
         return
     x0, x1 = int(wp.ceil(wp.max(box[0] - 0.5, 0.0))), int(wp.floor(wp.min(box[2] - 0.5, float(width - 1))))

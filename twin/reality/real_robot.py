@@ -34,7 +34,7 @@ import numpy as np
 
 from twin.errors import InputError
 from twin.reality import SEED
-from twin.reality.place_objects import KnownPlace
+from twin.reality.place_objects import KnownPlace, Solids
 from twin.types import Array
 
 # ---- facts (Clearpath's description of the Husky A200)
@@ -220,7 +220,7 @@ class RealRobot:
     def __init__(self, robot: HiddenRobot, place: KnownPlace) -> None:
         self.robot = robot
         self._ground = place.route.ground_height
-        self._solids = Solids(place)
+        self._solids = Solids(place, FOOTPRINT)
         self._mass = _EMPTY_MASS + robot.payload
         self._height = (_EMPTY_MASS * _EMPTY_HEIGHT + robot.payload * robot.payload_height) / self._mass
         self._yaw_inertia = _EMPTY_YAW_INERTIA + 0.03 * robot.payload
@@ -481,64 +481,3 @@ def pose_matrix(pose: tuple[float, ...]) -> Array:
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = turn @ nose @ lean, (x, y, z)
     return out
-
-
-# ---- collision
-
-
-class Solids:
-    """The solid objects of a place, tested against the robot's footprint by separating axes."""
-
-    def __init__(self, place: KnownPlace) -> None:
-        solids = [one for obj in place.objects for one in obj.solids]
-        self._center = np.array([one.center for one in solids]).reshape(-1, 3)
-        self._half = np.array([one.half for one in solids]).reshape(-1, 3)
-        self._round = np.array([one.kind == "cylinder" for one in solids], bool)
-        # A cylinder's half sizes are its radius, half its height and 0.
-        self._up = np.where(self._round, self._half[:, 1], self._half[:, 2])
-        self._reach = np.where(self._round, self._half[:, 0], np.hypot(self._half[:, 0], self._half[:, 1]))
-        self._reach += 0.5 * hypot(*FOOTPRINT)
-        self._yaw = np.array([one.yaw for one in solids])
-
-    def hit(self, x: float, y: float, yaw: float, low: float, high: float) -> bool:
-        """True if the footprint at a pose [m], [rad] overlaps an object between two heights [m]."""
-        off = self._center[:, :2] - (x, y)
-        near = np.flatnonzero(
-            (np.hypot(off[:, 0], off[:, 1]) < self._reach)
-            & (self._center[:, 2] - self._up < high)
-            & (self._center[:, 2] + self._up > low)
-        )
-        return any(self._overlaps(int(i), off[i], yaw) for i in near)
-
-    def _overlaps(self, i: int, off: Array, yaw: float) -> bool:
-        long, wide = 0.5 * FOOTPRINT[0], 0.5 * FOOTPRINT[1]
-        c, s = cos(yaw), sin(yaw)
-        ahead, aside = float(c * off[0] + s * off[1]), float(c * off[1] - s * off[0])
-        if self._round[i]:
-            return hypot(max(abs(ahead) - long, 0.0), max(abs(aside) - wide, 0.0)) < self._half[i, 0]
-        # The separating axes of two rectangles are the axes of both.
-        turn = float(self._yaw[i]) - yaw
-        ct, st = cos(turn), sin(turn)
-        a, b = float(self._half[i, 0]), float(self._half[i, 1])
-        if abs(ahead) > long + a * abs(ct) + b * abs(st) or abs(aside) > wide + a * abs(st) + b * abs(ct):
-            return False
-        u, v = ct * ahead + st * aside, ct * aside - st * ahead
-        return abs(u) <= a + long * abs(ct) + wide * abs(st) and abs(v) <= b + long * abs(st) + wide * abs(ct)
-
-
-def follow(line: Array, pose: tuple[float, float, float], station: float, speed: float, most: float) -> float:
-    """Yaw rate [rad/s] that steers the base towards a line, by pure pursuit.
-
-    Args:
-        line: Points (x, y) of the line [m], shape (m, 2).
-        pose: x, y [m], yaw [rad] of the base.
-        station: Station of the nearest point of the line [m].
-        speed: Speed of the robot [m/s].
-        most: Bound of the yaw rate [rad/s].
-    """
-    ahead = 0.6 + 0.6 * speed
-    knots = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
-    x, y = (float(np.interp(station + ahead, knots, line[:, k])) for k in (0, 1))
-    bearing = atan2(y - pose[1], x - pose[0]) - pose[2]
-    rate = 2.0 * speed * sin(bearing) / max(hypot(x - pose[0], y - pose[1]), 0.2)
-    return copysign(min(abs(rate), most), rate)

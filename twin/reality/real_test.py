@@ -2,7 +2,7 @@
 
 A policy receives images only. The training side supplies only the policy's file and, optionally, a task as JSON. Robot,
 camera, haze and judge are implemented independently of the twin (`real_robot.py`, `real_camera.py`, `lighting.py`,
-`real_judge.py`); the renderer is `rasterizer.py`. The code of the twin loads policy files and defines the format of
+`road_task.py`); the renderer is `rasterizer.py`. The code of the twin loads policy files and defines the format of
 tables. Places, days, robots and cameras have numbers. The results list the values of the robot and the camera that lie
 outside the ranges of training (`outside_training`).
 
@@ -33,11 +33,10 @@ from twin.reality.place_sampling import check_length
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_camera import TRAINED as camera_ranges
 from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of
-from twin.reality.real_judge import RealJudge
 from twin.reality.real_robot import TRAINED as robot_ranges
 from twin.reality.real_robot import RealRobot, draw_robot
-from twin.reality.road_task import CAMPUS_TASKS, RoadTask, task_of_place
-from twin.reality.trial_place import place_on_test_day, rasterizer_of
+from twin.reality.road_task import CAMPUS_TASKS, RealJudge, RoadTask, place_on_test_day, task_of_place
+from twin.reality.true_world import rasterizer_of
 from twin.runtime import bar, exclusive_lock
 from twin.types import Image
 

@@ -1,13 +1,18 @@
-"""The task of a trial, as numbers: a line on the road, the corridor's width, start, goal and limits.
+"""The task of a trial on the road (a line, the corridor's width, start, goal and limits), and the trial's judge.
 
 The twin writes a task as JSON (`twin export SCENE --task NAME --task-file FILE`); `read_task` reads it and transforms
 it from the scene's frame into that of the generated world (the *true frame*). Without a twin, `task_of_place` gives a
 place's tasks on its filmed path, with the default rules. *Station*: arc length along the line [m].
+
+The judge decides when a trial ends, and why: goal, collision, timeout, ... It uses the task's numbers and the robot's
+position, tilt and contact, and shares no code with the twin's `RewardAndTermination`. A test compares the two on a
+thousand paths.
 """
 
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from functools import cache
-from math import cos, radians, sin
+from math import cos, hypot, radians, sin
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +20,15 @@ import numpy as np
 
 from twin.errors import InputError, short_repr
 from twin.files import read_json, wrap_read_errors
+from twin.geometry.passes import path_length, smooth_path
 from twin.geometry.poses import Similarity
-from twin.reality.filming import FilmingPlan
+from twin.reality import campus_road
+from twin.reality.campus_road import RoadLine
+from twin.reality.drawn_place import build_number
+from twin.reality.filming import FilmingPlan, trajectory
+from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.place_sampling import draw
 from twin.reality.place_spec import tasks
-from twin.reality.trial_place import place_on_test_day, true_route
 from twin.types import Array
 
 CAMPUS_TASKS = {"straight": (0.0, 30.0), "right_turn": (0.25, 60.0), "route": (0.0, 60.349)}
@@ -32,6 +41,7 @@ _STUCK = (0.1, 5.0)  # [m], [s]
 _MAX_TILT = radians(60.0)
 _START_OFFSET, _START_HEADING = 0.3, radians(10.0)  # [m], [rad]
 _HEADING_WINDOW = 1.0  # [m]
+_LENGTH_TOLERANCE = 0.98  # least length of the route, as a fraction of the longest path
 
 
 @dataclass(frozen=True)
@@ -140,6 +150,27 @@ def parse_task(table: dict[str, Any], to_truth: Similarity | None = None) -> Roa
     )
 
 
+# ---- tasks of a place
+
+
+def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) -> Array:
+    """The route on the true ground [m], shape (m, 3).
+
+    As in a build, it is the path of the first film whose path has at least 98 % of the longest path's length.
+    """
+    plan, line = plan or FilmingPlan(), line or RoadLine()
+    paths = [smooth_path(trajectory(plan, line, lighting)[1][:, :3, 3]) for lighting in plan.lightings]
+    lengths = np.array([path_length(path) for path in paths])
+    xy = paths[int(np.argmax(lengths >= _LENGTH_TOLERANCE * lengths.max()))]
+    return np.column_stack([xy, line.ground_height(xy)])
+
+
+@cache
+def place_on_test_day(number: int = 0, length: float = 0.0) -> KnownPlace:
+    """The place with a number on the day of the trials; `length` [m] as for `place_sampling.draw`."""
+    return build_number(number, displaced=True, length=length) if number else campus_road.build(displaced=True)
+
+
 @cache
 def _filmed_line(number: int, length: float) -> Array:
     place = place_on_test_day(number, length)
@@ -176,3 +207,76 @@ def task_of_place(
         yaw_rate=yaw_rate,
         control_timestep=control_timestep,
     )
+
+
+# ---- judge
+
+_BEHIND, _AHEAD = 1.5, 4.0  # [m] range of the search for the nearest point: behind and ahead of the previous one
+
+
+class RealJudge:
+    """Judges one trial at a time."""
+
+    def __init__(self, task: RoadTask) -> None:
+        self._task = task
+        self._points = task.line.tolist()
+        self._knots = task.knots.tolist()
+
+    def begin(self, x: float, y: float) -> None:
+        """Starts a trial at a position [m]."""
+        self.cause = ""
+        """Cause of the trial's end, one of `twin.config.CAUSES`; empty while it goes on."""
+        self.station, self.offset = self._task.start, 0.0
+        """Station of the nearest point of the line, and the distance from that point, positive to its left [m]."""
+        self._locate(x, y)
+        self._rested, self._since = (x, y), 0.0
+
+    def see(self, x: float, y: float, tilt: float, touched: bool, time: float) -> str:
+        """Takes the robot's state once per control step; returns the cause of the trial's end, empty while it goes on.
+
+        Args:
+            x: Position of the base [m].
+            y: Position of the base [m].
+            tilt: Angle between the robot's and the world's up axes [rad].
+            touched: True if the robot has touched an object.
+            time: Time since the start [s].
+        """
+        task = self._task
+        self._locate(x, y)
+        distance, patience = task.stuck
+        if hypot(x - self._rested[0], y - self._rested[1]) > distance:
+            self._rested, self._since = (x, y), time
+        if tilt > task.max_tilt:
+            self.cause = "rollover"
+        elif touched:
+            self.cause = "collision"
+        elif abs(self.offset) > task.half_width:
+            self.cause = "out_of_bounds"
+        elif self.station >= task.goal:
+            self.cause = "goal"
+        elif time > task.time_limit - 1e-6:
+            self.cause = "timeout"
+        elif time - self._since >= patience:
+            self.cause = "stuck"
+        return self.cause
+
+    @property
+    def progress(self) -> float:
+        """Distance along the line from the task's start [m]."""
+        return self.station - self._task.start
+
+    def _locate(self, x: float, y: float) -> None:
+        """Finds the nearest point of the line within the search range around the previous one."""
+        low, high = self.station - _BEHIND, self.station + _AHEAD
+        best = (float("inf"), self.station, 0.0)
+        first = max(bisect_left(self._knots, low) - 1, 0)
+        for k in range(first, min(bisect_right(self._knots, high), len(self._points) - 1)):
+            (ax, ay), (bx, by) = self._points[k], self._points[k + 1]
+            dx, dy = bx - ax, by - ay
+            squared = dx * dx + dy * dy
+            share = min(max(((x - ax) * dx + (y - ay) * dy) / squared, 0.0), 1.0) if squared > 0.0 else 0.0
+            away = hypot(x - ax - share * dx, y - ay - share * dy)
+            if away < best[0]:
+                left = dx * (y - ay) - dy * (x - ax)
+                best = (away, self._knots[k] + share * (self._knots[k + 1] - self._knots[k]), left)
+        self.station, self.offset = best[1], best[0] if best[2] >= 0.0 else -best[0]

@@ -1,14 +1,22 @@
-"""Procedural textures: RGB in [0, 1], shape (rows, columns, 3), with detail at every scale.
+"""Procedural textures: RGB in [0, 1], shape (rows, columns, 3), with detail at every scale; and the atlas.
 
 Nothing repeats along the road, since a repeating texture causes false matches in structure from motion. Each texture
-has its own random generator, so a change of one does not change the others.
+has its own random generator, so a change of one does not change the others. An *atlas* is one image with a square cell
+for each small surface, from bark to windows.
 """
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.reality.place_objects import ATLAS_CELL
 from twin.types import Array32
+
+CHIPS = np.array([[0.55, 0.54, 0.52], [0.22, 0.22, 0.22], [0.47, 0.43, 0.39], [0.17, 0.17, 0.18]], np.float32)
+"""Colors of the stones in asphalt and concrete."""
 
 
 def fbm(rng: np.random.Generator, shape: tuple[int, int], coarsest: float, finest: float = 1.0, gain: float = 0.7):
@@ -84,6 +92,36 @@ def crack(rng: np.random.Generator, mask: NDArray, start: NDArray, heading: floa
             crack(rng, mask, point, heading + rng.choice([-1, 1]) * rng.uniform(0.5, 1.2), length * 0.35, width * 0.7)
 
 
+def add_cracks(
+    rng: np.random.Generator,
+    image: NDArray,
+    count: int,
+    widths: tuple[float, float],
+    color: tuple[float, float, float],
+    weight: float,
+) -> None:
+    """Draws cracks along and across a road into its image, in place; `widths` is their range [px]."""
+    rows, columns = image.shape[:2]
+    mask = np.zeros((rows, columns), np.float32)
+    for _ in range(count):
+        start = np.array([rng.uniform(0, columns), rng.uniform(0, rows)])
+        heading = (np.pi / 2 if rng.random() < 0.45 else 0.0) + rng.normal(0, 0.25) + rng.integers(0, 2) * np.pi
+        crack(rng, mask, start, heading, rng.uniform(40, 330), rng.uniform(*widths))
+    blend(image, color, weight * cv2.GaussianBlur(mask, (3, 3), 0.6))
+
+
+def add_patch(rng: np.random.Generator, part: NDArray, tone: tuple[float, float, float]) -> None:
+    """Turns a part of a road's image into a repaired patch of another tone with a tarred seam, in place."""
+    rows, columns = part.shape[:2]
+    fresh = tinted(tone, fbm(rng, (rows, columns), 30, 2.0), 0.14)
+    grains(rng, fresh, rng.uniform(0.05, 0.2), CHIPS)
+    part[:] = 0.25 * part + 0.75 * fresh
+    seam = np.zeros((rows, columns), np.float32)
+    cv2.rectangle(seam, (1, 1), (columns - 2, rows - 2), 1.0, int(rng.integers(2, 4)))
+    worn = np.clip(0.6 + 0.4 * fbm(rng, seam.shape, 40, 3.0), 0.0, 0.9)
+    blend(part, (0.12, 0.12, 0.125), seam * worn)
+
+
 def road(rng: np.random.Generator, length: float, half_width: float, pixel: float) -> Array32:
     """Asphalt with rows across the road (row 0 at the left edge) and columns along it. Lengths and `pixel` [m].
 
@@ -95,9 +133,8 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
     image = tinted(
         (0.37, 0.37, 0.375), fbm(rng, shape, 3.0 / pixel, 2.0), 0.13, 0.5 * fbm(rng, shape, 6.0 / pixel, 40.0)
     )
-    chips = np.array([[0.55, 0.54, 0.52], [0.22, 0.22, 0.22], [0.47, 0.43, 0.39], [0.17, 0.17, 0.18]], np.float32)
-    grains(rng, image, 0.16, chips)
-    speckle(rng, image, int(length * 45), (0.5, 1.6), chips)
+    grains(rng, image, 0.16, CHIPS)
+    speckle(rng, image, int(length * 45), (0.5, 1.6), CHIPS)
     for track in (-1.95, -0.75, 0.75, 1.95):  # polished by wheels
         wander = track + 0.08 * fbm(rng, (1, columns), 8.0 / pixel, 200.0)
         blend(image, (0.27, 0.27, 0.275), 0.33 * np.exp(-0.5 * ((lateral - wander) / 0.22) ** 2))
@@ -111,20 +148,8 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
         if c1 - c0 < 8 or r1 - r0 < 8:
             continue
         level = rng.uniform(0.19, 0.48)
-        part = tinted((level, level, level * 1.02), fbm(rng, (r1 - r0, c1 - c0), 30, 2.0), 0.14)
-        grains(rng, part, rng.uniform(0.05, 0.2), chips)
-        image[r0:r1, c0:c1] = 0.25 * image[r0:r1, c0:c1] + 0.75 * part
-        seam = np.zeros((r1 - r0, c1 - c0), np.float32)
-        cv2.rectangle(seam, (1, 1), (c1 - c0 - 2, r1 - r0 - 2), 1.0, int(rng.integers(2, 4)))
-        worn = np.clip(0.6 + 0.4 * fbm(rng, seam.shape, 40, 3.0), 0.0, 0.9)
-        blend(image[r0:r1, c0:c1], (0.12, 0.12, 0.125), seam * worn)
-    cracks = np.zeros(shape, np.float32)
-    for _ in range(int(length * 1.1)):
-        start = np.array([rng.uniform(0, columns), rng.uniform(0, rows)])
-        across = rng.random() < 0.45
-        heading = (np.pi / 2 if across else 0.0) + rng.normal(0, 0.25) + rng.integers(0, 2) * np.pi
-        crack(rng, cracks, start, heading, rng.uniform(40, 330), rng.uniform(1.0, 3.0))
-    blend(image, (0.08, 0.08, 0.085), 0.85 * cv2.GaussianBlur(cracks, (3, 3), 0.6))
+        add_patch(rng, image[r0:r1, c0:c1], (level, level, level * 1.02))
+    add_cracks(rng, image, int(length * 1.1), (1.0, 3.0), (0.08, 0.08, 0.085), 0.85)
     for _ in range(int(length / 1.8)):  # drips of oil, spilt water, chewing gum
         center = [int(rng.uniform(0, columns)), int(rng.uniform(0, rows))]
         size = int(rng.uniform(3, 26))
@@ -372,3 +397,92 @@ def resized(image: Array32, shape: tuple[int, int], smooth: bool = True) -> Arra
     """The image scaled to (rows, columns), with cubic (`smooth`) or linear interpolation."""
     how = cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR
     return cv2.resize(image, shape[::-1], interpolation=how).astype(np.float32)
+
+
+# ---- atlas
+
+_Rgb = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class AtlasColors:
+    """Colors and styles that differ between the atlases of places; the defaults are those of the campus road."""
+
+    metals: Mapping[str, _Rgb] = field(
+        default_factory=lambda: {
+            "zinc": (0.55, 0.57, 0.58),
+            "dark": (0.16, 0.17, 0.18),
+            "green": (0.12, 0.30, 0.18),
+            "red": (0.58, 0.12, 0.10),
+            "blue": (0.13, 0.24, 0.46),
+            "white": (0.78, 0.78, 0.76),
+            "rubber": (0.09, 0.09, 0.09),
+            "tank": (0.34, 0.33, 0.33),
+            "glass": (0.16, 0.2, 0.24),
+        }
+    )
+    woods: Mapping[str, _Rgb] = field(
+        default_factory=lambda: {"planks": (0.50, 0.37, 0.24), "crate": (0.50, 0.37, 0.24)}
+    )
+    masonry: Mapping[str, _Rgb] = field(default_factory=dict)
+    doors: tuple[_Rgb, _Rgb] = ((0.50, 0.37, 0.24), (0.50, 0.37, 0.24))
+    greens: tuple[_Rgb, ...] = ((0.26, 0.37, 0.12), (0.33, 0.42, 0.13), (0.40, 0.40, 0.14), (0.22, 0.33, 0.14))
+    hedge: _Rgb = (0.10, 0.16, 0.06)
+    barks: tuple[_Rgb, ...] = ((0.34, 0.27, 0.20),) * 3
+    lamp: _Rgb = (1.0, 0.93, 0.76)
+    signs: tuple[tuple[_Rgb, str], ...] = (
+        *(((0.10, 0.22, 0.55), "LIBRARY"), ((0.85, 0.85, 0.82), "SLOW"), ((0.9, 0.75, 0.1), "WORKS")),
+        *(((0.12, 0.4, 0.2), "HALL B"), ((0.75, 0.1, 0.1), "STOP"), ((0.92, 0.9, 0.85), "MAP")),
+        *(((0.95, 0.95, 0.9), "KA 214"), ((0.93, 0.8, 0.2), "RX 730")),
+    )
+    window: str = "cross"
+    frames: NDArray[np.float64] = field(
+        default_factory=lambda: np.array([[0.86, 0.86, 0.84], [0.32, 0.22, 0.15], [0.25, 0.3, 0.27]])
+    )
+
+
+def to_uint8(image: NDArray) -> NDArray[np.uint8]:
+    """Converts an image in [0, 1] to 8 bits."""
+    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def paint_atlas(
+    rng: Callable[[int], np.random.Generator], names: tuple[str, ...], colors: AtlasColors
+) -> NDArray[np.float32]:
+    """The image of an atlas in [0, 1]; `rng(k)` is the random generator of cell k."""
+    rows = max(8, -(-len(names) // 8))
+    image = np.zeros((rows * ATLAS_CELL, 8 * ATLAS_CELL, 3), np.float32)
+    for k, name in enumerate(names):
+        row, column = divmod(k, 8)
+        tile = _cell(rng(k), name, colors)
+        image[row * ATLAS_CELL : (row + 1) * ATLAS_CELL, column * ATLAS_CELL : (column + 1) * ATLAS_CELL] = tile
+    return image
+
+
+def _cell(rng: np.random.Generator, name: str, colors: AtlasColors) -> Array32 | NDArray[np.float32]:
+    square = (ATLAS_CELL, ATLAS_CELL)
+    if name.startswith("bark"):
+        return bark(rng, square, colors.barks[int(name[-1])])
+    if name.startswith("leaf"):
+        return leaf(rng, square, colors.greens[int(name[-1])])
+    if name == "hedge":
+        return leaf(rng, square, colors.hedge)
+    if name in colors.metals:
+        return metal(rng, square, colors.metals[name])
+    if name in colors.masonry:
+        return bricks(rng, square, 0.02, colors.masonry[name])
+    if name == "birch":
+        return bark(rng, square, (0.72, 0.71, 0.67))
+    if name in colors.woods:
+        return wood(rng, square, colors.woods[name])
+    if name == "cone":
+        return stripes(rng, square, (0.85, 0.30, 0.08), (0.88, 0.88, 0.85), 5)
+    if name == "barrier":
+        return np.rot90(stripes(rng, square, (0.75, 0.1, 0.08), (0.9, 0.9, 0.88), 7)).copy()
+    if name.startswith("door"):
+        return wood(rng, square, colors.doors[int(name[-1])]) * np.float32(0.55)
+    if name == "lamp":
+        return np.full((*square, 3), colors.lamp, np.float32)
+    if name.startswith("sign"):
+        return notice(rng, square, *colors.signs[int(name[-1])])
+    return resized(window(rng, name.startswith("lit"), colors.window, colors.frames), square)

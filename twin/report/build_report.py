@@ -148,7 +148,7 @@ def load_truth_comparison(scene: SceneDir) -> dict[str, Any] | None:
     """Loads the comparison of this build with ground truth, written by `twin reality compare`.
 
     Returns:
-        A dictionary with `figures` (see `twin.reality.comparison`) and `camera_errors_m` (a list per source [m]); None
+        A dictionary with `figures` (see `twin.reality.truth`) and `camera_errors_m` (a list per source [m]); None
         if this build was not compared.
     """
     if not scene.truth_json.exists():

@@ -20,10 +20,9 @@ from tqdm import tqdm
 from twin.env.drivers import RecordedDrive
 from twin.errors import join_names
 from twin.files import write_bytes
-from twin.geometry.cameras import Cameras, Viewpoints, nearest_frame
+from twin.geometry.cameras import Cameras, RenderableField, Rendering, Viewpoints, nearest_frame
 from twin.geometry.images import psnr, read_image, resize, to_uint8
 from twin.mjcf.world import World, arc_lengths
-from twin.nerf.rendering import RenderableField, Rendering
 from twin.report.video_layout import (
     ACCENT,
     AMBER,

@@ -23,12 +23,11 @@ from twin.env.mujoco_renderer import SceneCamera, chase_poses
 from twin.env.physics import HuskyPhysics
 from twin.env.trust import Trust
 from twin.files import write_json
-from twin.geometry.cameras import Cameras, Viewpoints
+from twin.geometry.cameras import Cameras, RenderableField, Viewpoints
 from twin.geometry.poses import look_at
 from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.nerf.baked import BakedField
-from twin.nerf.rendering import RenderableField
 from twin.report.html import follower_verdict
 from twin.report.review_chapters import (
     COMPARISON_STRIP,

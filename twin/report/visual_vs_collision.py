@@ -26,10 +26,18 @@ from scipy.spatial import cKDTree
 
 from twin.assets.ground import Ground
 from twin.assets.solids import HEADROOM
-from twin.geometry.cameras import Cameras, Viewpoints, opencv_to_mujoco, pixel_grid, project, unproject
+from twin.geometry.cameras import (
+    FAR,
+    Cameras,
+    RenderableField,
+    Viewpoints,
+    opencv_to_mujoco,
+    pixel_grid,
+    project,
+    unproject,
+)
 from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import CAMERA_SIZE, GROUND_GROUP, PART_GROUP, World, arc_lengths, point_at
-from twin.nerf.rendering import FAR, RenderableField
 from twin.report.video_layout import (
     PANEL_BACKGROUND,
     caption_line,

@@ -14,7 +14,8 @@ from mujoco import rollout
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from twin.mjcf.husky import ROBOT_VISUAL_GROUP, add_husky, set_options
+from twin.mjcf.husky import add_husky, set_options
+from twin.mjcf.husky_visuals import ROBOT_VISUAL_GROUP
 from twin.robot import WHEELS, HuskyParams
 from twin.runtime import available_cores
 from twin.sysid.drivetrain import CONTROL_STEP, EXTRA_SAMPLES

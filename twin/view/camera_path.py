@@ -20,7 +20,7 @@ from twin.errors import short_repr
 from twin.files import json_bytes, read_json, wrap_read_errors, write_bytes
 from twin.geometry.images import to_uint8
 from twin.nerf.baked import BakedField
-from twin.nerf.fog import mixed
+from twin.nerf.lightings import mixed_fog
 from twin.nerf.sun import mixed_sunlight
 from twin.types import Array
 from twin.view.scene_picture import FreeCamera, ScenePicture
@@ -123,7 +123,7 @@ def mixed_lighting(one: EpisodeLighting, other: EpisodeLighting, share: float) -
         return other
     start = ((1.0 - share) * one.start + share * other.start).astype(np.float32)
     suns = mixed_sunlight(one.sunlight, other.sunlight, share)
-    fog, name = mixed(one.fog, other.fog, share), f"{one.name} → {other.name}"
+    fog, name = mixed_fog(one.fog, other.fog, share), f"{one.name} → {other.name}"
     return MixedLighting(name, start, fog=fog, sunlight=suns, parts=(one, other), share=share)
 
 

@@ -16,10 +16,9 @@ import numpy as np
 
 from twin.config import ObstacleConfig
 from twin.env.episode_lighting import EpisodeLighting
-from twin.geometry.cameras import Viewpoints, opencv_to_mujoco, pixel_grid, unproject
+from twin.geometry.cameras import Rendering, Viewpoints, opencv_to_mujoco, pixel_grid, unproject
 from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
-from twin.nerf.rendering import Rendering
 from twin.nerf.sun import relit
 from twin.types import Array, Array32
 

@@ -1,7 +1,7 @@
 """Bricks: sparse storage of a baked field's samples, and the kernels that fine-tune them; `march.py` renders them.
 
 *Brick*: 8³ cells of a grid, stored as the 9³ samples on their corners, so that interpolation never leaves the brick. A
-sample is `CHANNELS` bytes: raw density and features (see `composite.py`), each scaled to the range of its channel.
+sample is `CHANNELS` bytes: raw density and features (see `volume.py`), each scaled to the range of its channel.
 *Slot*: row of a stored brick; the *index* maps each brick of a grid to its slot, or to −1 if it is not stored. *Block*:
 2³ cells. The *near* grid covers the near box; the *far* grid, with larger cells, covers the contracted cube.
 """
@@ -9,8 +9,7 @@ sample is `CHANNELS` bytes: raw density and features (see `composite.py`), each 
 # Warp evaluates annotations, so they contain calls, which mypy does not accept. In a kernel, float() and int() declare
 # a variable that a loop changes.
 # mypy: ignore-errors
-from twin.nerf.kernels.composite import CHANNELS, Channels
-from twin.nerf.kernels.sampler import inside_near_box, near_box_position
+from twin.nerf.kernels.volume import CHANNELS, Channels, inside_near_box, near_box_position
 from twin.warp_runtime import wp
 
 CELLS = 8

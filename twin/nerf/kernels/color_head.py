@@ -9,9 +9,9 @@ own lighting.
 from functools import cache
 from typing import Any
 
-from twin.nerf.kernels.composite import CHANNELS
+from twin.geometry.cameras import FAR
 from twin.nerf.kernels.march import OPTIONS, ImageBuffers, fast_exp
-from twin.nerf.rendering import FAR
+from twin.nerf.kernels.volume import CHANNELS
 from twin.warp_runtime import wp
 
 HARMONICS = 16

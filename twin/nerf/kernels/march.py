@@ -3,7 +3,7 @@
 *Packet*: neighboring rays, eight to a row, that march together, one per *lane*. Loops over lanes have no branches, so
 the compiler vectorizes them; on CUDA, where the hardware runs threads in parallel, a packet has one lane. *Tile*: 8 × 8
 pixels; space is empty along its rays up to the distance *start* [m]. *Skip distance* of a block: its distance [blocks]
-in the maximum norm from the nearest occupied block, see `brick_layout.skip_distances`. `bricks.py` defines bricks,
+in the maximum norm from the nearest occupied block, see `baked_arrays.skip_distances`. `bricks.py` defines bricks,
 blocks and grids; `space.py` defines positions.
 """
 
@@ -15,8 +15,8 @@ from functools import cache
 from typing import Any
 
 from twin.nerf.kernels.bricks import BLOCKS, CORNERS, DENSITIES, HALF_CORNERS, SAMPLES, Bricks, Bytes
-from twin.nerf.kernels.composite import CHANNELS, RAW_LIMIT, Channels
 from twin.nerf.kernels.space import grid_position, max_norm
+from twin.nerf.kernels.volume import CHANNELS, RAW_LIMIT, Channels
 from twin.warp_runtime import wp
 
 TILE = 8

@@ -13,8 +13,8 @@ share the rows of a table. *Footprint*: width of a pixel on the surface [m]; it 
 # mypy: ignore-errors
 # ruff: noqa: RUF046
 from twin.nerf.kernels.bricks import Bytes
-from twin.nerf.kernels.composite import CHANNELS, Channels
 from twin.nerf.kernels.march import OPTIONS, ImageBuffers, as_floats, sample_of, slot_of
+from twin.nerf.kernels.volume import CHANNELS, Channels
 from twin.warp_runtime import wp
 
 wp.set_module_options(OPTIONS)
