@@ -56,7 +56,7 @@ def write_hdr_film(path: Path, pictures: Sequence[np.ndarray], transfer: int) ->
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx265", rate=10)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p10le"
-        stream.options = {"crf": "8", "x265-params": "log-level=error"}
+        stream.options = {"crf": "8", "x265-params": "log-level=error:bframes=0"}  # B-frames lose the time stamps of short films
         _tag(stream.codec_context, transfer)
         for k, picture in enumerate(pictures):
             frame = av.VideoFrame(width, height, "yuv420p10le")
