@@ -56,7 +56,8 @@ def write_hdr_film(path: Path, pictures: Sequence[np.ndarray], transfer: int) ->
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx265", rate=10)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p10le"
-        stream.options = {"crf": "8", "x265-params": "log-level=error:bframes=0"}  # B-frames lose the time stamps of short films
+        # With B-frames, the packets of a short film sometimes lack time stamps.
+        stream.options = {"crf": "8", "x265-params": "log-level=error:bframes=0"}
         _tag(stream.codec_context, transfer)
         for k, picture in enumerate(pictures):
             frame = av.VideoFrame(width, height, "yuv420p10le")
