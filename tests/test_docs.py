@@ -125,7 +125,7 @@ def test_the_table_of_real_trials_is_accepted(tmp_path):
     (block,) = _blocks(ROOT / "docs" / "forecast.md", "csv")
     (tmp_path / "real.csv").write_text(block)
     twin = [Cell(name, "straight", "held-out+randomised", 20, 15) for name in ("first", "first/000006000")]
-    assert [cell.successes for cell in read_results(tmp_path / "real.csv", twin)] == [8, 3]
+    assert [cell.successes for cell in read_results([tmp_path / "real.csv"], twin)] == [8, 3]
 
 
 def test_the_readme_is_read_in_five_minutes():

@@ -411,7 +411,7 @@ If the twin has no lighting of a name, a column twin_lighting names the lighting
 held-out+randomised.
 """
     add("scene", type=Path, help="folder of a scene with validated policies")
-    add("--real", type=Path, metavar="CSV", help="trials on the road; see below")
+    add("--real", type=Path, nargs="+", default=[], metavar="CSV", help="trials on the road, in one table or several; see below")
     add("--seed", type=int, default=0, help="seed of the sampling from posteriors")
     add("--quiet", action="store_true", help="no summary")
 
