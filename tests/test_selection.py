@@ -45,7 +45,7 @@ def scripted(monkeypatch):
     script: dict[int, tuple[int, float]] = {}
     asked: list[tuple[int, tuple[int, ...], str]] = []
 
-    def pretend(policy, envs, seeds, watch):
+    def pretend(policy, envs, seeds, watch, among=None):
         step = policy.trained["step"]
         order = selection._seeds(CONFIG)
         asked.append((step, tuple(seeds), envs.options.lighting))
