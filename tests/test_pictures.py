@@ -79,7 +79,9 @@ def test_pictures_with_brightness_before_colors_are_decoded(encoding, order):
     picture = RawPicture(encoding, width, height, width + 6, padded.tobytes()).decode()
     assert picture.shape == SMOOTH.shape
     assert np.abs(picture.astype(int) - SMOOTH).mean() < 4.0  # swapped colors differ by 50
-    with pytest.raises(PictureError, match=rf"{encoding} picture .* expected {width} a row .* {width * height * 3 // 2} in"):
+    with pytest.raises(
+        PictureError, match=rf"{encoding} picture .* expected {width} a row .* {width * height * 3 // 2} in"
+    ):
         RawPicture(encoding, width, height, width, rows[:height].tobytes()).decode()
 
 

@@ -150,7 +150,10 @@ def _film(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _OTHERS_POLICIES
     add("scene", type=Path, help="folder of a built scene, or a pack")
     add("--task", default="right_turn", help="straight, right_turn, route, or one of scene.toml")
-    add("--policy", help="a run, a checkpoint, an ONNX file, module:function or a zip; default: a scripted route follower")
+    add(
+        "--policy",
+        help="a run, a checkpoint, an ONNX file, module:function or a zip; default: a scripted route follower",
+    )
     add("--trust", action="store_true", help="load a policy file that may run code")
     add(
         "--lighting",
@@ -411,7 +414,14 @@ If the twin has no lighting of a name, a column twin_lighting names the lighting
 held-out+randomised.
 """
     add("scene", type=Path, help="folder of a scene with validated policies")
-    add("--real", type=Path, nargs="+", default=[], metavar="CSV", help="trials on the road, in one table or several; see below")
+    add(
+        "--real",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="CSV",
+        help="trials on the road, in one table or several; see below",
+    )
     add("--seed", type=int, default=0, help="seed of the sampling from posteriors")
     add("--quiet", action="store_true", help="no summary")
 

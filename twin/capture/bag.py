@@ -102,8 +102,8 @@ class Bag:
                 back = int((times[:-lag] - times[lag:]).min(1, initial=2**62).max(initial=0))
                 if back > _SET_BACK:
                     raise InputError(
-                        f"{self._path}: {topic}: the recorder's clock was set back by about {back * 1e-9:.0f} s, so parts of "
-                        "the recording have the same times; record it anew after the clock has been set"
+                        f"{self._path}: {topic}: the recorder's clock was set back by about {back * 1e-9:.0f} s, so "
+                        "parts of the recording have the same times; record it anew after the clock has been set"
                     )
 
     def on(self, *topics: str) -> list[Any]:
