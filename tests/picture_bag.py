@@ -64,15 +64,19 @@ def command(v: float, yaw_rate: float, stamp: int) -> Recorded:
 
 
 def write(
-    path: Path, messages: Sequence[Recorded], mcap: bool = True, compression: CompressionMode = CompressionMode.NONE
+    path: Path,
+    messages: Sequence[Recorded],
+    mcap: bool = True,
+    compression: CompressionMode = CompressionMode.NONE,
+    in_order: bool = True,
 ) -> Path:
-    """Writes a bag's folder, in MCAP or sqlite3."""
+    """Writes a bag's folder, in MCAP or sqlite3, with the messages sorted by time if `in_order`."""
     plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
     writer = Writer(path, version=9, storage_plugin=plugin)
     writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
         topics: dict[tuple[str, str], Any] = {}
-        for one in sorted(messages, key=lambda each: each.stamp):
+        for one in sorted(messages, key=lambda each: each.stamp) if in_order else messages:
             key = one.topic, one.type
             if key not in topics:
                 topics[key] = writer.add_connection(*key, typestore=MESSAGES.store)

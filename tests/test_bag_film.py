@@ -284,6 +284,30 @@ def test_a_compressed_file_of_a_bag_is_read_in_its_folder(tmp_path: Path, capsys
         assert "give the bag's folder" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("mcap", [True, False])
+def test_a_clock_that_was_set_back(tmp_path: Path, capsys: pytest.CaptureFixture, mcap: bool) -> None:
+    """A camera's is replaced by the recorder's. Of a recorder's own, the film would mix the parts of equal times."""
+    back = START + np.round((TIMES - np.where(TIMES < 2.0, 0.0, 300.0)) * 1e9).astype(int)
+    film = pictures(views(SHIFTS), TIMES)
+    for one, stamp in zip(film, back.tolist(), strict=True):
+        one.message.header.stamp.sec, one.message.header.stamp.nanosec = divmod(stamp, 10**9)
+    contents = read_contents(write(tmp_path / "camera", [camera_info(PINHOLE), *film], mcap))
+    assert len(contents.stamps) == len(TIMES) and contents.duration == pytest.approx(TIMES[-1])
+    assert (
+        "the clock of /camera/image was set back by 300 s; the times of recording are used" in capsys.readouterr().err
+    )
+    times = np.arange(80) * 0.1  # several chunks of a megabyte
+    both = [
+        replace(one, stamp=one.stamp - (300 * 10**9 if time > 2.0 else 0))
+        for one, time in zip(pictures([views(SHIFTS)[0]] * len(times), times), times, strict=True)
+    ]
+    bag = write(tmp_path / "recorder", [camera_info(PINHOLE), *both], mcap, in_order=False)
+    with pytest.raises(
+        InputError, match=r"/camera/image: the recorder's clock was set back by about (29\d|300) s.*anew"
+    ):
+        read_contents(bag)
+
+
 # ---- bad bags
 
 

@@ -27,7 +27,7 @@ from twin.report import build_report as report_page
 from twin.report import build_sections, build_topics
 from twin.report import html as report_html
 from twin.report.build_report import page, write_page
-from twin.report.build_sections import SECTIONS, cautions, headline_sections, mjcf_section, sections
+from twin.report.build_sections import SECTIONS, capture_section, cautions, headline_sections, mjcf_section, sections
 from twin.report.build_topics import truth_section
 from twin.report.html import (
     NOT_MEASURED,
@@ -255,7 +255,7 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("metric", "metric.gravity_uncertainty_deg", 3.0, "3.0°"),
     ("metric", "metric.road_reliable", False, "Too few points"),
     ("field", "field.psnr", {"day": 12.0}, "12.0 dB"),
-    ("field", "field.n", {"day": 1}, "Only 1 frame"),
+    ("field", "field.n", {"day": 1}, "Only 1 held-out frame"),
     ("field", "field.cross_lighting", {"colour_follows": {"day": 0.4}}, "Only 40% of the places"),
     (
         "field",
@@ -423,7 +423,7 @@ def test_a_failed_drive_says_what_to_try() -> None:
 
 
 def test_errors_against_ground_truth_are_shown_where_it_is_known(scene: SceneDir) -> None:
-    assert "generated places only" in truth_section(REPORT).not_applicable
+    assert "ground truth" not in read(page(scene, REPORT)).text
     known = changed("truth", {"ate_m": 0.042, "ground_median_m": 0.09, "corridor_intrusions": 2, "scale_error": None})
     section = truth_section(known)
     values = {fact.name: fact.value for fact in section.facts}
@@ -437,6 +437,15 @@ def test_charts_are_drawn_from_the_report(scene: SceneDir) -> None:
     assert "24.3 dB (n = 10)" in text
     assert "PSNR during training" in text and "Cross-track error of the drive" in text
     assert "Ground and convex parts" not in text  # no mesh stage on disk
+
+
+def test_held_out_frames_are_told_from_scored_ones_and_photos_from_films(scene: SceneDir) -> None:
+    """A report counts held-out frames of all lightings, and for each lighting those that were scored."""
+    text = read(page(scene, REPORT)).text
+    assert "on 10 of its held-out frames" in text and "are scored under Radiance field" in text
+    photos = {"day": {"kind": "images", "kept": 160}}
+    assert "at regular spacing" not in capture_section(changed("capture.sources", photos)).done
+    assert "at regular spacing" in capture_section({"capture": {"sources": {"day": {"promised": 160}}}}).done
 
 
 def test_a_chart_has_its_heading_as_accessible_name() -> None:

@@ -101,6 +101,13 @@ def test_statistics_are_those_of_all_frames(written):
     actions = np.concatenate([episode.actions[:-1] for episode, _, _ in drives]).astype(np.float32)
     for kind, wanted in (("mean", actions.mean(0)), ("std", actions.std(0)), ("min", actions.min(0))):
         np.testing.assert_allclose(stats["action"][kind], wanted, rtol=1e-5)
+    parts = [episode.actions[:-1].astype(np.float32) for episode, _, _ in drives]
+    for kind, share in (("q01", 0.01), ("q50", 0.5), ("q99", 0.99)):
+        each = [np.quantile(part, share, axis=0) for part in parts]
+        np.testing.assert_allclose(stats["action"][kind], np.average(each, 0, [len(part) for part in parts]), rtol=1e-5)
+        each = [np.quantile(np.array(one[:-1]).reshape(-1, 3) / 255, share, 0) for _, one, _ in drives]
+        wanted = np.average(each, 0, [len(part) for part in parts])
+        np.testing.assert_allclose(np.ravel(stats[CAMERA][kind]), wanted, atol=1 / 255)
     colors = np.concatenate([pictures[:-1] for _, pictures, _ in drives]).reshape(-1, 3) / 255
     np.testing.assert_allclose(np.ravel(stats[CAMERA]["mean"]), colors.mean(0))
     np.testing.assert_allclose(np.ravel(stats[CAMERA]["std"]), colors.std(0))

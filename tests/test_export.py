@@ -11,10 +11,11 @@ import trimesh
 from test_gaussians import floor_views
 from tiny_twin import tiny_twin
 
+from twin import runtime
 from twin.assets.gaussians import read_ply
 from twin.capture.formats import read_model, read_transforms
 from twin.export import gltf
-from twin.export.__main__ import main
+from twin.export.__main__ import export, main
 from twin.geometry.cameras import Cameras, SparsePoints, project
 from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
@@ -150,6 +151,14 @@ def test_splats_and_mesh_have_the_lighting(out, scene) -> None:
 
 
 # ---- texture
+
+
+def test_each_progress_bar_has_its_own_name(scene, tmp_path, monkeypatch) -> None:
+    names: list[str] = []
+    bar = runtime.bar
+    monkeypatch.setattr(runtime, "bar", lambda what, *more, **how: (names.append(what), bar(what, *more, **how))[1])
+    export(scene, None, ply=tmp_path / "a.ply", glb=tmp_path / "a.glb")
+    assert [name.split(",")[0] for name in names] == ["splats", "splats", "textures"] and len(set(names)) == len(names)
 
 
 def test_a_baked_texture_shows_what_the_views_show() -> None:

@@ -188,7 +188,7 @@ def test_implausible_counts_of_trials_are_refused(tmp_path, count):
     path = tmp_path / "real.csv"
     path.write_text(f"policy,lighting,trials,successes\nfirst,day,{count},0\n")
     with pytest.raises(InputError, match="line 2: trials") as refused:
-        read_results(path, [Cell("first", "straight", "day", 5, 5)])
+        read_results([path], [Cell("first", "straight", "day", 5, 5)])
     assert len(str(refused.value)) < len(str(path)) + 200
 
 

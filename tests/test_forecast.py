@@ -500,7 +500,7 @@ def test_a_wrong_table_leaves_the_last_forecast_alone(tmp_path: Path) -> None:
     before = (root / "forecast" / "forecast.json").read_bytes()
     table = results(tmp_path / "results.csv", [*real, Cell("p9", "straight", "sun", 5, 5, "sun")])
     with pytest.raises(InputError, match="policy 'p9' was not validated"):
-        forecast(root, table)
+        forecast(root, [table])
     assert (root / "forecast" / "forecast.json").read_bytes() == before
 
 

@@ -3,6 +3,9 @@
 import gzip
 import importlib
 import importlib.util
+import os
+import signal
+import subprocess
 import sys
 import threading
 import time
@@ -287,6 +290,16 @@ def _records(forecast, protocol, results, look, places=6, noise=0.0):
 
 def _counted(policy, lighting, won, count):
     return [Trial(policy, "whole", lighting, k, "goal" if k < won else "stuck", 1.0, 9) for k in range(count)]
+
+
+def test_tables_may_be_cut_by_another_program(tmp_path):
+    """As by `| head`: no traceback, and the scores are stored."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, str(FOLDER), "--tables", "--results", str(tmp_path)]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "") and list(tmp_path.glob("*/scores.json"))
 
 
 def test_a_twin_that_agrees_with_the_road_reaches_what_is_wanted_and_beats_the_baselines(forecast, tmp_path):

@@ -25,6 +25,7 @@ from twin.capture.video import (
     upright,
 )
 from twin.config import CalibrationConfig, SourceConfig
+from twin.errors import InputError
 from twin.geometry.images import read_image, write_image
 
 
@@ -137,6 +138,10 @@ def test_a_smaller_frame_has_smaller_intrinsics(tmp_path: Path) -> None:
         path="a.mp4", camera=CalibrationConfig("PINHOLE", (150.0, 150.0, 60.0, 80.0), HEIGHT, WIDTH)
     )
     refused(tmp_path, sideways, "upright")
+    film(tmp_path / "b.mp4", views([5 * i for i in range(6)]))
+    with pytest.raises(InputError, match=r"a\.mp4: camera is for"):  # before the other film is read
+        captured(tmp_path, [SourceConfig(path="b.mp4"), sideways], frames=6)
+    assert not (tmp_path / "out/images/b").exists()
 
 
 def test_a_mask_hides_what_moves_with_the_camera(tmp_path: Path) -> None:

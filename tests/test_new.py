@@ -101,6 +101,31 @@ def test_a_posed_image_set_is_copied_with_its_images_and_can_be_built(tmp_path: 
     assert not list((root / "input").rglob("*.db")) and not list((root / "input").glob("*.partial"))
 
 
+@pytest.mark.parametrize("kind", ["transforms", "colmap"])
+def test_the_inner_folder_of_a_posed_image_set_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture, kind: str
+) -> None:
+    data = tmp_path / "fox"
+    _transforms(data) if kind == "transforms" else _colmap(data)
+    photos = next(data.rglob("*.png")).parent
+    assert new_main([str(tmp_path / "scene"), str(photos)]) == 0
+    said = capsys.readouterr().err
+    assert f"{data} has camera poses of these photos, which are not used; to use them, delete" in said
+    alone = shutil.copytree(photos, tmp_path / "alone/images")
+    assert new_main([str(tmp_path / "other"), str(alone)]) == 0
+    assert "camera poses" not in capsys.readouterr().err
+
+
+def test_a_camera_that_does_not_fit_its_images_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    table = _transforms(tmp_path / "fox")
+    for name, size, words in (("far", (WIDTH, HEIGHT), "times the longer"), ("wide", (1920, 540), "its camera is for")):
+        whole = json.loads(table.read_text()) | {"w": size[0], "h": size[1], "fl_x": 10.0 * size[0]}
+        whole["fl_x"] = 10.0 * WIDTH if name == "far" else 1500.0
+        table.write_text(json.dumps(whole))
+        assert new_main([str(tmp_path / name), str(tmp_path / "fox")]) == 2
+        assert words in capsys.readouterr().err
+
+
 def test_a_posed_image_set_in_the_scene_stays_where_it_is(tmp_path: Path) -> None:
     table = _transforms(tmp_path / "scene/input/fox")
     assert new_main([str(tmp_path / "scene"), str(table), "--camera-height", "1.2"]) == 0

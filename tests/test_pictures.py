@@ -69,6 +69,22 @@ def test_yuv_pictures_are_decoded(encoding, order):
     assert np.abs(picture.astype(int) - SMOOTH).mean() < 3.0
 
 
+@pytest.mark.parametrize(("encoding", "order"), [("nv12", (0, 1)), ("nv21", (1, 0))])
+def test_pictures_with_brightness_before_colors_are_decoded(encoding, order):
+    height, width = SMOOTH.shape[:2]
+    planes = cv2.cvtColor(SMOOTH, cv2.COLOR_RGB2YUV_I420)  # brightness, U, V
+    colors = planes[height:].reshape(2, height // 2, width // 2)[list(order)]
+    rows = np.vstack([planes[:height], colors.transpose(1, 2, 0).reshape(height // 2, width)])
+    padded = np.pad(rows, ((0, 0), (0, 6)))
+    picture = RawPicture(encoding, width, height, width + 6, padded.tobytes()).decode()
+    assert picture.shape == SMOOTH.shape
+    assert np.abs(picture.astype(int) - SMOOTH).mean() < 4.0  # swapped colors differ by 50
+    with pytest.raises(
+        PictureError, match=rf"{encoding} picture .* expected {width} a row .* {width * height * 3 // 2} in"
+    ):
+        RawPicture(encoding, width, height, width, rows[:height].tobytes()).decode()
+
+
 def test_compressed_pictures_are_decoded():
     np.testing.assert_array_equal(CompressedPicture(image(SMOOTH, 0, encoding="png").message.data).decode(), SMOOTH)
     near = CompressedPicture(image(SMOOTH, 0, encoding="jpeg").message.data.tobytes()).decode()

@@ -270,8 +270,9 @@ def sb3_model(algorithm: str = "SAC", images=None, low: float = -1.0, **settings
         observation_space = images or gymnasium.spaces.Box(0, 255, (12, 36, 64), np.uint8)
         action_space = gymnasium.spaces.Box(low, 1, (2,), np.float32)
 
-    kind = "MultiInputPolicy" if images else "CnnPolicy"
-    return getattr(sb3, algorithm)(kind, Road(), policy_kwargs={"net_arch": [8]}, **settings)
+    kind = "MultiInputPolicy" if isinstance(images, gymnasium.spaces.Dict) else "CnnPolicy"
+    keywords = {"net_arch": [8], "normalize_images": not images or images.dtype != np.float32}
+    return getattr(sb3, algorithm)(kind, Road(), policy_kwargs=keywords, **settings)
 
 
 @pytest.mark.parametrize(
@@ -293,9 +294,11 @@ def test_an_sb3_zip_that_does_not_fit_is_refused(tmp_path):
     (tmp_path / "no.zip").write_bytes(b"PK nothing")
     sb3_model("PPO", images).save(tmp_path / "odometry.zip")
     sb3_model("PPO", low=0.0).save(tmp_path / "rescaled.zip")
+    sb3_model("PPO", spaces.Box(0, 1, (12, 36, 64), np.float32)).save(tmp_path / "scaled.zip")
     for name, message in (
         ("no", "not a model"),
-        ("odometry", "expected pictures alone"),
+        ("odometry", "observes pixels and state; expected pictures alone.* train it without the option state"),
+        ("scaled", "expected pictures uint8"),
         ("rescaled", "range of twin"),
     ):
         with pytest.raises(InputError, match=message):
@@ -343,7 +346,7 @@ def test_a_callable_that_raises_is_named(tmp_path, monkeypatch):
     (tmp_path / "tired_policy.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     policy = load_policy("tired_policy:act")
-    with pytest.raises(InputError, match="tired_policy:act: raised IndexError"):
+    with pytest.raises(InputError, match=r"tired_policy:act: raised IndexError.*; it was given uint8 \(12, 90, 160\)"):
         policy(np.zeros((12, 90, 160), np.uint8))
 
 

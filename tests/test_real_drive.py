@@ -265,7 +265,7 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
     assert load_policy(left)(stack) == pytest.approx(0.9) and load_policy(ahead)(stack) == pytest.approx(0.001)
     real_test.run([left, ahead, left], "straight", ["rain", "haze", "rain"], 2, out)
     twin = [Cell(policy, "straight", "held-out+randomised", 10, 5) for policy in ("left", "ahead")]
-    cells = read_results(out, twin)
+    cells = read_results([out], twin)
     trials = read_trials(out.with_name("results_trials.csv"))
     assert len(trials) == 8 and len(cells) == 4
     starts = {(t.lighting, t.seed) for t in trials}
@@ -281,7 +281,7 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
         real_test.run([left], "straight", ["rain"], 3, out)
     third = max(t.seed for t in trials if t.lighting == "rain") + 1
     real_test.run([left], "straight", ["rain"], 3, out, "sun", films=tmp_path / "films")
-    assert {cell.twin_lighting for cell in read_results(out, twin)} == {"held-out+randomised"}  # as it was before
+    assert {cell.twin_lighting for cell in read_results([out], twin)} == {"held-out+randomised"}  # as it was before
     assert [film.name for film in (tmp_path / "films").iterdir()] == [f"left_straight_rain_{third}.mp4"]
     after = out.with_name("results_trials.csv").read_text()
     assert after.startswith(before) and after.count("\n") == before.count("\n") + 1
@@ -342,7 +342,7 @@ def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):
     record = json.loads((tmp_path / "results_setup.json").read_text())
     assert (record["place"], record["robot"], record["camera"]) == (3, 2, 5) and record["version"] == 2
     assert record["robot_values"]["payload"] == pytest.approx(23.97, abs=0.01)
-    assert read_results(out, [Cell("left", "whole", "held-out+randomised", 10, 5)])
+    assert read_results([out], [Cell("left", "whole", "held-out+randomised", 10, 5)])
     assert main([*given, "--place", "3", "--robot", "-1"]) == 2
     assert "robot -1: expected 0 or more" in capsys.readouterr().err
 

@@ -45,7 +45,7 @@ def scripted(monkeypatch):
     script: dict[int, tuple[int, float]] = {}
     asked: list[tuple[int, tuple[int, ...], str]] = []
 
-    def pretend(policy, envs, seeds, watch):
+    def pretend(policy, envs, seeds, watch, among=None):
         step = policy.trained["step"]
         order = selection._seeds(CONFIG)
         asked.append((step, tuple(seeds), envs.options.lighting))
@@ -198,11 +198,11 @@ def test_a_new_training_keeps_nothing_of_the_previous_one(scene, tmp_path, scrip
 def test_tests_are_whole_episodes_as_in_training_with_the_same_result_each_time(scene, tmp_path, monkeypatch):
     seen = []
 
-    def spy(policy, envs, seeds, watch):
-        o = envs.get(0, "options")
+    def spy(policy, envs, seeds, watch, among=None):
+        o = envs.get(among[0] if among else 0, "options")
         seen.append((o.start_along, o.lighting, o.randomise))
-        driven = run_episodes(policy, envs, seeds[:2], watch)
-        assert driven == run_episodes(policy, envs, seeds[:2], watch)
+        driven = run_episodes(policy, envs, seeds[:2], watch, among)
+        assert driven == run_episodes(policy, envs, seeds[:2], watch, among)
         assert all(np.isfinite(one.reward) and one.steps > 0 and one.lighting for one in driven)
         return driven
 

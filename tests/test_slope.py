@@ -8,6 +8,7 @@ import pytest
 from drive_logs import SOFT, windows_of
 from scipy.stats import multivariate_normal
 
+from twin import runtime
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
 from twin.sysid import drivetrain, kinematics, logs, rollout, tires
 
@@ -157,9 +158,13 @@ def test_the_fit_begins_each_window_as_the_log_does(monkeypatch):
         return rollout.Rollouts(*(np.zeros((len(commands), *shape)) for shape in shapes))
 
     monkeypatch.setattr(tires, "simulate_windows", noted)
+    made, bar = [], runtime.bar
+    monkeypatch.setattr(runtime, "bar", lambda *given: made.append(bar(*given)) or made[-1])
     params = HuskyParams()
     tires.fit_ground(params, drivetrain.Drivetrain.from_robot(params, False), windows, np.zeros((n, 2)))
-    assert seen
+    # Each step of the two searches has a bar with an estimate of the time left.
+    assert [one.desc.strip() for one in made] == ["coarse search", "final fit"] and all(one.total for one in made)
+    assert seen and sum(one.n for one in made) == len(seen)
     for before in seen:
         np.testing.assert_array_equal(before, windows.preceding_wheels[::2])
 

@@ -28,7 +28,8 @@ from twin.learn import selection
 from twin.learn.policy import load_policy
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
-from twin.learn.training import TRAINING_EPISODE_COLUMNS, _keep_rows, check_same
+from twin.learn.training import TRAINING_EPISODE_COLUMNS, Segment, _keep_rows, check_same, checkpoint_folder
+from twin.learn.training import train as train_policy
 from twin.runtime import exclusive_lock
 
 
@@ -227,6 +228,23 @@ def test_the_goal_is_worth_surviving_for_ever():
     for_ever = sum(rewards.step * config.gamma**k for k in range(2000))
     assert rewards.step + rewards.goal == pytest.approx(for_ever)
     assert (rewards.collision, rewards.out_of_bounds) == (-4.0, -5.0)
+
+
+def test_tests_break_off_no_episode_of_the_training(scene, tmp_path):
+    """Else the success rate lacks long episodes, all successes of a route that takes longer than the time between."""
+    driven = {}
+    for tested in (False, True):
+        folder = tmp_path / str(tested)
+
+        def referee(step, drive, folder=folder, tested=tested):
+            if tested and step:
+                assert len(drive(checkpoint_folder(folder, step), [5, 6], lambda: None)) == 2
+            return Segment(step + 40, None) if step < 200 else None
+
+        train_policy(twin.load_scene(scene), folder, SHORT, processes=1, referee=referee)
+        driven[tested] = [{**row, "wall_s": ""} for row in rows(folder / "episodes.csv")]
+    assert driven[True] == driven[False]
+    assert any(int(row["step"]) // 40 > (int(row["step"]) - 4 * int(row["steps"])) // 40 for row in driven[True])
 
 
 def test_episodes_that_start_along_the_route_do_not_count(tmp_path):

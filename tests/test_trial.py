@@ -87,7 +87,7 @@ def test_a_bag_of_an_episode_is_judged_as_the_episode_was(place, tmp_path, name,
     (row,) = read_trials(tmp_path / "real_trials.csv")
     assert (row.cause, row.steps, row.policy) == (cause, steps, name)
     assert row.progress == pytest.approx(progress, abs=1e-3)
-    (cell,) = read_results(out, [Cell(name, "ahead", "day", 20, 10)])
+    (cell,) = read_results([out], [Cell(name, "ahead", "day", 20, 10)])
     assert (cell.trials, cell.successes) == (1, int(cause == "goal"))
     figures = json.loads((scene / "trials" / "monday" / "trial.json").read_text())
     assert figures["policy"] == {"commands": steps, "same": 1.0, "v_rms": 0.0, "yaw_rate_rms": 0.0}
@@ -213,7 +213,7 @@ def test_trials_add_up_and_a_bag_counts_once(place, tmp_path):
     bags = [bag_of(drives["ahead"], tmp_path / "a"), write(tmp_path / "b", later)]
     for bag in (bags[0], bags[1], bags[0]):
         trial.record_trial(scene, bag, "ahead", "ahead", "dusk", out, "day+randomised", frame="scene")
-    (cell,) = read_results(out, [Cell("ahead", "ahead", "day+randomised", 20, 10)])
+    (cell,) = read_results([out], [Cell("ahead", "ahead", "day+randomised", 20, 10)])
     assert (cell.trials, cell.successes, cell.lighting) == (2, 1, "dusk")
 
 

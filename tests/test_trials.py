@@ -93,7 +93,7 @@ def test_results_find_their_cell(tmp_path: Path) -> None:
     text = (
         "policy, lighting ,trials,successes,task,twin_lighting\nnerf,sun,10,9,,\n\nnerf, dusk ,20,5,straight,held-out\n"
     )
-    first, second = read_results(write(tmp_path, "\ufeff" + text), TWIN)
+    first, second = read_results([write(tmp_path, "\ufeff" + text)], TWIN)
     assert (first.key, first.twin_key) == (("nerf", "straight", "sun"), ("nerf", "straight", "sun"))
     assert (second.key, second.twin_key) == (("nerf", "straight", "dusk"), ("nerf", "straight", "held-out"))
     assert (second.trials, second.successes, second.rate) == (20, 5, 0.25)
@@ -115,7 +115,7 @@ def test_results_find_their_cell(tmp_path: Path) -> None:
         (HEADER + "nerf,dusk,10,5\n", "expected one of held-out, sun; or add a column twin_lighting"),
         (HEADER + "nerf,night,10,5\n", "policy 'nerf' was not validated under 'night'; run twin validate"),
         (HEADER + "simulator,sun,10,5\n", "was validated on straight and right_turn; add a column task"),
-        (HEADER + "nerf,sun,10,5\nnerf,sun,10,6\n", "line 3: policy 'nerf', lighting 'sun', task 'straight' is there"),
+        (HEADER + "nerf,sun,10,5\nnerf,sun,10,6\n", "results.csv line 2, too; if these"),
         (HEADER + ",sun,10,5\n", "line 2: no policy; expected a name"),
         (HEADER + "nerf,sun,10\n", "line 2: 3 fields; expected 4"),
         (HEADER, "has a header and no rows"),
@@ -125,7 +125,7 @@ def test_results_find_their_cell(tmp_path: Path) -> None:
         ("policy,lighting,trials,successes,\n", "column 5 has no name; delete it"),
         (HEADER + "nerf,sun,10,5\n" + HEADER, "line 3 repeats the header; delete it"),
         (HEADER + 'nerf,sun,10,5\nnerf,"sun,10,5\nnerf,sun,10,5\n', "line 3: 2 fields; expected 4"),
-        (DAYS + "nerf,monday,10,5,sun\nnerf,Monday,10,5,sun\n", "'Monday' is 'monday' above; write the two alike"),
+        (DAYS + "nerf,monday,10,5,sun\nnerf,Monday,10,5,sun\n", "results.csv line 2; write the two alike"),
         (HEADER + "varied,dawn,10,5\n", "lighting 'dawn' is not in the twin; did you mean 'dawn+randomised'?"),
         ("policy,lighting,trials\nnerf,sun,10\n", "no column successes"),
         ("policy,lighting,trials,successes,note\n", "unknown column 'note'"),
@@ -136,13 +136,26 @@ def test_results_find_their_cell(tmp_path: Path) -> None:
 )
 def test_wrong_results_are_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError) as error:
-        read_results(write(tmp_path, text), TWIN)
+        read_results([write(tmp_path, text)], TWIN)
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_several_tables_are_one_without_doubled_trials(tmp_path: Path) -> None:
+    tables = [tmp_path / "monday.csv", tmp_path / "tuesday.csv"]
+    for table, policy in zip(tables, ("nerf", "varied"), strict=True):
+        table.write_text(f"{DAYS}{policy},{table.stem},10,5,{'sun' if policy == 'nerf' else 'dawn+randomised'}\n")
+    assert [(cell.policy, cell.lighting) for cell in read_results(tables, TWIN)] == [
+        ("nerf", "monday"),
+        ("varied", "tuesday"),
+    ]
+    tables[1].write_text(tables[0].read_text())
+    with pytest.raises(InputError, match=r"tuesday.csv line 2: .* is in .*monday.csv line 2, too; if these are other"):
+        read_results(tables, TWIN)
 
 
 def test_lightings_of_the_twin_may_differ_in_case_alone(tmp_path: Path) -> None:
     twin = [Cell("nerf", "straight", name, 10, 5) for name in ("Day", "day")]
-    rows = read_results(write(tmp_path, HEADER + "nerf,Day,10,5\nnerf,day,10,5\n"), twin)
+    rows = read_results([write(tmp_path, HEADER + "nerf,Day,10,5\nnerf,day,10,5\n")], twin)
     assert [row.lighting for row in rows] == ["Day", "day"]
 
 
@@ -150,6 +163,6 @@ def test_binary_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "results.csv"
     path.write_bytes(b"policy,lighting\xff\xfe\n")
     with pytest.raises(InputError, match="no UTF-8"):
-        read_results(path, TWIN)
+        read_results([path], TWIN)
     with pytest.raises(InputError, match="does not exist"):
-        read_results(tmp_path / "none.csv", TWIN)
+        read_results([tmp_path / "none.csv"], TWIN)

@@ -3,6 +3,7 @@
 import json
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -741,6 +742,19 @@ def test_pictures_go_on_after_an_error(field, capsys):
         assert client.notices == ["section 2 is missing"] and client.pictures[-1].shape == (90, 160, 3)
     finally:
         loop.close()
+
+
+def test_a_closed_page_ends_the_process_of_its_job(scene):
+    page = open_page(scene, port=0)
+    try:
+        began = time.monotonic()
+        job = threading.Thread(target=page.viewer.run, args=([sys.executable, "-c", "import time; time.sleep(60)"],))
+        job.start()
+        _wait(lambda: page.viewer._child)
+    finally:
+        page.viewer.close()
+    job.join(30.0)
+    assert not job.is_alive() and page.viewer._child.returncode == -signal.SIGTERM and time.monotonic() - began < 50.0
 
 
 def test_a_photo_replaces_no_lighting_but_the_named_one(page, notices, monkeypatch):

@@ -48,6 +48,12 @@ def parser_of(verb: str) -> argparse.ArgumentParser:
 
 # ---- options
 
+_OTHERS_POLICIES = (
+    "module:function gets the last four pictures, uint8 (12, 90, 160), and returns 1 number in [-1, 1] (yaw rate at 1 "
+    "m/s) or 2 (speed, yaw rate). A stable-baselines3 zip gets pictures of the size and number it was trained with, "
+    "without state. Both drive with the defaults of an environment: at most 1 m/s and 1 rad/s, 10 actions per second."
+)
+
 
 def _new(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
@@ -142,9 +148,13 @@ def _align(parser: argparse.ArgumentParser) -> None:
 def _film(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     parser.description = "Film a drive in a built scene: robot view, chase view, map, speed and reward."
+    parser.epilog = _OTHERS_POLICIES
     add("scene", type=Path, help="folder of a built scene, or a pack")
     add("--task", default="right_turn", help="straight, right_turn, route, or one of scene.toml")
-    add("--policy", help="a run, a checkpoint, an ONNX file or module:function; default: a scripted route follower")
+    add(
+        "--policy",
+        help="a run, a checkpoint, an ONNX file, module:function or a zip; default: a scripted route follower",
+    )
     add("--trust", action="store_true", help="load a policy file that may run code")
     add(
         "--lighting",
@@ -326,8 +336,9 @@ def _train(parser: argparse.ArgumentParser) -> None:
 def _validate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     parser.description = "Measure how often policies succeed, lighting by lighting."
+    parser.epilog = _OTHERS_POLICIES
     add("scene", type=Path, help="folder of a built scene")
-    add("--policy", nargs="+", required=True, help="runs, checkpoints, ONNX files or module:function")
+    add("--policy", nargs="+", required=True, help="runs, checkpoints, ONNX files, module:function or zips; see below")
     add("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
     add(
         "--lightings",
@@ -404,7 +415,14 @@ If the twin has no lighting of a name, a column twin_lighting names the lighting
 held-out+randomised.
 """
     add("scene", type=Path, help="folder of a scene with validated policies")
-    add("--real", type=Path, metavar="CSV", help="trials on the road; see below")
+    add(
+        "--real",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="CSV",
+        help="trials on the road, in one table or several; see below",
+    )
     add("--seed", type=int, default=0, help="seed of the sampling from posteriors")
     add("--quiet", action="store_true", help="no summary")
 

@@ -1,14 +1,15 @@
 """`twin forecast`: forecasts success on the real road from success in the twin.
 
-    twin forecast SCENE [--real results.csv]
+    twin forecast SCENE [--real results.csv ...]
 
-This reads `validation/episodes.csv`, which `twin.validate` writes, and the user's table of real trials. It writes
+This reads `validation/episodes.csv`, which `twin.validate` writes, and the user's tables of real trials. It writes
 `forecast.json`, `forecast.csv` and `forecast.html` to `<SCENE>/forecast`. Without real trials, it only ranks the
 policies in the twin.
 """
 
 import argparse
 import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -25,12 +26,12 @@ from twin.report.policy_card import write_policy_cards
 from twin.scene import SceneDir
 
 
-def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
+def forecast(root: Path, real: Sequence[Path] = (), seed: int = 0) -> Forecast:
     """Computes and writes the forecast of a scene.
 
     Args:
         root: The scene folder.
-        real: `results.csv` of real trials, if any.
+        real: Results tables of real trials, if any.
         seed: Seed of the sampling from posteriors.
 
     Raises:
@@ -40,7 +41,7 @@ def forecast(root: Path, real: Path | None = None, seed: int = 0) -> Forecast:
     if not root.is_dir():
         raise InputError(f"{root} is no folder; give the scene's folder, such as scenes/demo")
     twin = tally(read_trials(scene.episodes_csv))
-    cells = read_results(real, twin) if real else []
+    cells = read_results(real, twin)
     trained = {
         (policy, row["task"]): Estimate(best["rate"], best["low"], best["high"], best["trials"])
         for policy, row in training_summaries(root, {cell.policy for cell in twin}).items()

@@ -12,6 +12,7 @@ folder that contains all of its files; they are copied with their paths relative
 """
 
 import argparse
+import contextlib
 import os
 import shutil
 import sys
@@ -26,6 +27,7 @@ from twin.capture.bag_film import BagContents, CameraSeat, read_contents
 from twin.capture.film_check import FilmCheck, check_film, timing_notes
 from twin.capture.formats import ImageSet, find_model, listed_files, read_colmap, read_transforms
 from twin.capture.frames import detect_kind
+from twin.capture.photos import load_photo
 from twin.capture.scale import local_east_north_up
 from twin.capture.video import probe
 from twin.config import MAX_CAMERA_HEIGHT, RANDOMIZED, RESERVED_LIGHTINGS
@@ -114,7 +116,9 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
         elif kind == "bag":
             bags[film] = read_contents(film, topic)
         elif kind in _POSED:
-            _image_set(film)
+            posed = _image_set(film)
+            if posed.lenses:
+                load_photo(posed.paths[0], posed.lenses[0])  # raises an error if the camera does not fit the images
     if topic and not bags:
         raise InputError(f"--topic {topic}: none of the films is a bag; leave it out")
     inputs = root / "input"
@@ -131,6 +135,11 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
             check = check_film(film)
             found, mask = _mask_lines(check, inputs, path)
             notes += [f"{film.name}: {note}" for note in check.notes + found]
+        elif detect_kind(film) == "images" and (outer := _posed_around(film)):
+            notes.append(
+                f"{film}: {outer} has camera poses of these photos, which are not used; to use them, delete "
+                f"{scene.config_file} and give {outer}"
+            )
         elif film in bags:
             notes += [f"{film.name}: {note}" for note in timing_notes(bags[film].film().timing)]
         text += _SOURCE.format(path=path_text, topic=chosen, lighting=toml_string(lighting), mask=mask)
@@ -312,6 +321,18 @@ def _image_set(film: Path) -> ImageSet:
         return read_colmap(film) if detect_kind(film) == "colmap" else read_transforms(film)
     except InputError as error:
         raise InputError(str(error).replace("set images =", "put them beside it, or set images =")) from None
+
+
+def _posed_around(folder: Path) -> Path | None:
+    """The posed image set in one of the two folders above an image folder, if it refers to images of the folder."""
+    folder = folder.resolve()
+    for outer in folder.parents[:2]:
+        with contextlib.suppress(InputError, OSError):
+            if detect_kind(outer) in _POSED and any(
+                path.resolve().is_relative_to(folder) for path in _image_set(outer).paths
+            ):
+                return outer
+    return None
 
 
 def _posed_files(film: Path) -> tuple[Path, list[Path]]:

@@ -36,6 +36,7 @@ from place_record import EPISODES, FAILURE, HELD_OUT_CONDITION, PLACE, TRIALS, b
 from place_scores import score, tables
 from protocol import PROTOCOL, Protocol, read_protocol
 
+from twin.command_line import run
 from twin.errors import InputError, print_error
 from twin.evaluation.training_curves import CHOICE_FILE
 from twin.evaluation.trials import read_trials
@@ -43,7 +44,7 @@ from twin.files import read_json, write_json
 from twin.loading import load_scene
 
 sys.path.append(str(Path(__file__).parents[1]))
-from record import save
+from record import write_record
 
 RESULTS = Path(__file__).with_name("results")
 _DISK_OF_A_PLACE = 8 * 2**30  # [bytes] that must be free before a step
@@ -295,19 +296,19 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="number of processes in parallel, each on one core")
     parser.add_argument("--ray", metavar="ADDRESS", help="Ray cluster that runs the validations")
     parser.add_argument("--tables", action="store_true", help="run nothing; score what is recorded")
-    given = parser.parse_args()
-    try:
-        protocol = read_protocol(given.protocol)
-        if not given.tables:
-            if given.work is None:
-                raise InputError("no folder of scenes; give WORK, or --tables")
-            _run(protocol, given)
-        found = score(protocol, given.results)
-    except (InputError, OSError) as error:
-        return print_error(error)
-    print(tables(protocol, found))
+    return run(parser, _work)
+
+
+def _work(given: argparse.Namespace) -> None:
+    protocol = read_protocol(given.protocol)
+    if not given.tables:
+        if given.work is None:
+            raise InputError("no folder of scenes; give WORK, or --tables")
+        _run(protocol, given)
+    found = score(protocol, given.results)
     (given.results / protocol.name).mkdir(parents=True, exist_ok=True)
-    return save(given.results / protocol.name / "scores.json", found, replace=None)
+    write_record(given.results / protocol.name / "scores.json", found, replace=None)
+    print(tables(protocol, found))
 
 
 def _run(protocol: Protocol, given: argparse.Namespace) -> None:

@@ -82,7 +82,7 @@ def _readers(samples: Samples) -> list[tuple[str, Callable[[Path], Any]]]:
         ("mask.png", lambda p: read_mask(p, 8, 8)),
         ("film.mp4", probe),
         ("any.mp4", frames.detect_kind),
-        ("results.csv", lambda p: read_results(p, samples.cells)),
+        ("results.csv", lambda p: read_results([p], samples.cells)),
         ("table.csv", read_trials),
         ("episodes.csv", lambda p: read_episodes(p.parent)),
         ("log.csv", read_log),

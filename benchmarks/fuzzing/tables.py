@@ -35,7 +35,7 @@ def results(case: Case) -> None:
 
     path = case.folder / "results.csv"
     path.write_bytes(mutated_csv(case.rng, RESULTS_CSV))
-    read_results(path, case.samples.cells)
+    read_results([path], case.samples.cells)
 
 
 def episodes(case: Case) -> None:

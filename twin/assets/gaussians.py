@@ -153,7 +153,7 @@ def views_by_lighting(field: ColorField, cameras: Cameras, lightings: Sequence[s
     """
     filmed = [name for name in field.lightings if name in cameras.lightings]
     names = dict.fromkeys([*lightings, *filmed])
-    views = {name: render_views(field, cameras, VIEWS, WIDTH, FAR, name) for name in names}
+    views = {name: render_views(field, cameras, VIEWS, WIDTH, FAR, name, f"splats, {name}") for name in names}
     depth = views[lightings[0]].depth.copy()
     depth[sky_on_surfaces([views[name] for name in filmed])] = 10.0 * FAR
     return {name: replace(views[name], depth=depth) for name in lightings}

@@ -64,19 +64,25 @@ class Views:
 
 
 def render_views(
-    field: RenderableField, cameras: Cameras, count: int, width: int, far: float, lighting: str | None = None
+    field: RenderableField,
+    cameras: Cameras,
+    count: int,
+    width: int,
+    far: float,
+    lighting: str | None = None,
+    what: str = "rendering depth",
 ) -> Views:
     """Renders the field at up to `count` well-distributed training poses, by default under its first lighting.
 
     Views are `width` [px] wide and have the aspect ratio of the first camera. Pixels with depth beyond `far` [m] are
-    background.
+    background. `what` is the name of the progress bar.
     """
     chosen = cameras.select(select_spread_frames(cameras, count))
     size = (width, max(2, round(width * float(cameras.sizes[0, 1] / cameras.sizes[0, 0]))))
     native = [(int(w), int(h)) for w, h in chosen.sizes]
     intrinsics = np.stack([scaled_intrinsics(k, s, size) for k, s in zip(chosen.intrinsics, native, strict=True)])
     rgb, depth = [], []
-    with runtime.bar("rendering depth", len(chosen), "view") as bar:
+    with runtime.bar(what, len(chosen), "view") as bar:
         for start in range(0, len(chosen), _BATCH):
             part = slice(start, start + _BATCH)
             image = field.render(chosen.select(np.arange(len(chosen))[part]), lighting or field.lightings[0], size)

@@ -60,6 +60,7 @@ many."""
 _OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")
 # [ns] If header and recording times differ by more than this in the median, the header times are of another clock.
 _CLOCK = 1_000_000_000
+_SET_BACK = 10 * _CLOCK  # [ns] times that decrease by more, in the order of the file, are of a clock that was set back
 _MAX_METADATA = 16 << 20  # [bytes] largest accepted metadata.yaml
 _MAX_CHUNK = 1 << 30  # [bytes] largest accepted MCAP chunk, uncompressed
 
@@ -88,8 +89,22 @@ class Bag:
         if not connections:
             return
         with _wrap_errors(self._path, self._cure):
+            self._check_clock({one.topic for one in connections})
             for connection, recorded, raw in self._reader.messages(connections=connections):
                 yield connection, recorded, self._deserialize(raw, connection.msgtype)
+
+    def _check_clock(self, topics: set[str]) -> None:
+        """Raises InputError if the recorder's clock was set back: readers sort messages by it, which would mix them."""
+        for topic in sorted(topics):
+            times = np.array([*_times_in_file(self._reader, topic)], np.int64).reshape(-1, 2)
+            # A jump within a chunk shows in the next chunk only when compared with the one before.
+            for lag in (1, 2):
+                back = int((times[:-lag] - times[lag:]).min(1, initial=2**62).max(initial=0))
+                if back > _SET_BACK:
+                    raise InputError(
+                        f"{self._path}: {topic}: the recorder's clock was set back by about {back * 1e-9:.0f} s, so "
+                        "parts of the recording have the same times; record it anew after the clock has been set"
+                    )
 
     def on(self, *topics: str) -> list[Any]:
         return [one for one in self.connections if one.topic in topics]
@@ -134,6 +149,23 @@ def _check_chunks(reader: Any) -> None:
     largest = max((chunk.uncompressed_size for chunk in chunks), default=0)
     if largest > _MAX_CHUNK:
         raise ValueError(f"a chunk of {largest:,} bytes; expected at most {_MAX_CHUNK:,}")
+
+
+def _times_in_file(reader: Any, topic: str) -> Iterator[tuple[int, int]]:
+    """Yields first and last time [ns] of a topic's messages or chunks in the order in which they were written."""
+    if hasattr(reader, "chunk_infos"):  # ROS 1
+        ids = {one.id for one in reader.connections if one.topic == topic}
+        yield from ((c.start_time, c.end_time) for c in reader.chunk_infos if not ids.isdisjoint(c.connection_counts))
+        return
+    for storage in getattr(reader.storage, "storages", [reader.storage]):
+        ids = {one.id for one in storage.connections if one.topic == topic}
+        if hasattr(storage, "dbconn"):
+            known = ",".join(map(str, ids)) or "NULL"
+            query = f"SELECT timestamp, timestamp FROM messages WHERE topic_id IN ({known}) ORDER BY id"
+            yield from storage.dbconn.cursor().execute(query)
+        for chunk in getattr(storage, "chunks", ()):
+            if any(chunk.channel_count.get(one) for one in ids):
+                yield chunk.message_start_time, chunk.message_end_time
 
 
 _COMPRESSED = re.compile(r"compression_mode: *['\"]?[A-Za-z]")
@@ -262,13 +294,20 @@ def header_time(message: Any) -> int:
 def message_times(times: NDArray[np.int64], topic: str, path: Path) -> NDArray[np.int64]:
     """Times of a topic's messages [ns], shape (n,), from their header and recording times, shape (n, 2).
 
-    The header times are used, or the recording times if the headers have no times or times of another clock.
+    The header times are used, or the recording times if the headers have no times, or times of another clock or of one
+    that was set back.
     """
     header, recorded = times.reshape(-1, 2).T
     if not header.any():
         return recorded.copy()
     if abs(int(np.median(recorded - header))) > _CLOCK:
         runtime.log_line(f"{path}: headers on {topic} have another clock; the times of recording are used")
+        return recorded.copy()
+    back = (header[:-1] - header[1:]).max(initial=0)
+    if back > _SET_BACK:
+        runtime.log_line(
+            f"{path}: the clock of {topic} was set back by {back * 1e-9:.0f} s; the times of recording are used"
+        )
         return recorded.copy()
     return header.copy()
 

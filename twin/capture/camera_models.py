@@ -33,6 +33,7 @@ PixelMap = NDArray[np.float32]
 _NEGLIGIBLE_DISTORTION = 0.1  # [px] smaller displacements are ignored
 _MAX_ZOOM = 4.0  # largest ratio of the pinhole's focal length to that of the lens
 _MAX_ASPECT_ERROR = 0.01
+_FOCAL_RANGE = (0.05, 8.0)  # plausible focal lengths / longer side; at 8, the angle of view is 7°
 _MAX_SIDE = 1_000_000  # [px] largest side of an image
 
 
@@ -122,8 +123,11 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
         raise InputError(f"{where}: a parameter of the {model} camera is not a finite number; calibrate again")
     fx, fy, cx, cy = lens.intrinsics
     longer = max(width, height)
-    if not (0.05 * longer < fx < 100 * longer and 0.05 * longer < fy < 100 * longer):
-        raise InputError(f"{where}: focal length {fx:g}, {fy:g} px for {width}x{height}; give it in px of that size")
+    if not all(_FOCAL_RANGE[0] * longer < focal < _FOCAL_RANGE[1] * longer for focal in (fx, fy)):
+        raise InputError(
+            f"{where}: focal length {fx:g}, {fy:g} px for {width}x{height}, {fx / longer:.3g} times the longer side "
+            "(phones have 0.6 to 1); give it in px of that size"
+        )
     if not (-0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
         raise InputError(
             f"{where}: principal point {cx:g}, {cy:g} px lies far outside {width}x{height}; check the parameters' order"

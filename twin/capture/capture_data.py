@@ -122,6 +122,25 @@ def read_mask(path: Path, width: int, height: int) -> Image:
     return cv2.resize(binary, (width, height), interpolation=cv2.INTER_NEAREST).astype(np.uint8, copy=False)
 
 
+def given_lens(path: Path, source: SourceConfig, native: tuple[int, int]) -> Lens | None:
+    """The calibration of a source in `scene.toml`, or None; `native` is the upright size of the input at `path` [px].
+
+    Raises InputError: an impossible calibration, or a calibration for another aspect ratio.
+    """
+    camera = source.camera
+    if camera is None:
+        return None
+    where = f"{path.name}: camera"
+    width, height = (camera.width, camera.height) if camera.width or camera.height else native
+    lens = checked_lens(camera.model, camera.params, width, height, where)
+    if not lens.fits(*native):
+        raise InputError(
+            f"{where} is for {width}x{height}, but the upright picture is {native[0]}x{native[1]}; "
+            "give the calibration of the upright picture"
+        )
+    return lens
+
+
 @dataclass(frozen=True)
 class SourceTask:
     """The inputs for reading one source."""
@@ -141,22 +160,8 @@ class SourceTask:
         return self.source.keep or self.config.keep
 
     def given_lens(self, native: tuple[int, int]) -> Lens | None:
-        """The calibration in `scene.toml`, or None; `native` is the upright size of the input [px].
-
-        Raises InputError: an impossible calibration, or a calibration for another aspect ratio.
-        """
-        camera = self.source.camera
-        if camera is None:
-            return None
-        where = f"{self.path.name}: camera"
-        width, height = (camera.width, camera.height) if camera.width or camera.height else native
-        lens = checked_lens(camera.model, camera.params, width, height, where)
-        if not lens.fits(*native):
-            raise InputError(
-                f"{where} is for {width}x{height}, but the upright picture is {native[0]}x{native[1]}; "
-                "give the calibration of the upright picture"
-            )
-        return lens
+        """The calibration in `scene.toml`, see `given_lens`."""
+        return given_lens(self.path, self.source, native)
 
     def info(self, size: tuple[int, int], lens: Lens | None, calibrated: bool) -> SourceInfo:
         """The `SourceInfo` for a frame size [px]; an unknown lens gets SIMPLE_RADIAL, which fits most cameras."""

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from twin import runtime
 from twin.capture.bag import BAG_SUFFIXES, bag_files, is_bag
 from twin.capture.bag_film import BagContents, read_contents
-from twin.capture.capture_data import NO_GPS, Capture, FrameWriter, KeptFrames, SourceTask
+from twin.capture.capture_data import NO_GPS, Capture, FrameWriter, KeptFrames, SourceTask, given_lens
 from twin.capture.formats import find_model, image_files, listed_files, read_colmap, read_image_folder, read_transforms
-from twin.capture.photos import read_photos
-from twin.capture.video import FilmStatistics, damage_note, format_note, read_film, video_film
+from twin.capture.photos import load_photo, read_photos
+from twin.capture.video import FilmStatistics, damage_note, first_size, format_note, read_film, video_film
 from twin.config import CaptureConfig, SceneConfig, SourceConfig
 from twin.config_file import MAX_NAME, check_lighting
 from twin.errors import InputError
@@ -37,6 +37,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     """
     names = source_names([source.path for source in config.source])
     lightings = [_lighting_name(source) for source in config.source]
+    for source in config.source:
+        _check_calibration(scene.root / source.path, source)
     kept = []
     for name, lighting, source in zip(names, lightings, config.source, strict=True):
         with FrameWriter(out, name) as writer:
@@ -138,6 +140,16 @@ def _lighting_name(source: SourceConfig) -> str:
     return lighting
 
 
+def _check_calibration(path: Path, source: SourceConfig) -> None:
+    """Raises InputError, before anything is read, if a calibration in `scene.toml` does not fit its film or photos."""
+    kind = detect_kind(path) if source.kind == "auto" else source.kind
+    if source.camera is None or kind not in ("video", "images"):
+        return  # a bag is read twice, so its size is known before its pictures are read
+    size = first_size(path) if kind == "video" else load_photo(read_image_folder(path).paths[0], None)[0].shape[1::-1]
+    if size is not None:
+        given_lens(path, source, size)
+
+
 def _read_source(
     root: Path, name: str, lighting: str, source: SourceConfig, config: CaptureConfig, writer: FrameWriter
 ) -> KeptFrames:
@@ -165,6 +177,8 @@ def _read_source(
 def _read_video(task: SourceTask, bag: BagContents | None) -> KeptFrames:
     """Reads a video file, or the film in a bag with its calibration and positions."""
     film = video_film(task.path) if bag is None else bag.film()
+    if bag is not None:
+        task.given_lens(bag.size)
     index: list[int] = []
     times: list[float] = []
     count, unmasked, size = FilmStatistics(), 0, (0, 0)

@@ -468,6 +468,15 @@ def open_film(path: Path) -> Iterator[tuple[av.container.InputContainer, av.Vide
 # ---- size and orientation
 
 
+def first_size(path: Path) -> tuple[int, int] | None:
+    """Width and height [px] of a film's first frame, upright; None if none can be decoded."""
+    with contextlib.suppress(av.error.FFmpegError, ValueError), open_film(path) as (container, stream):
+        for frame in container.decode(stream):
+            height, width = upright(frame).shape[:2]
+            return width, height
+    return None
+
+
 def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
     """Width and height [px] scaled down to a longer side of at most `max_size`."""
     scale = min(1.0, max_size / max(width, height))

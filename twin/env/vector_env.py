@@ -75,8 +75,9 @@ class ProcessVectorEnv:
     ) -> None:
         """Arguments as in `make_vector_env`; `processes` is at most the number of environments."""
         self.options, self.processes, count = parse_options(options), processes, len(seeds)
-        parts = np.array_split(np.arange(count), processes)
-        self._location = [(c, k) for c, part in enumerate(parts) for k in range(len(part))]
+        # Neighbors are in different processes, so that those of any range of environments have equal work.
+        parts = [range(c, count, processes) for c in range(processes)]
+        self._location = [(i % processes, i // processes) for i in range(count)]
         self._lock = threading.Lock()
         self._children: list[_Child] = []
         self._end = weakref.finalize(self, _kill, self._children)

@@ -18,6 +18,7 @@ import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from twin.config import CAUSES
@@ -209,16 +210,19 @@ def read_trials(path: Path) -> list[Trial]:
     return list(trials.values())
 
 
-def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
-    """Reads a results table and checks that the twin has a cell to compare with each real cell.
+def read_results(paths: Sequence[Path], twin: Sequence[Cell]) -> list[Cell]:
+    """Reads results tables and checks that the twin has a cell to compare with each real cell.
 
-    Raises InputError: no such file, a wrong header, or a line with an unknown name, an impossible count or a duplicate.
+    Raises InputError: no such file, a wrong header, or a line with an unknown name, an impossible count or a duplicate,
+    also of a line in another table.
     """
-    if not path.exists():
-        raise InputError(f"{path} does not exist; write one, with the columns {','.join(RESULT_COLUMNS)}")
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path} does not exist; write one, with the columns {','.join(RESULT_COLUMNS)}")
     cells: dict[tuple[str, str, str], Cell] = {}
-    known, spelled = {cell.key for cell in twin}, dict[str, str]()
-    for where, row in _rows(path, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS):
+    places: dict[tuple[str, str, str], str] = {}  # where each cell is
+    known, spelled = {cell.key for cell in twin}, dict[str, tuple[str, str]]()
+    for where, row in chain.from_iterable(_rows(path, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS) for path in paths):
         policy, task = _policy_and_task(where, row, twin)
         trials, successes = _parse_int(where, row, "trials"), _parse_int(where, row, "successes")
         if trials == 0:
@@ -230,14 +234,14 @@ def read_results(path: Path, twin: Sequence[Cell]) -> list[Cell]:
             raise InputError(f"{where}: {_unknown_lighting(cell, known)}")
         if cell.key in cells:
             raise InputError(
-                f"{where}: policy {policy!r}, lighting {cell.lighting!r}, task {task!r} is there twice; "
-                "replace the two lines by one with their sums"
+                f"{where}: policy {policy!r}, lighting {cell.lighting!r}, task {task!r} is in {places[cell.key]}, too; "
+                "if these are other trials, replace the two lines by one with their sums, else delete one"
             )
         # A forecast counts days by their names, so a day written in two ways would make intervals too narrow.
-        alike = spelled.setdefault(cell.lighting.casefold(), cell.lighting)
+        alike, place = spelled.setdefault(cell.lighting.casefold(), (cell.lighting, where))
         if alike != cell.lighting and not {alike, cell.lighting} <= {key[-1] for key in known}:
-            raise InputError(f"{where}: lighting {cell.lighting!r} is {alike!r} above; write the two alike")
-        cells[cell.key] = cell
+            raise InputError(f"{where}: lighting {cell.lighting!r} is {alike!r} in {place}; write the two alike")
+        cells[cell.key], places[cell.key] = cell, where
     return list(cells.values())
 
 

@@ -144,7 +144,7 @@ def _field_files(
                 f"convex parts{', the Husky' if world else ''}, {usd_file.stat().st_size / _MEGABYTE:.0f} MB, z up [m]"
             )
     if glb:
-        views_of_one = render_views(field, cameras, gltf.VIEWS, gltf.WIDTH, gltf.FAR, lighting)
+        views_of_one = render_views(field, cameras, gltf.VIEWS, gltf.WIDTH, gltf.FAR, lighting, f"textures, {lighting}")
         write_bytes(glb, gltf.textured_glb(mesh["vertices"].astype(np.float64), mesh["faces"], views_of_one))
         lines.append(f"{glb}: {len(mesh['faces'])} textured faces under {lighting}, y up [m]")
     return lines

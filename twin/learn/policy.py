@@ -170,7 +170,7 @@ def load_policy(source: str | Path, trust: bool = False) -> Policy:
     - a policy folder (or its policy.json), such as the folder of a run or of a checkpoint;
     - an ONNX file with one input, uint8 or float32 (n, 3 · stack, height, width) with values 0 to 255, and one output
       (n, 1 or 2) with values in [-1, 1];
-    - `module:function`: the user's own function, which receives one stack, uint8 (3 · stack, height, width);
+    - `module:function`: the user's own function, which receives one stack of the default size, uint8 (12, 90, 160);
     - a zip file of any algorithm of stable-baselines3 that sees pictures; `trust` must be True, since loading the file
       runs code from it.
 
@@ -281,7 +281,8 @@ def _from_callable(name: str) -> Policy:
         try:
             return np.asarray(function(stack), np.float32)
         except (Exception, SystemExit) as error:  # the user's code may raise anything
-            raise InputError(f"policy {name}: raised {type(error).__name__}: {error}") from error
+            given = f"{stack.dtype} {stack.shape}, the last {len(stack) // 3} pictures"
+            raise InputError(f"policy {name}: raised {type(error).__name__}: {error}; it was given {given}") from error
 
     def act(stacks: Image) -> Array32:
         outputs = [output_of(stack) for stack in stacks]
@@ -317,9 +318,14 @@ def _from_zip(path: Path) -> Policy:
     except Exception as error:  # damaged zips and pickles raise many kinds of errors
         raise InputError(f"{path}: not a model of stable-baselines3: {type(error).__name__}: {error}") from None
     shape, actions = pictures.shape, range_.shape
-    if shape is None or len(shape) != 3 or shape[0] % 3 or actions not in ((1,), (2,)):
+    if shape is None:
         raise InputError(
-            f"{path}: observes {pictures}, acts in {range_}; expected pictures alone, (3 · stack, height, width), and "
+            f"{path}: observes {' and '.join(pictures)}; expected pictures alone, which are all that a robot's policy "
+            "gets: train it without the option state, or measure it by evaluate_policy, as examples/ppo.py does"
+        )
+    if pictures.dtype != np.uint8 or len(shape) != 3 or shape[0] % 3 or actions not in ((1,), (2,)):
+        raise InputError(
+            f"{path}: observes {pictures}, acts in {range_}; expected pictures uint8 (3 · stack, height, width), and "
             "1 or 2 numbers"
         )
     if (range_.low != -1.0).any() or (range_.high != 1.0).any():

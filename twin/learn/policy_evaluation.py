@@ -80,19 +80,24 @@ def run_episodes(
     envs: LocalVectorEnv | ProcessVectorEnv,
     seeds: Sequence[int],
     watch: Callable[[], object] = lambda: None,
+    among: Sequence[int] | None = None,
 ) -> list[EpisodeResult]:
     """Drives one episode per seed, in parallel environments; returns results in the order of the seeds.
 
-    `envs` must render pictures; their current episodes are abandoned. `watch` is called after every episode.
+    Args:
+        envs: Environments that render pictures.
+        watch: Called after every episode.
+        among: The environments that are used, whose current episodes are abandoned; None: all.
     """
     assert envs.pixels is not None
+    among = range(len(envs)) if among is None else among
     waiting = list(range(len(seeds)))
     driving: dict[int, int] = {}  # environment → number of its episode
     trusts: list[list[float]] = [[] for _ in seeds]
     rewards = np.zeros(len(seeds))
     done: dict[int, EpisodeResult] = {}
     while waiting or driving:
-        free = [i for i in range(len(envs)) if i not in driving][: len(waiting)]
+        free = [i for i in among if i not in driving][: len(waiting)]
         for i in free:
             driving[i] = waiting.pop(0)
             envs.seed(i, seeds[driving[i]])

@@ -169,12 +169,6 @@ class PixelSAC(SAC):
         for name, value in zip(_LOGGED, sums / gradient_steps, strict=True):
             self.logger.record(f"train/{name}", value)
 
-    def break_off_episodes(self) -> None:
-        """Makes all environments begin new episodes at the next step; until then they may drive other episodes."""
-        assert isinstance(self.replay_buffer, FrameReplayBuffer)
-        self.replay_buffer.break_off()
-        self._last_obs = None
-
     def _scaled(self, states: torch.Tensor) -> torch.Tensor:
         return (states / self._scale).clamp(-_MAX_STATE, _MAX_STATE)
 

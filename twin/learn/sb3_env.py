@@ -20,6 +20,8 @@ class DriveVecEnv(VecEnv):
     Every `info` has the privileged `state`; at the end of an episode, it also has `first_state`, the state at the start
     of the next episode. `lighting` is the name of the lighting in tables; `sampled_lighting` adds the sampled mixture,
     as `lighting` does in the `info` of the Gymnasium environments.
+
+    `vector_env` has more environments behind these, which a step leaves as they are.
     """
 
     def __init__(
@@ -29,13 +31,16 @@ class DriveVecEnv(VecEnv):
         n_envs: int = 8,
         seed: int | None = None,
         processes: int | None = None,
+        spare: int = 0,
         **options: Any,
     ) -> None:
-        """`seed`: environment i has the seed `seed` + i; None: unpredictable seeds.
-
-        The other arguments are those of `make_vector_env`.
         """
-        self.vector_env = make_vector_env(scene, task, options, [None] * n_envs, processes)
+        Args:
+            seed: Environment i has the seed `seed` + i; None: unpredictable seeds.
+            spare: Number of additional environments in `vector_env`.
+            scene, task, processes, options: See `make_vector_env`.
+        """
+        self.vector_env = make_vector_env(scene, task, options, [None] * (n_envs + spare), processes)
         super().__init__(n_envs, *make_spaces(self.vector_env))
         self._returns, self._lengths = np.zeros(n_envs), np.zeros(n_envs, int)
         self.seed(seed)
@@ -48,19 +53,23 @@ class DriveVecEnv(VecEnv):
         self._returns[:], self._lengths[:] = 0.0, 0
         self.vector_env.begin(range(self.num_envs))
         self.reset_infos = [self.vector_env.info(i) for i in range(self.num_envs)]
-        return observations(self.vector_env)
+        return self._observations()
+
+    def _observations(self) -> Any:
+        found, n = observations(self.vector_env), self.num_envs
+        return {name: values[:n] for name, values in found.items()} if isinstance(found, dict) else found[:n]
 
     def step_async(self, actions: NDArray) -> None:
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, NDArray, NDArray, list[dict[str, Any]]]:
-        out = self.vector_env.step(self._actions)
+        out = self.vector_env.step(self._actions, range(self.num_envs))
         infos = [{**self.vector_env.info(i), "state": self.vector_env.state(i)} for i in range(self.num_envs)]
         self._returns += out.reward
         self._lengths += 1
         over = np.flatnonzero(out.over).tolist()
         if over:
-            last = observations(self.vector_env)
+            last = self._observations()
             for i in over:
                 infos[i] |= {
                     "terminal_observation": of_one(last, i),
@@ -71,7 +80,7 @@ class DriveVecEnv(VecEnv):
             self.vector_env.begin(over)
             for i in over:
                 infos[i]["first_state"] = self.vector_env.state(i)
-        return observations(self.vector_env), out.reward.astype(np.float32), out.over, infos
+        return self._observations(), out.reward.astype(np.float32), out.over, infos
 
     def close(self) -> None:
         self.vector_env.close()
@@ -79,7 +88,7 @@ class DriveVecEnv(VecEnv):
     def get_images(self) -> Sequence[NDArray | None]:
         if not self.vector_env.pixels:
             return [None] * self.num_envs
-        return [stack[-1].transpose(1, 2, 0) for stack in self.vector_env.pixels.stacks]
+        return [stack[-1].transpose(1, 2, 0) for stack in self.vector_env.pixels.stacks[: self.num_envs]]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         if attr_name == "render_mode":

@@ -46,12 +46,15 @@ _SCALE_SOURCES = {
 
 def capture_section(report: dict[str, Any]) -> Section:
     sources = pick(report, "capture.sources") or {}
+    photos = bool(sources) and all("promised" not in source for source in sources.values())  # a film's declared frames
+    chosen = "without blank photos and duplicates" if photos else "the sharpest of each time slot"
+    scored = "excluded from training; up to six per lighting, evenly spaced, are scored under Radiance field"
     facts = [
         *facts_of(
             report,
-            ("capture.frames", "frames kept", "{}", "the sharpest of each time slot"),
+            ("capture.frames", "frames kept", "{}", chosen),
             ("capture.train", "training frames", "{}", "the field is trained on them"),
-            ("capture.held_out", "held out", "{}", "excluded from training, for evaluation"),
+            ("capture.held_out", "held out", "{}", scored),
         ),
         Fact("sources", number(len(sources) or None, "{}"), "films or photo folders, each under one lighting"),
     ]
@@ -67,10 +70,10 @@ def capture_section(report: dict[str, Any]) -> Section:
         if damaged := source.get("damaged"):
             cure = "copy the film from the camera again if possible."
             cautions.append(Caution(f"{damaged} frame(s) of “{name}” are damaged.", cure))
-    done = (
-        "Frames were chosen from the films at regular spacing, without blurred and stationary ones, and split into "
-        "training and held-out frames."
+    taken = (
+        "Photos were read" if photos else "Frames were chosen at regular spacing, without blurred and stationary ones,"
     )
+    done = f"{taken} and split into training and held-out frames."
     return Section("capture", "Capture", done, facts, cautions)
 
 
@@ -221,14 +224,14 @@ def field_section(report: dict[str, Any]) -> Section:
     psnr, ssim, n = (numbers(field.get(key)) for key in ("psnr", "ssim", "n"))
     cautions, facts = [], []
     for name, value in psnr.items():
-        frames = f"{n[name]:.0f} held-out frames" if name in n else "held-out frames"
+        frames = f"{n[name]:.0f} of its held-out frames" if name in n else "held-out frames"
         text = f"{value:.1f} dB PSNR" + (f", {ssim[name]:.2f} SSIM" if name in ssim else "")
-        facts.append(Fact(name, text, f"on {frames}, compared with the real film"))
+        facts.append(Fact(name, text, f"on {frames}, compared with the real ones"))
         if value < _LOW_PSNR:
             cure = "raise nerf.steps, mask moving things, film slower in this lighting, or film it from more places."
             cautions.append(Caution(f"“{name}” is rendered at only {value:.1f} dB.", cure))
         if name in n and n[name] < _FEW_HELD_OUT:
-            what = f"Only {n[name]:.0f} frame(s) of “{name}” were held out, so its PSNR is uncertain."
+            what = f"Only {n[name]:.0f} held-out frame(s) of “{name}” were scored, so its PSNR is uncertain."
             cure = "keep more frames (capture.fps) or hold out more of them (capture.held_out_every)."
             cautions.append(Caution(what, cure))
     facts = facts or [Fact("held-out PSNR", NOT_MEASURED)]
@@ -429,7 +432,8 @@ SECTIONS: dict[str, Callable[[dict[str, Any]], Section]] = {
 
 
 def sections(report: dict[str, Any]) -> list[Section]:
-    return [make(report) for make in (*SECTIONS.values(), geometry_section, truth_section, costs_section)]
+    truth = [truth_section(report)] if isinstance(pick(report, "truth"), dict) else []
+    return [*(make(report) for make in (*SECTIONS.values(), geometry_section)), *truth, costs_section(report)]
 
 
 def headline_sections(report: dict[str, Any]) -> list[Section]:

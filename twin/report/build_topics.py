@@ -66,14 +66,9 @@ def geometry_section(report: dict[str, Any]) -> Section:
 
 
 def truth_section(report: dict[str, Any]) -> Section:
-    """Errors of the twin compared with ground truth; not applicable for a real place."""
-    truth = pick(report, "truth")
+    """Errors of the twin compared with ground truth, which only generated places have (`twin reality compare`)."""
+    truth = report["truth"]
     name, title = "truth", "Comparison with ground truth"
-    if not isinstance(truth, dict):
-        reason = (
-            "there is no ground truth to compare with; it exists for generated places only (twin reality compare SCENE)"
-        )
-        return Section(name, title, "", not_applicable=reason)
     kinds = {"ground": "ground", "obstacle": "obstacles of any height", "foliage": "leaves"}
     shares = {kind: truth.get(f"mesh_completeness_10cm_{kind}") for kind in kinds}
     complete = [f"{number(share, '{:.0%}')} of {kinds[kind]}" for kind, share in shares.items() if share is not None]

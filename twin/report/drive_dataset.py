@@ -27,6 +27,8 @@ VERSION = "v3.0"
 CAMERA = "observation.images.front"
 """Key of the robot's pictures."""
 
+_QUANTILES = {f"q{percent:02d}": percent / 100.0 for percent in (1, 10, 50, 90, 99)}
+"""Name in LeRobot's statistics → probability; some of its policies are normalized by them."""
 _CRF = 18
 _CHUNK = 1000  # videos per folder
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -236,7 +238,8 @@ def require_pyarrow() -> None:
 def _statistics(values: NDArray) -> dict[str, Array]:
     """LeRobot's statistics of a column (k, n) or (k,). All but `count` have shape (n,), or (1,) for a column (k,)."""
     table = values.reshape(len(values), -1).astype(np.float64)
-    return _summary(table.min(0), table.max(0), table.mean(0), table.std(0), len(table))
+    quantiles = {name: np.quantile(table, share, 0) for name, share in _QUANTILES.items()}
+    return _summary(table.min(0), table.max(0), table.mean(0), table.std(0), len(table)) | quantiles
 
 
 def _colors(pictures: Sequence[NDArray[np.uint8]]) -> dict[str, Array]:
@@ -246,8 +249,10 @@ def _colors(pictures: Sequence[NDArray[np.uint8]]) -> dict[str, Array]:
     mean = share @ levels
     deviation = np.sqrt(share @ levels**2 - mean**2)
     low, high = (levels[[np.flatnonzero(one)[end] for one in counts]] for end in (0, -1))
-    low, high, mean, deviation = (one[:, None, None] for one in (low, high, mean, deviation))
-    return _summary(low, high, mean, deviation, len(pictures))
+    below = share.cumsum(1)
+    values = {"min": low, "max": high, "mean": mean, "std": deviation}
+    values |= {name: levels[(below < part - 1e-9).sum(1)] for name, part in _QUANTILES.items()}
+    return {name: one[:, None, None] for name, one in values.items()} | {"count": np.array([len(pictures)])}
 
 
 def _summary(low: Array, high: Array, mean: Array, deviation: Array, count: int) -> dict[str, Array]:
@@ -255,14 +260,15 @@ def _summary(low: Array, high: Array, mean: Array, deviation: Array, count: int)
 
 
 def _merged(stats: list[dict[str, Array]]) -> dict[str, Array]:
-    """Combines the statistics of several drives."""
+    """Combines the statistics of several drives; quantiles are averaged, as LeRobot does."""
     counts = np.array([one["count"][0] for one in stats], float)
     means, deviations = (np.stack([one[kind] for one in stats]) for kind in ("mean", "std"))
     weights = (counts / counts.sum()).reshape(-1, *[1] * (means.ndim - 1))
     mean = (weights * means).sum(0)
     variance = (weights * (deviations**2 + (means - mean) ** 2)).sum(0)
     low, high = np.min([one["min"] for one in stats], 0), np.max([one["max"] for one in stats], 0)
-    return _summary(low, high, mean, np.sqrt(variance), int(counts.sum()))
+    quantiles = {name: (weights * np.stack([one[name] for one in stats])).sum(0) for name in _QUANTILES}
+    return _summary(low, high, mean, np.sqrt(variance), int(counts.sum())) | quantiles
 
 
 def _task_table(tasks: list[str]) -> "pyarrow.Table":

@@ -231,7 +231,7 @@ def write_comparison_chapter(studio: Studio, map_view: MapView, chosen: dict[str
                 row, score = comparison_row(studio, i)
                 caption = (
                     f"{lighting}: real frame, render at the same pose ({score:.1f} dB PSNR), depth, and error. "
-                    "The frame is from the middle of the film and was not used for training."
+                    "The frame was not used for training."
                 )
                 studio.save_picture(f"compare_{number}", "field", caption, row, row.shape[1])
             progress.update()

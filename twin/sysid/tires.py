@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
+from twin import runtime
 from twin.robot import WHEEL_RADIUS, HuskyParams
 from twin.sysid.drivetrain import Drivetrain, simulate_drivetrain
 from twin.sysid.estimation import Fit, Parameter, fit_parameters, maximize_posterior
@@ -53,6 +55,7 @@ from twin.types import Array
 # describes power, and may differ.
 
 _MANY = 100  # with fewer windows the delay of poses is not fitted, and the coarse search uses all windows
+_USUAL = 120, 90  # usual numbers of simulations in the coarse search and in the final fit, for the time left
 _NEAR = 0.25  # `reach` of the search that starts near the solution
 _TURNS, _BENDS = "hard turns at several speeds", "gentle bends as well as hard turns"
 _BRAKING = "hard braking, or slopes"
@@ -165,13 +168,16 @@ def fit_ground(
     before = windows.preceding_wheels
     base = _with_drivetrain(params, drivetrain)
 
-    def residuals_of(which: NDArray[np.int64], timestep: float | None) -> Callable[[dict[str, float]], Array]:
+    def residuals_of(
+        which: NDArray[np.int64], timestep: float | None, bar: tqdm
+    ) -> Callable[[dict[str, float]], Array]:
         some = windows.select(which)
 
         def pose_residuals(values: dict[str, float]) -> Array:
             values = defaults | values
             robot = robot_with_values(base, values)
             out = simulate_windows(robot, targets[which], before[which], slope[which], timestep)
+            bar.update()
             return residuals(_measured_poses(out, values, some), some)
 
         return pose_residuals
@@ -184,7 +190,10 @@ def fit_ground(
         some = np.sort(np.random.default_rng(0).choice(fitting, len(fitting) // 3, replace=False))
     progress(f"coarse search with {len(some)} windows")
     start = {p.name: _TABLE[p.name][0] for p in table}
-    coarse, fine = residuals_of(some, COARSE_TIMESTEP), residuals_of(fitting, None)
-    near = maximize_posterior(table, coarse, POSE_KINDS, start, progress=progress)
-    found = fit_parameters(table, fine, POSE_KINDS, windows.groups[fitting], near, _NEAR, progress)
+    with runtime.bar("coarse search", _USUAL[0], "simulation") as bar:
+        coarse = residuals_of(some, COARSE_TIMESTEP, bar)
+        near = maximize_posterior(table, coarse, POSE_KINDS, start, progress=progress)
+    with runtime.bar("final fit", _USUAL[1], "simulation") as bar:
+        fine = residuals_of(fitting, None, bar)
+        found = fit_parameters(table, fine, POSE_KINDS, windows.groups[fitting], near, _NEAR, progress)
     return replace(found, values=defaults | found.values, refused=refused | found.refused)

@@ -1,7 +1,6 @@
 """The page's controls of the lighting: a slider through the field's lightings, sampling, and relighting by a photo."""
 
 import itertools
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -15,7 +14,6 @@ from twin.errors import InputError
 from twin.files import exists
 from twin.nerf.baked import BakedField
 from twin.nerf.lightings import added_lightings
-from twin.runtime import child_environment
 from twin.scene import check_name
 from twin.view.camera_path import named_lighting
 from twin.view.viewer import Viewer
@@ -103,12 +101,9 @@ class LightingPanel:
             with tempfile.TemporaryDirectory(prefix="twin-") as folder:
                 photo = Path(folder) / f"photo{suffix}"
                 photo.write_bytes(content)
-                done = subprocess.run(
-                    [sys.executable, "-m", "twin.relight", root, str(photo), "--name", name],
-                    capture_output=True,
-                    text=True,
-                    env=child_environment(),
-                )
+                done = self._viewer.run([sys.executable, "-m", "twin.relight", root, str(photo), "--name", name])
+            if self._viewer.closed.is_set():
+                return
             with self._viewer.locked():
                 if done.returncode:
                     last = (done.stderr.strip().splitlines() or ["no reason given"])[-1]

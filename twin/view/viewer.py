@@ -4,8 +4,9 @@ All pages of a server show the same lighting, layers, robot and obstacles; each 
 on many threads. Callbacks of controls hold the viewer's lock; their `InputError` or `OSError` is shown as a notice.
 """
 
+import subprocess
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
@@ -54,6 +55,7 @@ class Viewer:
         self._chase: ChaseCamera | None = None
         self._lock = threading.RLock()
         self._jobs = ThreadPoolExecutor(1, thread_name_prefix="jobs")
+        self._child: subprocess.Popen[str] | None = None  # of the running job
         self._first = self.cameras.camera_to_world[0]
         camera = self.server.initial_camera  # that of the first filmed frame
         camera.position = self._first[:3, 3]
@@ -155,8 +157,18 @@ class Viewer:
         """Runs a job in the background, after all earlier ones; prints the traceback of an unexpected error."""
         self._jobs.submit(job, *given).add_done_callback(lambda future: future.cancelled() or future.result())
 
+    def run(self, command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+        """Runs a command, for a job; returns its exit status and output. `close` ends it."""
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as self._child:
+            if self.closed.is_set():
+                self._child.terminate()
+            output = self._child.communicate()
+            return subprocess.CompletedProcess(command, self._child.returncode, *output)
+
     def close(self) -> None:
         self.closed.set()
+        if self._child is not None:
+            self._child.terminate()  # the process would wait for the job
         self.loop.close()
         if self.driving is not None:
             self.driving.close()

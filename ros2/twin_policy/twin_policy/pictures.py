@@ -25,6 +25,8 @@ _YUV = {
     "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
     "yuyv": cv2.COLOR_YUV2RGB_YUY2,
 }
+# The colors follow the brightness, in half as many rows.
+_PLANAR = {"nv12": cv2.COLOR_YUV2RGB_NV12, "nv21": cv2.COLOR_YUV2RGB_NV21}
 _TO_RGB = {
     "bgr8": cv2.COLOR_BGR2RGB,
     "8UC3": cv2.COLOR_BGR2RGB,
@@ -33,7 +35,7 @@ _TO_RGB = {
     "mono8": cv2.COLOR_GRAY2RGB,
     "8UC1": cv2.COLOR_GRAY2RGB,
 }
-ENCODINGS = (*_CHANNELS, *_BAYER, *_YUV)
+ENCODINGS = (*_CHANNELS, *_BAYER, *_YUV, *_PLANAR)
 """Supported encodings of raw pictures."""
 
 _COEFFICIENTS = {"": (0,), "none": (0,), "plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
@@ -64,19 +66,20 @@ class RawPicture:
         if name not in ENCODINGS:
             raise PictureError(f"encoding {name!r}; expected one of {', '.join(ENCODINGS)}")
         channels = 2 if name in _YUV else _CHANNELS.get(name, 1)
+        lines = height + height // 2 if name in _PLANAR else height
         flat = np.frombuffer(self.data, np.uint8)
         sides = 1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE
-        if not sides or self.step < width * channels or len(flat) < self.step * height:
+        if not sides or self.step < width * channels or len(flat) < self.step * lines:
             raise PictureError(
                 f"{name} picture of {width} x {height} px with {self.step} bytes a row has {len(flat)} bytes; expected "
-                f"{width * channels} a row or more, and {max(self.step, width * channels) * height} in all"
+                f"{width * channels} a row or more, and {max(self.step, width * channels) * lines} in all"
             )
-        rows = flat[: self.step * height].reshape(height, self.step)[:, : width * channels]
-        picture = np.ascontiguousarray(rows).reshape(height, width, channels)
-        if name in _BAYER or name in _YUV:
-            if width % 2 or (height % 2 and name in _BAYER) or min(width, height) < 4:
+        rows = flat[: self.step * lines].reshape(lines, self.step)[:, : width * channels]
+        picture = np.ascontiguousarray(rows).reshape(lines, width, channels)
+        if code := (_BAYER | _YUV | _PLANAR).get(name):
+            if width % 2 or (height % 2 and name not in _YUV) or min(width, height) < 4:
                 raise PictureError(f"{name} picture of {width} x {height} px; expected even sides of 4 px or more")
-            return cv2.cvtColor(picture, (_BAYER | _YUV)[name])
+            return cv2.cvtColor(picture, code)
         return cv2.cvtColor(picture, _TO_RGB[name]) if name in _TO_RGB else picture
 
 
