@@ -23,7 +23,7 @@ _MIN_MATCHES = 15  # least number of matches of a pair
 _PIXEL_ERROR = 0.5  # [px] standard deviation of the epipolar error of a right match
 _OUTLIER = 4.0  # [standard deviations] matches with a larger epipolar error are wrong
 _MUCH_WORSE = 1.1  # ratio of the costs of two poses of a pair
-_NEAR_ANGLE = np.radians(0.5)  # smallest angle between the rays to a point whose depth is used
+_NEAR_ANGLE = 4.0  # [standard deviations of the epipolar error] smallest angle between the rays to a near point
 _MIN_COSINE = 0.2  # of the angle from the optical axis, in the size of a pixel
 _EPIPOLE = 20.0  # [standard deviations] the epipolar error of rays nearer to the epipole is not magnified further
 _WIDE = 4.0  # the first steps use a loss that is wider by this factor
@@ -149,7 +149,7 @@ def _described(pair: PairMatches, rotation: Array, translation: Array, cost: flo
     along_a, along_b = turned @ translation, b @ translation
     depths = np.stack([cosine * along_b - along_a, along_b - cosine * along_a], 1)
     depths /= np.maximum(np.sin(angle)[:, None] ** 2, 1e-12)
-    usable = agrees & (angle > _NEAR_ANGLE)
+    usable = agrees & (angle > _NEAR_ANGLE * error)
     if (usable & (depths < 0).all(1)).sum() > (usable & (depths > 0).all(1)).sum():
         depths, translation = -depths, -translation
     near = usable & (depths > 0).all(1)

@@ -22,6 +22,8 @@ _OUTLIER = 3.0  # [standard deviations] scale of the Cauchy loss
 _STEPS = 50  # largest number of steps of a solution
 _MIN_ROTATION_ERROR = np.radians(0.02)  # standard deviation of a pair's rotation, at least
 _MAX_ROTATION_RESIDUAL = np.radians(0.5)  # pairs that deviate more from the averaged rotations are left out
+_STRAIGHT = 0.7  # of the steps between two frames: ratio of their sum to their number, in a film that is straight there
+_MAX_TURN = np.radians(30.0)  # largest angle between the direction of two frames and that of the steps between
 _MIN_SCALE_ERROR = 0.004  # standard deviation of the logarithm of a ratio of units, at least
 _MIN_DIRECTION_ERROR = 0.015  # [rad] standard deviation of the direction between two cameras, at least
 _MIN_NEAR = 8  # least number of near points of a pair whose unit of length is used
@@ -65,23 +67,45 @@ def averaged_poses(
             pairs[k] = with_rotation(pair, rotations[second[k]] @ rotations[first[k]].T, seed) or pair
     cost = _ends(pairs, row_of, film)[2]
     rotations, residual = _average_rotations(pairs, first, second, cost, len(film))
+    directions = np.stack([-rotations[j].T @ pair.translation for j, pair in zip(second, pairs, strict=True)])
+    along = _goes_along(first, second, directions, film)
     usable = [
-        k for k, pair in enumerate(pairs) if _is_consistent(pair, residual[k]) and len(pair.features) >= _MIN_NEAR
+        k
+        for k, pair in enumerate(pairs)
+        if along[k] and _is_consistent(pair, residual[k]) and len(pair.features) >= _MIN_NEAR
     ]
-    scaled, units = _units([pairs[k] for k in usable], len(usable))
+    scaled, units = _units([pairs[k] for k in usable], cost[usable])
     kept = np.array(usable, np.int64)[scaled]
     if not len(kept):
         return np.zeros(0, np.int64), np.zeros((0, 4, 4))
     units /= np.median(units)
-    directions = np.stack([-rotations[second[k]].T @ pairs[k].translation for k in kept])
     errors = np.array([max(pairs[k].direction_error, _MIN_DIRECTION_ERROR) for k in kept]) * units
     frames, positions, _ = solve_differences(
-        Differences(second[kept], first[kept], units[:, None] * directions, errors, cost[kept]), len(film)
+        Differences(second[kept], first[kept], units[:, None] * directions[kept], errors, cost[kept]), len(film)
     )
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     poses[:, :3, :3] = np.swapaxes(rotations[frames], 1, 2)
     poses[:, :3, 3] = positions[frames]
     return frames, poses
+
+
+def _goes_along(
+    first: NDArray[np.int64], second: NDArray[np.int64], directions: Array, film: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """False for pairs (m,) of a film whose direction contradicts those of the successive frames between.
+
+    Distant frames may match by a repeated pattern, and then have a wrong direction with many near points.
+    """
+    step = np.zeros((len(film), 3))  # direction from each frame to the next one of its film
+    for i, j, direction in zip(first, second, directions, strict=True):
+        if film[i] == film[j] and abs(i - j) == 1:
+            step[min(i, j)] = direction if i < j else -direction
+    path = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
+    expected = path[second] - path[first]
+    length = np.linalg.norm(expected, axis=1)
+    # A film that turns or stands still between two frames does not tell the direction.
+    told = (film[first] == film[second]) & (length > _STRAIGHT * np.abs(second - first))
+    return ~told | ((expected * directions).sum(1) > np.cos(_MAX_TURN) * length)
 
 
 def consistent_pairs(
@@ -148,15 +172,15 @@ def _average_rotations(
     return rotations, np.linalg.norm(deviations(), axis=1)
 
 
-def _units(pairs: list[PairGeometry], count: int) -> tuple[NDArray[np.int64], Array]:
+def _units(pairs: list[PairGeometry], cost: Array) -> tuple[NDArray[np.int64], Array]:
     """Pairs (k,) whose units of length are known relative to each other, and these units (k,)."""
-    equations = _unit_equations(pairs)
+    equations, count = _unit_equations(pairs), len(pairs)
     if not equations:
         return np.zeros(0, np.int64), np.zeros(0)
     first, second = (np.array([one[k] for one in equations], np.int64) for k in (0, 1))
     value, error, shared = (np.array([one[k] for one in equations], np.float64) for k in (2, 3, 4))
     solved, logarithms, residual = solve_differences(
-        Differences(first, second, value[:, None], error, 1 / shared), count
+        Differences(first, second, value[:, None], error, (cost[first] + cost[second]) / shared), count
     )
     wrong = (residual > _WRONG * error).astype(np.float64)
     used = np.isfinite(residual)
