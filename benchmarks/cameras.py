@@ -35,7 +35,6 @@ def measure(folder: Path) -> dict[str, Any]:
     """Errors [m] of the built cameras of a filmed place."""
     cameras = Cameras.load(SceneDir(folder).stage("cameras"))
     with np.load(folder / "truth" / "truth.npz", allow_pickle=False) as truth:
-        total = sum(len(truth[name]) for name in truth.files if name.startswith("times_"))
         true = []
         for source, seconds in zip(cameras.sources, cameras.times, strict=True):
             k = int(np.argmin(np.abs(truth[f"times_{source}"] - seconds)))
@@ -45,7 +44,7 @@ def measure(folder: Path) -> dict[str, Any]:
     report = json.loads((folder / "build" / "report.json").read_text())["cameras"]
     return {
         "registered": len(cameras),
-        "total": total,
+        "total": report["total"],
         "films": len(set(cameras.sources)),
         "rms_m": round(float(np.sqrt(np.mean(errors**2))), 4),
         "worst_m": round(float(errors.max()), 4),
@@ -63,6 +62,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write the table to this file")
     given = parser.parse_args()
     rows: list[dict[str, Any]] = []
+    failed = False
     for place in given.places:
         folder = given.work / f"place_{place}"
         if not (folder / "scene.toml").exists() and (
@@ -77,9 +77,10 @@ def main() -> int:
         row = {"place": place, "seconds": round(time.monotonic() - start)}
         rows.append(row | ({"error": error} if error else measure(folder)))
         print(json.dumps(rows[-1]), flush=True)
+        failed = failed or bool(error)
         if given.json:
             given.json.write_text(json.dumps(rows, indent=1) + "\n")
-    return 0
+    return int(failed)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from twin.capture.pose_averaging import Differences, averaged_poses, consistent_
 from twin.geometry.poses import umeyama
 from twin.types import Array
 
-FRAMES, FOCAL, WIDTH, HEIGHT = 16, 500.0, 640, 360
+FRAMES, FOCAL, WIDTH, HEIGHT = 16, 520.0, 640, 360
 NOISE = 0.3  # [px]
 FEATURES = 1000  # keypoints per frame of the first kind; wrong ones follow them
 
@@ -35,8 +35,8 @@ class Film:
         return float(np.linalg.norm(umeyama(found, true).points(found) - true, axis=1).max())
 
 
-def _film(path: Path, wrong: bool = False) -> Film:
-    """A camera that shakes goes 1 m per frame round a bend over a plane, with a skyline; far points have long tracks.
+def _film(path: Path, wrong: bool = False, bend: float = 0.04, shake: float = 0.03) -> Film:
+    """A camera that shakes [rad] goes 1 m per frame round a bend [rad per frame] over a plane, with a skyline.
 
     A tenth of all matches are wrong. If `wrong`, frames 2 and 13 share 120 matches of a repeated pattern, too.
     """
@@ -52,10 +52,10 @@ def _film(path: Path, wrong: bool = False) -> Film:
         axes = np.stack([np.cross(forward, [0, 0, 1]), [0.0, 0, 0], forward / np.linalg.norm(forward)], 1)
         axes[:, 0] /= np.linalg.norm(axes[:, 0])
         axes[:, 1] = np.cross(axes[:, 2], axes[:, 0])
-        poses[k, :3, :3] = axes @ Rotation.from_rotvec(rng.normal(0, 0.03, 3)).as_matrix()
+        poses[k, :3, :3] = axes @ Rotation.from_rotvec(rng.normal(0, shake, 3)).as_matrix()
         poses[k, :3, 3] = at
         at = at + np.array([np.cos(heading), np.sin(heading), 0.0])
-        heading += 0.04
+        heading += bend
     pixels = np.full((FRAMES, len(points), 2), np.nan)
     for k, pose in enumerate(poses):
         local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -167,18 +167,29 @@ def test_another_pose_is_taken_only_if_it_explains_the_matches(film: Film, pairs
     assert with_rotation(pairs[0], pairs[0].rotation @ Rotation.from_rotvec([0.0, 2.5, 0.0]).as_matrix(), 0) is None
 
 
-@pytest.mark.parametrize("guess", [250.0, 768.0])
-def test_the_focal_length_is_found_from_matches(film: Film, tmp_path: Path, guess: float) -> None:
-    path = tmp_path / "database.db"
+@pytest.mark.parametrize(("model", "guess"), [("SIMPLE_RADIAL", 250.0), ("SIMPLE_RADIAL", 768.0), ("PINHOLE", 768.0)])
+def test_the_focal_length_is_found_from_matches(film: Film, tmp_path: Path, model: str, guess: float) -> None:
+    found = _fitted(film, tmp_path / "database.db", model, guess)
+    assert found[0] == pytest.approx(FOCAL, rel=0.05)  # the nearest first guesses are 7 and 8 % off
+    assert len(found) == 4 and (model == "PINHOLE" or abs(found[3]) < 0.05)
+
+
+def test_a_focal_length_that_the_matches_do_not_tell_stays_near_the_guess(tmp_path: Path) -> None:
+    """A camera that goes straight ahead and does not turn: a longer focal length looks like longer steps."""
+    film = _film(tmp_path / "straight.db", bend=0.0, shake=0.0)
+    assert 0.5 * FOCAL < _fitted(film, tmp_path / "database.db", "SIMPLE_RADIAL", 600.0)[0] < 2.0 * FOCAL
+
+
+def _fitted(film: Film, path: Path, model: str, guess: float) -> list[float]:
+    """Parameters of the film's camera, fitted in a copy of its database."""
     path.write_bytes(film.database.read_bytes())
     with pycolmap.Database.open(path) as database:
-        (camera,) = database.read_all_cameras()
-        camera.params, camera.has_prior_focal_length = [guess, WIDTH / 2, HEIGHT / 2, 0.0], False
+        camera = pycolmap.Camera.create_from_model_name(1, model, guess, WIDTH, HEIGHT)
+        camera.has_prior_focal_length = False
         database.update_camera(camera)
     estimate_focal_lengths(path, 0)
     with pycolmap.Database.open(path) as database:
-        (camera,) = database.read_all_cameras()
-    assert camera.params[0] == pytest.approx(FOCAL, rel=0.05) and abs(camera.params[3]) < 0.05
+        return list(database.read_all_cameras()[0].params)
 
 
 def test_a_given_focal_length_is_kept(film: Film, tmp_path: Path) -> None:

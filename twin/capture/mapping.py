@@ -170,7 +170,9 @@ class Mapper:
         """
         matcher, needed = self._matcher, self._min_registered * len(self._matcher.frames)
         best: pycolmap.Reconstruction | None = None
+        averaged: pycolmap.Reconstruction | None = None
         kept: set[int] = set()
+        held: set[int] = set()  # frames of the averaged model
         for name, attempt in self._attempts():
             if best is not None and name == "incremental" and len(kept) >= needed:
                 break  # slow, and rarely better than a torn model of global mapping
@@ -179,10 +181,12 @@ class Mapper:
                 continue
             coherent = coherent_frames(model, matcher)
             better = best is None or len(coherent) > len(kept)
-            if better and best is not None and summary["mapper"] == "averaging" and len(kept) >= needed:
-                better = _agree(best, model, sorted(kept & coherent), matcher)
+            if better and averaged is not None:
+                better = _agree(averaged, model, sorted(held & coherent), matcher)
             if better:
                 best, kept, summary["mapper"] = model, coherent, name
+            if name == "averaging" and len(kept) >= needed:
+                averaged, held = model, coherent
             if len(kept) >= max(needed, _COHERENT_FRACTION * len(matcher.frames)):
                 break
         if best is None:

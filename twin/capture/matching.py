@@ -292,7 +292,8 @@ class Matcher:
         for i, j in consistent_pairs(self.geometries(), self.frame_of(), source):
             consistent[source[i], source[j]] += 1
         frames = np.bincount(source, minlength=count)
-        enough = np.minimum(_LINKING_PAIRS, np.minimum(frames, frames[:, None]) / 2)
+        # One pair alone agrees with itself.
+        enough = np.clip(np.minimum(frames, frames[:, None]) / 2, 2, _LINKING_PAIRS)
         linked = csr_matrix(consistent + consistent.T >= enough)
         group = connected_components(linked, directed=False)[1]
         groups = [np.flatnonzero(group[source] == k) for k in range(int(group.max()) + 1)]

@@ -24,7 +24,6 @@ _PIXEL_ERROR = 0.5  # [px] standard deviation of the epipolar error of a right m
 _OUTLIER = 4.0  # [standard deviations] matches with a larger epipolar error are wrong
 _MUCH_WORSE = 1.1  # ratio of the costs of two poses of a pair
 _NEAR_ANGLE = 4.0  # [standard deviations of the epipolar error] smallest angle between the rays to a near point
-_MIN_COSINE = 0.2  # of the angle from the optical axis, in the size of a pixel
 _EPIPOLE = 20.0  # [standard deviations] the epipolar error of rays nearer to the epipole is not magnified further
 _WIDE = 4.0  # the first steps use a loss that is wider by this factor
 _WIDE_STEPS, _STEPS = 5, 12  # largest number of Gauss–Newton steps
@@ -91,23 +90,24 @@ def pair_geometries(
     if fresh:
         send_message(bar="relative poses", total=len(fresh))
     rays = {image_id: camera_rays(cameras[camera_of[image_id]], xy) for image_id, xy in points.items()}
-    # Some lenses cannot be inverted everywhere.
-    finite = {image_id: np.isfinite(one.sum(1)) for image_id, one in rays.items()}
+    errors = {i: _keypoint_errors(cameras[camera_of[i]], xy, rays[i]) for i, xy in points.items()}
     for (first, second), geometry in fresh:
         send_message(step=1)
         matches = geometry.inlier_matches.astype(np.int64)
-        matches = matches[finite[first][matches[:, 0]] & finite[second][matches[:, 1]]]
+        error = (errors[first][matches[:, 0]] + errors[second][matches[:, 1]]) / 2
+        matches, error = matches[np.isfinite(error)], error[np.isfinite(error)]  # some lenses cannot be inverted
+        if len(matches) < _MIN_MATCHES:
+            continue
         two = cameras[camera_of[first]], cameras[camera_of[second]]
         rng = np.random.default_rng([seed, first, second])
         a, b = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
-        pixel = float(np.mean([1 / camera.mean_focal_length() for camera in two]))
-        pair = PairMatches(first, second, matches, a, b, _errors(b, pixel))
+        pair = PairMatches(first, second, matches, a, b, error)
         starts = [np.eye(3), common_rotation(a, b, rng)]
         if pycolmap.estimate_two_view_geometry_pose(two[0], points[first], two[1], points[second], geometry):
             assert geometry.cam2_from_cam1 is not None
             starts.append(geometry.cam2_from_cam1.rotation.matrix())
         known[first, second] = _described(pair, *relative_pose(a, b, starts, pair.error, rng))
-    return [known[pair] for pair, _ in verified]
+    return [known[pair] for pair, _ in verified if pair in known]
 
 
 def with_rotation(pair: PairGeometry, rotation: Array, seed: int) -> PairGeometry | None:
@@ -131,12 +131,16 @@ def camera_rays(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Array:
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _errors(rays: Array, pixel: float) -> Array:
-    """[rad] Standard deviations (n,) of the epipolar errors of right matches; `pixel` [rad] is a central pixel's size.
+def _keypoint_errors(camera: pycolmap.Camera, pixels: NDArray[np.floating], rays: Array) -> Array:
+    """[rad] Standard deviations (n,) of the directions of keypoints, by the angular size of their pixels.
 
-    Pixels are smaller off the center. Without this, short focal lengths would seem to fit better.
+    Off the center, the pixels of a lens without distortion are smaller. With one size for all, short focal lengths
+    would seem to fit better. The size is that of the longer axis, across the radius: epipolar lines run along it when a
+    camera goes forward.
     """
-    return _PIXEL_ERROR * pixel * np.maximum(rays[:, 2], _MIN_COSINE)
+    x, y = (camera_rays(camera, pixels + shift) - rays for shift in np.eye(2))
+    xx, yy, xy = (x * x).sum(1), (y * y).sum(1), (x * y).sum(1)
+    return _PIXEL_ERROR * np.sqrt((xx + yy + np.sqrt((xx - yy) ** 2 + 4 * xy**2)) / 2)
 
 
 def _described(pair: PairMatches, rotation: Array, translation: Array, cost: float) -> PairGeometry:
@@ -276,7 +280,7 @@ def _minimized(
 def estimate_focal_lengths(database: Path, seed: int) -> None:
     """Fits the focal length and the first distortion parameter of each camera without a prior to pairs of near frames.
 
-    Images of a camera must have ids in the order of time. A camera keeps its parameters if no pair is usable.
+    A film's images must have ids in the order of time. A camera keeps its parameters if the matches do not tell them.
     """
     with pycolmap.Database.open(database) as opened:
         cameras, camera_of = _cameras(opened)
@@ -286,13 +290,14 @@ def estimate_focal_lengths(database: Path, seed: int) -> None:
             if camera.has_prior_focal_length:
                 continue
             send_message(bar=f"focal length of camera {camera.camera_id}", total=0)
-            near = [
+            own = [
                 (first, second, matches[:: 1 + len(matches) // _FOCAL_MATCHES])
                 for (first, second), matches in verified
-                if camera_of[first] == camera_of[second] == camera.camera_id
-                and abs(first - second) <= _FOCAL_STEPS
-                and len(matches) >= 2 * _MIN_MATCHES
+                if camera_of[first] == camera_of[second] == camera.camera_id and len(matches) >= 2 * _MIN_MATCHES
             ]
+            near = [one for one in own if abs(one[0] - one[1]) <= _FOCAL_STEPS]
+            if len(near) < min(_FOCAL_PAIRS, len(own)):  # photos in no order
+                near = sorted(own, key=lambda one: -len(one[2]))[:_FOCAL_PAIRS]
             chosen = near[:: 1 + len(near) // _FOCAL_PAIRS]
             ids = sorted({image_id for first, second, _ in chosen for image_id in (first, second)})
             points = {image_id: opened.read_keypoints(image_id)[:, :2].astype(np.float64) for image_id in ids}
@@ -305,49 +310,51 @@ def estimate_focal_lengths(database: Path, seed: int) -> None:
 def _fitted_camera(camera: pycolmap.Camera, pixels: list[tuple[Array, Array]], rng: np.random.Generator) -> list[float]:
     """Parameters of a camera that explain the matched pixels (n, 2) of pairs of its frames with the least cost."""
     focals, distortion = list(camera.focal_length_idxs()), list(camera.extra_params_idxs())[:1]
-    longer, guess, first = (
-        max(camera.width, camera.height),
-        camera.mean_focal_length(),
-        np.array(camera.params, np.float64),
-    )
+    first, guess = list(camera.params), camera.mean_focal_length()
+    grid = max(camera.width, camera.height) * _FOCAL_GRID
+    most = np.log1p(_OUTLIER**2)  # so that wrong matches, whose errors shrink with the focal length, do not matter
     poses: list[tuple[Array, Array, float]] = []
 
-    def changed(focal: float, distort: float) -> pycolmap.Camera:
-        params = first.copy()
-        params[focals] = focal
-        params[distortion] = distort
+    def observed(values: Array) -> list[tuple[Array, Array, Array]]:
+        """Rays of all matches, and their errors, for the logarithm of a focal length and a distortion parameter."""
+        params = np.array(first, np.float64)
+        params[focals] = np.exp(values[0])
+        params[distortion] = values[1:]
         camera.params = params.tolist()
-        return camera
+        rays = [(camera_rays(camera, p), camera_rays(camera, q)) for p, q in pixels]
+        errors = [
+            (_keypoint_errors(camera, p, a) + _keypoint_errors(camera, q, b)) / 2
+            for (p, q), (a, b) in zip(pixels, rays, strict=True)
+        ]
+        return [(a, b, error) for (a, b), error in zip(rays, errors, strict=True)]
 
     def cost(values: Array) -> float:
-        """Cost of the logarithm of the focal length, and of the distortion parameter, from the poses found before."""
-        focal = float(np.exp(values[0]))
-        if (
-            not longer * _FOCAL_GRID[0] <= focal * 1.001 <= longer * _FOCAL_GRID[-1] * 1.002
-            or abs(values[1]) > _MAX_DISTORTION
-        ):
+        """Cost of the same values, beginning with the poses found before."""
+        if not grid[0] <= np.exp(values[0]) * 1.001 <= 1.002 * grid[-1] or (np.abs(values[1:]) > _MAX_DISTORTION).any():
             return np.inf
-        one = changed(focal, float(values[1]))
-        total = 0.5 * ((values[0] - np.log(guess)) / _FOCAL_PRIOR) ** 2 + 0.5 * (values[1] / _DISTORTION_PRIOR) ** 2
-        for k, (p, q) in enumerate(pixels):
-            a, b = camera_rays(one, p), camera_rays(one, q)
-            if not np.isfinite(a).all() or not np.isfinite(b).all():
+        total = 0.5 * ((values[0] - np.log(guess)) / _FOCAL_PRIOR) ** 2
+        total += 0.5 * float((values[1:] ** 2).sum()) / _DISTORTION_PRIOR**2
+        for (a, b, error), pose in zip(observed(values), poses, strict=True):
+            if not np.isfinite(error).all():
                 return np.inf
-            total += _minimized(a, b, *poses[k][:2], _errors(b, 1 / focal), _WIDE_STEPS)[2]
-        return total
+            rotation, translation, _ = _minimized(a, b, *pose[:2], error, _WIDE_STEPS)
+            residual = _epipolar(a, b, rotation, translation, error)[0]
+            total += np.minimum(np.log1p(residual**2), most).sum()
+        return float(total)
 
-    best = (np.inf, 0.0, poses)
-    for focal in longer * _FOCAL_GRID:
-        one = changed(float(focal), 0.0)
-        both = [(camera_rays(one, p), camera_rays(one, q)) for p, q in pixels]
+    found = []
+    for focal in grid:
+        values = np.array([np.log(focal), *np.zeros(len(distortion))])
         poses = [
-            relative_pose(a, b, [common_rotation(a, b, rng), np.eye(3)], _errors(b, 1 / focal), rng) for a, b in both
+            relative_pose(a, b, [common_rotation(a, b, rng), np.eye(3)], error, rng) for a, b, error in observed(values)
         ]
-        best = min(best, (cost(np.array([np.log(focal), 0.0])), float(np.log(focal)), poses), key=lambda one: one[0])
-    _, start, poses = best
-    simplex = [[start, 0.0], [start + 0.1, 0.0], [start, 0.05]]
+        found.append((cost(values), values, poses))
+    _, start, poses = min(found, key=lambda one: one[0])
+    simplex = start + np.concatenate([np.zeros((1, len(start))), np.diag([0.1, 0.05][: len(start)])])
     options = {"initial_simplex": simplex, "xatol": 2e-3, "fatol": 0.1, "maxfev": 60}
-    found = (
-        minimize(cost, simplex[0], method="Nelder-Mead", options=options).x if distortion else np.array([start, 0.0])
-    )
-    return list(changed(float(np.exp(found[0])), float(found[1])).params)
+    best = minimize(cost, start, method="Nelder-Mead", options=options).x
+    if not grid[0] * 1.05 < np.exp(best[0]) < grid[-1] / 1.05:
+        send_message(say=f"  the matches do not tell the focal length of a film; {guess:.0f} px is the first guess")
+        return first
+    observed(best)
+    return list(camera.params)

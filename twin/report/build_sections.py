@@ -137,7 +137,11 @@ def cameras_section(report: dict[str, Any]) -> Section:
         ),
         Fact("track length", number(cameras.get("mean_track_length"), "{:.1f} frames"), "frames that observe a point"),
         Fact("focal length", ", ".join(texts) or NOT_MEASURED, "given, or estimated by the reconstruction"),
-        Fact("method", str(cameras.get("mapper") or NOT_MEASURED), "global, or incremental if that fails"),
+        Fact(
+            "method",
+            str(cameras.get("mapper") or NOT_MEASURED),
+            "averaging of pairs, then COLMAP's global and incremental mapping if that fails",
+        ),
     ]
     if joined := cameras.get("joined"):
         meaning = "films in the opposite direction: reconstructed separately, and placed by the ground seen from above"
