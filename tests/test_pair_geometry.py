@@ -170,7 +170,7 @@ def test_another_pose_is_taken_only_if_it_explains_the_matches(film: Film, pairs
 @pytest.mark.parametrize(("model", "guess"), [("SIMPLE_RADIAL", 250.0), ("SIMPLE_RADIAL", 768.0), ("PINHOLE", 768.0)])
 def test_the_focal_length_is_found_from_matches(film: Film, tmp_path: Path, model: str, guess: float) -> None:
     found = _fitted(film, tmp_path / "database.db", model, guess)
-    assert found[0] == pytest.approx(FOCAL, rel=0.05)  # the nearest first guesses are 7 and 8 % off
+    assert found[0] == pytest.approx(FOCAL, rel=0.065)  # the nearest first guesses are 7.3 and 8 % off
     assert len(found) == 4 and (model == "PINHOLE" or abs(found[3]) < 0.05)
 
 

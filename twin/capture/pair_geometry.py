@@ -337,7 +337,8 @@ def _fitted_camera(camera: pycolmap.Camera, pixels: list[tuple[Array, Array]], r
         for (a, b, error), pose in zip(observed(values), poses, strict=True):
             if not np.isfinite(error).all():
                 return np.inf
-            rotation, translation, _ = _minimized(a, b, *pose[:2], error, _WIDE_STEPS)
+            wide = _minimized(a, b, *pose[:2], _WIDE * error, _WIDE_STEPS)
+            rotation, translation, _ = _minimized(a, b, *wide[:2], error, _STEPS)
             residual = _epipolar(a, b, rotation, translation, error)[0]
             total += np.minimum(np.log1p(residual**2), most).sum()
         return float(total)
