@@ -13,7 +13,7 @@ from twin.capture.pose_averaging import Differences, averaged_poses, consistent_
 from twin.geometry.poses import umeyama
 from twin.types import Array
 
-FRAMES, FOCAL, WIDTH, HEIGHT = 16, 520.0, 640, 360
+FRAMES, FOCAL, WIDTH, HEIGHT = 16, 525.0, 640, 360
 NOISE = 0.3  # [px]
 FEATURES = 1000  # keypoints per frame of the first kind; wrong ones follow them
 
@@ -170,7 +170,7 @@ def test_another_pose_is_taken_only_if_it_explains_the_matches(film: Film, pairs
 @pytest.mark.parametrize(("model", "guess"), [("SIMPLE_RADIAL", 250.0), ("SIMPLE_RADIAL", 768.0), ("PINHOLE", 768.0)])
 def test_the_focal_length_is_found_from_matches(film: Film, tmp_path: Path, model: str, guess: float) -> None:
     found = _fitted(film, tmp_path / "database.db", model, guess)
-    assert found[0] == pytest.approx(FOCAL, rel=0.065)  # the nearest first guesses are 7.3 and 8 % off
+    assert 0.925 * FOCAL < found[0] < 1.06 * FOCAL  # the nearest first guesses are 8 % shorter and 7 % longer
     assert len(found) == 4 and (model == "PINHOLE" or abs(found[3]) < 0.05)
 
 
