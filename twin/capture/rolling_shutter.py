@@ -100,14 +100,14 @@ class _Frame:
         length (1), skew (3) or shift (2).
         """
         points2d = self._image.points2D
-        seen = [k for k, point in enumerate(points2d) if point.has_point3D()]
+        seen = np.array([k for k, point in enumerate(points2d) if point.has_point3D()], np.int64)
         points = np.array([list(self._model.points3D[points2d[k].point3D_id].xyz) for k in seen]).reshape(-1, 3)
         pose = self._image.cam_from_world().matrix()
         x = points @ pose[:, :3].T + pose[:, 3]
         rays = self._corrected_rays()[seen]
         # Bundle adjustment may leave a point behind a camera, and not every lens model can be inverted everywhere.
         used = (x[:, 2] > _MIN_DEPTH * np.median(np.abs(x[:, 2]))) & np.isfinite(rays).all(1) & (rays[:, 2] > 0)
-        seen, x, rays = np.array(seen)[used], x[used], rays[used]
+        seen, x, rays = seen[used], x[used], rays[used]
         focal = self._camera.mean_focal_length()
         jacobian = np.zeros((len(x), 2, 3))  # of the projection, by X
         jacobian[:, 0, 0] = jacobian[:, 1, 1] = focal / x[:, 2]
