@@ -1,7 +1,7 @@
 """Benchmark of the simulated real test: speed of its rasterizer, difference from the film's renderer, error of a route.
 
     python benchmarks/reality.py [--scene BUILT_SCENE_WITH_TRUTH] [--json FILE] [--pictures FOLDER]
-    python benchmarks/reality.py --sheet docs/campus.jpg
+    python benchmarks/reality.py --sheet docs/places.jpg
 
 Rasterized pictures of 160×90, without the sensor model, are compared with frames that the film's renderer draws in the
 film's size and that are then reduced to 160×90. The poses lie on the film's path, at the height of a robot's camera.

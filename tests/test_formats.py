@@ -318,6 +318,7 @@ def test_scaling_a_lens_scales_what_it_projects() -> None:
         ("PINHOLE", (50.0, 50.0, 32.0, math.inf), (64, 48), "finite"),
         ("PINHOLE", (0.8, 0.8, 32.0, 24.0), (64, 48), "focal length"),
         ("PINHOLE", (640.0, 640.0, 32.0, 24.0), (64, 48), "10 times the longer side"),
+        ("PINHOLE", (60.0, 640.0, 32.0, 24.0), (64, 48), "focal length 60, 640 px .*, 10 times the longer side"),
         ("PINHOLE", (50.0, 50.0, 3200.0, 24.0), (64, 48), "principal point"),
         ("PINHOLE", (50.0, 50.0, 32.0, 24.0), (0, 48), "image size"),
     ],

@@ -288,6 +288,17 @@ def test_an_sb3_zip_needs_trust(tmp_path, algorithm, settings):
     np.testing.assert_allclose(policy.actions(stacks), model.predict(stacks, deterministic=True)[0], atol=1e-6)
 
 
+def test_an_sb3_zip_trained_on_floats_of_0_to_255(tmp_path):
+    spaces = pytest.importorskip("gymnasium").spaces
+    model = sb3_model("PPO", spaces.Box(0, 255, (12, 36, 64), np.float32))
+    model.save(tmp_path / "floats.zip")
+    stacks = np.random.default_rng(0).integers(0, 256, (2, 12, 36, 64), np.uint8)
+    expected = model.predict(stacks.astype(np.float32), deterministic=True)[0]
+    assert np.ptp(expected) > 0.0
+    actions = load_policy(tmp_path / "floats.zip", trust=True).actions(stacks)
+    np.testing.assert_allclose(actions, expected, atol=1e-6)
+
+
 def test_an_sb3_zip_that_does_not_fit_is_refused(tmp_path):
     spaces = pytest.importorskip("gymnasium").spaces
     images = spaces.Dict({"pixels": spaces.Box(0, 255, (12, 36, 64), np.uint8), "state": spaces.Box(-1, 1, (2,))})
@@ -295,10 +306,12 @@ def test_an_sb3_zip_that_does_not_fit_is_refused(tmp_path):
     sb3_model("PPO", images).save(tmp_path / "odometry.zip")
     sb3_model("PPO", low=0.0).save(tmp_path / "rescaled.zip")
     sb3_model("PPO", spaces.Box(0, 1, (12, 36, 64), np.float32)).save(tmp_path / "scaled.zip")
+    sb3_model("PPO", spaces.Box(-1, 255, (12, 36, 64), np.float32)).save(tmp_path / "shifted.zip")
     for name, message in (
         ("no", "not a model"),
         ("odometry", "observes pixels and state; expected pictures alone.* train it without the option state"),
-        ("scaled", "expected pictures uint8"),
+        ("scaled", "expected pictures .*uint8 or floats of 0 to 255"),
+        ("shifted", "expected pictures .*uint8 or floats of 0 to 255"),
         ("rescaled", "range of twin"),
     ):
         with pytest.raises(InputError, match=message):

@@ -94,7 +94,10 @@ class Bag:
                 yield connection, recorded, self._deserialize(raw, connection.msgtype)
 
     def _check_clock(self, topics: set[str]) -> None:
-        """Raises InputError if the recorder's clock was set back: readers sort messages by it, which would mix them."""
+        """Raises InputError if the recorder's clock was set back: readers sort messages by it, which would mix them.
+
+        MCAP and ROS 1 bags store times by chunk, so a clock set back within the first or last chunk is not seen.
+        """
         for topic in sorted(topics):
             times = np.array([*_times_in_file(self._reader, topic)], np.int64).reshape(-1, 2)
             # A jump within a chunk shows in the next chunk only when compared with the one before.

@@ -123,10 +123,11 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
         raise InputError(f"{where}: a parameter of the {model} camera is not a finite number; calibrate again")
     fx, fy, cx, cy = lens.intrinsics
     longer = max(width, height)
-    if not all(_FOCAL_RANGE[0] * longer < focal < _FOCAL_RANGE[1] * longer for focal in (fx, fy)):
+    wrong = [f for f in (fx, fy) if not _FOCAL_RANGE[0] * longer < f < _FOCAL_RANGE[1] * longer]
+    if wrong:
         raise InputError(
-            f"{where}: focal length {fx:g}, {fy:g} px for {width}x{height}, {fx / longer:.3g} times the longer side "
-            "(phones have 0.6 to 1); give it in px of that size"
+            f"{where}: focal length {fx:g}, {fy:g} px for {width}x{height}, {wrong[0] / longer:.3g} times the "
+            "longer side (phones have 0.6 to 1); give it in px of that size"
         )
     if not (-0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
         raise InputError(

@@ -141,10 +141,13 @@ def _lighting_name(source: SourceConfig) -> str:
 
 
 def _check_calibration(path: Path, source: SourceConfig) -> None:
-    """Raises InputError, before anything is read, if a calibration in `scene.toml` does not fit its film or photos."""
+    """Raises InputError if a calibration in `scene.toml` does not fit its film or folder of photos.
+
+    This is called before any source is read. Posed sets and bags are checked only when they are read.
+    """
     kind = detect_kind(path) if source.kind == "auto" else source.kind
     if source.camera is None or kind not in ("video", "images"):
-        return  # a bag is read twice, so its size is known before its pictures are read
+        return
     size = first_size(path) if kind == "video" else load_photo(read_image_folder(path).paths[0], None)[0].shape[1::-1]
     if size is not None:
         given_lens(path, source, size)

@@ -303,6 +303,11 @@ def serve() -> None:
 # ---- choice of the vector environment
 
 
+def default_processes(count: int) -> int:
+    """Number of processes on a CPU for `count` environments: one per core, at most 8, with at least two each."""
+    return max(1, min(available_cores(), count // _MIN_ENVS, _MAX_PROCESSES))
+
+
 def make_vector_env(
     scene: str | Path | Twin,
     task: str,
@@ -317,7 +322,7 @@ def make_vector_env(
         task: See `twin.load`.
         options: See `twin.env.options.Options`.
         seeds: Seed of each environment's sequence of episodes; None: unpredictable.
-        processes: Number of processes on a CPU; None: one per core, but at most 8, with at least two environments each.
+        processes: Number of processes on a CPU; None: see `default_processes`.
 
     Raises:
         InputError: as in `EnvFactory.open`; also if `processes` is below 1, or there are no seeds.
@@ -328,7 +333,7 @@ def make_vector_env(
         raise InputError(f"processes = {processes}; expected at least 1")
     if parse_options(options).device == CPU:
         if processes is None:
-            processes = min(available_cores(), len(seeds) // _MIN_ENVS, _MAX_PROCESSES)
+            processes = default_processes(len(seeds))
         if processes > 1:
             return ProcessVectorEnv(scene, task, options, seeds, min(processes, len(seeds)))
         return LocalVectorEnv(EnvFactory.open(scene, task, options), seeds)

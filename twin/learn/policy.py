@@ -323,10 +323,13 @@ def _from_zip(path: Path) -> Policy:
             f"{path}: observes {' and '.join(pictures)}; expected pictures alone, which are all that a robot's policy "
             "gets: train it without the option state, or measure it by evaluate_policy, as examples/ppo.py does"
         )
-    if pictures.dtype != np.uint8 or len(shape) != 3 or shape[0] % 3 or actions not in ((1,), (2,)):
+    whole = pictures.dtype == np.uint8 or (
+        np.issubdtype(pictures.dtype, np.floating) and (pictures.low == 0.0).all() and (pictures.high == 255.0).all()
+    )
+    if not whole or len(shape) != 3 or shape[0] % 3 or actions not in ((1,), (2,)):
         raise InputError(
-            f"{path}: observes {pictures}, acts in {range_}; expected pictures uint8 (3 · stack, height, width), and "
-            "1 or 2 numbers"
+            f"{path}: observes {pictures}, acts in {range_}; expected pictures (3 · stack, height, width), uint8 or "
+            "floats of 0 to 255, and 1 or 2 numbers"
         )
     if (range_.low != -1.0).any() or (range_.high != 1.0).any():
         raise InputError(f"{path}: acts in {range_}; expected -1 to 1, the range of twin's environments")

@@ -35,6 +35,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from twin import runtime
 from twin.config import Condition
 from twin.env.suite import fingerprint
+from twin.env.vector_env import default_processes
 from twin.errors import InputError
 from twin.evaluation.training_curves import CHOICE_FILE
 from twin.evaluation.trials import RECENT_EPISODES, csv_text
@@ -125,8 +126,10 @@ def train(
 
     Args:
         config: Must equal that of an existing run, except for `steps` and `success`.
-        processes: See `make_vector_env`; the number does not change the result.
-        referee: Plans the training; by default, the training is one segment of `config.steps`.
+        processes: See `make_vector_env`, by default for `config.worlds`; the number does not change the result.
+        referee: Plans the training; by default, the training is one segment of `config.steps`. With a referee, there
+            are as many environments again for its tests. On a GPU, each step of the training simulates them, too; what
+            that costs has not been measured.
         writers: Also receive the numbers that are written to `tensorboard/`, `episodes.csv` and `log.csv`.
 
     Raises:
@@ -149,6 +152,8 @@ def train(
     # Tests have environments of their own. Episodes that a test broke off would be missing in the success rate, mostly
     # the long ones, which are the successes.
     spare = range(config.worlds, 2 * config.worlds) if referee else range(0)
+    # Only one half of the environments steps at a time, so the others need no processes of their own.
+    processes = default_processes(config.worlds) if processes is None else processes
     vec_env = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, len(spare), **config.options())
     for i in spare:
         vec_env.vector_env.set(i, "options", dataclasses.replace(vec_env.vector_env.options, start_along=0.0))
