@@ -30,9 +30,7 @@ _MIN_NEAR = 8  # least number of near points of a pair whose unit of length is u
 _SHARED = 4  # least number of near points in common of two pairs
 _WRONG = 4.0  # [standard deviations] an equation with a larger residual is wrong
 _WRONG_FRACTION = 0.5  # a pair with a larger fraction of wrong equations is left out
-_OTHER_FILM_STEPS = (
-    10  # [frames] a pair of frames of two films is as reliable as one of frames so far apart in one film
-)
+_OTHER_FILM_STEPS = 10  # [frames] pairs of two films are as reliable as those of frames so far apart in one film
 
 
 @dataclass(frozen=True)
