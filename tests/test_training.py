@@ -247,6 +247,24 @@ def test_tests_break_off_no_episode_of_the_training(scene, tmp_path):
     assert any(int(row["step"]) // 40 > (int(row["step"]) - 4 * int(row["steps"])) // 40 for row in driven[True])
 
 
+@pytest.mark.parametrize(("given", "expected"), [(None, 2), (1, 1)])
+def test_environments_for_tests_add_no_processes(scene, tmp_path, monkeypatch, given, expected):
+    """Four environments get two processes, as without the four of the tests."""
+    from twin.learn import training
+
+    class Made(Exception):
+        """Ends the training as soon as its environments would be made."""
+
+    def made(built, task, count, seed, processes, spare, **options):
+        assert (count, processes, spare) == (4, expected, 4)
+        raise Made
+
+    monkeypatch.setattr("twin.env.vector_env.available_cores", lambda: 8)
+    monkeypatch.setattr(training, "DriveVecEnv", made)
+    with pytest.raises(Made):
+        training.train(twin.load_scene(scene), tmp_path, SHORT, processes=given, referee=lambda *_: None)
+
+
 def test_episodes_that_start_along_the_route_do_not_count(tmp_path):
     some = [("8", 1, "0.00"), ("16", 0, "7.50"), ("24", 0, "0.00"), ("32", 1, "0.10"), ("40", 1, "0.00")]
     rows = [[step, "1.0", "7", "training", str(won), "goal", "3.0", "8", "1.0", start] for step, won, start in some]
