@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from twin.capture.pair_geometry import PairGeometry, estimate_focal_lengths, pair_geometries, with_rotation
-from twin.capture.pose_averaging import Differences, averaged_poses, consistent_pairs, solve_differences
+from twin.capture.pose_averaging import Differences, _goes_along, averaged_poses, consistent_pairs, solve_differences
 from twin.geometry.poses import umeyama
 from twin.types import Array
 
@@ -217,3 +217,25 @@ def test_differences_are_solved_for_the_largest_part_and_outliers_have_no_effect
 def test_without_pairs_no_frame_has_a_pose() -> None:
     frames, poses = averaged_poses([], ROW, ONE_FILM, 0)
     assert len(frames) == len(poses) == 0 and consistent_pairs([], ROW, ONE_FILM) == []
+
+
+def test_a_pair_whose_direction_contradicts_the_steps_between_is_told() -> None:
+    """A film along x, and one pair of two films, of which nothing is known."""
+    first, second = np.array([0, 1, 2, 3, 0, 0, 2]), np.array([1, 2, 3, 4, 3, 4, 5])
+    directions = np.array([[1.0, 0, 0]] * 4 + [[1.0, 0.1, 0], [0, 1.0, 0], [0, 1.0, 0]])
+    film = np.array([0, 0, 0, 0, 0, 1])
+    assert _goes_along(first, second, directions, film).tolist() == [True] * 5 + [False, True]
+
+
+def test_a_pair_where_the_lens_cannot_be_inverted_is_left_out(film: Film, tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    path.write_bytes(film.database.read_bytes())
+    with pycolmap.Database.open(path) as database:
+        (camera,) = database.read_all_cameras()
+        camera.params = [FOCAL / 8, WIDTH / 2, HEIGHT / 2, -0.5]
+        database.update_camera(camera)
+        corner = np.flatnonzero((np.abs(film.pixels[:2, :, 0] - WIDTH / 2) > 0.3 * WIDTH).all(0))[:20].astype(np.uint32)
+        database.delete_two_view_geometry(1, 2)
+        database.write_two_view_geometry(1, 2, _geometry(np.stack([corner, corner], 1)))
+    assert len(corner) == 20
+    assert (1, 2) not in {(pair.matches.first, pair.matches.second) for pair in pair_geometries(path, 0)}
