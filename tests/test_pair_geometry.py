@@ -1,6 +1,6 @@
 """Relative poses of pairs, focal lengths, and camera poses averaged from them, on a simulated film of a road."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -150,6 +150,21 @@ def test_a_pair_of_a_repeated_pattern_does_not_bend_the_path(tmp_path: Path) -> 
     frames, poses = averaged_poses(pairs, ROW, ONE_FILM, 0)
     assert film.error(frames, poses) < 0.1
     assert (2, 13) not in consistent_pairs(pairs, ROW, ONE_FILM)
+
+
+def test_pairs_whose_rotation_contradicts_the_others_do_not_bend_the_path(
+    film: Film, pairs: list[PairGeometry]
+) -> None:
+    """As where another pose explains the matches of a plane better than the true one: it cannot be mended."""
+    turn = Rotation.from_rotvec([0.0, np.radians(8.0), 0.0]).as_matrix()
+    bent = [
+        replace(pair, rotation=turn @ pair.rotation, translation=turn @ pair.translation, cost=0.0)
+        if pair.matches.second - pair.matches.first == 3
+        else pair
+        for pair in pairs
+    ]
+    frames, poses = averaged_poses(bent, ROW, ONE_FILM, 0)
+    assert frames.tolist() == list(range(FRAMES)) and film.error(frames, poses) < 0.02
 
 
 def test_known_pairs_are_not_computed_again(film: Film, pairs: list[PairGeometry]) -> None:

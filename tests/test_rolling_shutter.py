@@ -125,6 +125,22 @@ def test_a_rolling_shutter_is_found_and_corrected(axis: int) -> None:
     assert rotation_error(model, truth) < 0.5 * before
 
 
+def test_a_frame_that_loses_all_points_has_no_skew() -> None:
+    """Bundle adjustment may filter out the last point of a frame."""
+    model, matcher, _ = film(shaken(0.012), np.zeros((FRAMES, 2)))
+
+    def refine_without_a_frame(model: pycolmap.Reconstruction) -> None:
+        image = model.images[6]
+        for k, point in enumerate(image.points2D):
+            if point.has_point3D():
+                model.delete_observation(6, k)
+        refine(model)
+
+    found, _ = correct_model(model, matcher, refine_without_a_frame)
+    skews = found["film"].skews
+    assert all(np.isfinite(skew).all() for skew in skews.values()) and np.linalg.norm(skews[5]) < 0.006
+
+
 @pytest.mark.parametrize("skew", [0.0, 0.006])
 def test_a_stabilized_film_is_recognized(skew: float) -> None:
     shifts = 6.0 * shaken(1.0, 6)[:, :2]

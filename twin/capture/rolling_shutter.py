@@ -105,8 +105,9 @@ class _Frame:
         pose = self._image.cam_from_world().matrix()
         x = points @ pose[:, :3].T + pose[:, 3]
         rays = self._corrected_rays()[seen]
+        typical = np.median(np.abs(x[:, 2])) if len(x) else 1.0
         # Bundle adjustment may leave a point behind a camera, and not every lens model can be inverted everywhere.
-        used = (x[:, 2] > _MIN_DEPTH * np.median(np.abs(x[:, 2]))) & np.isfinite(rays).all(1) & (rays[:, 2] > 0)
+        used = (x[:, 2] > _MIN_DEPTH * typical) & np.isfinite(rays).all(1) & (rays[:, 2] > 0)
         seen, x, rays = seen[used], x[used], rays[used]
         focal = self._camera.mean_focal_length()
         jacobian = np.zeros((len(x), 2, 3))  # of the projection, by X
