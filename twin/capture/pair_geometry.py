@@ -241,7 +241,7 @@ def _epipolar(
     turned = a @ rotation.T
     sine = (error * np.sqrt(np.maximum(1 - (turned @ translation) ** 2, (_EPIPOLE * error) ** 2)))[:, None]
     # Rows of the Householder reflection that maps the translation to an axis; a decomposition takes six times as long.
-    normal = translation + [np.copysign(1.0, translation[0]), 0.0, 0.0]
+    normal = translation + np.array([np.copysign(1.0, translation[0]), 0.0, 0.0])
     across = (np.eye(3) - 2 / (normal @ normal) * np.outer(normal, normal))[1:]
     normals = _cross(turned, b) / sine
     residual = normals @ translation
@@ -283,7 +283,7 @@ def _minimized(
     return rotation, translation, cost
 
 
-def _turn(vector: Array) -> Array:
+def _turn(vector: NDArray[np.floating]) -> Array:
     """Rotation (3, 3) about a vector (3,) by its length [rad], by Rodrigues; scipy's takes three times as long."""
     x, y, z = vector
     angle = np.sqrt(x * x + y * y + z * z)
