@@ -156,7 +156,7 @@ def test_without_package_or_login_one_line_says_what_to_do(scene, stand_in, monk
     assert "WANDB_MODE=offline" in said
     monkeypatch.setitem(sys.modules, "wandb", None)
     assert trained(scene, "refused", 8, "--wandb", "roads") == 2
-    assert capsys.readouterr().err == "error: --wandb needs more: pip install 'twin[wandb]'\n"
+    assert capsys.readouterr().err == "error: --wandb needs the package wandb: pip install 'twin[wandb]'\n"
 
 
 @pytest.mark.slow
