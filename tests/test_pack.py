@@ -200,7 +200,7 @@ def test_what_is_private_stays_behind(root, packed):
         note = archive.read("README.txt").decode()
     assert b"neighbor" not in text and b"/home/me" not in text and b"input/" not in text
     assert not any(name.startswith(("input", "build/1", "build/2_cameras", "build/6", "runs/left")) for name in names)
-    assert "PRIVACY" in note and "not stated" in note and "No GPS position" in note
+    assert "PRIVACY" in note and "not stated" in note and "It has no GPS positions" in note
 
 
 def test_positions_are_taken_along_when_asked_for(root, tmp_path):

@@ -288,7 +288,7 @@ def _from_callable(name: str) -> Policy:
         outputs = [output_of(stack) for stack in stacks]
         if any(one.shape != example.shape for one in outputs):
             raise InputError(
-                f"policy {name}: returned {short_repr(outputs)}; expected {example.shape[0]} number(s), as for a black picture"
+                f"policy {name}: returned {short_repr(outputs)}; expected {example.shape[0]} number(s), as before"
             )
         return np.stack(outputs)
 
