@@ -200,7 +200,7 @@ def test_what_is_private_stays_behind(root, packed):
         note = archive.read("README.txt").decode()
     assert b"neighbor" not in text and b"/home/me" not in text and b"input/" not in text
     assert not any(name.startswith(("input", "build/1", "build/2_cameras", "build/6", "runs/left")) for name in names)
-    assert "PRIVACY" in note and "not stated" in note and "No GPS position" in note
+    assert "PRIVACY" in note and "not stated" in note and "It has no GPS positions" in note
 
 
 def test_positions_are_taken_along_when_asked_for(root, tmp_path):
@@ -263,7 +263,7 @@ def test_verbs_that_add_results_ask_for_a_folder(packed, capsys):
     trial = ["a.mcap", "--policy", "ahead", "--lighting", "monday"]
     for verb, more in (("validate", ["--policy", "ahead"]), ("train", ["--run", "x"]), ("trial", trial)):
         assert main([verb, str(packed), *more]) == 2
-        assert "unpack it where results may go: twin unpack" in capsys.readouterr().err
+        assert "unpack it to a folder, which can take results: twin unpack" in capsys.readouterr().err
 
 
 def test_verbs_that_need_films_say_what_is_absent(packed, tmp_path, capsys):
@@ -271,9 +271,9 @@ def test_verbs_that_need_films_say_what_is_absent(packed, tmp_path, capsys):
     (tmp_path / "photo.png").write_bytes(b"")
     there = str(tmp_path / "there")
     assert main(["relight", there, str(tmp_path / "photo.png"), "--name", "noon"]) == 2
-    assert "has no 1_capture, nor films" in capsys.readouterr().err
+    assert "has neither 1_capture nor films" in capsys.readouterr().err
     assert main(["export", there, "--colmap", str(tmp_path / "colmap")]) == 2
-    assert "has no 1_capture, nor films" in capsys.readouterr().err
+    assert "has neither 1_capture nor films" in capsys.readouterr().err
     assert main(["build", there]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 

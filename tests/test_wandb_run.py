@@ -154,9 +154,10 @@ def test_without_package_or_login_one_line_says_what_to_do(scene, stand_in, monk
         said.startswith("error: --wandb nobody: No API key configured. Use `wandb login`; ") and said.count("\n") == 1
     )
     assert "WANDB_MODE=offline" in said
-    monkeypatch.setitem(sys.modules, "wandb", None)
-    assert trained(scene, "refused", 8, "--wandb", "roads") == 2
-    assert capsys.readouterr().err == "error: --wandb needs more: pip install 'twin[wandb]'\n"
+    with monkeypatch.context() as patch:  # undone before `stand_in` ends, which removes its module
+        patch.setitem(sys.modules, "wandb", None)
+        assert trained(scene, "refused", 8, "--wandb", "roads") == 2
+    assert capsys.readouterr().err == "error: --wandb needs the package wandb: pip install 'twin[wandb]'\n"
 
 
 @pytest.mark.slow

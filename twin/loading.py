@@ -84,5 +84,5 @@ def load_writable(path: Path) -> Twin:
     """Opens a scene folder to which results will be added. Raises InputError as `load_scene` does, or for a pack."""
     twin = load_scene(path)
     if twin.scene.root != path:
-        raise InputError(f"{path} is a pack; unpack it where results may go: twin unpack {path} FOLDER")
+        raise InputError(f"{path} is a pack; unpack it to a folder, which can take results: twin unpack {path} FOLDER")
     return twin

@@ -259,8 +259,8 @@ def _write(out: Path, files: dict[str, bytes], head: dict[str, Any]) -> dict[str
         licence=head["licence"],
         positions="GPS positions of the frames are in positions.csv."
         if head["positions"]
-        else "No GPS position is, either.",
-        zips=", but a policy in policies/ may when it is loaded" if any(n.endswith(".zip") for n in files) else "",
+        else "It has no GPS positions.",
+        zips=", but loading a policy in policies/ may run its code" if any(n.endswith(".zip") for n in files) else "",
     )
     with (
         atomic_path(out) as partial,

@@ -421,7 +421,7 @@ _OVERLAP = 0.5  # [m] by which the triangles begin below the top of the mesh's b
 def shadow_casters(scene: SceneDir, field: RenderableField) -> ShadowCasters:
     """The surfaces of a scene that cast shadows: its visual mesh and, above and around it, depth of the field.
 
-    Raises InputError if its mesh is not built or damaged."""
+    Raises InputError if its mesh is damaged or was not built."""
     stage = require_stage(scene, "mesh")
     data = load_arrays(stage / "visual.npz")
     vertices, faces = data["vertices"].astype(np.float64), data["faces"].astype(np.int64)

@@ -1,4 +1,4 @@
-"""Constants and parameters of the Clearpath Husky, such as wheel radius and mass; `mjcf/husky.py` builds its model.
+"""Constants and parameters of the Clearpath Husky: wheels, mass, friction, limits; `mjcf/husky.py` builds its model.
 
 *Base* is Clearpath's `base_link`: x forward, y left, z up; its origin lies between the wheels, 0.132 m above flat
 ground. A *side* is the front and rear wheel on the left or right, driven by one motor through gear and belt. The *track

@@ -13,7 +13,7 @@ scenes/<name>/
 
 A stage's *key* is the hash of everything on which its result depends: its config sections, the digests of its input
 files, the *results* (content digests) of its upstream stages, its version and the seed. A stage folder is up to date if
-its stamp has the present key and its files match the stamp. Package versions are recorded, but are not part of the key.
+its stamp has the current key and its files match the stamp. Package versions are recorded, but are not part of the key.
 """
 
 import os
@@ -256,7 +256,7 @@ def _verified_stamp(scene: SceneDir, stage: str) -> Stamp:
     path = folder / "stamp.json"
     if not path.exists() and (scene.root / PACK_JSON).exists():
         raise InputError(
-            f"{scene.root} was unpacked from a pack, which has no {STAGES[stage]}, nor films; ask its sender for those"
+            f"{scene.root} comes from a pack, which has neither {STAGES[stage]} nor films; ask its sender for them"
         )
     if not path.exists():
         raise InputError(f"{scene.root} has no {STAGES[stage]} yet; run twin build {scene.root}")

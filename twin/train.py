@@ -81,7 +81,7 @@ def _train(
         from twin.learn.training import prepare_folder
         from twin.learn.wandb_run import wandb_run
     except ImportError as error:
-        raise InputError(f"training needs more: pip install 'twin[learn]' ({error})") from None
+        raise InputError(f"training needs further packages: pip install 'twin[learn]' ({error})") from None
 
     if choice := earlier_choice(twin, folder, config):
         return choice

@@ -25,7 +25,7 @@ from twin.geometry.route import distance_to_route, every_second
 from twin.types import Array
 
 HEADROOM = 1.5  # [m] height of the corridor above the ground
-_GROUND_CLEARANCE = 0.1  # [m] everything less than this above the height field is ground
+_GROUND_CLEARANCE = 0.1  # [m] what lies below this height above the height field is ground
 _MAX_GROUND_GAP = 0.6  # [m] smaller gaps to the ground are closed, so that nothing hovers
 _EMBEDDING = 0.15  # [m] depth to which parts extend below the ground
 _TILE_SIZE = 3.0  # [m] large obstacles are divided into square columns with this side
@@ -44,7 +44,7 @@ class Corridor:
     """Free space along the route and its branches."""
 
     lines: tuple[Array, ...]
-    """Each of shape (m, 2) [m]."""
+    """Polylines [m], each of shape (m, 2)."""
     reach: float
     """Half width of the corridor plus its margin [m]."""
 
@@ -196,7 +196,7 @@ def _components(key: NDArray[np.int64]) -> NDArray[np.int64]:
         return np.zeros(0, np.int64)
     start, end = [], []
     offsets = np.argwhere(np.ones((3, 3, 3), bool)) - 1
-    for step in _keys(offsets[14:]) - _keys(offsets[13:14]):  # of 13 neighbors; the other 13 have this voxel as theirs
+    for step in _keys(offsets[14:]) - _keys(offsets[13:14]):  # to 13 of 26 neighbors; the others link to this voxel
         at = np.minimum(np.searchsorted(key, key + step), len(key) - 1)
         found = np.flatnonzero(key[at] == key + step)
         start.append(found)

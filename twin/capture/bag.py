@@ -3,7 +3,7 @@
 A bag is the folder of a ROS 2 recording (MCAP or SQLite), one of its .mcap or .db3 files, or a .bag file of ROS 1.
 Messages are deserialized with the standard definitions of their types. The definitions inside the bag are not used,
 because `rosbags` would generate code from them. Messages are streamed; memory holds one chunk of the file.
-Pictures are decoded by `twin_policy.pictures`, as on the robot.
+Pictures are decoded by `ros2/twin_policy/twin_policy/pictures.py`, as on the robot.
 
 Topics are found by message type:
 

@@ -28,7 +28,7 @@ _MIN_VARIANCE_RATIO = 10.0
 """A principal axis of points constrains up only if the variance along it is more than this multiple of the smallest."""
 _MIN_WIDTH = 0.05
 """An axis of the path constrains up only if the path's standard deviation along it is more than this fraction of the
-largest one. A path that is narrower is straight, and undulates as much vertically as sideways."""
+largest one. A narrower path is straight: it deviates as much vertically as sideways."""
 _UNDULATION = 0.003  # lower bound of the path's vertical standard deviation [fraction of the largest one]
 _LAYER = 0.06  # half thickness of the road layer, for undulation, camber and noise [fraction of the drop]
 _MAX_TILT = np.radians(25.0)  # largest angle between the road's normal and the cameras' mean up axis [rad]

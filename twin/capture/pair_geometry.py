@@ -1,9 +1,9 @@
 """Relative poses of pairs of frames, and focal lengths, from verified matches.
 
 COLMAP's relative pose of a pair is often wrong by degrees on a road: the ground is one plane, which two poses explain
-equally well, and repeated patterns are matched one period off. Here all matches of a pair share a pose that minimizes
-their epipolar error under a Cauchy loss. Several starts are tried, since there are many local minima; one of them is
-the rotation on which most matches agree, that of points on the skyline.
+equally well, and repeated patterns are matched one period off. Here, a pair's pose minimizes the epipolar errors of all
+its matches under a Cauchy loss. There are many local minima, so the search has several starts. One is the rotation on
+which most matches agree: that of far points, such as those on the skyline.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from twin.capture.worker import send_message
 from twin.types import Array
 
 _MIN_MATCHES = 15  # least number of matches of a pair
-_PIXEL_ERROR = 0.5  # [px] standard deviation of the epipolar error of a right match
+_PIXEL_ERROR = 0.5  # [px] standard deviation of the epipolar error of a correct match
 _OUTLIER = 4.0  # [standard deviations] matches with a larger epipolar error are wrong
 _MUCH_WORSE = 1.1  # ratio of the costs of two poses of a pair
 _NEAR_ANGLE = 4.0  # [standard deviations of the epipolar error] smallest angle between the rays to a near point
@@ -46,7 +46,7 @@ class PairMatches:
     features: NDArray[np.int64]  # (n, 2) numbers of the matched features
     first_rays: Array  # (n, 3) unit directions in the coordinates of each camera
     second_rays: Array
-    error: Array  # (n,) [rad] standard deviation of the epipolar error of a right match
+    error: Array  # (n,) [rad] standard deviation of the epipolar error of a correct match
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class PairGeometry:
     rotation: Array  # (3, 3)
     translation: Array  # (3,), of length 1
     cost: float  # Cauchy loss of all matches
-    features: NDArray[np.int64]  # (k, 2) those of the points that are near and in front of both cameras
+    features: NDArray[np.int64]  # (k, 2) features of the points that are near and in front of both cameras
     depths: Array  # (k, 2) their distances from both cameras
     depth_error: Array  # (k,) relative standard deviation of the depths
     rotation_error: float  # [rad] standard deviation
@@ -74,7 +74,7 @@ def pair_geometries(
 ) -> list[PairGeometry]:
     """Geometry of all verified pairs of a database, with its cameras' parameters.
 
-    `known` has those of some pairs of images; it gets the others.
+    `known` has the geometry of some pairs of images, which is not computed again; the geometry of the others is added.
     """
     known = {} if known is None else known
     with pycolmap.Database.open(database) as opened:
@@ -135,8 +135,8 @@ def _keypoint_errors(camera: pycolmap.Camera, pixels: NDArray[np.floating], rays
     """[rad] Standard deviations (n,) of the directions of keypoints, by the angular size of their pixels.
 
     Off the center, the pixels of a lens without distortion are smaller. With one size for all, short focal lengths
-    would seem to fit better. The size is that of the longer axis, across the radius: epipolar lines run along it when a
-    camera goes forward.
+    would seem to fit better. The size is that across the radius, which is the larger one: when a camera goes forward,
+    epipolar lines are radial, so their errors are measured across the radius.
     """
     x, y = (camera_rays(camera, pixels + shift) - rays for shift in np.eye(2))
     xx, yy, xy = (x * x).sum(1), (y * y).sum(1), (x * y).sum(1)
@@ -179,8 +179,8 @@ def relative_pose(
         a: Unit rays (n, 3) of the matches in the first camera.
         b: Those in the second camera.
         rotations: Starts (3, 3).
-        error: [rad] Standard deviations (n,) of the epipolar errors of right matches.
-        rng: Draws matches.
+        error: [rad] Standard deviations (n,) of the epipolar errors of correct matches.
+        rng: Random generator for the choice of matches.
     """
     wide: list[tuple[Array, Array, float]] = []
     for start in rotations:
@@ -214,7 +214,7 @@ def _triads(rays: Array) -> Array:
 
 
 def _first_translation(a: Array, b: Array, rotation: Array, error: Array, rng: np.random.Generator) -> Array:
-    """The translation with the smallest epipolar errors, of the forward direction and those of random pairs of matches.
+    """The translation with the smallest epipolar errors: forward, or one that a random pair of matches determines.
 
     The translation lies in the plane of the two rays of each match, so two matches determine it.
     """
@@ -234,8 +234,8 @@ def _epipolar(
 ) -> tuple[Array, Array, Array, Array]:
     """Angles between the second rays and their epipolar planes, and the normal equations of a Gauss–Newton step.
 
-    The unknowns are a small rotation (3,), applied after the rotation, and shifts along two directions across the
-    translation: returns the residuals (n,) in standard deviations, the Hessian (5, 5), the gradient (5,)
+    The unknowns are a small rotation (3,), applied after the rotation, and shifts along two directions perpendicular to
+    the translation: returns the residuals (n,) in standard deviations, the Hessian (5, 5), the gradient (5,)
     and the directions (2, 3).
     """
     turned = a @ rotation.T
@@ -297,7 +297,8 @@ def _turn(vector: NDArray[np.floating]) -> Array:
 def estimate_focal_lengths(database: Path, seed: int) -> None:
     """Fits the focal length and the first distortion parameter of each camera without a prior to pairs of near frames.
 
-    A film's images must have ids in the order of time. A camera keeps its parameters if the matches do not tell them.
+    A film's images must have ids in the order of time. A camera keeps its parameters if its matches do not
+    determine them.
     """
     with pycolmap.Database.open(database) as opened:
         cameras, camera_of = _cameras(opened)
@@ -329,7 +330,7 @@ def _fitted_camera(camera: pycolmap.Camera, pixels: list[tuple[Array, Array]], r
     focals, distortion = list(camera.focal_length_idxs()), list(camera.extra_params_idxs())[:1]
     first, guess = list(camera.params), camera.mean_focal_length()
     grid = max(camera.width, camera.height) * _FOCAL_GRID
-    most = np.log1p(_OUTLIER**2)  # so that wrong matches, whose errors shrink with the focal length, do not matter
+    most = np.log1p(_OUTLIER**2)  # caps the cost of wrong matches, whose errors shrink with the focal length
     poses: list[tuple[Array, Array, float]] = []
 
     def observed(values: Array) -> list[tuple[Array, Array, Array]]:
@@ -346,7 +347,7 @@ def _fitted_camera(camera: pycolmap.Camera, pixels: list[tuple[Array, Array]], r
         return [(a, b, error) for (a, b), error in zip(rays, errors, strict=True)]
 
     def cost(values: Array) -> float:
-        """Cost of the same values, beginning with the poses found before."""
+        """Cost of these values, after a refinement of the poses in `poses`."""
         if not grid[0] <= np.exp(values[0]) * 1.001 <= 1.002 * grid[-1] or (np.abs(values[1:]) > _MAX_DISTORTION).any():
             return np.inf
         total = 0.5 * ((values[0] - np.log(guess)) / _FOCAL_PRIOR) ** 2
@@ -372,7 +373,7 @@ def _fitted_camera(camera: pycolmap.Camera, pixels: list[tuple[Array, Array]], r
     options = {"initial_simplex": simplex, "xatol": 2e-3, "fatol": 0.1, "maxfev": 60}
     best = minimize(cost, start, method="Nelder-Mead", options=options).x
     if not grid[0] * 1.05 < np.exp(best[0]) < grid[-1] / 1.05:
-        send_message(say=f"  the matches do not tell the focal length of a film; {guess:.0f} px is the first guess")
+        send_message(say=f"  the matches do not determine the focal length of a film; {guess:.0f} px are assumed")
         return first
     observed(best)
     return list(camera.params)

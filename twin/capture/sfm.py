@@ -236,7 +236,7 @@ def solve_mapping(job: dict[str, Any], work: Path) -> None:
 
 
 def _arrays(model: pycolmap.Reconstruction, matcher: Matcher) -> dict[str, NDArray]:
-    """Frames, poses, points and observations of a model; `point` and `frame` number the point and frame of each."""
+    """Frames, poses, points and observations of a model; `point` and `frame` are indices."""
     frames, poses = registered_poses(model, matcher)
     frame_of = matcher.frame_of()
     points = list(model.points3D.values())

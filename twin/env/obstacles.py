@@ -291,7 +291,7 @@ def obstacle_pose(obstacle: ObstacleConfig, route: Array, time: float) -> tuple[
     if length < 1e-9:
         return (*_route_point(route, *start), float(heading_at(route, start[0])) + turn)
     passes = (time + obstacle.delay) * obstacle.speed / length
-    back = bool(passes // 1.0 % 2.0)  # a pass back; also before the first pass, if the delay is negative
+    back = bool(passes // 1.0 % 2.0)  # true on the way back; correct for times before 0, too
     share = passes % 1.0
     station, lateral = start + step * (1.0 - share if back else share)
     x, y = _route_point(route, station, lateral)

@@ -75,7 +75,7 @@ class ProcessVectorEnv:
     ) -> None:
         """Arguments as in `make_vector_env`; `processes` is at most the number of environments."""
         self.options, self.processes, count = parse_options(options), processes, len(seeds)
-        # Neighbors are in different processes, so that those of any range of environments have equal work.
+        # Neighbors are in different processes, so that any range of environments is spread over all processes.
         parts = [range(c, count, processes) for c in range(processes)]
         self._location = [(i % processes, i // processes) for i in range(count)]
         self._lock = threading.Lock()
@@ -207,7 +207,7 @@ class _Child:
                 stdout=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(),),
                 process_group=0,  # Ctrl-C reaches only the parent, which can then save its state
-                # It renders on the CPU; seeing no GPU, it takes none of its memory.
+                # The child renders on the CPU. The GPU is hidden, so that the child takes none of its memory.
                 env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": str(share), "CUDA_VISIBLE_DEVICES": ""},
             )
 

@@ -55,7 +55,7 @@ from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
 
 DEPENDENT = "none: policies, and their predictions, depend on each other"
-"""Reason why a fraction of, or a mean over, policies or cells has no interval."""
+"""Reason why a mean over policies or cells, or a fraction of them, has no interval."""
 
 _MAXIMUM = "none for a single place, since the value depends on the best policy alone"
 

@@ -62,7 +62,7 @@ def export(
     Raises:
         InputError: nothing to write, the scene is not built, it is a pack and frames are wanted, the lighting or
             task is unknown, a lighting is given for files that have none, a file has another suffix than its format,
-            an output folder does not exist, or a folder to write is there already.
+            an output folder does not exist, or a folder to write exists already.
     """
     files, folders = [one for one in (usd_file, glb, ply) if one], [one for one in (nerfstudio, colmap) if one]
     task_files = [task_file] if task_file else []

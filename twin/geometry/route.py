@@ -24,7 +24,7 @@ _AS_LONG = 0.98  # lines longer than this fraction of the longest count as equal
 _ASIDE = 0.6  # [m] largest lateral offset between a pass and its continuation; the joined line runs midway
 _BEYOND = 3.0  # [m] least length that a continuation adds
 _AGREE = np.cos(np.deg2rad(40.0))  # least cosine between the headings of joined passes
-_BLEND = 3.0  # [m] length before and after a join over which the joined line shifts from one to the other
+_BLEND = 3.0  # [m] length before and after a join over which the joined line changes from one pass to the other
 _MAX_FOLD = np.cos(np.deg2rad(120.0))  # cosine of the greatest change of heading over `_FOLD_CHORD`
 _FOLD_CHORD = 2.0  # [m] length along the line between the headings that are compared
 _STRETCH = 40  # number of segments of a long route whose distances are computed together
@@ -203,7 +203,7 @@ def every_second(line: Array) -> Array:
 def distance_to_route(route: Array, xy: Array, up_to: float = np.inf) -> Array:
     """Distance [m] of points (..., 2) to a polyline (m, 2) including its end points, shape (...).
 
-    Distances above `up_to` [m] may be larger than they are, up to infinity; a low value saves time on long routes.
+    Distances above `up_to` [m] may be overestimated, up to infinity; a low value saves time on long routes.
     """
     if len(route) < 2:
         return np.linalg.norm(xy - route[0], axis=-1)

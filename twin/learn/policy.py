@@ -6,8 +6,8 @@
 
 A *policy folder* contains three files. `policy.json` describes the control, the network's sizes and the training.
 `policy.safetensors` contains the weights. `policy.onnx` contains all of this in one file, for robots with ONNX Runtime
-but without this package. `load_policy` lists the other formats. Loading a file runs code from it only if the user
-trusts it.
+but without this package: there, `ros2/twin_policy` runs it, and stops the robot when something is wrong. `load_policy`
+lists the other formats. Loading a file runs code from it only if the user trusts it.
 """
 
 import contextlib
@@ -288,7 +288,7 @@ def _from_callable(name: str) -> Policy:
         outputs = [output_of(stack) for stack in stacks]
         if any(one.shape != example.shape for one in outputs):
             raise InputError(
-                f"policy {name}: returned {short_repr(outputs)}; expected {example.shape[0]} number(s), as at first"
+                f"policy {name}: returned {short_repr(outputs)}; expected {example.shape[0]} number(s), as before"
             )
         return np.stack(outputs)
 
@@ -320,8 +320,8 @@ def _from_zip(path: Path) -> Policy:
     shape, actions = pictures.shape, range_.shape
     if shape is None:
         raise InputError(
-            f"{path}: observes {' and '.join(pictures)}; expected pictures alone, which are all that a robot's policy "
-            "gets: train it without the option state, or measure it by evaluate_policy, as examples/ppo.py does"
+            f"{path}: observes {' and '.join(pictures)}; expected pictures alone, since a robot's policy gets nothing "
+            "else: train it without the option state, or measure it by evaluate_policy, as examples/ppo.py does"
         )
     whole = pictures.dtype == np.uint8 or (
         np.issubdtype(pictures.dtype, np.floating) and (pictures.low == 0.0).all() and (pictures.high == 255.0).all()

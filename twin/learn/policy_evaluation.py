@@ -204,7 +204,7 @@ def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[li
     try:
         import ray
     except ImportError:
-        raise InputError("--ray needs more: pip install 'twin[ray]'") from None
+        raise InputError("--ray needs the package ray: pip install 'twin[ray]'") from None
     try:
         if address != "auto":  # checked here, since Ray retries for minutes
             host, _, port = address.rpartition(":")

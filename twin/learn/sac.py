@@ -97,7 +97,7 @@ class PixelSAC(SAC):
 
     averaged_actor: Actor
     """Running mean of the actor and its encoder, which is saved as the policy. The actor itself fluctuates between
-    updates: saved at a bad moment, it would leave the road."""
+    updates: a policy saved at a bad moment would leave the road."""
 
     def __init__(self, *arguments: Any, state_scales: tuple[float, ...] = (), **rest: Any) -> None:
         """`state_scales`: typical magnitude of each component of the privileged state; empty: no state is used.

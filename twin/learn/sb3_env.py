@@ -21,7 +21,7 @@ class DriveVecEnv(VecEnv):
     of the next episode. `lighting` is the name of the lighting in tables; `sampled_lighting` adds the sampled mixture,
     as `lighting` does in the `info` of the Gymnasium environments.
 
-    `vector_env` has more environments behind these, which a step leaves as they are.
+    `vector_env` has `spare` further environments after these; a step does not advance them.
     """
 
     def __init__(

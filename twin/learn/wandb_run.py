@@ -71,7 +71,7 @@ def wandb_run(project: str, folder: Path, config: Mapping[str, Any]) -> Iterator
     try:
         import wandb
     except ImportError:
-        raise InputError("--wandb needs more: pip install 'twin[wandb]'") from None
+        raise InputError("--wandb needs the package wandb: pip install 'twin[wandb]'") from None
     entity, _, name = project.rpartition("/")
     try:
         run = wandb.init(
@@ -97,6 +97,6 @@ def _earlier_id(folder: Path, project: str) -> str | None:
     path = folder / ID_FILE
     if not path.exists() or not has_state(folder / "state"):
         return None
-    with wrap_read_errors(path, "delete it, and a new run of Weights & Biases is made"):
+    with wrap_read_errors(path, "delete it; a new run of Weights & Biases then begins"):
         before = read_json(path)
         return str(before["id"]) if before["project"] == project else None

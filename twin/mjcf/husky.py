@@ -90,7 +90,7 @@ class WrongOption:
 
 
 def check(model: mujoco.MjModel) -> list[WrongOption]:
-    """Lists the options of a model with a Husky that are wrong for skid steering.
+    """Lists the options of a model that are wrong for the skid steering of the Husky in it.
 
     When a robot is attached to a scene, MuJoCo keeps the options of the scene, and the scene's ground can override the
     contact parameters of the tires.

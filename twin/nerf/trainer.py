@@ -1,6 +1,6 @@
 """Stage `field`: trains a radiance field on frames with known poses, bakes it, adds detail, and evaluates it.
 
-Training takes `nerf.steps` steps, however long they last. On a CPU, the same input gives the same field bit for bit.
+Training takes `nerf.steps` steps, without a time limit. On a CPU, the same input gives the same field bit for bit.
 Each step also penalizes density at *free points*: random points near the camera path, where space must be empty.
 """
 
@@ -57,7 +57,7 @@ _MAX_BEND = 0.5  # upper limit of the relative second difference of inverse dept
 _HORIZON_SINE = 0.03  # a ray is neither above nor below the horizon if its sine of elevation is between ± this
 # Weights of the loss terms beside the color error.
 _DISTORTION = 0.005
-_DEPTH, _DEPTH_REACH = 0.25, 0.5  # with 1.0, stereo's errors blur: it costs 0.3 dB, near the camera 0.6 to 0.8 dB
+_DEPTH, _DEPTH_REACH = 0.25, 0.5  # with 1.0, errors of stereo blur the field: −0.3 dB, near the camera −0.6 to −0.8 dB
 _PLANE = 0.01
 _FREE = 1e-3
 _SKY, _GROUND = 1e-2, 1e-2
@@ -464,7 +464,7 @@ def train_field(
         while not trainer.done:
             pending.append(trainer.step())
             report = trainer.steps_done % 20 == 0 or trainer.done
-            # A GPU is asked seldom, but before the field is used to find movers.
+            # Reading a result stops a GPU, so it is done seldom, but always before the field is used to find movers.
             if device == "cpu" or report or trainer.steps_done == trainer.movers_step:
                 for k, shards in enumerate(torch.stack(pending).tolist(), trainer.steps_done - len(pending) + 1):
                     error = sum(shards) / len(shards)

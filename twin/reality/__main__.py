@@ -146,12 +146,12 @@ def _check_lightings(names: list[str], among: Iterable[str]) -> None:
 
 
 def command(options: argparse.Namespace) -> None:
-    """Runs the command in the options parsed by `twin.commands`."""
+    """Runs the command that the options name, as parsed by `twin.commands`."""
     if getattr(options, "length", 0.0):
         if not _LENGTHS[0] <= options.length <= _LENGTHS[1]:
             raise InputError(f"--length {options.length:g}: expected {_LENGTHS[0]:g} to {_LENGTHS[1]:g} m")
         if options.place == 0:
-            raise InputError("--length: the demo's street has its length; give a --place from 1 on")
+            raise InputError("--length: the demo's road cannot be lengthened; give a --place from 1 on")
         check_length(options.place, options.length)
     if options.command == "film":
         plan = TINY if options.tiny else FilmingPlan()

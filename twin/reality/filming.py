@@ -350,7 +350,7 @@ def depth_maps(
     small = replace(plan, width=plan.width // part, height=plan.height // part, samples=1, oversize=1.0)
     frames = np.unique(np.linspace(0, len(poses) - 1, 10).round().astype(np.int64))
     if is_long(place):
-        # A ray per pixel as in the renderer, but onto the whole place, which a renderer would hold in parts.
+        # One ray per pixel, as in the renderer, but at the mesh of the whole place; a renderer may have a part of it.
         whole = primitives.join([one.part for one in place.objects])
         surface = Surface(whole.vertices, whole.faces)
         rays = unproject(pixel_grid(small.width, small.height), small.intrinsics).reshape(-1, 3)

@@ -80,7 +80,7 @@ def add_block(
 
 # ---- houses under pitched roofs
 
-_STOREY = 2.75  # [m] of a floor
+_STOREY = 2.75  # [m] height of a floor
 _EAVES = 0.45  # [m] overhang of a roof
 
 

@@ -132,7 +132,7 @@ TRAINED: dict[str, tuple[float, float]] = {
 
 
 def draw_camera(number: int) -> HiddenCamera:
-    """The camera with a number, always the same. Camera 0 takes the demo's pictures; it lies within `TRAINED`.
+    """The camera with a number, which determines it. Camera 0 takes the demo's pictures; it lies within `TRAINED`.
 
     Raises:
         InputError: a negative number.

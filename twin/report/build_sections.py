@@ -111,7 +111,7 @@ def cameras_section(report: dict[str, Any]) -> Section:
         what = (
             f"The scale may drift along these films, since most attempts tore them apart: {join_names(may_drift, 6)}."
         )
-        cure = "look at the map: is the road as long as it is, and without jumps? Film with more frames per meter."
+        cure = "check on the map that the road has its true length and no jumps. Film with more frames per meter."
         cautions.append(Caution(what, cure))
     if stabilized := cameras.get("stabilized"):
         films = join_names(stabilized, 6)
