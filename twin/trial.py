@@ -40,8 +40,7 @@ from twin.report.drive_dataset import drives_summary
 from twin.report.drive_video import write_trial_video
 from twin.report.review_video import load_ground_and_parts
 from twin.robot import PixelCamera
-from twin.sysid.frame_fit import FIT, FrameFit, scene_frame
-from twin.sysid.trial_recording import TrialRecording, read_trial
+from twin.sysid.trial_recording import FIT, FrameFit, TrialRecording, read_trial, scene_frame
 from twin.types import Array, Image
 from twin_policy import Limits, Pilot, Rectifier
 
@@ -75,7 +74,7 @@ def record_trial(
         twin_lighting: The lighting of the twin that the trial is counted under, by default `lighting`. Pictures are
             compared with it or, if the field has none of that name, with the lighting that matches them best.
         cause: The cause of the recording's end, as stated by the operator.
-        frame: See `twin.sysid.frame_fit.scene_frame`.
+        frame: See `twin.sysid.trial_recording.scene_frame`.
         topics: Topics of the bag; see `read_trial`.
 
     Raises:

@@ -24,8 +24,7 @@ from twin.learn.policy import find_policy, load_policy
 from twin.loading import load_scene
 from twin.report.drive_dataset import DriveDataset, drive_instruction, require_pyarrow
 from twin.scene import require_stage
-from twin.sysid.frame_fit import FIT, scene_frame
-from twin.sysid.trial_recording import TrialRecording, read_trial
+from twin.sysid.trial_recording import FIT, TrialRecording, read_trial, scene_frame
 from twin.types import Array, Image
 from twin_policy import Rectifier
 
@@ -54,7 +53,7 @@ def write_bag_dataset(
         policy_name: The policy that determines the frames' camera and period; None: those of the scene's environments.
         lighting: Name of the day or light in the dataset's table of drives.
         cause: The cause of the recording's end, as stated by the operator; only allowed with a single bag.
-        frame: See `twin.sysid.frame_fit.scene_frame`.
+        frame: See `twin.sysid.trial_recording.scene_frame`.
         topics: Topics of the bags; see `read_trial`.
 
     Raises:
