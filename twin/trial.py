@@ -14,7 +14,7 @@ the recorded pictures. The trial is counted in `real.csv`, and listed with its c
 
     twin trial scenes/my_road monday_1.mcap monday_2.mcap --task straight --lerobot drives
 
-With `--lerobot`, recordings are written as a dataset for learning instead; see `twin/report/bag_dataset.py`.
+With `--lerobot`, recordings are written as a dataset for learning instead; see `twin/report/drive_dataset.py`.
 """
 
 import argparse
@@ -35,8 +35,7 @@ from twin.evaluation.trials import Trial, recorded_trials, write_real_trials
 from twin.files import write_json
 from twin.learn.policy import Policy, find_policy, load_policy
 from twin.loading import load_writable
-from twin.report.bag_dataset import write_bag_dataset
-from twin.report.drive_dataset import drives_summary
+from twin.report.drive_dataset import drives_summary, write_bag_dataset
 from twin.report.drive_video import write_trial_video
 from twin.report.review_video import load_ground_and_parts
 from twin.robot import PixelCamera
