@@ -286,7 +286,7 @@ def test_fields_of_the_scene_that_override_fitted_ones_are_named(tmp_path, monke
     errors = {"friction": 0.01, "spin_friction": 0.01}
     monkeypatch.setattr("twin.align.identify", lambda *_: aligned(ground_errors=errors))
     monkeypatch.setattr("twin.align.check_log", lambda *_: None)
-    monkeypatch.setattr("twin.sysid.plots.write_plots", lambda *_: None)
+    monkeypatch.setattr("twin.align.write_plots", lambda *_: None)
     scene, log = tmp_path / "x", tmp_path / "log.npz"
     scene.mkdir()
     (scene / "scene.toml").write_text(
