@@ -27,7 +27,7 @@ from twin.evaluation.statistics import wilson
 from twin.files import read_text, wrap_read_errors, write_text
 
 EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "progress_m", "steps", "trust")
-"""Columns of `validation/episodes.csv`; `trust` is the trial's mean image reliability (`twin.env.observation`), or empty."""
+"""Columns of `validation/episodes.csv`; `trust` is the trial's mean trust (`twin.env.observation`), or empty."""
 CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "low", "high")
 """Columns of `validation/cells.csv`: counts of episodes, with Wilson's interval."""
 RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")

@@ -1,11 +1,12 @@
-"""Writes drives in the twin, or a robot's ROS bags, as a LeRobot dataset (version 3.0), for imitation learning and offline
-reinforcement learning.
+"""Writes drives as a LeRobot dataset (version 3.0), for imitation learning and offline reinforcement learning.
+
+Drives are episodes in the twin, or a robot's ROS bags of drives by a policy or by hand.
 
 Each drive has one video and one row in `meta/episodes`; one table contains the frames of all drives. A frame has the
 robot's picture, motion and pose; the action that followed; and the reward and outcome of that action. The format is
 described at huggingface.co/docs/lerobot under "LeRobotDataset v3.0".
 
-In a bag of a drive, by a policy or by hand, a frame has the newest picture, as a policy would see it; speed and yaw
+In a bag, a frame has the newest picture, as a policy would see it; speed and yaw
 rate from the poses before it; and the mean of the commands until the next frame. Rewards and outcome follow from the
 poses by the twin's rules.
 """
