@@ -290,8 +290,7 @@ def publish(scene: SceneDir, report: dict[str, Any]) -> None:
 
     Adds `truth` (the comparison with the ground truth, if there is one) and `cautions` to the report.
     """
-    from twin.report.build_report import load_truth_comparison
-    from twin.report.build_sections import cautions
+    from twin.report.build_report import cautions, load_truth_comparison
 
     compared = load_truth_comparison(scene)
     report["truth"] = compared and compared["figures"]
@@ -306,7 +305,7 @@ def publish(scene: SceneDir, report: dict[str, Any]) -> None:
 
 def summary(report: dict[str, Any]) -> str:
     """The text printed at the end of a build: a row per stage, then a line per caution of the report."""
-    from twin.report.build_sections import cautions
+    from twin.report.build_report import cautions
 
     def number(stage: str, key: str, form: str) -> str:
         value = report.get(stage, {}).get(key)
