@@ -290,15 +290,13 @@ def publish(scene: SceneDir, report: dict[str, Any]) -> None:
 
     Adds `truth` (the comparison with the ground truth, if there is one) and `cautions` to the report.
     """
-    from twin.report.build_report import cautions, load_truth_comparison
+    from twin.report.build_report import cautions, load_truth_comparison, write_page
 
     compared = load_truth_comparison(scene)
     report["truth"] = compared and compared["figures"]
     report["cautions"] = cautions(report)
     write_json(scene.report_json, report)
     if "review" in report:
-        from twin.report.build_report import write_page
-
         replace_file(scene.stage("review") / "review.mp4", scene.review_mp4)
         write_page(scene, report)
 
