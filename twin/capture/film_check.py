@@ -23,8 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.capture.hdr import NAMES, hdr_transfer
-from twin.capture.video import FilmTiming, fitted_size, open_film, probe, sharpness, upright
+from twin.capture.decoding import HDR_NAMES, fitted_size, hdr_transfer, open_film, upright
+from twin.capture.video import FilmTiming, probe, sharpness
 from twin.geometry.images import resize
 from twin.types import Array, Image
 
@@ -235,7 +235,7 @@ def check_film(path: Path) -> FilmCheck:
             "film (ffmpeg -vf scale=iw*sar:ih,setsar=1), or give a calibration with fx and fy"
         )
     if transfer := hdr_transfer(first):
-        notes.append(f"HDR ({NAMES[transfer]}): converted to SDR by a fixed curve; turn HDR off for the next film")
+        notes.append(f"HDR ({HDR_NAMES[transfer]}): converted to SDR by a fixed curve; turn HDR off for the next film")
     if first.interlaced_frame:
         notes.append(
             "interlaced: the build deinterlaces the film, at a loss of detail; film in a progressive mode (p, not i)"
