@@ -43,7 +43,8 @@ from twin.robot import WHEEL_RADIUS, HuskyParams
 from twin.scene import SceneDir
 from twin.sysid.identification import Identification, format_error, identify, robot_toml, toml_text
 from twin.sysid.kinematics import Prediction, steady_windows, track_ratios
-from twin.sysid.logs import DURATION, PERIOD, Windows, check_log, cut_windows, read_log
+from twin.sysid.log_files import filmed_poses, read_bag, read_log
+from twin.sysid.logs import DURATION, PERIOD, Windows, check_log, cut_windows
 from twin.types import Array
 
 if TYPE_CHECKING:
@@ -97,7 +98,6 @@ def _windows(target: str, log: Path, topic: str) -> Windows:
     """The time windows of a log. If it is a bag that the scene was built from, reconstructed poses can be used."""
     if not is_bag(log):
         return read_log(log)
-    from twin.sysid.ros_bags import filmed_poses, read_bag
 
     scene = SceneDir(_scene_root(target))
     filmed = filmed_poses(scene, load_config(scene.config_file), log) if scene.config_file.exists() else None
