@@ -45,7 +45,6 @@ from twin.sysid.camera_extrinsics import base_below_camera
 from twin.sysid.logs import ACCELERATION, POSE, TWIST, WHEEL_SPEEDS, Windows, cut_windows, published_windows
 from twin.types import Array
 
-
 # ---- tables
 
 _MAX_BYTES = 512 << 20  # largest log, unpacked
