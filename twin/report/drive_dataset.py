@@ -19,30 +19,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from twin.env.episode import Episode
-from twin.errors import InputError
-from twin.files import write_json
-from twin.report.video_writer import VideoWriter
-from twin.types import Array
-
-if TYPE_CHECKING:
-    import pyarrow
-
 from scipy.spatial.transform import Rotation
 
 from twin import runtime
 from twin.assets.ground import Ground
 from twin.config import TWIST
+from twin.env.episode import Episode
 from twin.env.suite import EnvFactory
+from twin.errors import InputError
 from twin.evaluation.trial_judge import judge
-from twin.files import new_folder, require_absent
+from twin.files import new_folder, require_absent, write_json
 from twin.learn.policy import find_policy, load_policy
 from twin.loading import load_scene
+from twin.report.video_writer import VideoWriter
 from twin.scene import require_stage
-from twin.sysid.trial_recording import FIT, TrialRecording, read_trial, scene_frame
-from twin.types import Image
+from twin.types import Array, Image
 from twin_policy import Rectifier
+
+if TYPE_CHECKING:
+    import pyarrow
+
+    from twin.sysid.trial_recording import TrialRecording
 
 VERSION = "v3.0"
 CAMERA = "observation.images.front"
@@ -322,7 +319,7 @@ def write_bag_dataset(
     policy_name: str | None = None,
     lighting: str = "",
     cause: str | None = None,
-    frame: str = FIT,
+    frame: str = "pictures",
     topics: dict[str, str] | None = None,
 ) -> list[Episode]:
     """Writes recordings of drives as a LeRobot dataset; returns the drives as episodes.
@@ -343,6 +340,8 @@ def write_bag_dataset(
     """
     if cause and len(bags) > 1:
         raise InputError(f"--cause {cause} applies to one bag; there are {len(bags)}")
+    from twin.sysid.trial_recording import read_trial, scene_frame  # loads pycolmap
+
     require_pyarrow()
     require_absent(out)
     scene = load_scene(root)
@@ -400,14 +399,14 @@ def write_bag_dataset(
     return drives
 
 
-def _motion(recording: TrialRecording, stamps: NDArray[np.int64]) -> Array:
+def _motion(recording: "TrialRecording", stamps: NDArray[np.int64]) -> Array:
     """Speed along the heading [m/s] and yaw rate [rad/s] over the last `_SPEED_SPAN`, shape (k, 2)."""
     now, before = (recording.poses_at(one) for one in (stamps, stamps - round(_SPEED_SPAN * 1e9)))
     (x, y, turn), yaw = ((now - before) / _SPEED_SPAN).T, (now[:, 2] + before[:, 2]) / 2.0
     return np.column_stack([x * np.cos(yaw) + y * np.sin(yaw), turn])
 
 
-def _actions(recording: TrialRecording, stamps: NDArray[np.int64], period: float) -> Array:
+def _actions(recording: "TrialRecording", stamps: NDArray[np.int64], period: float) -> Array:
     """Action in the step after each instant, v [m/s] and ω [rad/s], shape (k, 2); the last one is zero.
 
     An action is the mean of the commands in the step. Without commands it is the last earlier command, or zero if that
@@ -424,7 +423,7 @@ def _actions(recording: TrialRecording, stamps: NDArray[np.int64], period: float
     return actions
 
 
-def _pictures_at(recording: TrialRecording, rectify: Rectifier, stamps: NDArray[np.int64]) -> list[Image]:
+def _pictures_at(recording: "TrialRecording", rectify: Rectifier, stamps: NDArray[np.int64]) -> list[Image]:
     """The newest picture (h, w, 3) at each instant. Raises InputError: at an instant there is no recent picture."""
     newest = np.maximum(0, np.searchsorted(recording.shutter, stamps, side="right") - 1)
     ages = np.abs(stamps - recording.shutter[newest]) * 1e-9
