@@ -31,7 +31,8 @@ from twin.robot import REAR_HEAVY, HuskyParams
 from twin.sysid.estimation import fit_with_scales, robust_loss
 from twin.sysid.identification import identify
 from twin.sysid.kinematics import POSE_KINDS, IcrModel, Prediction, integrate, residuals
-from twin.sysid.logs import MAX_POSE_AGE, PERIOD, Windows, read_log, resample_poses
+from twin.sysid.log_files import read_log
+from twin.sysid.logs import MAX_POSE_AGE, PERIOD, Windows, resample_poses
 from twin.sysid.rollout import slope_gravity
 from twin.types import Array
 

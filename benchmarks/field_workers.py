@@ -145,7 +145,8 @@ def memory(scene: str, count: str, steps: str) -> dict[str, Any]:
     from twin.config_file import load_config
     from twin.files import read_json
     from twin.geometry.cameras import Cameras, SparsePoints
-    from twin.nerf.trainer import constant_height, train_field
+    from twin.nerf.dataset import constant_height
+    from twin.nerf.trainer import train_field
     from twin.runtime import set_quiet
     from twin.scene import SceneDir
 

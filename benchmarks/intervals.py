@@ -38,18 +38,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from place_intervals import mean_difference_interval, place_interval
 from record import record_parser, save
 from scipy.special import expit
 from scipy.stats import norm
 
-from twin.evaluation.jackknife import (
-    STATISTICS,
-    PairedCells,
-    jackknife_interval,
-    mean_difference_interval,
-    place_interval,
-)
-from twin.evaluation.rate_model import MIN_RATE_DAYS, MIN_SETUP_TRAININGS, RateModel
+from twin.evaluation.jackknife import STATISTICS, PairedCells, jackknife_interval
+from twin.evaluation.rate_model import MIN_RATE_DAYS, RateModel
 from twin.evaluation.statistics import MIN_PREDICTORS, UndefinedStatistic, leave_one_group_out, rate_over_days
 
 WORLDS = 1000
@@ -57,6 +52,7 @@ _MEAN_OVER = 6000  # worlds from which the mean of a statistic is estimated
 _BATCH = 250  # worlds simulated together
 _RATE_WORLDS = 250  # of `WORLDS`, in which rates are estimated for more than `_USERS_POLICIES` policies
 _USERS_POLICIES = 10
+_MIN_SETUP_TRAININGS = 4  # trainings below which the rate of a training setup has no interval
 _QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)
 
 
@@ -315,7 +311,7 @@ def _setups(worlds: Worlds) -> Hits:
     true = worlds.policy_rates()[:, :, done]
     rows = [worlds.real[:, :, done][:, :, setups == setup] for setup in range(3)]  # (worlds, places, trainings, days)
     count = rows[0].shape[1] * rows[0].shape[2]
-    if not shape.setups or count < MIN_SETUP_TRAININGS:
+    if not shape.setups or count < _MIN_SETUP_TRAININGS:
         return {"setup": rate.mean(1), "setup, these trainings": own.mean(1), "setups' difference": difference.mean(1)}
     for i in range(_counted(worlds)):
         mine = [row[i].reshape(count, shape.days) for row in rows]

@@ -16,7 +16,8 @@ from scipy.optimize import brentq
 from twin.errors import InputError
 from twin.robot import WHEEL_RADIUS, HuskyParams
 from twin.sysid.drivetrain import CONTROL_STEP, EXTRA_SAMPLES
-from twin.sysid.logs import PERIOD, SAMPLES, read_npz
+from twin.sysid.log_files import read_npz
+from twin.sysid.logs import PERIOD, SAMPLES
 from twin.sysid.rollout import COARSE_TIMESTEP, LEAD_SAMPLES, simulate_windows
 from twin.types import Array
 

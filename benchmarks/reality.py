@@ -26,10 +26,10 @@ from twin.loading import load_scene
 from twin.mjcf.world import nearest_on_route
 from twin.reality import campus_road, filming, true_world
 from twin.reality.drawn_place import build
-from twin.reality.lighting import apply_haze
 from twin.reality.place_sampling import draw
 from twin.reality.rasterizer import Rasterizer
 from twin.reality.road_task import true_route
+from twin.reality.sky import apply_haze
 from twin.reality.truth import Truth, align_rigid, matched_poses
 from twin.runtime import track
 

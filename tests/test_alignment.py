@@ -15,7 +15,7 @@ from twin.align import main, summary
 from twin.config_file import parse_table, read_robot
 from twin.env.controller import Controller, limit_command, wheel_speeds
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
-from twin.sysid import drivetrain, kinematics, logs, rollout
+from twin.sysid import drivetrain, kinematics, log_files, logs, rollout
 from twin.sysid.estimation import Fit
 from twin.sysid.identification import Identification, identify, robot_toml
 from twin.sysid.kinematics import IcrModel, Prediction
@@ -286,7 +286,7 @@ def test_fields_of_the_scene_that_override_fitted_ones_are_named(tmp_path, monke
     errors = {"friction": 0.01, "spin_friction": 0.01}
     monkeypatch.setattr("twin.align.identify", lambda *_: aligned(ground_errors=errors))
     monkeypatch.setattr("twin.align.check_log", lambda *_: None)
-    monkeypatch.setattr("twin.sysid.plots.write_plots", lambda *_: None)
+    monkeypatch.setattr("twin.align.write_plots", lambda *_: None)
     scene, log = tmp_path / "x", tmp_path / "log.npz"
     scene.mkdir()
     (scene / "scene.toml").write_text(
@@ -354,7 +354,7 @@ def test_rolling_resistance_from_motor_currents():
 @pytest.mark.realdata
 def test_kinematic_baselines_on_the_real_log(real_data: Path):
     """Others computed these errors from the same log: 0.45 m and 70° nominal, 0.18 m and 7° with a fitted ICR model."""
-    windows = logs.read_log(real_data / "husky_drive" / "husky_drive_dev.npz")
+    windows = log_files.read_log(real_data / "husky_drive" / "husky_drive_dev.npz")
     held_out = ~windows.fitting
     distance, angle = Prediction("nominal", windows, kinematics.predict(kinematics.NOMINAL, windows)).errors
     assert np.median(distance[held_out]) == pytest.approx(0.45, abs=0.02)

@@ -24,11 +24,10 @@ from twin.errors import join_names
 from twin.files import write_json
 from twin.geometry.images import write_image
 from twin.report import build_report as report_page
-from twin.report import build_sections, build_topics
+from twin.report import build_sections, visual_vs_collision
 from twin.report import html as report_html
-from twin.report.build_report import page, write_page
-from twin.report.build_sections import SECTIONS, capture_section, cautions, headline_sections, mjcf_section, sections
-from twin.report.build_topics import truth_section
+from twin.report.build_report import cautions, headline_sections, page, sections, truth_section, write_page
+from twin.report.build_sections import SECTIONS, capture_section, mjcf_section
 from twin.report.html import (
     NOT_MEASURED,
     Caution,
@@ -342,7 +341,7 @@ def test_every_defect_gives_a_caution_with_a_cure_in_section_and_summary(
 
 def test_the_defects_tried_cover_every_kind_of_caution(monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise a caution that the code can give, but the list above lacks, would not be tested."""
-    makers = (build_sections, build_topics, report_html)
+    makers = (build_sections, report_page, report_html)
     given: set[tuple[str, int]] = set()
     limits: set[str] = set()
     exceeded: set[str] = set()
@@ -360,6 +359,7 @@ def test_the_defects_tried_cover_every_kind_of_caution(monkeypatch: pytest.Monke
 
     for maker in makers:
         monkeypatch.setattr(maker, "Caution", recording)
+    for maker in (*makers, visual_vs_collision):
         monkeypatch.setattr(maker, "cautions_above", recording_limits)
     for _, path, value, _ in CAUTIONS:
         sections(changed(path, value))
@@ -377,7 +377,7 @@ def test_the_defects_tried_cover_every_kind_of_caution(monkeypatch: pytest.Monke
         if "Caution(" in path.read_text(encoding="utf-8").replace("class Caution", "")
     }
     # The pages of a validation and of a forecast have their own.
-    assert elsewhere == {"build_sections", "build_topics", "html", "validation_report", "forecast_text"}
+    assert elsewhere == {"build_report", "build_sections", "html", "validation_report", "forecast_text"}
 
 
 @pytest.mark.usefixtures("no_charts")

@@ -16,7 +16,7 @@ from twin import files
 from twin.errors import InputError
 from twin.evaluation.trials import Cell, read_results, read_trials
 from twin.scene import SceneDir, check_name, require_stage, run_folder, write_stamp
-from twin.sysid.logs import read_log
+from twin.sysid.log_files import read_log
 
 _DEEP = 100_000
 

@@ -19,10 +19,10 @@ from twin.nerf.appearance import fit_appearance
 from twin.nerf.bake import bake
 from twin.nerf.baked import BakedField
 from twin.nerf.buffers import CameraArrays, Workspace, single_threaded_torch
-from twin.nerf.dataset import TrainingPixels, load_frame
+from twin.nerf.dataset import TrainingPixels, constant_height, free_segments, load_frame
 from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
-from twin.nerf.trainer import Trainer, constant_height, free_segments, plane_loss, run, train_field
+from twin.nerf.trainer import Trainer, plane_loss, run, train_field
 from twin.runtime import set_quiet
 from twin.scene import SceneDir
 

@@ -5,18 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from intervals import KINDS, Shape, expected, simulate
+from place_intervals import MIN_PLACES, mean_difference_interval, place_interval
 from scipy import stats
 
 from twin.evaluation.jackknife import (
     MIN_DAYS,
-    MIN_PLACES,
     MIN_TRAININGS,
     STATISTICS,
     PairedCells,
     jackknife_interval,
-    mean_difference_interval,
     pair_cells,
-    place_interval,
 )
 from twin.evaluation.statistics import UndefinedStatistic, spearman_batched
 from twin.evaluation.trials import Cell

@@ -10,7 +10,7 @@ from drive_logs import columns, write_csv
 from twin.align import main
 from twin.errors import InputError
 from twin.robot import WHEEL_RADIUS, HuskyParams
-from twin.sysid import kinematics, logs, ros_bags
+from twin.sysid import kinematics, log_files, logs
 
 
 def _bad(table: dict[str, np.ndarray], **changes) -> dict[str, np.ndarray]:
@@ -90,8 +90,8 @@ def test_a_log_with_too_few_turns_is_refused(tmp_path):
 
 def test_csv_and_npz_are_the_same_log(drive, tmp_path):
     np.savez(tmp_path / "log.npz", **drive)
-    one = logs.read_log(write_csv(tmp_path / "log.CSV", drive))
-    other = logs.read_log(tmp_path / "log.npz")
+    one = log_files.read_log(write_csv(tmp_path / "log.CSV", drive))
+    other = log_files.read_log(tmp_path / "log.npz")
     assert np.array_equal(one.poses, other.poses)
     assert np.array_equal(one.wheels, other.wheels)
     assert one.follows[1:].all()
@@ -109,13 +109,13 @@ def test_csv_and_npz_are_the_same_log(drive, tmp_path):
 def test_bad_tables_are_refused(text, message, tmp_path):
     (tmp_path / "log.csv").write_text(text)
     with pytest.raises(InputError, match=message):
-        logs.read_log(tmp_path / "log.csv")
+        log_files.read_log(tmp_path / "log.csv")
 
 
 def test_nothing_in_an_npz_runs_code(tmp_path):
     np.savez(tmp_path / "log.npz", time=np.array([{"a": 1}], object))
     with pytest.raises(InputError, match="without pickled objects"):
-        logs.read_log(tmp_path / "log.npz")
+        log_files.read_log(tmp_path / "log.npz")
 
 
 def test_gaps_are_left_out(drive):
@@ -172,7 +172,7 @@ def test_bag_is_the_same_log(drive, tmp_path):
     from ros_bag import write_bag
 
     rows = {name: column[:900] for name, column in drive.items()}
-    bag = logs.cut_windows(ros_bags.read_bag(write_bag(tmp_path / "bag", rows)), "bag")
+    bag = logs.cut_windows(log_files.read_bag(write_bag(tmp_path / "bag", rows)), "bag")
     table = logs.cut_windows(rows, "log")
     assert len(bag) == len(table)
     for name in ("commands", "wheels", "poses", "acceleration"):
@@ -185,12 +185,12 @@ def test_a_bag_without_commands_is_refused(drive, tmp_path):
 
     bag = write_bag(tmp_path / "bag", {name: column[:50] for name, column in drive.items()}, without=("commands",))
     with pytest.raises(InputError, match=r"no topic with commands .*record it"):
-        ros_bags.read_bag(bag)
+        log_files.read_bag(bag)
 
 
 @pytest.mark.realdata
 def test_published_windows_are_read(real_data: Path):
-    windows = logs.read_log(real_data / "husky_drive" / "husky_drive_dev.npz")
+    windows = log_files.read_log(real_data / "husky_drive" / "husky_drive_dev.npz")
     assert len(windows) == 402
     assert set(windows.groups % 2) == {0, 1}
     logs.check_log(windows, "log")

@@ -11,7 +11,7 @@ from twin.env.domain_randomization import Ranges
 from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.reality import real_camera
-from twin.reality.lighting import WEATHER, apply_haze
+from twin.reality.lighting import WEATHER
 from twin.reality.real_camera import (
     RANGES,
     TRAINED,
@@ -23,6 +23,7 @@ from twin.reality.real_camera import (
     response,
 )
 from twin.reality.real_robot import RealRobot, draw_robot
+from twin.reality.sky import apply_haze
 
 SIZE = (160, 90)
 CLEAR = WEATHER["afternoon"]

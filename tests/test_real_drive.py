@@ -33,7 +33,7 @@ from twin.reality.real_test import RealTest, Setup, task_for
 from twin.reality.recordings import follow
 from twin.reality.road_task import CAMPUS_TASKS, parse_task, place_on_test_day, task_of_place, true_route
 from twin.runtime import exclusive_lock
-from twin.sysid.logs import read_log
+from twin.sysid.log_files import read_log
 
 ROOT = Path(__file__).parents[1]
 NARROW = Architecture(convolutions=((2, 8, 8),), features=2, hidden=(2,))

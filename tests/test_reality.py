@@ -17,7 +17,8 @@ from twin.geometry.poses import Similarity, umeyama
 from twin.reality import campus_road, filming, primitives
 from twin.reality import truth as truth_module
 from twin.reality.campus_road import RoadLine
-from twin.reality.lighting import LIGHTINGS, sky_cube_map
+from twin.reality.lighting import LIGHTINGS
+from twin.reality.sky import sky_cube_map
 from twin.reality.truth import (
     HALF_WIDTH,
     TrueFilm,

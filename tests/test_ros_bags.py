@@ -19,8 +19,8 @@ from twin.geometry.cameras import Cameras
 from twin.robot import HuskyParams
 from twin.scene import write_stamp
 from twin.sysid.camera_extrinsics import camera_pose_on_ground
+from twin.sysid.log_files import FilmedPoses, filmed_poses, read_bag
 from twin.sysid.logs import relative_poses
-from twin.sysid.ros_bags import FilmedPoses, filmed_poses, read_bag
 
 ROWS = 200
 

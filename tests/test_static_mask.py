@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from filmed_wall import film
 
-from twin.capture.film_check import check_film
-from twin.capture.static_mask import static_parts
+from twin.capture.film_check import check_film, static_parts
 from twin.config_file import load_config
 from twin.geometry.images import read_image
 from twin.new import new_scene

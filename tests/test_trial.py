@@ -22,10 +22,9 @@ from twin.errors import InputError
 from twin.evaluation.trials import Cell, Trial, read_results, read_trials
 from twin.learn.policy import Control, load_policy, save_policy
 from twin.learn.policy_network import Architecture
-from twin.report.bag_dataset import write_bag_dataset
+from twin.report.drive_dataset import write_bag_dataset
 from twin.report.video_writer import read_frames
-from twin.sysid.frame_fit import fit_frame
-from twin.sysid.trial_recording import read_trial
+from twin.sysid.trial_recording import fit_frame, read_trial
 
 STEP = 100_000_000  # [ns]
 SMALL = Architecture((64, 36), 2, 1, ((4, 8, 8),), 8, (8,), 1)

@@ -18,12 +18,12 @@ from twin.env import episode_lighting
 from twin.env.domain_randomization import EVALUATION_RANGES, condition_options
 from twin.env.suite import EnvFactory, fingerprint
 from twin.errors import InputError
-from twin.evaluation.trials import Trial, read_trials
+from twin.evaluation.trials import Trial, compare_pairs, read_trials, success_rate, summarize
 from twin.learn import policy_evaluation
 from twin.learn.policy import Control, load_policy, save_policy
 from twin.learn.policy_evaluation import EpisodeChunk, campaign, run_chunk, with_sampled_lighting
 from twin.loading import Twin
-from twin.report.validation_report import compare_pairs, success_rate, summarize, summary_lines
+from twin.report.validation_report import summary_lines
 from twin.robot import HuskyParams
 from twin.runtime import exclusive_lock
 from twin.validate import lighting_seeds

@@ -20,7 +20,17 @@ from twin import film, runtime, validate
 from twin.errors import InputError
 from twin.evaluation.statistics import rate_summary
 from twin.evaluation.training_curves import binned_rates, plot_success_curve, training_summaries
-from twin.evaluation.trials import EPISODE_COLUMNS, RECENT_EPISODES, Trial, csv_text, read_trials
+from twin.evaluation.trials import (
+    EPISODE_COLUMNS,
+    RECENT_EPISODES,
+    Trial,
+    csv_text,
+    read_trials,
+    success_rate,
+    summarize,
+    typical_episode,
+    worst_episode,
+)
 from twin.files import digest_file, write_json
 from twin.report.figures import SERIES
 from twin.report.validation_report import (
@@ -35,12 +45,8 @@ from twin.report.validation_report import (
     rate_figure,
     rate_heatmap,
     rate_text,
-    success_rate,
-    summarize,
-    typical_episode,
     validation_page,
     verdicts,
-    worst_episode,
 )
 
 TRAINED = {"run": "ahead", "task": "ahead", "observe": "nerf", "lighting": "training", "step": 300}

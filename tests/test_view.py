@@ -51,8 +51,7 @@ from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_ti
 from twin.view.driving import KEYS_DRIVER, SCRIPTED_DRIVER, Driving, PlacedObstacles, station_and_lateral
 from twin.view.guarded_server import Gate, HeldKeys, open_server
 from twin.view.layers import _trust_map, clicked_frame, scene_layers
-from twin.view.lighting_panel import slider_lighting
-from twin.view.path_panel import PathPanel
+from twin.view.panels import PathPanel, slider_lighting
 from twin.view.picture_loop import COARSE_AREA, FilmedFrame, PictureLoop, Shot, add_film, film_camera, picture_size
 from twin.view.scene_picture import FreeCamera, ScenePicture
 
@@ -691,7 +690,7 @@ def test_a_path_that_cannot_be_shown_or_saved_is_a_notice(page, field, notices, 
 
 def test_results_of_a_pack_are_written_to_the_working_folder(page, field, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("twin.view.path_panel.is_cached", lambda root: True)
+    monkeypatch.setattr("twin.view.panels.is_cached", lambda root: True)
     panel = PathPanel(page.viewer)
     panel._keys = _views(field, 0.5)
     panel._save()

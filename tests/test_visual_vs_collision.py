@@ -13,11 +13,11 @@ from twin.geometry.poses import look_at
 from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import point_at
 from twin.report.build_report import page
-from twin.report.build_topics import geometry_section
 from twin.report.visual_vs_collision import (
     GeometryViews,
     compare_geometry,
     gap_row,
+    geometry_section,
     render_views,
     view_poses,
 )

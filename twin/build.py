@@ -292,23 +292,20 @@ def publish(scene: SceneDir, report: dict[str, Any]) -> None:
 
     Adds `truth` (the comparison with the ground truth, if there is one) and `cautions` to the report.
     """
-    from twin.report.build_report import load_truth_comparison
-    from twin.report.build_sections import cautions
+    from twin.report.build_report import cautions, load_truth_comparison, write_page
 
     compared = load_truth_comparison(scene)
     report["truth"] = compared and compared["figures"]
     report["cautions"] = cautions(report)
     write_json(scene.report_json, report)
     if "review" in report:
-        from twin.report.build_report import write_page
-
         replace_file(scene.stage("review") / "review.mp4", scene.review_mp4)
         write_page(scene, report)
 
 
 def summary(report: dict[str, Any]) -> str:
     """The text printed at the end of a build: a row per stage, then a line per caution of the report."""
-    from twin.report.build_sections import cautions
+    from twin.report.build_report import cautions
 
     def number(stage: str, key: str, form: str) -> str:
         value = report.get(stage, {}).get(key)

@@ -14,7 +14,7 @@ the recorded pictures. The trial is counted in `real.csv`, and listed with its c
 
     twin trial scenes/my_road monday_1.mcap monday_2.mcap --task straight --lerobot drives
 
-With `--lerobot`, recordings are written as a dataset for learning instead; see `twin/report/bag_dataset.py`.
+With `--lerobot`, recordings are written as a dataset for learning instead; see `twin/report/drive_dataset.py`.
 """
 
 import argparse
@@ -35,13 +35,11 @@ from twin.evaluation.trials import Trial, recorded_trials, write_real_trials
 from twin.files import write_json
 from twin.learn.policy import Policy, find_policy, load_policy
 from twin.loading import load_writable
-from twin.report.bag_dataset import write_bag_dataset
-from twin.report.drive_dataset import drives_summary
+from twin.report.drive_dataset import drives_summary, write_bag_dataset
 from twin.report.drive_video import write_trial_video
 from twin.report.review_video import load_ground_and_parts
 from twin.robot import PixelCamera
-from twin.sysid.frame_fit import FIT, FrameFit, scene_frame
-from twin.sysid.trial_recording import TrialRecording, read_trial
+from twin.sysid.trial_recording import FIT, FrameFit, TrialRecording, read_trial, scene_frame
 from twin.types import Array, Image
 from twin_policy import Limits, Pilot, Rectifier
 
@@ -75,7 +73,7 @@ def record_trial(
         twin_lighting: The lighting of the twin that the trial is counted under, by default `lighting`. Pictures are
             compared with it or, if the field has none of that name, with the lighting that matches them best.
         cause: The cause of the recording's end, as stated by the operator.
-        frame: See `twin.sysid.frame_fit.scene_frame`.
+        frame: See `twin.sysid.trial_recording.scene_frame`.
         topics: Topics of the bag; see `read_trial`.
 
     Raises:

@@ -24,20 +24,23 @@ from twin.env.route_segments import find_task
 from twin.env.suite import fingerprint
 from twin.errors import InputError
 from twin.evaluation.training_curves import read_episodes, training_summaries
-from twin.evaluation.trials import EPISODE_COLUMNS, Trial, cells_csv, csv_text, read_trials, tally
+from twin.evaluation.trials import (
+    EPISODE_COLUMNS,
+    Trial,
+    cells_csv,
+    csv_text,
+    read_trials,
+    summarize,
+    tally,
+    typical_episode,
+    worst_episode,
+)
 from twin.files import digest_file, digest_json, read_json, wrap_read_errors, write_bytes, write_json, write_text
 from twin.learn.policy import JSON, find_policy, load_policy
 from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, campaign, campaign_on_ray
 from twin.loading import Twin, load_writable
 from twin.report.policy_card import write_policy_cards
-from twin.report.validation_report import (
-    failure_map,
-    summarize,
-    summary_lines,
-    typical_episode,
-    worst_episode,
-    write_validation_page,
-)
+from twin.report.validation_report import failure_map, summary_lines, write_validation_page
 from twin.runtime import exclusive_lock
 from twin.scene import SceneDir
 

@@ -32,7 +32,7 @@ _ENVIRONMENT = {key: value for key, value in os.environ.items() if key != "PYTHO
 
 
 def sky_picture(cube: NDArray[np.uint8]) -> Array32:
-    """Converts a cube map (6 n, n, 3), see `lighting.sky_cube_map`, to an equirectangular picture (rows, 2 rows, 3).
+    """Converts a cube map (6 n, n, 3), see `sky.sky_cube_map`, to an equirectangular picture (rows, 2 rows, 3).
 
     Row 0 is the zenith. Column 0 is the direction −x; azimuth, counterclockwise from +x, decreases with the column.
     """

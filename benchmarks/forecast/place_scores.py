@@ -13,6 +13,7 @@ Intervals (90 %) have the place as their unit (`twin.evaluation.jackknife`), so 
 places. Fewer than five places give no intervals.
 """
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import numpy as np
 from place_record import FAILURE, POLICIES, PlaceRecord, read_place
 from protocol import Protocol
 
-from twin.evaluation.jackknife import STATISTICS, PairedCells, Statistic, mean_difference_interval, place_interval
+from twin.evaluation.jackknife import STATISTICS, PairedCells, Statistic
 from twin.evaluation.probability_scores import (
     brier,
     calibration,
@@ -33,6 +34,9 @@ from twin.evaluation.probability_scores import (
 from twin.evaluation.statistics import UndefinedStatistic, rate_over_days, winner
 from twin.files import read_json
 from twin.types import Array
+
+sys.path.append(str(Path(__file__).parents[1]))
+from place_intervals import mean_difference_interval, place_interval
 
 TWIN, HELD_OUT, SETUP = "twin, by a photo of each day", "twin, held-out lightings", "same setup at other places"
 MEAN, SHUFFLED = "mean of other places", "twin, its days shuffled"

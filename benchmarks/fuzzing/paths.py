@@ -68,7 +68,7 @@ def _readers(samples: Samples) -> list[tuple[str, Callable[[Path], Any]]]:
     from twin.mjcf.world import World
     from twin.nerf.baked import BakedField
     from twin.scene import Stamp
-    from twin.sysid.logs import read_log
+    from twin.sysid.log_files import read_log
 
     return [
         ("scene.toml", load_config),

@@ -54,7 +54,7 @@ def training(case: Case) -> None:
 
 
 def log_csv(case: Case) -> None:
-    from twin.sysid.logs import read_log
+    from twin.sysid.log_files import read_log
 
     log = case.samples.log
     rows = zip(*(column[:60] for column in log.values()), strict=True)
@@ -66,7 +66,7 @@ def log_csv(case: Case) -> None:
 
 def log_npz(case: Case) -> None:
     """A log with up to two hostile columns; in some cases, its file is then given a false header or corrupted."""
-    from twin.sysid.logs import read_log
+    from twin.sysid.log_files import read_log
 
     rng, columns = case.rng, dict(case.samples.log)
     path = case.folder / "log.npz"

@@ -113,6 +113,7 @@ _SIGMA_PATH = 0.012  # [m] σ of path data if the camera is rigidly mounted
 _LATERAL_OFFSETS = (-0.6, -0.3, 0.0, 0.3, 0.6)  # [m] positions of data beside the path, where the wheels drove
 _CROSS_SLOPE = 0.02  # [m/m] possible cross slope of a road, which the path does not measure
 _DATA_CELL = 0.25  # [m] side of the squares with one datum each
+_BIAS_REACH = 0.8  # [m] greatest distance of data from the path data with which their heights are compared
 _MAX_DEPTH = 18.0  # [m] deeper pixels are not used: the ground there fills only a few pixel rows
 
 
@@ -224,11 +225,11 @@ def _path_strip(xyz: Array, sigma: float) -> HeightData:
     return HeightData(np.array(points).reshape(-1, 3), np.array(sigmas), np.full(len(points), 2, np.int8))
 
 
-def bias_to_path(data: HeightData, path: HeightData, reach: float = 0.8) -> float:
-    """Median height [m] of data above their nearest path data, at most `reach` [m] away; 0 for under ten pairs."""
+def bias_to_path(data: HeightData, path: HeightData) -> float:
+    """Median height [m] of data above their nearest path data, `_BIAS_REACH` away at most; 0 for under ten pairs."""
     if len(path.xyz) == 0 or len(data.xyz) == 0:
         return 0.0
-    away, nearest = cKDTree(path.xyz[:, :2]).query(data.xyz[:, :2], distance_upper_bound=reach)
+    away, nearest = cKDTree(path.xyz[:, :2]).query(data.xyz[:, :2], distance_upper_bound=_BIAS_REACH)
     paired = np.isfinite(away)
     return float(np.median(data.xyz[paired, 2] - path.xyz[nearest[paired], 2])) if paired.sum() >= 10 else 0.0
 

@@ -1,15 +1,14 @@
-"""Jackknife intervals of statistics over policies. The units left out are places, or trainings and days.
+"""Jackknife intervals of statistics over policies. The units left out are trainings and days.
 
 The *estimand* of an interval is the mean of the statistic over repeated experiments at the same place, each with the
-same numbers of new trainings, days and trials. If there are several places, each repetition also has new places. For a
-mean rate or a bias, this is the value in the population. For a correlation, MMRV (`statistics.mmrv`) or regret, it is
-the average result of such an experiment, including the noise of its few days and trials. An interval says nothing about
-the measured policies on the measured days.
+same numbers of new trainings, days and trials. For a mean rate or a bias, this is the value in the population. For a
+correlation, MMRV (`statistics.mmrv`) or regret, it is the average result of such an experiment, including the noise of
+its few days and trials. An interval says nothing about the measured policies on the measured days.
 
-Units vary independently of each other: a *training* (checkpoints of a run are one unit), a *day* (a lighting of the
-real trials, left out of the twin and the road together), a *place* (with all its policies and days). With one place,
-trainings and days are crossed, so the variance is that of two-way clustering (Cameron, Gelbach and Miller, J. Bus.
-Econ. Stat. 29, 2011); each part is computed by leaving one unit out (Efron and Stein 1981):
+Units vary independently of each other: a *training* (checkpoints of a run are one unit), and a *day* (a lighting of the
+real trials, left out of the twin and the road together). They are crossed, so the variance is that of two-way
+clustering (Cameron, Gelbach and Miller, J. Bus. Econ. Stat. 29, 2011); each part is computed by leaving one unit out
+(Efron and Stein 1981):
 
     V = V_training + V_day − V_both / 2        for the bias, − V_both
 
@@ -37,8 +36,8 @@ from twin.evaluation.statistics import CONFIDENCE, UndefinedStatistic, mmrv_batc
 from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
 
-MIN_TRAININGS, MIN_DAYS, MIN_PLACES = 8, 4, 5
-"""Numbers of trainings, days and places below which a statistic has no interval, except for those below."""
+MIN_TRAININGS, MIN_DAYS = 8, 4
+"""Numbers of trainings and days below which a statistic has no interval, except for those below."""
 MIN_PEARSON_TRAININGS = 12
 """Number of trainings below which Pearson's correlation has no interval, since a single policy may determine it."""
 MIN_BIAS_TRAININGS, MIN_BIAS_DAYS = 5, 3
@@ -201,66 +200,25 @@ def jackknife_interval(statistic: Statistic, data: PairedCells) -> tuple[Array, 
     both = [t | d for t in of_training for d in of_day]
     with np.errstate(invalid="ignore", divide="ignore"):
         each = [[statistic.of(**data.rates(kept)) for kept in units] for units in (of_training, of_day, both)]
-        parts = [_spread(np.stack([statistic.scale(value) for value in values])) for values in each]
+        parts = [jackknife_variance(np.stack([statistic.scale(value) for value in values])) for values in each]
         variance = parts[0] + parts[1] - (1.0 if statistic.linear else _SHARE_OF_BOTH) * parts[2]
         variance = np.where(variance > 0, variance, np.maximum(parts[0], parts[1]))
         freedom = variance**2 / (parts[0] ** 2 / (trainings - 1) + parts[1] ** 2 / (days - 1))
     freedom = np.clip(freedom, (trainings - 1) / 2, trainings + days - 2)
-    return _ends(statistic, statistic.of(**data.rates()), variance, freedom)
+    return interval_ends(statistic, statistic.of(**data.rates()), variance, freedom)
 
 
-def place_interval(
-    statistic: Statistic, places: Sequence[PairedCells], pooled: bool = False
-) -> tuple[Array, Array, Array]:
-    """A statistic over several places, and the ends of its interval with the place as the unit, shapes (...).
-
-    The value is the mean of the statistics of the single places; if `pooled`, it is the statistic of the policies of
-    all places together. Raises UndefinedStatistic as `jackknife_interval` does.
-    """
-    if len(places) < MIN_PLACES:
-        raise UndefinedStatistic(f"too few for an interval: {len(places)} places, {MIN_PLACES} are needed")
-    each = [place.rates() for place in places]
-
-    def of(kept: Sequence[dict[str, Array]]) -> Array:
-        if not pooled:
-            return np.asarray(np.mean([statistic.of(**rates) for rates in kept], 0))
-        return statistic.of(**{key: np.concatenate([rates[key] for rates in kept], -1) for key in ("twin", "real")})
-
-    value = of(each)
-    left_out = np.stack([statistic.scale(of([*each[:i], *each[i + 1 :]])) for i in range(len(each))])
-    low, high = _ends(statistic, value, _spread(left_out), np.asarray(len(places) - 1.0))
-    return value, low, high
-
-
-def mean_difference_interval(
-    differences: Array, limits: tuple[float, float] = (-1.0, 1.0)
-) -> tuple[float, float, float]:
-    """Mean difference of two training setups, and the ends of its interval by Student's t.
-
-    Args:
-        differences: One value per pair of trainings or per place, shape (n,).
-        limits: The interval is clipped to these; by default, those of a difference of rates.
-
-    Raises:
-        UndefinedStatistic: there are fewer than `MIN_PLACES` differences, or all are equal.
-    """
-    n = len(differences)
-    if n < MIN_PLACES:
-        raise UndefinedStatistic(f"too few for an interval: {n} pairs, {MIN_PLACES} are needed")
-    mean, error = float(np.mean(differences)), float(np.std(differences, ddof=1) / np.sqrt(n))
-    if error < 1e-9:
-        raise UndefinedStatistic("no interval: all pairs differ by the same amount")
-    half = float(student.ppf(0.5 + CONFIDENCE / 2, n - 1)) * error
-    return mean, max(mean - half, limits[0]), min(mean + half, limits[1])
-
-
-def _spread(left_out: Array) -> Array:
-    """Jackknife variance, from the m values that leave out one unit each, shape (m, ...)."""
+def jackknife_variance(left_out: Array) -> Array:
+    """Variance of a statistic, shape (...), from the m values that leave out one unit each, shape (m, ...)."""
     m = len(left_out)
     return np.asarray((m - 1) / m * ((left_out - left_out.mean(0)) ** 2).sum(0))
 
 
-def _ends(statistic: Statistic, value: Array, variance: Array, freedom: Array) -> tuple[Array, Array]:
+def interval_ends(statistic: Statistic, value: Array, variance: Array, freedom: Array) -> tuple[Array, Array]:
+    """Ends of a statistic's interval by Student's t, from variance and degrees of freedom on its scale, shapes (...).
+
+    Raises UndefinedStatistic: a single variance is zero or nan. Ends of others are nan.
+    """
     variance = np.where(variance > 1e-18, variance, np.nan)
     if np.ndim(variance) == 0 and np.isnan(variance):
         raise UndefinedStatistic(

@@ -43,8 +43,6 @@ from twin.types import Array
 
 MIN_RATE_DAYS = 2
 """Number of days below which a policy's rate over days has no interval."""
-MIN_SETUP_TRAININGS = 4
-"""Number of trainings below which the rate of a training setup has no interval."""
 
 _EDGES = np.concatenate([[0.0], expit(np.linspace(-7.5, 7.5, 47)), [1.0]])
 """Edges of the grid of rates."""

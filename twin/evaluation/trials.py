@@ -9,6 +9,9 @@ policy, task and lighting. `validation/episodes.csv` has a row for each trial in
 `task` is required only for a policy that was validated on several tasks. `twin_lighting` names the twin's lighting to
 compare with, such as `held-out+randomised` for `dusk_on_monday`; it is required if `lighting` is not the name of one
 of the twin's lightings.
+
+A validation's summary compares two policies on *paired* episodes, which share lighting and seed, by the exact McNemar
+test. It takes two counts: the episodes in which only policy A succeeded, and those in which only policy B succeeded.
 """
 
 import csv
@@ -18,16 +21,19 @@ import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, combinations
 from pathlib import Path
+from typing import Any
+
+from scipy.stats import binomtest
 
 from twin.config import CAUSES
 from twin.errors import InputError
-from twin.evaluation.statistics import wilson
+from twin.evaluation.statistics import rate_summary, wilson
 from twin.files import read_text, wrap_read_errors, write_text
 
 EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "progress_m", "steps", "trust")
-"""Columns of `validation/episodes.csv`; `trust` is the trial's mean image reliability (`twin.env.trust`), or empty."""
+"""Columns of `validation/episodes.csv`; `trust` is the trial's mean trust (`twin.env.observation`), or empty."""
 CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "low", "high")
 """Columns of `validation/cells.csv`: counts of episodes, with Wilson's interval."""
 RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
@@ -60,7 +66,7 @@ class Trial:
     steps: int
     """Control steps."""
     trust: float | None = None
-    """Mean over the pictures (see `twin.env.trust`), in [0, 1]; None without pictures."""
+    """Mean over the pictures (see `twin.env.observation`), in [0, 1]; None without pictures."""
 
     @property
     def success(self) -> bool:
@@ -367,3 +373,60 @@ def _parse_float(where: str, row: dict[str, str], name: str) -> float:
     if not abs(value) < float("inf"):
         raise InputError(f"{where}: {name} = {row[name]!r}; expected a number")
     return value
+
+
+# ---- summary of a validation
+
+TRUSTED = 0.8
+"""An episode is counted separately if the mean trust in its pictures is lower."""
+
+
+def success_rate(trials: Sequence[Trial]) -> dict[str, Any]:
+    return rate_summary(sum(t.success for t in trials), len(trials))
+
+
+def summarize(trials: Sequence[Trial]) -> dict[str, Any]:
+    """Counts successes and causes of failure per policy, task and lighting, and compares policies in pairs."""
+    cells = []
+    for cell in tally(trials):
+        own = [t for t in trials if t.cell == cell.key]
+        trusted = [t for t in own if t.trust is not None and t.trust >= TRUSTED]
+        cells.append(
+            {"policy": cell.policy, "task": cell.task, "lighting": cell.lighting}
+            | success_rate(own)
+            | {"causes": {c: n for c, n in Counter(t.cause for t in own).items() if c != "goal"}}
+            | {"trusted": success_rate(trusted), "low_trust": success_rate([t for t in own if t not in trusted])}
+        )
+    return {"confidence": 0.9, "trusted_from": TRUSTED, "cells": cells, "pairs": compare_pairs(trials)}
+
+
+def compare_pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
+    """Compares every two policies of a task on the episodes that both drove, unless there are none."""
+    by_policy: dict[tuple[str, str], dict[tuple[str, int], bool]] = {}
+    for t in trials:
+        by_policy.setdefault((t.task, t.policy), {})[t.lighting, t.seed] = t.success
+    out = []
+    for (task, a), (other, b) in combinations(by_policy, 2):
+        first, second = by_policy[task, a], by_policy[other, b]
+        both = [(first[key], second[key]) for key in first if key in second]
+        if task != other or not both:
+            continue
+        only_a, only_b = sum(x and not y for x, y in both), sum(y and not x for x, y in both)
+        chance = float(binomtest(only_a, only_a + only_b).pvalue) if only_a + only_b else 1.0
+        out.append(
+            {"task": task, "a": a, "b": b, "episodes": len(both), "only_a": only_a, "only_b": only_b, "p": chance}
+        )
+    return out
+
+
+def typical_episode(trials: Sequence[Trial]) -> Trial:
+    """The episode with the median progress. For an even number of episodes, it is the upper one of the middle two."""
+    return sorted(trials, key=lambda t: t.progress)[len(trials) // 2]
+
+
+def worst_episode(trials: Sequence[Trial]) -> Trial:
+    """The failed episode with the least progress; if none failed, the one with the lowest trust."""
+    failed = [t for t in trials if not t.success]
+    if failed:
+        return min(failed, key=lambda t: t.progress)
+    return min(trials, key=lambda t: 1.0 if t.trust is None else t.trust)

@@ -354,8 +354,8 @@ def center_of_mass(params: HuskyParams) -> Array:
 # ---- quasi-static skid steering, a reference for the model
 
 
-def coulomb_track_ratio(center: Array, curvature_radius: float = 0.0) -> float:
-    """Track ratio chi (effective track / `TRACK`) of four point contacts under Coulomb friction at constant speed.
+def coulomb_track_ratio(center: Array) -> float:
+    """Track ratio chi (effective track / `TRACK`) of four point contacts under Coulomb friction in a steady point turn.
 
     It does not depend on the friction coefficient μ.
 
@@ -364,7 +364,6 @@ def coulomb_track_ratio(center: Array, curvature_radius: float = 0.0) -> float:
 
     Args:
         center: Center of mass in the base [m], shape (≥2,); x and y are used.
-        curvature_radius: Mean wheel speed of both sides / yaw rate of the body [m].
 
     Raises:
         ArithmeticError: no balance was found.
@@ -376,13 +375,13 @@ def coulomb_track_ratio(center: Array, curvature_radius: float = 0.0) -> float:
 
     def residual(unknown: Array) -> Array:
         vx, vy, chi = unknown  # body velocity at the center of mass for unit yaw rate
-        rolling = curvature_radius + np.array([-1.0, 1.0, -1.0, 1.0]) * chi * TRACK / 2
+        rolling = np.array([-1.0, 1.0, -1.0, 1.0]) * chi * TRACK / 2
         slip = np.stack([vx - arm[:, 1] - rolling, vy + arm[:, 0]], 1)
         force = -load[:, None] * slip / np.linalg.norm(slip, axis=1, keepdims=True)
         moment = arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]
         return np.array([force[:, 0].sum(), force[:, 1].sum(), moment.sum()])
 
-    solution = root(residual, np.array([curvature_radius, -center[0] * 0.5, 1.0 + (WHEELBASE / TRACK) ** 2]))
+    solution = root(residual, np.array([0.0, -center[0] * 0.5, 1.0 + (WHEELBASE / TRACK) ** 2]))
     if not solution.success:
         raise ArithmeticError(f"no quasi-static balance for a center of mass at {center}: {solution.message}")
     return float(solution.x[2])

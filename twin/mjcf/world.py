@@ -19,6 +19,7 @@ from twin.types import Array
 SCENE_XML = "scene.xml"
 GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4
 """Geom groups of ground, visual mesh and convex parts (for collision); site group of route, corridor and goal."""
+_CHORD = 1.0  # [m] length of the chord whose direction is the heading of a route
 
 
 @dataclass(frozen=True)
@@ -133,14 +134,14 @@ def point_at(route: Array, s: Array | float) -> Array:
     return np.stack([np.interp(s, knots, route[:, k]) for k in range(route.shape[1])], -1)
 
 
-def heading_at(route: Array, s: Array | float, window: float = 1.0) -> Array:
+def heading_at(route: Array, s: Array | float) -> Array:
     """Heading [rad] at arc lengths s [m], in the shape of s.
 
-    It is the direction of the chord from s - window / 2 to s + window / 2; near an end of the route, it is that of
-    the route's first or last chord of this length.
+    It is the direction of a chord of length `_CHORD` around s; near an end of the route, it is that of the route's
+    first or last chord of this length.
     """
     length = arc_lengths(route)[-1]
-    window = min(window, length)
+    window = min(_CHORD, length)
     middle = np.clip(s, window / 2, length - window / 2)
     chord = point_at(route[:, :2], middle + window / 2) - point_at(route[:, :2], middle - window / 2)
     return np.arctan2(chord[..., 1], chord[..., 0])

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from twin.config import NerfConfig
 from twin.errors import InputError, short_repr
 from twin.nerf.kernels import hashgrid, space, volume
 from twin.runtime import available_cores
@@ -101,8 +102,11 @@ def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
 _NEAR_CELLS = 3_000_000  # cells of the near opacity grid: 12 MB, which fit in a laptop's cache
 _FAR_CELLS = 1_000_000  # cells of the far opacity grid
 _INITIAL_OPTICAL_DEPTH = 1.5  # optical depth of the untrained field along the near box's longest half side
-COARSEST_CELLS = 16
-"""Cells of the coarsest hash level along the longest axis."""
+_COARSEST_CELLS = 16  # cells of the coarsest hash level along the longest axis
+_CELL_PIXELS = 2.0  # projected side of the finest hash cell at the distance of near surfaces [px of a training frame]
+_GROWTH_RANGE = (1.3, 2.2)  # limits of the factor between the cells per axis of consecutive hash levels
+_HIDDEN = 64  # units per hidden layer
+_MIN_NEAR_PLANE = 1e-3  # [m] losses divide by distances along rays, so no sample may be at a camera
 
 
 @dataclass(frozen=True)
@@ -122,6 +126,13 @@ class NearBox:
     def scale(self) -> float:
         """The longest half side [m]."""
         return max(self.half)
+
+    def grid_positions(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Points (n, 3) [m] → grid positions in [0, 1), shape (n, 3); see `kernels/space.py`."""
+        u = (points - np.array(self.center)) / np.array(self.half)
+        m = np.maximum(np.abs(u).max(1, keepdims=True), 1.0)
+        u *= (2.0 - 1.0 / m) / m
+        return (u * 0.25 + 0.5).clip(0.0, 1.0 - 1e-6).astype(np.float32)
 
 
 def near_box_of_cameras(camera_to_world: NDArray[np.float64], near_half_extent: float = 0.0) -> NearBox:
@@ -161,7 +172,7 @@ def level_cells(near_box: NearBox, levels: int, growth: float) -> NDArray[np.flo
     Inside the near box, cells are cubes.
     """
     sides = 4.0 * np.array(near_box.half)
-    per_meter = COARSEST_CELLS * growth ** np.arange(levels) / sides.max()
+    per_meter = _COARSEST_CELLS * growth ** np.arange(levels) / sides.max()
     return np.maximum(per_meter[:, None] * sides, 1.0).astype(np.float32)
 
 
@@ -196,6 +207,32 @@ class Layout:
     def density_unit(self) -> float:
         """Density at raw output 0 [1/contracted m]."""
         return _INITIAL_OPTICAL_DEPTH / self.near_box.scale
+
+
+def near_distance(near_box: NearBox, known: NDArray) -> float:
+    """Distance of near surfaces from the cameras [m]: a low quantile of the known distances (k,), if there are any."""
+    return float(np.quantile(known, 0.05)) if len(known) else 0.25 * near_box.scale
+
+
+def section_layout(camera_to_world: NDArray[np.float64], config: NerfConfig, known: NDArray, focal: float) -> Layout:
+    """The layout of a section that is filmed by cameras (n, 4, 4).
+
+    The finest hash cell is `_CELL_PIXELS` wide at the distance of near surfaces, for a focal length [px of a training
+    frame].
+    """
+    near_box = near_box_of_cameras(camera_to_world, config.near_half_extent)
+    cell = _CELL_PIXELS * near_distance(near_box, known) / focal
+    ratio = 4.0 * near_box.scale / cell / _COARSEST_CELLS
+    return Layout(
+        near_box.center,
+        near_box.half,
+        near_plane=max(config.near_plane, _MIN_NEAR_PLANE),
+        levels=config.levels,
+        growth=float(np.clip(ratio ** (1.0 / max(1, config.levels - 1)), *_GROWTH_RANGE)),
+        log2_table=config.log2_table,
+        hidden=_HIDDEN,
+        appearance_dim=config.appearance_dim,
+    )
 
 
 class Workspace:

@@ -8,6 +8,7 @@ camera height is constant), and stereo.
 import copy
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -278,3 +279,41 @@ def load_frame(
         image = resize(image, w, h)
     size = (int(cameras.sizes[i, 0]), int(cameras.sizes[i, 1]))
     return image, mask, scaled_intrinsics(cameras.intrinsics[i], size, (w, h))
+
+
+# ---- free space and camera height
+
+_HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is not constant
+
+
+def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
+    """Straight segments of the camera path, shape (k, 2, 3) [m]; space closer to them than `near_plane` is empty.
+
+    A segment of 3 times its film's median length or more is a jump between photos, so only its ends count.
+    """
+    pieces = [np.repeat(cameras.positions[:, None], 2, 1)] if near_plane > 0 else []
+    for source in dict.fromkeys(cameras.sources):
+        p = cameras.positions[np.array([s == source for s in cameras.sources])]
+        if len(p) > 2 and near_plane > 0:
+            length = np.linalg.norm(np.diff(p, axis=0), axis=1)
+            keep = length < 3.0 * np.median(length)
+            pieces.append(np.stack([p[:-1], p[1:]], 1)[keep])
+    return np.concatenate(pieces) if pieces else np.zeros((0, 2, 3))
+
+
+def random_free_points(
+    rng: np.random.Generator, segments: NDArray[np.float64], n: int, near_plane: float
+) -> NDArray[np.float64]:
+    """Random points (n, 3) [m], less than `near_plane` [m] from one of the segments (k, 2, 3) [m]."""
+    pick = segments[rng.integers(len(segments), size=n)]
+    offset = rng.normal(size=(n, 3))
+    offset *= near_plane * rng.random((n, 1)) ** (1 / 3) / np.linalg.norm(offset, axis=1)[:, None]
+    return pick[:, 0] + (pick[:, 1] - pick[:, 0]) * rng.random((n, 1)) + offset
+
+
+def constant_height(metric: dict[str, Any]) -> float:
+    """Camera height above the ground [m] if stage `metric` found a reliable, constant one, else 0."""
+    height, spread = metric.get("camera_height_median_m"), metric.get("local_height_spread_m")
+    if not height or not (metric.get("road_reliable") or metric.get("scale_source") == "camera_height"):
+        return 0.0
+    return 0.0 if spread is not None and spread > _HEIGHT_SPREAD * height else float(height)

@@ -24,19 +24,17 @@ from twin.nerf import network
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.bake import bake
 from twin.nerf.buffers import (
-    COARSEST_CELLS,
     CameraArrays,
-    Layout,
-    NearBox,
     Workspace,
-    near_box_of_cameras,
+    near_distance,
     parallel,
     resolve_device,
+    section_layout,
     shard_count,
     single_threaded_torch,
     warp_view,
 )
-from twin.nerf.dataset import TrainingPixels
+from twin.nerf.dataset import TrainingPixels, constant_height, free_segments, random_free_points
 from twin.nerf.detail import fit_detail
 from twin.nerf.evaluate import cross_lighting, evaluate
 from twin.nerf.field import FieldSection, RadianceField, untrained_field
@@ -44,7 +42,7 @@ from twin.nerf.kernels import hashgrid, volume
 from twin.nerf.pose_refinement import PoseRefinement
 from twin.nerf.road import divide_road
 from twin.nerf.stereo import stereo_depths
-from twin.nerf.transients import LeftObject, cell_centers, cell_size, left_objects, mover_masks, object_masks
+from twin.nerf.transients import LeftObject, cell_depths, left_objects, mover_masks, object_masks
 from twin.nerf.transients import picture as excluded_picture
 from twin.runtime import bar
 from twin.scene import SceneDir
@@ -89,10 +87,6 @@ def horizon_loss(opacity: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
 
 # ---- training
 
-_CELL_PIXELS = 2.0  # projected side of the finest hash cell at the distance of near surfaces [px of a training frame]
-_GROWTH_RANGE = (1.3, 2.2)  # limits of the factor between the cells per axis of consecutive hash levels
-_HIDDEN = 64  # units per hidden layer
-_MIN_NEAR_PLANE = 1e-3  # [m] losses divide by distances along rays, so no sample may be at a camera
 _TRIPLE_SHARE = 0.3  # share of the rays that come in triples, for the plane loss
 _FREE_POINTS = 1024  # free points per step
 _NETWORK_RATE = 1e-2  # initial learning rate of networks and embeddings
@@ -136,7 +130,11 @@ class Trainer:
             self._exclude(object_masks(self.pixels, self.left))
         lightings = tuple(dict.fromkeys(train.lightings))
         frame_lighting = np.array([lightings.index(name) for name in train.lightings])
-        layouts = [self._layout(cameras.select(frames)) for frames in self.road.frames(cameras.positions)]
+        known, focal = self.pixels.points.distance, float(np.median(self.pixels.intrinsics[:, 0]))
+        layouts = [
+            section_layout(cameras.camera_to_world[frames], config, known, focal)
+            for frames in self.road.frames(cameras.positions)
+        ]
         self.parts = [self.pixels.of_frames(frames) for frames in self.frames]
         """Pixels of each section."""
         appearance = initial_appearance(lightings, train.names, frame_lighting, config.appearance_dim, seed)
@@ -152,7 +150,7 @@ class Trainer:
         self.refinement: PoseRefinement | None = None
         """Camera corrections; None without `nerf.refine_cameras`."""
         if config.refine_cameras:
-            near = self._near_distance(layouts[0].near_box)
+            near = near_distance(layouts[0].near_box, known)
             self.refinement = PoseRefinement(train.camera_to_world, self.pixels.intrinsics, near, self.ws)
             self.arrays = self.refinement.arrays
         else:
@@ -179,31 +177,6 @@ class Trainer:
         """Number of steps after which movers are searched."""
         self.steps_done = 0
 
-    def _layout(self, cameras: Cameras) -> Layout:
-        """Layout of the section that is filmed by the cameras."""
-        config, near_box = self.config, near_box_of_cameras(cameras.camera_to_world, self.config.near_half_extent)
-        return Layout(
-            near_box.center,
-            near_box.half,
-            near_plane=max(config.near_plane, _MIN_NEAR_PLANE),
-            levels=config.levels,
-            growth=self._growth(near_box),
-            log2_table=config.log2_table,
-            hidden=_HIDDEN,
-            appearance_dim=config.appearance_dim,
-        )
-
-    def _growth(self, near_box: NearBox) -> float:
-        """Factor between the cells per axis of consecutive hash levels: makes the finest cell `_CELL_PIXELS` wide."""
-        cell = _CELL_PIXELS * self._near_distance(near_box) / float(np.median(self.pixels.intrinsics[:, 0]))
-        ratio = 4.0 * near_box.scale / cell / COARSEST_CELLS
-        return float(np.clip(ratio ** (1.0 / max(1, self.config.levels - 1)), *_GROWTH_RANGE))
-
-    def _near_distance(self, near_box: NearBox) -> float:
-        """Distance of near surfaces from the cameras [m]: a low quantile of the known distances, if there are any."""
-        seen = self.pixels.points.distance
-        return float(np.quantile(seen, 0.05)) if len(seen) else 0.25 * near_box.scale
-
     @property
     def done(self) -> bool:
         return self.steps_done >= self.steps
@@ -219,7 +192,7 @@ class Trainer:
         Reading them at once would stop a GPU until the host has prepared the next step.
         """
         if self.config.transients and self.steps_done == self.movers_step:
-            movers = mover_masks(self.pixels, self._cell_depths())
+            movers = mover_masks(self.pixels, cell_depths(self.pixels, self.field, self.arrays))
             self.moving = sum(float(mask.sum()) for mask in movers) / len(self.pixels.colors)
             self._exclude(movers)
         ws, device = self.ws, self.device
@@ -315,17 +288,6 @@ class Trainer:
         before = self.excluded or [np.zeros_like(mask) for mask in masks]
         self.excluded = [one | other for one, other in zip(before, masks, strict=True)]
 
-    def _cell_depths(self) -> list[NDArray[np.float32]]:
-        """The field's z-depths [m] at the centers of every frame's cells (`transients.py`), shapes (rows, columns)."""
-        side = cell_size(self.pixels)
-        sizes = zip(self.pixels.width, self.pixels.height, strict=True)
-        centers = [cell_centers(int(width), int(height), side) for width, height in sizes]
-        counts = [grid.shape[0] * grid.shape[1] for grid in centers]
-        frame = np.repeat(np.arange(len(centers)), counts)
-        depth = self.field.trace(self.arrays, frame, np.concatenate([grid.reshape(-1, 2) for grid in centers]))[2]
-        parts = np.split(depth.cpu().numpy(), np.cumsum(counts)[:-1])
-        return [part.reshape(grid.shape[:2]) for part, grid in zip(parts, centers, strict=True)]
-
     @property
     def _refines(self) -> bool:
         """True if this step refines cameras: not at first, while the field is less accurate than the cameras."""
@@ -409,36 +371,15 @@ class Trainer:
         free = self.free[section]
         if not len(free):
             return None
-        pick = free[self.rng.integers(len(free), size=n)]
-        offset = self.rng.normal(size=(n, 3))
-        offset *= self.config.near_plane * self.rng.random((n, 1)) ** (1 / 3) / np.linalg.norm(offset, axis=1)[:, None]
-        x = pick[:, 0] + (pick[:, 1] - pick[:, 0]) * self.rng.random((n, 1)) + offset
-        layout = self.field.sections[section].layout
-        u = (x - np.array(layout.centre)) / np.array(layout.half)
-        m = np.maximum(np.abs(u).max(1, keepdims=True), 1.0)  # contraction, see `kernels/space.py`
-        u *= (2.0 - 1.0 / m) / m
-        return torch.as_tensor((u * 0.25 + 0.5).clip(0.0, 1.0 - 1e-6).astype(np.float32), device=self.device)
+        points = random_free_points(self.rng, free, n, self.config.near_plane)
+        near_box = self.field.sections[section].layout.near_box
+        return torch.as_tensor(near_box.grid_positions(points), device=self.device)
 
     def finish(self) -> RadianceField:
         """The trained field, detached from autograd."""
         for tensor in self.torch_parameters.values():
             tensor.requires_grad_(False)
         return self.field
-
-
-def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
-    """Straight segments of the camera path, shape (k, 2, 3) [m]; space closer to them than `near_plane` is empty.
-
-    A segment of 3 times its film's median length or more is a jump between photos, so only its ends count.
-    """
-    pieces = [np.repeat(cameras.positions[:, None], 2, 1)] if near_plane > 0 else []
-    for source in dict.fromkeys(cameras.sources):
-        p = cameras.positions[np.array([s == source for s in cameras.sources])]
-        if len(p) > 2 and near_plane > 0:
-            length = np.linalg.norm(np.diff(p, axis=0), axis=1)
-            keep = length < 3.0 * np.median(length)
-            pieces.append(np.stack([p[:-1], p[1:]], 1)[keep])
-    return np.concatenate(pieces) if pieces else np.zeros((0, 2, 3))
 
 
 def train_field(
@@ -507,15 +448,6 @@ def train_field(
 # ---- stage
 
 _TIMING_KEYS = ("seconds", "seconds_train", "rays_per_second")
-_HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is not constant
-
-
-def constant_height(metric: dict[str, Any]) -> float:
-    """Camera height above the ground [m] if stage `metric` found a reliable, constant one, else 0."""
-    height, spread = metric.get("camera_height_median_m"), metric.get("local_height_spread_m")
-    if not height or not (metric.get("road_reliable") or metric.get("scale_source") == "camera_height"):
-        return 0.0
-    return 0.0 if spread is not None and spread > _HEIGHT_SPREAD * height else float(height)
 
 
 def without_timings(metrics: dict[str, Any]) -> dict[str, Any]:

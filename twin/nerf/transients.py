@@ -22,8 +22,9 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from twin.geometry.cameras import pixel_grid, project, unproject
 from twin.geometry.images import resize
-from twin.nerf.buffers import parallel
+from twin.nerf.buffers import CameraArrays, parallel
 from twin.nerf.dataset import TrainingPixels
+from twin.nerf.field import RadianceField
 from twin.types import Array, Array32
 
 _GRID_CELLS = 80  # cells along a frame's longer side
@@ -152,6 +153,17 @@ def _median(stack: Array32, count: NDArray) -> Array32:
     ordered = np.sort(stack, 0)  # nan comes last
     index = np.arange(len(count))
     return 0.5 * (ordered[np.maximum(count - 1, 0) // 2, index] + ordered[count // 2, index])
+
+
+def cell_depths(pixels: TrainingPixels, field: RadianceField, arrays: CameraArrays) -> list[Array32]:
+    """A field's z-depths [m] at the centers of every frame's cells, shapes (rows, columns); `arrays`: the cameras."""
+    side = cell_size(pixels)
+    centers = [cell_centers(int(w), int(h), side) for w, h in zip(pixels.width, pixels.height, strict=True)]
+    counts = [grid.shape[0] * grid.shape[1] for grid in centers]
+    frame = np.repeat(np.arange(len(centers)), counts)
+    depth = field.trace(arrays, frame, np.concatenate([grid.reshape(-1, 2) for grid in centers]))[2]
+    parts = np.split(depth.cpu().numpy(), np.cumsum(counts)[:-1])
+    return [part.reshape(grid.shape[:2]) for part, grid in zip(parts, centers, strict=True)]
 
 
 def mover_masks(pixels: TrainingPixels, depths: list[Array32]) -> list[NDArray[np.bool_]]:

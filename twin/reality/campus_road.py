@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from twin.reality import SEED, primitives, textures
 from twin.reality.houses import add_block
-from twin.reality.lighting import LIGHTINGS, sky_cube_map
+from twin.reality.lighting import LIGHTINGS
 from twin.reality.place_objects import CELLS, DrivenLine, GroundLayout, KnownPlace, PlaceObject, Solid, up
 from twin.reality.plants import add_hedge, add_tree, add_tufts
 from twin.reality.primitives import MeshPart
+from twin.reality.sky import sky_cube_map
 from twin.reality.street_furniture import (
     add_bench,
     add_bin,

@@ -13,14 +13,15 @@ import numpy as np
 
 from twin.reality import SEED
 from twin.reality import street_furniture as furniture
-from twin.reality.drawn_lighting import place_lightings, place_sky
 from twin.reality.drawn_road import STEP, DrawnRoad, add_land, add_road, add_side_roads, land_boxes
 from twin.reality.drawn_textures import DRAWN_CELLS, drawn_textures
 from twin.reality.houses import House, add_house
+from twin.reality.lighting import place_lightings
 from twin.reality.place_objects import Atlas, GroundLayout, KnownPlace
 from twin.reality.place_sampling import draw
 from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, PlaceSpec, Rgb, stream
 from twin.reality.plants import add_bare_tree, add_conifer, add_crowned_tree, add_shrub, add_tufts
+from twin.reality.sky import place_sky
 from twin.reality.street_furniture import BAY, add_boundary, thickness
 from twin.types import Array
 

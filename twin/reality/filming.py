@@ -20,11 +20,12 @@ from scipy.spatial.transform import Rotation
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.reality import SEED, primitives, true_world
-from twin.reality.lighting import Lighting, apply_haze
+from twin.reality.lighting import Lighting
 from twin.reality.place_objects import DrivenLine, KnownPlace, PlaceObject
 from twin.reality.place_spec import PassSpec, PlaceSpec
 from twin.reality.primitives import MeshPart
 from twin.reality.rasterizer import PlaceRenderer
+from twin.reality.sky import apply_haze
 from twin.reality.street_furniture import VEHICLES, add_vehicle, vehicle_size
 from twin.reality.true_world import StretchRenderer, is_long
 from twin.runtime import track

@@ -1,20 +1,19 @@
-"""Lightings of the simulated reality: lights, sky, haze and the camera's exposure under them.
+"""Lightings of the simulated reality: lights, colors of the sky, and the camera's exposure under them.
 
-`LIGHTINGS` are those of films of the campus road; `WEATHER` are those of the real test, which are not filmed. Colors
-are display values, not radiometric ones: the renderer adds lights linearly and clips at 1, and `filming.py` applies
-exposure and a tone curve.
+`LIGHTINGS` are those of films of the campus road; `WEATHER` are those of the real test, which are not filmed. Randomly
+sampled places have lightings of their own. Colors are display values, not radiometric ones: the renderer adds lights
+linearly and clips at 1, and `filming.py` applies exposure and a tone curve.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import cv2
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import InputError, short_repr
 from twin.reality import SEED
-from twin.reality.textures import fbm
+from twin.reality.place_spec import LightSpec, PlaceSpec, Rgb
 
 Color = tuple[float, float, float]
 
@@ -122,97 +121,6 @@ LIGHTINGS: dict[str, Lighting] = {
         ),
     )
 }
-
-
-def _tree_line(seed: int) -> tuple[NDArray, NDArray]:
-    """The skyline of the campus road: a row of trees; see `drawn_lighting.skyline`."""
-    still = np.random.default_rng([seed, 7])
-    ring = fbm(still, (1, 4096), 300, 3.0, 0.75)[0]
-    ring[-200:] += (ring[0] - ring[-1]) * np.linspace(0, 1, 200)  # makes both ends of the ring meet
-    return 0.075 + 0.028 * ring, 1.0 + 0.22 * fbm(still, (512, 4096), 40, 2.0, 0.8)
-
-
-def sky_cube_map(
-    lighting: Lighting, seed: int, width: int = 512, skyline: tuple[NDArray, NDArray] | None = None
-) -> NDArray[np.uint8]:
-    """A cube map for MuJoCo's skybox: six stacked faces, shape (6 · width, width, 3) uint8.
-
-    The clouds differ per lighting; the skyline (see `drawn_lighting.skyline`) is the same under all lightings.
-    """
-    t, s = np.meshgrid(np.arange(width), np.arange(width), indexing="ij")
-    a, b = (2 * (s + 0.5) / width - 1), (2 * (t + 0.5) / width - 1)
-    one = np.ones_like(a)
-    # OpenGL's order of cube faces: +X −X +Y −Y +Z −Z; MuJoCo takes the cube's y axis along the world's z.
-    cube = [(one, -b, -a), (-one, -b, a), (a, one, b), (a, -one, -b), (a, -b, one), (-a, -b, -one)]
-    rays = np.stack([np.stack(face, -1) for face in cube])
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    world = np.stack([rays[..., 0], -rays[..., 2], rays[..., 1]], -1)
-    azimuth, elevation = np.arctan2(world[..., 1], world[..., 0]), np.arcsin(np.clip(world[..., 2], -1, 1))
-    height = np.clip(np.sin(elevation), 0.0, 1.0)[..., None]
-    out = np.asarray(lighting.horizon) + (np.asarray(lighting.zenith) - lighting.horizon) * height**0.55
-    rng = np.random.default_rng([seed, sum(map(ord, lighting.name))])
-    plane = world[..., :2] / np.maximum(world[..., 2:], 0.06)
-    field = fbm(rng, (1024, 1024), 220, 2.0, 0.62)
-    grid = (plane * 55.0 + 512.0).astype(np.float32) % 1024
-    noise = np.stack(
-        [cv2.remap(field, g[..., 0], g[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for g in grid]
-    )
-    threshold = np.quantile(field, 1.0 - lighting.clouds)
-    cover = np.clip((noise - threshold) / 0.9, 0.0, 1.0) * np.clip((elevation - 0.02) / 0.25, 0.0, 1.0)
-    shade = 1.0 - 0.13 * np.clip(noise, -1.0, 2.0)
-    out += (cover * 0.9)[..., None] * (np.asarray(lighting.cloud) * shade[..., None] - out)
-    if lighting.suns and sum(lighting.glow_sun):
-        toward = -np.asarray(lighting.suns[0][0]) / np.linalg.norm(lighting.suns[0][0])
-        close = np.clip((world * toward).sum(-1), 0.0, 1.0)[..., None]
-        out += np.asarray(lighting.glow_sun) * (close**24 + 2.0 * close**600)
-    heights, shade = skyline or _tree_line(seed)
-    column = ((azimuth / (2 * np.pi) + 0.5) * 4095).astype(int)
-    edge = heights[column]
-    row = np.clip((elevation / 0.2 * 511), 0, 511).astype(int)
-    trees = np.asarray(lighting.skyline) * shade[row, column][..., None]
-    out = np.where((elevation < edge)[..., None], trees, out)
-    return (np.clip(out, 0.0, 1.0) * 255 + 0.5).astype(np.uint8).reshape(6 * width, width, 3)
-
-
-_HAZE_HEIGHT = 25.0  # [m] height over which the density of haze falls to 1/e
-_FORWARD_SCATTER = 0.35  # relative excess of the haze's brightness in the direction of the sun
-_SKY = 400.0  # [m] assumed length of the ray through haze for a pixel of the sky
-
-
-def apply_haze(
-    light: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    rays: NDArray,
-    camera_to_world: NDArray[np.float64],
-    lighting: Lighting,
-    ground: float,
-) -> NDArray[np.float32]:
-    """Adds haze to an image. The haze's extinction falls exponentially with height; its airlight grows towards the sun.
-
-    Args:
-        light: Linear RGB, shape (h, w, 3).
-        depth: z-depth [m], 0 = sky, shape (h, w).
-        rays: Rays of the pixels with z = 1 in the camera frame, shape (h, w, 3).
-        camera_to_world: OpenCV axes, shape (4, 4).
-        lighting: Its `visibility` applies at the ground; its `horizon` is the color of the haze.
-        ground: Height of the ground [m].
-    """
-    if np.isinf(lighting.visibility):
-        return light
-    world = rays @ camera_to_world[:3, :3].T
-    per_depth = np.linalg.norm(rays, axis=-1)
-    length = np.where(depth > 0.0, depth * per_depth, _SKY)
-    # The bound of −3 limits the extinction along rays that go below the ground.
-    rise = np.clip(world[..., 2] / per_depth * length / _HAZE_HEIGHT, -3.0, 60.0)
-    start = np.exp(-max(float(camera_to_world[2, 3]) - ground, 0.0) / _HAZE_HEIGHT)
-    level = np.abs(rise) < 1e-4
-    # Mean of exp(−h) over h from 0 to `rise`.
-    mean = np.where(level, 1.0, -np.expm1(-rise) / np.where(level, 1.0, rise))
-    through = np.exp(-length / lighting.visibility * start * mean)[..., None]
-    toward = -np.asarray(lighting.suns[0][0]) / np.linalg.norm(lighting.suns[0][0])
-    facing = np.clip((world * toward).sum(-1) / per_depth, 0.0, 1.0)
-    airlight = np.asarray(lighting.horizon) * (1.0 + _FORWARD_SCATTER * facing[..., None] ** 4)
-    return (through * light + (1.0 - through) * airlight).astype(np.float32)
 
 
 def add_lights(spec: mujoco.MjSpec, lighting: Lighting, lamp_heads: NDArray[np.float64]) -> None:
@@ -466,3 +374,65 @@ def weather_index(name: str) -> int:
 def day_number(name: str) -> str:
     """The number N of `day_N`, as text; empty for the designed weathers."""
     return name.removeprefix("day_") if name.startswith("day_") else ""
+
+
+# ---- lightings of randomly sampled places
+
+
+def place_lightings(spec: PlaceSpec) -> dict[str, Lighting]:
+    """The lightings of a place's films by name."""
+    return {light.name: _lighting(light, spec) for light in spec.lights}
+
+
+def _lighting(light: LightSpec, spec: PlaceSpec) -> Lighting:
+    gain = (1.0 + light.warmth, 1.0, 1.0 - light.warmth)
+    lamps, lit = spec.lamps.color, spec.lamps.kind != "none"
+    if light.name == "night":
+        # Without lamps the moon is brighter and the camera's exposure is longer.
+        base, moon = LIGHTINGS["night"], 1.0 if lit else 1.9
+        return replace(
+            base,
+            ambient=_scaled(base.ambient, moon),
+            suns=((_ray(light), (0.10 * moon, 0.11 * moon, 0.15 * moon), False),),
+            zenith=_scaled(base.zenith, moon),
+            horizon=_scaled(base.horizon, moon),
+            clouds=light.clouds,
+            skyline=(0.02 * moon, 0.02 * moon, 0.03 * moon),
+            lamps=lamps if lit else (0.0, 0.0, 0.0),
+            exposure=1.8 if lit else 2.1,
+            gain=gain,
+        )
+    day = daylight(
+        light.name,
+        light.elevation,
+        np.deg2rad(light.azimuth),
+        light.clouds,
+        0.2,
+        light.haze,
+        0.0,
+        light.warmth,
+        1.0,
+    )
+    if light.name == "dusk":
+        day = replace(
+            day,
+            ambient=_scaled(day.ambient, 0.75),
+            zenith=_scaled(day.zenith, 0.55),
+            horizon=_scaled(day.horizon, 0.85),
+            cloud=_scaled(day.cloud, 0.65),
+            skyline=_scaled(day.skyline, 0.5),
+            lamps=_scaled(lamps, 0.3) if lit else (0.0, 0.0, 0.0),
+            glow=0.75,
+            noise=0.006,
+        )
+    return day
+
+
+def _ray(light: LightSpec) -> Rgb:
+    """Unit vector along the rays of sun or moon."""
+    up, azimuth = np.deg2rad(light.elevation), np.deg2rad(light.azimuth)
+    return float(-np.cos(up) * np.cos(azimuth)), float(-np.cos(up) * np.sin(azimuth)), float(-np.sin(up))
+
+
+def _scaled(color: Rgb, factor: float) -> Rgb:
+    return factor * color[0], factor * color[1], factor * color[2]

@@ -119,7 +119,7 @@ class KnownPlace:
     lightings: Mapping[str, Any]
     """`Lighting`s of the films by name."""
     sky: Callable[[Any], NDArray[np.uint8]]
-    """Returns the cube map of the sky under a lighting; see `lighting.sky_cube_map`."""
+    """Returns the cube map of the sky under a lighting; see `sky.sky_cube_map`."""
     number: int = 0
     seed: tuple[int, ...] = (SEED,)
     """Seed of the objects' details."""

@@ -1,6 +1,6 @@
 """The real test's robot cameras, by number: extrinsics, and all effects between light and picture.
 
-The light comes from `rasterizer.py`. *Haze* depends on the length of a ray and on height (`lighting.py`). *Shutter*:
+The light comes from `rasterizer.py`. *Haze* depends on the length of a ray and on height (`sky.py`). *Shutter*:
 rows are read one after another while the robot moves, and each is exposed for some time. *Lens*: dirt, vignetting, and
 bloom around light beyond the sensor's range. *Exposure*: a second-order automatic exposure, which lags behind the
 brightness of the pictures and overshoots. *White balance*: drifts over seconds. *Sensor*: noise and a response curve.
@@ -19,9 +19,10 @@ from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.reality import SEED
 from twin.reality.filming import FilmingPlan, motion_between, read_rows, smooth_noise
-from twin.reality.lighting import Lighting, apply_haze
+from twin.reality.lighting import Lighting
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_robot import RealRobot
+from twin.reality.sky import apply_haze
 from twin.types import Array, Array32, Image
 
 # ---- one camera's numbers

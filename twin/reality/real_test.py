@@ -1,7 +1,7 @@
 """The real test: a policy file drives a robot on the true road, in weather that was never filmed.
 
 A policy receives images only. The training side supplies only the policy's file and, optionally, a task as JSON. Robot,
-camera, haze and judge are implemented independently of the twin (`real_robot.py`, `real_camera.py`, `lighting.py`,
+camera, haze and judge are implemented independently of the twin (`real_robot.py`, `real_camera.py`, `sky.py`,
 `road_task.py`); the renderer is `rasterizer.py`. The code of the twin loads policy files and defines the format of
 tables. Places, days, robots and cameras have numbers. The results list the values of the robot and the camera that lie
 outside the ranges of training (`outside_training`).

@@ -1,8 +1,8 @@
 """Writes `report.html`: what a build did, how good the result is, and how to improve it.
 
 The page is self-contained except for the review video, a file beside it. Pictures come from the stage folders. Figures
-show data from these folders and from the report. The text comes from `build_sections.py` and
-`build_topics.py`.
+show data from these folders and from the report. `build_sections.py` describes the stages. `sections` is the only
+source of headlines and cautions for the page, `report.json` and the printed summary.
 """
 
 import shlex
@@ -12,21 +12,26 @@ import numpy as np
 
 from twin.assets.ground import Ground
 from twin.env.route_segments import scene_tasks
+from twin.errors import join_names
 from twin.files import read_json, wrap_read_errors, write_text
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.passes import find_passes
 from twin.geometry.route import BRANCH
 from twin.mjcf.world import SCENE_XML, World
 from twin.report import figures
-from twin.report.build_sections import SECTIONS, headline_sections, sections
-from twin.report.build_topics import costs_section
+from twin.report.build_sections import SECTIONS
 from twin.report.html import (
+    Caution,
     Chart,
     Picture,
+    Section,
+    Verdict,
     as_number,
+    cautions_above,
     command,
     data_url,
     duration,
+    facts_of,
     flatten,
     number,
     numbers,
@@ -34,11 +39,95 @@ from twin.report.html import (
     render,
 )
 from twin.report.video_layout import load_footprints
+from twin.report.visual_vs_collision import geometry_section
 from twin.scene import SceneDir, stage_result
+
+# ---- sections
+
+_LARGE_MEMORY = 4.0  # [GiB]
+
+
+def truth_section(report: dict[str, Any]) -> Section:
+    """Errors of the twin compared with ground truth, which only generated places have (`twin reality compare`)."""
+    truth = report["truth"]
+    name, title = "truth", "Comparison with ground truth"
+    kinds = {"ground": "ground", "obstacle": "obstacles of any height", "foliage": "leaves"}
+    shares = {kind: truth.get(f"mesh_completeness_10cm_{kind}") for kind in kinds}
+    complete = [f"{number(share, '{:.0%}')} of {kinds[kind]}" for kind, share in shares.items() if share is not None]
+    rigid = "after a rigid fit, without a change of scale"
+    seen = "of that seen within 10 m of the route"
+    by_kind = join_names(complete) if complete else "completeness of the mesh"
+    facts = facts_of(
+        truth,
+        ("ate_m", "camera positions", "{:.3f} m", "root mean square, after a similarity fit of the paths"),
+        ("ate_max_m", "worst camera", "{:.3f} m", "the frame with the largest error"),
+        ("ate_rigid_m", "camera positions, in the twin’s meters", "{:.3f} m", rigid),
+        ("rotation_median_deg", "camera directions", "{:.2f}°", "median"),
+        ("scale_error", "scale", "{:+.2%}", "the twin’s meter compared with the true one"),
+        ("tilt_deg", "gravity", "{:.2f}°", "between the twin’s vertical and the true one"),
+        ("ground_median_m", "ground height", "{:.3f} m", "median error inside the corridor"),
+        ("ground_p95_m", "the same, 95th percentile", "{:.3f} m", "error inside the corridor"),
+        ("obstacle_accuracy_m", "convex parts to true surface", "{:.3f} m", "median: accuracy of the parts"),
+        ("obstacle_completeness_m", "true surface to convex parts", "{:.3f} m", "median: completeness of the parts"),
+        ("mesh_accuracy_median_m", "visual mesh to true surface", "{:.3f} m", "median: accuracy of the mesh"),
+        ("mesh_accuracy_mean_m", "the same, mean", "{:.3f} m", "errors above 1 m count as 1 m"),
+        ("mesh_completeness_5cm", "true surface within 5 cm of the mesh", "{:.0%}", seen),
+        ("mesh_completeness_10cm", "true surface within 10 cm of the mesh", "{:.0%}", by_kind),
+        ("mesh_chamfer_m", "visual mesh, Chamfer distance", "{:.3f} m", "mean of both directions, each up to 1 m"),
+        ("corridor_intrusions", "parts inside the true corridor", "{}", "the corridor must be free"),
+        ("route_median_m", "route", "{:.3f} m", "median distance to the true center line"),
+        ("depth_median_m", "depth of the field", "{:.3f} m", "median error, up to 20 m"),
+    )
+    wider = "raise nerf.steps, or mjcf.corridor_margin."
+    cautions = cautions_above(
+        truth,
+        ("ate_m", 0.08, "The camera path is {:.3f} m off, more than {:.3f} m.", "give the camera’s calibration."),
+        ("scale_error", 0.02, "The scale is {:.1%} off, more than {:.1%}.", "check the source of the scale."),
+        ("ground_median_m", 0.04, "The ground is {:.3f} m off, more than {:.3f} m.", "check the camera’s height."),
+        ("obstacle_median_m", 0.1, "Convex parts are {:.3f} m off, more than {:.3f} m.", "lower mesh.max_protrusion."),
+        ("corridor_intrusions", 0, "{} convex part(s) reach into the true corridor.", wider),
+    )
+    off, ground = as_number(truth.get("ate_m")), as_number(truth.get("ground_median_m"))
+    verdict = None
+    if off is not None:
+        also = "" if ground is None else f" and the ground by {100 * ground:.1f} cm (median)"
+        verdict = Verdict(f"Compared with ground truth, the cameras are off by {100 * off:.1f} cm (rms){also}.", "good")
+    done = "This place was generated, so its ground truth is known. Only this comparison uses it; the build does not."
+    return Section(name, title, done, facts, cautions, verdict=verdict)
+
+
+def costs_section(report: dict[str, Any]) -> Section:
+    peak, cautions = as_number(pick(report, "peak_memory_bytes")), []
+    if peak is not None and peak / 2**30 > _LARGE_MEMORY:
+        cure = "for a smaller machine lower capture.max_size or nerf.rays, or raise mesh.voxel."
+        cautions.append(Caution(f"The build needed {peak / 2**30:.1f} GiB of memory.", cure))
+    done = "Time and memory per stage, and everything needed to reproduce this build."
+    return Section("costs", "Costs and provenance", done, cautions=cautions)
+
+
+def sections(report: dict[str, Any]) -> list[Section]:
+    truth = [truth_section(report)] if isinstance(pick(report, "truth"), dict) else []
+    return [*(make(report) for make in (*SECTIONS.values(), geometry_section)), *truth, costs_section(report)]
+
+
+def headline_sections(report: dict[str, Any]) -> list[Section]:
+    """The sections with a headline. The review is first, because the twin is made for driving; the others follow."""
+    with_headline = [section for section in sections(report) if section.headline]
+    return sorted(with_headline, key=lambda section: section.name != "review")
+
+
+def cautions(report: dict[str, Any]) -> list[dict[str, str]]:
+    return [
+        {"section": section.name, "title": section.title, "what": caution.what, "cure": caution.cure}
+        for section in sections(report)
+        for caution in section.cautions
+    ]
+
+
+# ---- figures
 
 _MAX_REPROJECTION = 4.0  # [px] right end of the histogram of reprojection errors
 _MAX_TRACK_LENGTH = 30.0  # [frames] right end of the histogram of track lengths
-_EXCLUDED = "Frames of each lighting. Red pixels were not used: they seem to show things that moved or went away."
 
 
 def charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
@@ -163,6 +252,9 @@ def load_truth_comparison(scene: SceneDir) -> dict[str, Any] | None:
         return compared
 
 
+# ---- page
+
+_EXCLUDED = "Frames of each lighting. Red pixels were not used: they seem to show things that moved or went away."
 _STAGE_TITLES = {name: make({}).title for name, make in SECTIONS.items()}
 
 

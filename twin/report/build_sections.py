@@ -1,15 +1,10 @@
-"""Sections of the build report: a description of each stage, its numbers, and cautions with their cures.
-
-`sections` is the only source of headlines and cautions for the page, `report.json` and the printed summary.
-`build_topics.py` makes the sections that describe no stage.
-"""
+"""Sections of the build report on its stages: a description of each, its numbers, and cautions with their cures."""
 
 from collections.abc import Callable
 from typing import Any
 
 from twin.errors import join_names
 from twin.mjcf.scene_xml import CLEARANCE_RANGE
-from twin.report.build_topics import costs_section, geometry_section, truth_section
 from twin.report.html import (
     NOT_MEASURED,
     Caution,
@@ -433,22 +428,3 @@ SECTIONS: dict[str, Callable[[dict[str, Any]], Section]] = {
     "review": review_section,
 }
 """Stage name → function that makes its section, in page order."""
-
-
-def sections(report: dict[str, Any]) -> list[Section]:
-    truth = [truth_section(report)] if isinstance(pick(report, "truth"), dict) else []
-    return [*(make(report) for make in (*SECTIONS.values(), geometry_section)), *truth, costs_section(report)]
-
-
-def headline_sections(report: dict[str, Any]) -> list[Section]:
-    """The sections with a headline. The review is first, because the twin is made for driving; the others follow."""
-    with_headline = [section for section in sections(report) if section.headline]
-    return sorted(with_headline, key=lambda section: section.name != "review")
-
-
-def cautions(report: dict[str, Any]) -> list[dict[str, str]]:
-    return [
-        {"section": section.name, "title": section.title, "what": caution.what, "cure": caution.cure}
-        for section in sections(report)
-        for caution in section.cautions
-    ]

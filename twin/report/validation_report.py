@@ -1,14 +1,10 @@
-"""The summary of a validation, and `validation.html`: how often policies reach the goal, and why they fail.
+"""Writes `validation.html`: how often policies reach the goal, and why they fail.
 
-`results` is the content of `summary.json`: the result of `summarize`, and entries that `twin.validate` adds. Paired
-episodes share lighting and seed. Two policies are compared by the exact McNemar test. It takes two counts: the episodes
-in which only policy A succeeded, and those in which only policy B succeeded. Videos are files beside the page; their
-posters are embedded in the page.
+`results` is the content of `summary.json`: the result of `twin.evaluation.trials.summarize`, and entries that
+`twin.validate` adds. Videos are files beside the page; their posters are embedded in the page.
 """
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -16,14 +12,13 @@ from urllib.parse import quote
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.stats import binomtest
 
 from twin.config import ANY, HELD_OUT, TRAINING, Condition
 from twin.errors import join_names
 from twin.evaluation.agreement import Estimate
-from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS, rate_summary
+from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.evaluation.training_curves import plot_success_curve
-from twin.evaluation.trials import RECENT_EPISODES, Trial, csv_text, tally
+from twin.evaluation.trials import RECENT_EPISODES, Trial, csv_text
 from twin.files import write_text
 from twin.mjcf.world import World, point_at
 from twin.report.figures import (
@@ -51,8 +46,6 @@ MAX_P_VALUE = 0.1
 """A paired difference with a larger p-value is reported as not significant."""
 FEW_EPISODES = 30
 """A cell (one policy on one task in one lighting) with fewer episodes gets a caution that its interval is wide."""
-TRUSTED = 0.8
-"""An episode is counted separately if the mean trust in its pictures is lower."""
 FAILURES = {
     "collision": ("hit something", "touched anything solid except the ground"),
     "out_of_bounds": ("left the corridor", "the robot’s center was farther from the route than the corridor’s edge"),
@@ -69,60 +62,6 @@ LIGHTING_SETS = {
 """Name of a set of lightings → its meaning."""
 
 _GOOD_RATE, _MIXED_RATE = 0.9, 0.5
-
-# ---- summary
-
-
-def success_rate(trials: Sequence[Trial]) -> dict[str, Any]:
-    return rate_summary(sum(t.success for t in trials), len(trials))
-
-
-def summarize(trials: Sequence[Trial]) -> dict[str, Any]:
-    """Counts successes and causes of failure per policy, task and lighting, and compares policies in pairs."""
-    cells = []
-    for cell in tally(trials):
-        own = [t for t in trials if t.cell == cell.key]
-        trusted = [t for t in own if t.trust is not None and t.trust >= TRUSTED]
-        cells.append(
-            {"policy": cell.policy, "task": cell.task, "lighting": cell.lighting}
-            | success_rate(own)
-            | {"causes": {c: n for c, n in Counter(t.cause for t in own).items() if c != "goal"}}
-            | {"trusted": success_rate(trusted), "low_trust": success_rate([t for t in own if t not in trusted])}
-        )
-    return {"confidence": 0.9, "trusted_from": TRUSTED, "cells": cells, "pairs": compare_pairs(trials)}
-
-
-def compare_pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """Compares every two policies of a task on the episodes that both drove, unless there are none."""
-    by_policy: dict[tuple[str, str], dict[tuple[str, int], bool]] = {}
-    for t in trials:
-        by_policy.setdefault((t.task, t.policy), {})[t.lighting, t.seed] = t.success
-    out = []
-    for (task, a), (other, b) in combinations(by_policy, 2):
-        first, second = by_policy[task, a], by_policy[other, b]
-        both = [(first[key], second[key]) for key in first if key in second]
-        if task != other or not both:
-            continue
-        only_a, only_b = sum(x and not y for x, y in both), sum(y and not x for x, y in both)
-        chance = float(binomtest(only_a, only_a + only_b).pvalue) if only_a + only_b else 1.0
-        out.append(
-            {"task": task, "a": a, "b": b, "episodes": len(both), "only_a": only_a, "only_b": only_b, "p": chance}
-        )
-    return out
-
-
-def typical_episode(trials: Sequence[Trial]) -> Trial:
-    """The episode with the median progress. For an even number of episodes, it is the upper one of the middle two."""
-    return sorted(trials, key=lambda t: t.progress)[len(trials) // 2]
-
-
-def worst_episode(trials: Sequence[Trial]) -> Trial:
-    """The failed episode with the least progress; if none failed, the one with the lowest trust."""
-    failed = [t for t in trials if not t.success]
-    if failed:
-        return min(failed, key=lambda t: t.progress)
-    return min(trials, key=lambda t: 1.0 if t.trust is None else t.trust)
-
 
 # ---- words
 

@@ -38,6 +38,7 @@ from twin.geometry.cameras import (
 )
 from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import CAMERA_SIZE, GROUND_GROUP, PART_GROUP, World, arc_lengths, point_at
+from twin.report.html import Section, Verdict, as_number, cautions_above, facts_of, pick
 from twin.report.video_layout import (
     PANEL_BACKGROUND,
     caption_line,
@@ -280,3 +281,62 @@ def gap_row(views: GeometryViews, k: int) -> Image:
         titled_panel(fit(colors, size), "gap", f"within {MAX_DEPTH:g} m", scale),
     ]
     return panel_row(panels)
+
+
+# ---- section of the build report
+
+
+def geometry_section(report: dict[str, Any]) -> Section:
+    """The review stage's comparison of visual with collision geometry (`twin.report.visual_vs_collision`)."""
+    name, title = "seen_touched", "Visual and collision geometry"
+    found = pick(report, name)
+    if not isinstance(found, dict):
+        return Section(name, title, "", not_applicable="no robot was driven, so there are no views to compare")
+    visible = "height of visible geometry above the ground"
+    behind = "distance by which visible geometry lies behind it"
+    nearest = "median distance to the nearest surface"
+    far = f"of points on parts, over {LARGE_ERROR:g} m from visible geometry"
+    twice = "where no film shows the corridor from two directions; not part of the previous number"
+    within = f"median within {MAX_DEPTH:g} m, ground and parts"
+    facts = facts_of(
+        found,
+        ("median_m", "visual to collision geometry, along the ray", "{:.3f} m", within),
+        ("p90_m", "the same, 90th percentile", "{:.3f} m", "large where the ground is seen at a low angle"),
+        ("ground_median_m", "visual to collision ground", "{:.3f} m", "median height difference in the corridor"),
+        ("ground_p95_m", "the same, 95th percentile", "{:.3f} m", "height difference in the corridor"),
+        ("corridor_leak_m", "largest visual-only in the corridor", "{:.3f} m", visible),
+        ("corridor_ghost_m", "largest collision-only in the corridor", "{:.3f} m", behind),
+        ("unfilmed_ghost_m", "largest collision-only, filmed from one direction", "{:.3f} m", twice),
+        ("standing_median_m", "visible obstacles to collision geometry", "{:.3f} m", nearest),
+        ("leak_share", "visual-only", "{:.1%}", f"of obstacle points, over {LARGE_ERROR:g} m from collision geometry"),
+        ("ghost_share", "collision-only", "{:.1%}", far),
+        ("views", "views", "{}", "of the robot’s camera, along its drive"),
+    )
+    beyond = ". The largest difference is {:.3f} m, more than {:g} m."
+    unfilmed = (
+        "No film shows some of the corridor, usually its first meters, from two directions. The field’s depth there is "
+        "not determined, may differ from build to build, and differs from collision geometry" + beyond
+    )
+    leak = "Something in the corridor is visible but has no collision geometry" + beyond
+    ghost = "Collision geometry in the corridor is not visible" + beyond
+    earlier = (
+        "film from a few meters before the start; without a new film, let tasks start further along ([[task]] with "
+        "start = 3.0, for example), which avoids these meters but leaves this caution."
+    )
+    apart = "Visual and collision geometry differ by {:.3f} m in the median, more than {:g} m."
+    cautions = cautions_above(
+        found,
+        ("median_m", 0.05, apart, "raise nerf.steps, or lower mesh.voxel."),
+        ("corridor_leak_m", LARGE_ERROR, leak, "mask what moved while filming."),
+        ("corridor_ghost_m", LARGE_ERROR, ghost, "raise nerf.steps."),
+        ("unfilmed_ghost_m", LARGE_ERROR, unfilmed, earlier),
+    )
+    done = (
+        "A policy sees the radiance field but collides with MuJoCo’s ground and convex parts. Both were rendered from "
+        "the robot’s camera along the drive and compared pixel by pixel."
+    )
+    median = as_number(found.get("median_m"))
+    verdict = None
+    if median is not None:
+        verdict = Verdict(f"Visual and collision geometry differ by {100 * median:.1f} cm in the median.", "good")
+    return Section(name, title, done, facts, cautions, verdict=verdict)

@@ -4,8 +4,9 @@ A *window* contains evenly spaced samples of commands, wheel speeds, poses relat
 accelerations. Windows of one *group* belong to one experiment; even groups are for fitting, odd ones for scoring. A
 window *follows* the previous one if it begins when that one ends. A pose is *fresh* if it differs from the one before.
 
-`twin.sysid.ros_bags` converts a robot's bag to the columns of a table. `read_log` reads
+`twin.sysid.log_files` reads
 
+- bags, which it converts to the columns of a table;
 - a table (.csv, or .npz of equally long columns) with one row per instant: `time` [s]; commands, either `cmd_v` [m/s]
   and `cmd_yaw_rate` [rad/s], or `cmd_left` and `cmd_right` [rad/s at the wheels]; `left_wheel_vel`, `right_wheel_vel`
   [rad/s]; `x`, `y` [m], `yaw` [rad] of the base in any fixed frame; optionally `acceleration_x`, `acceleration_y`
@@ -13,13 +14,9 @@ window *follows* the previous one if it begins when that one ends. A pose is *fr
 - windows as published with DRIVE (Samson et al., BSD-3): an .npz of arrays (n, 40) at 20 Hz.
 """
 
-import csv
-import io
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +25,6 @@ from scipy.stats import theilslopes
 
 from twin import runtime
 from twin.errors import InputError
-from twin.files import exists, load_arrays, read_text, wrap_read_errors
 from twin.robot import TRACK, WHEEL_RADIUS
 from twin.types import Array
 
@@ -53,7 +49,6 @@ _UNSTEADY = 0.1  # if a larger fraction of windows contradicts the period, the s
 _DROPOUT = 30  # [samples] windows without a fresh pose for longer are left out if the wheels turn
 _TURNING = 0.5  # [rad/s] mean of both sides' wheel speeds above which the wheels count as turning
 _STANDING = 0.05  # [rad/s], [m/s]; windows in which wheels and commands never reach it are left out
-_MAX_BYTES = 512 << 20  # largest log, unpacked
 _TICK = 1e-6  # [s] instants closer than this are the same
 _GROUP_WINDOWS = 3  # windows per group in a table without groups: six seconds
 _CONTINUES = 1.0  # [rad/s] largest change of wheel speeds between consecutive windows, summed over both sides
@@ -198,47 +193,6 @@ class Windows:
         return self.measurement_times - self.measurement_times[:, :1]
 
 
-def read_log(path: Path) -> Windows:
-    """Reads a table or windows. Raises InputError: an unreadable file, missing columns, impossible times or values."""
-    if not exists(path):
-        raise InputError(f"{path}: no such log; expected a .csv, an .npz or a bag")
-    if path.suffix.lower() == ".csv":
-        return cut_windows(_read_csv(path), str(path))
-    if path.suffix.lower() == ".npz":
-        columns = read_npz(path)
-        if columns.get("icp_x", np.zeros(0)).ndim == 2:
-            return _published_windows(columns, str(path))
-        return cut_windows(columns, str(path))
-    raise InputError(f"{path}: expected a log in .csv, .npz or a bag; convert it to one of these")
-
-
-def _read_csv(path: Path) -> dict[str, Array]:
-    text = read_text(path, _MAX_BYTES)
-    try:
-        head, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row] or [[]]
-        values = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
-    except (ValueError, csv.Error) as error:
-        raise InputError(f"{path}: not a table of numbers under one line of names: {error}; export it anew") from None
-    if not rows:
-        raise InputError(f"{path}: no row of numbers; expected one per instant, under a line of names; export it anew")
-    if values.ndim != 2 or values.shape[1] != len(head):
-        raise InputError(f"{path}: {len(head)} names in the first line, but rows of another length; export it anew")
-    names = [name.strip() for name in head]
-    twice = [name for name, count in Counter(names).items() if name and count > 1]
-    if twice:
-        raise InputError(
-            f"{path}: column {twice[0]} appears {names.count(twice[0])} times; expected once; rename the others"
-        )
-    return {name: values[:, i] for i, name in enumerate(names)}
-
-
-def read_npz(path: Path) -> dict[str, Array]:
-    """Numeric arrays of an .npz file by name."""
-    arrays = load_arrays(path, _MAX_BYTES)
-    with wrap_read_errors(path, "expected plain arrays of numbers; save it anew with numpy.savez"):
-        return {name: np.asarray(values, np.float64) for name, values in arrays.items()}
-
-
 def cut_windows(columns: dict[str, Array], where: str) -> Windows:
     """Cuts a table into windows; a sample has the values of the last row that is not later than the sample.
 
@@ -341,7 +295,7 @@ def _gapless(time: Array, where: str) -> NDArray[np.int64]:
     return np.concatenate([np.arange(a, b) for a, b in zip(low, high, strict=True)])
 
 
-def _published_windows(columns: dict[str, Array], where: str) -> Windows:
+def published_windows(columns: dict[str, Array], where: str) -> Windows:
     """Windows of DRIVE: the pose at 2 s, `gt_icp_*`, is the 41st sample; x and y of the robot's IMU are negated.
 
     The data show that their sign is wrong: `imu_acceleration_x` falls when the wheels speed up, and

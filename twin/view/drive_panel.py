@@ -14,7 +14,7 @@ from twin.report.drive_video import CAUSE_TEXT, draw_curves
 from twin.report.video_layout import ACCENT, AMBER
 from twin.types import Image
 from twin.view.driving import KEYS_DRIVER, DriveFacts, Driving
-from twin.view.film_panel import FilmPanel
+from twin.view.panels import FilmPanel
 from twin.view.viewer import Viewer, camera_pose_of
 
 _HISTORY = 100  # control steps in the plot of torques

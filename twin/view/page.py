@@ -7,11 +7,9 @@ import viser
 from twin.env.episode_lighting import EpisodeLighting
 from twin.loading import Twin
 from twin.nerf.baked import BakedField
-from twin.view.film_panel import FilmPanel
 from twin.view.guarded_server import GuardedServer
 from twin.view.layers import FILMED_CAMERAS, scene_layers
-from twin.view.lighting_panel import LightingPanel
-from twin.view.path_panel import PathPanel
+from twin.view.panels import FilmPanel, LightingPanel, PathPanel
 from twin.view.picture_loop import Shot
 from twin.view.viewer import Viewer, camera_pose_of
 

@@ -1,10 +1,13 @@
-"""Converts bags to drive logs: tables with a row per joint state and the newest values of the other topics.
+"""Reads drive logs from files: tables, windows as published with DRIVE, and bags.
 
-If a bag has no joint states, the wheel speeds are computed from the wheels' odometry by the inverse of Clearpath's
-kinematics. Poses that come from the wheels are not used, since they hide the wheels' slip. If a bag has no other poses,
-but a scene was built from its pictures, the poses are those of a robot at rest below the reconstructed cameras.
+A bag becomes a table with a row per joint state and the newest values of the other topics. If a bag has no joint
+states, the wheel speeds are computed from the wheels' odometry by the inverse of Clearpath's kinematics. Poses that
+come from the wheels are not used, since they hide the wheels' slip. If a bag has no other poses, but a scene was built
+from its pictures, the poses are those of a robot at rest below the reconstructed cameras.
 """
 
+import csv
+import io
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,13 +37,61 @@ from twin.capture.bag_film import read_contents
 from twin.capture.frames import source_names
 from twin.config import SceneConfig
 from twin.errors import InputError, join_names
-from twin.files import digest_file
+from twin.files import digest_file, exists, load_arrays, read_text, wrap_read_errors
 from twin.geometry.cameras import Cameras
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
 from twin.scene import SceneDir, require_stage
 from twin.sysid.camera_extrinsics import base_below_camera
-from twin.sysid.logs import ACCELERATION, POSE, TWIST, WHEEL_SPEEDS
+from twin.sysid.logs import ACCELERATION, POSE, TWIST, WHEEL_SPEEDS, Windows, cut_windows, published_windows
 from twin.types import Array
+
+# ---- tables
+
+_MAX_BYTES = 512 << 20  # largest log, unpacked
+
+
+def read_log(path: Path) -> Windows:
+    """Reads a table or windows. Raises InputError: an unreadable file, missing columns, impossible times or values."""
+    if not exists(path):
+        raise InputError(f"{path}: no such log; expected a .csv, an .npz or a bag")
+    if path.suffix.lower() == ".csv":
+        return cut_windows(_read_csv(path), str(path))
+    if path.suffix.lower() == ".npz":
+        columns = read_npz(path)
+        if columns.get("icp_x", np.zeros(0)).ndim == 2:
+            return published_windows(columns, str(path))
+        return cut_windows(columns, str(path))
+    raise InputError(f"{path}: expected a log in .csv, .npz or a bag; convert it to one of these")
+
+
+def _read_csv(path: Path) -> dict[str, Array]:
+    text = read_text(path, _MAX_BYTES)
+    try:
+        head, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row] or [[]]
+        values = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
+    except (ValueError, csv.Error) as error:
+        raise InputError(f"{path}: not a table of numbers under one line of names: {error}; export it anew") from None
+    if not rows:
+        raise InputError(f"{path}: no row of numbers; expected one per instant, under a line of names; export it anew")
+    if values.ndim != 2 or values.shape[1] != len(head):
+        raise InputError(f"{path}: {len(head)} names in the first line, but rows of another length; export it anew")
+    names = [name.strip() for name in head]
+    twice = [name for name, count in Counter(names).items() if name and count > 1]
+    if twice:
+        raise InputError(
+            f"{path}: column {twice[0]} appears {names.count(twice[0])} times; expected once; rename the others"
+        )
+    return {name: values[:, i] for i, name in enumerate(names)}
+
+
+def read_npz(path: Path) -> dict[str, Array]:
+    """Numeric arrays of an .npz file by name."""
+    arrays = load_arrays(path, _MAX_BYTES)
+    with wrap_read_errors(path, "expected plain arrays of numbers; save it anew with numpy.savez"):
+        return {name: np.asarray(values, np.float64) for name, values in arrays.items()}
+
+
+# ---- bags
 
 
 @dataclass(frozen=True)
