@@ -271,6 +271,12 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("mjcf", "mjcf.spawn_touched", ["part_0003"], "part_0003"),
     ("review", "review.follower.reached_goal", False, "did not reach the goal"),
     ("review", "review.follower.touched", ["part_0001"], "The robot touched part_0001."),
+    (
+        "review",
+        "review.branches",
+        {"side": {"reached_goal": False, "touched": ["part_0002"], "max_cross_track_m": 0.4}},
+        "On branch side, the scripted driver touched part_0002.",
+    ),
     ("seen_touched", "seen_touched.median_m", 0.052, "differ by 0.052 m"),
     (
         "seen_touched",

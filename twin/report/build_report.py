@@ -73,7 +73,8 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     if (mesh / "ground.npz").exists():
         ground = Ground.load(mesh)
         path = cameras.positions[:, :2] if route is None else route
-        drawn = figures.ground_map(ground, path, route, wide, load_footprints(mesh / "parts.npz", ground))
+        parts = load_footprints(mesh / "parts.npz", ground)
+        drawn = figures.ground_map(ground, path, route, wide, parts, branches)
         out.append(Chart("Ground and convex parts", figures.svg(drawn), "mesh"))
     return out
 
