@@ -146,7 +146,8 @@ def follow_route(
     length = float(arc_lengths(world.route)[-1])
     timeout = 3.0 * length / speed + 10.0 if timeout is None else timeout
     if branch:
-        physics.set_pose(*world.route[0, :2].tolist(), float(heading_at(world.route, 0.0)))
+        x, y, _ = world.route[0].tolist()
+        physics.set_pose(x, y, float(heading_at(world.route, 0.0)))
     else:
         physics.reset()
 
