@@ -233,6 +233,15 @@ def test_the_headline_states_the_outcome_of_the_drive(follower: dict[str, Any], 
     assert verdict.mood == mood
 
 
+def test_the_headline_names_the_branches() -> None:
+    branches = {"east": {"reached_goal": True}, "west": {"reached_goal": True}}
+    verdict = follower_verdict(changed("review.branches", branches))
+    assert verdict.text.startswith("The Husky followed the 59.8 m route, branch east and branch west from start to end")
+    assert verdict.mood == "good"
+    verdict = follower_verdict(changed("review.branches", branches | {"west": {"reached_goal": False}}))
+    assert verdict.text.endswith(" It did not reach the end of branch west.") and verdict.mood == "mixed"
+
+
 def test_no_drive_says_why(scene: SceneDir) -> None:
     report = changed("review.follower", None)
     report["review"]["not_applicable"] = "this is no drive"

@@ -19,6 +19,7 @@ from twin.reality.drawn_road import DrawnRoad
 from twin.reality.place_sampling import draw
 from twin.reality.place_spec import FREE_HALF_WIDTH
 from twin.reality.side_roads import LEAD, SIDE_VERGE, SideAxis, SideLine, occupied, turn_end
+from twin.reality.true_world import near_stretch
 from twin.reality.truth import HALF_WIDTH, Truth, corridor
 from twin.scene import SceneDir
 
@@ -143,6 +144,15 @@ def test_the_ground_mesh_is_the_true_ground(place, spec):
         assert high - low == pytest.approx(spec.section.kerb_height, abs=0.002)
 
 
+def test_a_long_road_has_textures_for_its_side_roads():
+    """Parts of a long place that are rendered alone have all the textures that they use."""
+    spec = draw(PLACE, 160.0, side_roads=True)
+    assert spec.line.side_roads and spec.line.length == 160.0
+    part = near_stretch(build(spec), 0.0, 50.0)
+    used = {obj.texture for obj in part.objects} - {"lamp_glass", "windows_by_day", "windows_by_night"}
+    assert "side_1" in used and used <= {*part.textures()}
+
+
 @pytest.fixture
 def filmed(tmp_path, monkeypatch, spec):
     """A scene of tiny films with gray pictures, and its truth."""
@@ -190,7 +200,7 @@ def test_the_true_corridor_covers_all_lines(filmed):
         (["--place", "0"], "--side-roads: the demo's street has none; give a --place from 1 on"),
         (["--place", "28", "--traffic"], "walkers and cars keep to the main road; leave one of them out"),
         (["--place", "1"], "place 1 has no side road with room for a film; choose one of the places 2, 4, 5,"),
-        (["--place", "7", "--tiny"], "no side road with room for a film in its first 12 m; choose one of"),
+        (["--place", "7", "--tiny"], "place 7 has no side road in its first 12 m; film without --tiny"),
     ],
 )
 def test_what_cannot_be_filmed_is_refused(given, said, tmp_path, capsys):

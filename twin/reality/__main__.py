@@ -135,12 +135,14 @@ def _filmed_sides(spec: PlaceSpec, plan: FilmingPlan) -> _Sides:
         if one.mouth.station - one.radius <= plan.length:
             length = SideLine(road, one).length
             out.append((one, plan.side(one.name, min(length, _TINY_SIDE) if tiny else length)))
+    if not out and spec.line.side_roads:
+        raise InputError(
+            f"--side-roads: place {spec.number} has no side road in its first {plan.length:g} m; film without --tiny"
+        )
     if not out:
         known = ", ".join(str(n) for n in range(1, _DEVELOPMENT + 1) if draw(n, side_roads=True).line.side_roads)
         raise InputError(
-            f"--side-roads: place {spec.number} has no side road with room for a film"
-            + (f" in its first {plan.length:g} m" if tiny and spec.line.side_roads else "")
-            + f"; choose one of the places {known}"
+            f"--side-roads: place {spec.number} has no side road with room for a film; choose one of the places {known}"
         )
     return out
 
