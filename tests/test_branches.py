@@ -12,12 +12,16 @@ from twin import runtime
 from twin.config import Condition, TaskConfig
 from twin.config_file import load_config
 from twin.env import suite
+from twin.env.drivers import follow_route
+from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import scene_tasks
 from twin.env.suite import EnvFactory, fingerprint
 from twin.errors import InputError
 from twin.geometry.route import BRANCH
 from twin.mjcf.scene_xml import run
 from twin.mjcf.world import World, arc_lengths
+from twin.report.build_sections import mjcf_section, review_section
+from twin.report.review_video import drive_metrics
 from twin.scene import SceneDir, write_stamp
 
 BRANCHED = """
@@ -92,6 +96,23 @@ def test_episode_drives_along_the_branch(root):
     info = env.task.info(env.physics)
     assert info["cause"] == "goal" and abs(info["cross_track"]) < 0.2
     assert env.physics.base_to_world[0, 3] > 5.0 and env.physics.base_to_world[1, 3] > 0.4
+
+
+def test_scripted_driver_follows_the_branch(root):
+    world = World.load(SceneDir(root).stage("mjcf"))
+    drive = follow_route(world, HuskyPhysics(world.model(), world.robot), branch="side")
+    assert np.linalg.norm(drive.base_to_world[0, :2, 3] - side()[0, :2]) < 0.05
+    assert drive.reached_goal and np.linalg.norm(drive.base_to_world[-1, :2, 3] - side()[-1, :2]) < 1.1
+
+
+def test_report_tells_the_drives_along_branches(root):
+    world = World.load(SceneDir(root).stage("mjcf"))
+    drive = follow_route(world, HuskyPhysics(world.model(), world.robot), branch="side")
+    review = review_section({"review": {"branches": {"side": drive_metrics(drive)}}})
+    assert (review.facts[0].name, review.facts[0].value) == ("goal of branch side reached", "yes")
+    assert not review.cautions
+    scene = mjcf_section({"mesh": {"branches_m": {"side": 8.06}}})
+    assert ("branch side", "8.1 m") in [(fact.name, fact.value) for fact in scene.facts]
 
 
 def test_obstacles_stand_on_their_own_route(root):

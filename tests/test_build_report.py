@@ -232,6 +232,15 @@ def test_the_headline_states_the_outcome_of_the_drive(follower: dict[str, Any], 
     assert verdict.mood == mood
 
 
+def test_the_headline_names_the_branches() -> None:
+    branches = {"east": {"reached_goal": True}, "west": {"reached_goal": True}}
+    verdict = follower_verdict(changed("review.branches", branches))
+    assert verdict.text.startswith("The Husky followed the 59.8 m route, branch east and branch west from start to end")
+    assert verdict.mood == "good"
+    verdict = follower_verdict(changed("review.branches", branches | {"west": {"reached_goal": False}}))
+    assert verdict.text.endswith(" It did not reach the end of branch west.") and verdict.mood == "mixed"
+
+
 def test_no_drive_says_why(scene: SceneDir) -> None:
     report = changed("review.follower", None)
     report["review"]["not_applicable"] = "this is no drive"
@@ -270,6 +279,12 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("mjcf", "mjcf.spawn_touched", ["part_0003"], "part_0003"),
     ("review", "review.follower.reached_goal", False, "did not reach the goal"),
     ("review", "review.follower.touched", ["part_0001"], "The robot touched part_0001."),
+    (
+        "review",
+        "review.branches",
+        {"side": {"reached_goal": False, "touched": ["part_0002"], "max_cross_track_m": 0.4}},
+        "On branch side, the scripted driver touched part_0002.",
+    ),
     ("seen_touched", "seen_touched.median_m", 0.052, "differ by 0.052 m"),
     (
         "seen_touched",

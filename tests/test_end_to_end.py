@@ -18,7 +18,7 @@ from twin.reality.__main__ import TINY, film
 from twin.reality.__main__ import main as reality
 from twin.scene import STAGES
 
-_QUICK = (
+QUICK = (
     "nerf.steps=250",
     "nerf.rays=2048",
     "nerf.max_width=240",
@@ -33,7 +33,7 @@ _QUICK = (
 
 
 def _command(root, *options):
-    settings = [word for setting in _QUICK for word in ("--set", setting)]
+    settings = [word for setting in QUICK for word in ("--set", setting)]
     return [sys.executable, "-m", "twin.build", str(root), *settings, *options]
 
 
@@ -102,7 +102,7 @@ def test_scene_loads_in_plain_mujoco_after_zipping(built, tmp_path):
 
 def test_a_second_build_has_nothing_to_do(built):
     root, _ = built
-    report = verb.build(root, overrides=_QUICK)
+    report = verb.build(root, overrides=QUICK)
     assert all(stage["skipped"] for stage in report["stages"].values())
 
 

@@ -475,6 +475,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="walkers and cars move through the films, and parked cars have left in the last lighting",
     )
+    add("--side-roads", action="store_true", help="film the side roads of a sampled place, too: films of their own")
     add("--readout", type=float, default=0.0, metavar="SECONDS", help="rolling shutter; 0: none")
     add("--shake", type=float, metavar="FACTOR", help="shake of the camera; 1: as on a cart")
     _, add = command("compare", "compare a build of a filmed place with its truth, and show it in the build's report")

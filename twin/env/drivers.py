@@ -24,7 +24,7 @@ from twin.env.controller import CONTROL_PERIOD
 from twin.env.options import check_actions
 from twin.env.physics import HuskyPhysics
 from twin.errors import InputError, short_repr
-from twin.mjcf.world import World, arc_lengths, heading_error, nearest_on_route, point_at
+from twin.mjcf.world import World, arc_lengths, heading_at, heading_error, nearest_on_route, point_at
 from twin.types import Array
 
 if TYPE_CHECKING:  # not imported at run time: `follow_route` works without dm_control
@@ -127,7 +127,7 @@ class PurePursuit:
 
 
 def follow_route(
-    world: World, physics: HuskyPhysics, speed: float = 1.0, timeout: float | None = None
+    world: World, physics: HuskyPhysics, speed: float = 1.0, timeout: float | None = None, branch: str = ""
 ) -> RecordedDrive:
     """Drives along the route until the goal, a contact, the corridor's edge or the time limit.
 
@@ -136,11 +136,20 @@ def follow_route(
         physics: Physics of the world's model; it is reset.
         speed: [m/s]; wheels reach at most 1 m/s, so turns are slower.
         timeout: [s]; None: 3 · route length / speed + 10 s.
+        branch: Name of the branch to drive along instead of the route, from its start.
+
+    Raises:
+        InputError: there is no ground below a wheel at the start of the branch.
     """
+    world = world.along(branch)
     speed = min(speed, physics.params.max_speed)
     length = float(arc_lengths(world.route)[-1])
     timeout = 3.0 * length / speed + 10.0 if timeout is None else timeout
-    physics.reset()
+    if branch:
+        x, y, _ = world.route[0].tolist()
+        physics.set_pose(x, y, float(heading_at(world.route, 0.0)))
+    else:
+        physics.reset()
 
     rows: list[dict[str, Any]] = []
     touched: set[str] = set()

@@ -1,6 +1,6 @@
 """`twin reality`: films a generated place whose truth is known, drives in it, and measures builds of it.
 
-    twin reality film [--place NUMBER [--length METERS]] --out DIR
+    twin reality film [--place NUMBER [--length METERS] [--side-roads]] --out DIR
     twin reality compare DIR
     twin reality drive --policy FILE... --task straight [--place N] [--robot N] [--camera N] --day 1 2
         --out results.csv
@@ -17,7 +17,7 @@ film by the robot's camera, also for `twin.align`. `bag` writes a robot's record
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -35,12 +35,13 @@ from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass, parked_cars
 from twin.reality.lighting import LIGHTINGS, WEATHER
-from twin.reality.place_objects import KnownPlace
+from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.place_sampling import check_length, draw
-from twin.reality.place_spec import PlaceSpec, tasks
+from twin.reality.place_spec import PlaceSpec, SideRoad, tasks
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_test import Setup
 from twin.reality.road_task import RoadTask, read_task
+from twin.reality.side_roads import SideLine, turn_end
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, align_rigid, compare, matched_poses
 from twin.scene import SceneDir, require_stage
 
@@ -67,32 +68,40 @@ def film(
     traffic: bool = False,
     renderer_of: Callable[[str, KnownPlace], PlaceRenderer] | None = None,
     length: float = 0.0,
+    side_roads: bool = False,
 ) -> Truth:
     """Films every pass of a plan under every lighting into the scene folder `out`, and saves the truth there.
 
     With `traffic`, walkers and cars move through every film, and the films of all lightings but the last show parked
     cars. The truth contains none of them. `renderer_of` returns the renderer for a lighting and a place; the default is
-    `filming.Renderer`, the only one that shows moving traffic. `length` [m] is that for `place_sampling.draw`.
+    `filming.Renderer`, the only one that shows moving traffic. `length` [m] is that for `place_sampling.draw`. With
+    `side_roads`, every side road into which a line turns off the filmed length gets films of its own.
 
     Raises:
-        InputError: `out` is not empty and has no folder `truth`.
+        InputError: `out` is not empty and has no folder `truth`; the place has no such side road.
     """
     if out.is_dir() and any(out.iterdir()) and not (out / "truth").is_dir():
         raise InputError(f"{out} is not empty and has no truth/, so this command did not write it; give another --out")
+    spec = draw(number, length, side_roads) if number else None
+    sides = _filmed_sides(spec, plan) if spec and side_roads else []
     (out / "input").mkdir(parents=True, exist_ok=True)
-    place = build_number(number, length=length) if number else campus_road.build()
+    place = build_number(number, length=length, side_roads=side_roads) if number else campus_road.build()
+    assert isinstance(place.route, RoadLine | DrawnRoad)
+    lines: list[tuple[FilmingPlan, DrivenLine]] = [(plan, place.route)]
+    lines += [(one_plan, SideLine(place.route, one)) for one, one_plan in sides]
     parked = parked_cars(place, plan.start, plan.length) if traffic else []
     films, lightings = {}, {}
     for lighting in plan.lightings:
         there = replace(place, objects=[*place.objects, *(parked if lighting != plan.lightings[-1] else [])])
         renderer = renderer_of(lighting, there) if renderer_of else None
-        for one in plan.passes:
-            name = film_name(lighting, one)
-            times, poses = film_pass(lighting, there, plan, out / "input" / f"{name}.mp4", one, traffic, renderer)
-            films[name] = TrueFilm(times, poses, *depth_maps(lighting, place, plan, poses))
-            lightings[name] = lighting
+        for one_plan, line in lines:
+            for one in one_plan.passes:
+                name = film_name(lighting, one)
+                path = out / "input" / f"{name}.mp4"
+                times, poses = film_pass(lighting, there, one_plan, path, one, traffic, renderer, line)
+                films[name] = TrueFilm(times, poses, *depth_maps(lighting, place, one_plan, poses))
+                lightings[name] = lighting
     size = plan.width, plan.height
-    assert isinstance(place.route, RoadLine | DrawnRoad)
     truth = Truth(
         place.route,
         plan.start,
@@ -104,21 +113,51 @@ def film(
         number,
         lightings,
         plan.camera_height,
+        {one.name: one_plan.length for one, one_plan in sides},
     )
     truth.save(out / "truth")
-    spec = draw(number, length) if number else None
-    write_text(out / "scene.toml", scene_toml(plan, out.resolve().name, spec, truth.road_length))
+    write_text(out / "scene.toml", scene_toml(plan, out.resolve().name, spec, truth.road_length, sides))
     return truth
 
 
-def scene_toml(plan: FilmingPlan, name: str, spec: PlaceSpec | None = None, road_length: float = 0.0) -> str:
+_Sides = Sequence[tuple[SideRoad, FilmingPlan]]
+"""Filmed side roads and the plans of their films."""
+_AFTER_TURN = 4.0  # [m] from the end of the turn to that of the task `into_<side road>`
+_DEVELOPMENT = 49  # places up to this number are for development
+_TINY_SIDE = 20.0  # [m] of a side road's line that `--tiny` films
+
+
+def _filmed_sides(spec: PlaceSpec, plan: FilmingPlan) -> _Sides:
+    """The side roads into which a line turns off the filmed length. Raises InputError if there are none."""
+    tiny = plan.length < spec.line.length
+    road, out = DrawnRoad(spec), []
+    for one in spec.line.side_roads:
+        if one.mouth.station - one.radius <= plan.length:
+            length = SideLine(road, one).length
+            out.append((one, plan.side(one.name, min(length, _TINY_SIDE) if tiny else length)))
+    if not out and spec.line.side_roads:
+        raise InputError(
+            f"--side-roads: place {spec.number} has no side road in its first {plan.length:g} m; film without --tiny"
+        )
+    if not out:
+        known = ", ".join(str(n) for n in range(1, _DEVELOPMENT + 1) if draw(n, side_roads=True).line.side_roads)
+        raise InputError(
+            f"--side-roads: place {spec.number} has no side road with room for a film; choose one of the places {known}"
+        )
+    return out
+
+
+def scene_toml(
+    plan: FilmingPlan, name: str, spec: PlaceSpec | None = None, road_length: float = 0.0, sides: _Sides = ()
+) -> str:
     """The contents of `scene.toml`, as a user would write them; `spec` is None for the campus road.
 
-    `road_length` is `Truth.road_length` [m].
+    `road_length` is `Truth.road_length` [m]; `sides` are the filmed side roads and the plans of their films.
     """
     fx, fy, cx, cy = (round(float(v), 4) for v in plan.intrinsics)
     place = f" --place {spec.number}" if spec else ""
     place += f" --length {road_length:g}" if road_length else ""
+    place += " --side-roads" if sides else ""
     place += f" --readout {plan.readout:g}" if plan.readout else ""
     place += f" --shake {plan.shake:g}" if plan.shake != (spec.film.shake if spec else FilmingPlan.shake) else ""
     height = f"camera_height = {plan.camera_height}  # [m]"
@@ -127,15 +166,23 @@ def scene_toml(plan: FilmingPlan, name: str, spec: PlaceSpec | None = None, road
     lines = [f"# A generated place, filmed by twin reality film{place} --out THIS_FOLDER"]
     lines += [f"name = {toml_string(name)}", "seed = 0", "", "[metric]", height, ""]
     for lighting in plan.lightings:
-        for one in plan.passes:
+        for one in [*plan.passes, *(one for _, there in sides for one in there.passes)]:
             lines += ["[[source]]", f'path = "input/{film_name(lighting, one)}.mp4"', f'lighting = "{lighting}"']
             if spec is None or spec.film.calibrated:
                 lines += ["[source.camera]", 'model = "PINHOLE"', f"params = [{fx}, {fy}, {cx}, {cy}]"]
                 lines += [f"width = {plan.width}", f"height = {plan.height}"]
             lines += [""]
+    if sides:
+        lines += ["[route]", f'passes = ["{film_name(plan.lightings[0], plan.passes[0])}"]', ""]
     for task, (start, length) in (tasks(spec.line) if spec else {}).items():
         if start + length <= plan.length:
             lines += ["[[task]]", f'name = "{task}"', f"start = {start}", f"length = {length}", ""]
+    for side, there in sides:
+        lines += ["[[branch]]", f'name = "{side.name}"  # also a task: the whole branch']
+        lines += [f'passes = ["{film_name(plan.lightings[0], there.passes[0])}"]', ""]
+        end = min(turn_end(side) + _AFTER_TURN, 0.9 * there.length)
+        lines += ["[[task]]", f'name = "into_{side.name}"', f'route = "{side.name}"']
+        lines += ["start = 0.5", f"length = {end - 0.5:.2f}", ""]
     return "\n".join(lines)
 
 
@@ -143,6 +190,13 @@ def _check_lightings(names: list[str], among: Iterable[str]) -> None:
     for name in names:
         if name not in among:
             raise InputError(f"no lighting {short_repr(name)} in this place; expected one of {', '.join(among)}")
+
+
+def _check_side_roads(options: argparse.Namespace) -> None:
+    if options.place == 0:
+        raise InputError("--side-roads: the demo's street has none; give a --place from 1 on")
+    if options.traffic:
+        raise InputError("--side-roads with --traffic: walkers and cars keep to the main road; leave one of them out")
 
 
 def command(options: argparse.Namespace) -> None:
@@ -158,6 +212,8 @@ def command(options: argparse.Namespace) -> None:
         if options.place:
             plan = FilmingPlan.of(draw(options.place, options.length))
             plan = _tiny(plan) if options.tiny else plan
+        if options.side_roads:
+            _check_side_roads(options)
         _check_lightings(options.lightings or [], plan.lightings if options.place else LIGHTINGS)
         plan = replace(plan, lightings=tuple(dict.fromkeys(options.lightings))) if options.lightings else plan
         if not 0.0 <= options.readout <= _MAX_READOUT:
@@ -166,7 +222,7 @@ def command(options: argparse.Namespace) -> None:
             raise InputError(f"--shake {options.shake:g}: expected 0 to {_MAX_SHAKE:g}")
         plan = replace(plan, readout=options.readout)
         plan = plan if options.shake is None else replace(plan, shake=options.shake)
-        film(plan, options.out, options.place, options.traffic, length=options.length)
+        film(plan, options.out, options.place, options.traffic, None, options.length, options.side_roads)
     elif options.command == "compare":
         scene = SceneDir(options.scene)
         figures = compare(scene)["figures"]
@@ -225,6 +281,8 @@ def scene_task(given: str, scene: Path | None, place: int, length: float = 0.0) 
     truth = Truth.load(root.truth)
     if truth.number != place:
         raise InputError(f"{scene} is a film of place {truth.number}; give --place {truth.number}")
+    if truth.side_roads:
+        raise InputError(f"{scene} was filmed with --side-roads, which twin reality drive does not have; film without")
     if place and truth.route.length != draw(place, length).line.length:
         cure = f"give --length {truth.road_length:g}" if truth.road_length else "leave --length out"
         raise InputError(f"{scene} has a road of {truth.route.length:g} m, this place another; {cure}")

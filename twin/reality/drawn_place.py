@@ -1,11 +1,12 @@
 """Builds a place from its description (`PlaceSpec`): ground, objects, textures, lightings.
 
-Objects are placed one after the other: houses, lamps and boundaries first, then poles, cars, furniture and trees. An
-object is left out if its footprint touches the road, a side road, the corridor along the driven line or an earlier
-footprint.
+Objects stand along the driven line first, then along the side roads that are filmed. They are placed one after the
+other: houses, lamps and boundaries first, then poles, cars, furniture and trees. An object is left out if its footprint
+touches the road, a side road, the corridor along a filmed line or an earlier footprint.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from math import hypot
 
@@ -21,6 +22,7 @@ from twin.reality.place_objects import Atlas, GroundLayout, KnownPlace
 from twin.reality.place_sampling import draw
 from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, PlaceSpec, Rgb, stream
 from twin.reality.plants import add_bare_tree, add_conifer, add_crowned_tree, add_shrub, add_tufts
+from twin.reality.side_roads import SIDE_VERGE, SideLine, add_side_road, begin_of_verges, occupied
 from twin.reality.sky import place_sky
 from twin.reality.street_furniture import BAY, add_boundary, thickness
 from twin.types import Array
@@ -42,7 +44,8 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
     stations = np.arange(road.start, road.end + STEP / 2, STEP)
     parts = max(1, round((stations[-1] - stations[0]) / _PART_LENGTH))
     ends = np.linspace(0, len(stations) - 1, parts + 1).round().astype(int).tolist()
-    driven = road.at(np.linspace(0.0, spec.line.length, 200))
+    beside = [axis.at(np.linspace(0.0, axis.length, 50)) for axis in road.side_axes]
+    driven = np.concatenate([road.at(np.linspace(0.0, spec.line.length, 200)), *beside])
     corners = ((driven.min(0) - _FIELD_MARGIN).tolist(), (driven.max(0) + _FIELD_MARGIN).tolist())
     section = spec.section
     left, right = section.left + section.kerb_width, -section.right - section.kerb_width
@@ -52,7 +55,7 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
         "verge_right": (right, right - section.sides[1].width),
     }
     names_of_parts = [f"_{k}" if k else "" for k in range(parts)]
-    lands = land_boxes(road.at(stations), tiled=parts > 1)
+    lands = land_boxes(np.concatenate([road.at(stations), *beside]), tiled=parts > 1)
     layout = GroundLayout(
         bands={
             f"{name}{part}": (float(stations[first]), float(stations[last]), *laterals)
@@ -65,6 +68,7 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
             *(f"{name}{part}" for part in names_of_parts for name in ("road", "kerb", "verge_left", "verge_right")),
             *lands,
             "side_road",
+            *(f"{one.name}{end}" for one in spec.line.side_roads for end in ("", "_mouth", "_kerb", "_verge")),
         ),
     )
     names: dict[str, tuple[House, str, Rgb, Rgb]] = {}
@@ -81,37 +85,36 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
     for part, first, last in zip(names_of_parts, ends, ends[1:], strict=False):
         add_road(place, road, stations[first : last + 1], part)
     add_side_roads(place, road, stations)
+    for axis, one in zip(road.side_axes, spec.line.side_roads, strict=True):
+        add_side_road(place, section, axis, one)
     for name, box in lands.items():
         add_land(place, road, name, box)
     site = Site(road)
-    names.update(_add_houses(place, spec, site))
-    _add_lamps(place, spec, site)
-    _add_boundaries(place, spec, site)
-    _add_poles(place, spec, site)
-    _add_cars(place, spec, site, place.rng(20) if displaced else None)
-    _add_furniture(place, spec, site, place.rng(21) if displaced else None)
-    _add_trees(place, spec, site)
-    _add_tufts(place, spec)
+    names.update(_furnish(place, _of_driven_line(spec), site, displaced))
+    for k, axis in enumerate(road.side_axes):
+        there = replace(place, route=axis, seed=(*place.seed, 30 + k))  # shares the lists of objects and lamps
+        names.update(_furnish(there, _of_side_road(spec, k), site, displaced))
     return place
 
 
 @cache
-def build_number(number: int, displaced: bool = False, length: float = 0.0) -> KnownPlace:
-    """Builds the place with a number, 1 or more; `length` [m] as for `draw`."""
-    return build(draw(number, length), displaced)
+def build_number(number: int, displaced: bool = False, length: float = 0.0, side_roads: bool = False) -> KnownPlace:
+    """Builds the place with a number, 1 or more; `length` [m] and `side_roads` as for `draw`."""
+    return build(draw(number, length, side_roads), displaced)
 
 
 # ---- placement
 
 
 class Site:
-    """Occupied ground: road, side roads, the corridor along the driven line, and the footprints of placed objects.
+    """Occupied ground: road, side roads, the corridors along filmed lines, and the footprints of placed objects.
 
     A footprint is a rectangle: its center [m], half sizes [m] and the direction of its first axis [rad].
     """
 
     def __init__(self, road: DrawnRoad) -> None:
         self._road = road
+        self._side_lines = [SideLine(road, one) for one in road.line.side_roads]
         self._taken: list[tuple[float, float, float, Array]] = []  # x, y, radius, corners
 
     def take(
@@ -142,10 +145,15 @@ class Site:
         counts = [max(2, round(2 * h / 0.4) + 1) for h in half]
         a, b = np.meshgrid(*(np.linspace(-h, h, n) for h, n in zip(half, counts, strict=True)))
         axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-        station, lateral = road.project(center + np.stack([a.ravel(), b.ravel()], -1) @ axes)
+        xy = center + np.stack([a.ravel(), b.ravel()], -1) @ axes
+        station, lateral = road.project(xy)
         free = (road.edges(lateral) > section.kerb_width + clear) & (np.abs(lateral) > FREE_HALF_WIDTH + CLEARANCE)
         for mouth in road.line.mouths:
             free &= (np.abs(station - mouth.station) > mouth.width / 2 + 0.4) | (lateral * mouth.side < 0.0)
+        for line, axis, one in zip(self._side_lines, road.side_axes, road.line.side_roads, strict=True):
+            free &= ~occupied(section, one, *axis.project(xy), clear)
+            along, off = line.project(xy)
+            free &= (np.abs(off) > FREE_HALF_WIDTH + CLEARANCE) | (along < 0.0) | (along > line.length)
         return bool(free.all())
 
 
@@ -165,29 +173,92 @@ def _overlap(a: Array, b: Array) -> bool:
     return True
 
 
-def _edge(spec: PlaceSpec, side: int) -> float:
-    """Distance of the curb's outer edge from the driven line on a side (1 = left) [m]."""
-    return (spec.section.left if side > 0 else spec.section.right) + spec.section.kerb_width
+@dataclass(frozen=True)
+class _Roadside:
+    """The two sides of a road, along which objects stand. Pairs are left, right."""
+
+    spec: PlaceSpec
+    first: float
+    """Station from which on objects stand [m]."""
+    last: float
+    """Station up to which objects stand [m]."""
+    tufts: tuple[float, float]
+    """Range of the stations of grass [m]."""
+    edges: tuple[float, float]
+    """Distances of the curbs' outer edges from the line [m]."""
+    verges: tuple[float, float]
+    """Widths of sidewalk and verge together [m]."""
+    paved: tuple[float, float]
+    """Widths of the sidewalks [m]."""
+    key: tuple[int, ...] = ()
+    """Key of its random streams: none for the driven line, the number of a side road."""
+
+    def stream(self, aspect: str, *more: int) -> np.random.Generator:
+        """A random generator, see `place_spec.stream`."""
+        if not self.key:
+            return stream(self.spec.number, aspect, *more)
+        kinds = ("houses", "lamps", "boundaries", "furniture", "cars", "trees")
+        return stream(self.spec.number, "side_roads", *self.key, kinds.index(aspect), *more)
+
+    def numbered(self, k: int) -> int:
+        """The number, unique in the place, of the k-th object of a kind."""
+        return k + 1000 * (1 + self.key[0]) if self.key else k
+
+    def suffix(self) -> str:
+        """End of the names of objects that occur once per road."""
+        return f"_{self.spec.line.side_roads[self.key[0]].name}" if self.key else ""
+
+    def edge(self, side: int) -> float:
+        """Distance of the curb's outer edge from the line on a side (1 = left) [m]."""
+        return self.edges[0 if side > 0 else 1]
+
+    def verge(self, side: int) -> float:
+        """Width of sidewalk and verge on a side [m]."""
+        return self.verges[0 if side > 0 else 1]
 
 
-def _verge(spec: PlaceSpec, side: int) -> float:
-    """Width of sidewalk and verge on a side [m]."""
-    return spec.section.sides[0 if side > 0 else 1].width
+def _of_driven_line(spec: PlaceSpec) -> _Roadside:
+    section, length = spec.section, spec.line.length
+    return _Roadside(
+        spec,
+        *(-6.0, length + 22.0, (-7.0, length + 20.0)),
+        (section.left + section.kerb_width, section.right + section.kerb_width),
+        (section.sides[0].width, section.sides[1].width),
+        (section.sides[0].pavement, section.sides[1].pavement),
+    )
 
 
-def _reach(spec: PlaceSpec) -> tuple[float, float]:
-    """Stations between which objects stand [m]."""
-    return -6.0, spec.line.length + 22.0
+def _of_side_road(spec: PlaceSpec, k: int) -> _Roadside:
+    one, section = spec.line.side_roads[k], spec.section
+    edge, begin = 0.5 * one.mouth.width + section.kerb_width, begin_of_verges(section, one)
+    last = one.length - 1.0
+    return _Roadside(spec, begin, last, (begin, last), (edge, edge), (SIDE_VERGE, SIDE_VERGE), (0.0, 0.0), (k,))
 
 
 # ---- objects
 
 
-def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tuple[House, str, Rgb, Rgb]]:
+def _furnish(
+    place: KnownPlace, along: _Roadside, site: Site, displaced: bool
+) -> dict[str, tuple[House, str, Rgb, Rgb]]:
+    """Adds all objects along a road; returns its houses as `_add_houses` does."""
+    houses = _add_houses(place, along, site)
+    _add_lamps(place, along, site)
+    _add_boundaries(place, along, site)
+    _add_poles(place, along, site)
+    _add_cars(place, along, site, place.rng(20) if displaced else None)
+    _add_furniture(place, along, site, place.rng(21) if displaced else None)
+    _add_trees(place, along, site)
+    _add_tufts(place, along)
+    return houses
+
+
+def _add_houses(place: KnownPlace, along: _Roadside, site: Site) -> dict[str, tuple[House, str, Rgb, Rgb]]:
     """Adds rows of houses; returns, by name, house, wall material, wall color and roof color."""
-    rng, houses = stream(spec.number, "houses", 1), spec.houses
+    rng, spec = along.stream("houses", 1), along.spec
+    houses = spec.houses
     out: dict[str, tuple[House, str, Rgb, Rgb]] = {}
-    first, last = _reach(spec)
+    first, last = along.first, along.last
     if houses.density <= 0.05:
         return out
     most = max(16, int(0.14 * (last - first)))
@@ -197,7 +268,7 @@ def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tup
             width, depth = float(rng.uniform(*houses.front)), float(rng.uniform(6.0, 11.0))
             storeys = int(rng.integers(houses.storeys[0], houses.storeys[1] + 1))
             setback = float(rng.uniform(*houses.setback))
-            away = _edge(spec, side) + max(0.6, _verge(spec, side) - 1.0) + setback + depth / 2
+            away = along.edge(side) + max(0.6, along.verge(side) - 1.0) + setback + depth / 2
             yaw = place.heading(station) + (0.0 if side > 0 else np.pi) + float(rng.normal(0.0, 0.03))
             wall, roof = str(rng.choice(houses.walls)), str(rng.choice(houses.roofs))
             color = houses.colors[int(rng.integers(len(houses.colors)))]
@@ -206,7 +277,7 @@ def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tup
                 place.route.at(station, side * away), yaw, width, depth, storeys, roof, houses.pitch, houses.window
             )
             if len(out) < most and site.take(house.center, (width / 2 + 0.3, depth / 2 + 0.3), yaw, 0.6, 0.6):
-                name = f"house_{len(out)}"
+                name = f"house_{along.numbered(len(out))}"
                 add_house(place, name, house, spec.lamps.lit_windows)
                 out[name] = (house, wall, color, tiles)
             mean = 100.0 / houses.density
@@ -214,15 +285,15 @@ def _add_houses(place: KnownPlace, spec: PlaceSpec, site: Site) -> dict[str, tup
     return out
 
 
-def _add_lamps(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
-    rng, lamps = stream(spec.number, "lamps", 1), spec.lamps
+def _add_lamps(place: KnownPlace, along: _Roadside, site: Site) -> None:
+    rng, lamps = along.stream("lamps", 1), along.spec.lamps
     if lamps.kind == "none":
         return
-    first, last = _reach(spec)
+    first, last = along.first, along.last
     for k, station in enumerate(np.arange(first + rng.uniform(0.0, lamps.spacing), last, lamps.spacing)):
         side = lamps.side or (1 if k % 2 else -1)
         shines = bool(rng.random() >= lamps.broken)
-        away = max(_edge(spec, side) + 0.45, FREE_HALF_WIDTH + 0.35)
+        away = max(along.edge(side) + 0.45, FREE_HALF_WIDTH + 0.35)
         for shift in (0.0, 3.0, -3.0):
             at = float(station + shift), side * away
             if site.take(place.route.at(*at), (0.12, 0.12), 0.0):
@@ -230,24 +301,25 @@ def _add_lamps(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
         else:
             continue
         if lamps.kind in ("post_top", "lantern"):
-            furniture.add_lantern(place, k, *at, lamps.height, lamps.kind, shines)
+            furniture.add_lantern(place, along.numbered(k), *at, lamps.height, lamps.kind, shines)
         else:
             arm = 0.25 * lamps.height
             arms = (arm, -arm) if lamps.kind == "double" else (arm,)
-            furniture.add_lamp_post(place, k, *at, lamps.height, arms, shines)
+            furniture.add_lamp_post(place, along.numbered(k), *at, lamps.height, arms, shines)
 
 
-def _add_boundaries(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
-    rng = stream(spec.number, "boundaries", 1)
-    first, last = _reach(spec)
+def _add_boundaries(place: KnownPlace, along: _Roadside, site: Site) -> None:
+    rng, spec = along.stream("boundaries", 1), along.spec
+    first, last = along.first, along.last
     for side, name, boundary in ((1, "left", spec.boundaries[0]), (-1, "right", spec.boundaries[1])):
         if boundary.kind == "none":
             continue
-        away = _edge(spec, side) + max(boundary.distance, 0.3)
+        away = along.edge(side) + max(boundary.distance, 0.3)
         if away < FREE_HALF_WIDTH + 0.6:
             away = FREE_HALF_WIDTH + 0.6
         lateral, thick = side * away, thickness(boundary.kind)
-        tight = min((1 / abs(p.curvature) for p in spec.line.pieces if side * p.curvature > 0.0), default=np.inf)
+        pieces = spec.line.pieces if not along.key else ()  # side roads are straight
+        tight = min((1 / abs(p.curvature) for p in pieces if side * p.curvature > 0.0), default=np.inf)
         if away > tight - 0.8:
             continue
         runs: list[list[float]] = [[]]
@@ -263,35 +335,35 @@ def _add_boundaries(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
                 runs.append([])
         for k, run in enumerate(runs):
             skin = f"boundary_{name}"
-            add_boundary(place, f"{name}_{boundary.kind}_{k}", boundary, skin, np.array(run), lateral)
+            add_boundary(place, f"{name}_{boundary.kind}_{along.numbered(k)}", boundary, skin, np.array(run), lateral)
 
 
-def _add_poles(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
-    if not spec.furniture.poles:
+def _add_poles(place: KnownPlace, along: _Roadside, site: Site) -> None:
+    if not along.spec.furniture.poles:
         return
-    rng = stream(spec.number, "furniture", 1)
+    rng = along.stream("furniture", 1)
     side, height = int(rng.choice([-1, 1])), float(rng.uniform(6.5, 8.5))
-    away = _edge(spec, side) + min(1.2, 0.5 * _verge(spec, side)) + float(rng.uniform(0.4, 1.6))
-    first, last = _reach(spec)
+    away = along.edge(side) + min(1.2, 0.5 * along.verge(side)) + float(rng.uniform(0.4, 1.6))
+    first, last = along.first, along.last
     feet = []
     for k, station in enumerate(np.arange(first + rng.uniform(0, 10), last, rng.uniform(20.0, 30.0))):
         at = float(station), side * away
         if site.take(place.route.at(*at), (0.16, 0.16), 0.0):
-            furniture.add_post(place, f"pole_{k}", *at, height, 0.13, "pole")
+            furniture.add_post(place, f"pole_{along.numbered(k)}", *at, height, 0.13, "pole")
             feet.append(at)
     if len(feet) > 1:
-        furniture.add_wires(place, "wires", feet, height)
+        furniture.add_wires(place, f"wires{along.suffix()}", feet, height)
 
 
 def _scatter(
-    rng: np.random.Generator, spec: PlaceSpec, amount: float, near: float, far: float
+    rng: np.random.Generator, along: _Roadside, amount: float, near: float, far: float
 ) -> list[tuple[float, float]]:
     """Random stations and laterals [m]: `amount` per 100 m of road, at `near` to `far` from the curb."""
-    first, last = _reach(spec)
+    first, last = along.first, along.last
     out = []
     for _ in range(int(rng.poisson(amount * (last - first) / 100.0))):
         side = int(rng.choice([-1, 1]))
-        out.append((float(rng.uniform(first, last)), side * (_edge(spec, side) + float(rng.uniform(near, far)))))
+        out.append((float(rng.uniform(first, last)), side * (along.edge(side) + float(rng.uniform(near, far)))))
     return out
 
 
@@ -306,9 +378,9 @@ def _moved(
     return moved if free else at
 
 
-def _add_cars(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np.random.Generator | None) -> None:
-    rng = stream(spec.number, "cars", 1)
-    for k, (station, lateral) in enumerate(_scatter(rng, spec, spec.furniture.cars, 1.25, 3.2)):
+def _add_cars(place: KnownPlace, along: _Roadside, site: Site, other_day: np.random.Generator | None) -> None:
+    rng, spec = along.stream("cars", 1), along.spec
+    for k, (station, lateral) in enumerate(_scatter(rng, along, spec.furniture.cars, 1.25, 3.2)):
         kinds = furniture.VEHICLES
         kind = "van" if rng.random() < spec.furniture.vans else str(rng.choice(kinds[:-1]))
         turn = np.pi * int(rng.integers(0, 2)) + float(rng.normal(0.0, 0.03))
@@ -322,21 +394,21 @@ def _add_cars(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np.rand
                 shifted = station + float(other_day.uniform(-1.5, 1.5))
                 if site.take(place.route.at(shifted, lateral), (length / 2, width / 2), yaw, gap=-1.7):
                     station = shifted
-            furniture.add_vehicle(place, k, station, lateral, turn, kind, skin)
+            furniture.add_vehicle(place, along.numbered(k), station, lateral, turn, kind, skin)
 
 
 _Adder = Callable[[int, tuple[float, float], np.random.Generator], None]
 """Adds object k at a station and lateral [m]; the generator samples its other properties."""
 
 
-def _add_furniture(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np.random.Generator | None) -> None:
-    f = spec.furniture
+def _add_furniture(place: KnownPlace, along: _Roadside, site: Site, other_day: np.random.Generator | None) -> None:
+    f = along.spec.furniture
 
     def each(index: int, amount: float, near: float, far: float, radius: float, add: _Adder) -> None:
-        rng = stream(spec.number, "furniture", 2, index)
-        for k, at in enumerate(_scatter(rng, spec, amount, near, far)):
+        rng = along.stream("furniture", 2, index)
+        for k, at in enumerate(_scatter(rng, along, amount, near, far)):
             if site.take(place.route.at(*at), (radius, radius), place.heading(at[0])):
-                add(k, at, rng)
+                add(along.numbered(k), at, rng)
 
     def sign(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
         wide, high = float(rng.uniform(0.5, 1.3)), float(rng.uniform(1.7, 2.7))
@@ -380,22 +452,23 @@ def _add_furniture(place: KnownPlace, spec: PlaceSpec, site: Site, other_day: np
     )
 
 
-def _add_trees(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
-    rng, trees = stream(spec.number, "trees", 1), spec.trees
-    first, last = _reach(spec)
+def _add_trees(place: KnownPlace, along: _Roadside, site: Site) -> None:
+    rng, spec = along.stream("trees", 1), along.spec
+    trees = spec.trees
+    first, last = along.first, along.last
     spots: list[tuple[float, float]] = []
     for side in (1, -1):
         count = int(trees.density * (last - first + 8.0) / 100.0)
-        row = max(1.0, 0.6 * _verge(spec, side))
+        row = max(1.0, 0.6 * along.verge(side))
         for k in range(count):
             station = first + (k + float(rng.uniform(0.2, 0.8))) / max(1, count) * (last - first + 8.0)
             beyond = row + float(rng.normal(0.0, 0.15)) if trees.row else float(rng.gamma(2.0, 3.5)) + 0.8
-            spots.append((station, side * (_edge(spec, side) + beyond)))
+            spots.append((station, side * (along.edge(side) + beyond)))
     distant = 14 if spec.setting not in ("town", "works") else 5  # farther away from the road
     for _ in range(round(distant * max(1.0, (last - first) / _LONGEST_REACH))):
         side = int(rng.choice([-1, 1]))
         spots.append((float(rng.uniform(first, last + 25.0)), side * float(rng.uniform(14.0, 38.0))))
-    for k, at in enumerate(spots):
+    for k, at in enumerate(spots, along.numbered(0)):
         kind, height = str(rng.choice(trees.kinds)), float(rng.uniform(*trees.height))
         skin = f"leaf{int(rng.integers(0, 3))}"
         crown, low = height * float(rng.uniform(0.22, 0.36)), float(rng.uniform(0.7, 1.8))
@@ -417,19 +490,19 @@ def _add_trees(place: KnownPlace, spec: PlaceSpec, site: Site) -> None:
             add_crowned_tree(place, k, at, height, crown, 1.0, skin)
 
 
-def _add_tufts(place: KnownPlace, spec: PlaceSpec) -> None:
-    rng = stream(spec.number, "trees", 2)
-    road = place.route
-    count = int(spec.trees.tufts * (spec.line.length + 20.0))
-    station = rng.uniform(-7.0, spec.line.length + 20.0, count)
+def _add_tufts(place: KnownPlace, along: _Roadside) -> None:
+    rng, spec = along.stream("trees", 2), along.spec
+    road, (first, last) = place.route, along.tufts
+    count = int(spec.trees.tufts * (last - max(first, 0.0)))
+    station = rng.uniform(first, last, count)
     side = rng.choice([-1, 1], count)
-    edges = np.where(side > 0, _edge(spec, 1), _edge(spec, -1))
-    paved = np.where(side > 0, spec.section.sides[0].pavement, spec.section.sides[1].pavement)
+    edges = np.where(side > 0, along.edge(1), along.edge(-1))
+    paved = np.where(side > 0, *along.paved)
     lateral = side * (edges + paved + 0.06 + rng.exponential(0.9, count).clip(0, 5.0))
     keep = np.ones(count, bool)
-    for mouth in spec.line.mouths:
+    for mouth in spec.line.mouths if not along.key else ():
         keep &= (np.abs(station - mouth.station) > mouth.width / 2 + 0.2) | (side != mouth.side)
     xy = road.at(station, lateral)
     keep &= np.abs(road.project(xy)[1]) > 0.5 * edges  # within a bend, a tuft may lie on another part of the road
     if keep.any():
-        add_tufts(place, rng, station[keep], lateral[keep])
+        add_tufts(place, rng, station[keep], lateral[keep], f"tufts{along.suffix()}")

@@ -26,6 +26,7 @@ from twin.reality.place_spec import (
     SectionSpec,
     stream,
 )
+from twin.reality.side_roads import SideAxis, depth_below, verge_lift
 from twin.types import Array
 
 _CROWN_ROUNDING = 0.3  # [m] half width of the rounding of a crown
@@ -61,6 +62,7 @@ class DrawnRoad:
         self._headings = np.array(headings)
         self._points = np.array(points)
         self._curvatures = np.array([*(piece.curvature for piece in spec.line.pieces), 0.0])
+        self.side_axes = [SideAxis(self, one) for one in spec.line.side_roads]
 
     # ---- plan
 
@@ -210,6 +212,8 @@ class DrawnRoad:
         if off.any():
             z = np.array(z)
             z[off] = (1.0 - share[off]) * z[off] + share[off] * self._land(xy[off])
+        for axis, one in zip(self.side_axes, self.line.side_roads, strict=True):
+            z = z + verge_lift(section, one, *axis.project(xy))
         return z
 
 
@@ -292,9 +296,12 @@ def add_road(place: KnownPlace, road: DrawnRoad, stations: Array, suffix: str) -
 
 
 def add_side_roads(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
-    """Adds side roads; `stations` are those of the vertices along the road."""
+    """Adds the side roads that are not filmed; `stations` are those of the vertices along the road."""
     section = road.section
+    filmed = [one.mouth for one in road.line.side_roads]
     for k, mouth in enumerate(road.line.mouths):
+        if mouth in filmed:
+            continue
         edge = section.left if mouth.side > 0 else section.right
         reach = edge + section.kerb_width + np.arange(0.0, MOUTH_REACH, 0.5)
         first = stations[np.argmax(stations + STEP / 2 > mouth.station - mouth.width / 2)]
@@ -324,6 +331,8 @@ def add_land(place: KnownPlace, road: DrawnRoad, name: str, box: tuple[float, fl
     for mouth in road.line.mouths:
         near = (np.abs(station - mouth.station) < mouth.width / 2 + 1.6) & (lateral * mouth.side > 0.0)
         sunk = np.where(near & (away < MOUTH_REACH), 0.3, sunk)
+    for axis, one in zip(road.side_axes, road.line.side_roads, strict=True):
+        sunk = np.maximum(sunk, depth_below(section, one, *axis.project(xy), _LAND_STEP + 0.1))
     points = np.concatenate([xy, (road.ground_height(xy) - sunk)[..., None]], -1)
     uv = np.clip(np.stack([(x - x0) / (x1 - x0), (y1 - y) / (y1 - y0)], -1), 0.0, 1.0)
     place.objects.append(PlaceObject(name, "ground", primitives.grid(points, uv), name))

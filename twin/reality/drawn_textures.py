@@ -11,7 +11,17 @@ from twin.reality import textures
 from twin.reality.drawn_road import MOUTH_REACH
 from twin.reality.houses import House
 from twin.reality.place_objects import CELLS, GroundLayout
-from twin.reality.place_spec import BoundarySpec, HousesSpec, PlaceSpec, Rgb, SectionSpec, SurfaceSpec, stream
+from twin.reality.place_spec import (
+    BoundarySpec,
+    HousesSpec,
+    PlaceSpec,
+    Rgb,
+    SectionSpec,
+    SideRoad,
+    SurfaceSpec,
+    stream,
+)
+from twin.reality.side_roads import SIDE_VERGE, texture_sizes
 from twin.reality.textures import (
     CHIPS,
     AtlasColors,
@@ -420,6 +430,27 @@ def drawn_textures(
 _painted: dict[PlaceSpec, dict[str, NDArray[np.uint8]]] = {}
 
 
+def _paint_side_road(spec: PlaceSpec, k: int, one: SideRoad) -> dict[str, NDArray[np.uint8]]:
+    """The textures of the ground of side road number `k`."""
+    surface, section = replace(spec.surface, markings=(), strip=0.0), spec.section
+
+    def rng(key: int) -> np.random.Generator:
+        return stream(spec.number, "side_roads", k, 10, key)
+
+    half, (before, length) = 0.5 * one.mouth.width, texture_sizes(section, one)
+    across = replace(section, left=half, right=half)
+    out = {
+        one.name: road(rng(0), surface, across, length, _ROAD_PIXEL),
+        f"{one.name}_mouth": road(rng(1), surface, replace(across, kerb_height=0.0), before, _ROAD_PIXEL),
+    }
+    shape = round(SIDE_VERGE / _VERGE_PIXEL), round(length / _VERGE_PIXEL)
+    out[f"{one.name}_verge"] = turf(rng(2), surface, shape, _VERGE_PIXEL, section.sides[0].verge)
+    if section.kerb_height > 0.0:
+        tone, unit = rng(3).uniform(0.7, 1.25), float(rng(4).uniform(0.5, 1.2))
+        out[f"{one.name}_kerb"] = slabs(rng(5), (16, round(length / 0.02)), 0.02, (10.0, unit)) * tone
+    return {name: to_uint8(image) for name, image in out.items()}
+
+
 def _paint(
     spec: PlaceSpec, layout: GroundLayout, houses: dict[str, tuple[House, str, Rgb, Rgb]]
 ) -> dict[str, NDArray[np.uint8]]:
@@ -462,6 +493,8 @@ def _paint(
         half = 0.5 * max(mouth.width for mouth in spec.line.mouths)
         across = replace(section, left=half, right=half, kerb_height=0.0)
         out["side_road"] = to_uint8(road(rng(7), plain, across, MOUTH_REACH / 0.25, 0.02))
+    for k, one in enumerate(spec.line.side_roads):
+        out |= _paint_side_road(spec, k, one)
     kind = {"town": "grass", "works": "gravel", "field": "meadow", "forest": "earth"}.get(spec.setting, "grass")
     for n, (name, (x0, x1, y0, y1)) in enumerate(layout.lands.items()):
         shape = (round((y1 - y0) / _LAND_PIXEL), round((x1 - x0) / _LAND_PIXEL))

@@ -34,6 +34,8 @@ from twin.warp_runtime import wp
 
 CAMERA_HEIGHT = 1.2  # [m] mean height of the lens above the ground, from which it deviates by less than 1 cm
 OUT = PassSpec("out", 0.0, False)
+_SIDE_SPEED = 1.0  # [m/s] highest speed in films of side roads
+_SIDE_SPACING = 0.5  # [m] largest distance between frames there
 _SKY_DISTANCE = 1.0e4  # [m] assumed depth of the sky, for the motion of its pixels
 _OPEN_SAMPLES = 3  # instants over which a row's exposure is averaged
 
@@ -91,6 +93,15 @@ class FilmingPlan:
             shake=film.shake,
             passes=film.passes,
         )
+
+    def side(self, name: str, length: float) -> "FilmingPlan":
+        """The plan of the films of a side road, along `length` [m] of its `side_roads.SideLine`.
+
+        At a turn of a few meters' radius, a camera has to be slow.
+        """
+        speed = min(self.speed, _SIDE_SPEED)
+        fps = int(np.ceil(speed / _SIDE_SPACING))
+        return replace(self, start=0.0, length=length, speed=speed, fps=fps, passes=(PassSpec(name, 0.0, False),))
 
     @property
     def intrinsics(self) -> Array:
@@ -295,13 +306,15 @@ def film_pass(
     one: PassSpec = OUT,
     traffic: bool = False,
     renderer: PlaceRenderer | None = None,
+    line: DrivenLine | None = None,
 ) -> tuple[Array, Array]:
     """Writes the film of one pass under one lighting; returns its times (n,) [s] and poses (n, 4, 4).
 
-    With `traffic`, walkers and cars move through the film; no other `renderer` than the default one shows them.
+    With `traffic`, walkers and cars move through the film; no other `renderer` than the default one shows them. The
+    camera follows `line`, by default the place's driven line.
     """
-    name = film_name(lighting, one)
-    times, poses = trajectory(plan, place.route, name, one)
+    name, line = film_name(lighting, one), line or place.route
+    times, poses = trajectory(plan, line, name, one)
     light = place.lightings[lighting]
     gains = exposures(light, times)
     rng = np.random.default_rng([SEED, 13, sum(map(ord, name))])
@@ -309,7 +322,7 @@ def film_pass(
     make = partial(Renderer, lighting, plan=plan, movers=moving)
     render: PlaceRenderer = renderer or (StretchRenderer(place, make) if is_long(place) else make(place))
     half = 0.5 * plan.readout
-    begun, ended = (trajectory(plan, place.route, name, one, later)[1] for later in (-half, half))
+    begun, ended = (trajectory(plan, line, name, one, later)[1] for later in (-half, half))
     steps = track(list(zip(times, poses, gains, begun, ended, strict=True)), f"film {name}", unit="frame")
     rays = unproject(pixel_grid(plan.width, plan.height), plan.intrinsics)
 

@@ -7,12 +7,13 @@ sampled in `drawn_road.py`. The *setting*, such as `village`, sets probabilities
 
 import colorsys
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
 from twin.errors import InputError
-from twin.reality.drawn_road import lengthen, sample_line
+from twin.reality.drawn_road import DrawnRoad, lengthen, sample_line
 from twin.reality.place_spec import (
     SETTINGS,
     BoundarySpec,
@@ -32,6 +33,7 @@ from twin.reality.place_spec import (
     TreesSpec,
     stream,
 )
+from twin.reality.side_roads import with_side_roads
 
 T = TypeVar("T")
 
@@ -46,11 +48,12 @@ def check_length(number: int, length: float) -> None:
         )
 
 
-def draw(number: int, length: float = 0.0) -> PlaceSpec:
+def draw(number: int, length: float = 0.0, side_roads: bool = False) -> PlaceSpec:
     """The description of the place with a number, always the same.
 
     If its line is shorter than `length` [m], it is lengthened to that. Section, materials, amounts and camera are then
-    those of the place, but what stands beside the road is placed anew.
+    those of the place, but what stands beside the road is placed anew. With `side_roads`, the place has side roads to
+    drive into, where there is room.
 
     Raises:
         InputError: `number` < 1; place 0 has no `PlaceSpec`.
@@ -66,7 +69,7 @@ def draw(number: int, length: float = 0.0) -> PlaceSpec:
     surface = _surface(stream(number, "surface"), stream(number, "markings"), setting, section)
     lamps = _lamps(stream(number, "lamps"), setting)
     lights = _lights(stream(number, "weather"), lamps)
-    return PlaceSpec(
+    spec = PlaceSpec(
         number,
         setting,
         line,
@@ -81,6 +84,10 @@ def draw(number: int, length: float = 0.0) -> PlaceSpec:
         lights,
         _film(stream(number, "film"), line, section, len(lights)),
     )
+    if not side_roads:
+        return spec
+    road = DrawnRoad(spec)
+    return replace(spec, line=with_side_roads(line, fitted, road, road.start, road.end))
 
 
 # ---- aspects

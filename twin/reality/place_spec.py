@@ -41,6 +41,21 @@ class Mouth:
 
 
 @dataclass(frozen=True)
+class SideRoad:
+    """A side road that is filmed and driven: straight, and at right angles to the driven line."""
+
+    name: str
+    """`side_1`, `side_2`, ... in driving order."""
+    mouth: Mouth
+    radius: float
+    """Radius of the turn from the driven line into the side road [m]."""
+    driven: float
+    """Distance from the driven line to the end of the film [m]."""
+    length: float
+    """Distance from the driven line to the end of the side road [m]."""
+
+
+@dataclass(frozen=True)
 class LineSpec:
     """The driven line in plan and in profile."""
 
@@ -54,6 +69,8 @@ class LineSpec:
     mouths: tuple[Mouth, ...]
     relief: float
     """Standard deviation of the land's swells away from the road [m]."""
+    side_roads: tuple[SideRoad, ...] = ()
+    """Side roads that are filmed; the other mouths have short ones."""
 
 
 GRADE_STEP = 20.0  # [m] between grades
@@ -371,7 +388,7 @@ def tasks(line: LineSpec) -> dict[str, tuple[float, float]]:
 
 _ASPECTS = (
     *("setting", "line", "section", "surface", "markings", "houses", "boundaries", "trees", "furniture", "cars"),
-    *("lamps", "horizon", "weather", "film", "longer"),
+    *("lamps", "horizon", "weather", "film", "longer", "side_roads"),
 )
 """The aspects by index; new ones go to the end."""
 

@@ -61,8 +61,8 @@ def add_hedge(place: KnownPlace, k: int, stations: Array, lateral: float) -> Non
     place.objects.append(PlaceObject(f"hedge_{k}", "obstacle", primitives.join([*core, twigs]), "atlas", tuple(solids)))
 
 
-def add_tufts(place: KnownPlace, rng: np.random.Generator, station: Array, lateral: Array) -> None:
-    """Adds blades of grass and weeds at stations and laterals [m], shapes (n,)."""
+def add_tufts(place: KnownPlace, rng: np.random.Generator, station: Array, lateral: Array, name: str = "tufts") -> None:
+    """Adds blades of grass and weeds at stations and laterals [m], shapes (n,), as one object."""
     n = len(station)
     xy = place.route.at(station, lateral)
     foot = np.concatenate([xy, place.route.ground_height(xy)[:, None]], 1)
@@ -73,7 +73,7 @@ def add_tufts(place: KnownPlace, rng: np.random.Generator, station: Array, later
     window = rng.uniform(0.5, 0.9, (n, 1, 2)) + 0.08 * np.array([[0, 1], [1, 1], [0.5, 0]])
     points = np.stack([foot - across - up(0.02), foot + across - up(0.02), tip], 1)
     blades = MeshPart(points.reshape(-1, 3), np.arange(3 * n, dtype=np.int32).reshape(-1, 3), window.reshape(-1, 2))
-    place.objects.append(PlaceObject("tufts", "detail", place.cell("leaf2", blades)))
+    place.objects.append(PlaceObject(name, "detail", place.cell("leaf2", blades)))
 
 
 # ---- trees of sampled places

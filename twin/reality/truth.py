@@ -26,15 +26,17 @@ from twin.files import load_arrays, read_json, wrap_read_errors, write_json
 from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, scaled_intrinsics, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, rotation_angle, umeyama
+from twin.geometry.route import BRANCH
 from twin.nerf.baked import BakedField
 from twin.reality import SEED, campus_road
 from twin.reality.campus_road import RoadLine
 from twin.reality.drawn_place import build_number
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import CAMERA_HEIGHT
-from twin.reality.place_objects import KnownPlace
+from twin.reality.place_objects import DrivenLine, KnownPlace
 from twin.reality.place_sampling import draw
 from twin.reality.place_spec import FREE_HALF_WIDTH
+from twin.reality.side_roads import SideLine
 from twin.scene import SceneDir, stage_result
 from twin.types import Array
 
@@ -78,6 +80,8 @@ class Truth:
     """Lighting of each film by source name; a film that is missing here is named after its lighting."""
     camera_height: float = CAMERA_HEIGHT
     """Mean height of the lens above the ground [m]."""
+    side_roads: dict[str, float] = field(default_factory=dict)
+    """Filmed lengths along the lines into the side roads [m], by name."""
 
     def save(self, folder: Path) -> None:
         """Writes `truth.json` and `truth.npz`."""
@@ -92,6 +96,8 @@ class Truth:
         }
         if self.road_length > 0.0:
             head["road_length"] = self.road_length
+        if self.side_roads:
+            head["side_roads"] = self.side_roads
         head |= {"half_width": self.half_width}
         if self.number > 0:
             head |= {"lightings": self.lightings, "camera_height": self.camera_height}
@@ -110,8 +116,11 @@ class Truth:
             data = load_arrays(folder / "truth.npz")
             keys = ("times", "camera_to_world", "depth_frames", "depth")
             number = int(head.get("place", 0))
+            side_roads = head.get("side_roads", {})
             truth = Truth(
-                DrawnRoad(draw(number, head.get("road_length", 0.0))) if number else RoadLine(**head["route"]),
+                DrawnRoad(draw(number, head.get("road_length", 0.0), bool(side_roads)))
+                if number
+                else RoadLine(**head["route"]),
                 head["start"],
                 head["length"],
                 head["half_width"],
@@ -121,6 +130,7 @@ class Truth:
                 number,
                 head.get("lightings", {}),
                 head.get("camera_height", CAMERA_HEIGHT),
+                side_roads,
             )
         if not np.allclose(head["fingerprint"], fingerprint(truth.place), atol=1e-4):
             raise InputError(f"{folder}: filmed in another version of the place; film again: twin reality film")
@@ -136,7 +146,16 @@ class Truth:
         """The rebuilt place."""
         if isinstance(self.route, RoadLine):
             return campus_road.build(self.route)
-        return build_number(self.number, length=self.road_length)
+        return build_number(self.number, length=self.road_length, side_roads=bool(self.side_roads))
+
+    @cached_property
+    def lines(self) -> dict[str, tuple[DrivenLine, float, float]]:
+        """The filmed lines by name, "" for the driven line: line, first station, filmed length [m]."""
+        out: dict[str, tuple[DrivenLine, float, float]] = {"": (self.route, self.start, self.length)}
+        if isinstance(self.route, DrawnRoad):
+            sides = {one.name: one for one in self.route.line.side_roads}
+            out |= {name: (SideLine(self.route, sides[name]), 0.0, length) for name, length in self.side_roads.items()}
+        return out
 
     def ground_height(self, xy: Array) -> Array:
         """Height of the ground [m], shape (..., 2) → (...)."""
@@ -215,7 +234,8 @@ def measure(scene: SceneDir) -> dict[str, Any]:
         `obstacle_accuracy_m` (median distance from the convex parts' visible surface to the true surface),
         `obstacle_completeness_m` (median distance from the true surface to the parts), `obstacle_median_m` (the larger
         of the two), `corridor_intrusions` (number of convex parts in the corridor), `route_median_m` (median distance
-        of the twin's route from the true center line), `depth_median_m`, `depth_relative` (median error of the field's
+        of the twin's route from the true center line), the same for filmed side roads with their names appended
+        (`route_median_m_side_1`), `depth_median_m`, `depth_relative` (median error of the field's
         depth, absolute and relative, up to a true depth of 20 m).
 
         The `mesh_*` figures compare the visual mesh with the true surface, at any height within 10 m of the route, in
@@ -290,10 +310,13 @@ def camera_errors(poses: Array, true_poses: Array) -> dict[str, float]:
 
 
 def corridor(truth: Truth, half_width: float, step: float = 0.25) -> Array:
-    """Grid of ground points within the true corridor [m], shape (m, 3)."""
-    stations = np.arange(truth.start, truth.start + truth.length + step / 2, step)
+    """Grid of ground points within the true corridors of all filmed lines [m], shape (m, 3)."""
     laterals = np.linspace(-half_width, half_width, 2 * round(half_width / step) + 1)
-    xy = truth.route.at(stations[:, None], laterals[None]).reshape(-1, 2)
+    parts = []
+    for line, start, length in truth.lines.values():
+        stations = np.arange(start, start + length + step / 2, step)
+        parts.append(line.at(stations[:, None], laterals[None]).reshape(-1, 2))
+    xy = np.concatenate(parts)
     return np.concatenate([xy, truth.ground_height(xy)[:, None]], 1)
 
 
@@ -318,8 +341,11 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
     )
     if (mesh / "route.npz").exists():
         with np.load(mesh / "route.npz", allow_pickle=False) as data:
-            points = to_truth.points(np.concatenate([data["xy"], data["z"][:, None]], 1))
-        out["route_median_m"] = float(np.median(np.abs(truth.route.project(points[:, :2])[1])))
+            lines = {"": np.concatenate([data["xy"], data["z"][:, None]], 1)}
+            lines |= {name: data[f"{BRANCH}{name}"] for name in truth.side_roads if f"{BRANCH}{name}" in data}
+        for name, points in lines.items():
+            off = truth.lines[name][0].project(to_truth.points(points)[:, :2])[1]
+            out[f"route_median_m{name and f'_{name}'}"] = float(np.median(np.abs(off)))
     if not (mesh / "parts.npz").exists():
         return out
     parts = [(to_truth.points(v), f) for v, f in load_parts(mesh)]
@@ -402,10 +428,12 @@ def _obstacle_points(points: Array, truth: Truth) -> Array:
 
 
 def _near_route(points: Array, truth: Truth) -> Array:
-    """Keeps the points near the filmed route, at any height."""
-    station, lateral = truth.route.project(points[:, :2])
-    along = (station > truth.start) & (station < truth.start + truth.length + _NEAR_ROUTE)
-    return points[along & (np.abs(lateral) < _NEAR_ROUTE)]
+    """Keeps the points near the filmed lines, at any height."""
+    near = np.zeros(len(points), bool)
+    for line, start, length in truth.lines.values():
+        station, lateral = line.project(points[:, :2])
+        near |= (station > start) & (station < start + length + _NEAR_ROUTE) & (np.abs(lateral) < _NEAR_ROUTE)
+    return points[near]
 
 
 def _surface(meshes: list[tuple[Array, NDArray]]) -> Surface:

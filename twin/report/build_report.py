@@ -76,6 +76,7 @@ def truth_section(report: dict[str, Any]) -> Section:
         ("mesh_chamfer_m", "visual mesh, Chamfer distance", "{:.3f} m", "mean of both directions, each up to 1 m"),
         ("corridor_intrusions", "parts inside the true corridor", "{}", "the corridor must be free"),
         ("route_median_m", "route", "{:.3f} m", "median distance to the true center line"),
+        *_branch_rows(truth),
         ("depth_median_m", "depth of the field", "{:.3f} m", "median error, up to 20 m"),
     )
     wider = "raise nerf.steps, or mjcf.corridor_margin."
@@ -94,6 +95,12 @@ def truth_section(report: dict[str, Any]) -> Section:
         verdict = Verdict(f"Compared with ground truth, the cameras are off by {100 * off:.1f} cm (rms){also}.", "good")
     done = "This place was generated, so its ground truth is known. Only this comparison uses it; the build does not."
     return Section(name, title, done, facts, cautions, verdict=verdict)
+
+
+def _branch_rows(truth: dict[str, Any]) -> list[tuple[str, str, str, str]]:
+    prefix = "route_median_m_"
+    names = [key.removeprefix(prefix) for key in truth if key.startswith(prefix)]
+    return [(f"{prefix}{name}", f"branch {name}", "{:.3f} m", "median distance to its true line") for name in names]
 
 
 def costs_section(report: dict[str, Any]) -> Section:
@@ -162,7 +169,8 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     if (mesh / "ground.npz").exists():
         ground = Ground.load(mesh)
         path = cameras.positions[:, :2] if route is None else route
-        drawn = figures.ground_map(ground, path, route, wide, load_footprints(mesh / "parts.npz", ground))
+        parts = load_footprints(mesh / "parts.npz", ground)
+        drawn = figures.ground_map(ground, path, route, wide, parts, branches)
         out.append(Chart("Ground and convex parts", figures.svg(drawn), "mesh"))
     return out
 

@@ -360,6 +360,8 @@ def mjcf_section(report: dict[str, Any]) -> Section:
             ("mjcf.turn_deg", "turn", "{:+.0f}°", "from the first heading to the last; right is negative"),
             ("mjcf.half_width_m", "corridor", "± {:.2f} m", "kept free of convex parts"),
         )
+        for name, length in numbers(pick(report, "mesh.branches_m")).items():
+            route.append(Fact(f"branch {name}", f"{length:.1f} m", "another route, with the same corridor"))
         free = number(pick(report, "mjcf.spawn_clearance_m"), "{:.2f} m")
         if free == NOT_MEASURED and "spawn_clearance_m" in (pick(report, "mjcf") or {}):
             free = f"over {CLEARANCE_RANGE:g} m"  # None: no part within that range
@@ -408,6 +410,15 @@ def review_section(report: dict[str, Any]) -> Section:
                 ("review.trust.mean", "trust in the pictures", "{:.2f}", trust),
             ),
         ]
+    branches = pick(report, "review.branches")
+    for name, drive in branches.items() if isinstance(branches, dict) else ():
+        off, touched = number(pick(drive, "max_cross_track_m"), "{:.2f} m"), pick(drive, "touched")
+        reached = format_value(pick(drive, "reached_goal"))
+        facts.append(Fact(f"goal of branch {name} reached", reached, f"at most {off} off the line; not in the video"))
+        if not pick(drive, "reached_goal"):
+            what = f"touched {join_names(touched, 8)}" if touched else "did not reach the goal"
+            cure = "find in the map what is in the way: raise mjcf.corridor_margin, or film that part again."
+            cautions.append(Caution(f"On branch {name}, the scripted driver {what}.", cure))
     frames = number(pick(report, "review.frames"), "{} frames")
     facts.append(Fact("video", duration(pick(report, "review.duration_s")), frames))
     facts += facts_of(

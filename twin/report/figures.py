@@ -163,8 +163,7 @@ def place_map(
     axes.scatter(points[shown, 0], points[shown, 1], s=0.8, c=colors, linewidths=0, rasterized=True)
     _draw_route(axes, route, half_width)
     _draw_passes(axes, passes)
-    for name, line in (branches or {}).items():
-        axes.plot(*line.T, color=INK, lw=1.0, ls="--", label=f"branch {name}", zorder=3)
+    _draw_branches(axes, branches or {}, half_width)
     for i, source in enumerate(dict.fromkeys(sources)):
         mine = np.array([name == source for name in sources])
         color, marker = SERIES[i % len(SERIES)], MARKERS[i % len(MARKERS)]
@@ -180,9 +179,20 @@ def place_map(
 
 
 @styled
-def ground_map(ground: Ground, path: Array, route: Array | None, half_width: float, parts: Sequence[Array]) -> Figure:
-    """Map of the measured ground height [m], the route with its corridor, and the footprints of parts."""
-    figure, axes, low, high = _map_axes(path if route is None else route)
+def ground_map(
+    ground: Ground,
+    path: Array,
+    route: Array | None,
+    half_width: float,
+    parts: Sequence[Array],
+    branches: Mapping[str, Array] | None = None,
+) -> Figure:
+    """Map of the measured ground height [m], the route and its branches with their corridors, and footprints of parts.
+
+    Shapes: `path`, `route` and `branches` (k, 2).
+    """
+    branches = branches or {}
+    figure, axes, low, high = _map_axes(path if route is None else np.concatenate([route, *branches.values()]))
     rows, columns = ground.height.shape
     x = ground.origin[0] + ground.cell * np.arange(columns)
     y = ground.origin[1] + ground.cell * np.arange(rows)
@@ -199,6 +209,7 @@ def ground_map(ground: Ground, path: Array, route: Array | None, half_width: flo
     )
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     _draw_route(axes, route, half_width)
+    _draw_branches(axes, branches, half_width)
     if len(parts):
         look: dict[str, Any] = {"facecolors": SERIES[1], "edgecolors": SERIES[1], "alpha": 0.55, "lw": 0.5}
         axes.add_collection(PolyCollection(list(parts), label="convex part", **look))
@@ -239,6 +250,18 @@ def _draw_route(axes: Axes, route: Array | None, half_width: float) -> None:
     for word, at in (("start", route[0]), ("goal", route[-1])):
         box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
         axes.annotate(word, at, xytext=(5, 5), textcoords="offset points", fontsize=8, bbox=box, zorder=5)
+
+
+def _draw_branches(axes: Axes, branches: Mapping[str, Array], half_width: float) -> None:
+    """Draws the branches, dashed, with their corridors; each has its name at its end."""
+    for name, line in branches.items():
+        if half_width > 0.0 and len(line) > 1:
+            outline = corridor_outline(line, half_width)
+            axes.add_collection(PolyCollection([outline], facecolors=SERIES[2], alpha=0.25))
+        axes.plot(*line.T, color=INK, lw=1.0, ls="--", label=f"branch {name}", zorder=3)
+        axes.plot(*line[0], "o", color=INK, ms=4, zorder=3)
+        box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
+        axes.annotate(name, line[-1], xytext=(5, 5), textcoords="offset points", fontsize=8, bbox=box, zorder=5)
 
 
 # ---- curves and bars

@@ -164,7 +164,7 @@ def cautions_above(report: dict[str, Any], *limits: Limit) -> list[Caution]:
 
 
 def follower_verdict(report: dict[str, Any]) -> Verdict:
-    """Outcome of the drive by the scripted driver in one sentence."""
+    """Outcome of the scripted driver's drive along the route, and of those along the branches if there are any."""
     follower = pick(report, "review.follower")
     if not isinstance(follower, dict):
         reason = pick(report, "review.not_applicable") or "this build has no drive"
@@ -175,10 +175,16 @@ def follower_verdict(report: dict[str, Any]) -> Verdict:
     contact = "its contacts were not measured"
     if isinstance(touched, list):
         contact = f"touched {join_names(touched)}" if touched else "touched nothing but the ground"
+    branches = pick(report, "review.branches")
+    branches = branches if isinstance(branches, dict) else {}
+    arrived = {name: bool(pick(drive, "reached_goal")) for name, drive in branches.items()}
+    missed = [f"branch {name}" for name, reached in arrived.items() if not reached]
     if follower.get("reached_goal"):
+        lines = join_names([f"the {length}route", *(f"branch {name}" for name, reached in arrived.items() if reached)])
+        failed = f" It did not reach the end of {join_names(missed)}." if missed else ""
         return Verdict(
-            f"The Husky followed the {length}route from start to end and {contact}.",
-            "mixed" if touched or touched is None else "good",
+            f"The Husky followed {lines} from start to end and {contact}.{failed}",
+            "mixed" if touched or touched is None or missed else "good",
         )
     gone = number(follower.get("distance_m"), "it drove {:.1f} m")
     gone = "" if gone == NOT_MEASURED else f"{gone} and "

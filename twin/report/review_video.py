@@ -86,8 +86,9 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         out: Receives `review.mp4`, `review.json` and `pictures/*.jpg`.
 
     Returns:
-        Metrics for the report: `follower`, `frames`, `duration_s`, `renders`, `render_seconds_per_frame`. With a route
-        also `trust` (see `trust_metrics`), `trace` (see `drive_trace`) and `seen_touched` (see
+        Metrics for the report: `follower`, `frames`, `duration_s`, `renders`, `render_seconds_per_frame`. With branches
+        also `branches`: metrics like `follower` by name; those drives are not in the video. With a route also `trust`
+        (see `trust_metrics`), `trace` (see `drive_trace`) and `seen_touched` (see
         `twin.report.visual_vs_collision.compare_geometry`). Without one, `follower` is None, and `not_applicable`
         contains the reason.
     """
@@ -105,6 +106,8 @@ def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: R
     metrics: dict[str, Any] = {"follower": drive_metrics(drive) if drive else None}
     if not drive:
         metrics["not_applicable"] = no_drive_reason(config)
+    if world and world.branches:
+        metrics["branches"] = {name: _branch_metrics(world, config.review.speed, name) for name in world.branches}
     with VideoWriter(out / "review.mp4", layout.size, config.review.fps, _CRF) as writer:
         studio = Studio(config.name, field, cameras, layout, writer, out, config.review.render_width, path)
         _save_capture_pictures(studio)
@@ -125,6 +128,10 @@ def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: R
     # The file contains no run times, so that the same build writes the same bytes.
     write_json(out / "review.json", metrics | {"pictures": studio.pictures})
     return metrics | {"render_seconds_per_frame": studio.render_seconds / max(1, studio.renders)}
+
+
+def _branch_metrics(world: World, speed: float, name: str) -> dict[str, Any]:
+    return drive_metrics(follow_route(world, HuskyPhysics(world.model(), world.robot), speed, branch=name))
 
 
 def no_drive_reason(config: SceneConfig) -> str:
