@@ -279,7 +279,7 @@ def trust(scene: Path) -> dict[str, Any]:
     from overlay import SIZE, TrueWorld
     from scipy.stats import spearmanr
 
-    from twin.env.observation import Trust
+    from twin.env.trust import Trust
     from twin.geometry.cameras import Viewpoints
     from twin.loading import load_scene
     from twin.mjcf.world import arc_lengths

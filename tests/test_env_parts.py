@@ -18,11 +18,11 @@ from twin.env.domain_randomization import EVALUATION_RANGES, NominalModel, Rando
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
 from twin.env.episode import record_episode
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
-from twin.env.observation import Trust
 from twin.env.options import parse_options
 from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import find_task, scene_tasks
 from twin.env.suite import EnvFactory, episode_spec
+from twin.env.trust import Trust
 from twin.env.vector_env import make_vector_env
 from twin.errors import InputError
 from twin.film import main

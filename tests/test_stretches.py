@@ -150,7 +150,7 @@ def test_the_truth_of_a_long_place_has_its_length(place, tmp_path):
         scene_task("task.json", tmp_path, PLACE)
 
 
-@pytest.mark.parametrize(("given", "said"), [(("12", "10"), "expected 20 to 2000"), (("0", "100"), "demo's street")])
+@pytest.mark.parametrize(("given", "said"), [(("12", "10"), "expected 20 to 2000"), (("0", "100"), "demo's road")])
 def test_a_length_that_cannot_be_is_refused(given, said, tmp_path, capsys):
     assert main(["film", "--place", given[0], "--length", given[1], "--out", str(tmp_path / "x")]) != 0
     assert said in capsys.readouterr().err and not (tmp_path / "x").exists()

@@ -36,7 +36,7 @@ class Episode:
     progress: Array
     """Distance along the route segment [m], shape (k,)."""
     trust: Array
-    """Trust of the image at each instant (see `twin.env.observation`), in [0, 1], shape (k,); nan without images."""
+    """Trust of the image at each instant (see `twin.env.trust`), in [0, 1], shape (k,); nan without images."""
     cause: str
     """Cause of the end, one of `CAUSES`; empty if the episode was cut off."""
     touched: tuple[str, ...]

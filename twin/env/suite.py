@@ -26,12 +26,13 @@ from twin.env.compositor import Compositor, ObjectRenderer
 from twin.env.domain_randomization import EVALUATION_RANGES, KNOWN_WEATHER_FRACTION, PAYLOAD, VERSION, Ranges
 from twin.env.episode_lighting import EpisodeLighting
 from twin.env.mujoco_renderer import SceneRenderer
-from twin.env.observation import GpuPixelObserver, PixelObserver, Trust
+from twin.env.observation import GpuPixelObserver, PixelObserver
 from twin.env.obstacles import EpisodeObstacles, add_obstacles
 from twin.env.options import CPU, NERF, Options, parse_options, state_size
 from twin.env.physics import camera_pose
 from twin.env.route_segments import RouteSegment, find_task
 from twin.env.task import DrivePhysics, DriveTask, RewardAndTermination, control
+from twin.env.trust import Trust
 from twin.errors import InputError
 from twin.files import digest_file, digest_json
 from twin.loading import Twin, load_scene

@@ -124,7 +124,7 @@ class TrialViews:
     """PSNR [dB], shape (n,), with the mean and standard deviation of each color channel matched to the robot's picture,
     so global brightness, contrast and tint do not affect it."""
     trust: Array
-    """See `twin.env.observation`, shape (n,)."""
+    """See `twin.env.trust`, shape (n,)."""
 
 
 def view(

@@ -33,7 +33,7 @@ from twin.evaluation.statistics import rate_summary, wilson
 from twin.files import read_text, wrap_read_errors, write_text
 
 EPISODE_COLUMNS = ("policy", "task", "lighting", "seed", "success", "cause", "progress_m", "steps", "trust")
-"""Columns of `validation/episodes.csv`; `trust` is the trial's mean trust (`twin.env.observation`), or empty."""
+"""Columns of `validation/episodes.csv`; `trust` is the trial's mean trust (`twin.env.trust`), or empty."""
 CELL_COLUMNS = ("policy", "task", "lighting", "trials", "successes", "rate", "low", "high")
 """Columns of `validation/cells.csv`: counts of episodes, with Wilson's interval."""
 RESULT_COLUMNS = ("policy", "lighting", "trials", "successes")
@@ -66,7 +66,7 @@ class Trial:
     steps: int
     """Control steps."""
     trust: float | None = None
-    """Mean over the pictures (see `twin.env.observation`), in [0, 1]; None without pictures."""
+    """Mean over the pictures (see `twin.env.trust`), in [0, 1]; None without pictures."""
 
     @property
     def success(self) -> bool:

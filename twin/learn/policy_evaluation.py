@@ -52,7 +52,7 @@ class EpisodeChunk:
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """Result of an episode, with progress [m], mean trust (`env/observation.py`), and sum of its rewards.
+    """Result of an episode, with progress [m], mean trust (`env/trust.py`), and sum of its rewards.
 
     `lighting` is the lighting's name and, if it was sampled, its mixture; see `LocalVectorEnv.info`.
     """

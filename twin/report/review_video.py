@@ -20,8 +20,8 @@ from twin.assets.ground import Ground
 from twin.config import SceneConfig
 from twin.env.drivers import RecordedDrive, follow_route
 from twin.env.mujoco_renderer import SceneCamera, chase_poses
-from twin.env.observation import Trust
 from twin.env.physics import HuskyPhysics
+from twin.env.trust import Trust
 from twin.files import write_json
 from twin.geometry.cameras import Cameras, RenderableField, Viewpoints
 from twin.geometry.poses import look_at
@@ -298,7 +298,7 @@ _MARGIN_ROWS, _MARGIN_RIGHT = 26, 40  # [px] above and below; at the right, for 
 
 
 def trust_grid(field: RenderableField, cameras: Cameras, world: World) -> tuple[Array, Array, Array]:
-    """Trust (`twin.env.observation`) in views of the front camera along the route, on and beside it.
+    """Trust (`twin.env.trust`) in views of the front camera along the route, on and beside it.
 
     Returns:
         Arc lengths [m], shape (k,); lateral offsets, left positive [m], shape (m,); trust in [0, 1], shape (m, k).
