@@ -8,6 +8,8 @@ between. The offset of two cameras is their distance [m] plus `_PER_TURN` · (1 
 their optical axes;
 *opacity*: the mean opacity of the lower half of the picture, where only ground and objects should be visible;
 *sky in the road*: 1 minus `_SKY_WEIGHT` times the fraction of the lower half whose opacity is below `SKY_OPACITY`.
+
+It is apart from the observation, because a build, which needs no dm_control, draws a map of it.
 """
 
 import numpy as np
