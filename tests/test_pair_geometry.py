@@ -155,7 +155,7 @@ def test_a_pair_of_a_repeated_pattern_does_not_bend_the_path(tmp_path: Path) -> 
 def test_pairs_whose_rotation_contradicts_the_others_do_not_bend_the_path(
     film: Film, pairs: list[PairGeometry]
 ) -> None:
-    """As where another pose explains the matches of a plane better than the true one: it cannot be mended."""
+    """As where another pose explains the matches of a plane better than the true one. Such pairs link no films."""
     turn = Rotation.from_rotvec([0.0, np.radians(8.0), 0.0]).as_matrix()
     bent = [
         replace(pair, rotation=turn @ pair.rotation, translation=turn @ pair.translation, cost=0.0)
@@ -165,6 +165,8 @@ def test_pairs_whose_rotation_contradicts_the_others_do_not_bend_the_path(
     ]
     frames, poses = averaged_poses(bent, ROW, ONE_FILM, 0)
     assert frames.tolist() == list(range(FRAMES)) and film.error(frames, poses) < 0.02
+    kept = consistent_pairs(bent, ROW, ONE_FILM)
+    assert {j - i for i, j in kept} == {1, 2} and len(kept) == 2 * FRAMES - 3
 
 
 def test_known_pairs_are_not_computed_again(film: Film, pairs: list[PairGeometry]) -> None:

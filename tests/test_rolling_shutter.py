@@ -125,7 +125,8 @@ def test_a_rolling_shutter_is_found_and_corrected(axis: int) -> None:
     assert rotation_error(model, truth) < 0.5 * before
 
 
-def test_a_frame_that_loses_all_points_has_no_skew() -> None:
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_frame_that_loses_all_points_has_little_skew() -> None:
     """Bundle adjustment may filter out the last point of a frame."""
     model, matcher, _ = film(shaken(0.012), np.zeros((FRAMES, 2)))
 
@@ -138,7 +139,9 @@ def test_a_frame_that_loses_all_points_has_no_skew() -> None:
 
     found, _ = correct_model(model, matcher, refine_without_a_frame)
     skews = found["film"].skews
-    assert all(np.isfinite(skew).all() for skew in skews.values()) and np.linalg.norm(skews[5]) < 0.006
+    assert (
+        all(np.isfinite(skew).all() for skew in skews.values()) and np.linalg.norm(skews[5]) < 0.006
+    )  # half the shake
 
 
 @pytest.mark.parametrize("skew", [0.0, 0.006])

@@ -9,7 +9,7 @@ does not use the twin, and the twin's rates with the days shuffled.
 - single days: mean over places of the log and Brier scores of all cells (a policy on a day). *gain* is a predictor's
   log score minus that of the twin by photos; it is above 0 if the twin is better.
 
-Intervals (90 %) have the place as their unit (`twin.evaluation.jackknife`), so they hold for experiments at other
+Intervals (90 %) have the place as their unit (`benchmarks/place_intervals.py`), so they hold for experiments at other
 places. Fewer than five places give no intervals.
 """
 

@@ -65,7 +65,7 @@ def static_parts(frames: list[Image]) -> StaticParts:
     Nothing is found in fewer than 12 frames, in frames of several sizes, or if the camera hardly moves.
 
     Args:
-        frames: RGB, shape (h, w, 3), about 320 px wide; lengths in this module are in pixels of these frames.
+        frames: RGB, shape (h, w, 3), about 320 px wide; the result is in pixels of these frames.
     """
     if len(frames) < MIN_FRAMES or len({frame.shape for frame in frames}) > 1:
         return StaticParts()

@@ -28,7 +28,7 @@ def sky_cube_map(
 ) -> NDArray[np.uint8]:
     """A cube map for MuJoCo's skybox: six stacked faces, shape (6 · width, width, 3) uint8.
 
-    The clouds differ per lighting; the skyline (see `skyline`) is the same under all lightings.
+    The clouds differ per lighting; the skyline, as the function `skyline` returns it, is the same under all lightings.
     """
     t, s = np.meshgrid(np.arange(width), np.arange(width), indexing="ij")
     a, b = (2 * (s + 0.5) / width - 1), (2 * (t + 0.5) / width - 1)

@@ -6,9 +6,8 @@ Each drive has one video and one row in `meta/episodes`; one table contains the 
 robot's picture, motion and pose; the action that followed; and the reward and outcome of that action. The format is
 described at huggingface.co/docs/lerobot under "LeRobotDataset v3.0".
 
-In a bag, a frame has the newest picture, as a policy would see it; speed and yaw
-rate from the poses before it; and the mean of the commands until the next frame. Rewards and outcome follow from the
-poses by the twin's rules.
+In a bag, a frame has the newest picture, as a policy would see it; speed and yaw rate from the poses before it; and
+the mean of the commands until the next frame. Rewards and outcome follow from the poses by the twin's rules.
 """
 
 import json

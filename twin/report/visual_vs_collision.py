@@ -287,7 +287,7 @@ def gap_row(views: GeometryViews, k: int) -> Image:
 
 
 def geometry_section(report: dict[str, Any]) -> Section:
-    """The review stage's comparison of visual with collision geometry (`twin.report.visual_vs_collision`)."""
+    """The review stage's comparison of visual with collision geometry of this module."""
     name, title = "seen_touched", "Visual and collision geometry"
     found = pick(report, name)
     if not isinstance(found, dict):
