@@ -233,12 +233,14 @@ def test_the_headline_states_the_outcome_of_the_drive(follower: dict[str, Any], 
 
 
 def test_the_headline_names_the_branches() -> None:
-    branches = {"east": {"reached_goal": True}, "west": {"reached_goal": True}}
+    branches = {name: {"reached_goal": True, "touched": []} for name in ("east", "west")}
     verdict = follower_verdict(changed("review.branches", branches))
     assert verdict.text.startswith("The Husky followed the 59.8 m route, branch east and branch west from start to end")
     assert verdict.mood == "good"
-    verdict = follower_verdict(changed("review.branches", branches | {"west": {"reached_goal": False}}))
-    assert verdict.text.endswith(" It did not reach the end of branch west.") and verdict.mood == "mixed"
+    hit = {"west": {"reached_goal": False, "touched": ["part_7"]}}
+    verdict = follower_verdict(changed("review.branches", branches | hit))
+    assert verdict.text.endswith(" and touched part_7. It did not reach the end of branch west.")
+    assert verdict.mood == "mixed"
 
 
 def test_no_drive_says_why(scene: SceneDir) -> None:

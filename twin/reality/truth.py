@@ -116,7 +116,7 @@ class Truth:
             data = load_arrays(folder / "truth.npz")
             keys = ("times", "camera_to_world", "depth_frames", "depth")
             number = int(head.get("place", 0))
-            side_roads = head.get("side_roads", {})
+            side_roads = {name: float(length) for name, length in head.get("side_roads", {}).items()}
             truth = Truth(
                 DrawnRoad(draw(number, head.get("road_length", 0.0), bool(side_roads)))
                 if number

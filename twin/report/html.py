@@ -171,12 +171,15 @@ def follower_verdict(report: dict[str, Any]) -> Verdict:
         return Verdict(f"No robot was driven here: {reason}.")
     length = number(pick(report, "mjcf.route_length_m"), "{:.1f} m ")
     length = "" if length == NOT_MEASURED else length
-    touched = follower.get("touched")
-    contact = "its contacts were not measured"
-    if isinstance(touched, list):
-        contact = f"touched {join_names(touched)}" if touched else "touched nothing but the ground"
     branches = pick(report, "review.branches")
     branches = branches if isinstance(branches, dict) else {}
+    touched: list[str] | None = []
+    for drive in (follower, *branches.values()):
+        parts = pick(drive, "touched")
+        touched = [*touched, *parts] if isinstance(parts, list) and touched is not None else None
+    contact = "its contacts were not measured"
+    if touched is not None:
+        contact = f"touched {join_names(dict.fromkeys(touched))}" if touched else "touched nothing but the ground"
     arrived = {name: bool(pick(drive, "reached_goal")) for name, drive in branches.items()}
     missed = [f"branch {name}" for name, reached in arrived.items() if not reached]
     if follower.get("reached_goal"):

@@ -22,6 +22,7 @@ from twin.env.drivers import RecordedDrive, follow_route
 from twin.env.mujoco_renderer import SceneCamera, chase_poses
 from twin.env.physics import HuskyPhysics
 from twin.env.trust import Trust
+from twin.errors import InputError
 from twin.files import write_json
 from twin.geometry.cameras import Cameras, RenderableField, Viewpoints
 from twin.geometry.poses import look_at
@@ -131,7 +132,10 @@ def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: R
 
 
 def _branch_metrics(world: World, speed: float, name: str) -> dict[str, Any]:
-    return drive_metrics(follow_route(world, HuskyPhysics(world.model(), world.robot), speed, branch=name))
+    try:
+        return drive_metrics(follow_route(world, HuskyPhysics(world.model(), world.robot), speed, branch=name))
+    except InputError as error:
+        raise InputError(f"branch {name}: {error}") from None
 
 
 def no_drive_reason(config: SceneConfig) -> str:
