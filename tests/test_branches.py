@@ -20,6 +20,7 @@ from twin.errors import InputError
 from twin.geometry.route import BRANCH
 from twin.mjcf.scene_xml import run
 from twin.mjcf.world import World, arc_lengths
+from twin.report import review_video
 from twin.report.build_sections import mjcf_section, review_section
 from twin.report.review_video import drive_metrics
 from twin.scene import SceneDir, write_stamp
@@ -131,3 +132,13 @@ def test_digests_of_episodes_on_the_route_do_not_depend_on_branches(root, tmp_pa
     old, new = (fingerprint(twin.load_scene(place), "ahead", Condition("day")) for place in (before, root))
     assert old == new
     assert fingerprint(twin.load_scene(root), "side", Condition("day")) != new
+
+
+def test_a_branch_that_cannot_be_driven_is_named(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def off_the_ground(*_: object, **__: object) -> None:
+        raise InputError("the robot would start beyond the ground; raise mesh.margin")
+
+    monkeypatch.setattr(review_video, "follow_route", off_the_ground)
+    world = World.load(SceneDir(root).stage("mjcf"))
+    with pytest.raises(InputError, match=r"^branch side: the robot would start beyond the ground; raise mesh\.margin$"):
+        review_video.branch_metrics(world, 1.0, "side")

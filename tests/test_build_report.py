@@ -237,10 +237,23 @@ def test_the_headline_names_the_branches() -> None:
     verdict = follower_verdict(changed("review.branches", branches))
     assert verdict.text.startswith("The Husky followed the 59.8 m route, branch east and branch west from start to end")
     assert verdict.mood == "good"
-    hit = {"west": {"reached_goal": False, "touched": ["part_7"]}}
-    verdict = follower_verdict(changed("review.branches", branches | hit))
-    assert verdict.text.endswith(" and touched part_7. It did not reach the end of branch west.")
+    lost = {"west": {"reached_goal": False, "touched": []}}
+    verdict = follower_verdict(changed("review.branches", branches | lost))
+    assert verdict.text.endswith(" touched nothing but the ground. On branch west it did not arrive.")
     assert verdict.mood == "mixed"
+
+
+def test_the_headline_tells_contacts_on_branches_from_those_on_the_route() -> None:
+    branches = {"east": {"reached_goal": True, "touched": []}, "west": {"reached_goal": False, "touched": ["part_7"]}}
+    report = changed("review.branches", branches)
+    verdict = follower_verdict(report)
+    assert verdict.text.endswith(" touched nothing but the ground. On branch west it touched part_7.")
+    report["review"]["follower"] |= {"reached_goal": False, "distance_m": 3.0, "touched": []}
+    verdict = follower_verdict(report)
+    assert verdict.mood == "bad" and verdict.text == (
+        "The Husky did not reach the end of the 59.8 m route: it drove 3.0 m and touched nothing but the ground. "
+        "It followed branch east from start to end. On branch west it touched part_7."
+    )
 
 
 def test_no_drive_says_why(scene: SceneDir) -> None:

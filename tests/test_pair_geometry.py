@@ -8,7 +8,13 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twin.capture.pair_geometry import PairGeometry, estimate_focal_lengths, pair_geometries, with_rotation
+from twin.capture.pair_geometry import (
+    PairGeometry,
+    _is_near,
+    estimate_focal_lengths,
+    pair_geometries,
+    with_rotation,
+)
 from twin.capture.pose_averaging import Differences, _goes_along, averaged_poses, consistent_pairs, solve_differences
 from twin.geometry.poses import umeyama
 from twin.types import Array
@@ -182,6 +188,17 @@ def test_another_pose_is_taken_only_if_it_explains_the_matches(film: Film, pairs
     assert near is not None
     np.testing.assert_allclose(near.rotation, pairs[0].rotation, atol=1e-3)
     assert with_rotation(pairs[0], pairs[0].rotation @ Rotation.from_rotvec([0.0, 2.5, 0.0]).as_matrix(), 0) is None
+
+
+def test_starts_are_the_same_only_with_rotation_and_direction() -> None:
+    def pose(turn: float, bend: float, sign: float = 1.0) -> tuple[Array, Array, float]:
+        """Turned about x, with a direction turned about y [°]."""
+        angle = np.radians(bend)
+        rotation = Rotation.from_euler("x", turn, degrees=True).as_matrix()
+        return rotation, sign * np.array([np.sin(angle), 0.0, np.cos(angle)]), 0.0
+
+    assert _is_near(pose(0, 0), pose(0.2, 0.2)) and _is_near(pose(0, 0), pose(0, 0, -1.0))
+    assert not _is_near(pose(0, 0), pose(0.4, 0)) and not _is_near(pose(0, 0), pose(0, 0.4))
 
 
 @pytest.mark.parametrize(("model", "guess"), [("SIMPLE_RADIAL", 250.0), ("SIMPLE_RADIAL", 768.0), ("PINHOLE", 768.0)])

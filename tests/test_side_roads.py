@@ -17,7 +17,7 @@ from twin.reality import filming
 from twin.reality.drawn_place import build
 from twin.reality.drawn_road import DrawnRoad
 from twin.reality.place_sampling import draw
-from twin.reality.place_spec import FREE_HALF_WIDTH
+from twin.reality.place_spec import FREE_HALF_WIDTH, MOUTH_REACH
 from twin.reality.side_roads import LEAD, SIDE_VERGE, SideAxis, SideLine, occupied, turn_end
 from twin.reality.true_world import near_stretch
 from twin.reality.truth import HALF_WIDTH, Truth, corridor
@@ -55,6 +55,21 @@ def test_all_but_the_line_is_that_of_the_place():
         assert {one.mouth for one in spec.line.side_roads} <= {*spec.line.mouths}
         assert [one.name for one in spec.line.side_roads] == [f"side_{k + 1}" for k in range(len(spec.line.side_roads))]
     assert found > 15
+
+
+@pytest.mark.parametrize(("numbers", "length"), [(NUMBERS, 0.0), ([60], 0.0), ([3, 7, 8, 19], 600.0)])
+def test_no_other_side_road_crosses_one(numbers, length):
+    """Side roads that are not filmed are in the place, too."""
+    for number in numbers:
+        spec = draw(number, length, side_roads=True)
+        road, filmed = DrawnRoad(spec), [one.mouth for one in spec.line.side_roads]
+        for mouth in (one for one in spec.line.mouths if one not in filmed):
+            edge = (spec.section.left if mouth.side > 0 else spec.section.right) + spec.section.kerb_width
+            across = mouth.station + 0.5 * mouth.width * np.linspace(-1.0, 1.0, 9)
+            xy = road.at(across[:, None], mouth.side * (edge + np.arange(0.0, MOUTH_REACH, 0.25)))
+            for one in spec.line.side_roads:
+                at = SideAxis(road, one).project(xy)
+                assert not occupied(spec.section, one, *at, 0.0).any(), (number, one.name)
 
 
 def test_a_side_line_is_smooth_and_projects_back():
@@ -111,7 +126,7 @@ def test_nothing_stands_on_side_roads_and_things_stand_beside_them(place, spec):
 
 
 def test_what_stood_beside_the_driven_line_stands_there_still(place, spec):
-    """Of the solids of the place without filmed side roads, only those in the way of one are missing or moved."""
+    """Only solids in the way of a filmed side road are missing or moved."""
 
     def centers(one):
         return np.array([solid.center[:2] for obj in one.objects for solid in obj.solids])
@@ -199,14 +214,22 @@ def test_the_true_corridor_covers_all_lines(filmed):
     [
         (["--place", "0"], "--side-roads: the demo's street has none; give a --place from 1 on"),
         (["--place", "28", "--traffic"], "walkers and cars keep to the main road; leave one of them out"),
-        (["--place", "1"], "place 1 has no side road with room for a film; choose one of the places 2, 4, 5,"),
-        (["--place", "7", "--tiny"], "place 7 has no side road in its first 12 m; film without --tiny"),
+        (["--place", "1"], "m of place 1 has room for a film; choose one of the places 2, 4, 5,"),
+        (["--place", "7", "--tiny"], "choose one of the places 2, 28, or film without --tiny"),
     ],
 )
 def test_what_cannot_be_filmed_is_refused(given, said, tmp_path, capsys):
     assert verb.main(["film", "--side-roads", "--out", str(tmp_path / "x"), *given]) == 2
     error = capsys.readouterr().err
     assert said in error and len(error.strip().splitlines()) == 1 and not (tmp_path / "x").exists()
+
+
+def test_a_truth_with_an_unknown_side_road_is_refused(filmed):
+    root, _ = filmed
+    path = root / "truth" / "truth.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"side_roads": {"side_9": 20.0}}))
+    with pytest.raises(verb.InputError, match=r"KeyError: 'side_9'\); film again"):
+        Truth.load(root / "truth")
 
 
 def test_a_task_of_such_a_scene_is_refused_by_the_real_test(filmed):

@@ -28,10 +28,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from twin import commands, runtime
 from twin.capture.bag import is_bag
@@ -231,7 +230,6 @@ def write_plots(folder: Path, windows: Windows, fitted: Prediction, baseline: Pr
 
     They show the held-out windows; the plot of track ratios shows all windows of steady speed.
     """
-    matplotlib.use("Agg")  # needs no display
     figures = {
         folder / "ends.png": _plot_ends(windows, fitted, baseline),
         folder / "turning.png": _plot_turning(windows, fitted),
@@ -240,12 +238,12 @@ def write_plots(folder: Path, windows: Windows, fitted: Prediction, baseline: Pr
     }
     for path, figure in figures.items():
         figure.savefig(path, dpi=110)
-        plt.close(figure)
     return list(figures)
 
 
-def _plot_ends(windows: Windows, fitted: Prediction, baseline: Prediction) -> plt.Figure:
-    figure, axes = plt.subplots(1, 3, figsize=(12, 4.2), layout="constrained")
+def _plot_ends(windows: Windows, fitted: Prediction, baseline: Prediction) -> Figure:
+    figure = Figure(figsize=(12, 4.2), layout="constrained")
+    axes = figure.subplots(1, 3)
     score = ~windows.fitting
     for i, (axis, name) in enumerate(zip(axes, ("forward [m]", "left [m]", "yaw [°]"), strict=True)):
         unit = 180 / np.pi if i == 2 else 1.0
@@ -260,8 +258,9 @@ def _plot_ends(windows: Windows, fitted: Prediction, baseline: Prediction) -> pl
     return figure
 
 
-def _plot_turning(windows: Windows, fitted: Prediction) -> plt.Figure:
-    figure, axes = plt.subplots(1, 2, figsize=(12, 4.2), layout="constrained", sharey=True)
+def _plot_turning(windows: Windows, fitted: Prediction) -> Figure:
+    figure = Figure(figsize=(12, 4.2), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
     use = steady_windows(windows)
     sides = windows.wheels[use].mean(1) * WHEEL_RADIUS
     real, ours = (track_ratios(windows, ends)[use] for ends in (windows.poses[:, -1], fitted.ends))
@@ -282,13 +281,14 @@ def _plot_turning(windows: Windows, fitted: Prediction) -> plt.Figure:
     return figure
 
 
-def _plot_wheels(windows: Windows, fitted: Prediction) -> plt.Figure:
+def _plot_wheels(windows: Windows, fitted: Prediction) -> Figure:
     score = np.flatnonzero(~windows.fitting)
     change = np.ptp(windows.wheels[score], axis=1).sum(1)
     # Some windows with large changes of speed, spread over the log.
     changing = score[change >= np.quantile(change, 0.7)]
     chosen = changing[np.linspace(0, len(changing) - 1, min(_SHOWN, len(changing))).astype(int)]
-    figure, axes = plt.subplots(1, len(chosen), figsize=(12, 3.8), layout="constrained", sharey=True, squeeze=False)
+    figure = Figure(figsize=(12, 3.8), layout="constrained")
+    axes = figure.subplots(1, len(chosen), sharey=True, squeeze=False)
     time = np.arange(windows.wheels.shape[1]) * PERIOD
     for axis, i in zip(axes[0], chosen, strict=True):
         for side, color, name in ((0, _OTHER, "left"), (1, _MODEL, "right")):
@@ -301,8 +301,9 @@ def _plot_wheels(windows: Windows, fitted: Prediction) -> plt.Figure:
     return figure
 
 
-def _plot_errors(windows: Windows, fitted: Prediction, baseline: Prediction) -> plt.Figure:
-    figure, axes = plt.subplots(1, 2, figsize=(12, 4.2), layout="constrained")
+def _plot_errors(windows: Windows, fitted: Prediction, baseline: Prediction) -> Figure:
+    figure = Figure(figsize=(12, 4.2), layout="constrained")
+    axes = figure.subplots(1, 2)
     score = ~windows.fitting
     for prediction, color in ((baseline, _OTHER), (fitted, _MODEL)):
         for axis, values in zip(axes, prediction.errors, strict=True):

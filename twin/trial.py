@@ -39,7 +39,7 @@ from twin.report.drive_dataset import drives_summary, write_bag_dataset
 from twin.report.drive_video import write_trial_video
 from twin.report.review_video import load_ground_and_parts
 from twin.robot import PixelCamera
-from twin.sysid.trial_recording import FIT, FrameFit, TrialRecording, read_trial, scene_frame
+from twin.sysid.trial_recording import FrameFit, PosesFrame, TrialRecording, read_trial, scene_frame
 from twin.types import Array, Image
 from twin_policy import Limits, Pilot, Rectifier
 
@@ -58,7 +58,7 @@ def record_trial(
     out: Path | None = None,
     twin_lighting: str | None = None,
     cause: str | None = None,
-    frame: str = FIT,
+    frame: PosesFrame = "pictures",
     topics: dict[str, str] | None = None,
 ) -> tuple[Trial, dict[str, Any], Path]:
     """Evaluates a trial and writes its results. Returns its row of `real_trials.csv`, its figures and its folder.

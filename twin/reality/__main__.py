@@ -78,10 +78,14 @@ def film(
     `side_roads`, every side road into which a line turns off the filmed length gets films of its own.
 
     Raises:
-        InputError: `out` is not empty and has no folder `truth`; the place has no such side road.
+        InputError: `out` is not empty and has no folder `truth`; there is no such side road, or `traffic` with them.
     """
     if out.is_dir() and any(out.iterdir()) and not (out / "truth").is_dir():
         raise InputError(f"{out} is not empty and has no truth/, so this command did not write it; give another --out")
+    if side_roads and not number:
+        raise InputError("--side-roads: the demo's street has none; give a --place from 1 on")
+    if side_roads and traffic:
+        raise InputError("--side-roads with --traffic: walkers and cars keep to the main road; leave one of them out")
     spec = draw(number, length, side_roads) if number else None
     sides = _filmed_sides(spec, plan) if spec and side_roads else []
     (out / "input").mkdir(parents=True, exist_ok=True)
@@ -131,20 +135,22 @@ def _filmed_sides(spec: PlaceSpec, plan: FilmingPlan) -> _Sides:
     """The side roads into which a line turns off the filmed length. Raises InputError if there are none."""
     tiny = plan.length < spec.line.length
     road, out = DrawnRoad(spec), []
-    for one in spec.line.side_roads:
-        if one.mouth.station - one.radius <= plan.length:
-            length = SideLine(road, one).length
-            out.append((one, plan.side(one.name, min(length, _TINY_SIDE) if tiny else length)))
-    if not out and spec.line.side_roads:
-        raise InputError(
-            f"--side-roads: place {spec.number} has no side road in its first {plan.length:g} m; film without --tiny"
-        )
+    for one in _within(spec, plan.length):
+        length = SideLine(road, one).length
+        out.append((one, plan.side(one.name, min(length, _TINY_SIDE) if tiny else length)))
     if not out:
-        known = ", ".join(str(n) for n in range(1, _DEVELOPMENT + 1) if draw(n, side_roads=True).line.side_roads)
+        reach = plan.length if tiny else float("inf")
+        known = [str(n) for n in range(1, _DEVELOPMENT + 1) if _within(draw(n, side_roads=True), reach)]
         raise InputError(
-            f"--side-roads: place {spec.number} has no side road with room for a film; choose one of the places {known}"
+            f"--side-roads: no side road in the first {plan.length:g} m of place {spec.number} has room for a film; "
+            f"choose one of the places {', '.join(known)}" + (", or film without --tiny" if tiny else "")
         )
     return out
+
+
+def _within(spec: PlaceSpec, length: float) -> list[SideRoad]:
+    """The side roads into which a line turns off the first `length` meters of the road."""
+    return [one for one in spec.line.side_roads if one.mouth.station - one.radius <= length]
 
 
 def scene_toml(
@@ -192,13 +198,6 @@ def _check_lightings(names: list[str], among: Iterable[str]) -> None:
             raise InputError(f"no lighting {short_repr(name)} in this place; expected one of {', '.join(among)}")
 
 
-def _check_side_roads(options: argparse.Namespace) -> None:
-    if options.place == 0:
-        raise InputError("--side-roads: the demo's street has none; give a --place from 1 on")
-    if options.traffic:
-        raise InputError("--side-roads with --traffic: walkers and cars keep to the main road; leave one of them out")
-
-
 def command(options: argparse.Namespace) -> None:
     """Runs the command that the options name, as parsed by `twin.commands`."""
     if getattr(options, "length", 0.0):
@@ -212,8 +211,6 @@ def command(options: argparse.Namespace) -> None:
         if options.place:
             plan = FilmingPlan.of(draw(options.place, options.length))
             plan = _tiny(plan) if options.tiny else plan
-        if options.side_roads:
-            _check_side_roads(options)
         _check_lightings(options.lightings or [], plan.lightings if options.place else LIGHTINGS)
         plan = replace(plan, lightings=tuple(dict.fromkeys(options.lightings))) if options.lightings else plan
         if not 0.0 <= options.readout <= _MAX_READOUT:

@@ -17,6 +17,7 @@ from twin.reality.place_objects import KnownPlace, PlaceObject
 from twin.reality.place_spec import (
     GRADE_STEP,
     LONGEST_DRAWN,
+    MOUTH_REACH,
     RUN_IN,
     RUN_OUT,
     LineSpec,
@@ -35,7 +36,6 @@ _SWELL_LENGTHS = (25.0, 80.0)  # [m] range of wavelengths of the land's swells
 _LAND_SAMPLE = 2.0  # [m] between points of the line whose heights determine the land
 _LAND_SMOOTHING = 3.0  # [m] length over which these heights are smoothed
 _DROP_LENGTH = 0.8  # [m] over which a curb drops beside a side road
-MOUTH_REACH = 26.0  # [m] from the road's edge to the end of a side road
 _CHUNK = 40_000  # most points whose land height is computed together
 _CHUNK_DISTANCES = 4_000_000  # most distances between points and line that are computed together
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.reality import textures
-from twin.reality.drawn_road import MOUTH_REACH
 from twin.reality.houses import House
 from twin.reality.place_objects import CELLS, GroundLayout
 from twin.reality.place_spec import (
+    MOUTH_REACH,
     BoundarySpec,
     HousesSpec,
     PlaceSpec,

@@ -14,6 +14,7 @@ from twin.reality import SEED
 Rgb = tuple[float, float, float]
 
 SETTINGS = ("town", "suburb", "village", "works", "park", "forest", "field")
+MOUTH_REACH = 26.0  # [m] from the road's edge to the end of a side road that is not filmed
 FREE_HALF_WIDTH = 1.5  # [m] half width of the corridor along the driven line that is free of solid objects
 CLEARANCE = 0.15  # [m] least distance of solid objects from the corridor, and by default from road and curb
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twin.reality import primitives
 from twin.reality.place_objects import DrivenLine, KnownPlace, PlaceObject
-from twin.reality.place_spec import LineSpec, Mouth, SectionSpec, SideRoad
+from twin.reality.place_spec import MOUTH_REACH, LineSpec, Mouth, SectionSpec, SideRoad
 from twin.types import Array
 
 LEAD = 8.0  # [m] of the driven line in front of the turn, which both films show
@@ -126,9 +126,10 @@ def with_side_roads(line: LineSpec, section: SectionSpec, road: DrivenLine, star
     """The line with side roads at all mouths that have room for one; `road` is that line as a `DrivenLine`.
 
     A mouth has room if its film can begin on the driven line, and if the side road stays away from the rest of the
-    road, which extends from station `start` to `end` [m], and from other side roads.
+    road, which extends from station `start` to `end` [m], and from other side roads, filmed or not.
     """
     others = road.at(np.arange(start, end, 1.0))
+    short = {mouth: _short_axis(road, section, mouth) for mouth in line.mouths}
     found: list[tuple[Mouth, SideRoad]] = []
     taken: list[Array] = []
     for mouth in sorted(line.mouths, key=lambda one: one.station):
@@ -142,6 +143,10 @@ def with_side_roads(line: LineSpec, section: SectionSpec, road: DrivenLine, star
         out = np.arange(kerb, whole.length + 0.1, 0.5)
         axis = SideAxis(road, whole).at(out)
         free = np.linalg.norm(axis[:, None] - others, axis=-1).min(1) > np.minimum(_NEAR_MOUTH * out, _ROOM)
+        half = 0.5 * wide.width + section.kerb_width + SIDE_VERGE
+        for other, points in short.items():
+            if other != mouth:
+                free &= np.linalg.norm(axis[:, None] - points, axis=-1).min(1) > half + 0.5 * other.width
         for one in taken:
             free &= np.linalg.norm(axis[:, None] - one, axis=-1).min(1) > _APART
         length = float(out[-1] if free.all() else out[max(int(np.argmin(free)) - 1, 0)])
@@ -157,6 +162,12 @@ def with_side_roads(line: LineSpec, section: SectionSpec, road: DrivenLine, star
     )
 
 
+def _short_axis(road: DrivenLine, section: SectionSpec, mouth: Mouth) -> Array:
+    """Points (n, 2) [m] of a side road that is not filmed."""
+    out = surface_start(section, mouth) + np.arange(0.0, MOUTH_REACH, 0.5)
+    return road.at(np.full_like(out, mouth.station), mouth.side * out)
+
+
 # ---- ground
 
 
@@ -167,8 +178,7 @@ def _smooth(share: Array) -> Array:
 
 def begin_of_verges(section: SectionSpec, one: SideRoad) -> float:
     """Station of the axis where the verge of the driven road ends [m]; there, the side road's verges begin."""
-    k, edge = (0, section.left) if one.mouth.side > 0 else (1, section.right)
-    return edge + section.kerb_width + section.sides[k].width
+    return surface_start(section, one.mouth) + section.sides[0 if one.mouth.side > 0 else 1].width
 
 
 def _outer(section: SectionSpec, one: SideRoad) -> float:
@@ -200,9 +210,9 @@ def depth_below(section: SectionSpec, one: SideRoad, station: Array, lateral: Ar
     return np.where(along & (away < -margin), 0.5, np.where(along & (away < margin), 0.12, 0.0))
 
 
-def surface_start(section: SectionSpec, one: SideRoad) -> float:
+def surface_start(section: SectionSpec, mouth: Mouth) -> float:
     """Station of the axis where a side road's surface begins [m]: at the curb of the driven road."""
-    return (section.left if one.mouth.side > 0 else section.right) + section.kerb_width
+    return (section.left if mouth.side > 0 else section.right) + section.kerb_width
 
 
 def add_side_road(place: KnownPlace, section: SectionSpec, axis: SideAxis, one: SideRoad) -> None:
@@ -223,7 +233,8 @@ def add_side_road(place: KnownPlace, section: SectionSpec, axis: SideAxis, one: 
 
     begin, inner = begin_of_verges(section, one), 1e-6
     # Between the verges of the driven road, the surface is wider, as the verges' gap ends at a vertex.
-    strip(f"{one.name}_mouth", f"{one.name}_mouth", surface_start(section, one), _across(half + _STEP), begin, _LIFT)
+    first = surface_start(section, one.mouth)
+    strip(f"{one.name}_mouth", f"{one.name}_mouth", first, _across(half + _STEP), begin, _LIFT)
     strip(one.name, one.name, begin, _across(half - inner), one.length, _LIFT)
     for sign, side in ((1, "left"), (-1, "right")):
         outer = sign * np.linspace(half + kerb + inner, half + kerb + SIDE_VERGE, 5)
@@ -249,4 +260,4 @@ def _across(half: float) -> Array:
 def texture_sizes(section: SectionSpec, one: SideRoad) -> tuple[float, float]:
     """Length of a side road between the verges of the driven road, and beyond them [m]."""
     begin = begin_of_verges(section, one)
-    return begin - surface_start(section, one), one.length - begin
+    return begin - surface_start(section, one.mouth), one.length - begin

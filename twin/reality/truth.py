@@ -132,6 +132,7 @@ class Truth:
                 head.get("camera_height", CAMERA_HEIGHT),
                 side_roads,
             )
+            _ = truth.lines  # a KeyError if this version of the place lacks one of the side roads
         if not np.allclose(head["fingerprint"], fingerprint(truth.place), atol=1e-4):
             raise InputError(f"{folder}: filmed in another version of the place; film again: twin reality film")
         return truth

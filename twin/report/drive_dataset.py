@@ -14,7 +14,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -318,7 +318,7 @@ def write_bag_dataset(
     policy_name: str | None = None,
     lighting: str = "",
     cause: str | None = None,
-    frame: str = "pictures",
+    frame: Literal["scene", "pictures"] = "pictures",
     topics: dict[str, str] | None = None,
 ) -> list[Episode]:
     """Writes recordings of drives as a LeRobot dataset; returns the drives as episodes.
@@ -331,7 +331,7 @@ def write_bag_dataset(
         policy_name: The policy that determines the frames' camera and period; None: those of the scene's environments.
         lighting: Name of the day or light in the dataset's table of drives.
         cause: The cause of the recording's end, as stated by the operator; only allowed with a single bag.
-        frame: See `twin.sysid.trial_recording.scene_frame`.
+        frame: See `twin.sysid.trial_recording.PosesFrame`.
         topics: Topics of the bags; see `read_trial`.
 
     Raises:

@@ -171,27 +171,29 @@ def follower_verdict(report: dict[str, Any]) -> Verdict:
         return Verdict(f"No robot was driven here: {reason}.")
     length = number(pick(report, "mjcf.route_length_m"), "{:.1f} m ")
     length = "" if length == NOT_MEASURED else length
+    touched = follower.get("touched")
+    contact = "its contacts were not measured"
+    if isinstance(touched, list):
+        contact = f"touched {join_names(touched)}" if touched else "touched nothing but the ground"
     branches = pick(report, "review.branches")
     branches = branches if isinstance(branches, dict) else {}
-    touched: list[str] | None = []
-    for drive in (follower, *branches.values()):
-        parts = pick(drive, "touched")
-        touched = [*touched, *parts] if isinstance(parts, list) and touched is not None else None
-    contact = "its contacts were not measured"
-    if touched is not None:
-        contact = f"touched {join_names(dict.fromkeys(touched))}" if touched else "touched nothing but the ground"
-    arrived = {name: bool(pick(drive, "reached_goal")) for name, drive in branches.items()}
-    missed = [f"branch {name}" for name, reached in arrived.items() if not reached]
+    arrived = [f"branch {name}" for name, drive in branches.items() if pick(drive, "reached_goal")]
+    missed = [
+        f" On branch {name} it {f'touched {join_names(hit)}' if (hit := pick(drive, 'touched')) else 'did not arrive'}."
+        for name, drive in branches.items()
+        if not pick(drive, "reached_goal")
+    ]
     if follower.get("reached_goal"):
-        lines = join_names([f"the {length}route", *(f"branch {name}" for name, reached in arrived.items() if reached)])
-        failed = f" It did not reach the end of {join_names(missed)}." if missed else ""
+        lines = join_names([f"the {length}route", *arrived])
         return Verdict(
-            f"The Husky followed {lines} from start to end and {contact}.{failed}",
+            f"The Husky followed {lines} from start to end and {contact}.{''.join(missed)}",
             "mixed" if touched or touched is None or missed else "good",
         )
     gone = number(follower.get("distance_m"), "it drove {:.1f} m")
     gone = "" if gone == NOT_MEASURED else f"{gone} and "
-    return Verdict(f"The Husky did not reach the end of the {length}route: {gone}{contact}.", "bad")
+    also = [f" It followed {join_names(arrived)} from start to end."] if arrived else []
+    rest = "".join(also + missed)
+    return Verdict(f"The Husky did not reach the end of the {length}route: {gone}{contact}.{rest}", "bad")
 
 
 # ---- HTML

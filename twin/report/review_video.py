@@ -108,7 +108,7 @@ def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: R
     if not drive:
         metrics["not_applicable"] = no_drive_reason(config)
     if world and world.branches:
-        metrics["branches"] = {name: _branch_metrics(world, config.review.speed, name) for name in world.branches}
+        metrics["branches"] = {name: branch_metrics(world, config.review.speed, name) for name in world.branches}
     with VideoWriter(out / "review.mp4", layout.size, config.review.fps, _CRF) as writer:
         studio = Studio(config.name, field, cameras, layout, writer, out, config.review.render_width, path)
         _save_capture_pictures(studio)
@@ -131,7 +131,11 @@ def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: R
     return metrics | {"render_seconds_per_frame": studio.render_seconds / max(1, studio.renders)}
 
 
-def _branch_metrics(world: World, speed: float, name: str) -> dict[str, Any]:
+def branch_metrics(world: World, speed: float, name: str) -> dict[str, Any]:
+    """The scripted driver's drive along a branch at a speed [m/s].
+
+    Raises InputError: the branch begins off the ground.
+    """
     try:
         return drive_metrics(follow_route(world, HuskyPhysics(world.model(), world.robot), speed, branch=name))
     except InputError as error:

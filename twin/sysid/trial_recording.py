@@ -9,7 +9,7 @@ the bag only when they are needed.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -259,7 +259,7 @@ def _headings(xy: Array) -> Array:
 
 # ---- frame of the poses
 
-SCENE_FRAME, FIT = "scene", "pictures"
+PosesFrame = Literal["scene", "pictures"]
 """The poses are in the scene's frame, or their frame is fitted to localized pictures."""
 _LOCATED = 24  # largest number of pictures that are localized in the scene
 _MIN_LOCATED, _MIN_WAY = 5, 2.0  # least number of pictures; [m] least distance of the farthest pose from the first
@@ -290,17 +290,18 @@ class FrameFit:
         return np.column_stack([xy, poses[:, 2] + self.yaw])
 
 
-def scene_frame(recording: TrialRecording, frame: str, start: int, scene: SceneDir, robot: HuskyParams) -> FrameFit:
+def scene_frame(
+    recording: TrialRecording, frame: PosesFrame, start: int, scene: SceneDir, robot: HuskyParams
+) -> FrameFit:
     """The frame of a recording's poses in a built scene.
 
     Args:
-        frame: `SCENE_FRAME` or `FIT`.
         start: Time [ns] from which pictures are used.
 
     Raises:
         InputError: an error of `fit_frame`, or the pictures are missing or cannot be read.
     """
-    if frame == SCENE_FRAME:
+    if frame == "scene":
         return FrameFit(0.0, np.zeros(2))
     ground = Ground.load(require_stage(scene, "mesh"))
     stamps = recording.shutter[recording.shutter >= start]
