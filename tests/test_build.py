@@ -18,7 +18,7 @@ import pytest
 from twin import build as verb
 from twin.config import CaptureConfig, MjcfConfig, NerfConfig, SceneConfig, SourceConfig
 from twin.files import digest_json
-from twin.scene import SceneDir, Stamp
+from twin.scene import SceneDir, Stamp, replace_file
 
 _TOML = '[[source]]\npath = "input/a.txt"\n[metric]\ncamera_height = 1.0\n'
 
@@ -279,6 +279,17 @@ def test_a_kill_between_the_two_renames_loses_nothing(pipeline):
     final.rename(final.with_name(final.name + ".old"))
     assert _rerun(pipeline) == []
     assert Stamp.load(final) is not None
+
+
+def test_a_film_published_again_leaves_no_partial_file(tmp_path):
+    source, target = tmp_path / "stage" / "review.mp4", tmp_path / "review.mp4"
+    source.parent.mkdir()
+    for content in (b"first", b"first", b"second"):
+        if not source.exists() or source.read_bytes() != content:
+            source.unlink(missing_ok=True)
+            source.write_bytes(content)
+        replace_file(source, target)
+        assert target.read_bytes() == content and sorted(tmp_path.iterdir()) == [target, source.parent]
 
 
 def test_segments_of_films_are_in_the_key_only_if_given():

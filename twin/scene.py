@@ -312,6 +312,8 @@ def recover_stages(scene: SceneDir) -> None:
 
 def replace_file(source: Path, target: Path) -> None:
     """Replaces `target` atomically by a hard link to `source`, or by a copy if the file system has no hard links."""
+    if target.exists() and target.samefile(source):  # to rename one link to another would leave both names
+        return
     with atomic_path(target) as partial:
         partial.unlink(missing_ok=True)
         try:
