@@ -281,6 +281,7 @@ def bricks(facts) -> int:
     return facts["bricks_near"] + facts["bricks_far"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES)
 def test_baked_field_renders_like_the_field(cameras, device, monkeypatch):
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)

@@ -9,7 +9,7 @@ from fuzzing import cases, values
 
 from twin.errors import InputError
 
-CASES, SEED = 3000, 1
+CASES, SEED = 2000, 1
 
 
 def test_no_reader_and_no_verb_fails():

@@ -74,6 +74,7 @@ def test_gradients_equal_finite_differences(cameras):
             assert error.median() < 0.02
 
 
+@pytest.mark.slow
 def test_rotated_frames_are_corrected_in_a_trained_field(cameras, monkeypatch):
     config = replace(REFINING, steps=300, rays=512, samples=12, levels=4, log2_table=12, stereo=False, sightings=0.0)
     trainer = Trainer(cameras, floor_points(cameras), config, 0, "cpu", camera_height=1.5)

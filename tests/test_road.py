@@ -257,6 +257,7 @@ def test_damaged_detail_is_refused_before_rendering(tmp_path):
 # ---- training
 
 
+@pytest.mark.slow
 def test_field_of_two_sections_learns_renders_and_survives_the_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(road_module, "OVERLAP", 2.0)
     cameras = make_cameras(tmp_path, 28)

@@ -160,6 +160,7 @@ def test_street_is_solved(street: Street, tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "work").exists()
 
 
+@pytest.mark.slow
 def test_films_in_opposite_directions_are_joined_by_the_ground(tmp_path: Path) -> None:
     street = _film(tmp_path / "there_and_back", there_and_back=True)
     metrics = _run(street, tmp_path / "out")
@@ -179,6 +180,7 @@ def test_films_in_opposite_directions_are_joined_by_the_ground(tmp_path: Path) -
     assert (local[:, 2] > 0.0).all()
 
 
+@pytest.mark.slow
 def test_a_film_of_another_road_is_left_out(tmp_path: Path) -> None:
     """Another film has its lighting, so the build goes on; the metrics name the film that was left out."""
     street = _film(tmp_path / "s", there_and_back=True, same_road=False)

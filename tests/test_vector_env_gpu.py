@@ -104,7 +104,7 @@ def test_gpu_physics_agrees_with_mujoco(scene, device_name):
 
 
 @pytest.mark.parametrize("device_name", DEVICES)
-@pytest.mark.parametrize("obstacles", [(), (WALKER,)])
+@pytest.mark.parametrize("obstacles", [pytest.param((), marks=pytest.mark.slow), (WALKER,)])
 def test_gpu_observations_agree_with_the_cpu(scene, obstacles, device_name):
     """Images of the field alone, and images with obstacles, without access to the physics in between."""
     stage = EnvFactory.open(scene, "bend", {"obstacles": obstacles, "lighting": "day", **SMALL})
@@ -146,6 +146,7 @@ def test_gpu_overflow_and_divergence_raise(scene, device_name):
     envs.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device_name", DEVICES)
 def test_gpu_contact_ends_the_episode(scene, device_name):
     wall = ObstacleConfig("in_the_way", "box", station=0.95, lateral=0.0)
