@@ -52,6 +52,8 @@ def measure(folder: Path) -> dict[str, Any]:
         "joined": report.get("joined"),
         "apart": report.get("apart"),
         "may_drift": report.get("may_drift"),
+        "checked_steps": report["checked_steps"],
+        "contradicted_steps": len(report["contradicted_steps"]),
     }
 
 
@@ -59,6 +61,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path, help="folder for the scenes")
     parser.add_argument("--places", type=int, nargs="+", required=True, metavar="NUMBER")
+    parser.add_argument("--mapper", default="auto", help="cameras.mapper of the builds (default: auto)")
     parser.add_argument("--json", type=Path, help="write the table to this file")
     given = parser.parse_args()
     rows: list[dict[str, Any]] = []
@@ -73,7 +76,7 @@ def main() -> int:
             print(f"place {place}: {error}", file=sys.stderr)
             return 1
         start = time.monotonic()
-        error = _run("twin.build", folder, "--until", "cameras")
+        error = _run("twin.build", folder, "--until", "cameras", "--set", f"cameras.mapper={given.mapper}")
         row = {"place": place, "seconds": round(time.monotonic() - start)}
         rows.append(row | ({"error": error} if error else measure(folder)))
         print(json.dumps(rows[-1]), flush=True)

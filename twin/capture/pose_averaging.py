@@ -172,7 +172,7 @@ def _average_rotations(
 
 def _units(pairs: list[PairGeometry], cost: Array) -> tuple[NDArray[np.int64], Array]:
     """Pairs (k,) whose units of length are known relative to each other, and these units (k,)."""
-    equations, count = _unit_equations(pairs), len(pairs)
+    equations, count = unit_equations(pairs), len(pairs)
     if not equations:
         return np.zeros(0, np.int64), np.zeros(0)
     first, second = (np.array([one[k] for one in equations], np.int64) for k in (0, 1))
@@ -190,7 +190,7 @@ def _units(pairs: list[PairGeometry], cost: Array) -> tuple[NDArray[np.int64], A
     return good, np.exp(logarithms[good, 0])
 
 
-def _unit_equations(pairs: list[PairGeometry]) -> list[tuple[int, int, float, float, int]]:
+def unit_equations(pairs: list[PairGeometry]) -> list[tuple[int, int, float, float, int]]:
     """For pairs with near points in common: both pairs, the difference of the logarithms of their units, its standard
     deviation, and the number of points."""
     at: dict[int, list[tuple[int, int]]] = {}

@@ -42,6 +42,7 @@ from twin.capture.matching import (
     sequence_pairs,
 )
 from twin.capture.pair_geometry import estimate_focal_lengths
+from twin.capture.pose_check import check_poses
 from twin.capture.rolling_shutter import RollingShutter, correct_model, corrected_map, corrected_pinhole
 from twin.capture.worker import run_worker, send_message
 from twin.config import CamerasConfig, SceneConfig
@@ -171,7 +172,7 @@ def _metrics(capture: Capture, cameras: Cameras, points: SparsePoints, summary: 
     names = [source.name for source in capture.sources]
     of_source = np.array(cameras.sources)
     copied = ["pairs", "verified_pairs", "near_pairs", "outliers", "registered_anew", "mapper", "joined", "apart"]
-    copied += ["may_drift", "rolling_shutter_deg", "stabilized"]
+    copied += ["may_drift", "checked_steps", "contradicted_steps", "rolling_shutter_deg", "stabilized"]
     return {
         "registered": len(cameras),
         "total": len(capture.names),
@@ -205,15 +206,19 @@ def solve_mapping(job: dict[str, Any], work: Path) -> None:
     matcher.extract(job["features"], job["max_feature_size"])
     summary = _new_summary()
     shutters: dict[str, RollingShutter] = {}
-    summary["stabilized"] = []
+    summary["stabilized"], summary["checked_steps"], summary["contradicted_steps"] = [], 0, []
     if capture.camera_to_world is not None:
         summary["mapper"] = "given poses"
         solved = [(matcher, _triangulate(matcher, capture.camera_to_world, work))]
     else:
         solved = _reconstruct(matcher, job, work, summary)
         for its_matcher, model in solved:
-            found, stabilized = correct_model(model, its_matcher, Mapper(its_matcher, job, work).refine)
-            shutters |= found
+            posed = registered_poses(model, its_matcher)
+            found = check_poses(its_matcher.geometries(), its_matcher.frame_of(), capture.source_index, *posed)
+            summary["checked_steps"] += found.steps
+            summary["contradicted_steps"] += [[capture.names[i], capture.names[j]] for i, j in found.contradicted]
+            corrected, stabilized = correct_model(model, its_matcher, Mapper(its_matcher, job, work).refine)
+            shutters |= corrected
             summary["stabilized"] += stabilized
     results = [_arrays(model, its_matcher) for its_matcher, model in solved]
     order = np.argsort(np.concatenate([one["frames"] for one in results]))

@@ -1,0 +1,88 @@
+"""Checks camera poses against the relative poses of pairs of near frames of a film.
+
+A *step* leads from a frame of a film to the next one that has a pose. Each pair of frames that are at most `_REACH`
+steps apart tells how much the camera turned and in which direction it moved; this supports or contradicts the steps
+between them. Two pairs that meet in a frame and see the same near points tell the ratio of their lengths; this supports
+or contradicts the step that begins there. Reprojection errors do not reveal wrong poses: the pieces of a film that was
+torn apart have small ones.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from twin.capture.pair_geometry import PairGeometry
+from twin.capture.pose_averaging import unit_equations
+from twin.types import Array
+
+_REACH = 3  # [steps] between the frames of a pair that is used
+_MAX_TURN = np.radians(1.0)  # deviation from a pair's rotation that contradicts it, at least
+_MAX_DIRECTION = np.radians(10.0)  # deviation from a pair's direction that contradicts it, at least
+_MAX_RATIO = 0.25  # deviation of the logarithm of a ratio of two distances that contradicts it, at least
+_CERTAIN = 4.0  # [standard deviations] smaller deviations contradict nothing
+_STILL = 0.2  # [median step] cameras that are nearer to each other have no direction
+_MIN_NEAR = 8  # least number of near points of a pair that tells a direction
+
+
+@dataclass(frozen=True)
+class PoseCheck:
+    """Steps of films that pairs of frames tell about."""
+
+    steps: int
+    """Number of steps that were checked."""
+    contradicted: list[tuple[int, int]]
+    """Both frames of each step that most pairs contradict."""
+
+
+def check_poses(
+    pairs: list[PairGeometry],
+    row_of: dict[int, int],
+    film: NDArray[np.int64],
+    frames: NDArray[np.int64],
+    camera_to_world: Array,
+) -> PoseCheck:
+    """Compares poses with the geometry of pairs.
+
+    Args:
+        pairs: Pairs with geometry.
+        row_of: Frame of each of COLMAP's images.
+        film: Film of each frame (n,), whose frames are in the order of time.
+        frames: Frames with a pose (k,), sorted.
+        camera_to_world: Their poses (k, 4, 4), in any unit of length.
+    """
+    place = {int(frame): k for k, frame in enumerate(frames)}
+    ends: list[tuple[int, int]] = []  # of the pairs that are used, as indices of poses
+    used: list[PairGeometry] = []
+    for pair in pairs:
+        i, j = (place.get(row_of[image]) for image in (pair.matches.first, pair.matches.second))
+        if i is not None and j is not None and film[frames[i]] == film[frames[j]] and abs(i - j) <= _REACH:
+            ends.append((i, j))
+            used.append(pair)
+    if not used:
+        return PoseCheck(0, [])
+    votes = np.zeros((2, len(frames), 2), np.int64)  # of turns and directions, and of ratios: supports, contradictions
+    position = camera_to_world[:, :3, 3]
+    same = film[frames[1:]] == film[frames[:-1]]
+    step = float(np.median(np.linalg.norm(np.diff(position, axis=0), axis=1)[same]))
+    distance = np.array([np.linalg.norm(position[j] - position[i]) for i, j in ends])
+    for (i, j), pair, apart in zip(ends, used, distance, strict=True):
+        relative = camera_to_world[j, :3, :3].T @ camera_to_world[i, :3, :3]
+        turn = float(Rotation.from_matrix(pair.rotation.T @ relative).magnitude())
+        wrong = turn > max(_MAX_TURN, _CERTAIN * pair.rotation_error)
+        if apart > _STILL * step and len(pair.features) >= _MIN_NEAR:
+            direction = camera_to_world[j, :3, :3].T @ (position[i] - position[j]) / apart
+            angle = float(np.arccos(np.clip(direction @ pair.translation, -1.0, 1.0)))
+            wrong = wrong or angle > max(_MAX_DIRECTION, _CERTAIN * pair.direction_error)
+        votes[0, min(i, j) : max(i, j), int(wrong)] += 1
+    for one, other, ratio, error, _ in unit_equations(used):
+        # Where the scale changes, the pairs on both sides of a frame contradict each other; other pairs lie across.
+        before, after = sorted([sorted(ends[one]), sorted(ends[other])])
+        if before[1] == after[0] and max(distance[one], distance[other]) > _STILL * step:
+            found = np.log(max(distance[one], 1e-12) / max(distance[other], 1e-12))
+            votes[1, after[0], int(abs(found - ratio) > max(_MAX_RATIO, _CERTAIN * error))] += 1
+    torn = (votes[..., 1] > votes[..., 0]).any(0)
+    return PoseCheck(
+        int(np.count_nonzero(votes.sum((0, 2)))), [(int(frames[k]), int(frames[k + 1])) for k in np.flatnonzero(torn)]
+    )
