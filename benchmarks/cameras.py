@@ -52,8 +52,8 @@ def measure(folder: Path) -> dict[str, Any]:
         "joined": report.get("joined"),
         "apart": report.get("apart"),
         "may_drift": report.get("may_drift"),
-        "checked_steps": report["checked_steps"],
-        "contradicted_steps": len(report["contradicted_steps"]),
+        "checked_steps": report.get("checked_steps"),
+        "contradicted_steps": len(report.get("contradicted_steps") or []),
     }
 
 

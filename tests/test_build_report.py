@@ -53,7 +53,14 @@ REPORT: dict[str, Any] = {
         for k, name in enumerate(STAGES)
     },
     "capture": {"frames": 160, "train": 140, "held_out": 20, "sources": {"day": {"kept": 160, "damaged": 0}}},
-    "cameras": {"registered": 158, "total": 160, "reprojection_error_px": 0.61, "mean_track_length": 5.2},
+    "cameras": {
+        "registered": 158,
+        "total": 160,
+        "reprojection_error_px": 0.61,
+        "mean_track_length": 5.2,
+        "checked_steps": 157,
+        "contradicted_steps": [],
+    },
     "metric": {"scale_source": "camera_height", "scale_uncertainty": 0.012},
     "field": {"psnr": {"day": 24.3}, "ssim": {"day": 0.7}, "n": {"day": 10}, "curve": [[0, 10.0], [100, 20.0]]},
     "mesh": {"parts": 42},
@@ -268,6 +275,7 @@ CAUTIONS: list[tuple[str, str, Any, str]] = [
     ("capture", "capture.sources", {"day": {"damaged": 4}}, "4 frame(s)"),
     ("cameras", "cameras.registered", 100, "60 of 160 frames could not be placed"),
     ("cameras", "cameras.may_drift", ["noon"], "tore them apart: noon."),
+    ("cameras", "cameras.contradicted_steps", [["day/000001", "day/000002"]], "1 of 157 steps"),
     ("cameras", "cameras.reprojection_error_px", 2.5, "2.50 px"),
     ("cameras", "cameras.outliers", ["day/000001"], "day/000001"),
     ("cameras", "cameras.apart", ["day_back"], "day_back"),

@@ -41,7 +41,7 @@ class Film:
         return float(np.linalg.norm(umeyama(found, true).points(found) - true, axis=1).max())
 
 
-def _film(path: Path, wrong: bool = False, bend: float = 0.04, shake: float = 0.03) -> Film:
+def simulated_film(path: Path, wrong: bool = False, bend: float = 0.04, shake: float = 0.03) -> Film:
     """A camera that shakes [rad] goes 1 m per frame round a bend [rad per frame] over a plane, with a skyline.
 
     A tenth of all matches are wrong. If `wrong`, frames 2 and 13 share 120 matches of a repeated pattern, too.
@@ -111,7 +111,7 @@ ONE_FILM = np.zeros(FRAMES, np.int64)
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory: pytest.TempPathFactory) -> Film:
-    return _film(tmp_path_factory.mktemp("film") / "database.db")
+    return simulated_film(tmp_path_factory.mktemp("film") / "database.db")
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def test_poses_averaged_from_pairs_are_those_of_the_film(film: Film, pairs: list
 
 
 def test_a_pair_of_a_repeated_pattern_does_not_bend_the_path(tmp_path: Path) -> None:
-    film = _film(tmp_path / "database.db", wrong=True)
+    film = simulated_film(tmp_path / "database.db", wrong=True)
     pairs = pair_geometries(film.database, 0)
     assert (3, 14) in {(pair.matches.first, pair.matches.second) for pair in pairs}
     frames, poses = averaged_poses(pairs, ROW, ONE_FILM, 0)
@@ -210,7 +210,7 @@ def test_the_focal_length_is_found_from_matches(film: Film, tmp_path: Path, mode
 
 def test_a_focal_length_that_the_matches_do_not_tell_stays_near_the_guess(tmp_path: Path) -> None:
     """A camera that goes straight ahead and does not turn: a longer focal length looks like longer steps."""
-    film = _film(tmp_path / "straight.db", bend=0.0, shake=0.0)
+    film = simulated_film(tmp_path / "straight.db", bend=0.0, shake=0.0)
     assert 0.5 * FOCAL < _fitted(film, tmp_path / "database.db", "SIMPLE_RADIAL", 600.0)[0] < 2.0 * FOCAL
 
 
