@@ -141,6 +141,7 @@ def test_street_is_solved(street: Street, tmp_path: Path) -> None:
     cameras, points = Cameras.load(tmp_path / "out"), SparsePoints.load(tmp_path / "out")
     assert metrics["registered"] == metrics["total"] == len(cameras) == 21
     assert metrics["outliers"] == []
+    assert metrics["checked_steps"] == 19 and metrics["contradicted_steps"] == []
     assert metrics["reprojection_error_px"] < 1.0
     # The calibration is held: to the last digit, not merely nearly.
     np.testing.assert_array_equal(cameras.intrinsics, np.tile(INTRINSICS, (21, 1)))
@@ -286,8 +287,20 @@ def test_given_poses_are_kept(tmp_path: Path) -> None:
     true = np.array([street.truth[name] for name in cameras.names])
     np.testing.assert_allclose(cameras.camera_to_world, true, atol=1e-9)
     assert metrics["mapper"] == "given poses" and metrics["registered"] == 21
+    assert metrics["checked_steps"] == 19 and metrics["contradicted_steps"] == []
     assert len(points) > 200
     assert np.median(np.abs(points.xyz[points.xyz[:, 2] < 0.3, 2])) < 0.05
+
+
+def test_given_poses_that_contradict_the_pictures_are_told(tmp_path: Path) -> None:
+    street = _film(tmp_path / "posed", posed=True)
+    stage = street.scene.stage("capture")
+    capture = Capture.load(stage)
+    assert capture.camera_to_world is not None
+    torn = capture.camera_to_world.copy()
+    torn[5:12, 1, 3] += 1.0  # [m] the end of the first film
+    dataclasses.replace(capture, camera_to_world=torn).save(stage)
+    assert ["bright/000004", "bright/000005"] in _run(street, tmp_path / "out")["contradicted_steps"]
 
 
 def _mapper(street: Street, folder: Path) -> tuple[Matcher, mapping.Mapper]:

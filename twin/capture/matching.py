@@ -277,9 +277,15 @@ class Matcher:
         pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
         return {ordered_pair(frame_of[a], frame_of[b]): n for (a, b), n in zip(pairs, counts, strict=True) if n > 0}
 
-    def geometries(self) -> list[PairGeometry]:
-        """Geometry of all verified pairs. The cameras' parameters must not change after the first call."""
-        return pair_geometries(self.database, self.seed, self.known)
+    def geometries(self, among: set[Pair] | None = None) -> list[PairGeometry]:
+        """Geometry of the verified pairs, of all or of those among some pairs of frames.
+
+        The cameras' parameters must not change after the first call.
+        """
+        images = None
+        if among is not None:
+            images = {ordered_pair(int(self.image_ids[i]), int(self.image_ids[j])) for i, j in among}
+        return pair_geometries(self.database, self.seed, self.known, images)
 
     def linked_groups(self) -> list[NDArray[np.int64]]:
         """Groups of frames (k,) whose sources are linked, the largest first.

@@ -70,11 +70,16 @@ class PairGeometry:
 
 
 def pair_geometries(
-    database: Path, seed: int, known: dict[tuple[int, int], PairGeometry] | None = None
+    database: Path,
+    seed: int,
+    known: dict[tuple[int, int], PairGeometry] | None = None,
+    among: set[tuple[int, int]] | None = None,
 ) -> list[PairGeometry]:
-    """Geometry of all verified pairs of a database, with its cameras' parameters.
+    """Geometry of the verified pairs of a database, with its cameras' parameters.
 
-    `known` has the geometry of some pairs of images, which is not computed again; the geometry of the others is added.
+    Args:
+        known: Geometry of some pairs of images, which is not computed again; that of the others is added.
+        among: Pairs of images, smaller id first, to which the result is restricted; by default all.
     """
     known = {} if known is None else known
     with pycolmap.Database.open(database) as opened:
@@ -82,9 +87,9 @@ def pair_geometries(
         points = {image_id: opened.read_keypoints(image_id)[:, :2].astype(np.float64) for image_id in camera_of}
         found = zip(*opened.read_two_view_geometries(), strict=True)
         verified = [
-            (pycolmap.pair_id_to_image_pair(pair_id), geometry)
-            for pair_id, geometry in found
-            if len(geometry.inlier_matches) >= _MIN_MATCHES
+            (pair, geometry)
+            for pair, geometry in ((pycolmap.pair_id_to_image_pair(pair_id), geometry) for pair_id, geometry in found)
+            if len(geometry.inlier_matches) >= _MIN_MATCHES and (among is None or pair in among)
         ]
     fresh = [(pair, geometry) for pair, geometry in verified if pair not in known]
     if fresh:

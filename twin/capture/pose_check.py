@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from twin.capture.matching import Pair, ordered_pair
 from twin.capture.pair_geometry import PairGeometry
 from twin.capture.pose_averaging import unit_equations
 from twin.types import Array
@@ -36,6 +37,12 @@ class PoseCheck:
     """Both frames of each step that most pairs contradict."""
 
 
+def near_in_film(film: NDArray[np.int64], frames: NDArray[np.int64]) -> set[Pair]:
+    """The pairs of frames that `check_poses` uses: at most `_REACH` steps apart in a film. Arguments as there."""
+    within = [frames[film[frames] == one].tolist() for one in np.unique(film[frames])]
+    return {pair for one in within for k in range(1, _REACH + 1) for pair in zip(one[:-k], one[k:], strict=True)}
+
+
 def check_poses(
     pairs: list[PairGeometry],
     row_of: dict[int, int],
@@ -52,14 +59,14 @@ def check_poses(
         frames: Frames with a pose (k,), sorted.
         camera_to_world: Their poses (k, 4, 4), in any unit of length.
     """
+    near = near_in_film(film, frames)
     place = {int(frame): k for k, frame in enumerate(frames)}
-    ends: list[tuple[int, int]] = []  # of the pairs that are used, as indices of poses
-    used: list[PairGeometry] = []
+    used, ends = [], []  # pairs, and both ends as indices of poses
     for pair in pairs:
-        i, j = (place.get(row_of[image]) for image in (pair.matches.first, pair.matches.second))
-        if i is not None and j is not None and film[frames[i]] == film[frames[j]] and abs(i - j) <= _REACH:
-            ends.append((i, j))
+        first, second = row_of[pair.matches.first], row_of[pair.matches.second]
+        if ordered_pair(first, second) in near:
             used.append(pair)
+            ends.append((place[first], place[second]))
     if not used:
         return PoseCheck(0, [])
     votes = np.zeros((2, len(frames), 2), np.int64)  # of turns and directions, and of ratios: supports, contradictions

@@ -42,7 +42,7 @@ from twin.capture.matching import (
     sequence_pairs,
 )
 from twin.capture.pair_geometry import estimate_focal_lengths
-from twin.capture.pose_check import check_poses
+from twin.capture.pose_check import check_poses, near_in_film
 from twin.capture.rolling_shutter import RollingShutter, correct_model, corrected_map, corrected_pinhole
 from twin.capture.worker import run_worker, send_message
 from twin.config import CamerasConfig, SceneConfig
@@ -212,11 +212,14 @@ def solve_mapping(job: dict[str, Any], work: Path) -> None:
         solved = [(matcher, _triangulate(matcher, capture.camera_to_world, work))]
     else:
         solved = _reconstruct(matcher, job, work, summary)
+    for its_matcher, model in solved:
+        frames, poses = registered_poses(model, its_matcher)
+        pairs = its_matcher.geometries(near_in_film(capture.source_index, frames))
+        found = check_poses(pairs, its_matcher.frame_of(), capture.source_index, frames, poses)
+        summary["checked_steps"] += found.steps
+        summary["contradicted_steps"] += [[capture.names[i], capture.names[j]] for i, j in found.contradicted]
+    if capture.camera_to_world is None:
         for its_matcher, model in solved:
-            posed = registered_poses(model, its_matcher)
-            found = check_poses(its_matcher.geometries(), its_matcher.frame_of(), capture.source_index, *posed)
-            summary["checked_steps"] += found.steps
-            summary["contradicted_steps"] += [[capture.names[i], capture.names[j]] for i, j in found.contradicted]
             corrected, stabilized = correct_model(model, its_matcher, Mapper(its_matcher, job, work).refine)
             shutters |= corrected
             summary["stabilized"] += stabilized
