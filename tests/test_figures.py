@@ -73,6 +73,9 @@ def every_figure() -> dict[str, figures.Figure]:
         "place with branches": figures.place_map(
             positions, ["a"] * 10, half, points, colors, route, 1.0, (), {"side": route[:, ::-1]}
         ),
+        "torn place": figures.place_map(
+            positions, ["a"] * 10, half, points, colors, route, 1.0, contradicted=[(2, 3), (3, 4)]
+        ),
         "bare ground": figures.ground_map(ground, route, None, 0.0, []),
         "training": figures.curve_chart({"": ([0, 10, 20], [10.0, 15.0, 17.0])}, "step", "PSNR [dB]"),
         "bars": figures.bar_chart({"day": 23.44, "night": 17.0}, {"day": 7}, "dB", "PSNR [dB]"),

@@ -161,9 +161,10 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
             branches = {name.removeprefix(BRANCH): data[name][:, :2] for name in data if name.startswith(BRANCH)}
     wide = as_number(pick(report, "mjcf.half_width_m")) or 0.0
     passes = find_passes(cameras) if route is not None else []
-    drawn = figures.place_map(
-        cameras.positions, cameras.sources, cameras.held_out, points.xyz, points.rgb, route, wide, passes, branches
-    )
+    row = {name: k for k, name in enumerate(cameras.names)}
+    torn = [(row[a], row[b]) for a, b in pick(report, "cameras.contradicted_steps") or [] if a in row and b in row]
+    seen = cameras.positions, cameras.sources, cameras.held_out, points.xyz, points.rgb
+    drawn = figures.place_map(*seen, route, wide, passes, branches, torn)
     title = f"Map of points (n = {len(points):,}), cameras (n = {len(cameras)}) and route"
     out = [Chart(title, figures.svg(drawn), "metric")]
     if (mesh / "ground.npz").exists():

@@ -145,11 +145,13 @@ def place_map(
     half_width: float = 0.0,
     passes: Sequence[FilmedPass] = (),
     branches: Mapping[str, Array] | None = None,
+    contradicted: Sequence[tuple[int, int]] = (),
 ) -> Figure:
     """Map [m] of the sparse points, the cameras by source (held-out ones hollow), and the route with its corridor.
 
     Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (m, 3), `route` and `branches` (k, 2).
-    If a source has several passes (`twin.geometry.passes`), all passes are drawn as lines with their names.
+    If a source has several passes (`twin.geometry.passes`), all passes are drawn as lines with their names. Steps that
+    the pictures contradict are given by both their cameras, and are drawn thick.
     """
     others = (branches or {}).values()
     figure, axes, low, high = _map_axes(
@@ -174,6 +176,10 @@ def place_map(
         hollow: dict[str, Any] = {"facecolors": "none", "edgecolors": color, "lw": 0.8}
         axes.scatter(unseen[:, 0], unseen[:, 1], s=size, marker=marker, zorder=4, **hollow)
     axes.scatter([], [], s=12, facecolors="none", edgecolors=MUTED, lw=0.9, label="held out")
+    steps = positions[np.array(contradicted, np.int64).reshape(-1, 2), :2]
+    for k, step in enumerate(steps):
+        label = f"contradicted (n = {len(steps)})" if k == 0 else None
+        axes.plot(*step.T, color=SERIES[1], lw=4.0, solid_capstyle="round", label=label, zorder=5)
     add_legend(figure)
     return figure
 
