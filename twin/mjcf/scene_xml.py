@@ -1,5 +1,7 @@
 """Stage `mjcf`: writes `scene.xml`, its `assets/` and `world.json` from cameras, ground, convex parts and visual mesh.
 
+The wheels' height field is the ground of stage `mesh` in cells of `mjcf.hfield_cell`.
+
 Geom groups: 0 ground, 1 visual geoms of the robot, 2 visual mesh (no contacts), 3 convex parts `part_0000`...,
 4 collision geoms of the robot. Route, corridor and goal are sites of group 4. All paths in the XML are relative, so
 plain MuJoCo loads the folder from anywhere.
