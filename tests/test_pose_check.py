@@ -1,5 +1,7 @@
 """Poses that contradict the relative poses of near frames are told, step by step."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -59,6 +61,19 @@ def test_a_gap_is_told(film: Film, pairs: list[PairGeometry], offset: tuple[floa
     poses[TORN:, :3, 3] += offset
     torn = _check(pairs, poses).contradicted
     assert (TORN - 1, TORN) in torn and all(abs(i - TORN) <= 3 for i, _ in torn)
+
+
+def test_pairs_without_near_points_tell_turns_alone(film: Film, pairs: list[PairGeometry]) -> None:
+    far = [
+        replace(pair, features=pair.features[:0], depths=pair.depths[:0], depth_error=pair.depth_error[:0])
+        for pair in pairs
+    ]
+    poses = film.poses.copy()
+    poses[TORN:, :3, 3] += (0.0, 3.0, 0.0)
+    assert _check(far, poses) == PoseCheck(FRAMES - 1, [])
+    assert _check(far[:3] + pairs[3:], film.poses).contradicted == []
+    poses[TORN:, :3, :3] = Rotation.from_euler("z", 5, degrees=True).as_matrix() @ poses[TORN:, :3, :3]
+    assert _check(far, poses).contradicted == [(TORN - 1, TORN)]
 
 
 def test_steps_between_films_are_not_checked(film: Film, pairs: list[PairGeometry]) -> None:

@@ -24,7 +24,7 @@ _MAX_DIRECTION = np.radians(10.0)  # deviation from a pair's direction that cont
 _MAX_RATIO = 0.25  # deviation of the logarithm of a ratio of two distances that contradicts it, at least
 _CERTAIN = 4.0  # [standard deviations] smaller deviations contradict nothing
 _STILL = 0.2  # [median step] cameras that are nearer to each other have no direction
-_MIN_NEAR = 8  # least number of near points of a pair that tells a direction
+_MIN_NEAR = 8  # least number of near points of a pair that tells a direction and a ratio of distances
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,9 @@ def check_poses(
             angle = float(np.arccos(np.clip(direction @ pair.translation, -1.0, 1.0)))
             wrong = wrong or angle > max(_MAX_DIRECTION, _CERTAIN * pair.direction_error)
         votes[0, min(i, j) : max(i, j), int(wrong)] += 1
-    for one, other, ratio, error, _ in unit_equations(used):
+    scaled = [k for k, pair in enumerate(used) if len(pair.features) >= _MIN_NEAR]
+    for first, second, ratio, error, _ in unit_equations([used[k] for k in scaled]):
+        one, other = scaled[first], scaled[second]
         # Where the scale changes, the pairs on both sides of a frame contradict each other; other pairs lie across.
         before, after = sorted([sorted(ends[one]), sorted(ends[other])])
         if before[1] == after[0] and max(distance[one], distance[other]) > _STILL * step:
