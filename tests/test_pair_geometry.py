@@ -175,6 +175,16 @@ def test_pairs_whose_rotation_contradicts_the_others_do_not_bend_the_path(
     assert {j - i for i, j in kept} == {1, 2} and len(kept) == 2 * FRAMES - 3
 
 
+def test_refined_cameras_replace_those_of_the_database(film: Film, pairs: list[PairGeometry]) -> None:
+    known = {(pair.matches.first, pair.matches.second): pair for pair in pairs}
+    same = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", FOCAL, WIDTH, HEIGHT)
+    assert pair_geometries(film.database, 0, known, {(1, 2)}, {1: same})[0] is known[1, 2]
+    other = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.3 * FOCAL, WIDTH, HEIGHT)
+    (refined,) = pair_geometries(film.database, 0, known, {(1, 2)}, {1: other})
+    assert refined.matches.first_rays[0, 2] > pairs[0].matches.first_rays[0, 2]  # nearer to the axis
+    assert len(known) == len(pairs) and known[1, 2] is pairs[0]
+
+
 def test_known_pairs_are_not_computed_again(film: Film, pairs: list[PairGeometry]) -> None:
     known = {(pair.matches.first, pair.matches.second): pair for pair in pairs[:-1]}
     again = pair_geometries(film.database, 0, known)

@@ -9,6 +9,7 @@ image. A camera is *known* (a given, fixed calibration), has a focal length *pri
 
 import itertools
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -277,15 +278,14 @@ class Matcher:
         pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
         return {ordered_pair(frame_of[a], frame_of[b]): n for (a, b), n in zip(pairs, counts, strict=True) if n > 0}
 
-    def geometries(self, among: set[Pair] | None = None) -> list[PairGeometry]:
-        """Geometry of the verified pairs, of all or of those among some pairs of frames.
+    def geometries(self) -> list[PairGeometry]:
+        """Geometry of all verified pairs. The cameras' parameters must not change after the first call."""
+        return pair_geometries(self.database, self.seed, self.known)
 
-        The cameras' parameters must not change after the first call.
-        """
-        images = None
-        if among is not None:
-            images = {ordered_pair(int(self.image_ids[i]), int(self.image_ids[j])) for i, j in among}
-        return pair_geometries(self.database, self.seed, self.known, images)
+    def geometries_among(self, pairs: set[Pair], cameras: Mapping[int, pycolmap.Camera]) -> list[PairGeometry]:
+        """Geometry of those of some pairs of frames that are verified, with the cameras of a model."""
+        images = {ordered_pair(int(self.image_ids[i]), int(self.image_ids[j])) for i, j in pairs}
+        return pair_geometries(self.database, self.seed, self.known, images, cameras)
 
     def linked_groups(self) -> list[NDArray[np.int64]]:
         """Groups of frames (k,) whose sources are linked, the largest first.

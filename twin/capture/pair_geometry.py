@@ -6,7 +6,7 @@ its matches under a Cauchy loss. There are many local minima, so the search has 
 which most matches agree: that of far points, such as those on the skyline.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +28,7 @@ _WIDE = 4.0  # the first steps use a loss that is wider by this factor
 _WIDE_STEPS, _STEPS = 5, 12  # largest number of Gauss–Newton steps
 _SAME_START = np.radians(0.3)  # poses that differ less lead to the same minimum
 _ROTATION_TRIALS, _TRANSLATION_TRIALS = 60, 120  # random pairs of matches that propose a rotation and a translation
+_SAME_CAMERA = 1e-3  # largest relative difference of the parameters of cameras that count as the same
 _SAME_ROTATION = np.radians(0.2)  # largest deviation of a far point from the rotation that most points share
 _FOCAL_PAIRS, _FOCAL_MATCHES = 24, 300  # largest numbers of pairs and of their matches that a focal length is fitted to
 _FOCAL_STEPS = 3  # [frames] largest distance of these pairs
@@ -74,16 +75,20 @@ def pair_geometries(
     seed: int,
     known: dict[tuple[int, int], PairGeometry] | None = None,
     among: set[tuple[int, int]] | None = None,
+    refined: Mapping[int, pycolmap.Camera] | None = None,
 ) -> list[PairGeometry]:
-    """Geometry of the verified pairs of a database, with its cameras' parameters.
+    """Geometry of the verified pairs of a database.
 
     Args:
         known: Geometry of some pairs of images, which is not computed again; that of the others is added.
         among: Pairs of images, smaller id first, to which the result is restricted; by default all.
+        refined: Cameras by COLMAP's ids, instead of those of the database. If they differ, `known` is not used.
     """
     known = {} if known is None else known
     with pycolmap.Database.open(database) as opened:
         cameras, camera_of = _cameras(opened)
+        if any(not np.allclose(one.params, cameras[k].params, _SAME_CAMERA) for k, one in (refined or {}).items()):
+            cameras, known = {**cameras, **(refined or {})}, {}
         points = {image_id: opened.read_keypoints(image_id)[:, :2].astype(np.float64) for image_id in camera_of}
         found = zip(*opened.read_two_view_geometries(), strict=True)
         verified = [

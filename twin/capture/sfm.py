@@ -214,7 +214,7 @@ def solve_mapping(job: dict[str, Any], work: Path) -> None:
         solved = _reconstruct(matcher, job, work, summary)
     for its_matcher, model in solved:
         frames, poses = registered_poses(model, its_matcher)
-        pairs = its_matcher.geometries(near_in_film(capture.source_index, frames))
+        pairs = its_matcher.geometries_among(near_in_film(capture.source_index, frames), dict(model.cameras))
         found = check_poses(pairs, its_matcher.frame_of(), capture.source_index, frames, poses)
         summary["checked_steps"] += found.steps
         summary["contradicted_steps"] += [[capture.names[i], capture.names[j]] for i, j in found.contradicted]
