@@ -286,7 +286,8 @@ def refused(made: Forecast) -> str:
 def test_no_correlation_from_fewer_than_five_policies(driven: int) -> None:
     twin, real = cells(driven=driven)
     told = refused(make_forecast("road", twin, real))
-    assert told == f"{driven} policies driven on the road, 5 are needed: drive {5 - driven} more"
+    count = f"{driven} {'policy' if driven == 1 else 'policies'}"
+    assert told == f"{count} driven on the road, 5 are needed: drive {5 - driven} more"
 
 
 def test_no_correlation_from_cells_of_fewer_than_five_trials() -> None:

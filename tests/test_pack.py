@@ -243,7 +243,9 @@ def test_drive_films_a_pack_by_its_name(packed, tmp_path, monkeypatch, capsys):
         assert main(["drive", "tiny", "--out", wrong]) == 2
         assert f"--out {wrong}: expected the name of an .mp4 file" in capsys.readouterr().err
     assert main(["drive", "nowhere"]) == 2
-    assert "no nowhere.twin here or in scenes/" in capsys.readouterr().err
+    assert "no nowhere.twin here or in scenes/; give a path" in capsys.readouterr().err
+    assert main(["drive", "tiy"]) == 2
+    assert "no tiy.twin here or in scenes/; did you mean 'tiny'?" in capsys.readouterr().err
 
 
 def test_drive_says_what_is_wrong_with_a_pack_that_is_there(packed, tmp_path, monkeypatch, capsys):

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -133,7 +134,8 @@ def test_nothing_outlives_a_verb(cases, name, number):
     if number == signal.SIGKILL:
         return
     lines = [line for line in said.splitlines(keepends=True) if not line.startswith("Warp CUDA warning")]
-    assert (process.returncode, lines) == (128 + number, ["stopped; to continue, run the same command again\n"])
+    more = "" if name == "relight" else "; to continue, run the same command again"
+    assert (process.returncode, lines) == (128 + number, [f"stopped{more}\n"])
     scene = Path(cases[name].arguments[0])
     assert not [path for path in scene.rglob("*") if ".partial" in path.name or path.name.endswith(".lock")]
 
@@ -163,16 +165,56 @@ convex._run_coacd([piece(k) for k in range(40)], 0.01, Path({str(tmp_path)!r}), 
     assert not _left(children)
 
 
-def _runs(work, *arguments: str) -> int:
-    return command_line.run(command_line.Parser(prog="python -m twin.some"), lambda options: work(), list(arguments))
+def _runs(work, *arguments: str, resumes=False) -> int:
+    parser = command_line.Parser(prog="python -m twin.some")
+    parser.set_defaults(resumes=resumes)
+    return command_line.run(parser, lambda options: work(), list(arguments))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_a_signal_is_one_line_and_handlers_are_restored(capfd, number):
     before = signal.getsignal(number)
     assert _runs(lambda: signal.raise_signal(number)) == 128 + number
+    assert capfd.readouterr().err == "stopped\n"
+    assert _runs(lambda: signal.raise_signal(number), resumes=True) == 128 + number
     assert capfd.readouterr().err == "stopped; to continue, run the same command again\n"
     assert signal.getsignal(number) is before
+
+
+class _Thing:
+    pass
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_in_a_callback_whose_errors_python_drops_is_not_lost(capfd, number):
+    """Exceptions in callbacks of weak references, in __del__ and in those of the garbage collector are ignored."""
+    hook, ended = sys.unraisablehook, []
+
+    def work():
+        thing = _Thing()
+        reference = weakref.ref(thing, lambda _: signal.raise_signal(number))
+        del thing
+        assert reference() is None
+        try:
+            time.sleep(30)
+        finally:
+            ended.append(True)
+
+    assert _runs(work) == 128 + number and ended == [True]
+    assert capfd.readouterr().err == "stopped\n" and sys.unraisablehook is hook
+
+
+def test_other_errors_that_python_drops_are_reported(monkeypatch):
+    seen = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda what: seen.append(what.exc_type))
+
+    def work():
+        thing = _Thing()
+        reference = weakref.ref(thing, lambda _: 1 / 0)
+        del thing
+        assert reference() is None
+
+    assert _runs(work) == 0 and seen == [ZeroDivisionError]
 
 
 def test_ignored_signals_stay_ignored():
@@ -209,7 +251,7 @@ def test_colmap_keeps_our_signal_handlers(tmp_path):
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (
         128 + signal.SIGTERM,
-        "stopped; to continue, run the same command again\n",
+        "stopped\n",
     )
 
 

@@ -329,8 +329,15 @@ def test_any_policy_can_be_filmed_in_the_environment_it_asks_for(fresh, episodes
         np.testing.assert_array_equal(other.qpos, one.qpos)
     np.testing.assert_array_equal(callable_.actions[0], [0.5, 0.5])
     capsys.readouterr()
-    assert film.main([*common, "--policy", "nobody", "--quiet"]) == 2
-    assert capsys.readouterr().err.startswith("error: no policy nobody")
+    for wrong, hint in (
+        ("nobody", "expected one of ahead"),
+        ("ahed", "did you mean 'ahead'?"),
+        ("ahead/00000010", "did you mean 'ahead/000000100'?"),
+        ("nobody.onnx", "expected a run's folder, an .onnx file or module:function"),
+    ):
+        assert film.main([*common, "--policy", wrong, "--quiet"]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith(f"error: no policy {wrong}") and hint in said
 
 
 @pytest.mark.parametrize("count", [1, 4, 27, 1000])

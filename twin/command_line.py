@@ -76,7 +76,11 @@ class HelpFormatter(argparse.HelpFormatter):
 def run(
     parser: argparse.ArgumentParser, work: Callable[[argparse.Namespace], None], arguments: list[str] | None = None
 ) -> int:
-    """Parses arguments and calls `work` with the options; returns the exit status. `--quiet` turns progress off."""
+    """Parses arguments and calls `work` with the options; returns the exit status. `--quiet` turns progress off.
+
+    The parser's default `resumes` is True for commands that continue when they are run again after they were stopped.
+    """
+    options = argparse.Namespace()
     try:
         options = parser.parse_args(arguments)
         runtime.set_quiet(getattr(options, "quiet", runtime.is_quiet()))
@@ -97,7 +101,8 @@ def run(
         return print_error(_describe(error))
     except KeyboardInterrupt as error:
         with contextlib.suppress(OSError):
-            print("stopped; to continue, run the same command again", file=sys.stderr)
+            resumes = getattr(options, "resumes", False)
+            print("stopped" + resumes * "; to continue, run the same command again", file=sys.stderr)
         return 128 + (error.number if isinstance(error, runtime.Stopped) else int(signal.SIGINT))
     return 0
 

@@ -70,6 +70,7 @@ def _new(parser: argparse.ArgumentParser) -> None:
 def _build(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     parser.description = "Turn a filmed place into a drivable MuJoCo twin."
+    parser.set_defaults(resumes=True)
     parser.epilog = """\
 a scene.toml of your own road:
 
@@ -292,6 +293,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
 def _train(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     parser.description = "Train a policy by SAC from pixels."
+    parser.set_defaults(resumes=True)
     add("scene", type=Path, help="folder of a built scene")
     add("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
     add("--run", required=True, help="name of the run, a folder in SCENE/runs")
@@ -336,6 +338,7 @@ def _train(parser: argparse.ArgumentParser) -> None:
 def _validate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     parser.description = "Measure how often policies succeed, lighting by lighting."
+    parser.set_defaults(resumes=True)
     parser.epilog = _OTHERS_POLICIES
     add("scene", type=Path, help="folder of a built scene")
     add("--policy", nargs="+", required=True, help="runs, checkpoints, ONNX files, module:function or zips; see below")
@@ -481,6 +484,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     _, add = command("compare", "compare a build of a filmed place with its truth, and show it in the build's report")
     add("scene", type=Path, help="folder of a built scene")
     one, add = command("drive", "the real test: drive policy files in weather that was not filmed")
+    one.set_defaults(resumes=True)
     add("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
     add(
         "--task",

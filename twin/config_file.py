@@ -6,7 +6,6 @@ its default.
 """
 
 import dataclasses
-import difflib
 import math
 import types
 import typing
@@ -32,7 +31,7 @@ from twin.config import (
     SourceConfig,
     TaskConfig,
 )
-from twin.errors import InputError, short_repr
+from twin.errors import InputError, name_hint, short_repr
 from twin.files import exists, is_link, parse_toml, read_toml
 from twin.robot import HuskyParams
 from twin.scene import MAX_NAME
@@ -129,8 +128,7 @@ def parse_table(kind: type, table: Any, where: str) -> Any:
     hints = typing.get_type_hints(kind)
     for key in table:
         if key not in hints:
-            near = difflib.get_close_matches(key, list(hints), n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"valid keys: {', '.join(sorted(hints))}"
+            hint = name_hint(key, hints, f"valid keys: {', '.join(sorted(hints))}")
             raise InputError(f"{where}: unknown key {key!r}; {hint}")
     values = {key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
     try:
@@ -312,10 +310,8 @@ def _check_metric(metric: MetricConfig) -> None:
 def _check_choice(value: str, choices: Iterable[str], what: str) -> None:
     names = list(choices)
     if value not in names:
-        lower = {name.lower(): name for name in names}
-        near = difflib.get_close_matches(value.lower()[:MAX_NAME], list(lower), n=1)
         expected = " or ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
-        hint = f"did you mean {lower[near[0]]!r}?" if near else f"expected {expected}"
+        hint = name_hint(value, names, f"expected {expected}")
         raise InputError(f"{what} = {value!r}; {hint}")
 
 

@@ -14,11 +14,11 @@ from functools import partial
 from twin import commands
 from twin.config_file import load_config
 from twin.env.route_segments import scene_tasks
-from twin.errors import InputError
+from twin.errors import InputError, name_hint
 from twin.film import film, film_options, summary
 from twin.learn.policy import JSON, find_policy, load_policy
 from twin.loading import Twin, load_scene
-from twin.unpack import SUFFIX, find_pack, packed_policies
+from twin.unpack import SUFFIX, find_pack, packed_policies, place_names
 
 
 def chosen_policy(twin: Twin, name: str | None) -> str | None:
@@ -44,7 +44,8 @@ def command(given: argparse.Namespace) -> None:
     if len(given.scene.parts) == 1 and not given.scene.exists() and find_pack(given.scene) is None:
         named = f"{given.scene.name.removesuffix(SUFFIX)}{SUFFIX}"
         more = "; download scenes/demo.twin from twin's repository" if named == f"demo{SUFFIX}" else ""
-        raise InputError(f"{given.scene}: no folder, and no {named} here or in scenes/{more}")
+        missing = f"{given.scene}: no folder, and no {named} here or in scenes/"
+        raise InputError(missing + (more or f"; {name_hint(given.scene.name, place_names(), 'give a path')}"))
     twin = load_scene(given.scene)
     policy = chosen_policy(twin, given.policy)
     task = chosen_task(twin, given.task, policy, given.trust)

@@ -1,6 +1,7 @@
 """`InputError`, which is raised for wrong input (not for bugs), and helpers for short error messages."""
 
 import contextlib
+import difflib
 import re
 import sys
 from collections.abc import Iterable
@@ -56,6 +57,19 @@ def join_names(names: Iterable[str], most: int = 4) -> str:
     if len(names) > most:
         names = [*names[: most - 1], f"{len(names) - most + 1} more"]
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]])) if names else "none"
+
+
+def name_hint(name: str, valid: Iterable[str], otherwise: str | None = None) -> str:
+    """End of a message about an unknown name: "did you mean ...?" if a valid one is similar.
+
+    If none is, it is `otherwise`, by default a list of the valid names.
+    """
+    by_lower = {one.lower(): one for one in valid}
+    if near := difflib.get_close_matches(name.lower()[:_MAX_VALUE], list(by_lower), n=1):
+        return f"did you mean {by_lower[near[0]]!r}?"
+    names = list(by_lower.values())
+    listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+    return f"expected one of {listed}" if otherwise is None else otherwise
 
 
 def print_error(why: Exception | str) -> int:

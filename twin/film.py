@@ -13,6 +13,7 @@ as a recording for Rerun. With `--lerobot`, drives are recorded as a dataset for
 
 import argparse
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from twin.env.domain_randomization import condition_options
 from twin.env.drivers import Driver, PolicyDriver, RouteDriver
 from twin.env.episode import Episode, record_episode
 from twin.env.suite import load
+from twin.env.vector_env_local import sampled_text
 from twin.errors import InputError
 from twin.files import new_folder, require_absent, require_parent
 from twin.geometry.poses import inverse_pose
@@ -96,7 +98,9 @@ def film(
     driven, title = environment.task, f"{task.replace('_', ' ')}: {driver_name}"
     limits = driven.segment.start, driven.segment.end
     shown = driven.world, driven.half_width, limits, load_ground_and_parts(scene.scene)
-    write_episode_video(path, episode, images, shown, title)
+    lighting = environment.pixels.lightings[0]
+    told = episode.lighting + (sampled_text(lighting, scene.field()) if lighting else "")
+    write_episode_video(path, replace(episode, lighting=told), images, shown, title)
     if rerun:
         place = driven.world, driven.half_width, f"{scene.scene.root.resolve().name}, {title}"
         commands = episode.actions

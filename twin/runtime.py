@@ -107,6 +107,7 @@ def log_line(line: str) -> None:
 
 # ---- signals
 
+_AGAIN = 0.05  # [s] until a signal is sent again whose exception was dropped
 _STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
@@ -126,6 +127,7 @@ def stoppable() -> Iterator[None]:
     ignored when the process started, for example because of nohup, stay ignored.
     """
     stopping = False
+    again: list[threading.Timer] = []
 
     def stop(number: int, _: Any) -> None:
         nonlocal stopping
@@ -135,8 +137,25 @@ def stoppable() -> Iterator[None]:
         if number == signal.SIGINT:
             os._exit(128 + number)
 
-    with _handled(stop):
-        yield
+    def ignored(what: Any) -> None:
+        """Python drops exceptions that are raised in callbacks, such as those of weak references."""
+        nonlocal stopping
+        if isinstance(what.exc_value, Stopped):
+            stopping = False
+            again.append(threading.Timer(_AGAIN, os.kill, (os.getpid(), what.exc_value.number)))
+            again[-1].start()
+        else:
+            hook(what)
+
+    hook = sys.unraisablehook
+    sys.unraisablehook = ignored
+    try:
+        with _handled(stop):
+            yield
+    finally:
+        sys.unraisablehook = hook
+        for timer in again:
+            timer.cancel()
 
 
 class StopNotice:

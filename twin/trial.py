@@ -120,9 +120,9 @@ def record_trial(
     place = factory.world, half_width, limits, load_ground_and_parts(scene.scene)
     seconds = np.asarray((used - begin) * 1e-9, np.float64)
     title = f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}"
-    write_trial_video(folder / "trial.mp4", trial, replayed, pictures, seconds, views, place, title)
     write_json(folder / "trial.json", figures)
     write_real_trials([*(one for one in known if one.key != row.key), row], table, out, compared)
+    write_trial_video(folder / "trial.mp4", trial, replayed, pictures, seconds, views, place, title)
     return row, figures, folder
 
 

@@ -43,6 +43,11 @@ from twin.runtime import exclusive_lock
 from twin.scene import PACK_JSON, STAGES, SceneDir
 
 SUFFIX = ".twin"
+_SEARCHED = (
+    Path(),
+    Path("scenes"),
+    Path(__file__).resolve().parents[1] / "scenes",
+)  # folders of packs that have a name
 FORMAT, VERSION = "twin pack", 1
 MANIFEST, README = "manifest.json", "README.txt"
 PLAIN, DIFFERENCES = "plain", "differences"
@@ -344,8 +349,13 @@ def find_pack(path: Path) -> Path | None:
         return path if path.suffix == SUFFIX or zipfile.is_zipfile(path) else None
     if exists(path) or len(path.parts) != 1:
         return None
-    places = (Path(), Path("scenes"), Path(__file__).resolve().parents[1] / "scenes")
-    return next((one for place in places if is_file(one := place / f"{path.name}{SUFFIX}")), None)
+    return next((one for place in _SEARCHED if is_file(one := place / f"{path.name}{SUFFIX}")), None)
+
+
+def place_names() -> list[str]:
+    """Names that `find_pack` finds, and scene folders beside these packs."""
+    packs = {path.stem for place in _SEARCHED for path in place.glob(f"*{SUFFIX}")}
+    return sorted(packs | {str(path.parent) for place in _SEARCHED[:2] for path in place.glob("*/scene.toml")})
 
 
 def is_cached(root: Path) -> bool:

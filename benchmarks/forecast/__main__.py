@@ -296,6 +296,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="number of processes in parallel, each on one core")
     parser.add_argument("--ray", metavar="ADDRESS", help="Ray cluster that runs the validations")
     parser.add_argument("--tables", action="store_true", help="run nothing; score what is recorded")
+    parser.set_defaults(resumes=True)
     return run(parser, _work)
 
 

@@ -6,7 +6,6 @@ The pinhole's focal length is just large enough that every pinhole pixel lies in
 pixel is extrapolated.
 """
 
-import difflib
 import math
 import os
 import shutil
@@ -20,7 +19,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from twin.config import CAMERA_MODELS
-from twin.errors import InputError
+from twin.errors import InputError, name_hint
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.images import decode_image, write_image
 from twin.geometry.poses import inverse_pose
@@ -108,8 +107,7 @@ def checked_lens(model: str, params: tuple[float, ...], width: int, height: int,
     Raises InputError: unknown model, wrong number of parameters, or implausible values.
     """
     if model not in CAMERA_MODELS:
-        near = difflib.get_close_matches(model.upper(), CAMERA_MODELS, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(CAMERA_MODELS)}"
+        hint = name_hint(model, CAMERA_MODELS, f"valid: {', '.join(CAMERA_MODELS)}")
         raise InputError(f"{where}: unknown camera model {model!r}; {hint}")
     if not (0 < width < _MAX_SIDE and 0 < height < _MAX_SIDE):
         raise InputError(f"{where}: image size {width}x{height}; give the size [px] of the calibration images")

@@ -24,7 +24,9 @@ _MAX_DIRECTION = np.radians(10.0)  # deviation from a pair's direction that cont
 _MAX_RATIO = 0.25  # deviation of the logarithm of a ratio of two distances that contradicts it, at least
 _CERTAIN = 4.0  # [standard deviations] smaller deviations contradict nothing
 _STILL = 0.2  # [median step] cameras that are nearer to each other have no direction
-_MIN_NEAR = 8  # least number of near points of a pair that tells a direction and a ratio of distances
+# A pair tells a direction and a ratio of distances only with so many near points, at most so far away (median, in
+# distances of its cameras). With less parallax, moving things and a rolling shutter decide.
+_MIN_NEAR, _MAX_DEPTH = 8, 30.0
 
 
 @dataclass(frozen=True)
@@ -78,12 +80,12 @@ def check_poses(
         relative = camera_to_world[j, :3, :3].T @ camera_to_world[i, :3, :3]
         turn = float(Rotation.from_matrix(pair.rotation.T @ relative).magnitude())
         wrong = turn > max(_MAX_TURN, _CERTAIN * pair.rotation_error)
-        if apart > _STILL * step and len(pair.features) >= _MIN_NEAR:
+        if apart > _STILL * step and _has_parallax(pair):
             direction = camera_to_world[j, :3, :3].T @ (position[i] - position[j]) / apart
             angle = float(np.arccos(np.clip(direction @ pair.translation, -1.0, 1.0)))
             wrong = wrong or angle > max(_MAX_DIRECTION, _CERTAIN * pair.direction_error)
         votes[0, min(i, j) : max(i, j), int(wrong)] += 1
-    scaled = [k for k, pair in enumerate(used) if len(pair.features) >= _MIN_NEAR]
+    scaled = [k for k, pair in enumerate(used) if _has_parallax(pair)]
     for first, second, ratio, error, _ in unit_equations([used[k] for k in scaled]):
         one, other = scaled[first], scaled[second]
         # Where the scale changes, the pairs on both sides of a frame contradict each other; other pairs lie across.
@@ -95,3 +97,7 @@ def check_poses(
     return PoseCheck(
         int(np.count_nonzero(votes.sum((0, 2)))), [(int(frames[k]), int(frames[k + 1])) for k in np.flatnonzero(torn)]
     )
+
+
+def _has_parallax(pair: PairGeometry) -> bool:
+    return len(pair.features) >= _MIN_NEAR and float(np.median(pair.depths)) <= _MAX_DEPTH

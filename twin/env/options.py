@@ -4,7 +4,6 @@ Defaults are those of DriveEnv-NeRF (arXiv 2403.15791) where the paper states th
 """
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from twin.config import STEERING, TRAINING, TWIST, ObstacleConfig
 from twin.env.controller import COMMAND_TIMEOUT
 from twin.env.domain_randomization import Ranges
 from twin.env.picture_effects import CameraOptions
-from twin.errors import InputError, short_repr
+from twin.errors import InputError, name_hint, short_repr
 from twin.mjcf.husky import TIMESTEP
 from twin.types import Array
 from twin.warp_runtime import wp
@@ -250,8 +249,7 @@ def _from_keywords(kind: type, given: dict[str, Any], what: str) -> Any:
     names = [field.name for field in dataclasses.fields(kind)]
     for name in given:
         if name not in names:
-            near = difflib.get_close_matches(name, names, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names)}"
+            hint = name_hint(name, names, f"there are {', '.join(names)}")
             raise InputError(f"unknown {what} {name!r}; {hint}")
     return kind(**given)
 

@@ -21,6 +21,7 @@ from twin.env.observation import PixelObserver
 from twin.env.options import check_actions
 from twin.env.suite import EnvFactory
 from twin.env.task import DrivePhysics, DriveTask, control
+from twin.nerf.baked import BakedField
 from twin.nerf.lightings import Lightings
 from twin.runtime import available_cores
 from twin.types import Array, Array32
@@ -153,11 +154,7 @@ class LocalVectorEnv:
         known, field = self._mixtures[i], self.factory.field
         if known is not None and known[0] is lighting:
             return known[1]
-        text = ""
-        if field and not set(lighting.name.split(" → ")).isdisjoint(RESERVED_LIGHTINGS):
-            ends = [lighting.start] if lighting.end is None else [lighting.start, lighting.end]
-            filmed = field.lightings_by_name.filmed()
-            text = ": " + " → ".join(mixture_text(end, filmed) for end in ends)
+        text = sampled_text(lighting, field) if field else ""
         self._mixtures[i] = lighting, text
         return text
 
@@ -191,6 +188,15 @@ class LocalVectorEnv:
 
     def _each(self, function: Callable[[int], T], which: Iterable[int]) -> list[T]:
         return list(self._pool.map(function, which)) if self._pool else [function(i) for i in which]
+
+
+def sampled_text(lighting: EpisodeLighting, field: BakedField) -> str:
+    """Text of a sampled lighting's mixture, such as `: sun 0.62, night 0.38`; empty if the lighting was not sampled."""
+    if set(lighting.name.split(" → ")).isdisjoint(RESERVED_LIGHTINGS):
+        return ""
+    ends = [lighting.start] if lighting.end is None else [lighting.start, lighting.end]
+    filmed = field.lightings_by_name.filmed()
+    return ": " + " → ".join(mixture_text(end, filmed) for end in ends)
 
 
 def mixture_text(embedding: Array32, filmed: Lightings) -> str:

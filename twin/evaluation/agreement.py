@@ -158,7 +158,8 @@ def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
     out = []
     if policies < MIN_POLICIES:
         more = MIN_POLICIES - policies
-        out.append(f"{policies} policies driven on the road, {MIN_POLICIES} are needed: drive {more} more")
+        driven = "1 policy" if policies == 1 else f"{policies} policies"
+        out.append(f"{driven} driven on the road, {MIN_POLICIES} are needed: drive {more} more")
     short = [
         f"{c.policy} under {c.lighting} has {c.trials} {kind} ({MIN_TRIALS - c.trials} more)"
         for kind, cells in (

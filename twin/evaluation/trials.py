@@ -15,7 +15,6 @@ test. It takes two counts: the episodes in which only policy A succeeded, and th
 """
 
 import csv
-import difflib
 import gzip
 import io
 from collections import Counter
@@ -28,7 +27,7 @@ from typing import Any
 from scipy.stats import binomtest
 
 from twin.config import CAUSES
-from twin.errors import InputError
+from twin.errors import InputError, name_hint
 from twin.evaluation.statistics import rate_summary, wilson
 from twin.files import read_text, wrap_read_errors, write_text
 
@@ -269,7 +268,8 @@ def _policy_and_task(where: str, row: dict[str, str], twin: Sequence[Cell]) -> t
     policy, task = row["policy"], row.get("task", "")
     policies = list(dict.fromkeys(cell.policy for cell in twin))
     if policy not in policies:
-        raise InputError(f"{where}: policy {policy!r} was not validated; {_name_hint(policy, policies)}")
+        hint = name_hint(policy, policies, f"run {_VALIDATE_COMMAND} with --policy {policy}")
+        raise InputError(f"{where}: policy {policy!r} was not validated; {hint}")
     tasks = list(dict.fromkeys(cell.task for cell in twin if cell.policy == policy))
     if not task and len(tasks) > 1:
         valid = " and ".join(tasks)
@@ -294,10 +294,8 @@ def _unknown_lighting(cell: Cell, known: set[tuple[str, str, str]]) -> str:
 
 def _name_hint(name: str, valid: Sequence[str]) -> str:
     """End of an error message: "did you mean ...?", or the valid names."""
-    near = [one for one in valid if one.startswith(f"{name}+")] or difflib.get_close_matches(name, valid, n=1)
-    if near:
-        return f"did you mean {near[0]!r}?"
-    return f"expected one of {', '.join(valid[:8])}{', ...' if len(valid) > 8 else ''}"
+    longer = [one for one in valid if one.startswith(f"{name}+")]
+    return f"did you mean {longer[0]!r}?" if longer else name_hint(name, valid)
 
 
 def _has_rows(path: Path) -> bool:

@@ -12,6 +12,7 @@ lists the other formats. Loading a file runs code from it only if the user trust
 
 import contextlib
 import dataclasses
+import glob
 import hashlib
 import json
 from collections.abc import Callable, Iterator
@@ -25,7 +26,7 @@ from safetensors.numpy import load as safetensors_load
 from safetensors.numpy import save as safetensors_save
 
 from twin.config import STEERING, TWIST
-from twin.errors import InputError, short_repr
+from twin.errors import InputError, name_hint, short_repr
 from twin.files import atomic_path, digest_file, json_bytes, parse_json, read_bytes, read_json
 from twin.learn.policy_network import Architecture, onnx_bytes
 from twin.types import Array32, Image
@@ -154,14 +155,22 @@ def _replace_policy(folder: Path, files: dict[str, bytes]) -> None:
 def find_policy(root: Path, source: str) -> str:
     """Converts a name from a table (`run` or `run/checkpoint`) to its folder in `runs/`, for `load_policy`.
 
-    Existing paths become absolute, since nodes of a cluster have other working folders. Any other source is returned
+    Existing paths become absolute, since nodes of a cluster have other working folders. `module:function` is returned
     unchanged.
+
+    Raises InputError: there is no such policy, but there are others.
     """
     run, _, checkpoint = source.partition("/")
     folder = root / "runs" / run
     folder = folder / "checkpoints" / checkpoint if checkpoint else folder
     where = folder if not Path(source).exists() and (folder / JSON).exists() else Path(source)
-    return str(where.resolve()) if where.exists() else source
+    if where.exists():
+        return str(where.resolve())
+    found = sorted((root / "runs").glob(f"{glob.escape(run)}/checkpoints/*/{JSON}" if checkpoint else f"*/{JSON}"))
+    names = [f"{run}/{path.parent.name}" if checkpoint else path.parent.name for path in found]
+    if names and ":" not in source and where.suffix not in (".onnx", ".zip"):
+        raise InputError(f"no policy {source} in {root / 'runs'}; {name_hint(source, names)}")
+    return source
 
 
 def load_policy(source: str | Path, trust: bool = False) -> Policy:

@@ -9,6 +9,7 @@ printed address then has a token that the browser needs.
 """
 
 import argparse
+import signal
 import sys
 import threading
 import warnings
@@ -78,7 +79,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def serve(twin: Twin, given: argparse.Namespace) -> None:
-    """Serves the page until a signal stops the program."""
+    """Serves the page until a signal stops the program; Ctrl+C is its normal end."""
     if not 0 <= given.port <= 65535:
         raise InputError(f"--port {given.port}: expected 0 to 65535")
 
@@ -93,6 +94,9 @@ def serve(twin: Twin, given: argparse.Namespace) -> None:
         page.viewer.loop.has_shown.wait(_HEAD_START)  # rendering the first picture needs all cores
         load_driving(page, given.task, policy, given.seed)
         threading.Event().wait()
+    except runtime.Stopped as stop:
+        if stop.number != signal.SIGINT:
+            raise
     finally:
         page.viewer.close()
 
