@@ -97,9 +97,28 @@ def test_a_frame_without_a_pose_is_stepped_over(film: Film, pairs: list[PairGeom
 
 
 def test_cameras_on_one_spot_have_no_direction(film: Film, pairs: list[PairGeometry]) -> None:
-    """Where a film stands still, any direction may be found; where the others move, the pairs tell that it did not."""
+    """If all cameras stand on one spot, turns alone are compared; if one does, the pairs tell that it moved."""
+    still = film.poses.copy()
+    still[:, :3, 3] = 0.0
+    assert _check(pairs, still).contradicted == []
     poses = film.poses.copy()
     poses[TORN, :3, 3] = poses[TORN - 1, :3, 3] + 1e-6
-    assert (TORN - 1, TORN) in _check(pairs, poses).contradicted or (TORN, TORN + 1) in _check(
-        pairs, poses
-    ).contradicted
+    assert (TORN, TORN + 1) in _check(pairs, poses).contradicted
+
+
+@pytest.mark.parametrize(
+    ("degrees", "offset"), [(2.0, (0, 0, 0)), (180.0, (0, 0, 0)), (0.0, (0, 1, 0)), (0.0, (0, 0, 1)), (0.0, (0, 30, 0))]
+)
+def test_a_single_misplaced_frame_is_told(film: Film, pairs: list[PairGeometry], degrees: float, offset: tuple) -> None:
+    poses = film.poses.copy()
+    poses[TORN, :3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix() @ poses[TORN, :3, :3]
+    poses[TORN, :3, 3] += offset
+    torn = _check(pairs, poses).contradicted
+    assert {(TORN - 1, TORN), (TORN, TORN + 1)} <= set(torn) and all(abs(i - TORN) <= 3 for i, _ in torn)
+
+
+def test_many_misplaced_frames_are_told(film: Film, pairs: list[PairGeometry]) -> None:
+    poses = film.poses.copy()
+    poses[3:-1:4, :3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix() @ poses[3:-1:4, :3, :3]
+    torn = set(_check(pairs, poses).contradicted)
+    assert all({(k - 1, k), (k, k + 1)} <= torn for k in range(3, FRAMES - 1, 4))

@@ -36,6 +36,7 @@ def test_lund_street_is_metric_by_gps(place):
     root = place('[[source]]\npath = "input/images"\nlighting = "day"\n[metric]\ngps = true\n', "lund_street/images")
     report = verb.build(root, until="metric")
     assert report["cameras"]["total"] == 29 and report["cameras"]["registered"] >= 28
+    assert report["cameras"]["checked_steps"] >= 27 and report["cameras"]["contradicted_steps"] == []
     assert report["metric"]["scale_source"] == "gps"
     # The walk is 197 m by GPS, whose fixes scatter by 3 to 4 m.
     assert report["metric"]["path_length_m"] == pytest.approx(197, rel=0.08)
@@ -50,6 +51,7 @@ def test_kitti_straight_with_its_calibration_held(place, real_data):
     root = place(text, "kitti_straight/image_l")
     report = verb.build(root, until="metric")
     assert report["cameras"]["registered"] == 51
+    assert report["cameras"]["checked_steps"] == 50 and report["cameras"]["contradicted_steps"] == []
     cameras = Cameras.load(root / "build/2_metric")
     assert cameras.intrinsics[0, 0] == pytest.approx(707.0912, abs=1e-6)
     truth = np.loadtxt(real_data / "kitti_straight/poses.txt").reshape(-1, 3, 4)[:, :, 3]
@@ -68,6 +70,7 @@ def test_paper_road_two_lightings_agree(place):
     root = place(text, "driveenv_paper_road/cloudy2sunny.mp4", "driveenv_paper_road/day2night.mp4")
     report = verb.build(root, until="metric")
     assert report["cameras"]["total"] == 160 and report["cameras"]["registered"] >= 150
+    assert report["cameras"]["checked_steps"] >= 148 and report["cameras"]["contradicted_steps"] == []
     cameras = Cameras.load(root / "build/2_metric")
     frame = {name: i for i, name in enumerate(cameras.names)}
     pairs = [
@@ -98,6 +101,7 @@ def test_real_film_with_the_robot_masked(place):
     cv2.imwrite(str(root / "input/mask.png"), mask)
     report = verb.build(root, until="metric")
     assert report["cameras"]["registered"] >= 0.9 * report["cameras"]["total"] >= 40
+    assert len(report["cameras"]["contradicted_steps"]) <= 2  # of 56; the robot and walkers move
 
 
 def test_the_fox_capture_has_no_route(place):

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import weakref
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from textured import filmed_corridor, picture, pose_at
 from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
 
-from twin import command_line
+from twin import command_line, runtime
 from twin.errors import InputError, print_error, shortened
 from twin.geometry.images import write_image
 from twin.nerf.appearance import initial_appearance
@@ -202,6 +203,37 @@ def test_a_signal_in_a_callback_whose_errors_python_drops_is_not_lost(capfd, num
 
     assert _runs(work) == 128 + number and ended == [True]
     assert capfd.readouterr().err == "stopped\n" and sys.unraisablehook is hook
+
+
+def test_a_second_signal_before_the_first_is_sent_again_loses_no_cleanup(capfd):
+    ended = []
+
+    def work():
+        thing = _Thing()
+        reference = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGTERM))
+        del thing
+        assert reference() is None
+        signal.raise_signal(signal.SIGHUP)
+        try:
+            time.sleep(30)
+        finally:
+            time.sleep(0.2)
+            ended.append(True)
+
+    assert _runs(work) == 128 + signal.SIGTERM and ended == [True]
+
+
+def test_threads_leave_the_hook_alone():
+    hook, seen = sys.unraisablehook, []
+
+    def work():
+        with runtime.stoppable():
+            seen.append(sys.unraisablehook)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [hook] and sys.unraisablehook is hook
 
 
 def test_other_errors_that_python_drops_are_reported(monkeypatch):

@@ -110,7 +110,10 @@ def test_results_find_their_cell(tmp_path: Path) -> None:
         (HEADER + "nerf,sun,²,0\n", "line 2: trials = '²'; expected a whole number"),
         (HEADER + "nerf,sun,0,0\n", "line 2: trials = 0; expected at least 1"),
         (HEADER + "nerv,sun,10,5\n", "line 2: policy 'nerv' was not validated; did you mean 'nerf'?"),
-        (HEADER + "other,sun,10,5\n", "line 2: policy 'other' was not validated; run twin validate with --policy other"),
+        (
+            HEADER + "other,sun,10,5\n",
+            "line 2: policy 'other' was not validated; run twin validate with --policy other",
+        ),
         (HEADER + "nerf,sunn,10,5\n", "line 2: lighting 'sunn' is not in the twin; did you mean 'sun'?"),
         (HEADER + "nerf,dusk,10,5\n", "expected one of held-out, sun; or add a column twin_lighting"),
         (HEADER + "nerf,night,10,5\n", "policy 'nerf' was not validated under 'night'; run twin validate"),

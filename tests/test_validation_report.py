@@ -333,6 +333,8 @@ def test_any_policy_can_be_filmed_in_the_environment_it_asks_for(fresh, episodes
         ("nobody", "expected one of ahead"),
         ("ahed", "did you mean 'ahead'?"),
         ("ahead/00000010", "did you mean 'ahead/000000100'?"),
+        ("ahed/000000100", "did you mean 'ahead'?"),
+        ("/no/such/folder", "expected a run's folder, an .onnx file or module:function"),
         ("nobody.onnx", "expected a run's folder, an .onnx file or module:function"),
     ):
         assert film.main([*common, "--policy", wrong, "--quiet"]) == 2

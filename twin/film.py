@@ -99,7 +99,7 @@ def film(
     limits = driven.segment.start, driven.segment.end
     shown = driven.world, driven.half_width, limits, load_ground_and_parts(scene.scene)
     lighting = environment.pixels.lightings[0]
-    told = episode.lighting + (sampled_text(lighting, scene.field()) if lighting else "")
+    told = episode.lighting + (sampled_text(lighting, scene.field()) if lighting and lighting.is_sampled else "")
     write_episode_video(path, replace(episode, lighting=told), images, shown, title)
     if rerun:
         place = driven.world, driven.half_width, f"{scene.scene.root.resolve().name}, {title}"

@@ -128,6 +128,7 @@ def stoppable() -> Iterator[None]:
     """
     stopping = False
     again: list[threading.Timer] = []
+    main = threading.current_thread() is threading.main_thread()
 
     def stop(number: int, _: Any) -> None:
         nonlocal stopping
@@ -137,23 +138,30 @@ def stoppable() -> Iterator[None]:
         if number == signal.SIGINT:
             os._exit(128 + number)
 
+    def send_again(number: int) -> None:
+        nonlocal stopping
+        stopping = False
+        os.kill(os.getpid(), number)
+
     def ignored(what: Any) -> None:
         """Python drops exceptions that are raised in callbacks, such as those of weak references."""
-        nonlocal stopping
         if isinstance(what.exc_value, Stopped):
-            stopping = False
-            again.append(threading.Timer(_AGAIN, os.kill, (os.getpid(), what.exc_value.number)))
-            again[-1].start()
+            timer = threading.Timer(_AGAIN, send_again, (what.exc_value.number,))
+            timer.daemon = True
+            again.append(timer)
+            timer.start()
         else:
             hook(what)
 
     hook = sys.unraisablehook
-    sys.unraisablehook = ignored
+    if main:
+        sys.unraisablehook = ignored
     try:
         with _handled(stop):
             yield
     finally:
-        sys.unraisablehook = hook
+        if main:
+            sys.unraisablehook = hook
         for timer in again:
             timer.cancel()
 

@@ -73,7 +73,7 @@ def record_trial(
         twin_lighting: The lighting of the twin that the trial is counted under, by default `lighting`. Pictures are
             compared with it or, if the field has none of that name, with the lighting that matches them best.
         cause: The cause of the recording's end, as stated by the operator.
-        frame: See `twin.sysid.trial_recording.scene_frame`.
+        frame: See `twin.sysid.trial_recording.PosesFrame`.
         topics: Topics of the bag; see `read_trial`.
 
     Raises:

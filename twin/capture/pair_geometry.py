@@ -28,7 +28,7 @@ _WIDE = 4.0  # the first steps use a loss that is wider by this factor
 _WIDE_STEPS, _STEPS = 5, 12  # largest number of Gauss–Newton steps
 _SAME_START = np.radians(0.3)  # poses that differ less lead to the same minimum
 _ROTATION_TRIALS, _TRANSLATION_TRIALS = 60, 120  # random pairs of matches that propose a rotation and a translation
-_SAME_CAMERA = 1e-3  # largest relative difference of the parameters of cameras that count as the same
+_SAME_CAMERA = 1e-3  # largest difference of the directions [rad] of pixels of cameras that count as the same
 _SAME_ROTATION = np.radians(0.2)  # largest deviation of a far point from the rotation that most points share
 _FOCAL_PAIRS, _FOCAL_MATCHES = 24, 300  # largest numbers of pairs and of their matches that a focal length is fitted to
 _FOCAL_STEPS = 3  # [frames] largest distance of these pairs
@@ -82,13 +82,15 @@ def pair_geometries(
     Args:
         known: Geometry of some pairs of images, which is not computed again; that of the others is added.
         among: Pairs of images, smaller id first, to which the result is restricted; by default all.
-        refined: Cameras by COLMAP's ids, instead of those of the database. If they differ, `known` is not used.
+        refined: Cameras by COLMAP's ids that replace those of the database. Where they differ, `known` is not used.
     """
     known = {} if known is None else known
     with pycolmap.Database.open(database) as opened:
         cameras, camera_of = _cameras(opened)
-        if any(not np.allclose(one.params, cameras[k].params, _SAME_CAMERA) for k, one in (refined or {}).items()):
-            cameras, known = {**cameras, **(refined or {})}, {}
+        changed = {k for k, one in (refined or {}).items() if not _is_same(one, cameras[k])}
+        cameras |= {k: one for k, one in (refined or {}).items() if k in changed}
+        if changed:
+            known = {pair: one for pair, one in known.items() if changed.isdisjoint(camera_of[image] for image in pair)}
         points = {image_id: opened.read_keypoints(image_id)[:, :2].astype(np.float64) for image_id in camera_of}
         found = zip(*opened.read_two_view_geometries(), strict=True)
         verified = [
@@ -139,6 +141,11 @@ def camera_rays(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Array:
     directions = np.ones((len(pixels), 3))
     directions[:, :2] = camera.cam_from_img(pixels)
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _is_same(one: pycolmap.Camera, other: pycolmap.Camera) -> bool:
+    grid = np.stack(np.meshgrid(np.linspace(0, one.width, 5), np.linspace(0, one.height, 5)), -1).reshape(-1, 2)
+    return bool(np.linalg.norm(camera_rays(one, grid) - camera_rays(other, grid), axis=1).max() < _SAME_CAMERA)
 
 
 def _keypoint_errors(camera: pycolmap.Camera, pixels: NDArray[np.floating], rays: Array) -> Array:

@@ -2,9 +2,9 @@
 
 A *step* leads from a frame of a film to the next one that has a pose. Each pair of frames that are at most `_REACH`
 steps apart tells how much the camera turned and in which direction it moved; this supports or contradicts the steps
-between them. Two pairs that meet in a frame and see the same near points tell the ratio of their lengths; this supports
-or contradicts the step that begins there. Reprojection errors do not reveal wrong poses: the pieces of a film that was
-torn apart have small ones.
+between them, and both frames. Two pairs that meet in a frame and see the same near points tell the ratio of their
+lengths; this supports or contradicts the step that begins there. Reprojection errors do not reveal wrong poses: the
+pieces of a film that was torn apart have small ones.
 """
 
 from dataclasses import dataclass
@@ -71,7 +71,9 @@ def check_poses(
             ends.append((place[first], place[second]))
     if not used:
         return PoseCheck(0, [])
-    votes = np.zeros((2, len(frames), 2), np.int64)  # of turns and directions, and of ratios: supports, contradictions
+    # Supports and contradictions: of steps, by the frames where they begin, by turns and directions, and by ratios; and
+    # of frames, by the pairs that end in them.
+    votes = np.zeros((3, len(frames), 2), np.int64)
     position = camera_to_world[:, :3, 3]
     same = film[frames[1:]] == film[frames[:-1]]
     step = float(np.median(np.linalg.norm(np.diff(position, axis=0), axis=1)[same]))
@@ -85,6 +87,7 @@ def check_poses(
             angle = float(np.arccos(np.clip(direction @ pair.translation, -1.0, 1.0)))
             wrong = wrong or angle > max(_MAX_DIRECTION, _CERTAIN * pair.direction_error)
         votes[0, min(i, j) : max(i, j), int(wrong)] += 1
+        votes[2, [i, j], int(wrong)] += 1
     scaled = [k for k, pair in enumerate(used) if _has_parallax(pair)]
     for first, second, ratio, error, _ in unit_equations([used[k] for k in scaled]):
         one, other = scaled[first], scaled[second]
@@ -93,9 +96,11 @@ def check_poses(
         if before[1] == after[0] and max(distance[one], distance[other]) > _STILL * step:
             found = np.log(max(distance[one], 1e-12) / max(distance[other], 1e-12))
             votes[1, after[0], int(abs(found - ratio) > max(_MAX_RATIO, _CERTAIN * error))] += 1
-    torn = (votes[..., 1] > votes[..., 0]).any(0)
+    checked = votes[:2].sum((0, 2)) > 0
+    torn, misplaced = (votes[:2, :, 1] > votes[:2, :, 0]).any(0), votes[2, :, 1] > votes[2, :, 0]
+    torn |= checked & (misplaced | np.roll(misplaced, -1))  # the steps to and from a misplaced frame
     return PoseCheck(
-        int(np.count_nonzero(votes.sum((0, 2)))), [(int(frames[k]), int(frames[k + 1])) for k in np.flatnonzero(torn)]
+        int(np.count_nonzero(checked)), [(int(frames[k]), int(frames[k + 1])) for k in np.flatnonzero(torn)]
     )
 
 

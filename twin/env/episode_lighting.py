@@ -57,6 +57,11 @@ class EpisodeLighting:
     end_sunlight: Sunlight = ()
     """Suns after `duration`."""
 
+    @property
+    def is_sampled(self) -> bool:
+        """The name is that of a set of lightings from which this one was sampled."""
+        return not set(self.name.split(" → ")).isdisjoint(RESERVED_LIGHTINGS)
+
     def at(self, time: float) -> Array32:
         """The embedding after `time` [s], shape (dim,)."""
         if self.end is None:

@@ -15,7 +15,6 @@ import dm_env
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import RESERVED_LIGHTINGS
 from twin.env.episode_lighting import EpisodeLighting
 from twin.env.observation import PixelObserver
 from twin.env.options import check_actions
@@ -154,7 +153,7 @@ class LocalVectorEnv:
         known, field = self._mixtures[i], self.factory.field
         if known is not None and known[0] is lighting:
             return known[1]
-        text = sampled_text(lighting, field) if field else ""
+        text = sampled_text(lighting, field) if field and lighting.is_sampled else ""
         self._mixtures[i] = lighting, text
         return text
 
@@ -191,9 +190,7 @@ class LocalVectorEnv:
 
 
 def sampled_text(lighting: EpisodeLighting, field: BakedField) -> str:
-    """Text of a sampled lighting's mixture, such as `: sun 0.62, night 0.38`; empty if the lighting was not sampled."""
-    if set(lighting.name.split(" → ")).isdisjoint(RESERVED_LIGHTINGS):
-        return ""
+    """Text of a sampled lighting's mixture, such as `: sun 0.62, night 0.38`."""
     ends = [lighting.start] if lighting.end is None else [lighting.start, lighting.end]
     filmed = field.lightings_by_name.filmed()
     return ": " + " → ".join(mixture_text(end, filmed) for end in ends)

@@ -166,10 +166,13 @@ def find_policy(root: Path, source: str) -> str:
     where = folder if not Path(source).exists() and (folder / JSON).exists() else Path(source)
     if where.exists():
         return str(where.resolve())
-    found = sorted((root / "runs").glob(f"{glob.escape(run)}/checkpoints/*/{JSON}" if checkpoint else f"*/{JSON}"))
-    names = [f"{run}/{path.parent.name}" if checkpoint else path.parent.name for path in found]
-    if names and ":" not in source and where.suffix not in (".onnx", ".zip"):
-        raise InputError(f"no policy {source} in {root / 'runs'}; {name_hint(source, names)}")
+    if Path(source).is_absolute() or ":" in source or where.suffix in (".onnx", ".zip"):
+        return source
+    of_run = bool(checkpoint) and (root / "runs" / run).is_dir()
+    found = sorted((root / "runs").glob(f"{glob.escape(run)}/checkpoints/*/{JSON}" if of_run else f"*/{JSON}"))
+    names = [f"{run}/{path.parent.name}" if of_run else path.parent.name for path in found]
+    if names := [name for name in names if not name.startswith(".")]:
+        raise InputError(f"no policy {source} in {root / 'runs'}; {name_hint(source if of_run else run, names)}")
     return source
 
 

@@ -143,7 +143,8 @@ def _filmed_sides(spec: PlaceSpec, plan: FilmingPlan) -> _Sides:
         known = [str(n) for n in range(1, _DEVELOPMENT + 1) if _within(draw(n, side_roads=True), reach)]
         raise InputError(
             f"--side-roads: no side road in the first {plan.length:g} m of place {spec.number} has room for a film; "
-            f"choose one of the places {', '.join(known)}" + (", or film without --tiny" if tiny else "")
+            f"choose one of the places {', '.join(known)}"
+            + (", or film without --tiny" if spec.line.side_roads else "")
         )
     return out
 

@@ -109,13 +109,15 @@ def cameras_section(report: dict[str, Any]) -> Section:
         cure = "check on the map that the road has its true length and no jumps. Film with more frames per meter."
         cautions.append(Caution(what, cure))
     checked, contradicted = cameras.get("checked_steps"), cameras.get("contradicted_steps") or []
-    if contradicted:
+    if contradicted and checked:
         first = " to ".join(contradicted[0])
         what = (
             f"{len(contradicted)} of {checked} steps between successive frames contradict the matches of these frames: "
             f"first {first}."
         )
-        cure = "the path may be torn, bent or wrongly scaled there; check it on the map, and film slower at that place."
+        given = cameras.get("mapper") == "given poses"
+        more = "check the given poses and their calibration" if given else "film slower at that place"
+        cure = f"the path may be torn, bent or wrongly scaled there; check it on the map, and {more}."
         cautions.append(Caution(what, cure))
     if stabilized := cameras.get("stabilized"):
         films = join_names(stabilized, 6)
@@ -140,9 +142,9 @@ def cameras_section(report: dict[str, Any]) -> Section:
             ("cameras.points", "points", "{:,}", "triangulated"),
         ),
         Fact(
-            "steps confirmed",
+            "steps not contradicted",
             f"{checked - len(contradicted)} of {checked}" if checked else NOT_MEASURED,
-            "steps between successive frames that agree with the relative poses of pairs of near frames",
+            "steps between successive frames, by the relative poses of pairs of near frames",
         ),
         Fact("track length", number(cameras.get("mean_track_length"), "{:.1f} frames"), "frames that observe a point"),
         Fact("focal length", ", ".join(texts) or NOT_MEASURED, "given, or estimated by the reconstruction"),

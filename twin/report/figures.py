@@ -179,7 +179,7 @@ def place_map(
     steps = positions[np.array(contradicted, np.int64).reshape(-1, 2), :2]
     for k, step in enumerate(steps):
         label = f"contradicted (n = {len(steps)})" if k == 0 else None
-        axes.plot(*step.T, color=SERIES[1], lw=4.0, solid_capstyle="round", label=label, zorder=5)
+        axes.plot(*step.T, color=INK, lw=4.0, solid_capstyle="round", label=label, zorder=5)
     add_legend(figure)
     return figure
 
