@@ -155,7 +155,8 @@ def test_a_route_switched_off_is_distinguished_from_none_found(scene: SceneDir, 
     assert metrics["renders"] <= 5  # the first chapter's share: one lighting turns into nothing
 
 
-def test_the_same_scene_makes_the_same_files(scene: SceneDir, tmp_path: Path) -> None:
+def test_the_same_scene_makes_the_same_pictures(scene: SceneDir, tmp_path: Path) -> None:
+    """On a busy machine, x264 rarely codes the same pictures in other bytes, so films are compared picture by picture."""
     field = CheckeredField({"day": 1.0, "night": 0.25})
     make_cameras(scene.stage("metric"), field)
     contents = []
@@ -163,8 +164,10 @@ def test_the_same_scene_makes_the_same_files(scene: SceneDir, tmp_path: Path) ->
         (tmp_path / name).mkdir()
         write_review_video(scene, config(), tmp_path / name, field)
         files = sorted(p for p in (tmp_path / name).rglob("*") if p.is_file())
-        contents.append([(p.relative_to(tmp_path / name), p.read_bytes()) for p in files])
+        contents.append([(p.relative_to(tmp_path / name), p.read_bytes()) for p in files if p.suffix != ".mp4"])
     assert contents[0] == contents[1]
+    films = [read_frames(tmp_path / name / "review.mp4") for name in ("a", "b")]
+    assert all(np.array_equal(one, other) for one, other in zip(*films, strict=True))
 
 
 def test_frames_to_compare_show_both_kinds_in_order(tmp_path: Path) -> None:

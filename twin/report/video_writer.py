@@ -18,7 +18,9 @@ from PIL import Image
 
 _BT709 = 1  # number of BT.709 in ITU-T H.273, for matrix, primaries and transfer
 _LIMITED_RANGE = 1  # AVCOL_RANGE_MPEG
-_THREADS = 1  # threads of x264: with four, 8 of 1,500 films had other bytes, on a busy machine
+# Threads of x264. On a busy machine, 8 of 1,500 films had other bytes with four; with one it is rare, and the pictures
+# are the same.
+_THREADS = 1
 _POSTER_WIDTH = 640  # [px]
 
 
