@@ -24,6 +24,8 @@ _MAX_DIRECTION = np.radians(10.0)  # deviation from a pair's direction that cont
 _MAX_RATIO = 0.25  # deviation of the logarithm of a ratio of two distances that contradicts it, at least
 _CERTAIN = 4.0  # [standard deviations] smaller deviations contradict nothing
 _STILL = 0.2  # [median step] cameras that are nearer to each other have no direction
+# A pair of frames some steps apart is left out if it deviates more from the pairs between, in turn or in direction.
+_MAX_CHAIN_TURN, _MAX_CHAIN_ANGLE = np.radians(2.0), np.radians(60.0)
 # A pair tells a direction and a ratio of distances only with so many near points, at most so far away (median, in
 # distances of its cameras). With less parallax, moving things and a rolling shutter decide.
 _MIN_NEAR, _MAX_DEPTH = 8, 30.0
@@ -69,6 +71,8 @@ def check_poses(
         if ordered_pair(first, second) in near:
             used.append(pair)
             ends.append((place[first], place[second]))
+    agreeing = _agree_with_chains(used, ends)
+    used, ends = [used[k] for k in agreeing], [ends[k] for k in agreeing]
     if not used:
         return PoseCheck(0, [])
     # Supports and contradictions: of steps, by the frames where they begin, by turns and directions, and by ratios; and
@@ -102,6 +106,28 @@ def check_poses(
     return PoseCheck(
         int(np.count_nonzero(checked)), [(int(frames[k]), int(frames[k + 1])) for k in np.flatnonzero(torn)]
     )
+
+
+def _agree_with_chains(pairs: list[PairGeometry], ends: list[tuple[int, int]]) -> list[int]:
+    """Indices of the pairs that agree with those of the successive frames between them, where these are known.
+
+    Frames that are some steps apart may match by a repeated pattern, such as a row of houses or paving stones.
+    """
+    successive: dict[int, PairGeometry] = {i: p for (i, j), p in zip(ends, pairs, strict=True) if j == i + 1}
+    kept = []
+    for k, ((i, j), pair) in enumerate(zip(ends, pairs, strict=True)):
+        rotation, path = np.eye(3), np.zeros(3)  # from frame i; the path in its coordinates, if all steps are as long
+        chain = [successive.get(step) for step in range(i, j)]
+        for one in chain:
+            if one is not None:
+                path = path - rotation.T @ one.rotation.T @ one.translation
+                rotation = one.rotation @ rotation
+        direction = -pair.rotation.T @ pair.translation
+        turn = Rotation.from_matrix(pair.rotation @ rotation.T).magnitude()
+        agrees = turn < _MAX_CHAIN_TURN and direction @ path > np.cos(_MAX_CHAIN_ANGLE) * np.linalg.norm(path)
+        if j <= i + 1 or None in chain or agrees or not _has_parallax(pair):
+            kept.append(k)
+    return kept
 
 
 def _has_parallax(pair: PairGeometry) -> bool:
