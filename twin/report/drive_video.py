@@ -82,7 +82,7 @@ def write_episode_video(path: Path, episode: Episode, observations: Sequence[Ima
             yield i, observations[i], from_behind, marker, ("reward", f"{total[i]:.1f}"), float(episode.trust[i])
 
     end = f"collision with {join_names(episode.touched, 2)}" if episode.cause == "collision" else None
-    texts = title, f"lighting: {episode.lighting}, {_EVERY}× speed", "MuJoCo scene, convex parts outlined"
+    texts = title, f"{_EVERY}× speed, lighting: {episode.lighting}", "MuJoCo scene, convex parts outlined"
     curves = [("speed [m/s]", episode.speed, ACCENT), ("cumulative reward", total, GREEN)]
     _write_frames(path, layout, fps, place, texts, episode, curves, frames(), len(instants), end)
 

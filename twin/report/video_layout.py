@@ -198,7 +198,8 @@ class FrameLayout:
         out[:] = BACKGROUND
         big = round(self.text * 1.25)
         y = (self.header - round(big * 1.3)) // 2
-        note = shorten(note, width // 3, self.text)
+        beside = width - 4 * _MARGIN - text_width(title, big, bold=True)
+        note = shorten(note, max(width // 3, beside), self.text)
         free = width - 4 * _MARGIN - text_width(note, self.text)
         draw_text(out, shorten(title, free, big, bold=True), _MARGIN, y, big, INK, bold=True)
         draw_text(out, note, width - _MARGIN, y + (big - self.text), self.text, MUTED, align="right")
