@@ -1,4 +1,4 @@
-"""Relative poses of pairs, focal lengths, and camera poses averaged from them, on a simulated film of a road."""
+"""Relative poses of pairs, focal lengths, and camera poses averaged from or checked by pairs, on a simulated film."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +16,7 @@ from twin.capture.pair_geometry import (
     with_rotation,
 )
 from twin.capture.pose_averaging import Differences, _goes_along, averaged_poses, consistent_pairs, solve_differences
+from twin.capture.pose_check import PoseCheck, check_poses
 from twin.geometry.poses import umeyama
 from twin.types import Array
 
@@ -41,7 +42,7 @@ class Film:
         return float(np.linalg.norm(umeyama(found, true).points(found) - true, axis=1).max())
 
 
-def simulated_film(path: Path, wrong: bool = False, bend: float = 0.04, shake: float = 0.03) -> Film:
+def _film(path: Path, wrong: bool = False, bend: float = 0.04, shake: float = 0.03) -> Film:
     """A camera that shakes [rad] goes 1 m per frame round a bend [rad per frame] over a plane, with a skyline.
 
     A tenth of all matches are wrong. If `wrong`, frames 2 and 13 share 120 matches of a repeated pattern, too.
@@ -111,7 +112,7 @@ ONE_FILM = np.zeros(FRAMES, np.int64)
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory: pytest.TempPathFactory) -> Film:
-    return simulated_film(tmp_path_factory.mktemp("film") / "database.db")
+    return _film(tmp_path_factory.mktemp("film") / "database.db")
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +151,7 @@ def test_poses_averaged_from_pairs_are_those_of_the_film(film: Film, pairs: list
 
 
 def test_a_pair_of_a_repeated_pattern_does_not_bend_the_path(tmp_path: Path) -> None:
-    film = simulated_film(tmp_path / "database.db", wrong=True)
+    film = _film(tmp_path / "database.db", wrong=True)
     pairs = pair_geometries(film.database, 0)
     assert (3, 14) in {(pair.matches.first, pair.matches.second) for pair in pairs}
     frames, poses = averaged_poses(pairs, ROW, ONE_FILM, 0)
@@ -220,7 +221,7 @@ def test_the_focal_length_is_found_from_matches(film: Film, tmp_path: Path, mode
 
 def test_a_focal_length_that_the_matches_do_not_tell_stays_near_the_guess(tmp_path: Path) -> None:
     """A camera that goes straight ahead and does not turn: a longer focal length looks like longer steps."""
-    film = simulated_film(tmp_path / "straight.db", bend=0.0, shake=0.0)
+    film = _film(tmp_path / "straight.db", bend=0.0, shake=0.0)
     assert 0.5 * FOCAL < _fitted(film, tmp_path / "database.db", "SIMPLE_RADIAL", 600.0)[0] < 2.0 * FOCAL
 
 
@@ -283,3 +284,126 @@ def test_a_pair_where_the_lens_cannot_be_inverted_is_left_out(film: Film, tmp_pa
         database.write_two_view_geometry(1, 2, _geometry(np.stack([corner, corner], 1)))
     assert len(corner) == 20
     assert (1, 2) not in {(pair.matches.first, pair.matches.second) for pair in pair_geometries(path, 0)}
+
+
+# ---- poses checked by pairs
+
+
+TORN = 8  # frame at which the film is torn apart
+
+
+def _check(pairs: list[PairGeometry], poses: Array) -> PoseCheck:
+    return check_poses(pairs, ROW, ONE_FILM, np.arange(FRAMES), poses)
+
+
+def test_true_and_averaged_poses_are_supported(film: Film, pairs: list[PairGeometry]) -> None:
+    assert _check(pairs, film.poses) == PoseCheck(FRAMES - 1, [])
+    frames, poses = averaged_poses(pairs, ROW, ONE_FILM, 0)
+    assert check_poses(pairs, ROW, ONE_FILM, frames, poses).contradicted == []
+    shrunk = film.poses.copy()
+    shrunk[:, :3, 3] *= 1e-4  # the unit of length does not matter
+    assert _check(pairs, shrunk).contradicted == []
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.5, 0.7, 1.5])
+def test_a_piece_of_another_scale_is_told_where_it_begins(film: Film, pairs: list[PairGeometry], scale: float) -> None:
+    poses = film.poses.copy()
+    poses[TORN:, :3, 3] = poses[TORN, :3, 3] + scale * (poses[TORN:, :3, 3] - poses[TORN, :3, 3])
+    torn = _check(pairs, poses).contradicted
+    assert (TORN, TORN + 1) in torn and all(abs(i - TORN) <= 3 for i, _ in torn)
+
+
+@pytest.mark.parametrize("degrees", [1.5, 5.0, 30.0])
+def test_a_bend_that_is_not_there_is_told(film: Film, pairs: list[PairGeometry], degrees: float) -> None:
+    poses, pivot = film.poses.copy(), film.poses[TORN, :3, 3].copy()
+    turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    poses[TORN:, :3, :3] = turn @ poses[TORN:, :3, :3]
+    poses[TORN:, :3, 3] = pivot + (poses[TORN:, :3, 3] - pivot) @ turn.T
+    assert _check(pairs, poses).contradicted == [(TORN - 1, TORN)]
+
+
+@pytest.mark.parametrize("offset", [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (3.0, 0.0, 0.0)])
+def test_a_gap_is_told(film: Film, pairs: list[PairGeometry], offset: tuple[float, float, float]) -> None:
+    poses = film.poses.copy()
+    poses[TORN:, :3, 3] += offset
+    torn = _check(pairs, poses).contradicted
+    assert (TORN - 1, TORN) in torn and all(abs(i - TORN) <= 3 for i, _ in torn)
+
+
+def test_pairs_without_near_points_tell_turns_alone(film: Film, pairs: list[PairGeometry]) -> None:
+    far = [
+        replace(pair, features=pair.features[:0], depths=pair.depths[:0], depth_error=pair.depth_error[:0])
+        for pair in pairs
+    ]
+    poses = film.poses.copy()
+    poses[TORN:, :3, 3] += (0.0, 3.0, 0.0)
+    assert _check(far, poses) == PoseCheck(FRAMES - 1, [])
+    assert _check(far[:3] + pairs[3:], film.poses).contradicted == []
+    poses[TORN:, :3, :3] = Rotation.from_euler("z", 5, degrees=True).as_matrix() @ poses[TORN:, :3, :3]
+    assert _check(far, poses).contradicted == [(TORN - 1, TORN)]
+
+
+def test_steps_between_films_are_not_checked(film: Film, pairs: list[PairGeometry]) -> None:
+    poses = film.poses.copy()
+    poses[TORN:, :3, 3] += (0.0, 5.0, 0.0)
+    two = np.repeat([0, 1], [TORN, FRAMES - TORN])
+    assert check_poses(pairs, ROW, two, np.arange(FRAMES), poses) == PoseCheck(FRAMES - 2, [])
+
+
+def test_without_pairs_nothing_is_checked(film: Film, pairs: list[PairGeometry]) -> None:
+    assert check_poses([], ROW, ONE_FILM, np.arange(FRAMES), film.poses) == PoseCheck(0, [])
+    assert check_poses(pairs, ROW, ONE_FILM, np.arange(1), film.poses[:1]) == PoseCheck(0, [])
+
+
+def test_a_frame_without_a_pose_is_stepped_over(film: Film, pairs: list[PairGeometry]) -> None:
+    posed = np.delete(np.arange(FRAMES), 5)
+    assert check_poses(pairs, ROW, ONE_FILM, posed, film.poses[posed]) == PoseCheck(FRAMES - 2, [])
+    poses = film.poses[posed]
+    poses[5:, :3, 3] += (0.0, 3.0, 0.0)
+    assert (4, 6) in check_poses(pairs, ROW, ONE_FILM, posed, poses).contradicted
+
+
+def test_cameras_on_one_spot_have_no_direction(film: Film, pairs: list[PairGeometry]) -> None:
+    """If all cameras stand on one spot, turns alone are compared; if one does, the pairs tell that it moved."""
+    still = film.poses.copy()
+    still[:, :3, 3] = 0.0
+    assert _check(pairs, still).contradicted == []
+    poses = film.poses.copy()
+    poses[TORN, :3, 3] = poses[TORN - 1, :3, 3] + 1e-6
+    assert (TORN, TORN + 1) in _check(pairs, poses).contradicted
+
+
+@pytest.mark.parametrize(
+    ("degrees", "offset"), [(2.0, (0, 0, 0)), (180.0, (0, 0, 0)), (0.0, (0, 1, 0)), (0.0, (0, 0, 1)), (0.0, (0, 30, 0))]
+)
+def test_a_single_misplaced_frame_is_told(film: Film, pairs: list[PairGeometry], degrees: float, offset: tuple) -> None:
+    poses = film.poses.copy()
+    poses[TORN, :3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix() @ poses[TORN, :3, :3]
+    poses[TORN, :3, 3] += offset
+    torn = _check(pairs, poses).contradicted
+    assert {(TORN - 1, TORN), (TORN, TORN + 1)} <= set(torn) and all(abs(i - TORN) <= 3 for i, _ in torn)
+
+
+def test_many_misplaced_frames_are_told(film: Film, pairs: list[PairGeometry]) -> None:
+    poses = film.poses.copy()
+    poses[3:-1:4, :3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix() @ poses[3:-1:4, :3, :3]
+    torn = set(_check(pairs, poses).contradicted)
+    assert all({(k - 1, k), (k, k + 1)} <= torn for k in range(3, FRAMES - 1, 4))
+
+
+def _deflected(pair: PairGeometry, **changes: object) -> PairGeometry:
+    """The pair with a wrong direction of the translation."""
+    turn = Rotation.from_euler("y", 120, degrees=True).as_matrix()
+    return replace(pair, translation=turn @ pair.translation, **changes)
+
+
+def test_pairs_that_contradict_those_between_their_frames_do_not_count(film: Film, pairs: list[PairGeometry]) -> None:
+    """Frames that are some steps apart may match by a repeated pattern."""
+    near = [pair if pair.matches.second == pair.matches.first + 1 else _deflected(pair) for pair in pairs]
+    assert _check(near, film.poses) == PoseCheck(FRAMES - 1, [])
+    assert len(_check([_deflected(pair) for pair in pairs], film.poses).contradicted) == FRAMES - 1
+
+
+def test_directions_with_little_parallax_do_not_count(film: Film, pairs: list[PairGeometry]) -> None:
+    far = [_deflected(pair, depths=100.0 * pair.depths) for pair in pairs]
+    assert _check(far, film.poses) == PoseCheck(FRAMES - 1, [])
