@@ -22,6 +22,7 @@ from twin.build import summary
 from twin.commands import VERBS
 from twin.errors import join_names
 from twin.files import write_json
+from twin.geometry.cameras import Cameras
 from twin.geometry.images import write_image
 from twin.report import build_report as report_page
 from twin.report import build_sections, visual_vs_collision
@@ -355,6 +356,29 @@ def test_nothing_wrong_gives_no_caution() -> None:
     assert cautions(REPORT) == [] and cautions({}) == []
     assert {section.headline.mood for section in headline_sections(REPORT) if section.headline} == {"good"}
     assert "caution" not in summary(REPORT)
+
+
+def test_the_map_marks_the_steps_that_the_pictures_contradict(scene: SceneDir) -> None:
+    positions = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [2.0, 0.0, 1.0]])
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, 3] = positions
+    names = tuple(f"day/{k:06d}" for k in range(3))
+    sizes, times = np.tile(np.array([64, 36]), (3, 1)), np.arange(3.0)
+    folder = scene.stage("metric")
+    folder.mkdir(parents=True)
+    Cameras(names, poses, np.ones((3, 4)), sizes, ("day",) * 3, ("day",) * 3, times, np.zeros(3, bool), folder).save(
+        folder
+    )
+    steps = [["day/000000", "day/000001"], ["day/000001", "day/000002"], ["night/000000", "night/000001"]]
+    assert "contradicted (n = 2)" in page(scene, changed("cameras.contradicted_steps", steps))
+    assert "contradicted (n" not in page(scene, REPORT)
+
+
+@pytest.mark.parametrize(("mapper", "cure"), [("given poses", "check the given poses"), ("global", "film slower")])
+def test_the_cure_of_contradicted_steps_fits_where_the_poses_come_from(mapper: str, cure: str) -> None:
+    report = changed("cameras.contradicted_steps", [["day/000001", "day/000002"]])
+    (caution,) = cautions(changed("cameras.mapper", mapper, report))
+    assert cure in caution["cure"]
 
 
 @pytest.mark.usefixtures("no_charts")

@@ -170,6 +170,17 @@ def test_the_same_scene_makes_the_same_pictures(scene: SceneDir, tmp_path: Path)
     assert all(np.array_equal(one, other) for one, other in zip(*films, strict=True))
 
 
+def test_the_header_has_room_for_a_long_note_beside_a_short_title(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[str] = []
+    monkeypatch.setattr("twin.report.video_layout.draw_text", lambda image, text, *_, **__: drawn.append(text))
+    note = "2× speed, lighting: training: sun 0.59, night 0.41"
+    layout = FrameLayout.for_pictures(480, 9 / 16)
+    layout.canvas("straight: first", note)
+    layout.canvas("a long title " * 9, note)
+    assert drawn[:2] == ["straight: first", note]
+    assert drawn[2].endswith("…") and drawn[3].endswith("…")
+
+
 def test_frames_to_compare_show_both_kinds_in_order(tmp_path: Path) -> None:
     cameras = make_cameras(tmp_path / "build" / "2_metric", CheckeredField({"day": 1.0, "night": 0.3}))
     chosen = frames_to_compare(cameras, "night", 6)

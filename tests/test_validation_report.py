@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -340,6 +341,14 @@ def test_any_policy_can_be_filmed_in_the_environment_it_asks_for(fresh, episodes
         assert film.main([*common, "--policy", wrong, "--quiet"]) == 2
         said = capsys.readouterr().err
         assert said.startswith(f"error: no policy {wrong}") and hint in said
+
+
+@pytest.mark.parametrize(("lighting", "told"), [("day", "day"), ("training", r"training: [a-z]+ \d\.\d\d.*")])
+def test_a_film_names_the_mixture_of_a_sampled_lighting(fresh, tmp_path, monkeypatch, lighting, told):
+    shown = []
+    monkeypatch.setattr(film, "write_episode_video", lambda path, episode, *_: shown.append(episode.lighting))
+    _, episode = film.film(fresh, "ahead", seed=5, out=tmp_path / "a.mp4", lighting=lighting)
+    assert episode.lighting == lighting and len(shown) == 1 and re.fullmatch(told, shown[0])
 
 
 @pytest.mark.parametrize("count", [1, 4, 27, 1000])

@@ -809,6 +809,25 @@ def _picture(browser: Chromium, size: tuple[int, int]) -> np.ndarray:
     return page[: size[1], size[0] // 3 : size[0] // 2].astype(float)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_is_the_normal_end_of_the_page(monkeypatch, number):
+    closed = []
+    loop = SimpleNamespace(has_shown=threading.Event())
+    loop.has_shown.set()
+    page = SimpleNamespace(viewer=SimpleNamespace(loop=loop, close=lambda: closed.append(True)))
+
+    def loading(*_):
+        raise Stopped(number)
+
+    monkeypatch.setattr(view_verb, "open_page", lambda *_: page)
+    monkeypatch.setattr(view_verb, "load_driving", loading)
+    monkeypatch.setattr(view_verb, "_check_driver", lambda *_: None)
+    given = SimpleNamespace(port=0, host="127.0.0.1", lighting=None, task=None, seed=0, quiet=True)
+    with nullcontext() if number == signal.SIGINT else pytest.raises(Stopped):
+        view_verb.serve(None, given)
+    assert closed == [True]
+
+
 @pytest.mark.skipif(find_chromium() is None, reason="no chromium on this machine")
 def test_the_page_in_a_browser(scene):
     size = (960, 540)
