@@ -366,9 +366,8 @@ def test_the_map_marks_the_steps_that_the_pictures_contradict(scene: SceneDir) -
     sizes, times = np.tile(np.array([64, 36]), (3, 1)), np.arange(3.0)
     folder = scene.stage("metric")
     folder.mkdir(parents=True)
-    Cameras(names, poses, np.ones((3, 4)), sizes, ("day",) * 3, ("day",) * 3, times, np.zeros(3, bool), folder).save(
-        folder
-    )
+    rest = ("day",) * 3, ("day",) * 3, times, np.zeros(3, bool), folder
+    Cameras(names, poses, np.ones((3, 4)), sizes, *rest).save(folder)
     steps = [["day/000000", "day/000001"], ["day/000001", "day/000002"], ["night/000000", "night/000001"]]
     assert "contradicted (n = 2)" in page(scene, changed("cameras.contradicted_steps", steps))
     assert "contradicted (n" not in page(scene, REPORT)

@@ -10,6 +10,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from contextlib import nullcontext
 from dataclasses import replace
 from http import HTTPStatus
 from pathlib import Path
@@ -44,7 +45,9 @@ from twin.nerf.lightings import Fog
 from twin.nerf.sun import Sun
 from twin.report import build_report as report_page
 from twin.report.video_writer import read_frames
+from twin.runtime import Stopped
 from twin.scene import write_stamp
+from twin.view import __main__ as view_verb
 from twin.view import guarded_server
 from twin.view.__main__ import load_driving, open_page
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, spaced_times
