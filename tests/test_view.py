@@ -10,7 +10,6 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from contextlib import nullcontext
 from dataclasses import replace
 from http import HTTPStatus
 from pathlib import Path
@@ -826,9 +825,12 @@ def test_ctrl_c_is_the_normal_end_of_the_page(monkeypatch, number):
     monkeypatch.setattr(view_verb, "load_driving", loading)
     monkeypatch.setattr(view_verb, "_check_driver", lambda *_: None)
     given = SimpleNamespace(port=0, host="127.0.0.1", lighting=None, task=None, seed=0, quiet=True)
-    with nullcontext() if number == signal.SIGINT else pytest.raises(Stopped):
+    raised = None
+    try:
         view_verb.serve(None, given)
-    assert closed == [True]
+    except Stopped as stop:
+        raised = stop.number
+    assert raised == (None if number == signal.SIGINT else number) and closed == [True]
 
 
 @pytest.mark.skipif(find_chromium() is None, reason="no chromium on this machine")
