@@ -48,6 +48,20 @@ MUTATIONS = (
         ("jackknife",),
     ),
     Mutation(
+        "intervals over places are those of a normal distribution",
+        "benchmarks/place_intervals.py",
+        "np.asarray(len(places) - 1.0)",
+        "np.asarray(1e6)",
+        ("jackknife",),
+    ),
+    Mutation(
+        "intervals of differences are those of a normal distribution",
+        "benchmarks/place_intervals.py",
+        "student.ppf(0.5 + CONFIDENCE / 2, n - 1)",
+        "student.ppf(0.5 + CONFIDENCE / 2, 1e6)",
+        ("jackknife",),
+    ),
+    Mutation(
         "more than the largest number of trials is recommended",
         "twin/evaluation/rate_model.py",
         "return high if high <= MAX_TRIALS else None",
