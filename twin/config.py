@@ -224,6 +224,9 @@ class NerfConfig:
     pixels."""
     stereo: bool = True
     """Supervise depth from stereo between frames in addition to the sparse points."""
+    poles: bool = True
+    """Find lamp posts, signs and other poles in the films (`nerf/poles.py`), and make them visible and solid. Only if
+    the camera's height above the ground is constant."""
     transients: bool = True
     """Do not train on objects that moved during a film, or that are present under some lightings only."""
     bake_steps: Annotated[int, Range(1)] = 600

@@ -31,6 +31,7 @@ from twin.geometry.images import write_image
 from twin.geometry.passes import path_length
 from twin.geometry.route import BRANCH, distance_to_route, every_second, filmed_branches, filmed_route, route_metrics
 from twin.nerf.baked import BakedField
+from twin.nerf.poles import Poles
 from twin.scene import SceneDir
 from twin.types import Array
 
@@ -49,14 +50,21 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
     field = RadianceField.load(scene.stage("field"), device)
     cameras = Cameras.load(scene.stage("metric"))
     points = SparsePoints.load(scene.stage("metric"))
-    metrics = build_assets(field, cameras, points, config, out, scene.build / ".cache" / "convex")
+    poles = Poles.load(scene.stage("field"))
+    metrics = build_assets(field, cameras, points, config, out, scene.build / ".cache" / "convex", poles)
     baked = BakedField.load(scene.stage("field"), field.device)
     write_image(out / "ground.png", ground_picture(baked, cameras, Ground.load(out), baked.lightings[0]))
     return metrics
 
 
 def build_assets(
-    field: ColorField, cameras: Cameras, points: SparsePoints, config: SceneConfig, out: Path, cache: Path
+    field: ColorField,
+    cameras: Cameras,
+    points: SparsePoints,
+    config: SceneConfig,
+    out: Path,
+    cache: Path,
+    poles: Poles | None = None,
 ) -> dict[str, Any]:
     """Writes the files of the stage, except `ground.png`, from any field; returns the metrics."""
     clock = [("start", time.perf_counter())]
@@ -88,16 +96,17 @@ def build_assets(
         others = {f"{BRANCH}{name}": np.column_stack([line, ground.at(line)]) for name, line in branches.items()}
         np.savez(out / "route.npz", xy=route, z=ground.at(route), **others)  # type: ignore[arg-type]
         path = np.concatenate([every_second(line) for line in lines])
+    posts = solids.pole_parts(poles or Poles.none(), corridor, ground)
     fused = _fuse_sections(views, ground, corridor, path, box, settings)
     clock.append(("fuse", time.perf_counter()))
     visual, visual_metrics = _visual_mesh(
-        fused, views, ground, settings.voxel, FREE_SPACE_REACH * far, round(share * _VISUAL_FACES)
+        fused, posts, views, ground, settings.voxel, FREE_SPACE_REACH * far, round(share * _VISUAL_FACES)
     )
     np.savez(out / "visual.npz", **visual)  # type: ignore[arg-type]
     clock.append(("surface", time.perf_counter()))
     pieces, left_out = solids.solid_pieces(fused.solid, box[0], settings.voxel, path, settings)
     clock.append(("solids", time.perf_counter()))
-    part_metrics = _save_parts(pieces, corridor, ground, config, round(share * settings.max_parts), out, cache)
+    part_metrics = _save_parts(pieces, posts, corridor, ground, config, round(share * settings.max_parts), out, cache)
     clock.append(("convex", time.perf_counter()))
     return {
         **part_metrics,
@@ -180,7 +189,13 @@ def _far(settings: MeshConfig) -> float:
 
 
 def _visual_mesh(
-    fused: _Fused, views: Views, ground: Ground, voxel: float, far: float, max_faces: int
+    fused: _Fused,
+    posts: list[convex.ConvexPart],
+    views: Views,
+    ground: Ground,
+    voxel: float,
+    far: float,
+    max_faces: int,
 ) -> tuple[dict[str, NDArray], dict[str, Any]]:
     """Returns about `max_faces` colored triangles, two thirds of them above the ground, and metrics.
 
@@ -196,6 +211,11 @@ def _visual_mesh(
     vertices, faces, floaters = tsdf.remove_specks(vertices, faces, _SPECK_AREA)
     vertices, faces = tsdf.decimate(vertices, faces, max_faces * 2 // 3)
     colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, 2 * band, reach)
+    for post in posts:
+        shade, shown = color_points(post.vertices, _outward(post), views, 2 * band, reach)
+        faces = np.concatenate([faces, post.faces + len(vertices)])
+        vertices = np.concatenate([vertices, post.vertices])
+        colors, seen = np.concatenate([colors, shade]), np.append(seen, shown)
     if seen.any():
         colors[~seen] = colors[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
     ground_vertices, ground_faces = ground.triangles(_VISUAL_GROUND_CELL, max_faces // 3)
@@ -215,8 +235,16 @@ def _visual_mesh(
     }
 
 
+def _outward(part: convex.ConvexPart) -> Array:
+    """Unit vectors from a part's middle axis to its vertices, shape (v, 3)."""
+    away = part.vertices - part.vertices.mean(0)
+    away[:, 2] = 0.0
+    return away / np.linalg.norm(away, axis=1, keepdims=True)
+
+
 def _save_parts(
     pieces: list[convex.SolidPiece],
+    posts: list[convex.ConvexPart],
     corridor: solids.Corridor | None,
     ground: Ground,
     config: SceneConfig,
@@ -224,19 +252,22 @@ def _save_parts(
     out: Path,
     cache: Path,
 ) -> dict[str, Any]:
-    """Decomposes the pieces, clears the corridor, keeps the nearest `max_parts`, and writes `parts.npz`."""
+    """Decomposes the pieces, clears the corridor, keeps poles and the nearest parts, and writes `parts.npz`.
+
+    `posts` are the parts of poles, which count among the `max_parts` parts. They come last.
+    """
     bound = config.mesh.max_protrusion
     decomposition = convex.decompose(pieces, bound, cache, config.seed)
     kept = list(enumerate(decomposition.parts))
     clipped = 0
     if corridor is not None:
         kept, clipped = solids.clear_corridor(decomposition.parts, corridor, ground)
-    dropped = len(kept) - max_parts
+    dropped = len(kept) - max(max_parts - len(posts), 0)
     if dropped > 0:
         # Parts are sorted by distance from the path; the farthest are the least relevant to the robot.
-        kept = kept[:max_parts]
+        kept = kept[: max(max_parts - len(posts), 0)]
         runtime.log_line(f"  left out the {dropped} farthest convex parts, as mesh.max_parts = {config.mesh.max_parts}")
-    parts = [part for _, part in kept]
+    parts = [*(part for _, part in kept), *posts]
     empty = np.zeros((0, 3))
     np.savez(
         out / "parts.npz",
@@ -248,6 +279,7 @@ def _save_parts(
     protrusion = decomposition.protrusion[[i for i, _ in kept]]
     return {
         "parts": len(parts),
+        "poles": len(posts),
         "parts_left_out": max(dropped, 0),
         "pieces": len(pieces),
         "max_protrusion_m": float(protrusion.max(initial=0.0)),

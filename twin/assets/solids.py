@@ -22,6 +22,7 @@ from twin.assets.tsdf import BLOCK, Volume, zero_level
 from twin.config import MeshConfig
 from twin.geometry.passes import SPACING
 from twin.geometry.route import distance_to_route, every_second
+from twin.nerf.poles import Poles
 from twin.types import Array
 
 HEADROOM = 1.5  # [m] height of the corridor above the ground
@@ -36,6 +37,7 @@ _MAX_GAP = 0.45  # [m] narrower gaps in the solid are closed
 _SMOOTHING = 0.7  # [voxels] σ of the low-pass of the distance field
 _EROSION = 0.06  # [m] inward offset of surfaces: blur moves edges outwards, and convex hulls add volume
 _CERTAIN_DEPTH = 0.02  # [m] voxels deeper than this behind a seen surface are never eroded
+_PRISM_SIDES = 8  # of a pole's collision shape
 _CORRIDOR_SLACK = 0.02  # [m] added to the corridor's half width, against rounding in later stages
 
 
@@ -273,6 +275,23 @@ def _block_piece(values: NDArray, corner: Array, voxel: float, start: NDArray) -
         return map_coordinates(padded, ((points - origin) / voxel).T, order=1, mode="nearest") < 0
 
     return SolidPiece.from_mesh(vertices, faces, inside)
+
+
+def pole_parts(poles: Poles, corridor: Corridor | None, ground: Ground) -> list[ConvexPart]:
+    """A prism around each pole, from below the ground to the pole's top; without poles that reach into the corridor."""
+    if corridor is not None:
+        distance = corridor.distance(poles.foot[:, :2], corridor.reach + 1.0)
+        poles = poles.select(np.flatnonzero(distance > corridor.reach + _CORRIDOR_SLACK + poles.radius))
+    out = []
+    angles = 2.0 * np.pi * np.arange(_PRISM_SIDES) / _PRISM_SIDES
+    for foot, radius, height in zip(poles.foot, poles.radius, poles.height, strict=True):
+        ring = foot[:2] + radius * np.column_stack([np.cos(angles), np.sin(angles)])
+        low = float(ground.at(foot[None, :2])[0]) - _EMBEDDING
+        z = np.repeat([low, max(foot[2] + height, low + 2.0 * _EMBEDDING)], _PRISM_SIDES)
+        part = ConvexPart.hull(np.column_stack([np.tile(ring, (2, 1)), z]))
+        assert part is not None
+        out.append(part)
+    return out
 
 
 def clear_corridor(

@@ -137,7 +137,7 @@ class TrainingPixels:
         keep = self.unmasked[self.start[depths.frame] + v * self.width[depths.frame] + u]
         return DepthSupervision(depths.frame[keep], depths.pixel[keep], depths.distance[keep])
 
-    def _depths_in_frame(self, i: int, xyz: NDArray) -> DepthSupervision:
+    def depths_in_frame(self, i: int, xyz: NDArray) -> DepthSupervision:
         """Depth supervision of frame i from points (k, 3) [m]; drops points outside the frame or on masked pixels."""
         pixel, depth = project(xyz, self.cameras.camera_to_world[i], self.intrinsics[i])
         inside = (depth > 0) & (pixel > 0.5).all(1) & (pixel < [self.width[i] - 0.5, self.height[i] - 0.5]).all(1)
@@ -152,7 +152,7 @@ class TrainingPixels:
         found = []
         for i, original in enumerate(chosen):
             seen = points.point[(points.frame == original) & good[points.point]]
-            found.append(self._depths_in_frame(i, points.xyz[seen]))
+            found.append(self.depths_in_frame(i, points.xyz[seen]))
         return join_depths(found)
 
     def _depths_of_path(self, camera_height: float) -> DepthSupervision:
@@ -175,7 +175,7 @@ class TrainingPixels:
                 side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
                 ground = ahead - [0.0, 0.0, camera_height]
                 shifts = np.array(_PATH_OFFSETS) * camera_height
-                found.append(self._depths_in_frame(int(i), (ground + shifts[:, None, None] * side).reshape(-1, 3)))
+                found.append(self.depths_in_frame(int(i), (ground + shifts[:, None, None] * side).reshape(-1, 3)))
         return join_depths(found)
 
     def batch(self, rng: np.random.Generator, shards: int, triples: int, singles: int, supervised: int) -> RayBatch:

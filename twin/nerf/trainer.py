@@ -34,11 +34,12 @@ from twin.nerf.buffers import (
     single_threaded_torch,
     warp_view,
 )
-from twin.nerf.dataset import TrainingPixels, constant_height, free_segments, random_free_points
+from twin.nerf.dataset import TrainingPixels, constant_height, free_segments, join_depths, random_free_points
 from twin.nerf.detail import fit_detail
 from twin.nerf.evaluate import cross_lighting, evaluate
 from twin.nerf.field import FieldSection, RadianceField, untrained_field
 from twin.nerf.kernels import hashgrid, volume
+from twin.nerf.poles import Poles, find_poles, pole_depths
 from twin.nerf.pose_refinement import PoseRefinement
 from twin.nerf.road import divide_road
 from twin.nerf.stereo import stereo_depths
@@ -120,6 +121,7 @@ class Trainer:
         """Summary of the stereo depths; None without `nerf.stereo`."""
         if config.stereo:
             self.pixels.stereo, self.stereo = stereo_depths(self.pixels, seed, device)
+        self.poles = find_poles(self.pixels, camera_height) if config.poles and camera_height > 0.0 else Poles.none()
         self.excluded: list[NDArray[np.bool_]] = []
         """One mask per training frame, true on transients; an empty list before the first call of `_exclude`."""
         self.moving = 0.0
@@ -135,6 +137,7 @@ class Trainer:
             section_layout(cameras.camera_to_world[frames], config, known, focal)
             for frames in self.road.frames(cameras.positions)
         ]
+        self.pixels.points = join_depths([self.pixels.points, pole_depths(self.pixels, self.poles)])
         self.parts = [self.pixels.of_frames(frames) for frames in self.frames]
         """Pixels of each section."""
         appearance = initial_appearance(lightings, train.names, frame_lighting, config.appearance_dim, seed)
@@ -284,6 +287,7 @@ class Trainer:
     def _exclude(self, masks: list[NDArray[np.bool_]]) -> None:
         """Excludes marked pixels from training, in addition to earlier ones."""
         self.pixels.exclude(masks)
+        self.pixels.points = join_depths([self.pixels.points, pole_depths(self.pixels, self.poles)])
         self.parts = [self.pixels.of_frames(frames) for frames in self.frames]
         before = self.excluded or [np.zeros_like(mask) for mask in masks]
         self.excluded = [one | other for one, other in zip(before, masks, strict=True)]
@@ -389,8 +393,8 @@ def train_field(
     seed: int = 0,
     camera_height: float = 0.0,
     device: str | None = None,
-) -> tuple[RadianceField, dict[str, Any], Cameras, list[NDArray[np.bool_]]]:
-    """Trains a field; returns it, training metrics, cameras (refined if configured), and `Trainer.excluded`.
+) -> tuple[RadianceField, dict[str, Any], Cameras, list[NDArray[np.bool_]], Poles]:
+    """Trains a field; returns it, training metrics, cameras (refined if configured), `Trainer.excluded`, and poles.
 
     `camera_height` [m] is the constant height of the camera above the ground, 0 if it is not constant; for `device` see
     `buffers.resolve_device`. Raises InputError if training diverges.
@@ -434,6 +438,7 @@ def train_field(
             "sightings_points": len(trainer.pixels.points.frame),
             "sightings_path": len(trainer.pixels.path.frame),
             "stereo": trainer.stereo,
+            "poles": len(trainer.poles),
             "cameras_moved": moved,
             "transients": {"moving_share": round(trainer.moving, 4), "objects": [one.to_json() for one in trainer.left]}
             if config.transients
@@ -442,6 +447,7 @@ def train_field(
         },
         cameras,
         trainer.excluded,
+        trainer.poles,
     )
 
 
@@ -462,7 +468,7 @@ def without_timings(metrics: dict[str, Any]) -> dict[str, Any]:
 def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = None) -> dict[str, Any]:
     """Runs stage `field`: trains and bakes a field, adds detail, evaluates it on held-out frames, and saves it.
 
-    Saves both the trained and the baked field, and a picture of excluded pixels; returns the metrics. Raises
+    Saves both the trained and the baked field, the poles, and a picture of excluded pixels; returns the metrics. Raises
     InputError without a training frame, on an unreadable frame, on an unavailable device, or if training diverges.
     """
     cameras = Cameras.load(scene.stage("metric"))
@@ -470,7 +476,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
     height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
     # A capture around an object has no road to divide.
     nerf = config.nerf if config.mjcf.route else replace(config.nerf, section_length=0.0)
-    field, metrics, cameras, excluded = train_field(cameras, points, nerf, config.seed, height, device)
+    field, metrics, cameras, excluded, poles = train_field(cameras, points, nerf, config.seed, height, device)
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
     if any(mask.any() for mask in excluded):
         pixels.exclude(excluded)
@@ -488,6 +494,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
         "metrics": without_timings(metrics),
     }
     field.save(out)
+    poles.save(out)
     baked.about = field.about
     baked.save(out)
     return metrics

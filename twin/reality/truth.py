@@ -355,14 +355,14 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
     kinds = {
         kind: [t.part for t in truth.place.objects if t.kind == kind] for kind in ("ground", "obstacle", "foliage")
     }
-    solid = _surface([(p.vertices, p.faces) for p in kinds["obstacle"]])
-    leafy = _surface([(p.vertices, p.faces) for p in kinds["obstacle"] + kinds["foliage"]])
-    whole = _surface([(p.vertices, p.faces) for kind in kinds.values() for p in kind])
+    solid = surface_of([(p.vertices, p.faces) for p in kinds["obstacle"]])
+    leafy = surface_of([(p.vertices, p.faces) for p in kinds["obstacle"] + kinds["foliage"]])
+    whole = surface_of([(p.vertices, p.faces) for kind in kinds.values() for p in kind])
     visible = visible_points(whole, viewpoints, truth)
     seen_points = _obstacle_points(visible, truth)
     seen_points = seen_points[solid.distance(seen_points) < 1e-3]  # without leaves and ground
     if parts and len(seen_points):
-        twin = _surface(parts)
+        twin = surface_of(parts)
         standing = _obstacle_points(visible_points(twin, viewpoints, truth), truth)
         if len(standing):
             accuracy, completeness = np.median(leafy.distance(standing)), np.median(twin.distance(seen_points))
@@ -370,7 +370,7 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
             out["obstacle_median_m"] = float(max(accuracy, completeness))
     if (mesh / "visual.npz").exists():
         with np.load(mesh / "visual.npz", allow_pickle=False) as data:
-            visual = _surface([(to_truth.points(data["vertices"].astype(np.float64)), data["faces"])])
+            visual = surface_of([(to_truth.points(data["vertices"].astype(np.float64)), data["faces"])])
         near, seen_points = _near_route(visible_points(visual, viewpoints, truth), truth), _near_route(visible, truth)
         if len(near) and len(seen_points):
             to_mesh = visual.distance(seen_points)
@@ -378,7 +378,7 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
             for kind, objects in kinds.items():
                 if not objects:  # such as the foliage of place 17
                     continue
-                mine = _surface([(p.vertices, p.faces) for p in objects]).distance(seen_points) < 1e-3
+                mine = surface_of([(p.vertices, p.faces) for p in objects]).distance(seen_points) < 1e-3
                 if mine.any():
                     out[f"mesh_completeness_10cm_{kind}"] = float((to_mesh[mine] <= 0.1).mean())
     return out
@@ -437,7 +437,8 @@ def _near_route(points: Array, truth: Truth) -> Array:
     return points[near]
 
 
-def _surface(meshes: list[tuple[Array, NDArray]]) -> Surface:
+def surface_of(meshes: list[tuple[Array, NDArray]]) -> Surface:
+    """One surface of several meshes, each given by vertices (v, 3) [m] and faces (f, 3)."""
     starts = np.cumsum([0] + [len(v) for v, _ in meshes])
     faces = [f + start for (_, f), start in zip(meshes, starts, strict=False)]
     return Surface(np.concatenate([v for v, _ in meshes]), np.concatenate(faces))

@@ -338,6 +338,12 @@ def mesh_section(report: dict[str, Any]) -> Section:
     facts = facts_of(
         report,
         ("mesh.parts", "convex parts", "{}", "convex collision geometry"),
+        (
+            "mesh.poles",
+            "poles",
+            "{}",
+            "of them: lamp posts, signs, trunks and other thin upright things found in the films",
+        ),
         ("mesh.faces", "surface", "{:,} triangles", "visual mesh, without collisions"),
         ("mesh.ground.coverage", "ground measured", "{:.0%}", "the rest of its area was interpolated"),
         ("mesh.ground.corridor_coverage", "along the route", "{:.0%}", "of the ground was measured"),

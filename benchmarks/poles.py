@@ -1,0 +1,143 @@
+"""Counts the poles of a generated place that its twin shows and that are solid in it.
+
+    python benchmarks/poles.py SCENE ... [--json FILE]
+
+A scene is one of `twin reality film`, built up to stage `mesh`. Poles are the upright cylinders of the truth that are
+at least 0.7 m high, at most 16 cm in radius and up to 10 m beside the filmed road.
+
+- *seen*: the field's depth is within 10 cm of the pole's front in at least half of the samples. A sample is a height in
+  a filmed frame up to 10 m away in which nothing hides the pole there; there are up to two frames per film.
+- *solid*: at least half of 24 level rays toward the axis, from eight sides at three heights, end within 10 cm of the
+  pole's side on a convex part.
+- *false*: poles that the build found, and that are more than 15 cm from everything that stands in the truth.
+"""
+
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from record import record_parser
+from sections import run_sections, versions
+
+from twin.geometry.cameras import Cameras, Viewpoints, project
+from twin.geometry.mesh_rays import Surface
+from twin.geometry.poses import Similarity
+from twin.loading import load_scene
+from twin.nerf.baked import BakedField
+from twin.nerf.poles import Poles
+from twin.reality.place_objects import Solid
+from twin.reality.truth import Truth, align_rigid, load_parts, matched_poses, surface_of
+
+_LEAST_HEIGHT, _MAX_RADIUS = 0.7, 0.16  # [m]
+_BESIDE = 10.0  # [m]
+_HEIGHTS = (0.3, 0.7, 1.1, 1.5, 1.9, 2.3)  # [m] of samples
+_RAY_HEIGHTS, _SIDES, _START = (0.2, 0.4, 0.6), 8, 0.6  # [m], number, [m] from the axis
+_TOLERANCE = 0.10  # [m]
+_FALSE = 0.15  # [m]
+_BEST_DISTANCE, _FAR = 5.0, 10.0  # [m] from the camera
+TARGETS: dict[str, tuple[str, float]] = {"seen": ("≥", 0.95), "solid": ("≥", 0.95), "false": ("≤", 0.0)}
+
+
+def true_poles(truth: Truth) -> list[tuple[str, Solid]]:
+    """Names and shapes of the poles beside the filmed road."""
+    out = []
+    for thing in truth.place.objects:
+        for one in thing.solids:
+            thin = one.kind == "cylinder" and one.half[0] <= _MAX_RADIUS and 2.0 * one.half[1] >= _LEAST_HEIGHT
+            if thin and any(_is_beside(one.center, *line) for line in truth.lines.values()):
+                out.append((thing.name, one))
+    return out
+
+
+def _is_beside(point: NDArray, line: Any, start: float, length: float) -> bool:
+    station, lateral = line.project(point[None, :2])
+    return bool(start + 2.0 < station[0] < start + length + 2.0 and abs(lateral[0]) < _BESIDE)
+
+
+def depth_errors(pole: Solid, truth: Truth, to_truth: Similarity, field: BakedField, whole: Surface) -> NDArray:
+    """Depth of the field minus that of the pole's front in all samples [m]."""
+    ground = float(truth.ground_height(pole.center[None, :2])[0])
+    heights = [h for h in _HEIGHTS if ground + h < pole.center[2] + pole.half[1]]
+    points = np.array([[*pole.center[:2], ground + h] for h in heights])
+    errors = [np.zeros(0)]
+    for name, film in truth.films.items():
+        away = np.linalg.norm(film.camera_to_world[:, :2, 3] - pole.center[:2], axis=1)
+        used = 0
+        for i in np.argsort(np.abs(away - _BEST_DISTANCE)):
+            pixel, depth = project(points, film.camera_to_world[i], truth.intrinsics)
+            shown = (depth > 1.0) & (pixel > 4).all(1) & (pixel < np.array(truth.size) - 4).all(1)
+            if used == 2 or away[i] > _FAR or not shown.any():
+                continue
+            eye = film.camera_to_world[i, :3, 3]
+            true = whole.cast(np.tile(eye, (len(points), 1)), points - eye) * depth
+            shown &= np.abs(true - depth) < 0.25  # else something hides the pole
+            if shown.any():
+                used += 1
+                pose = to_truth.inverse().poses(film.camera_to_world[i][None])
+                view = Viewpoints.of(pose, truth.intrinsics, truth.size)
+                column, row = pixel[shown].astype(int).T
+                errors.append(field.render(view, truth.lighting(name), truth.size).depth[0, row, column] - true[shown])
+    return np.concatenate(errors)
+
+
+def solid_share(pole: Solid, truth: Truth, parts: Surface) -> float:
+    """Fraction of the rays toward the axis that end on a convex part at the pole's side."""
+    ground = float(truth.ground_height(pole.center[None, :2])[0])
+    angles = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
+    out = _START * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_SIDES)])
+    middles = np.array([[*pole.center[:2], ground + h] for h in _RAY_HEIGHTS])
+    origins = (middles[:, None] + out).reshape(-1, 3)
+    reach = parts.cast(origins, -np.tile(out, (len(middles), 1)) / _START)
+    return float(((reach > 0.0) & (np.abs(_START - reach - pole.half[0]) < _TOLERANCE)).mean())
+
+
+def measure(root: Path) -> dict[str, float]:
+    scene = load_scene(root).scene
+    truth, cameras = Truth.load(scene.truth), Cameras.load(scene.stage("metric"))
+    to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
+    field, found = BakedField.load(scene.stage("field")), Poles.load(scene.stage("field"))
+    whole, standing = (
+        surface_of([(one.part.vertices, one.part.faces) for one in truth.place.objects if one.kind not in without])
+        for without in ((), ("ground",))
+    )
+    parts = surface_of([(to_truth.points(v), f) for v, f in load_parts(scene.stage("mesh"))])
+    seen, solid, samples = [], [], []
+    for name, pole in true_poles(truth):
+        errors, share = depth_errors(pole, truth, to_truth, field, whole), solid_share(pole, truth, parts)
+        within = np.abs(errors) < _TOLERANCE
+        if len(errors):  # else it is hidden in all frames
+            seen.append(within.mean() >= 0.5)
+            solid.append(share >= 0.5)
+            samples.append(within)
+            shown = f"{within.mean():.0%} of {len(within)} samples"
+            print(
+                f"  {name}: radius {pole.half[0]:.3f} m, seen in {shown}, solid on {share:.0%} of the rays", flush=True
+            )
+    points = np.concatenate([to_truth.points(found.foot + np.array([0.0, 0.0, h])) for h in (0.3, 0.6)])
+    away = standing.distance(points).reshape(2, -1).max(0) if len(found) else np.zeros(0)
+    figures = {
+        "poles": len(seen),
+        "seen": float(np.mean(seen)),
+        "solid": float(np.mean(solid)),
+        "samples_within_10cm": float(np.concatenate(samples).mean()),
+        "found": len(found),
+        "false": int((away > _FALSE).sum()),
+    }
+    return {f"{root.name}.{name}": value for name, value in figures.items()}
+
+
+def main() -> int:
+    parser = record_parser(__doc__)
+    parser.add_argument("scenes", type=Path, nargs="+")
+    options = parser.parse_args()
+    about = {"scenes": [str(one) for one in options.scenes], "versions": versions("twin", "numpy")}
+    targets = {f"{root.name}.{name}": wanted for root in options.scenes for name, wanted in TARGETS.items()}
+    measures = [partial(measure, root) for root in options.scenes]
+    return run_sections(measures, targets, about, options.json, options.replace_record)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

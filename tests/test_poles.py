@@ -1,0 +1,117 @@
+"""Poles: thin upright things are found in the films, supervise the field, and become solid."""
+
+import numpy as np
+import pytest
+from analytic import AnalyticField, Box, Post
+
+from twin import runtime
+from twin.assets.solids import Corridor, pole_parts
+from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, unproject
+from twin.geometry.images import write_image
+from twin.geometry.poses import look_at
+from twin.nerf.dataset import TrainingPixels
+from twin.nerf.poles import Poles, find_poles, pole_depths
+
+WIDTH, HEIGHT = 320, 180
+K = np.array([220.0, 220.0, 160.0, 90.0])
+LENS = 1.2  # [m] above the ground
+WALLS = (Box(22.0, 0.0, 1.0, 30.0, 6.0), Box(10.0, 9.0, 30.0, 0.5, 5.0))
+POST, BOLLARD, COLUMN = (8.0, 2.6, 0.05, 2.2), (6.0, -2.2, 0.07, 0.9), (9.0, -3.5, 0.4, 2.5)
+"""x, y, radius and height [m]."""
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    runtime.set_quiet(True)
+
+
+def pattern(points: np.ndarray) -> np.ndarray:
+    """Gray in [0, 1] of places (..., 3): waves of 0.3 to 3 m in 16 directions."""
+    rng = np.random.default_rng(3)
+    direction = rng.normal(size=(16, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    waves = direction * (2 * np.pi / np.geomspace(0.3, 3.0, 16))[:, None]
+    return 0.55 + 0.09 * np.sin(points @ waves.T + rng.uniform(0, 2 * np.pi, 16)).sum(-1)
+
+
+def film(folder, things=(), n=12) -> TrainingPixels:
+    """A drive along x toward a wall, past dark posts."""
+    field = AnalyticField(WALLS, tuple(Post(*one) for one in things), amplitude=0.0)
+    eyes = np.stack([np.linspace(0.0, 5.5, n), np.zeros(n), np.full(n, LENS)], 1)
+    pose = np.stack([look_at(eye, eye + np.array([5.0, 0.0, -0.5])) for eye in eyes])
+    depth = field.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), "day").depth
+    names = tuple(f"day/{i:06d}" for i in range(n))
+    (folder / "day").mkdir(parents=True, exist_ok=True)
+    for i, name in enumerate(names):
+        rays = unproject(pixel_grid(WIDTH, HEIGHT), K)
+        places = (rays * depth[i][..., None]) @ pose[i, :3, :3].T + pose[i, :3, 3]
+        gray = pattern(places)
+        for x, y, radius, height in things:
+            away = np.linalg.norm(places[..., :2] - (x, y), axis=-1)
+            gray[(away < radius + 0.01) & (places[..., 2] > 0.02) & (places[..., 2] < height + 0.01)] = 0.1
+        write_image(folder / f"{name}.png", np.repeat((np.clip(gray, 0, 1) * 255).astype(np.uint8)[..., None], 3, -1))
+    cameras = Cameras(
+        *(names, pose, np.tile(K, (n, 1)), np.tile([WIDTH, HEIGHT], (n, 1)), ("day",) * n, ("day",) * n),
+        *(np.arange(n) / 2.0, np.zeros(n, bool), folder),
+    )
+    return TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
+
+
+def test_a_post_and_a_bollard_are_found_where_they_stand(tmp_path):
+    found = find_poles(film(tmp_path, (POST, BOLLARD)), LENS)
+    assert len(found) == 2
+    for x, y, radius, height in (POST, BOLLARD):
+        off = np.linalg.norm(found.foot[:, :2] - (x, y), axis=1)
+        k = off.argmin()
+        assert off[k] < 0.05
+        assert 0.7 * radius < found.radius[k] < 1.5 * radius
+        assert abs(found.height[k] - height) < 0.35 and abs(found.foot[k, 2]) < 1e-6
+
+
+def test_walls_a_thick_column_and_the_ground_are_no_poles(tmp_path):
+    assert len(find_poles(film(tmp_path, (COLUMN,)), LENS)) == 0
+
+
+def test_a_pole_beyond_the_last_frame_on_the_road_is_not_judged(tmp_path):
+    """All frames see it from the same bearing, so its distance is unknown."""
+    assert len(find_poles(film(tmp_path, ((8.5, 0.05, 0.05, 2.0),)), LENS)) == 0
+
+
+def test_supervised_depths_are_those_of_the_front(tmp_path):
+    pixels = film(tmp_path, (POST,))
+    x, y, radius, height = POST
+    poles = Poles(np.array([[x, y, 0.0]]), np.array([radius]), np.array([height]))
+    depths = pole_depths(pixels, poles)
+    assert len(depths.frame) > 200
+    eye = pixels.cameras.positions[depths.frame]
+    pose = pixels.cameras.camera_to_world[depths.frame]
+    rays = np.einsum("nij,nj->ni", pose[:, :3, :3], unproject(depths.pixel, K))
+    points = eye + rays / np.linalg.norm(rays, axis=1, keepdims=True) * depths.distance[:, None]
+    away = np.linalg.norm(points[:, :2] - (x, y), axis=1)
+    assert np.allclose(away, radius, atol=1e-3) and points[:, 2].max() < height and points[:, 2].min() > 0.05
+    gray = pixels.colors[pixels.start[depths.frame] + depths.pixel.astype(int) @ (1, WIDTH)][:, 0]
+    assert (gray < 80).mean() > 0.95  # they lie on the pole in the pictures
+
+
+class FlatGround:
+    def at(self, xy):
+        return np.full(len(xy), 0.25)
+
+
+def test_parts_stand_in_the_ground_and_leave_the_corridor_free():
+    poles = Poles(
+        np.array([[5.0, 2.0, 0.2], [5.0, 0.8, 0.2], [5.0, 1.04, 0.2]]), np.array([0.05, 0.05, 0.05]), np.full(3, 2.0)
+    )
+    corridor = Corridor((np.column_stack([np.arange(0.0, 10.0, 0.1), np.zeros(100)]),), 1.0)
+    (part,) = pole_parts(poles, corridor, FlatGround())
+    assert np.isclose(part.vertices[:, 2].min(), 0.1) and np.isclose(part.vertices[:, 2].max(), 2.2)
+    assert np.allclose(np.linalg.norm(part.vertices[:, :2] - (5.0, 2.0), axis=1), 0.05)
+    assert len(pole_parts(poles, None, FlatGround())) == 3
+
+
+def test_poles_survive_the_disk_and_older_fields_have_none(tmp_path):
+    assert len(Poles.load(tmp_path)) == 0
+    poles = Poles(np.array([[5.0, 2.0, 0.2]]), np.array([0.05]), np.array([2.0]))
+    poles.save(tmp_path)
+    again = Poles.load(tmp_path)
+    assert all(np.array_equal(getattr(again, name), value) for name, value in vars(poles).items())

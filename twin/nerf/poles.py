@@ -1,0 +1,346 @@
+"""Poles: thin upright bars, such as lamp posts, signs and bollards, found in the films.
+
+Stereo and the density grid are too coarse for a pole of 6 cm, so a field loses it, or shows it at the depth of what is
+behind it. But its shape is known: a *spot* on the ground, a radius and a height. A spot, a radius and a *band* of
+heights project to an upright bar in every picture of a level camera. The films show a pole there if the bar differs
+from what is left and right of it in each picture, and has the same color in all pictures of one lighting; where nothing
+stands, the bar shows the changing background.
+
+The *quality* of a bar is contrast / (contrast + deviation + noise), with means over pictures. The *evidence* for a pole
+is the sum over its bands, from the ground up, of quality − `_CHANCE`; the pole ends where the sum is largest. The spots
+with the most evidence come first. A spot is then judged without the pictures in which a pole that was already found
+covers it: beside a pole, bars show this pole, from a part of the cameras.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from twin.files import load_arrays, save_arrays
+from twin.nerf.buffers import parallel
+from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths
+from twin.nerf.kernels import upright as kernels
+from twin.runtime import track
+from twin.types import Array
+from twin.warp_runtime import wp
+
+POLES_FILE = "poles.npz"
+
+_BESIDE = 1.2, 10.0  # [m] least and greatest distance of a spot from the path of the cameras
+_DEPTHS = 1.2, 13.0  # [m] depths at which pictures are used
+_FRAME_SPACING = 0.4  # [m] pictures of a film that are closer to each other add nothing
+_TILE = 20.0  # [m] side of the squares that are searched one after the other, which bounds memory
+
+_RADII = (0.02, 0.028, 0.037, 0.048, 0.062, 0.08, 0.1, 0.125, 0.16, 0.2, 0.25)  # [m]
+_THIN = 8  # number of radii, the first ones, that a pole may have; the others compete with them
+_TWICE = 3  # this many radii further, the radius is twice as large
+_BAND = 0.2  # [m] height of a band
+_BANDS = tuple((0.1 + _BAND * k, 0.1 + _BAND * (k + 1)) for k in range(15))  # [m] above the ground
+
+_COARSE_CELL = 0.05  # [m] spacing of the first search
+_COARSE_RADII, _COARSE_BANDS = (0.03, 0.055, 0.1), ((0.1, 0.4), (0.4, 0.7))
+_COARSE_QUALITY = 0.4
+_FINE_SPANS = (0.04, 0.02)  # [m] half widths of the grids of 5 × 5 spots around a spot that refine it
+_FINE_BANDS = ((0.1, 0.3), (0.3, 0.5), (0.5, 0.7))
+_FINE_QUALITY = 0.42
+_LAST_STEPS = tuple(0.015 * k for k in range(-4, 5))  # [m] steps in x and y to the most evident spot
+
+_NOISE = 3.0  # [gray levels]
+_SPREAD = 1.5  # weight of the color's standard deviation over pictures
+_MIN_PICTURES = 4  # of a lighting; and `_MIN_ALL` together
+_MIN_ALL = 5
+_CHANCE = 0.42  # quality that bars reach where nothing stands
+_MIN_EVIDENCE = 0.7
+_MIN_SPREAD = 6.0  # [°] between the bearings from which pictures show a pole
+_MAX_RATIO = 0.9  # evidence for twice the radius / evidence for the radius: a thicker thing has a larger one
+_APART = 0.5  # [m] between two poles
+
+_POINT_SPACING = 0.04  # [m] between the points of a pole that get depth supervision
+_MIN_CONTRAST = 6.0  # [gray levels] in the picture
+
+
+@dataclass(frozen=True)
+class Poles:
+    """n upright cylinders."""
+
+    foot: Array
+    """Point of the axis on the ground, as high as the ground under the camera's path beside it [m], shape (n, 3)."""
+    radius: Array
+    """Shape (n,) [m]."""
+    height: Array
+    """Height above the foot, at most 3.1 m; a taller pole ends there. Shape (n,) [m]."""
+
+    def __len__(self) -> int:
+        return len(self.radius)
+
+    def save(self, folder: Path) -> None:
+        save_arrays(folder / POLES_FILE, dict(vars(self)))
+
+    @staticmethod
+    def load(folder: Path) -> "Poles":
+        """The saved poles of a field's folder; none if it has no such file."""
+        if not (folder / POLES_FILE).exists():
+            return Poles.none()
+        return Poles(**load_arrays(folder / POLES_FILE))
+
+    @staticmethod
+    def none() -> "Poles":
+        return Poles(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+
+    @staticmethod
+    def join(parts: "list[Poles]") -> "Poles":
+        return Poles(*(np.concatenate([getattr(one, name) for one in parts]) for name in vars(parts[0])))
+
+    def select(self, index: NDArray[np.int64]) -> "Poles":
+        return Poles(*(values[index] for values in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class _Bars:
+    """Sums over the pictures of one lighting, see `kernels.add_bars`, each of shape (spots, radii, bands)."""
+
+    count: Array
+    contrast: Array
+    color: Array
+    square: Array
+
+
+class _LevelPictures:
+    """Pictures of some frames as level cameras would have taken them, as summed-area tables."""
+
+    def __init__(self, pixels: TrainingPixels, frames: NDArray[np.int64]) -> None:
+        self.frames, self._intrinsics = frames, pixels.intrinsics
+        self.lightings = np.array(pixels.cameras.lightings)[frames]
+        self.positions = pixels.cameras.positions[frames]
+        self._turns = [_level(pixels.cameras.camera_to_world[i]) for i in frames]
+        self._sums = [self._table(pixels, i, turn) for i, turn in zip(frames, self._turns, strict=True)]
+
+    @staticmethod
+    def _table(pixels: TrainingPixels, i: int, turn: Array) -> wp.array:
+        width, height = int(pixels.width[i]), int(pixels.height[i])
+        fx, fy, cx, cy = pixels.intrinsics[i]
+        matrix = np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
+        rotation = turn.T @ pixels.cameras.camera_to_world[i, :3, :3]
+        picture = pixels.colors[pixels.start[i] : pixels.start[i + 1]].reshape(height, width, 3)
+        levelled = cv2.warpPerspective(
+            picture, matrix @ rotation @ np.linalg.inv(matrix), (width, height), borderMode=cv2.BORDER_REPLICATE
+        )
+        return wp.array(cv2.integral(levelled), dtype=wp.int32, device="cpu")
+
+    def seen(self, k: int, feet: Array) -> tuple[NDArray[np.int64], Array]:
+        """Indices of the spots (n, 3) before picture k, and their positions in its camera: right, up and ahead [m]."""
+        local = (feet - self.positions[k]) @ self._turns[k] * (1.0, -1.0, 1.0)
+        low, high = _DEPTHS
+        fx, _, cx, _ = self._intrinsics[self.frames[k]]
+        ahead = (local[:, 2] > low) & (local[:, 2] < high) & (np.abs(local[:, 0]) * fx < local[:, 2] * cx)
+        index = np.flatnonzero(ahead)
+        return index, local[index]
+
+    def spread(self, feet: Array) -> Array:
+        """Largest difference between the bearings from which pictures show spots (n, 3) [rad]; shape (n,)."""
+        low, high, first = np.zeros(len(feet)), np.zeros(len(feet)), np.full(len(feet), np.nan)
+        for k in range(len(self.frames)):
+            index, _ = self.seen(k, feet)
+            way = feet[index, :2] - self.positions[k, :2]
+            bearing = np.arctan2(way[:, 1], way[:, 0])
+            first[index] = np.where(np.isnan(first[index]), bearing, first[index])
+            turned = (bearing - first[index] + np.pi) % (2.0 * np.pi) - np.pi
+            low[index], high[index] = np.minimum(low[index], turned), np.maximum(high[index], turned)
+        return high - low
+
+    def bars(
+        self,
+        feet: Array,
+        radii: tuple[float, ...],
+        bands: tuple[tuple[float, float], ...],
+        found: "Poles | None" = None,
+        only: int | None = None,
+    ) -> list[_Bars]:
+        """Sums per lighting over all pictures, or of picture `only`, in which no pole `found` covers the spot."""
+        shape = len(feet), len(radii), len(bands)
+        halves = np.array_split(np.arange(len(feet)), 2)
+        out = []
+        for lighting in dict.fromkeys(self.lightings if only is None else self.lightings[[only]]):
+            chosen = np.flatnonzero(self.lightings == lighting) if only is None else np.array([only])
+            sums = [wp.zeros(shape, dtype=kind, device="cpu") for kind in (wp.float32, wp.float32, wp.vec3, wp.vec3)]
+            given: list[wp.array] = [
+                wp.array(np.array(radii, np.float32), dtype=wp.float32, device="cpu"),
+                wp.array(np.array(bands, np.float32), dtype=wp.vec2, device="cpu"),
+            ]
+
+            def add(half: int, chosen: NDArray = chosen, sums: list = sums, given: list = given) -> None:
+                for k in chosen:
+                    index, local = self.seen(k, feet[halves[half]])
+                    if found is not None and len(found) and len(index):
+                        free = ~self._covered(k, local, max(radii[:_THIN]), found)
+                        index, local = index[free], local[free]
+                    if not len(index):
+                        continue
+                    spots: wp.array = wp.array(local.astype(np.float32), dtype=wp.vec3, device="cpu")
+                    rows: wp.array = wp.array(halves[half][index].astype(np.int32), dtype=wp.int32, device="cpu")
+                    lens = wp.vec4(*map(float, self._intrinsics[self.frames[k]]))
+                    inputs = [self._sums[k], lens, spots, rows, *given]
+                    wp.launch(kernels.add_bars, len(index), inputs, sums, device="cpu")
+
+            parallel(add, range(2), "cpu")
+            out.append(_Bars(*(values.numpy() for values in sums)))
+        return out
+
+    def _covered(self, k: int, local: Array, radius: float, found: "Poles") -> NDArray[np.bool_]:
+        """True for the spots whose bars touch a found pole in picture k."""
+        index, pole = self.seen(k, found.foot)
+        if not len(index):
+            return np.zeros(len(local), bool)
+        apart = np.abs(local[:, :1] / local[:, 2:] - pole[:, 0] / pole[:, 2])
+        touching = apart < (radius + found.radius[index]) / np.minimum(local[:, 2:], pole[:, 2])
+        return np.asarray(touching.any(1))
+
+
+def find_poles(pixels: TrainingPixels, camera_height: float) -> Poles:
+    """Finds the poles up to 10 m beside the path of the cameras; `camera_height` [m] is that of the lens."""
+    positions = pixels.cameras.positions
+    spots = _grid(positions, camera_height)
+    tile = np.floor((spots[:, :2] - spots[:, :2].min(0, initial=np.inf)) / _TILE).astype(int)
+    kept = _spaced_frames(pixels)
+    parts: list[tuple[Poles, Array]] = []
+    for corner in track(np.unique(tile, axis=0), "poles", unit="square"):
+        mine = spots[(tile == corner).all(1)]
+        middle, half = (mine[:, :2].min(0) + mine[:, :2].max(0)) / 2, (mine[:, :2].max(0) - mine[:, :2].min(0)) / 2
+        beyond = np.linalg.norm(np.maximum(np.abs(positions[kept, :2] - middle) - half, 0.0), axis=1)
+        frames = kept[beyond < _DEPTHS[1]]
+        if len(frames) >= _MIN_ALL:
+            parts.append(_search(_LevelPictures(pixels, frames), mine))
+    if not parts:
+        return Poles.none()
+    poles, evidence = Poles.join([one for one, _ in parts]), np.concatenate([one for _, one in parts])
+    return poles.select(_peaks(poles.foot[:, :2], evidence, 0.0, _APART))
+
+
+def pole_depths(pixels: TrainingPixels, poles: Poles) -> DepthSupervision:
+    """Depth supervision on the fronts of poles, where a picture shows their bars."""
+    parts = []
+    near = cKDTree(poles.foot[:, :2]) if len(poles) else None
+    for i in range(len(pixels.cameras) if near else 0):
+        assert near is not None
+        index = np.array(near.query_ball_point(pixels.cameras.positions[i, :2], _DEPTHS[1]), int)
+        if not len(index):
+            continue
+        picture = _LevelPictures(pixels, np.array([i]))
+        for j in index:
+            bands = _BANDS[: round((poles.height[j] - _BANDS[0][0]) / _BAND)]
+            (bars,) = picture.bars(poles.foot[j : j + 1], (float(poles.radius[j]),), bands)
+            shown = (bars.count > 0) & (bars.contrast > _MIN_CONTRAST)
+            toward = pixels.cameras.positions[i, :2] - poles.foot[j, :2]
+            front = poles.foot[j, :2] + toward / np.linalg.norm(toward) * poles.radius[j]
+            for low, high in np.array(bands)[shown[0, 0]]:
+                z = poles.foot[j, 2] + np.arange(low, high, _POINT_SPACING)
+                parts.append(pixels.depths_in_frame(i, np.column_stack([np.tile(front, (len(z), 1)), z])))
+    return join_depths(parts)
+
+
+def _level(pose: Array) -> Array:
+    """Axes (right, down, ahead) of the level camera that looks where a camera looks, as columns, shape (3, 3)."""
+    ahead = np.array([pose[0, 2], pose[1, 2], 0.0])
+    ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
+    down = np.array([0.0, 0.0, -1.0])
+    return np.stack([np.cross(down, ahead), down, ahead], 1)
+
+
+def _spaced_frames(pixels: TrainingPixels) -> NDArray[np.int64]:
+    """Frames that are at least `_FRAME_SPACING` from the previous one of their film."""
+    last: dict[str, Array] = {}
+    kept = []
+    for i, source in enumerate(pixels.cameras.sources):
+        position = pixels.cameras.positions[i]
+        if source not in last or np.linalg.norm(position - last[source]) >= _FRAME_SPACING:
+            last[source] = position
+            kept.append(i)
+    return np.array(kept, np.int64)
+
+
+def _grid(positions: Array, camera_height: float) -> Array:
+    """Spots of the first search [m], shape (n, 3)."""
+    low, high = positions[:, :2].min(0) - _BESIDE[1], positions[:, :2].max(0) + _BESIDE[1]
+    path = cKDTree(positions[:, :2])
+    rows = []
+    for x in np.arange(low[0], high[0], _COARSE_CELL):
+        y = np.arange(low[1], high[1], _COARSE_CELL)
+        xy = np.column_stack([np.full(len(y), x), y])
+        distance, nearest = path.query(xy, distance_upper_bound=_BESIDE[1])
+        kept = np.isfinite(distance) & (distance > _BESIDE[0])
+        rows.append(np.column_stack([xy[kept], positions[nearest[kept], 2] - camera_height]))
+    return np.concatenate(rows)
+
+
+def _search(pictures: _LevelPictures, spots: Array) -> tuple[Poles, Array]:
+    """The poles among spots (n, 3), most evident first, and their evidence."""
+    quality = _quality(pictures.bars(spots, _COARSE_RADII, _COARSE_BANDS))[0].min(2).max(1)
+    feet = spots[_peaks(spots[:, :2], quality, _COARSE_QUALITY, 2.0 * _COARSE_CELL)]
+    score = np.zeros(len(feet))
+    for span in _FINE_SPANS:
+        steps = np.linspace(-span, span, 5)
+        offsets = np.array([(x, y, 0.0) for x, y in product(steps, steps)])
+        around = (feet[:, None] + offsets).reshape(-1, 3)
+        quality = _quality(pictures.bars(around, _RADII, _FINE_BANDS))[0].min(2).max(1).reshape(len(feet), -1)
+        feet, score = around.reshape(len(feet), -1, 3)[np.arange(len(feet)), quality.argmax(1)], quality.max(1)
+    feet = feet[_peaks(feet[:, :2], score, _FINE_QUALITY, 2.0 * _COARSE_CELL)]
+    feet = feet[pictures.spread(feet) > np.deg2rad(_MIN_SPREAD)]
+    found, evidence = Poles.none(), np.zeros(0)
+    offsets = np.array([(x, y, 0.0) for x, y in product(_LAST_STEPS, _LAST_STEPS)])
+    while len(feet):
+        sums = _judge(pictures, feet, found)[1]
+        best = int(sums.argmax())
+        if sums[best] < _MIN_EVIDENCE:
+            break
+        around, scores = _judge(pictures, feet[best] + offsets, found)
+        most = int(scores.argmax())
+        found = Poles.join([found, around.select(np.array([most]))])
+        evidence = np.append(evidence, scores[most])
+        apart = np.linalg.norm(feet[:, :2] - found.foot[-1, :2], axis=1) > _APART
+        apart[best] = False
+        feet = feet[apart & (sums > 0.0)]
+    return found, evidence
+
+
+def _judge(pictures: _LevelPictures, feet: Array, found: Poles) -> tuple[Poles, Array]:
+    """The best pole at each spot, and the evidence for it; 0 if a thicker thing stands there."""
+    quality, count = _quality(pictures.bars(feet, _RADII, _BANDS, found))
+    sums = np.cumsum(np.where(count >= _MIN_ALL, quality - _CHANCE, 0.0), 2)
+    rows = np.arange(len(feet))
+    radius = sums[:, :_THIN].max(2).argmax(1)
+    top = sums[rows, radius].argmax(1)
+    evidence, thicker = sums[rows, radius, top], sums[rows, radius + _TWICE, top]
+    poles = Poles(feet, np.array(_RADII)[radius], np.array(_BANDS)[top, 1])
+    return poles, np.where(thicker > _MAX_RATIO * evidence, 0.0, evidence)
+
+
+def _quality(bars: list[_Bars]) -> tuple[Array, Array]:
+    """Quality of bars and number of pictures, shape (spots, radii, bands): means over lightings by their pictures."""
+    total, weights = np.zeros(bars[0].count.shape), np.zeros(bars[0].count.shape)
+    for one in bars:
+        count = np.maximum(one.count, 1.0)
+        contrast, color = one.contrast / count, one.color / count[..., None]
+        deviation = np.sqrt(np.maximum(one.square / count[..., None] - color**2, 0.0).max(-1))
+        weight = np.where(one.count >= _MIN_PICTURES, one.count, 0.0)
+        total += weight * contrast / (contrast + _SPREAD * deviation + _NOISE)
+        weights += weight
+    return total / np.maximum(weights, 1.0), weights
+
+
+def _peaks(points: Array, score: Array, least: float, radius: float) -> NDArray[np.int64]:
+    """Indices of points (n, 2) that score at least `least`, best first; none within `radius` [m] of a better one."""
+    index = np.flatnonzero(score >= least)
+    index = index[np.argsort(-score[index], kind="stable")]
+    if not len(index):
+        return index
+    tree, taken, out = cKDTree(points[index]), np.zeros(len(index), bool), []
+    for k in range(len(index)):
+        if not taken[k]:
+            out.append(index[k])
+            taken[tree.query_ball_point(points[index[k]], radius)] = True
+    return np.array(out, np.int64)
