@@ -381,13 +381,25 @@ def test_a_frontal_wall_does_not_determine_the_focal_length():
         _shared_focal(sights(6.0, 6.01), simple(260.0))
 
 
-def test_uncertain_extrinsics_are_refused(scene, film, found_once, monkeypatch):
-    vague = CameraExtrinsics(0.001, 0.5, 0.1, 0.1)
+@pytest.mark.parametrize(
+    ("errors", "refused"),
+    [
+        *[(errors, True) for errors in ((0.001, 0.5, 0.1, 0.1), (0.001, 0.1, 0.4, 0.1), (0.001, 0.1, 0.1, 0.6))],
+        ((0.04, 0.1, 0.1, 0.1), True),
+        ((0.001, 0.29, 0.29, 0.45), False),
+    ],
+)
+def test_uncertain_extrinsics_are_refused(scene, film, found_once, monkeypatch, errors, refused):
+    vague = CameraExtrinsics(*errors)
     monkeypatch.setattr(
         "twin.sysid.camera_extrinsics.estimate_extrinsics", lambda *_: (CameraExtrinsics(1.0, 0.0, 5.0, 0.0), vague)
     )
     known = HuskyParams(camera_intrinsics=tuple(K), camera_size=(320, 240))
-    with pytest.raises(InputError, match=r"uncertain by 0\.50, 0\.10, 0\.10° .* film a longer drive"):
+    if not refused:
+        assert calibrate_camera(film, scene, known)[0].standard_errors == vague
+        return
+    turns = ", ".join(f"{turn:.2f}" for turn in errors[1:])
+    with pytest.raises(InputError, match=rf"uncertain by {turns}° .* film a longer drive"):
         calibrate_camera(film, scene, known)
 
 

@@ -55,8 +55,9 @@ _SPREAD = 1.5  # weight of the color's standard deviation over pictures
 _MIN_PICTURES = 4  # of a lighting; and `_MIN_ALL` together
 _MIN_ALL = 5
 _CHANCE = 0.42  # quality that bars reach where nothing stands
-_MIN_EVIDENCE = 0.7
-_MIN_SPREAD = 6.0  # [°] between the bearings from which pictures show a pole
+_MIN_EVIDENCE = 0.6
+_MIN_QUALITY = 0.57  # mean over a pole's bands
+_MIN_SPREAD = 8.0  # [°] between the bearings from which pictures show a pole
 _MAX_RATIO = 0.9  # evidence for twice the radius / evidence for the radius: a thicker thing has a larger one
 _APART = 0.5  # [m] between two poles
 
@@ -286,8 +287,8 @@ def _search(pictures: _LevelPictures, spots: Array) -> tuple[Poles, Array]:
         steps = np.linspace(-span, span, 5)
         offsets = np.array([(x, y, 0.0) for x, y in product(steps, steps)])
         around = (feet[:, None] + offsets).reshape(-1, 3)
-        quality = _quality(pictures.bars(around, _RADII, _FINE_BANDS))[0].min(2).max(1).reshape(len(feet), -1)
-        feet, score = around.reshape(len(feet), -1, 3)[np.arange(len(feet)), quality.argmax(1)], quality.max(1)
+        quality = _quality(pictures.bars(around, _RADII, _FINE_BANDS))[0].min(2).max(1).reshape(-1, len(offsets))
+        feet, score = feet + offsets[quality.argmax(1)], quality.max(1)
     feet = feet[_peaks(feet[:, :2], score, _FINE_QUALITY, 2.0 * _COARSE_CELL)]
     feet = feet[pictures.spread(feet) > np.deg2rad(_MIN_SPREAD)]
     found, evidence = Poles.none(), np.zeros(0)
@@ -308,7 +309,7 @@ def _search(pictures: _LevelPictures, spots: Array) -> tuple[Poles, Array]:
 
 
 def _judge(pictures: _LevelPictures, feet: Array, found: Poles) -> tuple[Poles, Array]:
-    """The best pole at each spot, and the evidence for it; 0 if a thicker thing stands there."""
+    """The best pole at each spot, and the evidence for it; 0 if its bars are poor or a thicker thing stands there."""
     quality, count = _quality(pictures.bars(feet, _RADII, _BANDS, found))
     sums = np.cumsum(np.where(count >= _MIN_ALL, quality - _CHANCE, 0.0), 2)
     rows = np.arange(len(feet))
@@ -316,7 +317,8 @@ def _judge(pictures: _LevelPictures, feet: Array, found: Poles) -> tuple[Poles, 
     top = sums[rows, radius].argmax(1)
     evidence, thicker = sums[rows, radius, top], sums[rows, radius + _TWICE, top]
     poles = Poles(feet, np.array(_RADII)[radius], np.array(_BANDS)[top, 1])
-    return poles, np.where(thicker > _MAX_RATIO * evidence, 0.0, evidence)
+    poor = evidence / (top + 1) + _CHANCE < _MIN_QUALITY
+    return poles, np.where(poor | (thicker > _MAX_RATIO * evidence), 0.0, evidence)
 
 
 def _quality(bars: list[_Bars]) -> tuple[Array, Array]:

@@ -277,17 +277,17 @@ def matched_poses(truth: Truth, cameras: Cameras) -> Array:
     return out
 
 
-def align_rigid(poses: Array, true_poses: Array) -> Similarity:
+def align_rigid(poses: Array, true_poses: Array, with_scale: bool = False) -> Similarity:
     """The rigid transform that best maps camera poses onto the true ones, shapes (n, 4, 4).
 
-    Each camera contributes its center and the tips of its axes, 1 m long, because centers on a straight path do not
-    determine the roll about it.
+    `with_scale` also corrects the twin's scale. Each camera contributes its center and the tips of its axes, 1 m long,
+    because centers on a straight path do not determine the roll about it.
     """
 
     def tripods(p: Array) -> Array:
         return np.concatenate([p[:, :3, 3], *(p[:, :3, 3] + p[:, :3, k] for k in range(3))])
 
-    return umeyama(tripods(poses), tripods(true_poses), with_scale=False)
+    return umeyama(tripods(poses), tripods(true_poses), with_scale=with_scale)
 
 
 def camera_errors(poses: Array, true_poses: Array) -> dict[str, float]:

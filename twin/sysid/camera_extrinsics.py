@@ -202,7 +202,8 @@ def _base_pose(
 # ---- calibration from a film
 
 _CHOICE = CaptureConfig(fps=2.0, max_frames=90)
-_WORST_TURN, _WORST_HEIGHT = 0.3, 0.03  # [°], [m] largest accepted standard errors
+# Largest accepted standard errors [°], [m]. Each turn moves the edge of the policy's 160×90 pictures by about 0.7 px.
+_WORST_TURN, _WORST_ROLL, _WORST_HEIGHT = 0.3, 0.5, 0.03
 _WORST_ERROR = 3.0  # [px] largest accepted median reprojection error if the longer side is 1280 px
 _PICTURES, _WIDTH = 3, 640  # number of frames in the comparison, and their largest width [px]
 
@@ -286,11 +287,12 @@ def calibrate_camera(
             f"expected at most {worst:.1f}; rectify the film (remove its lens distortion)"
         )
     extrinsics, errors = estimate_extrinsics(registration.camera_to_world, ground.at, params.camera_offset)
-    if max(errors.yaw, errors.pitch, errors.roll) > _WORST_TURN or errors.height > _WORST_HEIGHT:
+    turned = max(errors.yaw, errors.pitch) > _WORST_TURN or errors.roll > _WORST_ROLL
+    if turned or errors.height > _WORST_HEIGHT:
         raise InputError(
             f"{film}: leaves the camera's yaw, pitch, roll uncertain by {errors.yaw:.2f}, {errors.pitch:.2f}, "
-            f"{errors.roll:.2f}° and its height by {errors.height:.3f} m, expected at most {_WORST_TURN:g}° and "
-            f"{_WORST_HEIGHT:g} m; film a longer drive on the filmed path"
+            f"{errors.roll:.2f}° and its height by {errors.height:.3f} m, expected at most {_WORST_TURN:g}° (roll "
+            f"{_WORST_ROLL:g}°) and {_WORST_HEIGHT:g} m; film a longer drive on the filmed path"
         )
     given = bool(params.camera_intrinsics) and pinhole is None
     return CameraCalibration(registration, len(frames), extrinsics, errors, given), frames
