@@ -3,8 +3,8 @@
     python benchmarks/poles.py SCENE ... [--json FILE]
 
 A scene is one of `twin reality film`, built up to stage `mesh`. Errors of its scale do not count, since a similarity
-aligns the cameras with the true ones. Poles are the upright cylinders of the truth that are at least 0.7 m high, at most
-16 cm in radius and up to 10 m beside the filmed road.
+aligns the cameras with the true ones. Poles are the upright cylinders of the truth that are at least 0.7 m high, at
+most 16 cm in radius and up to 10 m beside the filmed road.
 
 - *seen*: the field's depth is within 10 cm of the pole's front in at least half of the samples. A sample is a height in
   a filmed frame up to 10 m away in which nothing hides the pole there; there are up to two frames per film.
