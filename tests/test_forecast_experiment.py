@@ -167,18 +167,18 @@ def test_a_place_that_cannot_be_built_is_recorded_as_failed_and_not_run_again(fo
     place = forecast.command.PlaceRun(protocol, 106, tmp_path / "work", tmp_path / "results", run, 1)
     with pytest.raises(InputError, match="no reconstructed point"):
         forecast.command.run_place(place, None)
-    failure = {"step": "build", "message": "no reconstructed point"}
+    failure = {"step": "build", "message": "robot.mp4: no reconstructed point"}  # without the machine's folders
     assert read_json(tmp_path / "results" / "version_2" / "place_106" / "failure.json") == failure
     forecast.command.run_place(place, None)
     assert run.calls == ["film"]
     found = forecast.place_scores.score(protocol, tmp_path / "results")
-    assert found["places"]["106"] == "failed: build: no reconstructed point"
-    assert "failed: build: no reconstructed point" in forecast.place_scores.tables(protocol, found)
+    assert found["places"]["106"] == "failed: build: robot.mp4: no reconstructed point"
+    assert "failed: build: robot.mp4: no reconstructed point" in forecast.place_scores.tables(protocol, found)
 
 
 def _fails_at(run, command, arguments, kind):
     if arguments[0] == command:
-        raise kind("no reconstructed point")
+        raise kind(f"{arguments[1]}/robot.mp4: no reconstructed point")
     assert run(*arguments) == 0
 
 

@@ -266,7 +266,8 @@ def run_place(one: PlaceRun, ray: str | None) -> None:
             except Refused as error:
                 if final:
                     one.record.mkdir(parents=True, exist_ok=True)
-                    write_json(one.record / FAILURE, {"step": step.__name__, "message": str(error)})
+                    message = str(error).replace(f"{one.scene}/", "")  # records name no folder of a machine
+                    write_json(one.record / FAILURE, {"step": step.__name__, "message": message})
                 raise
         one.validate(ray)
         one.drive()
