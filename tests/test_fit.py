@@ -19,9 +19,10 @@ from twin.nerf.appearance import fit_appearance
 from twin.nerf.bake import bake
 from twin.nerf.baked import BakedField
 from twin.nerf.buffers import CameraArrays, Workspace, single_threaded_torch
-from twin.nerf.dataset import TrainingPixels, constant_height, free_segments, load_frame
+from twin.nerf.dataset import DepthSupervision, TrainingPixels, constant_height, free_segments, join_depths, load_frame
 from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
+from twin.nerf.poles import Poles
 from twin.nerf.trainer import Trainer, plane_loss, run, train_field
 from twin.runtime import set_quiet
 from twin.scene import SceneDir
@@ -221,6 +222,21 @@ def test_a_training_that_diverges_is_one_line_before_the_field_is_used(cameras, 
     config = replace(CONFIG, steps=30, transients=True, refine_cameras=True)
     with pytest.raises(InputError, match=r"diverged at step [67]; lower nerf\.learning_rate"):
         train_field(cameras, SparsePoints.empty(), config, device=device)
+
+
+def test_poles_supervise_the_field_if_the_camera_has_a_constant_height(cameras, monkeypatch):
+    pole = Poles(cameras.positions[:1] + cameras.camera_to_world[:1, :3, 2] * 4.0, np.array([0.05]), np.array([2.0]))
+    pole.foot[:, 2] = 0.0
+    shown = DepthSupervision(np.zeros(3, np.int32), np.full((3, 2), 5.5), np.full(3, 4.0, np.float32))
+    monkeypatch.setattr("twin.nerf.trainer.find_poles", lambda *_: pole)
+    monkeypatch.setattr("twin.nerf.trainer.pole_depths", lambda _, poles: shown if len(poles) else join_depths([]))
+
+    def known(height, **settings):
+        trainer = Trainer(cameras, SparsePoints.empty(), replace(CONFIG, **settings), 0, "cpu", camera_height=height)
+        return len(trainer.poles), sum(len(part.points.frame) for part in trainer.parts)
+
+    assert known(1.5) == (1, 3)
+    assert known(0.0) == known(1.5, poles=False) == (0, 0)
 
 
 def test_another_seed_gives_another_field(cameras):

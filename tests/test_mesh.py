@@ -20,6 +20,7 @@ from twin.config import BranchConfig, MeshConfig, MetricConfig, MjcfConfig, Scen
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.route import BRANCH, distance_to_route, filmed_branches
+from twin.nerf.poles import Poles
 
 HALF_WIDTH = 1.0  # [m]
 WALL = Box(7.0, 3.0, 3.0, 1.0, 1.4)
@@ -40,7 +41,7 @@ def made(tmp_path_factory: pytest.TempPathFactory):
     return out, _build(cameras, root, out)
 
 
-def _build(cameras: Cameras, root: Path, out: Path, half_width: float = HALF_WIDTH, **settings):
+def _build(cameras: Cameras, root: Path, out: Path, half_width: float = HALF_WIDTH, poles=None, **settings):
     config = SceneConfig(
         source=(SourceConfig(path="day.mp4"),),
         metric=MetricConfig(camera_height=1.8),
@@ -48,7 +49,7 @@ def _build(cameras: Cameras, root: Path, out: Path, half_width: float = HALF_WID
         mjcf=MjcfConfig(half_width=half_width),
         **settings,
     )
-    return build_assets(PLACE, cameras, SparsePoints.load(root / "2_metric"), config, out, root / "cache")
+    return build_assets(PLACE, cameras, SparsePoints.load(root / "2_metric"), config, out, root / "cache", poles)
 
 
 def _load(folder: Path, name: str) -> dict[str, np.ndarray]:
@@ -79,6 +80,24 @@ def _edges(faces):
     """Number of faces at each edge."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
     return np.unique(edges, axis=0, return_counts=True)[1]
+
+
+def test_poles_are_parts_and_visible_but_never_in_the_corridor(made, tmp_path):
+    folder, facts = made
+    feet = np.array([[4.0, 2.0, 0.08], [5.0, 0.5, 0.1]])
+    poles = Poles(feet, np.array([0.04, 0.04]), np.array([1.5, 1.5]))
+    cameras = Cameras.load(folder.parent / "2_metric")
+    told = _build(cameras, folder.parent, tmp_path, poles=poles)
+    before, parts = _parts(folder), _parts(tmp_path)
+    assert facts["poles"] == 0 and told["poles"] == 1 and len(parts) == len(before) + 1 == told["parts"]
+    away = np.linalg.norm(parts[-1].vertices[:, :2] - (4.0, 2.0), axis=1)
+    assert np.allclose(away, 0.04, atol=1e-6) and np.isclose(parts[-1].vertices[:, 2].max(), 1.58)
+    assert inside_hull(parts[-1], np.array([[4.0, 2.0, 0.5]])).all()
+    near = [
+        int((np.linalg.norm(_load(one, "visual")["vertices"][:, :2] - (4.0, 2.0), axis=1) < 0.05).sum())
+        for one in (folder, tmp_path)
+    ]
+    assert near[1] >= near[0] + 16
 
 
 def test_sections_give_the_surface_and_the_solid_of_one(stood, monkeypatch):
