@@ -172,9 +172,9 @@ def test_a_short_film_is_refused():
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """The textured corridor with flat ground, filmed densely."""
+    """The textured corridor with flat ground."""
     runtime.set_quiet(True)
-    scene = filmed_corridor(tmp_path_factory.mktemp("corridor") / "scene", frames=16)
+    scene = filmed_corridor(tmp_path_factory.mktemp("corridor") / "scene", frames=9)
     mesh = scene.stage("mesh")
     mesh.mkdir()
     flat = np.zeros((80, 240))

@@ -19,16 +19,19 @@ from twin.reality.__main__ import main as reality
 from twin.scene import STAGES
 
 QUICK = (
-    "nerf.steps=250",
-    "nerf.rays=2048",
+    "nerf.steps=120",
+    "nerf.rays=1024",
     "nerf.max_width=240",
-    "nerf.bake_steps=30",
-    "nerf.detail_passes=0.5",
-    "nerf.max_bricks=2500",
+    "nerf.log2_table=16",
+    "nerf.bake_steps=20",
+    "nerf.detail_passes=0.25",
+    "nerf.max_bricks=1500",
     "mesh.margin=8",
-    "review.fps=5",
+    "mesh.views=30",
+    "mesh.view_width=120",
+    "review.fps=3",
     "review.width=240",
-    "review.renders=30",
+    "review.renders=12",
 )
 
 
@@ -40,7 +43,7 @@ def _command(root, *options):
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     root = tmp_path_factory.mktemp("tiny") / "scene"
-    film(replace(TINY, samples=1), root)
+    film(replace(TINY, samples=1, fps=2), root)  # as many frames as a build keeps
     done = subprocess.run(_command(root), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     assert reality(["compare", str(root)]) == 0
