@@ -91,6 +91,8 @@ def test_supervised_depths_are_those_of_the_front(tmp_path):
     assert np.allclose(away, radius, atol=1e-3) and points[:, 2].max() < height and points[:, 2].min() > 0.05
     gray = pixels.colors[pixels.start[depths.frame] + depths.pixel.astype(int) @ (1, WIDTH)][:, 0]
     assert (gray < 80).mean() > 0.95  # they lie on the pole in the pictures
+    pixels.colors[:] = 128
+    assert len(pole_depths(pixels, poles).frame) == 0  # no picture shows it
 
 
 class FlatGround:
