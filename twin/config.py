@@ -280,7 +280,7 @@ class MeshConfig:
     max_height: Annotated[float, Range(0.1, 100)] = 2.5
     """Height above the ground at which obstacles are cut off; choose it above the robot's reach [m]."""
     max_parts: Annotated[int, Range(0)] = 2000
-    """Largest number of convex parts; if the route is longer than 100 m, per 100 m of it."""
+    """Largest number of convex parts, without those of poles; if the route is longer than 100 m, per 100 m of it."""
     max_protrusion: Annotated[float, Range(0.01)] = 0.2
     """Protrusion of a convex part from its mesh, above which the part is split [m]."""
     margin: Annotated[float, Range(1, 1000)] = 12.0

@@ -96,7 +96,9 @@ def build_assets(
         others = {f"{BRANCH}{name}": np.column_stack([line, ground.at(line)]) for name, line in branches.items()}
         np.savez(out / "route.npz", xy=route, z=ground.at(route), **others)  # type: ignore[arg-type]
         path = np.concatenate([every_second(line) for line in lines])
-    posts = solids.pole_parts(poles or Poles.none(), corridor, ground)
+    poles = poles or Poles.none()
+    inside = (poles.foot[:, :2] > box[0, :2]) & (poles.foot[:, :2] < box[1, :2])
+    posts = solids.pole_parts(poles.select(np.flatnonzero(inside.all(1))), corridor, ground)
     fused = _fuse_sections(views, ground, corridor, path, box, settings)
     clock.append(("fuse", time.perf_counter()))
     visual, visual_metrics = _visual_mesh(
@@ -111,6 +113,7 @@ def build_assets(
     return {
         **part_metrics,
         **visual_metrics,
+        "poles_left_out": len(poles) - len(posts),
         "ground": ground_metrics | _roughness(ground, route),
         "views": len(views),
         "voxel_m": settings.voxel,
@@ -252,9 +255,9 @@ def _save_parts(
     out: Path,
     cache: Path,
 ) -> dict[str, Any]:
-    """Decomposes the pieces, clears the corridor, keeps poles and the nearest parts, and writes `parts.npz`.
+    """Decomposes the pieces, clears the corridor, keeps the nearest `max_parts`, and writes `parts.npz`.
 
-    `posts` are the parts of poles, which count among the `max_parts` parts. They come last.
+    `posts` are the parts of poles. They come last, in addition to the others.
     """
     bound = config.mesh.max_protrusion
     decomposition = convex.decompose(pieces, bound, cache, config.seed)
@@ -262,10 +265,10 @@ def _save_parts(
     clipped = 0
     if corridor is not None:
         kept, clipped = solids.clear_corridor(decomposition.parts, corridor, ground)
-    dropped = len(kept) - max(max_parts - len(posts), 0)
+    dropped = len(kept) - max_parts
     if dropped > 0:
         # Parts are sorted by distance from the path; the farthest are the least relevant to the robot.
-        kept = kept[: max(max_parts - len(posts), 0)]
+        kept = kept[:max_parts]
         runtime.log_line(f"  left out the {dropped} farthest convex parts, as mesh.max_parts = {config.mesh.max_parts}")
     parts = [*(part for _, part in kept), *posts]
     empty = np.zeros((0, 3))

@@ -56,11 +56,13 @@ class DepthSupervision:
 
 
 def join_depths(parts: list[DepthSupervision]) -> DepthSupervision:
-    """Concatenates depth supervision."""
+    """Joins depth supervision, in the order of the frames."""
+    frame = np.concatenate([np.zeros(0, np.int32), *(p.frame for p in parts)])
+    order = np.argsort(frame, kind="stable")
     return DepthSupervision(
-        np.concatenate([np.zeros(0, np.int32), *(p.frame for p in parts)]),
-        np.concatenate([np.zeros((0, 2)), *(p.pixel for p in parts)]),
-        np.concatenate([np.zeros(0, np.float32), *(p.distance for p in parts)]),
+        frame[order],
+        np.concatenate([np.zeros((0, 2)), *(p.pixel for p in parts)])[order],
+        np.concatenate([np.zeros(0, np.float32), *(p.distance for p in parts)])[order],
     )
 
 

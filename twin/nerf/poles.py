@@ -12,6 +12,7 @@ with the most evidence come first. A spot is then judged without the pictures in
 covers it: beside a pole, bars show this pole, from a part of the cameras.
 """
 
+import warnings
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -34,7 +35,8 @@ POLES_FILE = "poles.npz"
 _BESIDE = 1.2, 10.0  # [m] least and greatest distance of a spot from the path of the cameras
 _DEPTHS = 1.2, 13.0  # [m] depths at which pictures are used
 _FRAME_SPACING = 0.4  # [m] pictures of a film that are closer to each other add nothing
-_TILE = 20.0  # [m] side of the squares that are searched one after the other, which bounds memory
+_TILE = 20.0  # [m] side of the squares that are searched one after the other
+_MAX_PICTURES = 60  # pictures of a lighting around a square, which bounds memory
 
 _RADII = (0.02, 0.028, 0.037, 0.048, 0.062, 0.08, 0.1, 0.125, 0.16, 0.2, 0.25)  # [m]
 _THIN = 8  # number of radii, the first ones, that a pole may have; the others compete with them
@@ -49,6 +51,7 @@ _FINE_SPANS = (0.04, 0.02)  # [m] half widths of the grids of 5 × 5 spots aroun
 _FINE_BANDS = ((0.1, 0.3), (0.3, 0.5), (0.5, 0.7))
 _FINE_QUALITY = 0.42
 _LAST_STEPS = tuple(0.015 * k for k in range(-4, 5))  # [m] steps in x and y to the most evident spot
+_LAST_ROUNDS = 4  # such steps follow each other until the spot remains
 
 _NOISE = 3.0  # [gray levels]
 _SPREAD = 1.5  # weight of the color's standard deviation over pictures
@@ -63,6 +66,7 @@ _APART = 0.5  # [m] between two poles
 
 _POINT_SPACING = 0.04  # [m] between the points of a pole that get depth supervision
 _MIN_CONTRAST = 6.0  # [gray levels] in the picture
+_MAX_CHANGE = 0.7  # largest difference from the bar's median color, as a multiple of its median contrast
 
 
 @dataclass(frozen=True)
@@ -119,19 +123,23 @@ class _LevelPictures:
         self.lightings = np.array(pixels.cameras.lightings)[frames]
         self.positions = pixels.cameras.positions[frames]
         self._turns = [_level(pixels.cameras.camera_to_world[i]) for i in frames]
-        self._sums = [self._table(pixels, i, turn) for i, turn in zip(frames, self._turns, strict=True)]
+        self._tables = [self._table(pixels, i, turn) for i, turn in zip(frames, self._turns, strict=True)]
 
     @staticmethod
-    def _table(pixels: TrainingPixels, i: int, turn: Array) -> wp.array:
+    def _table(pixels: TrainingPixels, i: int, turn: Array) -> list[wp.array]:
+        """Tables of the colors, and of the pixels that are masked or outside the original picture."""
         width, height = int(pixels.width[i]), int(pixels.height[i])
         fx, fy, cx, cy = pixels.intrinsics[i]
         matrix = np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
         rotation = turn.T @ pixels.cameras.camera_to_world[i, :3, :3]
-        picture = pixels.colors[pixels.start[i] : pixels.start[i + 1]].reshape(height, width, 3)
-        levelled = cv2.warpPerspective(
-            picture, matrix @ rotation @ np.linalg.inv(matrix), (width, height), borderMode=cv2.BORDER_REPLICATE
+        homography = matrix @ rotation @ np.linalg.inv(matrix)
+        picture, mask = (
+            values[pixels.start[i] : pixels.start[i + 1]].reshape(height, width, -1)
+            for values in (pixels.colors, (~pixels.unmasked).astype(np.uint8))
         )
-        return wp.array(cv2.integral(levelled), dtype=wp.int32, device="cpu")
+        level = cv2.warpPerspective(picture, homography, (width, height))
+        hidden = cv2.warpPerspective(mask, homography, (width, height), flags=cv2.INTER_NEAREST, borderValue=1)
+        return [wp.array(cv2.integral(values), dtype=wp.int32, device="cpu") for values in (level, hidden)]
 
     def seen(self, k: int, feet: Array) -> tuple[NDArray[np.int64], Array]:
         """Indices of the spots (n, 3) before picture k, and their positions in its camera: right, up and ahead [m]."""
@@ -185,7 +193,7 @@ class _LevelPictures:
                     spots: wp.array = wp.array(local.astype(np.float32), dtype=wp.vec3, device="cpu")
                     rows: wp.array = wp.array(halves[half][index].astype(np.int32), dtype=wp.int32, device="cpu")
                     lens = wp.vec4(*map(float, self._intrinsics[self.frames[k]]))
-                    inputs = [self._sums[k], lens, spots, rows, *given]
+                    inputs = [*self._tables[k], lens, spots, rows, *given]
                     wp.launch(kernels.add_bars, len(index), inputs, sums, device="cpu")
 
             parallel(add, range(2), "cpu")
@@ -203,44 +211,52 @@ class _LevelPictures:
 
 
 def find_poles(pixels: TrainingPixels, camera_height: float) -> Poles:
-    """Finds the poles up to 10 m beside the path of the cameras; `camera_height` [m] is that of the lens."""
-    positions = pixels.cameras.positions
-    spots = _grid(positions, camera_height)
-    tile = np.floor((spots[:, :2] - spots[:, :2].min(0, initial=np.inf)) / _TILE).astype(int)
-    kept = _spaced_frames(pixels)
-    parts: list[tuple[Poles, Array]] = []
-    for corner in track(np.unique(tile, axis=0), "poles", unit="square"):
-        mine = spots[(tile == corner).all(1)]
-        middle, half = (mine[:, :2].min(0) + mine[:, :2].max(0)) / 2, (mine[:, :2].max(0) - mine[:, :2].min(0)) / 2
-        beyond = np.linalg.norm(np.maximum(np.abs(positions[kept, :2] - middle) - half, 0.0), axis=1)
-        frames = kept[beyond < _DEPTHS[1]]
-        if len(frames) >= _MIN_ALL:
-            parts.append(_search(_LevelPictures(pixels, frames), mine))
-    if not parts:
-        return Poles.none()
-    poles, evidence = Poles.join([one for one, _ in parts]), np.concatenate([one for _, one in parts])
+    """Finds the poles up to 10 m beside the path of the cameras; `camera_height` [m] is that of the lens.
+
+    Masked pixels are not used.
+    """
+    positions, kept = pixels.cameras.positions, _spaced_frames(pixels)
+    path = cKDTree(positions[:, :2])
+    steps = np.array(list(product((-1.0, 0.0, 1.0), repeat=2))) * _BESIDE[1]
+    tiles = np.unique(np.floor((positions[:, None, :2] + steps).reshape(-1, 2) / _TILE).astype(int), axis=0)
+    poles, evidence = Poles.none(), np.zeros(0)
+    for corner in track(tiles * _TILE, "poles", unit="square"):
+        spots = _spots(corner, path, positions[:, 2] - camera_height)
+        beyond = np.maximum(np.abs(positions[kept, :2] - corner - 0.5 * _TILE) - 0.5 * _TILE, 0.0)
+        frames = _at_most(kept[np.linalg.norm(beyond, axis=1) < _DEPTHS[1]], pixels.cameras.lightings)
+        if len(spots) and len(frames) >= _MIN_ALL:
+            more, sums = _search(_LevelPictures(pixels, frames), spots, poles)
+            poles, evidence = Poles.join([poles, more]), np.append(evidence, sums)
     return poles.select(_peaks(poles.foot[:, :2], evidence, 0.0, _APART))
 
 
 def pole_depths(pixels: TrainingPixels, poles: Poles) -> DepthSupervision:
-    """Depth supervision on the fronts of poles, where a picture shows their bars."""
+    """Depth supervision on the fronts of poles in the pictures that show their bars in the usual color."""
     parts = []
-    near = cKDTree(poles.foot[:, :2]) if len(poles) else None
-    for i in range(len(pixels.cameras) if near else 0):
-        assert near is not None
-        index = np.array(near.query_ball_point(pixels.cameras.positions[i, :2], _DEPTHS[1]), int)
-        if not len(index):
-            continue
-        picture = _LevelPictures(pixels, np.array([i]))
-        for j in index:
-            bands = _BANDS[: round((poles.height[j] - _BANDS[0][0]) / _BAND)]
-            (bars,) = picture.bars(poles.foot[j : j + 1], (float(poles.radius[j]),), bands)
-            shown = (bars.count > 0) & (bars.contrast > _MIN_CONTRAST)
-            toward = pixels.cameras.positions[i, :2] - poles.foot[j, :2]
-            front = poles.foot[j, :2] + toward / np.linalg.norm(toward) * poles.radius[j]
-            for low, high in np.array(bands)[shown[0, 0]]:
-                z = poles.foot[j, 2] + np.arange(low, high, _POINT_SPACING)
-                parts.append(pixels.depths_in_frame(i, np.column_stack([np.tile(front, (len(z), 1)), z])))
+    for foot, radius, height in zip(poles.foot, poles.radius, poles.height, strict=True):
+        away = np.linalg.norm(pixels.cameras.positions[:, :2] - foot[:2], axis=1)
+        pictures = _LevelPictures(pixels, np.flatnonzero(away < _DEPTHS[1]))
+        bands = _BANDS[: round((height - _BANDS[0][0]) / _BAND)]
+        single = [pictures.bars(foot[None], (float(radius),), bands, only=k)[0] for k in range(len(pictures.frames))]
+        for lighting in dict.fromkeys(pictures.lightings):
+            mine = np.flatnonzero(pictures.lightings == lighting)
+            count, contrast, color = (
+                np.stack([getattr(single[k], name)[0, 0] for k in mine]) for name in ("count", "contrast", "color")
+            )
+            judged = np.where(count > 0, 1.0, np.nan)
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # a band that no picture shows has no median
+                typical, usual = np.nanmedian(color * judged[..., None], 0), np.nanmedian(contrast * judged, 0)
+            same = np.abs(color - typical).max(-1) <= _MAX_CHANGE * usual
+            shown = (count > 0) & (contrast > _MIN_CONTRAST) & same
+            for k, row in zip(mine, shown, strict=True):
+                i = int(pictures.frames[k])
+                toward = pixels.cameras.positions[i, :2] - foot[:2]
+                front = foot[:2] + toward / np.linalg.norm(toward) * radius
+                z = [foot[2] + np.arange(low, high, _POINT_SPACING) for low, high in np.array(bands)[row]]
+                if z:
+                    rows = np.concatenate(z)
+                    parts.append(pixels.depths_in_frame(i, np.column_stack([np.tile(front, (len(rows), 1)), rows])))
     return join_depths(parts)
 
 
@@ -264,22 +280,29 @@ def _spaced_frames(pixels: TrainingPixels) -> NDArray[np.int64]:
     return np.array(kept, np.int64)
 
 
-def _grid(positions: Array, camera_height: float) -> Array:
-    """Spots of the first search [m], shape (n, 3)."""
-    low, high = positions[:, :2].min(0) - _BESIDE[1], positions[:, :2].max(0) + _BESIDE[1]
-    path = cKDTree(positions[:, :2])
-    rows = []
-    for x in np.arange(low[0], high[0], _COARSE_CELL):
-        y = np.arange(low[1], high[1], _COARSE_CELL)
-        xy = np.column_stack([np.full(len(y), x), y])
-        distance, nearest = path.query(xy, distance_upper_bound=_BESIDE[1])
-        kept = np.isfinite(distance) & (distance > _BESIDE[0])
-        rows.append(np.column_stack([xy[kept], positions[nearest[kept], 2] - camera_height]))
-    return np.concatenate(rows)
+def _at_most(frames: NDArray[np.int64], lightings: tuple[str, ...]) -> NDArray[np.int64]:
+    """At most `_MAX_PICTURES` of the frames per lighting, evenly spread."""
+    names = np.array(lightings)[frames]
+    parts = [frames[names == name] for name in dict.fromkeys(names)]
+    return np.sort(
+        np.concatenate(
+            [np.zeros(0, np.int64)]
+            + [p[np.unique(np.linspace(0, len(p) - 1, min(len(p), _MAX_PICTURES)).astype(int))] for p in parts]
+        )
+    )
 
 
-def _search(pictures: _LevelPictures, spots: Array) -> tuple[Poles, Array]:
-    """The poles among spots (n, 3), most evident first, and their evidence."""
+def _spots(corner: Array, path: cKDTree, floor: Array) -> Array:
+    """Spots (n, 3) [m] of the first search in the square at a corner (2,), as high as `floor` at the nearest camera."""
+    steps = np.arange(0.5 * _COARSE_CELL, _TILE, _COARSE_CELL)
+    xy = corner + np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
+    distance, nearest = path.query(xy, distance_upper_bound=_BESIDE[1])
+    near = np.isfinite(distance) & (distance > _BESIDE[0])
+    return np.column_stack([xy[near], floor[nearest[near]]])
+
+
+def _search(pictures: _LevelPictures, spots: Array, known: Poles) -> tuple[Poles, Array]:
+    """The poles among spots (n, 3), most evident first, and their evidence; without those that are known already."""
     quality = _quality(pictures.bars(spots, _COARSE_RADII, _COARSE_BANDS))[0].min(2).max(1)
     feet = spots[_peaks(spots[:, :2], quality, _COARSE_QUALITY, 2.0 * _COARSE_CELL)]
     score = np.zeros(len(feet))
@@ -291,21 +314,27 @@ def _search(pictures: _LevelPictures, spots: Array) -> tuple[Poles, Array]:
         feet, score = feet + offsets[quality.argmax(1)], quality.max(1)
     feet = feet[_peaks(feet[:, :2], score, _FINE_QUALITY, 2.0 * _COARSE_CELL)]
     feet = feet[pictures.spread(feet) > np.deg2rad(_MIN_SPREAD)]
-    found, evidence = Poles.none(), np.zeros(0)
+    found, evidence = known, np.zeros(0)
     offsets = np.array([(x, y, 0.0) for x, y in product(_LAST_STEPS, _LAST_STEPS)])
     while len(feet):
         sums = _judge(pictures, feet, found)[1]
         best = int(sums.argmax())
         if sums[best] < _MIN_EVIDENCE:
             break
-        around, scores = _judge(pictures, feet[best] + offsets, found)
-        most = int(scores.argmax())
-        found = Poles.join([found, around.select(np.array([most]))])
-        evidence = np.append(evidence, scores[most])
-        apart = np.linalg.norm(feet[:, :2] - found.foot[-1, :2], axis=1) > _APART
+        spot = feet[best]
+        for _ in range(_LAST_ROUNDS):
+            around, scores = _judge(pictures, spot + offsets, found)
+            most = int(scores.argmax())
+            spot, moved = around.foot[most], bool(np.abs(offsets[most]).max() >= max(_LAST_STEPS))
+            if not moved:
+                break
+        apart = np.linalg.norm(feet[:, :2] - spot[:2], axis=1) > _APART
         apart[best] = False
         feet = feet[apart & (sums > 0.0)]
-    return found, evidence
+        if len(found) and np.linalg.norm(found.foot[:, :2] - spot[:2], axis=1).min() < _APART:
+            continue
+        found, evidence = Poles.join([found, around.select(np.array([most]))]), np.append(evidence, scores[most])
+    return found.select(np.arange(len(known), len(found))), evidence
 
 
 def _judge(pictures: _LevelPictures, feet: Array, found: Poles) -> tuple[Poles, Array]:

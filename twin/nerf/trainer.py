@@ -121,7 +121,6 @@ class Trainer:
         """Summary of the stereo depths; None without `nerf.stereo`."""
         if config.stereo:
             self.pixels.stereo, self.stereo = stereo_depths(self.pixels, seed, device)
-        self.poles = find_poles(self.pixels, camera_height) if config.poles and camera_height > 0.0 else Poles.none()
         self.excluded: list[NDArray[np.bool_]] = []
         """One mask per training frame, true on transients; an empty list before the first call of `_exclude`."""
         self.moving = 0.0
@@ -130,6 +129,7 @@ class Trainer:
         # The field must never learn the colors of these objects: some lightings have no pixels that would correct them.
         if self.left:
             self._exclude(object_masks(self.pixels, self.left))
+        self.poles = find_poles(self.pixels, camera_height) if config.poles and camera_height > 0.0 else Poles.none()
         lightings = tuple(dict.fromkeys(train.lightings))
         frame_lighting = np.array([lightings.index(name) for name in train.lightings])
         known, focal = self.pixels.points.distance, float(np.median(self.pixels.intrinsics[:, 0]))
@@ -287,7 +287,6 @@ class Trainer:
     def _exclude(self, masks: list[NDArray[np.bool_]]) -> None:
         """Excludes marked pixels from training, in addition to earlier ones."""
         self.pixels.exclude(masks)
-        self.pixels.points = join_depths([self.pixels.points, pole_depths(self.pixels, self.poles)])
         self.parts = [self.pixels.of_frames(frames) for frames in self.frames]
         before = self.excluded or [np.zeros_like(mask) for mask in masks]
         self.excluded = [one | other for one, other in zip(before, masks, strict=True)]

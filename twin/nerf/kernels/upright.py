@@ -14,6 +14,7 @@ _GAP = 0.4  # [px] between the bar's edge and the boxes beside it
 _SIDE = 0.5  # width of the boxes beside the bar, as a fraction of its half width; at least 1 px
 _LEAST_HALF_WIDTH = 0.6  # [px] narrower bars are not judged
 _LEAST_ROWS = 3  # lower bands are not judged
+_MOST_HIDDEN = 0.05  # largest fraction of the three boxes' surroundings that may be masked
 
 
 @wp.func
@@ -44,6 +45,7 @@ def largest(color: wp.vec3) -> float:
 @wp.kernel
 def add_bars(
     sums: wp.array3d(dtype=wp.int32),
+    hidden: wp.array2d(dtype=wp.int32),
     intrinsics: wp.vec4,
     spot: wp.array(dtype=wp.vec3),
     index: wp.array(dtype=wp.int32),
@@ -56,9 +58,10 @@ def add_bars(
 ):
     """Adds one picture to the sums over pictures, for each spot, radius and band of heights.
 
-    `spot` is a spot's foot in the axes of the level camera: x to the right, height above the lens, z ahead [m]; `index`
-    is its row in the sums. `contrast` is the smaller of the color differences to the left and to the right, `color` and
-    `square` are the color inside and its square.
+    `hidden` is the summed-area table of the masked pixels, which are not judged. `spot` is a spot's foot in the axes of
+    the level camera: x to the right, height above the lens, z ahead [m]; `index` is its row in the sums. `contrast` is
+    the smaller of the color differences to the left and to the right, `color` and `square` are the color inside and its
+    square.
     """
     t = wp.tid()
     i = index[t]
@@ -74,7 +77,13 @@ def add_bars(
                 half = radii[r] * intrinsics[0] / z
                 side = wp.max(1.0, _SIDE * half)
                 reach = half + _GAP + side
-                if half >= _LEAST_HALF_WIDTH and u - reach >= 0.0 and u + reach < float(columns):
+                shown = half >= _LEAST_HALF_WIDTH and u - reach >= 0.0 and u + reach < float(columns)
+                if shown:
+                    first = int(u - reach)
+                    last = int(u + reach) + 1
+                    masked = hidden[bottom, last] - hidden[top, last] - hidden[bottom, first] + hidden[top, first]
+                    shown = float(masked) <= _MOST_HIDDEN * float((bottom - top) * (last - first))
+                if shown:
                     inside = box_mean(sums, top, bottom, u - _CORE * half, u + _CORE * half)
                     left = inside - box_mean(sums, top, bottom, u - reach, u - half - _GAP)
                     right = inside - box_mean(sums, top, bottom, u + half + _GAP, u + reach)
