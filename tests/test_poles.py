@@ -6,7 +6,7 @@ from analytic import AnalyticField, Box, Post
 
 from twin import runtime
 from twin.assets.solids import Corridor, pole_parts
-from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, unproject
+from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, project, unproject
 from twin.geometry.images import write_image
 from twin.geometry.poses import look_at
 from twin.nerf.dataset import TrainingPixels
@@ -68,6 +68,23 @@ def test_a_post_and_a_bollard_are_found_where_they_stand(tmp_path):
         assert abs(found.height[k] - height) < 0.35 and abs(found.foot[k, 2]) < 1e-6
 
 
+def test_masked_pixels_show_no_pole(tmp_path):
+    """Such as those of a bollard that left: it is masked in the lightings in which it stood."""
+    pixels = film(tmp_path, (POST, BOLLARD))
+    shown = np.zeros(len(pixels.colors), bool)
+    for i, pose in enumerate(pixels.cameras.camera_to_world):
+        axis = np.column_stack([np.tile(BOLLARD[:2], (60, 1)), np.linspace(0.0, 1.0, 60)])
+        pixel, depth = project(axis, pose, K)
+        for (u, v), z in zip(pixel, depth, strict=True):
+            half = 220.0 * 0.12 / max(z, 0.1)
+            if z > 0.5 and 0 <= v < HEIGHT:
+                row = pixels.start[i] + int(v) * WIDTH
+                shown[row + int(np.clip(u - half, 0, WIDTH)) : row + int(np.clip(u + half, 0, WIDTH))] = True
+    pixels.unmasked = ~shown
+    found = find_poles(pixels, LENS)
+    assert len(found) == 1 and np.linalg.norm(found.foot[0, :2] - POST[:2]) < 0.05
+
+
 def test_walls_a_thick_column_and_the_ground_are_no_poles(tmp_path):
     assert len(find_poles(film(tmp_path, (COLUMN,)), LENS)) == 0
 
@@ -91,6 +108,11 @@ def test_supervised_depths_are_those_of_the_front(tmp_path):
     assert np.allclose(away, radius, atol=1e-3) and points[:, 2].max() < height and points[:, 2].min() > 0.05
     gray = pixels.colors[pixels.start[depths.frame] + depths.pixel.astype(int) @ (1, WIDTH)][:, 0]
     assert (gray < 80).mean() > 0.95  # they lie on the pole in the pictures
+    hidden = [1, 2, 3]  # frames in which a light wall stands before it
+    for i in hidden:
+        pixels.colors[pixels.start[i] : pixels.start[i + 1]] //= 2
+        pixels.colors[pixels.start[i] : pixels.start[i + 1]] += 120
+    assert not np.isin(pole_depths(pixels, poles).frame, hidden).any()
     pixels.colors[:] = 128
     assert len(pole_depths(pixels, poles).frame) == 0  # no picture shows it
 
