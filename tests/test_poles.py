@@ -9,7 +9,7 @@ from twin.assets.solids import Corridor, pole_parts
 from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, project, unproject
 from twin.geometry.images import write_image
 from twin.geometry.poses import look_at
-from twin.nerf.dataset import TrainingPixels
+from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths
 from twin.nerf.poles import Poles, find_poles, pole_depths
 
 WIDTH, HEIGHT = 320, 180
@@ -115,6 +115,16 @@ def test_supervised_depths_are_those_of_the_front(tmp_path):
     assert not np.isin(pole_depths(pixels, poles).frame, hidden).any()
     pixels.colors[:] = 128
     assert len(pole_depths(pixels, poles).frame) == 0  # no picture shows it
+
+
+def test_joined_depths_are_in_the_order_of_the_frames():
+    parts = [
+        DepthSupervision(np.array(frames, np.int32), np.full((2, 2), value), np.full(2, value, np.float32))
+        for frames, value in (([1, 4], 1.0), ([0, 4], 2.0))
+    ]
+    joined = join_depths(parts)
+    assert joined.frame.tolist() == [0, 1, 4, 4] and joined.distance.tolist() == [2.0, 1.0, 1.0, 2.0]
+    assert joined.pixel[:, 0].tolist() == joined.distance.tolist() and joined.of_frame(4) == slice(2, 4)
 
 
 class FlatGround:
