@@ -289,7 +289,7 @@ def test_stage_writes_fields_that_load(cameras, tmp_path):
     nerf = replace(CONFIG, bake_steps=20, max_bricks=1500)
     metrics = run(scene, SceneConfig(name="x", source=(SourceConfig(path="a"),), nerf=nerf), out)
     assert metrics["steps"] == 6 and metrics["parameters"] > 0 and metrics["sightings_path"] > 0
-    names = ["baked.json", "baked.safetensors", "field.json", "field.safetensors"]
+    names = ["baked.json", "baked.safetensors", "field.json", "field.safetensors", "poles.npz"]
     assert sorted(p.name for p in out.iterdir()) == names
     assert metrics["cross_lighting"]["poses"] == 14 and metrics["cross_lighting"]["depth_moves_m"] == 0.0
     assert metrics["bake"]["bytes"] > 0 and set(metrics["baking_gain"]) == {"day", "night"}
