@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from record import record_parser
 from sections import run_sections, versions
 
+from twin.errors import InputError, print_error
 from twin.geometry.cameras import Cameras, Viewpoints, project
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity
@@ -123,6 +124,8 @@ def measure(root: Path) -> dict[str, float]:
                 f"  {name}: radius {pole.half[0]:.3f} m, seen in {shown}, solid at {share:.0%} of the heights",
                 flush=True,
             )
+    if not seen:
+        raise InputError(f"{root}: no pole of the place is in its films; choose another place")
     points = np.concatenate([to_truth.points(found.foot + np.array([0.0, 0.0, h])) for h in (0.3, 0.6)])
     away = standing.distance(points).reshape(2, -1).max(0) if len(found) else np.zeros(0)
     for foot, distance in zip(to_truth.points(found.foot), away, strict=True):
@@ -146,7 +149,10 @@ def main() -> int:
     about = {"scenes": [str(one) for one in options.scenes], "versions": versions("twin", "numpy")}
     targets = {f"{root.name}.{name}": wanted for root in options.scenes for name, wanted in TARGETS.items()}
     measures = [partial(measure, root) for root in options.scenes]
-    return run_sections(measures, targets, about, options.json, options.replace_record)
+    try:
+        return run_sections(measures, targets, about, options.json, options.replace_record)
+    except InputError as error:
+        return print_error(error)
 
 
 if __name__ == "__main__":
