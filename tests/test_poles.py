@@ -68,6 +68,13 @@ def test_a_post_and_a_bollard_are_found_where_they_stand(tmp_path):
         assert abs(found.height[k] - height) < 0.35 and abs(found.foot[k, 2]) < 1e-6
 
 
+def test_a_post_on_the_border_of_two_squares_is_found_once(tmp_path):
+    pixels = film(tmp_path, (POST,))
+    pixels.cameras.camera_to_world[:, 1, 3] += 20.0 - POST[1]  # the search is divided at multiples of 20 m
+    (foot,) = find_poles(pixels, LENS).foot
+    assert np.linalg.norm(foot[:2] - (POST[0], 20.0)) < 0.05
+
+
 def test_masked_pixels_show_no_pole(tmp_path):
     """Such as those of a bollard that left: it is masked in the lightings in which it stood."""
     pixels = film(tmp_path, (POST, BOLLARD))
