@@ -28,7 +28,7 @@ from twin.reality import recordings
 from twin.reality.campus_road import RoadLine
 from twin.reality.lighting import WEATHER
 from twin.reality.real_test import Setup
-from twin.reality.truth import Truth, align_rigid, matched_poses
+from twin.reality.truth import Truth, align_poses, matched_poses
 from twin.runtime import track
 
 STATIONS = (4.0, 10.0, 17.0, 24.0, 31.0, 37.0, 42.0, 48.0, 54.0)  # [m]; the lightings come from photos at the first one
@@ -101,7 +101,7 @@ def main() -> int:
     rays = unproject(pixel_grid(*SIZE), intrinsics)
     lengths = np.linalg.norm(rays, axis=-1).astype(np.float32)
     truth, true_poses = true_images(given.days)
-    to_truth = align_rigid(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras))
+    to_truth = align_poses(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras))
     poses = to_truth.inverse().poses(true_poses)
     views = Viewpoints.of(poses, intrinsics, SIZE)
     clear = [field.render(views, name) for name in given.days]

@@ -284,12 +284,12 @@ def trust(scene: Path) -> dict[str, Any]:
     from twin.loading import load_scene
     from twin.mjcf.world import arc_lengths
     from twin.reality.lighting import LIGHTINGS
-    from twin.reality.truth import Truth, align_rigid, matched_poses
+    from twin.reality.truth import Truth, align_poses, matched_poses
 
     opened = load_scene(scene)
     world, field, score = opened.world(), opened.field(), Trust(opened.cameras())
     truth, cameras = Truth.load(opened.scene.truth), opened.cameras()
-    to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
+    to_truth = align_poses(cameras.camera_to_world, matched_poses(truth, cameras))
     lighting = next(name for name in field.lightings if name in LIGHTINGS)
     true_world = TrueWorld(truth, lighting, world.intrinsics)
     rows = []

@@ -196,14 +196,14 @@ def _first_frame(bench: Bench, place: Path, views: Path) -> Figures:
 
 def depth(bench: Bench) -> Figures:
     """Error of rendered depth against the known truth up to 10 m, at the true camera poses."""
-    from twin.reality.truth import Truth, align_rigid, depth_errors, matched_poses
+    from twin.reality.truth import Truth, align_poses, depth_errors, matched_poses
 
     scene = SceneDir(bench.scene)
     if not (scene.truth / "truth.npz").exists():
         return {"depth.none": "the scene has no known truth"}
     truth = Truth.load(scene.truth)
     cameras = Cameras.load(scene.stage("metric"))
-    to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
+    to_truth = align_poses(cameras.camera_to_world, matched_poses(truth, cameras))
     found: Figures = {}
     for suffix, field in (("", load_baked(baked_path(bench))), ("_field", load_field(bench.scene))):
         errors = depth_errors(field, truth, to_truth, _NEAR)

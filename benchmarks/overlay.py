@@ -32,7 +32,7 @@ from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.reality import true_world as reality
 from twin.reality.filming import sensor_image
 from twin.reality.lighting import LIGHTINGS
-from twin.reality.truth import Truth, align_rigid, matched_poses
+from twin.reality.truth import Truth, align_poses, matched_poses
 
 SIZE = (160, 90)
 KINDS = ("cone", "box", "bollard", "car", "pedestrian", "cyclist", "husky")
@@ -141,7 +141,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
     world, field = scene.world(), scene.field()
     truth = Truth.load(scene.scene.truth)
     cameras: Cameras = scene.cameras()
-    to_truth: Similarity = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
+    to_truth: Similarity = align_poses(cameras.camera_to_world, matched_poses(truth, cameras))
     spec = mujoco.MjSpec.from_file(str(world.model_path))
     pool = tuple(ObstacleConfig(kind, kind) for kind in kinds)
     add_obstacles(spec, pool, world)

@@ -31,7 +31,7 @@ from twin.loading import load_scene
 from twin.nerf.baked import BakedField
 from twin.nerf.poles import Poles
 from twin.reality.place_objects import Solid
-from twin.reality.truth import Truth, align_rigid, load_parts, matched_poses, surface_of
+from twin.reality.truth import Truth, align_poses, load_parts, matched_poses, surface_of
 
 _LEAST_HEIGHT, _MAX_RADIUS = 0.7, 0.16  # [m]
 _BESIDE = 10.0  # [m]
@@ -104,7 +104,7 @@ def planes(vertices: NDArray, faces: NDArray) -> Planes:
 def measure(root: Path) -> dict[str, float]:
     scene = load_scene(root).scene
     truth, cameras = Truth.load(scene.truth), Cameras.load(scene.stage("metric"))
-    to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras), with_scale=True)
+    to_truth = align_poses(cameras.camera_to_world, matched_poses(truth, cameras), with_scale=True)
     field, found = BakedField.load(scene.stage("field")), Poles.load(scene.stage("field"))
     whole, standing = (
         surface_of([(one.part.vertices, one.part.faces) for one in truth.place.objects if one.kind not in without])

@@ -30,7 +30,7 @@ from twin.reality.place_sampling import draw
 from twin.reality.rasterizer import Rasterizer
 from twin.reality.road_task import true_route
 from twin.reality.sky import apply_haze
-from twin.reality.truth import Truth, align_rigid, matched_poses
+from twin.reality.truth import Truth, align_poses, matched_poses
 from twin.runtime import track
 
 _LIGHTINGS = ("sun", "overcast", "night")
@@ -70,7 +70,7 @@ def places_of_tasks(scene: Path) -> Iterator[tuple[str, float]]:
     twin = load_scene(scene)
     truth = Truth.load(twin.scene.truth)
     cameras = Cameras.load(twin.scene.stage("metric"))
-    to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
+    to_truth = align_poses(cameras.camera_to_world, matched_poses(truth, cameras))
     station, lateral = nearest_on_route(true_route(), to_truth.points(twin.world().route)[:, :2])
     yield "reality.route_off_max_m", float(np.abs(lateral).max())
     yield "reality.route_off_mean_m", float(np.abs(lateral).mean())

@@ -28,7 +28,7 @@ from twin.reality.lighting import Lighting, weather
 from twin.reality.real_camera import draw_camera, intrinsics_of
 from twin.reality.real_test import Setup
 from twin.reality.road_task import place_on_test_day
-from twin.reality.truth import Truth, align_rigid, matched_poses
+from twin.reality.truth import Truth, align_poses, matched_poses
 from twin.relight import PhotoFit, SunSource, fit_photo, shadow_casters, with_sun
 
 SIZE = (240, 135)  # [px]
@@ -113,7 +113,7 @@ def main() -> int:
     given = parser.parse_args()
     twin, setup = load_scene(given.scene), Setup(given.place, 0, given.camera)
     cameras = Cameras.load(twin.scene.stage("metric"))
-    from_truth = align_rigid(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras)).inverse()
+    from_truth = align_poses(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras)).inverse()
     field, baked, days = twin.radiance_field("cpu"), twin.field(), {}
     intrinsics, casters = intrinsics_of(draw_camera(setup.camera), SIZE), shadow_casters(twin.scene, baked)
     assert casters is not None

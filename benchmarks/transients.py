@@ -27,7 +27,7 @@ from twin.geometry.images import write_image
 from twin.nerf.baked import BakedField
 from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
-from twin.reality.truth import Truth, align_rigid, corridor, load_parts, matched_poses
+from twin.reality.truth import Truth, align_poses, corridor, load_parts, matched_poses
 from twin.scene import SceneDir
 
 _GHOST_HEIGHT = 0.10  # [m] above the true ground
@@ -67,7 +67,7 @@ def ghosts(scene: SceneDir) -> dict[str, float]:
     """Number of cells of the true corridor with ghosts, greatest height of these [m], number of convex parts in it."""
     truth = Truth.load(scene.truth)
     cameras = Cameras.load(scene.stage("metric"))
-    to_truth = align_rigid(cameras.camera_to_world, matched_poses(truth, cameras))
+    to_truth = align_poses(cameras.camera_to_world, matched_poses(truth, cameras))
     with np.load(scene.stage("mesh") / "visual.npz", allow_pickle=False) as data:
         vertices, faces = data["vertices"].astype(np.float64), data["faces"]
     points = to_truth.points(vertices[faces].mean(1))

@@ -47,6 +47,15 @@ class Rendering(NamedTuple):
     opacity: NDArray[np.float32]
 
 
+def waves(points: Array, count: int, amplitude: float) -> Array:
+    """Sum of waves of 0.3 to 3 m in random directions at points (..., 3); shape (...)."""
+    rng = np.random.default_rng(3)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction *= (2 * np.pi / np.geomspace(0.3, 3.0, count))[:, None]
+    return amplitude * np.sin(points @ direction.T + rng.uniform(0, 2 * np.pi, count)).sum(-1)
+
+
 @dataclass(frozen=True)
 class AnalyticField:
     """Has the interface of a RadianceField."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from analytic import AnalyticField, Box, Post
+from analytic import AnalyticField, Box, Post, waves
 
 from twin import runtime
 from twin.assets.solids import Corridor, pole_parts
@@ -26,12 +26,8 @@ def quiet():
 
 
 def pattern(points: np.ndarray) -> np.ndarray:
-    """Gray in [0, 1] of places (..., 3): waves of 0.3 to 3 m in 16 directions."""
-    rng = np.random.default_rng(3)
-    direction = rng.normal(size=(16, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    waves = direction * (2 * np.pi / np.geomspace(0.3, 3.0, 16))[:, None]
-    return 0.55 + 0.09 * np.sin(points @ waves.T + rng.uniform(0, 2 * np.pi, 16)).sum(-1)
+    """Gray in [0, 1] of places (..., 3)."""
+    return 0.55 + waves(points, 16, 0.09)
 
 
 def film(folder, things=(), n=12) -> TrainingPixels:

@@ -23,7 +23,7 @@ from twin.reality.truth import (
     HALF_WIDTH,
     TrueFilm,
     Truth,
-    align_rigid,
+    align_poses,
     camera_errors,
     compare,
     fingerprint,
@@ -316,7 +316,7 @@ def test_rigid_alignment_holds_on_a_straight_drive(truth):
     poses = truth.films["sun"].camera_to_world[:30]
     line = poses.copy()
     line[:, 1:3, 3] = 0.0
-    found = align_rigid(line, line)
+    found = align_poses(line, line)
     assert np.allclose(found.rotation, np.eye(3), atol=1e-9)
     assert np.linalg.matrix_rank(line[:, :3, 3] - line[:, :3, 3].mean(0), tol=1e-6) == 1
     assert umeyama(poses[:, :3, 3], poses[:, :3, 3]).scale == pytest.approx(1.0)

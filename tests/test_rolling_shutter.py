@@ -19,7 +19,7 @@ from twin.reality.__main__ import film as film_place
 from twin.reality.__main__ import main as reality
 from twin.reality.filming import FilmingPlan
 from twin.reality.place_sampling import draw
-from twin.reality.truth import align_rigid, matched_poses
+from twin.reality.truth import align_poses, matched_poses
 from twin.scene import SceneDir
 from twin.types import Array
 
@@ -217,7 +217,7 @@ def test_a_shaky_film_with_a_rolling_shutter_is_built(tmp_path: Path) -> None:
     assert 0.4 < metrics["rolling_shutter_deg"]["sun"] < 1.6 and metrics["stabilized"] == []
     cameras = Cameras.load(scene.stage("metric"))
     true = matched_poses(truth, cameras)
-    aligned = align_rigid(cameras.camera_to_world, true)
+    aligned = align_poses(cameras.camera_to_world, true)
     turn = Rotation.from_matrix(true[:, :3, :3]).inv() * Rotation.from_matrix(
         aligned.rotation @ cameras.camera_to_world[:, :3, :3]
     )

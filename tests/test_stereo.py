@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic import AnalyticField, Box
+from analytic import AnalyticField, Box, waves
 
 from twin import runtime
 from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, project, unproject
@@ -25,12 +25,8 @@ def quiet():
 
 
 def pattern(points: np.ndarray) -> np.ndarray:
-    """Gray in [0, 1] of places (..., 3): waves of 0.3 to 3 m in all directions."""
-    rng = np.random.default_rng(3)
-    direction = rng.normal(size=(40, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    waves = direction * (2 * np.pi / np.geomspace(0.3, 3.0, 40))[:, None]
-    return 0.5 + 0.06 * np.sin(points @ waves.T + rng.uniform(0, 2 * np.pi, 40)).sum(-1)
+    """Gray in [0, 1] of places (..., 3)."""
+    return 0.5 + waves(points, 40, 0.06)
 
 
 def poses(n: int, lateral: float = 0.0) -> np.ndarray:

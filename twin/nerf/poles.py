@@ -244,7 +244,7 @@ def pole_depths(pixels: TrainingPixels, poles: Poles) -> DepthSupervision:
                 np.stack([getattr(single[k], name)[0, 0] for k in mine]) for name in ("count", "contrast", "color")
             )
             judged = np.where(count > 0, 1.0, np.nan)
-            with np.errstate(all="ignore"), warnings.catch_warnings():
+            with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RuntimeWarning)  # a band that no picture shows has no median
                 typical, usual = np.nanmedian(color * judged[..., None], 0), np.nanmedian(contrast * judged, 0)
             same = np.abs(color - typical).max(-1) <= _MAX_CHANGE * usual
@@ -283,13 +283,11 @@ def _spaced_frames(pixels: TrainingPixels) -> NDArray[np.int64]:
 def _at_most(frames: NDArray[np.int64], lightings: tuple[str, ...]) -> NDArray[np.int64]:
     """At most `_MAX_PICTURES` of the frames per lighting, evenly spread."""
     names = np.array(lightings)[frames]
-    parts = [frames[names == name] for name in dict.fromkeys(names)]
-    return np.sort(
-        np.concatenate(
-            [np.zeros(0, np.int64)]
-            + [p[np.unique(np.linspace(0, len(p) - 1, min(len(p), _MAX_PICTURES)).astype(int))] for p in parts]
-        )
-    )
+    chosen = []
+    for name in dict.fromkeys(names):
+        mine = np.flatnonzero(names == name)
+        chosen += mine[np.linspace(0, len(mine) - 1, min(len(mine), _MAX_PICTURES)).astype(int)].tolist()
+    return frames[np.sort(np.array(chosen, np.int64))]
 
 
 def _spots(corner: Array, path: cKDTree, floor: Array) -> Array:

@@ -42,7 +42,7 @@ from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_test import Setup
 from twin.reality.road_task import RoadTask, read_task
 from twin.reality.side_roads import SideLine, turn_end
-from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, align_rigid, compare, matched_poses
+from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, align_poses, compare, matched_poses
 from twin.scene import SceneDir, require_stage
 
 TINY = FilmingPlan(
@@ -285,7 +285,7 @@ def scene_task(given: str, scene: Path | None, place: int, length: float = 0.0) 
         cure = f"give --length {truth.road_length:g}" if truth.road_length else "leave --length out"
         raise InputError(f"{scene} has a road of {truth.route.length:g} m, this place another; {cure}")
     cameras = Cameras.load(require_stage(root, "metric"))
-    return read_task(Path(given), align_rigid(cameras.camera_to_world, matched_poses(truth, cameras)))
+    return read_task(Path(given), align_poses(cameras.camera_to_world, matched_poses(truth, cameras)))
 
 
 main = partial(commands.main, "reality")

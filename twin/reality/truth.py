@@ -250,7 +250,7 @@ def measure(scene: SceneDir) -> dict[str, Any]:
     cameras = Cameras.load(scene.stage("metric"))
     true_poses = matched_poses(truth, cameras)
     figures: dict[str, Any] = dict(camera_errors(cameras.camera_to_world, true_poses))
-    to_truth = align_rigid(cameras.camera_to_world, true_poses)
+    to_truth = align_poses(cameras.camera_to_world, true_poses)
     mesh = scene.stage("mesh")
     figures |= _ground_errors(mesh, truth, to_truth)
     figures |= _surface_errors(mesh, truth, to_truth, true_poses)
@@ -277,10 +277,10 @@ def matched_poses(truth: Truth, cameras: Cameras) -> Array:
     return out
 
 
-def align_rigid(poses: Array, true_poses: Array, with_scale: bool = False) -> Similarity:
-    """The rigid transform that best maps camera poses onto the true ones, shapes (n, 4, 4).
+def align_poses(poses: Array, true_poses: Array, with_scale: bool = False) -> Similarity:
+    """The rigid transform, or similarity if `with_scale`, that best maps camera poses onto the true ones, (n, 4, 4).
 
-    `with_scale` also corrects the twin's scale. Each camera contributes its center and the tips of its axes, 1 m long,
+    Each camera contributes its center and the tips of its axes, 1 m long,
     because centers on a straight path do not determine the roll about it.
     """
 
@@ -295,7 +295,7 @@ def camera_errors(poses: Array, true_poses: Array) -> dict[str, float]:
     centers, true_centers = poses[:, :3, 3], true_poses[:, :3, 3]
     similarity = umeyama(centers, true_centers)
     off = np.linalg.norm(similarity.points(centers) - true_centers, axis=1)
-    rigid = align_rigid(poses, true_poses)
+    rigid = align_poses(poses, true_poses)
     rigid_off = np.linalg.norm(rigid.points(centers) - true_centers, axis=1)
     turned = np.swapaxes(true_poses[:, :3, :3], 1, 2) @ rigid.poses(poses)[:, :3, :3]
     return {
