@@ -16,6 +16,7 @@ from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, umeyama
 from twin.reality import campus_road, filming, primitives
 from twin.reality import truth as truth_module
+from twin.reality.__main__ import TINY, film
 from twin.reality.campus_road import RoadLine
 from twin.reality.lighting import LIGHTINGS
 from twin.reality.sky import sky_cube_map
@@ -302,6 +303,30 @@ def test_a_mesh_that_is_the_truth_is_complete_and_one_without_houses_is_not(trut
 def test_a_scene_without_truth_is_not_compared(tmp_path):
     with pytest.raises(InputError, match="has no truth"):
         compare(SceneDir(tmp_path))
+
+
+def test_filming_that_was_stopped_begins_anew(tmp_path):
+    """It must not take its own folder for another's, nor leave films beside an older film's truth."""
+    plan = replace(TINY, length=3.0, lightings=("sun",), samples=1)
+    out, gray = tmp_path / "place", np.full((plan.height, plan.width, 3), 0.5, np.float32)
+
+    def stopped(pose):
+        raise KeyboardInterrupt
+
+    def shot(pose):
+        return gray, np.full(gray.shape[:2], 5.0, np.float32)
+
+    for _ in range(2):  # stopped in an empty folder, then over a finished film
+        with pytest.raises(KeyboardInterrupt):
+            film(plan, out, renderer_of=lambda lighting, place: stopped)
+        with pytest.raises(InputError, match="has no truth"):
+            compare(SceneDir(out))
+        film(plan, out, renderer_of=lambda lighting, place: shot)
+        assert Truth.load(out / "truth").length == 3.0 and (out / "scene.toml").exists()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").touch()
+    with pytest.raises(InputError, match="has no truth/, so this command did not write it"):
+        film(plan, tmp_path / "other")
 
 
 def test_a_source_that_the_truth_does_not_have_is_refused(truth, tmp_path):

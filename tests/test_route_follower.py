@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from tiny_world import export, tiny_config, tiny_scene, tiny_world
 
+from twin.env import mujoco_renderer
 from twin.env.drivers import follow_route, pursuit_curvature
-from twin.env.mujoco_renderer import SceneCamera, blend_parts, chase_poses
+from twin.env.mujoco_renderer import NOTHING, ON_GROUND, CollisionCaster, SceneCamera, blend_parts, chase_poses
 from twin.env.physics import HuskyPhysics
-from twin.geometry.cameras import project
-from twin.geometry.poses import inverse_pose
+from twin.geometry.cameras import pixel_grid, project, unproject
+from twin.geometry.poses import inverse_pose, look_at
 from twin.mjcf.husky import add_husky, set_options
-from twin.mjcf.world import World
+from twin.mjcf.world import GROUND_GROUP, PART_GROUP, World
 from twin.report.video_writer import frame_indices
 from twin.robot import REAR_HEAVY, HuskyParams
 
@@ -159,6 +160,35 @@ def test_hidden_parts_are_not_blended():
     assert (out[:, :2] == 100).all() and (out[:, 4:] == 100).all()  # nothing there, or behind the wall
     assert (out[:, 3] > 100).all()
     assert (out[1:, 2] < out[1:, 3]).all()  # the outline is dark
+
+
+def test_parts_in_several_models_are_hit_as_in_one(world, monkeypatch):
+    """Each ray tells the nearest part's own number, wherever it is; numbers, depths and colors do not depend on it."""
+    model = world.model()
+    parts = np.flatnonzero(model.geom_group == PART_GROUP)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    middle = data.geom_xpos[parts].mean(0)
+    pose, intrinsics = look_at(middle + np.array([-6.0, 0.0, 2.0]), middle), np.array([60.0, 60.0, 40.0, 22.5])
+    one = CollisionCaster(world, (80, 45), intrinsics, ground=True)
+    monkeypatch.setattr(mujoco_renderer, "_PARTS_PER_MODEL", 1)
+    several = CollisionCaster(world, (80, 45), intrinsics, ground=True)
+    assert len(several._casters) == len(parts) == one.count > 1 and len(one._casters) == 1
+    for found, expected in zip(several.cast(pose), one.cast(pose), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    _, depth, hit = one.cast(pose)
+    assert set(np.unique(hit)) == {NOTHING, ON_GROUND, *range(len(parts))}
+    rays, geom = unproject(pixel_grid(80, 45), intrinsics) @ pose[:3, :3].T, np.zeros(1, np.int32)
+    groups = np.isin(np.arange(6), (GROUND_GROUP, PART_GROUP)).astype(np.uint8)
+    agree = []
+    for v, u in np.ndindex(hit.shape):
+        mujoco.mj_ray(model, data, pose[:3, 3], rays[v, u], groups, True, -1, geom)
+        known = {-1: NOTHING} | {part: number for number, part in enumerate(parts)}
+        agree.append(known.get(int(geom[0]), ON_GROUND) == hit[v, u])
+    assert np.mean(agree) > 0.99  # but for borders
+    assert ((depth > 0.0) == (hit != NOTHING)).all()
+    bare = CollisionCaster(world, (80, 45), intrinsics).cast(pose)[2]
+    assert ON_GROUND not in bare and (bare[hit >= 0] == hit[hit >= 0]).all()
 
 
 def test_chase_camera_is_behind_and_sees_the_robot(drive):

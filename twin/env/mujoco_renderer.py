@@ -1,7 +1,8 @@
 """Pictures of a MuJoCo scene by `mujoco_warp`'s ray caster on the CPU, without OpenGL.
 
 `SceneRenderer` renders the front camera's view with MuJoCo's own shading, as a baseline for radiance fields.
-`SceneCamera` renders from free poses, and draws the convex collision parts half transparent over the visual geometry.
+`CollisionCaster` casts rays at the convex collision parts. `SceneCamera` renders from free poses, and draws the parts
+half transparent over the visual geometry.
 The *chase camera* follows the robot from behind and above.
 """
 
@@ -24,7 +25,7 @@ from twin.geometry.cameras import FAR, Rendering, opencv_to_mujoco, pixel_grid, 
 from twin.geometry.poses import look_at
 from twin.mjcf.husky import ROBOT_COLLISION_GROUP
 from twin.mjcf.husky_visuals import camera_mount_geoms
-from twin.mjcf.world import GROUND_GROUP, World
+from twin.mjcf.world import GROUND_GROUP, PART_GROUP, World
 from twin.runtime import available_cores, log_line
 from twin.types import Array, Array32, Image
 from twin.warp_runtime import wp
@@ -110,6 +111,76 @@ def mujoco_rays(rays: Array) -> Array32:
     """Unit rays in MuJoCo's camera axes from OpenCV rays (..., 3), shape (n, 3)."""
     flipped = (rays * [1.0, -1.0, -1.0]).reshape(-1, 3)
     return (flipped / np.linalg.norm(flipped, axis=1, keepdims=True)).astype(np.float32)
+
+
+# ---- convex parts
+
+NOTHING, ON_GROUND = -1, -2
+"""What a ray hits that hits no part."""
+_PARTS_PER_MODEL = 2000
+
+
+class CollisionCaster:
+    """Casts rays at the convex parts of a scene and, if wanted, at its ground.
+
+    `mujoco_warp` lists all pairs of a model's geoms, which takes 9 GB for the 12,500 parts of a kilometer. So the parts
+    are spread over several models.
+    """
+
+    def __init__(self, world: World, size: tuple[int, int], intrinsics: Array, ground: bool = False) -> None:
+        """`size`: width, height [px] of a picture with the intrinsics fx, fy, cx, cy [px]."""
+        self.size = size
+        names = [geom.name for geom in world.spec(visuals=False).geoms if geom.group == PART_GROUP]
+        self.count = len(names)
+        numbers = {name: number for number, name in enumerate(names)}
+        rays = mujoco_rays(unproject(pixel_grid(*size), intrinsics))
+        self._casters, self._cameras, self._identities = [], [], []
+        for start in range(0, max(len(names), 1), _PARTS_PER_MODEL):
+            spec = world.spec(frozenset(names[start : start + _PARTS_PER_MODEL]).__contains__, visuals=False)
+            spec.worldbody.add_camera(name="free")
+            model = spec.compile()
+            data = mujoco.MjData(model)
+            mujoco.mj_forward(model, data)
+            caster = RayCaster(
+                model,
+                data,
+                cam_res=size,
+                cam_active=["free"],
+                render_seg=True,
+                use_textures=False,
+                enabled_geom_groups=[PART_GROUP, GROUND_GROUP] if ground else [PART_GROUP],
+            )
+            caster.set_rays(rays)
+            self._casters.append(caster)
+            self._cameras.append((data, model.camera("free").id))
+            hit = [numbers.get(model.geom(geom).name, ON_GROUND) for geom in range(model.ngeom)]
+            self._identities.append(np.array([*hit, NOTHING]))  # the index of no geom is −1
+        self.cast(np.eye(4))  # compiles the kernels, see `SceneCamera`
+
+    def cast(self, camera_to_world: Array) -> tuple[Array32, Array32, NDArray[np.int64]]:
+        """Casts the rays of a picture from an OpenCV camera pose.
+
+        Returns colors (height, width, 3) in [0, 255], z-depth (height, width) [m], 0 where nothing is hit, and the
+        number of the part that is hit (height, width), ON_GROUND or NOTHING.
+        """
+        pose = opencv_to_mujoco(camera_to_world)
+        found = [self._cast_one(number, pose) for number in range(len(self._casters))]
+        depths = np.stack([depth for _, depth, _ in found])
+        nearest = np.where(depths > 0.0, depths, np.inf).argmin(0)
+        width, height = self.size
+        rgb, depth, identity = (
+            np.take_along_axis(np.stack(one), nearest.reshape(1, -1, *[1] * (one[0].ndim - 1)), 0)[0]
+            for one in zip(*found, strict=True)
+        )
+        return rgb.reshape(height, width, 3), depth.reshape(height, width), identity.reshape(height, width)
+
+    def _cast_one(self, number: int, pose: Array) -> tuple[Array32, Array32, NDArray[np.int64]]:
+        data, camera = self._cameras[number]
+        data.cam_xpos[camera], data.cam_xmat[camera] = pose[:3, 3], pose[:3, :3].ravel()
+        caster = self._casters[number]
+        caster.set_poses(cam_xpos=data.cam_xpos, cam_xmat=data.cam_xmat)
+        rgb, depth = caster.cast()
+        return rgb, depth, self._identities[number][caster.hit_geoms()]
 
 
 # ---- the whole scene
@@ -214,7 +285,6 @@ class _SceneWorker:
 _FOVY = 50.0  # [°]
 _BEHIND, _ABOVE, _AHEAD = 3.0, 1.6, 2.0  # [m] camera position and look-at point relative to the robot
 _SMOOTHING = 0.15  # low-pass gain of the camera heading per control step (0.1 s)
-_PART_GROUPS = [3]
 _PART_ALPHA = 0.45
 _EDGE_RGB = (20, 20, 30)
 _OCCLUSION_TOLERANCE = 0.6  # [m] parts at most this far behind the visible surface are drawn, too
@@ -230,25 +300,22 @@ class SceneCamera:
         obstacles: Sequence[ObstacleConfig] = (),
     ) -> None:
         """`size`: width, height [px]. To show only some of `obstacles`, set the attribute `obstacles` to these."""
-        spec = mujoco.MjSpec.from_file(str(world.model_path))
+        spec = world.spec(keeps_part=lambda name: False)
         self.obstacles = tuple(obstacles)
         add_obstacles(spec, self.obstacles, world)
         spec.worldbody.add_camera(name="free", fovy=_FOVY)
         self.model = spec.compile()
+        """The scene without convex parts."""
         self.data = mujoco.MjData(self.model)
         self.size = size
         self._camera = self.model.camera("free").id
         mujoco.mj_forward(self.model, self.data)
-        view = {"cam_res": size, "cam_active": ["free"]}
-        self._casters = [RayCaster(self.model, self.data, **view, **_SCENE_SETTINGS)]
-        if np.isin(self.model.geom_group, _PART_GROUPS).any():
-            self._casters.append(
-                RayCaster(self.model, self.data, **view, enabled_geom_groups=_PART_GROUPS, render_seg=True)
-            )
+        self._caster = RayCaster(self.model, self.data, cam_res=size, cam_active=["free"], **_SCENE_SETTINGS)
         # Warp compiles kernels at their first launch; compiling in two threads at once corrupts them (observed:
         # pictures without ground). So each caster runs once here.
-        for caster in self._casters:
-            self._cast(caster)
+        self._cast()
+        parts = CollisionCaster(world, size, camera_intrinsics(self.model, self._camera, size))
+        self._parts = parts if parts.count else None
 
     def render(self, qpos: Array, camera_to_world: Array, time: float = 0.0) -> Image:
         """Picture of the scene at a time [s], with the robot at `qpos`, from an OpenCV camera pose; shape (h, w, 3)."""
@@ -259,27 +326,27 @@ class SceneCamera:
         pose = opencv_to_mujoco(camera_to_world)
         self.data.cam_xpos[self._camera] = pose[:3, 3]
         self.data.cam_xmat[self._camera] = pose[:3, :3].ravel()
-        if len(self._casters) == 1:
-            return self._cast(self._casters[0])[0]
+        if self._parts is None:
+            return self._cast()[0]
         # Warp's CPU kernels run on one thread each and release the GIL, so the two casts run in parallel.
-        with ThreadPoolExecutor(2) as pool:
-            (rgb, depth), (part_rgb, part_depth) = pool.map(self._cast, self._casters)
-        part = self._casters[1].hit_geoms().reshape(depth.shape)
-        return blend_parts(rgb, depth, part_rgb, part_depth, part)
+        with ThreadPoolExecutor(1) as pool:
+            parts = pool.submit(self._parts.cast, camera_to_world)
+            rgb, depth = self._cast()
+            return blend_parts(rgb, depth, *parts.result())
 
-    def _cast(self, caster: RayCaster) -> tuple[Image, Array32]:
+    def _cast(self) -> tuple[Image, Array32]:
         """Colors (height, width, 3) and z-depth (height, width) [m] at the present poses."""
-        caster.set_poses(**{name: getattr(self.data, name) for name in _POSES})
-        rgb, depth = caster.cast()
+        self._caster.set_poses(**{name: getattr(self.data, name) for name in _POSES})
+        rgb, depth = self._caster.cast()
         width, height = self.size
         return rgb.reshape(height, width, 3).astype(np.uint8), depth.reshape(height, width)
 
 
-def blend_parts(rgb: Image, depth: NDArray, part_rgb: Image, part_depth: NDArray, identity: NDArray) -> Image:
+def blend_parts(rgb: Image, depth: NDArray, part_rgb: NDArray, part_depth: NDArray, identity: NDArray) -> Image:
     """Draws the visible collision parts half transparent, with outlines, over a picture (h, w, 3).
 
     The z-depths `depth` and `part_depth` [m] have shape (h, w); `depth` is 0 where rays hit nothing. `identity` (h, w)
-    is the id of the nearest part, −1 where there is none.
+    is the number of the nearest part, negative where there is none.
     """
     visible = (identity >= 0) & ((depth <= 0) | (part_depth <= depth + _OCCLUSION_TOLERANCE))
     edge = np.zeros_like(visible)

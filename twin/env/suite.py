@@ -9,8 +9,6 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
 
 import dm_env
 import mujoco
@@ -122,8 +120,7 @@ class EnvFactory:
                 return GpuPixelObserver(self.field, self.trust, self.options, envs)
             compositor = Compositor(self.model, self.field, size, count, lit=(self.segment.start, self.segment.end))
             return PixelObserver(compositor, self.field, self.trust, self.options, envs)
-        half_width = self.options.half_width or self.world.half_width
-        spec = episode_spec(self.world, self.segment.start, self.segment.end, half_width, visuals=True)
+        spec = self.world.spec(keeps_part=lambda name: False)  # parts are not drawn
         add_obstacles(spec, self.obstacles.pool, self.world)
         splats = read_ply(Path(self.options.splats)) if self.options.splats else None
         renderer = SceneRenderer(spec.compile(), size, count, splats)
@@ -236,8 +233,8 @@ def load(
 _REACH = 1.5  # [m] reach beyond the corridor's edge; exceeds half the robot's length plus its motion in a control step
 
 
-def episode_spec(world: World, start: float, end: float, half_width: float, visuals: bool = False) -> mujoco.MjSpec:
-    """Returns the model of episodes between two arc lengths [m] of a scene's route.
+def episode_spec(world: World, start: float, end: float, half_width: float) -> mujoco.MjSpec:
+    """Returns the physics model of episodes between two arc lengths [m] of a scene's route.
 
     An episode ends when the robot leaves the corridor, so the robot never touches collision parts beyond its reach.
     The model lacks these parts. This changes no result, but saves a fifth of the physics' time and most of its memory.
@@ -247,30 +244,14 @@ def episode_spec(world: World, start: float, end: float, half_width: float, visu
         start: Arc length of the start [m].
         end: Arc length of the end [m].
         half_width: Half width of the corridor [m].
-        visuals: True keeps the visual mesh and textures, which only MuJoCo's renderer needs.
     """
-    tree = ElementTree.parse(world.model_path)
-    root, assets = tree.getroot(), world.folder / "assets"
     line = cKDTree(point_at(world.route[:, :2], np.arange(start, end + 0.1, 0.1)))
 
-    def wanted(geom: Element) -> bool:
-        if geom.get("contype") == "0":
-            return visuals
-        center, radius = _bounding_sphere(assets / f"{geom.get('mesh')}.obj")
+    def within_reach(part: str) -> bool:
+        center, radius = _bounding_sphere(world.folder / "assets" / f"{part}.obj")
         return line.query(center[:2])[0] - radius <= half_width + _REACH
 
-    # Parts are removed from the XML, since removing a single one from an MjSpec takes milliseconds.
-    worldbody, kept = root.find("worldbody"), root.find("asset")
-    assert worldbody is not None and kept is not None
-    left_out = {g.get("mesh"): g for g in worldbody.findall("geom") if g.get("type") == "mesh" and not wanted(g)}
-    # One pass over each list, since a long road has thousands of parts.
-    geoms = set(left_out.values())
-    worldbody[:] = [element for element in worldbody if element not in geoms]
-    kept[:] = [element for element in kept if not (element.tag == "mesh" and element.get("name") in left_out)]
-    if not visuals:
-        _strip_textures(root, kept)
-    spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-    spec.modelfiledir = str(world.folder.resolve())
+    spec = world.spec(within_reach, visuals=False)
     base = spec.body(world.names["body"])
     payload = base.add_body(name=PAYLOAD, pos=world.robot.payload_position)
     payload.explicitinertial = True
@@ -285,13 +266,3 @@ def _bounding_sphere(path: Path) -> tuple[Array, float]:
     vertices = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], float)
     center = (vertices.min(0) + vertices.max(0)) / 2
     return center, float(np.linalg.norm(vertices - center, axis=1).max())
-
-
-def _strip_textures(root: Element, assets: Element) -> None:
-    textured = {m.get("name") for m in assets.findall("material") if m.get("texture") or m.find("layer") is not None}
-    for geom in root.iter("geom"):
-        if geom.get("material") in textured:
-            del geom.attrib["material"]
-    for asset in list(assets):
-        if asset.tag == "texture" or (asset.tag == "material" and asset.get("name") in textured):
-            assets.remove(asset)

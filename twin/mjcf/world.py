@@ -5,8 +5,11 @@ plane, 0 at its start. *Cross-track error*: distance from the route in the plane
 from the x axis, positive towards y. *Corridor*: the area within `half_width` of the route.
 """
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import mujoco
 import numpy as np
@@ -67,6 +70,33 @@ class World:
     def model(self) -> mujoco.MjModel:
         return mujoco.MjModel.from_xml_path(str(self.model_path))
 
+    def spec(self, keeps_part: Callable[[str], bool] = lambda name: True, visuals: bool = True) -> mujoco.MjSpec:
+        """The model for editing, without the convex parts for whose names `keeps_part` is False.
+
+        Without `visuals`, it has no visual mesh and no textures, which physics does not need.
+        """
+        tree = ElementTree.parse(self.model_path)
+        root = tree.getroot()
+        worldbody, assets = root.find("worldbody"), root.find("asset")
+        assert worldbody is not None and assets is not None
+
+        def kept(geom: Element) -> bool:
+            if geom.get("type") != "mesh":
+                return True
+            return visuals if geom.get("contype") == "0" else keeps_part(geom.get("mesh", ""))
+
+        # Geoms are removed from the XML, since removing a single one from an MjSpec takes milliseconds; and in one pass
+        # over each list, since a long road has thousands of parts.
+        left_out = [geom for geom in worldbody.findall("geom") if not kept(geom)]
+        geoms, meshes = set(left_out), {geom.get("mesh") for geom in left_out}
+        worldbody[:] = [element for element in worldbody if element not in geoms]
+        assets[:] = [element for element in assets if not (element.tag == "mesh" and element.get("name") in meshes)]
+        if not visuals:
+            _strip_textures(root, assets)
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        spec.modelfiledir = str(self.folder.resolve())
+        return spec
+
     def save(self) -> None:
         """Writes `world.json` into the folder."""
         write_json(
@@ -121,6 +151,16 @@ class World:
             if missing:
                 raise ValueError(f"names of {', '.join(sorted(missing))} missing")
         return world
+
+
+def _strip_textures(root: Element, assets: Element) -> None:
+    textured = {m.get("name") for m in assets.findall("material") if m.get("texture") or m.find("layer") is not None}
+    for geom in root.iter("geom"):
+        if geom.get("material") in textured:
+            del geom.attrib["material"]
+    for asset in list(assets):
+        if asset.tag == "texture" or (asset.tag == "material" and asset.get("name") in textured):
+            assets.remove(asset)
 
 
 def arc_lengths(route: Array) -> Array:

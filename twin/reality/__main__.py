@@ -89,6 +89,9 @@ def film(
     spec = draw(number, length, side_roads) if number else None
     sides = _filmed_sides(spec, plan) if spec and side_roads else []
     (out / "input").mkdir(parents=True, exist_ok=True)
+    # The folder exists from the start, so that filming that was stopped can begin anew; an older film's truth does not.
+    (out / "truth").mkdir(exist_ok=True)
+    (out / "truth" / "truth.npz").unlink(missing_ok=True)
     place = build_number(number, length=length, side_roads=side_roads) if number else campus_road.build()
     assert isinstance(place.route, RoadLine | DrawnRoad)
     lines: list[tuple[FilmingPlan, DrivenLine]] = [(plan, place.route)]

@@ -18,7 +18,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -31,13 +30,12 @@ from twin.geometry.cameras import (
     Cameras,
     RenderableField,
     Viewpoints,
-    opencv_to_mujoco,
     pixel_grid,
     project,
     unproject,
 )
 from twin.mjcf.scene_xml import Parts
-from twin.mjcf.world import CAMERA_SIZE, GROUND_GROUP, PART_GROUP, World, arc_lengths, point_at
+from twin.mjcf.world import CAMERA_SIZE, World, arc_lengths, point_at
 from twin.report.html import Section, Verdict, as_number, cautions_above, facts_of, pick
 from twin.report.video_layout import (
     PANEL_BACKGROUND,
@@ -86,30 +84,14 @@ class GeometryViews:
 
 def render_views(field: RenderableField, world: World, camera_to_world: Array, lighting: str) -> GeometryViews:
     """Renders the field and casts rays at the collision geometry from camera poses (n, 4, 4)."""
-    from twin.env.mujoco_renderer import RayCaster  # slow to import
+    from twin.env.mujoco_renderer import ON_GROUND, CollisionCaster  # slow to import
 
-    model = world.model()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    camera, ground = model.camera(world.names["camera"]).id, model.geom(world.names["ground"]).id
-    caster = RayCaster(
-        model,
-        data,
-        cam_res=CAMERA_SIZE,
-        cam_active=[world.names["camera"]],
-        render_seg=True,
-        use_textures=False,
-        enabled_geom_groups=[GROUND_GROUP, PART_GROUP],
-    )
-    shape = CAMERA_SIZE[::-1]
+    caster = CollisionCaster(world, CAMERA_SIZE, world.intrinsics, ground=True)
     visual_depth, collision_depth, is_ground, rgb = [], [], [], []
     for pose in track(list(camera_to_world), "visual vs collision", unit="view"):
-        flipped = opencv_to_mujoco(pose)
-        data.cam_xpos[camera], data.cam_xmat[camera] = flipped[:3, 3], flipped[:3, :3].ravel()
-        caster.set_poses(cam_xpos=data.cam_xpos, cam_xmat=data.cam_xmat)
-        depth = caster.cast()[1].reshape(shape).astype(np.float64)
-        collision_depth.append(np.where(depth > 0.0, depth, FAR))
-        is_ground.append(caster.hit_geoms().reshape(shape) == ground)
+        _, depth, hit = caster.cast(pose)
+        collision_depth.append(np.where(depth > 0.0, depth, FAR).astype(np.float64))
+        is_ground.append(hit == ON_GROUND)
         out = field.render(Viewpoints.of(pose, world.intrinsics, CAMERA_SIZE), lighting, CAMERA_SIZE)
         visual_depth.append(np.where(out.opacity[0] >= _MIN_OPACITY, out.depth[0], FAR).astype(np.float64))
         rgb.append(out.rgb[0])

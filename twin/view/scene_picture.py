@@ -79,10 +79,9 @@ class ScenePicture:
 
     def add_objects(self, world: World, obstacles: tuple[ObstacleConfig, ...]) -> None:
         """Adds the robot of a world, and obstacles, to the pictures; an `ObjectState` lists obstacles in this order."""
-        from twin.env.obstacles import add_obstacles  # slow to import, as the next, which needs dm_control
-        from twin.env.suite import episode_spec
+        from twin.env.obstacles import add_obstacles  # slow to import
 
-        spec = episode_spec(world, 0.0, 0.0, 0.0)  # convex parts are not drawn
+        spec = world.spec(keeps_part=lambda name: False, visuals=False)  # convex parts are not drawn
         add_obstacles(spec, obstacles, world)
         spec.worldbody.add_camera(name=_CAMERA)
         model = spec.compile()
