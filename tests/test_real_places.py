@@ -64,13 +64,13 @@ def test_kitti_straight_with_its_calibration_held(place, real_data):
 def test_paper_road_two_lightings_agree(place):
     text = (
         '[[source]]\npath = "input/cloudy2sunny.mp4"\n[[source]]\npath = "input/day2night.mp4"\n'
-        "[capture]\nframes = 80\nmin_motion = 0.0\nmax_size = 640\n"
+        "[capture]\nframes = 50\nmin_motion = 0.0\nmax_size = 640\n"
         "[cameras]\nfeatures = 2000\n[metric]\ncamera_height = 1.8\n"
     )
     root = place(text, "driveenv_paper_road/cloudy2sunny.mp4", "driveenv_paper_road/day2night.mp4")
     report = verb.build(root, until="metric")
-    assert report["cameras"]["total"] == 160 and report["cameras"]["registered"] >= 150
-    assert report["cameras"]["checked_steps"] >= 148 and report["cameras"]["contradicted_steps"] == []
+    assert report["cameras"]["total"] == 100 and report["cameras"]["registered"] >= 94
+    assert report["cameras"]["checked_steps"] >= 92 and report["cameras"]["contradicted_steps"] == []
     cameras = Cameras.load(root / "build/2_metric")
     frame = {name: i for i, name in enumerate(cameras.names)}
     pairs = [
