@@ -1,6 +1,5 @@
 """Environments: interfaces of dm_env, Gymnasium and stable-baselines3, rewards, starts and rendering."""
 
-import gc
 import json
 import re
 import subprocess
@@ -9,7 +8,6 @@ import warnings
 
 import gymnasium
 import numpy as np
-import psutil
 import pytest
 from dm_env import StepType
 from gymnasium.utils.env_checker import check_env
@@ -355,25 +353,6 @@ def test_unknown_tasks_and_options_are_refused(scene):
     for options in ({"action": "jump"}, {"stack": 0}, {"control_timestep": 0.5}, {"rewards": {"fame": 1.0}}):
         with pytest.raises(InputError):
             twin.load(scene, "bend", **options)
-
-
-@pytest.mark.slow
-def test_twenty_thousand_steps_leak_no_memory_and_give_no_nan(scene):
-    """`benchmarks/env.py --only soak` runs five times as many steps, with pictures."""
-    envs = LocalVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "randomise": True, "obstacles": 2}), [0, 1])
-    rng = np.random.default_rng(0)
-    envs.begin([0, 1])
-    process, sizes = psutil.Process(), []
-    for k in range(10_000):
-        out = envs.step(rng.uniform(-1, 1, (2, 2)))
-        assert np.isfinite(out.reward).all() and np.isfinite(envs.observation()).all()
-        if out.over.any():
-            envs.begin(np.flatnonzero(out.over).tolist())
-        if k % 2_000 == 1_999:
-            gc.collect()
-            sizes.append(process.memory_info().rss)
-    assert sizes[-1] < sizes[0] + 8 * 2**20
-    envs.close()
 
 
 def test_the_sampled_lighting_is_named(scene):

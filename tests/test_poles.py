@@ -1,5 +1,7 @@
 """Poles: thin upright things are found in the films, supervise the field, and become solid."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from analytic import AnalyticField, Box, Post, waves
@@ -7,8 +9,9 @@ from analytic import AnalyticField, Box, Post, waves
 from twin import runtime
 from twin.assets.solids import Corridor, pole_parts
 from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, project, unproject
-from twin.geometry.images import write_image
+from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
+from twin.nerf import poles as poles_module
 from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths
 from twin.nerf.poles import Poles, find_poles, pole_depths
 
@@ -30,12 +33,18 @@ def pattern(points: np.ndarray) -> np.ndarray:
     return 0.55 + waves(points, 16, 0.09)
 
 
-def film(folder, things=(), n=12) -> TrainingPixels:
-    """A drive along x toward a wall, past dark posts."""
-    field = AnalyticField(WALLS, tuple(Post(*one) for one in things), amplitude=0.0)
+def film(folder, things=(), n=12, width=WIDTH, moved=lambda i: 0.0) -> TrainingPixels:
+    """A drive along x toward a wall, past dark posts; `moved` shifts all of them to the left in frame i [m]."""
     eyes = np.stack([np.linspace(0.0, 5.5, n), np.zeros(n), np.full(n, LENS)], 1)
     pose = np.stack([look_at(eye, eye + np.array([5.0, 0.0, -0.5])) for eye in eyes])
-    depth = field.render(Viewpoints.of(pose, K, (WIDTH, HEIGHT)), "day").depth
+    depth = np.stack(
+        [
+            AnalyticField(WALLS, tuple(Post(x, y + moved(i), *size) for x, y, *size in things), amplitude=0.0)
+            .render(Viewpoints.of(pose[i], K, (WIDTH, HEIGHT)), "day")
+            .depth[0]
+            for i in range(n)
+        ]
+    )
     names = tuple(f"day/{i:06d}" for i in range(n))
     (folder / "day").mkdir(parents=True, exist_ok=True)
     for i, name in enumerate(names):
@@ -43,14 +52,19 @@ def film(folder, things=(), n=12) -> TrainingPixels:
         places = (rays * depth[i][..., None]) @ pose[i, :3, :3].T + pose[i, :3, 3]
         gray = pattern(places)
         for x, y, radius, height in things:
-            away = np.linalg.norm(places[..., :2] - (x, y), axis=-1)
+            away = np.linalg.norm(places[..., :2] - (x, y + moved(i)), axis=-1)
             gray[(away < radius + 0.01) & (places[..., 2] > 0.02) & (places[..., 2] < height + 0.01)] = 0.1
         write_image(folder / f"{name}.png", np.repeat((np.clip(gray, 0, 1) * 255).astype(np.uint8)[..., None], 3, -1))
     cameras = Cameras(
         *(names, pose, np.tile(K, (n, 1)), np.tile([WIDTH, HEIGHT], (n, 1)), ("day",) * n, ("day",) * n),
         *(np.arange(n) / 2.0, np.zeros(n, bool), folder),
     )
-    return TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
+    return TrainingPixels(cameras, SparsePoints.empty(), width)
+
+
+def recolor(pixels: TrainingPixels, i: int, change) -> None:
+    path = pixels.cameras.image_path(i)
+    write_image(path, change(read_image(path)))
 
 
 def test_a_post_and_a_bollard_are_found_where_they_stand(tmp_path):
@@ -69,6 +83,32 @@ def test_a_post_on_the_border_of_two_squares_is_found_once(tmp_path):
     pixels.cameras.camera_to_world[:, 1, 3] += 20.0 - POST[1]  # the search is divided at multiples of 20 m
     (foot,) = find_poles(pixels, LENS).foot
     assert np.linalg.norm(foot[:2] - (POST[0], 20.0)) < 0.05
+
+
+def test_pictures_finer_than_those_of_training_are_searched(tmp_path):
+    """A post 9 px wide is 2 px wide in these."""
+    (foot,) = find_poles(film(tmp_path, (POST,), width=WIDTH // 4), LENS).foot
+    assert np.linalg.norm(foot[:2] - POST[:2]) < 0.05
+
+
+def test_a_post_may_be_brighter_in_another_film(tmp_path):
+    """As if from the other side; a bar's color need be the same within a film only."""
+    pixels = film(tmp_path, (POST,))
+    second = np.arange(12) % 2 == 1
+    sources = tuple(np.where(second, "back", "there"))
+    for i in np.flatnonzero(second):
+        recolor(pixels, i, lambda colors: np.where(colors < 40, 250, colors))
+    assert len(find_poles(pixels, LENS)) == 0
+    pixels.cameras = replace(pixels.cameras, sources=sources)
+    (foot,) = find_poles(pixels, LENS).foot
+    assert np.linalg.norm(foot[:2] - POST[:2]) < 0.05
+
+
+def test_a_bar_that_is_not_at_one_place_is_no_pole(tmp_path, monkeypatch):
+    pixels = film(tmp_path, (POST,), moved=lambda i: 0.03 * (-1) ** i)
+    assert len(find_poles(pixels, LENS)) == 0
+    monkeypatch.setattr(poles_module, "_agree", lambda *_: True)
+    assert len(find_poles(pixels, LENS)) == 1  # its contrast and color are those of a pole
 
 
 def test_masked_pixels_show_no_pole(tmp_path):
@@ -113,10 +153,10 @@ def test_supervised_depths_are_those_of_the_front(tmp_path):
     assert (gray < 80).mean() > 0.95  # they lie on the pole in the pictures
     hidden = [1, 2, 3]  # frames in which a light wall stands before it
     for i in hidden:
-        pixels.colors[pixels.start[i] : pixels.start[i + 1]] //= 2
-        pixels.colors[pixels.start[i] : pixels.start[i + 1]] += 120
+        recolor(pixels, i, lambda colors: colors // 2 + 120)
     assert not np.isin(pole_depths(pixels, poles).frame, hidden).any()
-    pixels.colors[:] = 128
+    for i in range(len(pixels.cameras)):
+        recolor(pixels, i, lambda colors: np.full_like(colors, 128))
     assert len(pole_depths(pixels, poles).frame) == 0  # no picture shows it
 
 

@@ -111,7 +111,8 @@ def test_the_fox_capture_has_no_route(place):
     text = (
         '[[source]]\npath = "input/transforms_orig_1080x1920.json"\nimages = "input/images"\nlighting = "indoor"\n'
         '[metric]\nposes_are_metric = true\nup = "cameras"\n[mjcf]\nroute = false\n'
-        "[nerf]\nsteps = 400\nmax_width = 240\n[review]\nfps = 5\nwidth = 240\n"
+        "[nerf]\nsteps = 250\nrays = 2048\nmax_width = 240\nbake_steps = 100\nmax_bricks = 2000\n"
+        "[mesh]\nviews = 40\n[review]\nfps = 5\nwidth = 240\n"
     )
     root = place(text, "fox/transforms_orig_1080x1920.json", "fox/images")
     report = verb.build(root)

@@ -3,15 +3,17 @@
 Stereo and the density grid are too coarse for a pole of 6 cm, so a field loses it, or shows it at the depth of what is
 behind it. But its shape is known: a *spot* on the ground, a radius and a height. A spot, a radius and a *band* of
 heights project to an upright bar in every picture of a level camera. The films show a pole there if the bar differs
-from what is left and right of it in each picture, and has the same color in all pictures of one lighting; where nothing
-stands, the bar shows the changing background.
+from what is left and right of it in each picture, and has the same color in all pictures of one film; where nothing
+stands, the bar shows the changing background. From the other side, as in a film that comes back, a pole may be darker.
 
 The *quality* of a bar is contrast / (contrast + deviation + noise), with means over pictures. The *evidence* for a pole
 is the sum over its bands, from the ground up, of quality − `_CHANCE`; the pole ends where the sum is largest. The spots
 with the most evidence come first. A spot is then judged without the pictures in which a pole that was already found
-covers it: beside a pole, bars show this pole, from a part of the cameras.
+covers it: beside a pole, bars show this pole, from a part of the cameras. Lastly, all pictures must agree on the pole's
+place: its bar, moved by up to two pixels in each picture to where its contrast is greatest, must stand on one spot.
 """
 
+import math
 import warnings
 from dataclasses import dataclass
 from itertools import product
@@ -20,11 +22,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import interp1d
+from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from twin.files import load_arrays, save_arrays
 from twin.nerf.buffers import parallel
-from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths
+from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths, load_frame
 from twin.nerf.kernels import upright as kernels
 from twin.runtime import track
 from twin.types import Array
@@ -36,7 +40,8 @@ _BESIDE = 1.2, 10.0  # [m] least and greatest distance of a spot from the path o
 _DEPTHS = 1.2, 13.0  # [m] depths at which pictures are used
 _FRAME_SPACING = 0.4  # [m] pictures of a film that are closer to each other add nothing
 _TILE = 20.0  # [m] side of the squares that are searched one after the other
-_MAX_PICTURES = 60  # pictures of a lighting around a square, which bounds memory
+_MAX_PICTURES = 60  # pictures of a film around a square, which bounds memory, as does their width
+_MAX_WIDTH = 640  # [px]; pictures of training are too coarse
 
 _RADII = (0.02, 0.028, 0.037, 0.048, 0.062, 0.08, 0.1, 0.125, 0.16, 0.2, 0.25)  # [m]
 _THIN = 8  # number of radii, the first ones, that a pole may have; the others compete with them
@@ -55,7 +60,7 @@ _LAST_ROUNDS = 4  # such steps follow each other until the spot remains
 
 _NOISE = 3.0  # [gray levels]
 _SPREAD = 1.5  # weight of the color's standard deviation over pictures
-_MIN_PICTURES = 4  # of a lighting; and `_MIN_ALL` together
+_MIN_PICTURES = 4  # of a film; and `_MIN_ALL` together
 _MIN_ALL = 5
 _CHANCE = 0.42  # quality that bars reach where nothing stands
 _MIN_EVIDENCE = 0.6
@@ -63,6 +68,12 @@ _MIN_QUALITY = 0.57  # mean over a pole's bands
 _MIN_SPREAD = 8.0  # [°] between the bearings from which pictures show a pole
 _MAX_RATIO = 0.9  # evidence for twice the radius / evidence for the radius: a thicker thing has a larger one
 _APART = 0.5  # [m] between two poles
+
+_OFFSET_WINDOW, _OFFSET_STEP = (1.0, 2.5), 0.25  # [px] search for a bar's place in a picture
+_OFFSET_SCALE = 0.01  # [m] of offsets; larger ones are outliers
+_OFFSET_CONTRAST = 40.0  # [gray levels] from which all pictures weigh the same
+_MAX_OFFSET = 0.009  # [m] largest median offset of a pole
+_AGREES, _MIN_AGREEING = 0.02, 0.83  # [m] offsets of at least this fraction of the pictures are smaller
 
 _POINT_SPACING = 0.04  # [m] between the points of a pole that get depth supervision
 _MIN_CONTRAST = 6.0  # [gray levels] in the picture
@@ -107,7 +118,7 @@ class Poles:
 
 @dataclass(frozen=True)
 class _Bars:
-    """Sums over the pictures of one lighting, see `kernels.add_bars`, each of shape (spots, radii, bands)."""
+    """Sums over the pictures of one film, see `kernels.add_bars`, each of shape (spots, radii, bands)."""
 
     count: Array
     contrast: Array
@@ -119,33 +130,33 @@ class _LevelPictures:
     """Pictures of some frames as level cameras would have taken them, as summed-area tables."""
 
     def __init__(self, pixels: TrainingPixels, frames: NDArray[np.int64]) -> None:
-        self.frames, self._intrinsics = frames, pixels.intrinsics
-        self.lightings = np.array(pixels.cameras.lightings)[frames]
+        self.frames = frames
+        self.films = np.array(pixels.cameras.sources)[frames]
         self.positions = pixels.cameras.positions[frames]
         self._turns = [_level(pixels.cameras.camera_to_world[i]) for i in frames]
-        self._tables = [self._table(pixels, i, turn) for i, turn in zip(frames, self._turns, strict=True)]
+        read = [self._read(pixels, i, turn) for i, turn in zip(frames, self._turns, strict=True)]
+        self._intrinsics, self._tables = [one[0] for one in read], [one[1] for one in read]
 
     @staticmethod
-    def _table(pixels: TrainingPixels, i: int, turn: Array) -> list[wp.array]:
-        """Tables of the colors, and of the pixels that are masked or outside the original picture."""
-        width, height = int(pixels.width[i]), int(pixels.height[i])
-        fx, fy, cx, cy = pixels.intrinsics[i]
+    def _read(pixels: TrainingPixels, i: int, turn: Array) -> tuple[Array, list[wp.array]]:
+        """Intrinsics fx, fy, cx, cy [px], and tables of the colors and of the pixels that are masked or outside."""
+        picture, _, intrinsics = load_frame(pixels.cameras, i, _MAX_WIDTH)
+        height, width = picture.shape[:2]
+        masked = ~pixels.unmasked[pixels.start[i] : pixels.start[i + 1]].reshape(pixels.height[i], pixels.width[i])
+        mask = cv2.resize(masked.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        fx, fy, cx, cy = intrinsics
         matrix = np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
         rotation = turn.T @ pixels.cameras.camera_to_world[i, :3, :3]
         homography = matrix @ rotation @ np.linalg.inv(matrix)
-        picture, mask = (
-            values[pixels.start[i] : pixels.start[i + 1]].reshape(height, width, -1)
-            for values in (pixels.colors, (~pixels.unmasked).astype(np.uint8))
-        )
         level = cv2.warpPerspective(picture, homography, (width, height))
         hidden = cv2.warpPerspective(mask, homography, (width, height), flags=cv2.INTER_NEAREST, borderValue=1)
-        return [wp.array(cv2.integral(values), dtype=wp.int32, device="cpu") for values in (level, hidden)]
+        return intrinsics, [wp.array(cv2.integral(one), dtype=wp.int32, device="cpu") for one in (level, hidden)]
 
     def seen(self, k: int, feet: Array) -> tuple[NDArray[np.int64], Array]:
         """Indices of the spots (n, 3) before picture k, and their positions in its camera: right, up and ahead [m]."""
         local = (feet - self.positions[k]) @ self._turns[k] * (1.0, -1.0, 1.0)
         low, high = _DEPTHS
-        fx, _, cx, _ = self._intrinsics[self.frames[k]]
+        fx, _, cx, _ = self._intrinsics[k]
         ahead = (local[:, 2] > low) & (local[:, 2] < high) & (np.abs(local[:, 0]) * fx < local[:, 2] * cx)
         index = np.flatnonzero(ahead)
         return index, local[index]
@@ -170,12 +181,12 @@ class _LevelPictures:
         found: "Poles | None" = None,
         only: int | None = None,
     ) -> list[_Bars]:
-        """Sums per lighting over all pictures, or of picture `only`, in which no pole `found` covers the spot."""
+        """Sums per film over all pictures, or of picture `only`, in which no pole `found` covers the spot."""
         shape = len(feet), len(radii), len(bands)
         halves = np.array_split(np.arange(len(feet)), 2)
         out = []
-        for lighting in dict.fromkeys(self.lightings if only is None else self.lightings[[only]]):
-            chosen = np.flatnonzero(self.lightings == lighting) if only is None else np.array([only])
+        for film in dict.fromkeys(self.films if only is None else self.films[[only]]):
+            chosen = np.flatnonzero(self.films == film) if only is None else np.array([only])
             sums = [wp.zeros(shape, dtype=kind, device="cpu") for kind in (wp.float32, wp.float32, wp.vec3, wp.vec3)]
             given: list[wp.array] = [
                 wp.array(np.array(radii, np.float32), dtype=wp.float32, device="cpu"),
@@ -192,13 +203,46 @@ class _LevelPictures:
                         continue
                     spots: wp.array = wp.array(local.astype(np.float32), dtype=wp.vec3, device="cpu")
                     rows: wp.array = wp.array(halves[half][index].astype(np.int32), dtype=wp.int32, device="cpu")
-                    lens = wp.vec4(*map(float, self._intrinsics[self.frames[k]]))
+                    lens = wp.vec4(*map(float, self._intrinsics[k]))
                     inputs = [*self._tables[k], lens, spots, rows, *given]
                     wp.launch(kernels.add_bars, len(index), inputs, sums, device="cpu")
 
             parallel(add, range(2), "cpu")
             out.append(_Bars(*(values.numpy() for values in sums)))
         return out
+
+    def offsets(self, foot: Array, radius: float, bands: tuple[tuple[float, float], ...], found: "Poles") -> Array:
+        """How far to the right of a spot (3,) the pictures show the bar's greatest contrast.
+
+        Returns a row for each picture in which no pole `found` covers the spot: its axis to the right (x, y), the
+        offset [m], and the contrast [gray levels]; shape (n, 4).
+        """
+        out = []
+        for k, (sums, _) in enumerate(self._tables):
+            index, local = self.seen(k, foot[None])
+            if not len(index) or (len(found) and self._covered(k, local, radius, found)[0]):
+                continue
+            (x, y, z), table, (fx, fy, cx, cy) = local[0], sums.numpy(), self._intrinsics[k]
+            half = radius * fx / z
+            middle, side = fx * x / z + cx, max(1.0, 0.5 * half)
+            most = int(np.clip(0.6 * half, *_OFFSET_WINDOW) / _OFFSET_STEP)
+            steps = _OFFSET_STEP * np.arange(-most, most + 1)
+            bottom, top = np.rint(cy - fy * (y + np.array(bands).T) / z).astype(int)
+            corners = middle + np.array([-half - side, -half, half, half + side])[:, None] + steps
+            first, last = math.floor(corners.min()), math.floor(corners.max()) + 1
+            shown = (top >= 0) & (bottom < len(table)) & (bottom - top >= kernels.LEAST_ROWS)
+            if half < kernels.LEAST_HALF_WIDTH or first < 0 or last >= table.shape[1] or not shown.any():
+                continue
+            columns = np.subtract(*table[np.stack([bottom, top])[:, shown], first : last + 1].astype(float))
+            means = columns / (bottom - top)[shown, None, None]  # sums over the columns left of a corner
+            at = interp1d(np.arange(first, last + 1), means, axis=1)(corners)
+            left, inside, right = (
+                (at[:, i + 1] - at[:, i]) / width for i, width in enumerate((side, 2.0 * half, side))
+            )
+            contrast = np.minimum(*(np.abs(inside - beside).max(-1) for beside in (left, right))).mean(0)
+            best = int(contrast.argmax())
+            out.append((*self._turns[k][:2, 0], steps[best] * z / fx, contrast[best]))
+        return np.array(out).reshape(-1, 4)
 
     def _covered(self, k: int, local: Array, radius: float, found: "Poles") -> NDArray[np.bool_]:
         """True for the spots whose bars touch a found pole in picture k."""
@@ -223,7 +267,7 @@ def find_poles(pixels: TrainingPixels, camera_height: float) -> Poles:
     for corner in track(tiles * _TILE, "poles", unit="square"):
         spots = _spots(corner, path, positions[:, 2] - camera_height)
         beyond = np.maximum(np.abs(positions[kept, :2] - corner - 0.5 * _TILE) - 0.5 * _TILE, 0.0)
-        frames = _at_most(kept[np.linalg.norm(beyond, axis=1) < _DEPTHS[1]], pixels.cameras.lightings)
+        frames = _at_most(kept[np.linalg.norm(beyond, axis=1) < _DEPTHS[1]], pixels.cameras.sources)
         if len(spots) and len(frames) >= _MIN_ALL:
             more, sums = _search(_LevelPictures(pixels, frames), spots, poles)
             poles, evidence = Poles.join([poles, more]), np.append(evidence, sums)
@@ -238,8 +282,8 @@ def pole_depths(pixels: TrainingPixels, poles: Poles) -> DepthSupervision:
         pictures = _LevelPictures(pixels, np.flatnonzero(away < _DEPTHS[1]))
         bands = _BANDS[: round((height - _BANDS[0][0]) / _BAND)]
         single = [pictures.bars(foot[None], (float(radius),), bands, only=k)[0] for k in range(len(pictures.frames))]
-        for lighting in dict.fromkeys(pictures.lightings):
-            mine = np.flatnonzero(pictures.lightings == lighting)
+        for film in dict.fromkeys(pictures.films):
+            mine = np.flatnonzero(pictures.films == film)
             count, contrast, color = (
                 np.stack([getattr(single[k], name)[0, 0] for k in mine]) for name in ("count", "contrast", "color")
             )
@@ -280,9 +324,9 @@ def _spaced_frames(pixels: TrainingPixels) -> NDArray[np.int64]:
     return np.array(kept, np.int64)
 
 
-def _at_most(frames: NDArray[np.int64], lightings: tuple[str, ...]) -> NDArray[np.int64]:
-    """At most `_MAX_PICTURES` of the frames per lighting, evenly spread."""
-    names = np.array(lightings)[frames]
+def _at_most(frames: NDArray[np.int64], films: tuple[str, ...]) -> NDArray[np.int64]:
+    """At most `_MAX_PICTURES` of the frames per film, evenly spread."""
+    names = np.array(films)[frames]
     chosen = []
     for name in dict.fromkeys(names):
         mine = np.flatnonzero(names == name)
@@ -329,7 +373,8 @@ def _search(pictures: _LevelPictures, spots: Array, known: Poles) -> tuple[Poles
         apart = np.linalg.norm(feet[:, :2] - spot[:2], axis=1) > _APART
         apart[best] = False
         feet = feet[apart & (sums > 0.0)]
-        if len(found) and np.linalg.norm(found.foot[:, :2] - spot[:2], axis=1).min() < _APART:
+        near = len(found) and np.linalg.norm(found.foot[:, :2] - spot[:2], axis=1).min() < _APART
+        if near or not _agree(pictures, around.select(np.array([most])), found):
             continue
         found, evidence = Poles.join([found, around.select(np.array([most]))]), np.append(evidence, scores[most])
     return found.select(np.arange(len(known), len(found))), evidence
@@ -348,8 +393,25 @@ def _judge(pictures: _LevelPictures, feet: Array, found: Poles) -> tuple[Poles, 
     return poles, np.where(poor | (thicker > _MAX_RATIO * evidence), 0.0, evidence)
 
 
+def _agree(pictures: _LevelPictures, pole: Poles, found: Poles) -> bool:
+    """True if the pictures show the bar at one place, which may be beside the given one.
+
+    A bar that consists of different things in different pictures has good contrast at different places.
+    """
+    bands = tuple(band for band in _BANDS if band[1] <= pole.height[0] + 0.5 * _BAND)
+    rows = pictures.offsets(pole.foot[0], float(pole.radius[0]), bands, found)
+    if len(rows) < _MIN_ALL:
+        return False
+    right, offset, weight = rows[:, :2], rows[:, 2], np.minimum(rows[:, 3] / _OFFSET_CONTRAST, 1.0)
+    place = least_squares(
+        lambda shift: weight * (offset - right @ shift), np.zeros(2), loss="cauchy", f_scale=_OFFSET_SCALE
+    ).x
+    left = np.abs(offset - right @ place)
+    return bool(np.median(left) <= _MAX_OFFSET and (left < _AGREES).mean() >= _MIN_AGREEING)
+
+
 def _quality(bars: list[_Bars]) -> tuple[Array, Array]:
-    """Quality of bars and number of pictures, shape (spots, radii, bands): means over lightings by their pictures."""
+    """Quality of bars and number of pictures, shape (spots, radii, bands): means over films by their pictures."""
     total, weights = np.zeros(bars[0].count.shape), np.zeros(bars[0].count.shape)
     for one in bars:
         count = np.maximum(one.count, 1.0)

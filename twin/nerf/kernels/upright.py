@@ -12,8 +12,8 @@ from twin.warp_runtime import wp
 _CORE = 0.7  # half width of the box inside a bar, as a fraction of the bar's half width
 _GAP = 0.4  # [px] between the bar's edge and the boxes beside it
 _SIDE = 0.5  # width of the boxes beside the bar, as a fraction of its half width; at least 1 px
-_LEAST_HALF_WIDTH = 0.6  # [px] narrower bars are not judged
-_LEAST_ROWS = 3  # lower bands are not judged
+LEAST_HALF_WIDTH = 0.6  # [px] narrower bars are not judged
+LEAST_ROWS = 3  # lower bands are not judged
 _MOST_HIDDEN = 0.05  # largest fraction of the three boxes' surroundings that may be masked
 
 
@@ -72,12 +72,12 @@ def add_bars(
     for b in range(bands.shape[0]):
         top = int(intrinsics[3] - intrinsics[1] * (spot[t][1] + bands[b][1]) / z + 0.5)
         bottom = int(intrinsics[3] - intrinsics[1] * (spot[t][1] + bands[b][0]) / z + 0.5)
-        if top >= 0 and bottom <= rows and bottom - top >= _LEAST_ROWS:
+        if top >= 0 and bottom <= rows and bottom - top >= LEAST_ROWS:
             for r in range(radii.shape[0]):
                 half = radii[r] * intrinsics[0] / z
                 side = wp.max(1.0, _SIDE * half)
                 reach = half + _GAP + side
-                shown = half >= _LEAST_HALF_WIDTH and u - reach >= 0.0 and u + reach < float(columns)
+                shown = half >= LEAST_HALF_WIDTH and u - reach >= 0.0 and u + reach < float(columns)
                 if shown:
                     first = int(u - reach)
                     last = int(u + reach) + 1
