@@ -9,8 +9,9 @@ from drive_logs import SOFT, columns
 from twin import runtime
 
 _LONGEST = (
-    *("test_real_places.py", "test_end_to_end.py", "test_alignment.py", "test_env.py", "test_vector_env_gpu.py"),
-    *("test_training.py", "test_sfm.py", "test_validate.py", "test_vector_env.py"),
+    *("test_real_places.py", "test_robustness.py", "test_end_to_end.py", "test_alignment.py", "test_validate.py"),
+    *("test_side_roads.py", "test_wheel.py", "test_env.py", "test_vector_env_gpu.py", "test_training.py"),
+    *("test_sfm.py", "test_vector_env.py"),
 )
 """Files that take minutes, or the better part of one, and so are begun with."""
 
