@@ -111,6 +111,45 @@ def test_a_bar_that_is_not_at_one_place_is_no_pole(tmp_path, monkeypatch):
     assert len(find_poles(pixels, LENS)) == 1  # its contrast and color are those of a pole
 
 
+@pytest.mark.parametrize("films", [2, 3])
+def test_a_post_in_several_short_films_of_a_lighting_is_found(tmp_path, films):
+    pixels = film(tmp_path, (POST,))
+    pixels.cameras = replace(pixels.cameras, sources=tuple(str(i % films) for i in range(12)))
+    (foot,) = find_poles(pixels, LENS).foot
+    assert np.linalg.norm(foot[:2] - POST[:2]) < 0.12  # along the line of sight
+
+
+def test_what_passes_before_a_post_and_is_masked_does_not_count(tmp_path):
+    pixels = film(tmp_path, (POST,))
+    for i in (1, 3, 6):
+        pose = pixels.cameras.camera_to_world[i]
+        (u, _), z = (value[0] for value in project(np.array([[*POST[:2], 1.0]]), pose, K))
+        left, right = (int(np.clip(u + side * 0.3 * 220.0 / z, 0, WIDTH)) for side in (-1, 1))
+        stripes = (np.arange(left, right) // 3 % 2 * 200).astype(np.uint8)[:, None]
+
+        def paint(colors, left=left, right=right, stripes=stripes):
+            colors = colors.copy()
+            colors[:, left:right] = stripes
+            return colors
+
+        recolor(pixels, i, paint)
+        pixels.unmasked[pixels.start[i] : pixels.start[i + 1]].reshape(HEIGHT, WIDTH)[:, left:right] = False
+    (foot,) = find_poles(pixels, LENS).foot
+    assert np.linalg.norm(foot[:2] - POST[:2]) < 0.05
+
+
+def test_a_rejected_bar_does_not_hide_the_post_beside_it(tmp_path, monkeypatch):
+    pixels, agree, asked = film(tmp_path, (POST, (8.0, 2.95, 0.05, 2.2))), poles_module._agree, []
+
+    def first_refused(pictures, pole, found):
+        asked.append(pole.foot[0])
+        return len(asked) > 1 and agree(pictures, pole, found)
+
+    monkeypatch.setattr(poles_module, "_agree", first_refused)
+    (foot,) = find_poles(pixels, LENS).foot
+    assert 0.2 < np.linalg.norm(foot[:2] - asked[0][:2]) < 0.5
+
+
 def test_masked_pixels_show_no_pole(tmp_path):
     """Such as those of a bollard that left: it is masked in the lightings in which it stood."""
     pixels = film(tmp_path, (POST, BOLLARD))

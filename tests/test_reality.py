@@ -321,6 +321,7 @@ def test_filming_that_was_stopped_begins_anew(tmp_path):
             film(plan, out, renderer_of=lambda lighting, place: stopped)
         with pytest.raises(InputError, match="has no truth"):
             compare(SceneDir(out))
+        assert not (out / "scene.toml").exists() and not (out / "truth" / "truth.json").exists()
         film(plan, out, renderer_of=lambda lighting, place: shot)
         assert Truth.load(out / "truth").length == 3.0 and (out / "scene.toml").exists()
     (tmp_path / "other").mkdir()

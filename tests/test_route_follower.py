@@ -191,6 +191,21 @@ def test_parts_in_several_models_are_hit_as_in_one(world, monkeypatch):
     assert ON_GROUND not in bare and (bare[hit >= 0] == hit[hit >= 0]).all()
 
 
+def test_an_open_place_is_drawn_and_hit(tmp_path):
+    """A scene without any convex part."""
+    scene = tiny_scene(tmp_path, boxes=())
+    export(scene)
+    bare = World.load(scene.stage("mjcf"))
+    camera = SceneCamera(bare, (80, 45))
+    assert np.ptp(camera.render(camera.data.qpos, look_at(np.array([0.0, 3.0, 1.5]), np.zeros(3)))) > 20
+    intrinsics, pose = np.array([60.0, 60.0, 40.0, 22.5]), look_at(np.array([0.0, 0.0, 1.5]), np.array([3.0, 0.0, 0.0]))
+    assert set(np.unique(CollisionCaster(bare, (80, 45), intrinsics, ground=True).cast(pose)[2])) == {
+        ON_GROUND,
+        NOTHING,
+    }
+    assert (CollisionCaster(bare, (80, 45), intrinsics).cast(pose)[2] == NOTHING).all()
+
+
 def test_chase_camera_is_behind_and_sees_the_robot(drive):
     poses = chase_poses(drive.base_to_world)
     behind = inverse_pose(drive.base_to_world) @ poses[:, :, 3:]

@@ -135,7 +135,7 @@ class CollisionCaster:
         numbers = {name: number for number, name in enumerate(names)}
         rays = mujoco_rays(unproject(pixel_grid(*size), intrinsics))
         self._casters, self._cameras, self._identities = [], [], []
-        for start in range(0, max(len(names), 1), _PARTS_PER_MODEL):
+        for start in range(0, max(len(names), int(ground)), _PARTS_PER_MODEL):
             spec = world.spec(frozenset(names[start : start + _PARTS_PER_MODEL]).__contains__, visuals=False)
             spec.worldbody.add_camera(name="free")
             model = spec.compile()
@@ -155,7 +155,8 @@ class CollisionCaster:
             self._cameras.append((data, model.camera("free").id))
             hit = [numbers.get(model.geom(geom).name, ON_GROUND) for geom in range(model.ngeom)]
             self._identities.append(np.array([*hit, NOTHING]))  # the index of no geom is −1
-        self.cast(np.eye(4))  # compiles the kernels, see `SceneCamera`
+        if self._casters:
+            self.cast(np.eye(4))  # compiles the kernels, see `SceneCamera`
 
     def cast(self, camera_to_world: Array) -> tuple[Array32, Array32, NDArray[np.int64]]:
         """Casts the rays of a picture from an OpenCV camera pose.
@@ -163,11 +164,14 @@ class CollisionCaster:
         Returns colors (height, width, 3) in [0, 255], z-depth (height, width) [m], 0 where nothing is hit, and the
         number of the part that is hit (height, width), ON_GROUND or NOTHING.
         """
+        width, height = self.size
+        if not self._casters:
+            empty = np.zeros((height, width), np.float32)
+            return np.zeros((height, width, 3), np.float32), empty, np.full(empty.shape, NOTHING)
         pose = opencv_to_mujoco(camera_to_world)
         found = [self._cast_one(number, pose) for number in range(len(self._casters))]
         depths = np.stack([depth for _, depth, _ in found])
         nearest = np.where(depths > 0.0, depths, np.inf).argmin(0)
-        width, height = self.size
         rgb, depth, identity = (
             np.take_along_axis(np.stack(one), nearest.reshape(1, -1, *[1] * (one[0].ndim - 1)), 0)[0]
             for one in zip(*found, strict=True)
@@ -197,7 +201,7 @@ class SceneRenderer:
     def __init__(
         self, model: mujoco.MjModel, size: tuple[int, int], max_envs: int, splats: Gaussians | None = None
     ) -> None:
-        """`model` must come from `episode_spec` with `visuals`; `splats`, if given, replace its visual mesh.
+        """`model` must come from `World.spec` with visual geometry; `splats`, if given, replace its visual mesh.
 
         The other arguments are those of `Compositor`.
         """

@@ -263,24 +263,31 @@ class TrainingPixels:
         return ((top * (1 - by) + bottom * by) / 255.0).astype(np.float32)
 
 
-def load_frame(
-    cameras: Cameras, i: int, max_width: int
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float64]]:
-    """Reads a frame, scaled to at most `max_width` on its longer side: image, mask (true = use), intrinsics [px]."""
+def load_picture(cameras: Cameras, i: int, max_width: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Reads a frame's picture, scaled to at most `max_width` on its longer side, and its intrinsics [px]."""
     image = read_image(cameras.image_path(i))
     height, width = image.shape[:2]
     shrink = min(1.0, max_width / max(width, height))
     w, h = max(1, round(width * shrink)), max(1, round(height * shrink))
+    if (w, h) != (width, height):
+        image = resize(image, w, h)
+    size = (int(cameras.sizes[i, 0]), int(cameras.sizes[i, 1]))
+    return image, scaled_intrinsics(cameras.intrinsics[i], size, (w, h))
+
+
+def load_frame(
+    cameras: Cameras, i: int, max_width: int
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float64]]:
+    """Reads a frame, scaled to at most `max_width` on its longer side: image, mask (true = use), intrinsics [px]."""
+    image, intrinsics = load_picture(cameras, i, max_width)
+    h, w = image.shape[:2]
     path = cameras.mask_path(i)
     mask = np.ones((h, w), bool)
     if path is not None:
         # A resized pixel is usable only if all pixels that it averages are usable.
         whole = read_image(path)[..., 0] > 0
         mask = resize(whole.astype(np.float32), w, h) > 0.999 if whole.shape != (h, w) else whole
-    if (w, h) != (width, height):
-        image = resize(image, w, h)
-    size = (int(cameras.sizes[i, 0]), int(cameras.sizes[i, 1]))
-    return image, mask, scaled_intrinsics(cameras.intrinsics[i], size, (w, h))
+    return image, mask, intrinsics
 
 
 # ---- free space and camera height

@@ -10,7 +10,7 @@ The *quality* of a bar is contrast / (contrast + deviation + noise), with means 
 is the sum over its bands, from the ground up, of quality − `_CHANCE`; the pole ends where the sum is largest. The spots
 with the most evidence come first. A spot is then judged without the pictures in which a pole that was already found
 covers it: beside a pole, bars show this pole, from a part of the cameras. Lastly, all pictures must agree on the pole's
-place: its bar, moved by up to two pixels in each picture to where its contrast is greatest, must stand on one spot.
+place: its bar, moved by a few pixels in each picture to where its contrast is greatest, must stand on one spot.
 """
 
 import math
@@ -27,8 +27,9 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from twin.files import load_arrays, save_arrays
+from twin.geometry.cameras import Cameras
 from twin.nerf.buffers import parallel
-from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths, load_frame
+from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths, load_picture
 from twin.nerf.kernels import upright as kernels
 from twin.runtime import track
 from twin.types import Array
@@ -40,8 +41,8 @@ _BESIDE = 1.2, 10.0  # [m] least and greatest distance of a spot from the path o
 _DEPTHS = 1.2, 13.0  # [m] depths at which pictures are used
 _FRAME_SPACING = 0.4  # [m] pictures of a film that are closer to each other add nothing
 _TILE = 20.0  # [m] side of the squares that are searched one after the other
-_MAX_PICTURES = 60  # pictures of a film around a square, which bounds memory, as does their width
-_MAX_WIDTH = 640  # [px]; pictures of training are too coarse
+_MAX_PICTURES = 60  # pictures of a lighting around a square, which bounds memory
+_LEAST_WIDTH = 640  # [px] pictures are read up to this width even if those of training are smaller
 
 _RADII = (0.02, 0.028, 0.037, 0.048, 0.062, 0.08, 0.1, 0.125, 0.16, 0.2, 0.25)  # [m]
 _THIN = 8  # number of radii, the first ones, that a pole may have; the others compete with them
@@ -60,7 +61,7 @@ _LAST_ROUNDS = 4  # such steps follow each other until the spot remains
 
 _NOISE = 3.0  # [gray levels]
 _SPREAD = 1.5  # weight of the color's standard deviation over pictures
-_MIN_PICTURES = 4  # of a film; and `_MIN_ALL` together
+_MIN_PICTURES = 4  # of a lighting; and `_MIN_ALL` together
 _MIN_ALL = 5
 _CHANCE = 0.42  # quality that bars reach where nothing stands
 _MIN_EVIDENCE = 0.6
@@ -77,6 +78,7 @@ _AGREES, _MIN_AGREEING = 0.02, 0.83  # [m] offsets of at least this fraction of 
 
 _POINT_SPACING = 0.04  # [m] between the points of a pole that get depth supervision
 _MIN_CONTRAST = 6.0  # [gray levels] in the picture
+_LEAST_ALIKE = 3  # pictures of a film whose median is the usual color
 _MAX_CHANGE = 0.7  # largest difference from the bar's median color, as a multiple of its median contrast
 
 
@@ -120,29 +122,42 @@ class Poles:
 class _Bars:
     """Sums over the pictures of one film, see `kernels.add_bars`, each of shape (spots, radii, bands)."""
 
+    lighting: str
     count: Array
     contrast: Array
     color: Array
     square: Array
 
 
+_Read = tuple[Array, list[wp.array]]
+
+
 class _LevelPictures:
     """Pictures of some frames as level cameras would have taken them, as summed-area tables."""
 
-    def __init__(self, pixels: TrainingPixels, frames: NDArray[np.int64]) -> None:
+    def __init__(
+        self, pixels: TrainingPixels, frames: NDArray[np.int64], before: "_LevelPictures | None" = None
+    ) -> None:
+        """Pictures that `before` has, too, are taken from it."""
         self.frames = frames
         self.films = np.array(pixels.cameras.sources)[frames]
+        self.lightings = np.array(pixels.cameras.lightings)[frames]
         self.positions = pixels.cameras.positions[frames]
         self._turns = [_level(pixels.cameras.camera_to_world[i]) for i in frames]
-        read = [self._read(pixels, i, turn) for i, turn in zip(frames, self._turns, strict=True)]
-        self._intrinsics, self._tables = [one[0] for one in read], [one[1] for one in read]
+        known: dict[int, _Read] = {} if before is None else dict(zip(before.frames, before._read, strict=True))
+        self._read: list[_Read] = [
+            known[i] if i in known else self._read_frame(pixels, i, turn)
+            for i, turn in zip(frames, self._turns, strict=True)
+        ]
+        self._intrinsics, self._tables = [one[0] for one in self._read], [one[1] for one in self._read]
 
     @staticmethod
-    def _read(pixels: TrainingPixels, i: int, turn: Array) -> tuple[Array, list[wp.array]]:
+    def _read_frame(pixels: TrainingPixels, i: int, turn: Array) -> "_Read":
         """Intrinsics fx, fy, cx, cy [px], and tables of the colors and of the pixels that are masked or outside."""
-        picture, _, intrinsics = load_frame(pixels.cameras, i, _MAX_WIDTH)
+        shape = int(pixels.height[i]), int(pixels.width[i])
+        picture, intrinsics = load_picture(pixels.cameras, i, max(_LEAST_WIDTH, *shape))
         height, width = picture.shape[:2]
-        masked = ~pixels.unmasked[pixels.start[i] : pixels.start[i + 1]].reshape(pixels.height[i], pixels.width[i])
+        masked = ~pixels.unmasked[pixels.start[i] : pixels.start[i + 1]].reshape(shape)
         mask = cv2.resize(masked.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
         fx, fy, cx, cy = intrinsics
         matrix = np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
@@ -179,14 +194,13 @@ class _LevelPictures:
         radii: tuple[float, ...],
         bands: tuple[tuple[float, float], ...],
         found: "Poles | None" = None,
-        only: int | None = None,
     ) -> list[_Bars]:
-        """Sums per film over all pictures, or of picture `only`, in which no pole `found` covers the spot."""
+        """Sums per film over the pictures in which no pole `found` covers the spot."""
         shape = len(feet), len(radii), len(bands)
         halves = np.array_split(np.arange(len(feet)), 2)
         out = []
-        for film in dict.fromkeys(self.films if only is None else self.films[[only]]):
-            chosen = np.flatnonzero(self.films == film) if only is None else np.array([only])
+        for film in dict.fromkeys(self.films):
+            chosen = np.flatnonzero(self.films == film)
             sums = [wp.zeros(shape, dtype=kind, device="cpu") for kind in (wp.float32, wp.float32, wp.vec3, wp.vec3)]
             given: list[wp.array] = [
                 wp.array(np.array(radii, np.float32), dtype=wp.float32, device="cpu"),
@@ -208,7 +222,7 @@ class _LevelPictures:
                     wp.launch(kernels.add_bars, len(index), inputs, sums, device="cpu")
 
             parallel(add, range(2), "cpu")
-            out.append(_Bars(*(values.numpy() for values in sums)))
+            out.append(_Bars(str(self.lightings[chosen[0]]), *(values.numpy() for values in sums)))
         return out
 
     def offsets(self, foot: Array, radius: float, bands: tuple[tuple[float, float], ...], found: "Poles") -> Array:
@@ -218,7 +232,7 @@ class _LevelPictures:
         offset [m], and the contrast [gray levels]; shape (n, 4).
         """
         out = []
-        for k, (sums, _) in enumerate(self._tables):
+        for k, (sums, hidden) in enumerate(self._tables):
             index, local = self.seen(k, foot[None])
             if not len(index) or (len(found) and self._covered(k, local, radius, found)[0]):
                 continue
@@ -232,6 +246,11 @@ class _LevelPictures:
             first, last = math.floor(corners.min()), math.floor(corners.max()) + 1
             shown = (top >= 0) & (bottom < len(table)) & (bottom - top >= kernels.LEAST_ROWS)
             if half < kernels.LEAST_HALF_WIDTH or first < 0 or last >= table.shape[1] or not shown.any():
+                continue
+            masked = np.diff(hidden.numpy()[np.stack([top, bottom])[:, shown]][..., [first, last]], axis=2)[..., 0]
+            size = (last - first) * (bottom - top)[shown]
+            shown[shown] = masked[1] - masked[0] <= kernels.MOST_HIDDEN * size
+            if not shown.any():
                 continue
             columns = np.subtract(*table[np.stack([bottom, top])[:, shown], first : last + 1].astype(float))
             means = columns / (bottom - top)[shown, None, None]  # sums over the columns left of a corner
@@ -263,45 +282,75 @@ def find_poles(pixels: TrainingPixels, camera_height: float) -> Poles:
     path = cKDTree(positions[:, :2])
     steps = np.array(list(product((-1.0, 0.0, 1.0), repeat=2))) * _BESIDE[1]
     tiles = np.unique(np.floor((positions[:, None, :2] + steps).reshape(-1, 2) / _TILE).astype(int), axis=0)
-    poles, evidence = Poles.none(), np.zeros(0)
+    poles, evidence, pictures = Poles.none(), np.zeros(0), None
     for corner in track(tiles * _TILE, "poles", unit="square"):
         spots = _spots(corner, path, positions[:, 2] - camera_height)
         beyond = np.maximum(np.abs(positions[kept, :2] - corner - 0.5 * _TILE) - 0.5 * _TILE, 0.0)
-        frames = _at_most(kept[np.linalg.norm(beyond, axis=1) < _DEPTHS[1]], pixels.cameras.sources)
+        frames = _at_most(kept[np.linalg.norm(beyond, axis=1) < _DEPTHS[1]], pixels.cameras.lightings)
         if len(spots) and len(frames) >= _MIN_ALL:
-            more, sums = _search(_LevelPictures(pixels, frames), spots, poles)
+            pictures = _LevelPictures(pixels, frames, pictures)
+            more, sums = _search(pictures, spots, poles)
             poles, evidence = Poles.join([poles, more]), np.append(evidence, sums)
     return poles.select(_peaks(poles.foot[:, :2], evidence, 0.0, _APART))
 
 
 def pole_depths(pixels: TrainingPixels, poles: Poles) -> DepthSupervision:
     """Depth supervision on the fronts of poles in the pictures that show their bars in the usual color."""
+    views: list[list[_View]] = [[] for _ in range(len(poles))]
+    for i, position in enumerate(pixels.cameras.positions):
+        near = np.flatnonzero(np.linalg.norm(poles.foot[:, :2] - position[:2], axis=1) < _DEPTHS[1])
+        if len(near):
+            pictures = _LevelPictures(pixels, np.array([i]))
+            (bars,) = pictures.bars(poles.foot[near], tuple(map(float, poles.radius[near])), _BANDS)
+            for row, pole in enumerate(near):
+                shown = bars.count[row, row] > 0
+                if shown.any():
+                    views[pole].append(_View(i, shown, bars.contrast[row, row], bars.color[row, row]))
     parts = []
-    for foot, radius, height in zip(poles.foot, poles.radius, poles.height, strict=True):
-        away = np.linalg.norm(pixels.cameras.positions[:, :2] - foot[:2], axis=1)
-        pictures = _LevelPictures(pixels, np.flatnonzero(away < _DEPTHS[1]))
+    for foot, radius, height, seen in zip(poles.foot, poles.radius, poles.height, views, strict=True):
         bands = _BANDS[: round((height - _BANDS[0][0]) / _BAND)]
-        single = [pictures.bars(foot[None], (float(radius),), bands, only=k)[0] for k in range(len(pictures.frames))]
-        for film in dict.fromkeys(pictures.films):
-            mine = np.flatnonzero(pictures.films == film)
-            count, contrast, color = (
-                np.stack([getattr(single[k], name)[0, 0] for k in mine]) for name in ("count", "contrast", "color")
-            )
-            judged = np.where(count > 0, 1.0, np.nan)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RuntimeWarning)  # a band that no picture shows has no median
-                typical, usual = np.nanmedian(color * judged[..., None], 0), np.nanmedian(contrast * judged, 0)
-            same = np.abs(color - typical).max(-1) <= _MAX_CHANGE * usual
-            shown = (count > 0) & (contrast > _MIN_CONTRAST) & same
-            for k, row in zip(mine, shown, strict=True):
-                i = int(pictures.frames[k])
-                toward = pixels.cameras.positions[i, :2] - foot[:2]
-                front = foot[:2] + toward / np.linalg.norm(toward) * radius
-                z = [foot[2] + np.arange(low, high, _POINT_SPACING) for low, high in np.array(bands)[row]]
-                if z:
-                    rows = np.concatenate(z)
-                    parts.append(pixels.depths_in_frame(i, np.column_stack([np.tile(front, (len(rows), 1)), rows])))
+        for one, shown in zip(seen, _usual(seen, pixels.cameras), strict=True):
+            toward = pixels.cameras.positions[one.frame, :2] - foot[:2]
+            front = foot[:2] + toward / np.linalg.norm(toward) * radius
+            z = [foot[2] + np.arange(low, high, _POINT_SPACING) for low, high in np.array(bands)[shown[: len(bands)]]]
+            if z:
+                rows = np.concatenate(z)
+                points = np.column_stack([np.tile(front, (len(rows), 1)), rows])
+                parts.append(pixels.depths_in_frame(one.frame, points))
     return join_depths(parts)
+
+
+@dataclass(frozen=True)
+class _View:
+    """The bars of a pole in one picture."""
+
+    frame: int
+    shown: NDArray[np.bool_]
+    """False for bands that are not judged in this picture, shape (bands,)."""
+    contrast: Array
+    """Shape (bands,)."""
+    color: Array
+    """Shape (bands, 3)."""
+
+
+def _usual(views: list[_View], cameras: Cameras) -> list[NDArray[np.bool_]]:
+    """Masks (bands,): the bands that show a pole in its usual color.
+
+    This is the median of the picture's film or, if the film has too few pictures of the pole, of its lighting.
+    """
+    out = []
+    for one in views:
+        film = [other for other in views if cameras.sources[other.frame] == cameras.sources[one.frame]]
+        lighting = [other for other in views if cameras.lightings[other.frame] == cameras.lightings[one.frame]]
+        alike = film if len(film) >= _LEAST_ALIKE else lighting
+        judged = np.stack([np.where(other.shown, 1.0, np.nan) for other in alike])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a band that no picture shows has no median
+            color = np.nanmedian(np.stack([other.color for other in alike]) * judged[..., None], 0)
+            contrast = np.nanmedian(np.stack([other.contrast for other in alike]) * judged, 0)
+        same = np.abs(one.color - color).max(-1) <= _MAX_CHANGE * contrast
+        out.append(one.shown & (one.contrast > _MIN_CONTRAST) & same)
+    return out
 
 
 def _level(pose: Array) -> Array:
@@ -324,9 +373,9 @@ def _spaced_frames(pixels: TrainingPixels) -> NDArray[np.int64]:
     return np.array(kept, np.int64)
 
 
-def _at_most(frames: NDArray[np.int64], films: tuple[str, ...]) -> NDArray[np.int64]:
-    """At most `_MAX_PICTURES` of the frames per film, evenly spread."""
-    names = np.array(films)[frames]
+def _at_most(frames: NDArray[np.int64], lightings: tuple[str, ...]) -> NDArray[np.int64]:
+    """At most `_MAX_PICTURES` of the frames per lighting, evenly spread."""
+    names = np.array(lightings)[frames]
     chosen = []
     for name in dict.fromkeys(names):
         mine = np.flatnonzero(names == name)
@@ -370,11 +419,13 @@ def _search(pictures: _LevelPictures, spots: Array, known: Poles) -> tuple[Poles
             spot, moved = around.foot[most], bool(np.abs(offsets[most]).max() >= max(_LAST_STEPS))
             if not moved:
                 break
-        apart = np.linalg.norm(feet[:, :2] - spot[:2], axis=1) > _APART
+        near = len(found) and np.linalg.norm(found.foot[:, :2] - spot[:2], axis=1).min() < _APART
+        accepted = not near and _agree(pictures, around.select(np.array([most])), found)
+        # A rejected spot may be the edge of something beside a pole.
+        apart = np.linalg.norm(feet[:, :2] - spot[:2], axis=1) > (_APART if accepted else 2.0 * _COARSE_CELL)
         apart[best] = False
         feet = feet[apart & (sums > 0.0)]
-        near = len(found) and np.linalg.norm(found.foot[:, :2] - spot[:2], axis=1).min() < _APART
-        if near or not _agree(pictures, around.select(np.array([most])), found):
+        if not accepted:
             continue
         found, evidence = Poles.join([found, around.select(np.array([most]))]), np.append(evidence, scores[most])
     return found.select(np.arange(len(known), len(found))), evidence
@@ -411,13 +462,20 @@ def _agree(pictures: _LevelPictures, pole: Poles, found: Poles) -> bool:
 
 
 def _quality(bars: list[_Bars]) -> tuple[Array, Array]:
-    """Quality of bars and number of pictures, shape (spots, radii, bands): means over films by their pictures."""
+    """Quality of bars and number of pictures, shape (spots, radii, bands): means over lightings by their pictures.
+
+    Colors deviate from the mean of their film. A film's first picture determines this mean, so of all films of a
+    lighting but one, it does not count.
+    """
     total, weights = np.zeros(bars[0].count.shape), np.zeros(bars[0].count.shape)
-    for one in bars:
-        count = np.maximum(one.count, 1.0)
-        contrast, color = one.contrast / count, one.color / count[..., None]
-        deviation = np.sqrt(np.maximum(one.square / count[..., None] - color**2, 0.0).max(-1))
-        weight = np.where(one.count >= _MIN_PICTURES, one.count, 0.0)
+    for lighting in dict.fromkeys(one.lighting for one in bars):
+        films = [one for one in bars if one.lighting == lighting]
+        count = sum(one.count for one in films)
+        effective = count - np.maximum(sum(one.count > 0 for one in films) - 1, 0)
+        contrast = sum(one.contrast for one in films) / np.maximum(count, 1.0)
+        squares = sum(one.square - one.color**2 / np.maximum(one.count, 1.0)[..., None] for one in films)
+        deviation = np.sqrt(np.maximum(squares, 0.0).max(-1) / np.maximum(effective, 1.0))
+        weight = np.where(effective >= _MIN_PICTURES, effective, 0.0)
         total += weight * contrast / (contrast + _SPREAD * deviation + _NOISE)
         weights += weight
     return total / np.maximum(weights, 1.0), weights

@@ -88,10 +88,12 @@ def film(
         raise InputError("--side-roads with --traffic: walkers and cars keep to the main road; leave one of them out")
     spec = draw(number, length, side_roads) if number else None
     sides = _filmed_sides(spec, plan) if spec and side_roads else []
-    (out / "input").mkdir(parents=True, exist_ok=True)
-    # The folder exists from the start, so that filming that was stopped can begin anew; an older film's truth does not.
-    (out / "truth").mkdir(exist_ok=True)
-    (out / "truth" / "truth.npz").unlink(missing_ok=True)
+    # The folder of the truth exists from the start, so that filming that was stopped can begin anew. What an older film
+    # left does not: new films with old settings would be another scene.
+    (out / "truth").mkdir(parents=True, exist_ok=True)
+    (out / "input").mkdir(exist_ok=True)
+    for old in (out / "scene.toml", out / "truth" / "truth.json", out / "truth" / "truth.npz"):
+        old.unlink(missing_ok=True)
     place = build_number(number, length=length, side_roads=side_roads) if number else campus_road.build()
     assert isinstance(place.route, RoadLine | DrawnRoad)
     lines: list[tuple[FilmingPlan, DrivenLine]] = [(plan, place.route)]

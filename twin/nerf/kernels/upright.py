@@ -14,7 +14,7 @@ _GAP = 0.4  # [px] between the bar's edge and the boxes beside it
 _SIDE = 0.5  # width of the boxes beside the bar, as a fraction of its half width; at least 1 px
 LEAST_HALF_WIDTH = 0.6  # [px] narrower bars are not judged
 LEAST_ROWS = 3  # lower bands are not judged
-_MOST_HIDDEN = 0.05  # largest fraction of the three boxes' surroundings that may be masked
+MOST_HIDDEN = 0.05  # largest fraction of the three boxes' surroundings that may be masked
 
 
 @wp.func
@@ -82,7 +82,7 @@ def add_bars(
                     first = int(u - reach)
                     last = int(u + reach) + 1
                     masked = hidden[bottom, last] - hidden[top, last] - hidden[bottom, first] + hidden[top, first]
-                    shown = float(masked) <= _MOST_HIDDEN * float((bottom - top) * (last - first))
+                    shown = float(masked) <= MOST_HIDDEN * float((bottom - top) * (last - first))
                 if shown:
                     inside = box_mean(sums, top, bottom, u - _CORE * half, u + _CORE * half)
                     left = inside - box_mean(sums, top, bottom, u - reach, u - half - _GAP)
