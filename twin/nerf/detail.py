@@ -40,6 +40,7 @@ _MIN_HITS = 24  # least number of training pixels in a stored tile
 _MAX_HITS = 8_000_000  # approximate upper limit of the training pixels used, which take 0.5 GB
 _RAYS = 16384  # rays per step
 _RATE, _FINAL_RATE = 0.04, 0.05  # initial learning rate, and the final one as a share of it
+_ROWS_AT_ONCE = 2**16
 _CLIPPED_SHARE = 2e-4  # share of values clipped by the range of a byte
 
 
@@ -308,9 +309,13 @@ class _DetailFitter:
 
 def _as_bytes(values: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Values (rows, CHANNELS) as bytes around 128, and the value of one byte step in each channel."""
-    used = values[np.abs(values).sum(1) > 0.0]
+    used = np.flatnonzero((values != 0.0).any(1))
     if not len(used):
         return np.full(values.shape, 128, np.uint8), np.zeros(values.shape[1], np.float32)
-    step = np.quantile(np.abs(used[:: max(1, len(used) // 200_000)]), 1.0 - _CLIPPED_SHARE, axis=0) / 127.0
-    codes = np.rint(values / np.maximum(step, 1e-9)).clip(-127, 127) + 128
-    return codes.astype(np.uint8), step.astype(np.float32)
+    sample = values[used[:: max(1, len(used) // 200_000)]]
+    step = np.quantile(np.abs(sample), 1.0 - _CLIPPED_SHARE, axis=0) / 127.0
+    codes = np.empty(values.shape, np.uint8)
+    for start in range(0, len(values), _ROWS_AT_ONCE):  # copies of the whole table would set the build's peak memory
+        rows = slice(start, start + _ROWS_AT_ONCE)
+        codes[rows] = np.rint(values[rows] / np.maximum(step, 1e-9)).clip(-127, 127) + 128
+    return codes, step.astype(np.float32)
