@@ -111,7 +111,7 @@ def test_a_bar_that_is_not_at_one_place_is_no_pole(tmp_path, monkeypatch):
     assert len(find_poles(pixels, LENS)) == 1  # its contrast and color are those of a pole
 
 
-@pytest.mark.parametrize("films", [2, 3])
+@pytest.mark.parametrize("films", [2, 4])
 def test_a_post_in_several_short_films_of_a_lighting_is_found(tmp_path, films):
     pixels = film(tmp_path, (POST,))
     pixels.cameras = replace(pixels.cameras, sources=tuple(str(i % films) for i in range(12)))
@@ -197,6 +197,37 @@ def test_supervised_depths_are_those_of_the_front(tmp_path):
     for i in range(len(pixels.cameras)):
         recolor(pixels, i, lambda colors: np.full_like(colors, 128))
     assert len(pole_depths(pixels, poles).frame) == 0  # no picture shows it
+
+
+def test_depths_of_several_poles_are_those_of_their_own_fronts(tmp_path):
+    """Also in short films, and with frames that show none of them."""
+    pixels = film(tmp_path, (POST, BOLLARD), n=14)
+    pixels.cameras.camera_to_world[-1, 0, 3] += 100.0
+    pixels.cameras = replace(pixels.cameras, sources=tuple(str(i % 6) for i in range(14)))
+    shapes = np.array([POST, BOLLARD])
+    feet = np.column_stack([shapes[:, :2], np.zeros(2)])
+    depths = pole_depths(pixels, Poles(feet, shapes[:, 2], shapes[:, 3]))
+    pose = pixels.cameras.camera_to_world[depths.frame]
+    rays = np.einsum("nij,nj->ni", pose[:, :3, :3], unproject(depths.pixel, K))
+    points = pose[:, :3, 3] + rays / np.linalg.norm(rays, axis=1, keepdims=True) * depths.distance[:, None]
+    away = np.linalg.norm(points[:, None, :2] - shapes[:, :2], axis=-1)
+    mine = away.argmin(1)
+    assert np.bincount(mine).min() > 100 and 13 not in depths.frame
+    assert np.allclose(away.min(1), shapes[mine, 2], atol=1e-3)
+    assert (points[:, 2] < shapes[mine, 3]).all()
+
+
+def test_a_bar_that_one_of_two_films_does_not_show_is_poorer(tmp_path):
+    """Its quality is the mean of both films', not that of their pictures together."""
+    one = np.full((1, 1, 1), 10.0)
+    films = [
+        poles_module._Bars(
+            "day", one, 10 * contrast * one / 10, np.zeros((1, 1, 1, 3)), np.full((1, 1, 1, 3), 10 * d**2)
+        )
+        for contrast, d in ((60.0, 10.0), (3.0, 3.0))
+    ]
+    quality, count = poles_module._quality(films)
+    assert count.item() == 20 and quality.item() == pytest.approx((60 / (60 + 15 + 3) + 3 / (3 + 4.5 + 3)) / 2)
 
 
 def test_joined_depths_are_in_the_order_of_the_frames():

@@ -41,7 +41,7 @@ _BESIDE = 1.2, 10.0  # [m] least and greatest distance of a spot from the path o
 _DEPTHS = 1.2, 13.0  # [m] depths at which pictures are used
 _FRAME_SPACING = 0.4  # [m] pictures of a film that are closer to each other add nothing
 _TILE = 20.0  # [m] side of the squares that are searched one after the other
-_MAX_PICTURES = 60  # pictures of a lighting around a square, which bounds memory
+_MAX_PIXELS = 300 * 640 * 360  # of the pictures around a square, which bounds memory
 _LEAST_WIDTH = 640  # [px] pictures are read up to this width even if those of training are smaller
 
 _RADII = (0.02, 0.028, 0.037, 0.048, 0.062, 0.08, 0.1, 0.125, 0.16, 0.2, 0.25)  # [m]
@@ -136,26 +136,26 @@ class _LevelPictures:
     """Pictures of some frames as level cameras would have taken them, as summed-area tables."""
 
     def __init__(
-        self, pixels: TrainingPixels, frames: NDArray[np.int64], before: "_LevelPictures | None" = None
+        self, pixels: TrainingPixels, frames: NDArray[np.int64], known: "dict[int, _Read] | None" = None
     ) -> None:
-        """Pictures that `before` has, too, are taken from it."""
+        """The pictures of the frames in `known` have been read before."""
         self.frames = frames
         self.films = np.array(pixels.cameras.sources)[frames]
         self.lightings = np.array(pixels.cameras.lightings)[frames]
         self.positions = pixels.cameras.positions[frames]
         self._turns = [_level(pixels.cameras.camera_to_world[i]) for i in frames]
-        known: dict[int, _Read] = {} if before is None else dict(zip(before.frames, before._read, strict=True))
-        self._read: list[_Read] = [
-            known[i] if i in known else self._read_frame(pixels, i, turn)
+        known = known or {}
+        self.read = {
+            int(i): known[i] if i in known else self._read_frame(pixels, i, turn)
             for i, turn in zip(frames, self._turns, strict=True)
-        ]
-        self._intrinsics, self._tables = [one[0] for one in self._read], [one[1] for one in self._read]
+        }
+        self._intrinsics, self._tables = zip(*self.read.values(), strict=True)
 
     @staticmethod
     def _read_frame(pixels: TrainingPixels, i: int, turn: Array) -> "_Read":
         """Intrinsics fx, fy, cx, cy [px], and tables of the colors and of the pixels that are masked or outside."""
         shape = int(pixels.height[i]), int(pixels.width[i])
-        picture, intrinsics = load_picture(pixels.cameras, i, max(_LEAST_WIDTH, *shape))
+        picture, intrinsics = load_picture(pixels.cameras, i, _width(pixels, i))
         height, width = picture.shape[:2]
         masked = ~pixels.unmasked[pixels.start[i] : pixels.start[i + 1]].reshape(shape)
         mask = cv2.resize(masked.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
@@ -282,41 +282,46 @@ def find_poles(pixels: TrainingPixels, camera_height: float) -> Poles:
     path = cKDTree(positions[:, :2])
     steps = np.array(list(product((-1.0, 0.0, 1.0), repeat=2))) * _BESIDE[1]
     tiles = np.unique(np.floor((positions[:, None, :2] + steps).reshape(-1, 2) / _TILE).astype(int), axis=0)
-    poles, evidence, pictures = Poles.none(), np.zeros(0), None
+    poles, evidence, read = Poles.none(), np.zeros(0), dict[int, _Read]()
     for corner in track(tiles * _TILE, "poles", unit="square"):
         spots = _spots(corner, path, positions[:, 2] - camera_height)
         beyond = np.maximum(np.abs(positions[kept, :2] - corner - 0.5 * _TILE) - 0.5 * _TILE, 0.0)
-        frames = _at_most(kept[np.linalg.norm(beyond, axis=1) < _DEPTHS[1]], pixels.cameras.lightings)
+        frames = _at_most(kept, np.linalg.norm(beyond, axis=1) < _DEPTHS[1], pixels)
         if len(spots) and len(frames) >= _MIN_ALL:
-            pictures = _LevelPictures(pixels, frames, pictures)
+            read = {i: read[i] for i in frames.tolist() if i in read}  # a square's pictures also show the next one
+            pictures = _LevelPictures(pixels, frames, read)
+            read = pictures.read
             more, sums = _search(pictures, spots, poles)
+            del pictures
             poles, evidence = Poles.join([poles, more]), np.append(evidence, sums)
     return poles.select(_peaks(poles.foot[:, :2], evidence, 0.0, _APART))
 
 
 def pole_depths(pixels: TrainingPixels, poles: Poles) -> DepthSupervision:
     """Depth supervision on the fronts of poles in the pictures that show their bars in the usual color."""
-    views: list[list[_View]] = [[] for _ in range(len(poles))]
+    tops = [round((height - _BANDS[0][0]) / _BAND) for height in poles.height]
+    views: list[list[_View]] = [[] for _ in tops]
     for i, position in enumerate(pixels.cameras.positions):
         near = np.flatnonzero(np.linalg.norm(poles.foot[:, :2] - position[:2], axis=1) < _DEPTHS[1])
         if len(near):
             pictures = _LevelPictures(pixels, np.array([i]))
             (bars,) = pictures.bars(poles.foot[near], tuple(map(float, poles.radius[near])), _BANDS)
+            rows = np.arange(len(near))
+            count, contrast, color = (one[rows, rows] for one in (bars.count, bars.contrast, bars.color))
             for row, pole in enumerate(near):
-                shown = bars.count[row, row] > 0
-                if shown.any():
-                    views[pole].append(_View(i, shown, bars.contrast[row, row], bars.color[row, row]))
+                top = tops[pole]
+                view = _View(i, count[row, :top] > 0, contrast[row, :top], color[row, :top])
+                if view.shown.any():
+                    views[pole].append(view)
     parts = []
-    for foot, radius, height, seen in zip(poles.foot, poles.radius, poles.height, views, strict=True):
-        bands = _BANDS[: round((height - _BANDS[0][0]) / _BAND)]
-        for one, shown in zip(seen, _usual(seen, pixels.cameras), strict=True):
+    for foot, radius, seen in zip(poles.foot, poles.radius, views, strict=True):
+        for one, usual in zip(seen, _usual(seen, pixels.cameras), strict=True):
             toward = pixels.cameras.positions[one.frame, :2] - foot[:2]
             front = foot[:2] + toward / np.linalg.norm(toward) * radius
-            z = [foot[2] + np.arange(low, high, _POINT_SPACING) for low, high in np.array(bands)[shown[: len(bands)]]]
-            if z:
-                rows = np.concatenate(z)
-                points = np.column_stack([np.tile(front, (len(rows), 1)), rows])
-                parts.append(pixels.depths_in_frame(one.frame, points))
+            bands = np.array(_BANDS[: len(usual)])[usual]
+            if len(bands):
+                z = np.concatenate([foot[2] + np.arange(low, high, _POINT_SPACING) for low, high in bands])
+                parts.append(pixels.depths_in_frame(one.frame, np.column_stack([np.tile(front, (len(z), 1)), z])))
     return join_depths(parts)
 
 
@@ -336,18 +341,28 @@ class _View:
 def _usual(views: list[_View], cameras: Cameras) -> list[NDArray[np.bool_]]:
     """Masks (bands,): the bands that show a pole in its usual color.
 
-    This is the median of the picture's film or, if the film has too few pictures of the pole, of its lighting.
+    This is the median of the picture's film or, in bands that the film shows too seldom, of its lighting.
     """
+    medians: dict[tuple[str, ...], tuple[Array, Array, Array]] = {}
+    for names in (cameras.sources, cameras.lightings):
+        for name in dict.fromkeys(names[one.frame] for one in views):
+            alike = [one for one in views if names[one.frame] == name]
+            judged = np.stack([np.where(one.shown, 1.0, np.nan) for one in alike])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # a band that no picture shows has no median
+                color = np.nanmedian(np.stack([one.color for one in alike]) * judged[..., None], 0)
+                contrast = np.nanmedian(np.stack([one.contrast for one in alike]) * judged, 0)
+            medians["film" if names is cameras.sources else "lighting", name] = (
+                (~np.isnan(judged)).sum(0),
+                color,
+                contrast,
+            )
     out = []
     for one in views:
-        film = [other for other in views if cameras.sources[other.frame] == cameras.sources[one.frame]]
-        lighting = [other for other in views if cameras.lightings[other.frame] == cameras.lightings[one.frame]]
-        alike = film if len(film) >= _LEAST_ALIKE else lighting
-        judged = np.stack([np.where(other.shown, 1.0, np.nan) for other in alike])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # a band that no picture shows has no median
-            color = np.nanmedian(np.stack([other.color for other in alike]) * judged[..., None], 0)
-            contrast = np.nanmedian(np.stack([other.contrast for other in alike]) * judged, 0)
+        count, color, contrast = medians["film", cameras.sources[one.frame]]
+        _, all_color, all_contrast = medians["lighting", cameras.lightings[one.frame]]
+        enough = count >= _LEAST_ALIKE
+        color, contrast = np.where(enough[:, None], color, all_color), np.where(enough, contrast, all_contrast)
         same = np.abs(one.color - color).max(-1) <= _MAX_CHANGE * contrast
         out.append(one.shown & (one.contrast > _MIN_CONTRAST) & same)
     return out
@@ -373,14 +388,17 @@ def _spaced_frames(pixels: TrainingPixels) -> NDArray[np.int64]:
     return np.array(kept, np.int64)
 
 
-def _at_most(frames: NDArray[np.int64], lightings: tuple[str, ...]) -> NDArray[np.int64]:
-    """At most `_MAX_PICTURES` of the frames per lighting, evenly spread."""
-    names = np.array(lightings)[frames]
-    chosen = []
-    for name in dict.fromkeys(names):
-        mine = np.flatnonzero(names == name)
-        chosen += mine[np.linspace(0, len(mine) - 1, min(len(mine), _MAX_PICTURES)).astype(int)].tolist()
-    return frames[np.sort(np.array(chosen, np.int64))]
+def _at_most(kept: NDArray[np.int64], near: NDArray[np.bool_], pixels: TrainingPixels) -> NDArray[np.int64]:
+    """The near ones of the kept frames; every second, third … of them if they had more than `_MAX_PIXELS`."""
+    frames = kept[near]
+    size = sum(_width(pixels, i) ** 2 * pixels.height[i] / pixels.width[i] for i in frames)
+    stride = max(1, math.ceil(size / _MAX_PIXELS))
+    return kept[near & (np.arange(len(kept)) % stride == 0)]
+
+
+def _width(pixels: TrainingPixels, i: int) -> int:
+    """Largest side [px] of frame i's picture in the search."""
+    return max(_LEAST_WIDTH, int(pixels.width[i]), int(pixels.height[i]))
 
 
 def _spots(corner: Array, path: cKDTree, floor: Array) -> Array:
@@ -407,8 +425,9 @@ def _search(pictures: _LevelPictures, spots: Array, known: Poles) -> tuple[Poles
     feet = feet[pictures.spread(feet) > np.deg2rad(_MIN_SPREAD)]
     found, evidence = known, np.zeros(0)
     offsets = np.array([(x, y, 0.0) for x, y in product(_LAST_STEPS, _LAST_STEPS)])
+    rejected = np.zeros((0, 3))
+    sums = _judge(pictures, feet, found)[1]
     while len(feet):
-        sums = _judge(pictures, feet, found)[1]
         best = int(sums.argmax())
         if sums[best] < _MIN_EVIDENCE:
             break
@@ -419,16 +438,24 @@ def _search(pictures: _LevelPictures, spots: Array, known: Poles) -> tuple[Poles
             spot, moved = around.foot[most], bool(np.abs(offsets[most]).max() >= max(_LAST_STEPS))
             if not moved:
                 break
-        near = len(found) and np.linalg.norm(found.foot[:, :2] - spot[:2], axis=1).min() < _APART
-        accepted = not near and _agree(pictures, around.select(np.array([most])), found)
+        near, again = _within(spot, found.foot, _APART), _within(spot, rejected, 2.0 * _COARSE_CELL)
+        accepted = not near and not again and _agree(pictures, around.select(np.array([most])), found)
         # A rejected spot may be the edge of something beside a pole.
-        apart = np.linalg.norm(feet[:, :2] - spot[:2], axis=1) > (_APART if accepted else 2.0 * _COARSE_CELL)
-        apart[best] = False
-        feet = feet[apart & (sums > 0.0)]
-        if not accepted:
-            continue
-        found, evidence = Poles.join([found, around.select(np.array([most]))]), np.append(evidence, scores[most])
+        cleared = _APART if accepted or near else 2.0 * _COARSE_CELL
+        keep = np.linalg.norm(feet[:, :2] - spot[:2], axis=1) > cleared
+        keep[best] = False
+        feet, sums = feet[keep & (sums > 0.0)], sums[keep & (sums > 0.0)]
+        if accepted:
+            found, evidence = Poles.join([found, around.select(np.array([most]))]), np.append(evidence, scores[most])
+            sums = _judge(pictures, feet, found)[1]
+        else:
+            rejected = np.vstack([rejected, spot])
     return found.select(np.arange(len(known), len(found))), evidence
+
+
+def _within(spot: Array, others: Array, distance: float) -> bool:
+    """True if one of the other spots (n, 3) is nearer than a distance [m]."""
+    return bool((np.linalg.norm(others[:, :2] - spot[:2], axis=1) < distance).any())
 
 
 def _judge(pictures: _LevelPictures, feet: Array, found: Poles) -> tuple[Poles, Array]:
@@ -462,22 +489,30 @@ def _agree(pictures: _LevelPictures, pole: Poles, found: Poles) -> bool:
 
 
 def _quality(bars: list[_Bars]) -> tuple[Array, Array]:
-    """Quality of bars and number of pictures, shape (spots, radii, bands): means over lightings by their pictures.
+    """Quality of bars and number of pictures, shape (spots, radii, bands): means over films by their pictures.
 
-    Colors deviate from the mean of their film. A film's first picture determines this mean, so of all films of a
-    lighting but one, it does not count.
+    Films with too few pictures count as one film per lighting. In this, colors deviate from the mean of their own film,
+    which its first picture determines; so of all these films but one, one picture does not count.
     """
     total, weights = np.zeros(bars[0].count.shape), np.zeros(bars[0].count.shape)
+
+    def add(count: Array, contrast: Array, squares: Array) -> None:
+        nonlocal total, weights
+        deviation = np.sqrt(np.maximum(squares, 0.0).max(-1) / np.maximum(count, 1.0))
+        weight = np.where(count >= _MIN_PICTURES, count, 0.0)
+        total = total + weight * contrast / (contrast + _SPREAD * deviation + _NOISE)
+        weights = weights + weight
+
     for lighting in dict.fromkeys(one.lighting for one in bars):
-        films = [one for one in bars if one.lighting == lighting]
-        count = sum(one.count for one in films)
-        effective = count - np.maximum(sum(one.count > 0 for one in films) - 1, 0)
-        contrast = sum(one.contrast for one in films) / np.maximum(count, 1.0)
-        squares = sum(one.square - one.color**2 / np.maximum(one.count, 1.0)[..., None] for one in films)
-        deviation = np.sqrt(np.maximum(squares, 0.0).max(-1) / np.maximum(effective, 1.0))
-        weight = np.where(effective >= _MIN_PICTURES, effective, 0.0)
-        total += weight * contrast / (contrast + _SPREAD * deviation + _NOISE)
-        weights += weight
+        short: list[Array] = [np.zeros(1)] * 4
+        for one in (one for one in bars if one.lighting == lighting):
+            squares = one.square - one.color**2 / np.maximum(one.count, 1.0)[..., None]
+            add(one.count, one.contrast / np.maximum(one.count, 1.0), squares)
+            few = (one.count > 0) & (one.count < _MIN_PICTURES)
+            parts = (1.0 * few, few * one.count, few * one.contrast, few[..., None] * squares)
+            short = [a + b for a, b in zip(short, parts, strict=True)]
+        films, count, contrast, squares = short
+        add(count - np.maximum(films - 1, 0), contrast / np.maximum(count, 1.0), squares)
     return total / np.maximum(weights, 1.0), weights
 
 

@@ -72,6 +72,8 @@ def film(
 ) -> Truth:
     """Films every pass of a plan under every lighting into the scene folder `out`, and saves the truth there.
 
+    The settings and the truth of an older film in this folder are deleted first.
+
     With `traffic`, walkers and cars move through every film, and the films of all lightings but the last show parked
     cars. The truth contains none of them. `renderer_of` returns the renderer for a lighting and a place; the default is
     `filming.Renderer`, the only one that shows moving traffic. `length` [m] is that for `place_sampling.draw`. With
