@@ -116,7 +116,7 @@ def mujoco_rays(rays: Array) -> Array32:
 # ---- convex parts
 
 NOTHING, ON_GROUND = -1, -2
-"""What a ray hits that hits no part."""
+"""Numbers that `CollisionCaster` returns for rays that hit no part."""
 _PARTS_PER_MODEL = 2000
 
 

@@ -136,7 +136,7 @@ class _LevelPictures:
     """Pictures of some frames as level cameras would have taken them, as summed-area tables."""
 
     def __init__(
-        self, pixels: TrainingPixels, frames: NDArray[np.int64], known: "dict[int, _Read] | None" = None
+        self, pixels: TrainingPixels, frames: NDArray[np.int64], known: dict[int, _Read] | None = None
     ) -> None:
         """The pictures of the frames in `known` have been read before."""
         self.frames = frames
@@ -152,7 +152,7 @@ class _LevelPictures:
         self._intrinsics, self._tables = zip(*self.read.values(), strict=True)
 
     @staticmethod
-    def _read_frame(pixels: TrainingPixels, i: int, turn: Array) -> "_Read":
+    def _read_frame(pixels: TrainingPixels, i: int, turn: Array) -> _Read:
         """Intrinsics fx, fy, cx, cy [px], and tables of the colors and of the pixels that are masked or outside."""
         shape = int(pixels.height[i]), int(pixels.width[i])
         picture, intrinsics = load_picture(pixels.cameras, i, _width(pixels, i))
@@ -225,8 +225,8 @@ class _LevelPictures:
             out.append(_Bars(str(self.lightings[chosen[0]]), *(values.numpy() for values in sums)))
         return out
 
-    def offsets(self, foot: Array, radius: float, bands: tuple[tuple[float, float], ...], found: "Poles") -> Array:
-        """How far to the right of a spot (3,) the pictures show the bar's greatest contrast.
+    def offsets(self, foot: Array, radius: float, bands: tuple[tuple[float, float], ...], found: Poles) -> Array:
+        """Measures how far to the right of a spot (3,) the pictures show the bar's greatest contrast.
 
         Returns a row for each picture in which no pole `found` covers the spot: its axis to the right (x, y), the
         offset [m], and the contrast [gray levels]; shape (n, 4).
@@ -343,29 +343,31 @@ def _usual(views: list[_View], cameras: Cameras) -> list[NDArray[np.bool_]]:
 
     This is the median of the picture's film or, in bands that the film shows too seldom, of its lighting.
     """
-    medians: dict[tuple[str, ...], tuple[Array, Array, Array]] = {}
-    for names in (cameras.sources, cameras.lightings):
-        for name in dict.fromkeys(names[one.frame] for one in views):
-            alike = [one for one in views if names[one.frame] == name]
-            judged = np.stack([np.where(one.shown, 1.0, np.nan) for one in alike])
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RuntimeWarning)  # a band that no picture shows has no median
-                color = np.nanmedian(np.stack([one.color for one in alike]) * judged[..., None], 0)
-                contrast = np.nanmedian(np.stack([one.contrast for one in alike]) * judged, 0)
-            medians["film" if names is cameras.sources else "lighting", name] = (
-                (~np.isnan(judged)).sum(0),
-                color,
-                contrast,
-            )
+    films, lightings = (
+        {name: _medians([one for one in views if names[one.frame] == name]) for name in dict.fromkeys(names)}
+        for names in (cameras.sources, cameras.lightings)
+    )
     out = []
     for one in views:
-        count, color, contrast = medians["film", cameras.sources[one.frame]]
-        _, all_color, all_contrast = medians["lighting", cameras.lightings[one.frame]]
+        count, color, contrast = films[cameras.sources[one.frame]]
+        _, all_color, all_contrast = lightings[cameras.lightings[one.frame]]
         enough = count >= _LEAST_ALIKE
         color, contrast = np.where(enough[:, None], color, all_color), np.where(enough, contrast, all_contrast)
         same = np.abs(one.color - color).max(-1) <= _MAX_CHANGE * contrast
         out.append(one.shown & (one.contrast > _MIN_CONTRAST) & same)
     return out
+
+
+def _medians(views: list[_View]) -> tuple[Array, Array, Array]:
+    """Number of views of each band, and medians of their colors and contrasts; empty without views."""
+    if not views:
+        return np.zeros(0), np.zeros((0, 3)), np.zeros(0)
+    judged = np.stack([np.where(one.shown, 1.0, np.nan) for one in views])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a band that no picture shows has no median
+        color = np.nanmedian(np.stack([one.color for one in views]) * judged[..., None], 0)
+        contrast = np.nanmedian(np.stack([one.contrast for one in views]) * judged, 0)
+    return (~np.isnan(judged)).sum(0), color, contrast
 
 
 def _level(pose: Array) -> Array:

@@ -280,8 +280,8 @@ def matched_poses(truth: Truth, cameras: Cameras) -> Array:
 def align_poses(poses: Array, true_poses: Array, with_scale: bool = False) -> Similarity:
     """The rigid transform, or similarity if `with_scale`, that best maps camera poses onto the true ones, (n, 4, 4).
 
-    Each camera contributes its center and the tips of its axes, 1 m long,
-    because centers on a straight path do not determine the roll about it.
+    Each camera contributes its center and the tips of its axes, 1 m long, because centers on a straight path do not
+    determine the roll about it.
     """
 
     def tripods(p: Array) -> Array:
