@@ -4,7 +4,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from twin.learn.replay_buffer import augment_colors
+from twin.learn.replay_buffer import draw_color_changes
+
+
+def augment_colors(stacks: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:
+    return draw_color_changes(len(stacks), stacks.shape[2:], strength, rng).applied(stacks)
 
 
 def stacks(count: int = 6) -> np.ndarray:

@@ -5,6 +5,8 @@ import pytest
 
 pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
 
+import torch
+from devices import DEVICES
 from gymnasium import spaces
 
 from twin.errors import InputError
@@ -108,7 +110,7 @@ def test_shifts_stay_within_their_limit_and_repeat_edges():
     buffer = FrameReplayBuffer(40, SPACE, ACTION, "cpu", ENVS, shift=2)
     stacks = np.random.default_rng(0).integers(0, 256, (60, 12, *SIZE), np.uint8)
     shifts = set()
-    for before, after in zip(stacks, buffer._shifted(stacks), strict=True):
+    for before, after in zip(stacks, buffer._shifted(stacks, buffer._draw_shifts(60)), strict=True):
         found = [
             (y, x)
             for y in range(-2, 3)
@@ -118,6 +120,28 @@ def test_shifts_stay_within_their_limit_and_repeat_edges():
         assert len(found) == 1
         shifts.add(found[0])
     assert len(shifts) > 15
+
+
+@pytest.mark.parametrize("device", ["cpu", *(name for name in DEVICES if name != "cpu")])
+def test_samples_on_a_gpu_equal_those_on_the_host(device, monkeypatch):
+    """Without a GPU, its code runs on the CPU."""
+    buffers = [
+        FrameReplayBuffer(20 * ENVS, SPACE, ACTION, one, ENVS, shift=2, color_strength=1.0, state_size=STATES)
+        for one in ("cpu", device)
+    ]
+    if device == "cpu":
+        buffers[1]._on_gpu = torch.as_tensor(buffers[1].frames).clone()
+    for buffer in buffers:
+        worlds = NaiveEnvs(3, 3)
+        for _ in range(50):
+            worlds.step(buffer)
+    for _ in range(3):
+        plain, other = (buffer.sample(40) for buffer in buffers)
+        for name in ("actions", "next_observations", "dones", "rewards", "states", "next_states"):
+            np.testing.assert_array_equal(getattr(plain, name), getattr(other, name).cpu(), err_msg=name)
+        off = np.abs(plain.observations.numpy().astype(int) - other.observations.cpu().numpy())
+        assert off.max() <= 1 and off.mean() < 0.1 and off[20:].max() == 0
+        assert not np.array_equal(plain.observations[:20], plain.next_observations[:20])
 
 
 def test_saved_transitions_survive_later_writes(tmp_path):

@@ -20,7 +20,7 @@ from twin.env.observation import GpuPixelObserver, PixelObserver
 from twin.env.picture_effects import CameraOptions
 from twin.env.suite import EnvFactory
 from twin.env.task import control
-from twin.env.vector_env_gpu import GpuVectorEnv
+from twin.env.vector_env_gpu import GpuVectorEnv, _compile_kernels
 from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError
 from twin.nerf.baked import BakedField
@@ -195,6 +195,29 @@ def test_gpu_frame_stacks_equal_those_on_the_host(scene, latency, device_name, m
         np.testing.assert_array_equal(device.tensor().cpu().numpy(), host.stacks.reshape(5, -1, 18, 32))
         assert before is None or not np.array_equal(before, host.stacks)
         before = device.stacks
+
+
+def test_kernels_are_compiled_before_the_first_step(scene, monkeypatch):
+    """Those that the list of kernels lacks would be compiled one by one; on the CPU, one has another block size."""
+    envs = GpuVectorEnv(EnvFactory.open(scene, "bend", {"pixels": False, "obstacles": ()}), [1, 2], "cpu")
+    simulation, load = envs._simulation, wp.Module.load
+    loaded: list[str] = []
+
+    def note(module, device, block_dim=None, **rest):
+        if (None, block_dim) not in module.execs:
+            loaded.append(module.name)
+        return load(module, device, block_dim, **rest)
+
+    monkeypatch.setattr(wp.Module, "load", note)
+    conditional = simulation._model.opt.graph_conditional
+    _compile_kernels(simulation._model, lambda: simulation._substep(0), "cpu")
+    assert simulation._model.opt.graph_conditional == conditional
+    loaded.clear()
+    envs.begin(range(2))
+    envs.step(np.array([[1.0, 0.0], [1.0, 0.0]]))
+    assert set(loaded) <= {"mujoco_warp._src.collision_driver"}
+    assert all(physics.speed > 0.01 for physics in envs.physics)
+    envs.close()
 
 
 def test_physics_starts_while_torch_shares_its_stream(scene):

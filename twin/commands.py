@@ -305,10 +305,11 @@ def _train(parser: argparse.ArgumentParser) -> None:
     add(
         "--steps",
         type=int,
-        help="largest number of control steps, all environments together (default: 24000; gpu: 240000)",
+        help="largest number of control steps, all environments together (default: 24000; gpu: 60000)",
     )
     add("--worlds", type=int, help="number of parallel environments (default: 8; gpu: 32)")
-    add("--processes", type=int, help="processes that step the environments (default: one per core, at most 8)")
+    add("--processes", type=int, help="processes that step the environments (default: one per core, at most 16)")
+    add("--device", choices=("cpu", "cuda"), help="where the networks are trained (default: cpu; preset gpu: cuda)")
     add("--updates", type=float, help="network updates per control step (default: 0.5)")
     add("--steering", type=float, help="penalty of full steering, as a share of a step's reward (default: 0.5)")
     add("--entropy", type=float, help="target entropy per action component [nat]; higher explores more (default: -0.5)")

@@ -34,7 +34,7 @@ from twin.errors import InputError
 from twin.loading import Twin
 from twin.runtime import available_cores
 
-_MIN_ENVS, _MAX_PROCESSES = 2, 8  # defaults: least number of environments per process; largest number of processes
+_MIN_ENVS, _MAX_PROCESSES = 2, 16  # defaults: least number of environments per process; largest number of processes
 _CHILD_CODE = "from twin.env.vector_env import serve; serve()"  # not -m, which would pickle classes as part of __main__
 _PARENT_CHECK_PERIOD = 2.0  # [s] between two checks whether the parent still runs
 
@@ -304,7 +304,7 @@ def serve() -> None:
 
 
 def default_processes(count: int) -> int:
-    """Number of processes on a CPU for `count` environments: one per core, at most 8, with at least two each."""
+    """Number of processes on a CPU for `count` environments: one per core, at most 16, with at least two each."""
     return max(1, min(available_cores(), count // _MIN_ENVS, _MAX_PROCESSES))
 
 

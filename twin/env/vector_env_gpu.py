@@ -8,8 +8,10 @@ Tests run this code on the CPU, where it is slower than MuJoCo, and on a GPU if 
 # mypy: disable-error-code="index, attr-defined, valid-type, misc, arg-type, operator, var-annotated, call-overload"
 # (kernels use Warp's own types, which mypy does not know)
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
+from unittest.mock import patch
 
 import mujoco_warp as mjw
 import numpy as np
@@ -25,6 +27,7 @@ from twin.env.suite import EnvFactory
 from twin.env.task import DrivePhysics, DriveTask, Motion, RewardAndTermination, control
 from twin.env.vector_env_local import LocalVectorEnv, StepResult
 from twin.geometry.cameras import opencv_to_mujoco
+from twin.runtime import available_cores
 from twin.types import Array, Indices
 from twin.warp_runtime import wp
 
@@ -148,8 +151,8 @@ class GpuSimulation:
             self._upload()
             self._graph: Any = None
             if device != "cpu":
-                runtime.log_line("preparing physics on the GPU; the first time on a machine, this takes minutes")
-                # The CUDA graph is captured now, while nothing else uses the GPU; the first run compiles the kernels.
+                _compile_kernels(self._model, lambda: self._substep(0), device)
+                # The CUDA graph is captured now, while nothing else uses the GPU.
                 # torch's default stream, which training a field makes Warp's, cannot be captured.
                 with wp.ScopedStream(wp.Stream(device), sync_enter=True, sync_exit=True):
                     self._advance()
@@ -290,14 +293,17 @@ class GpuSimulation:
         self._data.overflow.zero_()
 
     def _advance(self) -> None:
+        for k in range(self._steps):
+            self._substep(k)
+
+    def _substep(self, k: int) -> None:
         d, contact = self._data, self._data.contact
         commands = [self._segment, self._speeds, *self._mocap_on_device]
-        for k in range(self._steps):
-            wp.launch(_apply_commands, d.nworld, [k, *commands], [d.ctrl, d.mocap_pos, d.mocap_quat])
-            mjw.step(self._model, d)
-            wp.launch(_record_positions, d.qpos.shape, [k, self._segment, d.qpos], [self._history])
-            pairs = [d.nacon, contact.geom, contact.worldid, self._is_robot, self._is_collidable]
-            wp.launch(_mark_contacts, d.naconmax, [k, self._checks, *pairs], [self._touched_on_device])
+        wp.launch(_apply_commands, d.nworld, [k, *commands], [d.ctrl, d.mocap_pos, d.mocap_quat])
+        mjw.step(self._model, d)
+        wp.launch(_record_positions, d.qpos.shape, [k, self._segment, d.qpos], [self._history])
+        pairs = [d.nacon, contact.geom, contact.worldid, self._is_robot, self._is_collidable]
+        wp.launch(_mark_contacts, d.naconmax, [k, self._checks, *pairs], [self._touched_on_device])
 
     def _download(self, which: Indices, schedules: SubstepSchedules) -> None:
         over = self._data.overflow.numpy()[which] & int(_OVERFLOWS)
@@ -330,6 +336,36 @@ class GpuSimulation:
 def _rotation_matrices(quaternions: Array) -> Array:
     """Rotation matrices (k, 3, 3) of quaternions w, x, y, z, shape (k, 4), which need not be unit quaternions."""
     return Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
+
+
+def _compile_kernels(model: Any, launch: Callable[[], None], device: str) -> None:
+    """Compiles and loads the kernels that `launch` needs, one per core at a time.
+
+    Warp compiles a kernel when it is first launched. For the physics that would be some 80 kernels one after another,
+    which takes minutes on a machine that has not compiled them yet.
+    """
+    needed: dict[tuple[Any, int], None] = {}
+
+    def note(module: Any, _: Any, block_dim: int | None = None) -> None:
+        """Replaces `Module.load`. A launch whose module is not loaded does nothing."""
+        needed[module, block_dim or module.options["block_dim"]] = None
+
+    def suggest(kernel: Any, _: Any) -> tuple[int, int]:
+        """Replaces `get_suggested_block_size`, which needs a loaded module."""
+        note(kernel.module, None)
+        return 256, 1
+
+    conditional = model.opt.graph_conditional
+    model.opt.graph_conditional = False  # else loops would read what was not computed
+    with patch.object(wp.Module, "load", note), patch.object(wp, "get_suggested_block_size", suggest):
+        launch()
+    model.opt.graph_conditional = conditional
+    with (
+        runtime.bar("preparing physics on the GPU", len(needed), "kernel", after=1.0) as progress,
+        ThreadPoolExecutor(available_cores()) as pool,
+    ):
+        for _ in pool.map(lambda one: one[0].load(wp.get_device(device), one[1]), needed):
+            progress.update()
 
 
 class GpuVectorEnv(LocalVectorEnv):

@@ -17,22 +17,71 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
 
+from twin.env.options import CUDA
 from twin.errors import InputError
 from twin.files import allocate
+from twin.types import Array32
 
 # ---- color augmentation
 
 _GAMMA, _CONTRAST, _TINT = 0.25, 0.25, 0.08  # standard deviations of the logarithms of the random factors
 _KNOTS, _SHADING = (3, 5), 0.4  # brightness pattern: knots down and across; standard deviation of the logarithm
-_MAX_COVERS, _COVER_SIDES = 4, (0.1, 0.5)  # rectangles: the number is less than 4; range of sides / the picture's
+_MAX_COVERS, _COVER_SIDES = 3, (0.1, 0.5)  # rectangles: largest number; range of sides / the picture's
 _LEVELS = np.arange(256) / 255.0
 
 
-def augment_colors(stacks: NDArray[np.uint8], strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Randomizes the colors of stacks, to prepare policies for skies and shadows that no filmed lighting shows.
+class ColorChanges(NamedTuple):
+    """Random changes of the colors of k stacks, see `draw_color_changes`."""
 
-    The policy's normalization removes brightness, contrast and tint of the whole ground; this function randomizes what
+    curves: NDArray[np.uint8]
+    """Tone curve of each color, shape (k, 3, 256)."""
+    knots: Array32
+    """Brightness pattern, shape (k, 3, 5)."""
+    covers: NDArray[np.int64]
+    """First row, row after the last, first column and column after the last of each rectangle, shape (k, 3, 4). They
+    are drawn in this order; those that a stack does not have are empty."""
+    cover_colors: NDArray[np.uint8]
+    """Shape (k, 3, 3)."""
+
+    def applied(self, stacks: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Changed copies of stacks (k, 3 · stack, height, width)."""
+        count, channels, height, width = stacks.shape
+        out = np.empty_like(stacks)
+        for i in range(count):
+            shading = cv2.resize(self.knots[i], (width, height), interpolation=cv2.INTER_CUBIC)
+            for channel in range(channels):
+                toned = cv2.LUT(stacks[i, channel], self.curves[i, channel % 3])
+                cv2.multiply(toned, shading, out[i, channel], dtype=cv2.CV_8U)
+        for i, n in np.argwhere(self.covers[..., 1]):
+            top, bottom, left, right = self.covers[i, n]
+            out[i, :, top:bottom, left:right] = np.tile(self.cover_colors[i, n], channels // 3)[:, None, None]
+        return out
+
+    def applied_on_gpu(self, stacks: torch.Tensor) -> torch.Tensor:
+        """As `applied`, of a tensor; colors may differ by 1, as OpenCV rounds otherwise."""
+        (count, channels, height, width), device = stacks.shape, stacks.device
+        curves = torch.as_tensor(self.curves, device=device).repeat(1, channels // 3, 1)
+        toned = curves.gather(2, stacks.reshape(count, channels, -1).long()).reshape(stacks.shape)
+        knots = torch.as_tensor(self.knots, device=device)[:, None]
+        shading = nn.functional.interpolate(knots, (height, width), mode="bicubic")
+        out = (toned * shading).round().clamp(0, 255).to(torch.uint8)
+        # One rectangle of all stacks at a time; one launch per rectangle would take longer than all the rest.
+        corners = torch.as_tensor(self.covers, device=device)[..., None, None]
+        colors = torch.as_tensor(self.cover_colors, device=device).repeat(1, 1, channels // 3)[..., None, None]
+        row, column = torch.arange(height, device=device)[:, None], torch.arange(width, device=device)
+        for n in range(_MAX_COVERS):
+            top, bottom, left, right = corners[:, n].unbind(1)
+            inside = (row >= top) & (row < bottom) & (column >= left) & (column < right)
+            out = torch.where(inside[:, None], colors[:, n], out)
+        return out
+
+
+def draw_color_changes(count: int, size: tuple[int, ...], strength: float, rng: np.random.Generator) -> ColorChanges:
+    """Draws changes of color that prepare policies for skies and shadows that no filmed lighting shows.
+
+    The policy's normalization removes brightness, contrast and tint of the whole ground; the changes randomize what
     remains. Each stack is changed in its own way, but all pictures of a stack alike, which preserves motion:
 
         tone     v → v^gamma, then a change of contrast about the middle
@@ -41,24 +90,20 @@ def augment_colors(stacks: NDArray[np.uint8], strength: float, rng: np.random.Ge
         covers   rectangles in uniform colors, so that steering does not rely on a single object in the background
 
     Args:
-        stacks: Shape (k, 3 · stack, height, width); the three color channels of a picture are adjacent.
+        count: Number of stacks.
+        size: Height and width of the pictures.
         strength: Factor by which the standard deviations are multiplied; 0 changes nothing.
     """
-    count, channels, height, width = stacks.shape
     curves = _curves(count, strength, rng)
     knots = np.exp(strength * _SHADING * rng.normal(size=(count, *_KNOTS))).astype(np.float32)
-    out = np.empty_like(stacks)
+    covers, colors = np.zeros((count, _MAX_COVERS, 4), np.int64), np.zeros((count, _MAX_COVERS, 3), np.uint8)
     for i in range(count):
-        shading = cv2.resize(knots[i], (width, height), interpolation=cv2.INTER_CUBIC)
-        for channel in range(channels):
-            toned = cv2.LUT(stacks[i, channel], curves[i, channel % 3])
-            cv2.multiply(toned, shading, out[i, channel], dtype=cv2.CV_8U)
-        for _ in range(rng.integers(_MAX_COVERS) if strength else 0):
-            sides = (rng.uniform(*_COVER_SIDES, 2) * (height, width)).astype(int) + 1
-            top, left = (rng.uniform(size=2) * ((height, width) - sides)).astype(int)
-            color = np.tile(rng.integers(0, 256, 3, np.uint8), channels // 3)
-            out[i, :, top : top + sides[0], left : left + sides[1]] = color[:, None, None]
-    return out
+        for n in range(rng.integers(_MAX_COVERS + 1) if strength else 0):
+            height, width = (rng.uniform(*_COVER_SIDES, 2) * size).astype(int) + 1
+            top, left = (rng.uniform(size=2) * (size[0] - height, size[1] - width)).astype(int)
+            covers[i, n] = top, top + height, left, left + width
+            colors[i, n] = rng.integers(0, 256, 3, np.uint8)
+    return ColorChanges(curves, knots, covers, colors)
 
 
 def _curves(count: int, strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -119,7 +164,8 @@ class FrameReplayBuffer(ReplayBuffer):
             slack: Largest number of transitions, of all environments together, added between two saves.
             shift: Samples are shifted at random, by at most this in each direction [px]; edge pixels are repeated
                 (DrQ, Kostrikov et al. 2020).
-            color_strength: Strength of `augment_colors`, which changes half of the stacks before transitions.
+            color_strength: Strength of `draw_color_changes`, for half of the stacks before transitions.
+            device: On a GPU, it holds a second copy of all pictures.
             state_size: Number of components of the `state` in an `info`.
 
         Raises:
@@ -155,6 +201,8 @@ class FrameReplayBuffer(ReplayBuffer):
                 )
             allocate(file, bytes_needed)  # a full disk causes an error now, not a SIGBUS hours later
             self.frames = np.memmap(file, np.uint8, "r+", shape=shape)
+        # On a GPU, updates would wait for pictures that the processor gathers and changes.
+        self._on_gpu = torch.as_tensor(self.frames, device=self.device) if self.device.type == CUDA else None
         self.written = np.zeros(n_envs, np.int64)
         """Number of pictures written to each ring so far."""
         self._ages = np.full(n_envs, -1)  # steps since each environment's episode began; -1: no episode
@@ -172,13 +220,13 @@ class FrameReplayBuffer(ReplayBuffer):
 
         An environment's observations must be consecutive until its episode is `done`, or until `break_off`.
         """
+        new = self._ages < 0
+        self._write(np.flatnonzero(new), obs[new, -3:])
+        self._ages[new] = 0
+        self.newest[self.pos], self.age[self.pos] = self.written - 1, self._ages
+        self._write(np.arange(self.n_envs), next_obs[:, -3:])
+        self._ages = np.where(done, -1, self._ages + 1)
         for i in range(self.n_envs):
-            if self._ages[i] < 0:
-                self._write(i, obs[i, -3:])
-                self._ages[i] = 0
-            self.newest[self.pos, i], self.age[self.pos, i] = self.written[i] - 1, self._ages[i]
-            self._write(i, next_obs[i, -3:])
-            self._ages[i] = -1 if done[i] else self._ages[i] + 1
             if self._state.shape[1]:
                 self.states[self.pos, i] = self._state[i]
                 self.states_after[self.pos, i] = infos[i]["state"]
@@ -200,13 +248,7 @@ class FrameReplayBuffer(ReplayBuffer):
             complete = self.is_complete(*more)
             row, env_index = np.append(row, more[0][complete]), np.append(env_index, more[1][complete])
         row, env_index = row[:batch_size], env_index[:batch_size]
-        before, after = self.stacks(row, env_index)
-        if self.shift:
-            before, after = self._shifted(before), self._shifted(after)
-        if self.color_strength:
-            # Stacks after transitions stay unchanged, since targets are computed from them (SVEA, Hansen et al. 2021).
-            half = batch_size // 2
-            before[:half] = augment_colors(before[:half], self.color_strength, self.rng)
+        before, after = self._augmented(*self.stacks(row, env_index))
         rest = self.actions[row, env_index], after, self.ends[row, env_index, None], self.rewards[row, env_index, None]
         parts = (before, *rest, self.states[row, env_index], self.states_after[row, env_index])
         return ReplaySamples(*(torch.as_tensor(part, device=self.device) for part in parts))
@@ -216,16 +258,31 @@ class FrameReplayBuffer(ReplayBuffer):
         oldest = self.newest[row, env_index] - np.minimum(self.age[row, env_index], self.stack - 1)
         return oldest >= self.written[env_index] - self._reach
 
-    def stacks(self, row: NDArray, env_index: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """The stacks before, and the stacks after, k transitions; each has the shape (k, 3 · stack, height, width)."""
+    def stacks(self, row: NDArray, env_index: NDArray) -> tuple[Any, Any]:
+        """The stacks before, and the stacks after, k transitions; each has the shape (k, 3 · stack, height, width).
+
+        They are tensors on the buffer's device if that is a GPU, else arrays.
+        """
         newest, age = self.newest[row, env_index], self.age[row, env_index]
         back = np.arange(self.stack - 1, -1, -1)
         first = (newest - age)[:, None]
         out = []
         for at in (newest, newest + 1):
             where = np.maximum(at[:, None] - back, first) % self.length
-            out.append(self.frames[env_index[:, None], where].reshape(len(row), *self.obs_shape))
+            frames = self.frames if self._on_gpu is None else self._on_gpu
+            out.append(frames[env_index[:, None], where].reshape(len(row), *self.obs_shape))
         return out[0], out[1]
+
+    def _augmented(self, before: Any, after: Any) -> tuple[Any, Any]:
+        """Stacks as updates see them: all are shifted, and half of those before transitions have other colors."""
+        if self.shift:
+            before, after = (self._shifted(stacks, self._draw_shifts(len(stacks))) for stacks in (before, after))
+        if self.color_strength:
+            # Stacks after transitions stay unchanged, since targets are computed from them (SVEA, Hansen et al. 2021).
+            half = len(before) // 2
+            changes = draw_color_changes(half, self.obs_shape[1:], self.color_strength, self.rng)
+            before[:half] = (changes.applied if self._on_gpu is None else changes.applied_on_gpu)(before[:half])
+        return before, after
 
     def state(self) -> tuple[dict[str, NDArray], dict[str, Any]]:
         """Returns the buffer's state except for the pictures: arrays, and JSON-able values.
@@ -249,17 +306,31 @@ class FrameReplayBuffer(ReplayBuffer):
         """Call this before the next transition if all environments begin new episodes with it."""
         self._ages[:], self._state[:] = -1, np.nan
 
-    def _write(self, env_index: int, picture: NDArray) -> None:
-        self.frames[env_index, self.written[env_index] % self.length] = picture
+    def _write(self, env_index: NDArray[np.int64], pictures: NDArray) -> None:
+        """Adds a picture to the ring of each of k environments."""
+        at = self.written[env_index] % self.length
+        self.frames[env_index, at] = pictures
+        if self._on_gpu is not None and len(at):
+            self._on_gpu[env_index, at] = torch.as_tensor(np.ascontiguousarray(pictures), device=self.device)
         self.written[env_index] += 1
 
-    def _shifted(self, stacks: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _draw_shifts(self, count: int) -> NDArray[np.int64]:
+        """Shifts down and to the right, 0 to 2 · shift, where `shift` leaves a stack in its place; shape (count, 2)."""
+        return self.rng.integers(0, 2 * self.shift + 1, (count, 2))
+
+    def _shifted(self, stacks: Any, shifts: NDArray[np.int64]) -> Any:
         p, (height, width) = self.shift, self.obs_shape[1:]
+        if self._on_gpu is not None:
+            y, x = torch.as_tensor(shifts.T - p, device=self.device)[..., None]
+            rows = (torch.arange(height, device=self.device) + y).clamp(0, height - 1)[:, None, :, None]
+            columns = (torch.arange(width, device=self.device) + x).clamp(0, width - 1)[:, None, None, :]
+            k, channel = torch.arange(len(stacks), device=self.device), torch.arange(len(stacks[0]), device=self.device)
+            return stacks[k[:, None, None, None], channel[:, None, None], rows, columns]
         padded = np.empty((*stacks.shape[:2], height + 2 * p, width + 2 * p), np.uint8)
         padded[..., p:-p, p:-p] = stacks
         padded[..., :p, p:-p], padded[..., -p:, p:-p] = stacks[..., :1, :], stacks[..., -1:, :]
         padded[..., :p], padded[..., -p:] = padded[..., p : p + 1], padded[..., -p - 1 : -p]
         out = np.empty_like(stacks)
-        for i, (y, x) in enumerate(self.rng.integers(0, 2 * p + 1, (len(stacks), 2))):
+        for i, (y, x) in enumerate(shifts):
             out[i] = padded[i, :, y : y + height, x : x + width]
         return out

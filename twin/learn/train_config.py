@@ -100,7 +100,8 @@ class TrainConfig:
     """Number of steps, with a falling learning rate, after tests have ended a training (`selection.py`)."""
     save_every: Annotated[int, Range(1, 10**10)] = 4_000
     """Number of steps between two saved states."""
-    device: str = "cpu"
+    device: str = CPU
+    """Where the networks are trained; environments run on the CPU."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a value is out of range, or the lighting is reserved for validation."""
@@ -155,7 +156,6 @@ class TrainConfig:
             "randomise": ranges if self.randomise else None,
             "rewards": rewards,
             "start_along": self.start_along,
-            "device": self.device,
         }
 
 
@@ -169,12 +169,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "hidden": (512, 512),
         "worlds": 32,
         "batch": 256,
-        "buffer": 100_000,
-        "steps": 240_000,
-        "test_every": 30_000,
-        "settle": 20_000,
-        "cycle": 120_000,
+        "steps": 60_000,
         "shift": 4,
-        "device": "cuda",
+        "device": CUDA,
     },
 }

@@ -98,7 +98,7 @@ class BakedField:
             self._section(0, 1)
         self._kernels = RenderKernels(self.network, device)
         self._threads = available_cores()
-        self._pool = ThreadPoolExecutor(self._threads) if device == "cpu" and self._threads > 1 else None
+        self._pool = ThreadPoolExecutor(self._threads) if self._threads > 1 else None
 
     @property
     def lightings(self) -> tuple[str, ...]:
@@ -259,7 +259,7 @@ class BakedField:
         """Renders views by the sections that have a share in them; `features` needs shares that are 0 or 1."""
         needed = np.flatnonzero(shares.any(0)).tolist()
         if len(needed) == 1:
-            return self._render(needed[0], views).images(features)
+            return self._render(needed[0], views).images(features, self._pool)
         # Those in memory come first, before others take their place.
         with self._resident_lock:
             resident = set(self._resident)
@@ -269,7 +269,7 @@ class BakedField:
             # The number of views changes at every border; rounded up to a power of two, it has few render targets.
             count = min(1 << (len(rows) - 1).bit_length(), len(shares))
             padded = np.append(rows, np.repeat(rows[-1:], count - len(rows)))
-            parts[k] = rows, self._render(k, views.subset(padded), len(needed)).images(features)
+            parts[k] = rows, self._render(k, views.subset(padded), len(needed)).images(features, self._pool)
         n, (width, height) = len(shares), views.size
         out = RenderedImages(
             Rendering(*(np.zeros((n, height, width, *channels), np.float32) for channels in ((3,), (), ()))),
@@ -312,18 +312,18 @@ class BakedField:
         key = len(views.pose), *views.size, views.stop is not None
         if key not in targets:
             # More bands than cores keep all cores busy, as bands with sky finish sooner.
-            bands = 3 * self._threads if self._pool else 1
+            bands = 3 * self._threads if self._pool and self.device == "cpu" else 1
             targets[key] = RenderTarget(self._kernels, section, bands, *key)
         targets.move_to_end(key)
         if len(targets) > _MAX_TARGETS:
             targets.popitem(last=False)
         target = targets[key]
         target.set_cameras(views)
-        if self._pool is None:
+        if self._pool and len(target.bands) > 1:
+            list(self._pool.map(target.render_band, target.bands))
+        else:
             for band in target.bands:
                 target.render_band(band)
-        else:
-            list(self._pool.map(target.render_band, target.bands))
         return target
 
     def head_biases(self, lighting: str | NDArray | Sequence[str | NDArray], n: int) -> Array32:

@@ -424,15 +424,18 @@ def march_kernel(lanes: int) -> Any:
                 advance = wp.min(wp.min(wp.min(w0, w1), w2), leave[j] - tj) + 0.02 * bricks.near_cell
                 ahead[j] = wp.where(near > 0, wp.where(skip > 0, advance, stride), 0.0)
             if alive_count == 0 or queue_length == 32:
-                for n in range(queue_length):
-                    bits = queued[n]
-                    while bits != 0:
-                        j = lowest_bit(bits)
-                        bits = bits & (bits - 1)
-                        value = features_at(bricks, queued_slot[n, j], queued_0[n, j], queued_1[n, j], queued_2[n, j])
-                        for ch in range(CHANNELS):
-                            total[j, ch] = total[j, ch] + value[ch] * queued_weight[n, j]
-                queue_length = 0
+                if wp.static(lanes > 1):
+                    for n in range(queue_length):
+                        bits = queued[n]
+                        while bits != 0:
+                            j = lowest_bit(bits)
+                            bits = bits & (bits - 1)
+                            value = features_at(
+                                bricks, queued_slot[n, j], queued_0[n, j], queued_1[n, j], queued_2[n, j]
+                            )
+                            for ch in range(CHANNELS):
+                                total[j, ch] = total[j, ch] + value[ch] * queued_weight[n, j]
+                    queue_length = 0
                 if alive_count == 0:
                     break
             if outside_count > 0:
@@ -507,14 +510,20 @@ def march_kernel(lanes: int) -> Any:
                     due_now = wp.where(due > _MIN_WEIGHT, 1, 0)
                     pending[j] = wp.where(due_now > 0, 0.0, due)
                     counted[j] = counted[j] + wp.where(due_now > 0, due, 0.0)
-                    bits = bits | (due_now << j)
-                    queued_weight[queue_length, j] = due
-                    queued_slot[queue_length, j] = wp.max(slot[j], 0)
-                    queued_0[queue_length, j] = p0[j]
-                    queued_1[queue_length, j] = p1[j]
-                    queued_2[queue_length, j] = p2[j]
-                queued[queue_length] = bits
-                queue_length = queue_length + wp.where(bits != 0, 1, 0)
+                    if wp.static(lanes > 1):
+                        bits = bits | (due_now << j)
+                        queued_weight[queue_length, j] = due
+                        queued_slot[queue_length, j] = wp.max(slot[j], 0)
+                        queued_0[queue_length, j] = p0[j]
+                        queued_1[queue_length, j] = p1[j]
+                        queued_2[queue_length, j] = p2[j]
+                    elif due_now > 0:
+                        value = features_at(bricks, wp.max(slot[j], 0), p0[j], p1[j], p2[j])
+                        for ch in range(CHANNELS):
+                            total[j, ch] = total[j, ch] + value[ch] * due
+                if wp.static(lanes > 1):
+                    queued[queue_length] = bits
+                    queue_length = queue_length + wp.where(bits != 0, 1, 0)
             for j in range(lanes):
                 t[j] = t[j] + ahead[j]
         for j in range(lanes):
