@@ -8,6 +8,7 @@ most 16 cm in radius and up to 10 m beside the filmed road.
 
 - *seen*: the field's depth is within 10 cm of the pole's front in at least half of the samples. A sample is a height in
   a filmed frame up to 10 m away in which nothing hides the pole there; there are up to two frames per film.
+- *high samples*: samples above 3 m, in frames 7 to 18 m away; they do not count for *seen*.
 - *solid*: a convex part is within 10 cm of the axis, at more than half of three heights up to 0.6 m.
 - *false*: poles that the build found, and that are more than 15 cm from everything that stands in the truth.
 """
@@ -35,11 +36,12 @@ from twin.reality.truth import Truth, align_poses, load_parts, matched_poses, su
 
 _LEAST_HEIGHT, _MAX_RADIUS = 0.7, 0.16  # [m]
 _BESIDE = 10.0  # [m]
-_HEIGHTS = (0.3, 0.7, 1.1, 1.5, 1.9, 2.3)  # [m] of samples
+_HEIGHTS, _DISTANCES = (0.3, 0.7, 1.1, 1.5, 1.9, 2.3), (0.0, 5.0, 10.0)
+"""Of samples [m], and least, best and largest distance of their frames [m]."""
+_HIGH, _HIGH_DISTANCES = (3.3, 3.8, 4.3, 4.8), (7.0, 12.0, 18.0)
 _SOLID_HEIGHTS = (0.2, 0.4, 0.6)  # [m]
 _TOLERANCE = 0.10  # [m]
 _FALSE = 0.15  # [m]
-_BEST_DISTANCE, _FAR = 5.0, 10.0  # [m] from the camera
 Planes = tuple[NDArray, NDArray]
 TARGETS: dict[str, tuple[str, float]] = {"seen": ("≥", 0.95), "solid": ("≥", 0.95), "false": ("≤", 0.0)}
 
@@ -60,19 +62,29 @@ def _is_beside(point: NDArray, line: Any, start: float, length: float) -> bool:
     return bool(start + 2.0 < station[0] < start + length + 2.0 and abs(lateral[0]) < _BESIDE)
 
 
-def depth_errors(pole: Solid, truth: Truth, to_truth: Similarity, field: BakedField, whole: Surface) -> NDArray:
+def depth_errors(
+    pole: Solid,
+    truth: Truth,
+    to_truth: Similarity,
+    field: BakedField,
+    whole: Surface,
+    wanted: tuple[float, ...] = _HEIGHTS,
+    distances: tuple[float, float, float] = _DISTANCES,
+) -> NDArray:
     """Depth of the field minus that of the pole's front in all samples [m]."""
     ground = float(truth.ground_height(pole.center[None, :2])[0])
-    heights = [h for h in _HEIGHTS if ground + h < pole.center[2] + pole.half[1]]
-    points = np.array([[*pole.center[:2], ground + h] for h in heights])
+    heights = [h for h in wanted if ground + h < pole.center[2] + pole.half[1]]
+    if not heights:
+        return np.zeros(0)
+    points, (least, best, far) = np.array([[*pole.center[:2], ground + h] for h in heights]), distances
     errors = [np.zeros(0)]
     for name, film in truth.films.items():
         away = np.linalg.norm(film.camera_to_world[:, :2, 3] - pole.center[:2], axis=1)
         used = 0
-        for i in np.argsort(np.abs(away - _BEST_DISTANCE)):
+        for i in np.argsort(np.abs(away - best)):
             pixel, depth = project(points, film.camera_to_world[i], truth.intrinsics)
             shown = (depth > 1.0) & (pixel > 4).all(1) & (pixel < np.array(truth.size) - 4).all(1)
-            if used == 2 or away[i] > _FAR or not shown.any():
+            if used == 2 or not least < away[i] < far or not shown.any():
                 continue
             eye = film.camera_to_world[i, :3, 3]
             true = whole.cast(np.tile(eye, (len(points), 1)), points - eye) * depth
@@ -101,7 +113,7 @@ def planes(vertices: NDArray, faces: NDArray) -> Planes:
     return hull.face_normals, (hull.face_normals * hull.triangles[:, 0]).sum(1)
 
 
-def measure(root: Path) -> dict[str, float]:
+def measure(root: Path) -> dict[str, float | None]:
     scene = load_scene(root).scene
     truth, cameras = Truth.load(scene.truth), Cameras.load(scene.stage("metric"))
     to_truth = align_poses(cameras.camera_to_world, matched_poses(truth, cameras), with_scale=True)
@@ -111,10 +123,11 @@ def measure(root: Path) -> dict[str, float]:
         for without in ((), ("ground",))
     )
     parts = [planes(to_truth.points(v), f) for v, f in load_parts(scene.stage("mesh"))]
-    seen, solid, samples = [], [], []
+    seen, solid, samples, high = [], [], [], [np.zeros(0)]
     for name, pole in true_poles(truth):
         errors, share = depth_errors(pole, truth, to_truth, field, whole), solid_share(pole, truth, parts)
         within = np.abs(errors) < _TOLERANCE
+        high.append(np.abs(depth_errors(pole, truth, to_truth, field, whole, _HIGH, _HIGH_DISTANCES)) < _TOLERANCE)
         if len(errors):  # else it is hidden in all frames
             seen.append(within.mean() >= 0.5)
             solid.append(share > 0.5)
@@ -136,6 +149,8 @@ def measure(root: Path) -> dict[str, float]:
         "seen": float(np.mean(seen)),
         "solid": float(np.mean(solid)),
         "samples_within_10cm": float(np.concatenate(samples).mean()),
+        "high_samples": len(np.concatenate(high)),
+        "high_samples_within_10cm": float(np.concatenate(high).mean()) if len(np.concatenate(high)) else None,
         "found": len(found),
         "false": int((away > _FALSE).sum()),
     }

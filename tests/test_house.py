@@ -10,11 +10,14 @@ MODULES = {
     for path in sorted(ROOT.rglob("*.py"))
 }
 
+TEXTS = {module: path.read_text(encoding="utf-8") for module, path in MODULES.items()}
+TREES = {module: ast.parse(text) for module, text in TEXTS.items()}
+
 
 def _imports(module: str) -> set[str]:
     """Modules of the package that a module imports, also within functions."""
     out = set()
-    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+    for node in ast.walk(TREES[module]):
         if isinstance(node, ast.ImportFrom) and node.module:
             names = [f"{node.module}.{alias.name}" for alias in node.names]
             out |= {name if name in MODULES else node.module for name in names}
@@ -43,8 +46,8 @@ def test_no_two_modules_share_a_name():
 
 def test_no_two_classes_share_a_name():
     places = defaultdict(list)
-    for module, path in MODULES.items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for module, tree in TREES.items():
+        for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
                 places[node.name].append(module)
     assert not {name: modules for name, modules in places.items() if len(modules) > 1}
@@ -52,5 +55,4 @@ def test_no_two_classes_share_a_name():
 
 def test_every_module_has_a_head():
     """Empty modules, which only make a folder a package, need none."""
-    sources = {module: path.read_text(encoding="utf-8") for module, path in MODULES.items()}
-    assert not [module for module, text in sources.items() if text and not ast.get_docstring(ast.parse(text))]
+    assert not [module for module, text in TEXTS.items() if text and not ast.get_docstring(TREES[module])]

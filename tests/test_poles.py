@@ -78,6 +78,21 @@ def test_a_post_and_a_bollard_are_found_where_they_stand(tmp_path):
         assert abs(found.height[k] - height) < 0.35 and abs(found.foot[k, 2]) < 1e-6
 
 
+@pytest.mark.parametrize("height", [3.6, 4.4])
+def test_a_tall_post_is_followed_to_its_top(tmp_path, height):
+    """Far pictures show the part that is above the near ones."""
+    found = find_poles(film(tmp_path, ((13.0, 5.5, 0.07, height), BOLLARD), n=24), LENS)
+    tall = int(found.height.argmax())
+    assert len(found) == 2 and np.linalg.norm(found.foot[tall, :2] - (13.0, 5.5)) < 0.1
+    assert abs(found.height[tall] - height) < 0.35 and found.height[1 - tall] < 1.3
+
+
+def test_a_tall_post_that_no_far_picture_shows_keeps_its_height(tmp_path):
+    pixels = film(tmp_path, ((13.0, 5.5, 0.07, 4.4),), n=24)
+    poles = Poles(np.array([[5.0, 1.0, 0.0]]), np.array([0.07]), np.array([3.1]))  # within 6 m of every frame
+    assert poles_module._extended(pixels, np.arange(24), poles).height.tolist() == [3.1]
+
+
 def test_a_post_on_the_border_of_two_squares_is_found_once(tmp_path):
     pixels = film(tmp_path, (POST,))
     pixels.cameras.camera_to_world[:, 1, 3] += 20.0 - POST[1]  # the search is divided at multiples of 20 m

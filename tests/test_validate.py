@@ -313,7 +313,7 @@ def test_two_nodes_of_ray_give_the_table_of_one_process(fresh):
     ray = pytest.importorskip("ray", reason="ray is not installed")
     from ray.cluster_utils import Cluster
 
-    options = ("ahead", ("day", "night"), 20)
+    options = ("ahead", ("day", "night"), 8)
     whole = validate.validate(fresh, ("ahead", "left"), *options)
     path = fresh / "validation" / "episodes.csv"
     table = path.read_text()

@@ -48,7 +48,7 @@ PIPELINE = (
     Stage("capture", "twin.capture.frames", 2, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 5, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 1, ("metric",), ("capture", "cameras")),
-    Stage("field", "twin.nerf.trainer", 7, ("nerf", "mjcf.route"), ("cameras", "metric")),
+    Stage("field", "twin.nerf.trainer", 8, ("nerf", "mjcf.route"), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 6, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.scene_xml", 4, ("mjcf", "robot"), ("metric", "mesh")),
     Stage(

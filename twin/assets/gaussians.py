@@ -34,7 +34,7 @@ _MIN_CELL = 0.01  # [m] side of the smallest thinning cell; each cell keeps one 
 _DISK, _THICKNESS = 0.8, 0.2  # standard deviations along the surface and across it [pixel widths]
 _MAX_ELONGATION = 4.0  # length / width of a disk seen at a grazing angle
 _OPACITY = 0.97
-_SH_CONSTANT = 0.28209479177387814  # spherical harmonic of degree 0, 1 / (2 √π)
+SH_CONSTANT = 0.28209479177387814  # spherical harmonic of degree 0, 1 / (2 √π)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Gaussians:
         columns = {
             **dict(zip("xyz", self.positions.T, strict=True)),
             **{f"n{axis}": np.zeros(len(self.rgb)) for axis in "xyz"},
-            **{f"f_dc_{c}": (self.rgb[:, c] - 0.5) / _SH_CONSTANT for c in range(3)},
+            **{f"f_dc_{c}": (self.rgb[:, c] - 0.5) / SH_CONSTANT for c in range(3)},
             "opacity": np.log(self.opacity / (1.0 - self.opacity)),
             **{f"scale_{c}": np.log(self.scales[:, c]) for c in range(3)},
             **{f"rot_{c}": self.rotations[:, c] for c in range(4)},
@@ -131,7 +131,7 @@ def read_ply(path: Path) -> Gaussians:
         position, rotation = columns("x", "y", "z"), columns(*(f"rot_{c}" for c in range(4)))
         length = np.linalg.norm(rotation, axis=1, keepdims=True)
         scale = np.exp(columns(*(f"scale_{c}" for c in range(3))))
-        rgb = np.clip(columns(*(f"f_dc_{c}" for c in range(3))) * np.float32(_SH_CONSTANT) + np.float32(0.5), 0.0, 1.0)
+        rgb = np.clip(columns(*(f"f_dc_{c}" for c in range(3))) * np.float32(SH_CONSTANT) + np.float32(0.5), 0.0, 1.0)
         opacity = 1.0 / (1.0 + np.exp(-columns("opacity")[:, 0]))
     sound = (np.abs(position) < _MAX_COORDINATE).all(1) & (scale < _MAX_COORDINATE).all(1) & (length[:, 0] > 1e-6)
     sound &= np.isfinite(rgb).all(1) & np.isfinite(opacity) & np.isfinite(rotation).all(1)

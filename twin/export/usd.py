@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, UsdUtils, UsdVol, Vt
 from scipy.spatial import ConvexHull
 
-from twin.assets.gaussians import Gaussians
+from twin.assets.gaussians import SH_CONSTANT, Gaussians
 from twin.errors import InputError
 from twin.files import atomic_path
 from twin.mjcf.scene_xml import Parts
@@ -36,7 +36,6 @@ from twin.robot import WHEELS, HuskyParams
 from twin.types import Array
 
 _DOUBLE = UsdGeom.XformOp.PrecisionDouble
-_SH_CONSTANT = 0.28209479177387814  # spherical harmonic of degree 0, 1 / (2 √π)
 _APERTURE = 20.955  # [tenths of a meter] width of a camera's sensor; only its ratio to the focal length has an effect
 _CLIPPING = 0.01, 1000.0  # [m] nearest and farthest depth that cameras show
 _RING, _SHOULDER, _SHOULDER_OFFSET = 32, 16, 0.6  # vertices at a tire's middle, per shoulder; shoulder's y / half width
@@ -140,7 +139,7 @@ def _add_place(
         lightings.AddVariant(variant_name(name))
         lightings.SetVariantSelection(variant_name(name))
         with lightings.GetVariantEditContext():
-            harmonics = (these.rgb - np.float32(0.5)) / np.float32(_SH_CONSTANT)
+            harmonics = (these.rgb - np.float32(0.5)) / np.float32(SH_CONSTANT)
             field.CreateRadianceSphericalHarmonicsCoefficientsAttr(_vectors(harmonics))
             tint = UsdGeom.PrimvarsAPI(surface).CreatePrimvar(
                 "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex

@@ -11,6 +11,8 @@ is the sum over its bands, from the ground up, of quality − `_CHANCE`; the pol
 with the most evidence come first. A spot is then judged without the pictures in which a pole that was already found
 covers it: beside a pole, bars show this pole, from a part of the cameras. Lastly, all pictures must agree on the pole's
 place: its bar, moved by a few pixels in each picture to where its contrast is greatest, must stand on one spot.
+
+Poles that reach the highest band by which they are judged are followed upward in pictures that are further away.
 """
 
 import math
@@ -48,7 +50,9 @@ _RADII = (0.02, 0.028, 0.037, 0.048, 0.062, 0.08, 0.1, 0.125, 0.16, 0.2, 0.25)  
 _THIN = 8  # number of radii, the first ones, that a pole may have; the others compete with them
 _TWICE = 3  # this many radii further, the radius is twice as large
 _BAND = 0.2  # [m] height of a band
-_BANDS = tuple((0.1 + _BAND * k, 0.1 + _BAND * (k + 1)) for k in range(15))  # [m] above the ground
+_BANDS = tuple((0.1 + _BAND * k, 0.1 + _BAND * (k + 1)) for k in range(35))  # [m] above the ground
+_JUDGED = 15  # the first ones, by which poles are found
+_HIGH_DEPTHS = 6.0, 18.0  # [m] distances from which pictures show the others; they are above nearer pictures
 
 _COARSE_CELL = 0.05  # [m] spacing of the first search
 _COARSE_RADII, _COARSE_BANDS = (0.03, 0.055, 0.1), ((0.1, 0.4), (0.4, 0.7))
@@ -91,7 +95,7 @@ class Poles:
     radius: Array
     """Shape (n,) [m]."""
     height: Array
-    """Height above the foot, at most 3.1 m; a taller pole ends there. Shape (n,) [m]."""
+    """Height above the foot, at most 7.1 m; a taller pole ends there. Shape (n,) [m]."""
 
     def __len__(self) -> int:
         return len(self.radius)
@@ -136,10 +140,14 @@ class _LevelPictures:
     """Pictures of some frames as level cameras would have taken them, as summed-area tables."""
 
     def __init__(
-        self, pixels: TrainingPixels, frames: NDArray[np.int64], known: dict[int, _Read] | None = None
+        self,
+        pixels: TrainingPixels,
+        frames: NDArray[np.int64],
+        known: dict[int, _Read] | None = None,
+        far: float = _DEPTHS[1],
     ) -> None:
-        """The pictures of the frames in `known` have been read before."""
-        self.frames = frames
+        """The pictures of the frames in `known` have been read before. They are used up to the depth `far` [m]."""
+        self.frames, self._far = frames, far
         self.films = np.array(pixels.cameras.sources)[frames]
         self.lightings = np.array(pixels.cameras.lightings)[frames]
         self.positions = pixels.cameras.positions[frames]
@@ -170,9 +178,8 @@ class _LevelPictures:
     def seen(self, k: int, feet: Array) -> tuple[NDArray[np.int64], Array]:
         """Indices of the spots (n, 3) before picture k, and their positions in its camera: right, up and ahead [m]."""
         local = (feet - self.positions[k]) @ self._turns[k] * (1.0, -1.0, 1.0)
-        low, high = _DEPTHS
         fx, _, cx, _ = self._intrinsics[k]
-        ahead = (local[:, 2] > low) & (local[:, 2] < high) & (np.abs(local[:, 0]) * fx < local[:, 2] * cx)
+        ahead = (local[:, 2] > _DEPTHS[0]) & (local[:, 2] < self._far) & (np.abs(local[:, 0]) * fx < local[:, 2] * cx)
         index = np.flatnonzero(ahead)
         return index, local[index]
 
@@ -294,7 +301,26 @@ def find_poles(pixels: TrainingPixels, camera_height: float) -> Poles:
             more, sums = _search(pictures, spots, poles)
             del pictures
             poles, evidence = Poles.join([poles, more]), np.append(evidence, sums)
-    return poles.select(_peaks(poles.foot[:, :2], evidence, 0.0, _APART))
+    return _extended(pixels, kept, poles.select(_peaks(poles.foot[:, :2], evidence, 0.0, _APART)))
+
+
+def _extended(pixels: TrainingPixels, kept: NDArray[np.int64], poles: Poles) -> Poles:
+    """Poles that reach the highest band by which they were found, continued upward as far as pictures show them."""
+    height, read = poles.height.copy(), dict[int, _Read]()
+    for i in np.flatnonzero(height > _BANDS[_JUDGED - 1][0]):
+        away = np.linalg.norm(pixels.cameras.positions[kept, :2] - poles.foot[i, :2], axis=1)
+        frames = _at_most(kept, (away > _HIGH_DEPTHS[0]) & (away < _HIGH_DEPTHS[1]), pixels)
+        if len(frames) < _MIN_ALL:
+            continue
+        pictures = _LevelPictures(pixels, frames, {i: read[i] for i in frames.tolist() if i in read}, _HIGH_DEPTHS[1])
+        read = pictures.read
+        others = poles.select(np.delete(np.arange(len(poles)), i))
+        bars = pictures.bars(poles.foot[i : i + 1], (float(poles.radius[i]),), _BANDS[_JUDGED:], others)
+        quality, count = (one[0, 0] for one in _quality(bars))
+        sums = np.cumsum(np.where(count >= _MIN_ALL, quality - _CHANCE, 0.0))
+        if sums.max() > 0.0:
+            height[i] = _BANDS[_JUDGED + int(sums.argmax())][1]
+    return Poles(poles.foot, poles.radius, height)
 
 
 def pole_depths(pixels: TrainingPixels, poles: Poles) -> DepthSupervision:
@@ -302,15 +328,17 @@ def pole_depths(pixels: TrainingPixels, poles: Poles) -> DepthSupervision:
     tops = [round((height - _BANDS[0][0]) / _BAND) for height in poles.height]
     views: list[list[_View]] = [[] for _ in tops]
     for i, position in enumerate(pixels.cameras.positions):
-        near = np.flatnonzero(np.linalg.norm(poles.foot[:, :2] - position[:2], axis=1) < _DEPTHS[1])
+        away = np.linalg.norm(poles.foot[:, :2] - position[:2], axis=1)
+        near = np.flatnonzero(away < np.where(np.array(tops) > _JUDGED, _HIGH_DEPTHS[1], _DEPTHS[1]))
         if len(near):
-            pictures = _LevelPictures(pixels, np.array([i]))
+            pictures = _LevelPictures(pixels, np.array([i]), far=_HIGH_DEPTHS[1])
             (bars,) = pictures.bars(poles.foot[near], tuple(map(float, poles.radius[near])), _BANDS)
             rows = np.arange(len(near))
             count, contrast, color = (one[rows, rows] for one in (bars.count, bars.contrast, bars.color))
             for row, pole in enumerate(near):
                 top = tops[pole]
-                view = _View(i, count[row, :top] > 0, contrast[row, :top], color[row, :top])
+                shown = (count[row, :top] > 0) & ((away[pole] < _DEPTHS[1]) | (np.arange(top) >= _JUDGED))
+                view = _View(i, shown, contrast[row, :top], color[row, :top])
                 if view.shown.any():
                     views[pole].append(view)
     parts = []
@@ -462,7 +490,7 @@ def _within(spot: Array, others: Array, distance: float) -> bool:
 
 def _judge(pictures: _LevelPictures, feet: Array, found: Poles) -> tuple[Poles, Array]:
     """The best pole at each spot, and the evidence for it; 0 if its bars are poor or a thicker thing stands there."""
-    quality, count = _quality(pictures.bars(feet, _RADII, _BANDS, found))
+    quality, count = _quality(pictures.bars(feet, _RADII, _BANDS[:_JUDGED], found))
     sums = np.cumsum(np.where(count >= _MIN_ALL, quality - _CHANCE, 0.0), 2)
     rows = np.arange(len(feet))
     radius = sums[:, :_THIN].max(2).argmax(1)

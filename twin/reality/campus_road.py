@@ -13,6 +13,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from twin.geometry.images import to_uint8
 from twin.reality import SEED, primitives, textures
 from twin.reality.houses import add_block
 from twin.reality.lighting import LIGHTINGS
@@ -29,7 +30,7 @@ from twin.reality.street_furniture import (
     add_lamp_post,
     add_sign,
 )
-from twin.reality.textures import AtlasColors, paint_atlas, to_uint8
+from twin.reality.textures import AtlasColors, paint_atlas
 from twin.types import Array
 
 # ---- line

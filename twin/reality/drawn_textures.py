@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.geometry.images import to_uint8
 from twin.reality import textures
 from twin.reality.houses import House
 from twin.reality.place_objects import CELLS, GroundLayout
@@ -36,7 +37,6 @@ from twin.reality.textures import (
     slabs,
     speckle,
     tinted,
-    to_uint8,
 )
 from twin.types import Array32
 

@@ -441,11 +441,6 @@ class AtlasColors:
     )
 
 
-def to_uint8(image: NDArray) -> NDArray[np.uint8]:
-    """Converts an image in [0, 1] to 8 bits."""
-    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
-
-
 def paint_atlas(
     rng: Callable[[int], np.random.Generator], names: tuple[str, ...], colors: AtlasColors
 ) -> NDArray[np.float32]:
