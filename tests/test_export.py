@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 import trimesh
 from test_gaussians import floor_views
-from tiny_twin import tiny_twin
+from tiny_twin import filmed_tiny_twin
 
 from twin import runtime
 from twin.assets.gaussians import read_ply
@@ -17,49 +17,13 @@ from twin.capture.formats import read_model, read_transforms
 from twin.export import gltf
 from twin.export.__main__ import export, main
 from twin.geometry.cameras import Cameras, SparsePoints, project
-from twin.geometry.images import read_image, write_image
-from twin.geometry.poses import look_at
+from twin.geometry.images import read_image
 from twin.loading import load_scene
-from twin.scene import write_stamp
-
-SIZE = (96, 64)
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Path:
-    """A tiny twin filmed by six cameras under two lightings; the first frame is held out, two have masks."""
-    root = tiny_twin(tmp_path_factory.mktemp("export") / "scene")
-    build = root / "build"
-    names = [f"{lighting}/{k:06d}" for lighting in ("day", "night") for k in range(3)]
-    eyes = np.array([[k * 1.5, 0.1 * k, 1.5] for k in range(3)] * 2)
-    rng = np.random.default_rng(0)
-    for i, name in enumerate(names):
-        image = build / "2_cameras" / "images" / f"{name}.png"
-        image.parent.mkdir(parents=True, exist_ok=True)
-        write_image(image, rng.integers(0, 255, (SIZE[1], SIZE[0], 3)).astype(np.uint8))
-        if i in (1, 4):
-            mask = build / "1_capture" / "masks" / f"{name}.png"
-            mask.parent.mkdir(parents=True, exist_ok=True)
-            write_image(mask, np.full((SIZE[1], SIZE[0]), 255 * (i == 1), np.uint8))
-    cameras = Cameras(
-        names=tuple(names),
-        camera_to_world=np.array([look_at(eye, eye + np.array([3.0, 0.4, -0.8])) for eye in eyes]),
-        intrinsics=np.array([[60.0, 61.0, 47.0, 33.0]] * 3 + [[70.0, 70.5, 48.5, 31.0]] * 3),
-        sizes=np.tile(SIZE, (6, 1)),
-        lightings=("day",) * 3 + ("night",) * 3,
-        sources=("day",) * 3 + ("night",) * 3,
-        times=np.arange(6.0),
-        held_out=np.arange(6) == 0,
-        images=build / "2_cameras" / "images",
-        masks=build / "1_capture" / "masks",
-    )
-    xyz = rng.uniform([3, -1, 0], [6, 1, 1], (40, 3))
-    point, frame = np.divmod(np.arange(240), 6)
-    rgb = rng.integers(0, 255, (40, 3)).astype(np.uint8)
-    cameras.save(build / "2_metric")
-    SparsePoints(xyz, rgb, rng.uniform(0, 1, 40), point, frame).save(build / "2_metric")
-    write_stamp(build / "2_metric", "metric")
-    return root
+    return filmed_tiny_twin(tmp_path_factory.mktemp("export") / "scene")
 
 
 @pytest.fixture(scope="module")

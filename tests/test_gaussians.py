@@ -1,5 +1,7 @@
 """Splats lie on the surfaces of the views and render like them in MuJoCo; their files hold what was written."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -173,3 +175,9 @@ def test_damaged_files_are_refused(tmp_path, spoil, words) -> None:
     with pytest.raises(InputError) as raised:
         read_ply(path)
     assert words in str(raised.value)
+
+
+def test_views_that_show_nothing_are_refused_in_one_line():
+    views = floor_views()
+    with pytest.raises(InputError, match="no surface in any of the views"):
+        gaussians_of_views(replace(views, depth=np.zeros_like(views.depth)), 50.0)

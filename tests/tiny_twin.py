@@ -8,6 +8,9 @@ import numpy as np
 from test_baked import LOW, STEP, baked_of_arrays, networks, places
 from tiny_world import tiny_config, tiny_ground, tiny_scene
 
+from twin.geometry.cameras import Cameras, SparsePoints
+from twin.geometry.images import write_image
+from twin.geometry.poses import look_at
 from twin.mjcf.scene_xml import run
 from twin.nerf.baked import BakedField
 from twin.nerf.baked_arrays import BrickLayout, skip_distances
@@ -84,3 +87,43 @@ def tiny_field(boxes) -> BakedField:
     frames = np.repeat(vectors, 4, 0) + rng.normal(0, 0.1, (8, 4)).astype(np.float32)
     names = Lightings(("day", "night"), vectors, tuple(f"{n}/{k}" for n in ("day", "night") for k in range(4)), frames)
     return baked_of_arrays(layout, names, arrays | skip_distances(layout, arrays))
+
+
+FILM_SIZE = (96, 64)
+"""Width and height of the frames of `filmed_tiny_twin` [px]."""
+
+
+def filmed_tiny_twin(root: Path) -> Path:
+    """A tiny twin filmed by six cameras under two lightings; the first frame is held out, two have masks."""
+    tiny_twin(root)
+    build = root / "build"
+    names = [f"{lighting}/{k:06d}" for lighting in ("day", "night") for k in range(3)]
+    eyes = np.array([[k * 1.5, 0.1 * k, 1.5] for k in range(3)] * 2)
+    rng, (width, height) = np.random.default_rng(0), FILM_SIZE
+    for i, name in enumerate(names):
+        image = build / "2_cameras" / "images" / f"{name}.png"
+        image.parent.mkdir(parents=True, exist_ok=True)
+        write_image(image, rng.integers(0, 255, (height, width, 3)).astype(np.uint8))
+        if i in (1, 4):
+            mask = build / "1_capture" / "masks" / f"{name}.png"
+            mask.parent.mkdir(parents=True, exist_ok=True)
+            write_image(mask, np.full((height, width), 255 * (i == 1), np.uint8))
+    cameras = Cameras(
+        names=tuple(names),
+        camera_to_world=np.array([look_at(eye, eye + np.array([3.0, 0.4, -0.8])) for eye in eyes]),
+        intrinsics=np.array([[60.0, 61.0, 47.0, 33.0]] * 3 + [[70.0, 70.5, 48.5, 31.0]] * 3),
+        sizes=np.tile(FILM_SIZE, (6, 1)),
+        lightings=("day",) * 3 + ("night",) * 3,
+        sources=("day",) * 3 + ("night",) * 3,
+        times=np.arange(6.0),
+        held_out=np.arange(6) == 0,
+        images=build / "2_cameras" / "images",
+        masks=build / "1_capture" / "masks",
+    )
+    xyz = rng.uniform([3, -1, 0], [6, 1, 1], (40, 3))
+    point, frame = np.divmod(np.arange(240), 6)
+    rgb = rng.integers(0, 255, (40, 3)).astype(np.uint8)
+    cameras.save(build / "2_metric")
+    SparsePoints(xyz, rgb, rng.uniform(0, 1, 40), point, frame).save(build / "2_metric")
+    write_stamp(build / "2_metric", "metric")
+    return root

@@ -205,6 +205,8 @@ def gaussians_of_views(views: Views, background: float) -> tuple[Gaussians, NDAr
 
     Returns:
         k Gaussians, and for each the index (k,) of its pixel among the n · h · w pixels of the views.
+
+    Raises InputError: no pixel has a depth.
     """
     columns: list[list[NDArray]] = []
     for i in range(len(views)):
@@ -223,6 +225,8 @@ def gaussians_of_views(views: Views, background: float) -> tuple[Gaussians, NDAr
         pixel = np.flatnonzero(use) + i * use.size
         columns.append([position, position - camera, normal, width, width / slant, pixel])
     joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
+    if not len(joined[0]):
+        raise InputError("the field shows no surface in any of the views; build the scene with more nerf.steps")
     keep = select_sharpest(joined[0], joined[3])
     position, rays, normal, width, length, pixel = (column[keep] for column in joined)
     along = rays - (rays * normal).sum(1, keepdims=True) * normal  # long axis: the ray projected onto the surface
