@@ -198,6 +198,14 @@ def test_impossible_configurations_are_refused(wrong):
         TrainConfig(**wrong)
 
 
+def test_a_training_without_the_gpu_it_needs_is_refused_before_it_begins(scene, tmp_path, monkeypatch):
+    """stable-baselines3 would train on the CPU instead."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(InputError, match=r"device = 'cuda': no CUDA device is visible to torch; use --device cpu"):
+        train_policy(twin.load_scene(scene), tmp_path / "run", replace(SHORT, device="cuda"))
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("sizes", [{"pool": 3}, {"hidden": 64}, {"convolutions": ((16, 90, 1),)}, {"features": 5000}])
 def test_networks_that_do_not_exist_are_refused(sizes):
     with pytest.raises(InputError, match="no network of these sizes"):

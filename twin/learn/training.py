@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
@@ -34,6 +35,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from twin import runtime
 from twin.config import Condition
+from twin.env.options import CUDA
 from twin.env.suite import fingerprint
 from twin.env.vector_env import default_processes
 from twin.errors import InputError
@@ -128,15 +130,16 @@ def train(
         config: Must equal that of an existing run, except for `steps` and `success`.
         processes: See `make_vector_env`, by default for `config.worlds`; the number does not change the result.
         referee: Plans the training; by default, the training is one segment of `config.steps`. With a referee, there
-            are as many environments again for its tests. On a GPU, each step of the training simulates them, too; what
-            that costs has not been measured.
+            are as many environments again for its tests.
         writers: Also receive the numbers that are written to `tensorboard/`, `episodes.csv` and `log.csv`.
 
     Raises:
-        InputError: an existing run has another configuration or is damaged, the folder is neither empty nor a run, or
-            an error of `twin.load`.
+        InputError: there is no CUDA device and the configuration needs one, an existing run has another configuration
+            or is damaged, the folder is neither empty nor a run, or an error of `twin.load`.
         OSError: the disk is full; the last saved state is intact.
     """
+    if config.device == CUDA and not torch.cuda.is_available():
+        raise InputError(f"device = {CUDA!r}: no CUDA device is visible to torch; use --device cpu")
     settings = run_settings(twin, config)
     pictures = folder / "state" / "pictures.bin"
     resume = has_state(folder / "state")
