@@ -1,5 +1,6 @@
 """`twin view`: who is let in, camera paths, the film beside the twin, driving, and the page in a real browser."""
 
+import ctypes
 import json
 import shlex
 import shutil
@@ -885,3 +886,22 @@ def test_the_page_in_a_browser(scene):
             assert browser.errors == []
     finally:
         viewer.close()
+
+
+_FREED = """
+import psutil
+from twin.runtime import return_memory
+kept = [bytes(60_000) for _ in range(8000)]
+del kept[1::2]
+before = psutil.Process().memory_info().rss
+return_memory()
+print(before - psutil.Process().memory_info().rss)
+"""
+
+
+def test_freed_memory_returns_to_the_system():
+    """Between blocks that are still in use, the C library would keep it."""
+    if not hasattr(ctypes.CDLL(None), "malloc_trim"):
+        pytest.skip("the C library keeps freed memory")
+    done = subprocess.run([sys.executable, "-c", _FREED], capture_output=True, text=True, check=True)
+    assert int(done.stdout) > 100_000_000

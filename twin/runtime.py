@@ -278,6 +278,17 @@ def limit_cores(limit: int) -> None:
     _core_limit = limit
 
 
+def return_memory() -> None:
+    """Returns freed memory to the system, if the C library offers it, as glibc does.
+
+    The library keeps freed memory for later, in several places for several threads. A server that allocates pictures
+    of many sizes would grow by about 100 MB in an hour.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
 def available_cores() -> int:
     """Number of CPU cores that this process may use, by its affinity, the container's quota and `limit_cores`."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -15,6 +15,7 @@ import viser
 
 from twin.env.episode_lighting import EpisodeLighting
 from twin.geometry.images import to_uint8
+from twin.runtime import return_memory
 from twin.types import Array, Image
 from twin.view.scene_picture import FreeCamera, ObjectState, ScenePicture
 
@@ -23,6 +24,7 @@ COARSE_AREA, FINE_AREA = 320 * 180, 1280 * 720
 
 _REST = 0.12  # [s] without a change, after which the fine picture is rendered
 _MIN_PERIOD = 0.045  # [s] between two coarse pictures of a page; the browser needs CPU time, too
+_MEMORY_PERIOD = 20.0  # [s] least time between two returns of freed memory
 _COARSE_QUALITY, _FINE_QUALITY = 80, 92
 _DEPTH_MARGIN, _DEPTH_SHARE = 0.06, 0.01  # layers are drawn up to [m] + fraction of depth behind the picture's surface
 _MAX_DEPTH = 160.0  # [m] about the largest depth that viser can transmit; the picture hides layers beyond it
@@ -105,6 +107,7 @@ class PictureLoop:
         self._thread.join(5.0)
 
     def _run(self) -> None:
+        returned = time.monotonic()
         while not self._closed:
             self._wake.clear()
             with self._lock:
@@ -121,6 +124,9 @@ class PictureLoop:
                 elif page.needs_fine and now >= page.rest_at:
                     page.needs_fine = False
                     self._send(page, fine=True)
+                    if now - returned > _MEMORY_PERIOD:
+                        return_memory()
+                        returned = now
                 elif page.needs_fine:
                     due.append(page.rest_at - now)
             if min(due) > 0.0:
