@@ -1,6 +1,6 @@
 """The ROS 2 node: its callbacks on the real rclpy where that is installed, else on stand-ins; its package.
 
-Without ROS, nothing here runs the middleware: topics, executors and launch files are read, not run.
+Without ROS, nothing here runs the middleware: topics and executors are read, not run. Launch files are never run.
 """
 
 import ast
@@ -8,8 +8,10 @@ import importlib
 import importlib.util
 import runpy
 import shutil
+import signal
 import subprocess
 import sys
+import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,21 @@ from test_pilot import LENS, SMALL, picture, small_policy
 ROOT = Path(__file__).parents[1] / "ros2" / "twin_policy"
 HAS_ROS = importlib.util.find_spec("rclpy") is not None
 MS = 1_000_000
+
+
+def filled(image: Any, k: int) -> Any:
+    """The message with picture k."""
+    image.encoding, image.height, image.width, image.step = "rgb8", 18, 32, 96
+    image.data = picture(k).tobytes()
+    return image
+
+
+def calibrated(info: Any) -> Any:
+    """The message with the calibration of the pictures."""
+    info.width, info.height, info.distortion_model, info.d = *SMALL.size, "plumb_bob", [0.0] * 5
+    fx, fy, cx, cy = LENS.intrinsics
+    info.k = [fx, 0.0, cx - 0.5, 0.0, fy, cy - 0.5, 0.0, 0.0, 1.0]
+    return info
 
 
 class Rig:
@@ -44,7 +61,11 @@ class Rig:
 
             rclpy.init()
             overrides = [Parameter(name, value=value) for name, value in parameters.items()]
-            self.node = self.module.PolicyNode(parameter_overrides=overrides)
+            try:
+                self.node = self.module.PolicyNode(parameter_overrides=overrides)
+            except ValueError:
+                rclpy.shutdown()
+                raise
             self.published: list[tuple[str, Any]] = []
             for topic, publisher in (("cmd_vel", self.node._commands), ("/diagnostics", self.node._diagnostics)):
                 monkeypatch.setattr(
@@ -59,8 +80,6 @@ class Rig:
 
     def wait(self, milliseconds: int) -> None:
         if HAS_ROS:
-            import time
-
             time.sleep(milliseconds / 1000)
         else:
             self.steady += milliseconds * MS
@@ -72,17 +91,10 @@ class Rig:
         return message
 
     def show(self, k: int = 0) -> None:
-        image = self.stamped(self.module.Image())
-        image.encoding, image.height, image.width, image.step = "rgb8", 18, 32, 96
-        image.data = picture(k).tobytes()
-        self.node._on_image(image)
+        self.node._on_image(filled(self.stamped(self.module.Image()), k))
 
     def calibrate(self) -> None:
-        info = self.stamped(self.module.CameraInfo())
-        info.width, info.height, info.distortion_model, info.d = *SMALL.size, "plumb_bob", [0.0] * 5
-        fx, fy, cx, cy = LENS.intrinsics
-        info.k = [fx, 0.0, cx - 0.5, 0.0, fy, cy - 0.5, 0.0, 0.0, 1.0]
-        self.node._on_camera_info(info)
+        self.node._on_camera_info(calibrated(self.stamped(self.module.CameraInfo())))
 
     def commands(self) -> list[tuple[float, float]]:
         """v and yaw rate of the messages published so far, which are forgotten."""
@@ -106,7 +118,8 @@ def rig(monkeypatch, tmp_path):
 
         for one in rigs:
             one.node.destroy_node()
-        rclpy.shutdown()
+        if rclpy.ok():
+            rclpy.shutdown()
 
 
 def test_it_drives_while_the_switch_is_held(rig):
@@ -128,7 +141,7 @@ def test_it_drives_while_the_switch_is_held(rig):
 
 
 def test_it_stops_when_pictures_cease_and_is_silent_when_the_switch_is_released(rig):
-    r = rig(deadman_button=1)
+    r = rig(deadman_button=1, deadman=5.0)  # with rclpy the clocks run on
     r.calibrate()
     joy = r.module.Joy()
     joy.buttons = [0, 1]
@@ -200,6 +213,61 @@ def test_bad_parameters_are_one_error(rig):
 def test_a_running_node_refuses_other_parameters(rig):
     node = rig().node
     assert all(node.describe_parameter(name).read_only for name in ("timeout", "stamped", "deadman_button", "policy"))
+
+
+@pytest.mark.slow
+def test_it_drives_and_stops_across_the_middleware(tmp_path):
+    """The node runs in a process of its own; pictures and the switch come from this one, 10 times a second."""
+    rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+    from geometry_msgs.msg import TwistStamped
+    from sensor_msgs.msg import CameraInfo, Image
+    from std_msgs.msg import Bool
+
+    small_policy(tmp_path)
+    # Limits that hold beside other programs, too.
+    given = (f"policy:={tmp_path}", "timeout:=1.0", "inference:=1.0", "deadman:=1.0")
+    main = [sys.executable, "-c", "from twin_policy.node import main; main()", "--ros-args"]
+    process = subprocess.Popen([*main, *(word for one in given for word in ("-p", one))])
+    rclpy.init()
+    client = rclpy.create_node("client")
+    speeds: list[float] = []
+    client.create_subscription(TwistStamped, "cmd_vel", lambda sent: speeds.append(sent.twist.linear.x), 50)
+    kinds = {"image": Image, "camera_info": CameraInfo, "deadman": Bool}
+    topics = {name: client.create_publisher(kind, name, 1) for name, kind in kinds.items()}
+
+    def play(seconds: float, shown: bool, held: bool, until: Any = lambda: False) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not until():
+            image = Image()
+            image.header.stamp = client.get_clock().now().to_msg()
+            if shown:
+                topics["image"].publish(filled(image, 0))
+            topics["camera_info"].publish(calibrated(CameraInfo()))
+            topics["deadman"].publish(Bool(data=held))
+            rest = time.monotonic() + 0.1
+            while time.monotonic() < rest:
+                rclpy.spin_once(client, timeout_sec=0.02)
+
+    try:
+        play(30.0, shown=True, held=True, until=lambda: any(speeds))
+        assert any(speeds)
+        play(3.0, shown=False, held=True)
+        speeds.clear()
+        play(1.0, shown=False, held=True)
+        assert set(speeds) == {0.0}  # without pictures, nothing but stops
+        play(20.0, shown=True, held=True, until=lambda: any(speeds))
+        assert any(speeds)
+        play(3.0, shown=True, held=False)
+        assert speeds[-1] == 0.0
+        speeds.clear()
+        play(1.0, shown=True, held=False)
+        assert speeds == []  # another source may drive
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20.0) == 0
+    finally:
+        process.kill()
+        client.destroy_node()
+        rclpy.shutdown()
 
 
 # ---- what the package says
