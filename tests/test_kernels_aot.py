@@ -16,7 +16,7 @@ _MADE = {
     "steps of a GPU vector env": lambda: import_module("twin.env.vector_env_gpu"),
     "images of a GPU vector env": lambda: import_module("twin.env.observation"),
     "march of one lane": lambda: march.march_kernel(march.LANES["cuda"]).module,
-    "color head of one lane": lambda: color_head.color_head_kernel(color_head.LANES["cuda"], 64, 32)[0].module,
+    "color head of two lanes": lambda: color_head.color_head_kernel(color_head.LANES["cuda"], 64, 32)[0].module,
 }
 """Kernels outside this package, and those built for a number of lanes, each in its own module."""
 _NO_KERNEL = {"color_head"}

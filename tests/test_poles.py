@@ -223,6 +223,26 @@ def test_supervised_depths_are_those_of_the_front(tmp_path):
     assert len(pole_depths(pixels, poles).frame) == 0  # no picture shows it
 
 
+def test_far_frames_supervise_only_the_part_that_is_above_near_ones(tmp_path):
+    x, y, radius, height = post = (15.0, 2.6, 0.09, 4.6)
+    pixels = film(tmp_path, (post,))
+    depths = pole_depths(pixels, Poles(np.array([[x, y, 0.0]]), np.array([radius]), np.array([height])))
+    eye = pixels.cameras.positions[depths.frame]
+    rays = np.einsum("nij,nj->ni", pixels.cameras.camera_to_world[depths.frame, :3, :3], unproject(depths.pixel, K))
+    z = eye[:, 2] + rays[:, 2] / np.linalg.norm(rays, axis=1) * depths.distance
+    far = np.linalg.norm(eye[:, :2] - (x, y), axis=1) > 13.0
+    assert far.any() and z[far].min() > 3.05 and z[far].max() < height
+    assert (~far).any() and z[~far].min() < 0.5
+
+
+def test_a_post_is_not_continued_into_what_is_behind_it(tmp_path):
+    spots = [(13.0, 5.5), (12.0, -4.0), (14.0, 4.5), (11.0, 3.0)]
+    pixels = film(tmp_path, tuple((*spot, 0.07, 3.0) for spot in spots[:2]), n=24)  # nothing stands at the others
+    feet = np.column_stack([np.array(spots), np.zeros(4)])
+    poles = Poles(feet, np.full(4, 0.08), np.full(4, 3.1))
+    assert poles_module._extended(pixels, np.arange(24), poles).height.tolist() == [3.1] * 4
+
+
 def test_depths_of_several_poles_are_those_of_their_own_fronts(tmp_path):
     """Also in short films, and with frames that show none of them."""
     pixels = film(tmp_path, (POST, BOLLARD), n=14)

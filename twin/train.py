@@ -78,13 +78,14 @@ def _train(
     """Trains with progress bars; returns the contents of `choice.json`. `project`: name in Weights & Biases."""
     try:
         from twin.learn.selection import earlier_choice, train_until_learnt
-        from twin.learn.training import prepare_folder
+        from twin.learn.training import check_device, prepare_folder
         from twin.learn.wandb_run import wandb_run
     except ImportError as error:
         raise InputError(f"training needs further packages: pip install 'twin[learn]' ({error})") from None
 
     if choice := earlier_choice(twin, folder, config):
         return choice
+    check_device(config)
     if project:
         prepare_folder(folder)
     settings = {"scene": twin.scene.root.resolve().name, **dataclasses.asdict(config)}

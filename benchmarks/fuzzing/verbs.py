@@ -25,6 +25,7 @@ _OPTIONS: dict[str, dict[str, Sequence[str]]] = {
     "train": {
         **dict.fromkeys(("--task", "--run", "--lighting", "--steps", "--worlds", "--processes", "--updates"), ()),
         **dict.fromkeys(("--steering", "--entropy", "--colours", "--seed", "--observe", "--preset", "--action"), ()),
+        "--device": ("cuda", "tpu"),
     },
     "validate": {
         "--policy": ("ahead", "math:floor", "nothing:f", "ahead/100"),

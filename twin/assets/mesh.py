@@ -10,7 +10,7 @@ the solids, decomposes the solids into convex parts, and clears the corridor (`s
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,7 @@ _VISUAL_FACES = 150_000
 _MARGIN_ABOVE = 2.0  # [m] margin of the visual mesh's box above the highest obstacle
 _MARGIN_BELOW = 1.0  # [m] margin of the visual mesh's box below the lowest ground
 _VISUAL_GROUND_CELL = 0.4  # [m] smallest width of the ground triangles
+_MAX_POLE = 3.1  # [m] what is higher is out of reach; comparisons end at the height of the highest part
 _SPECK_AREA = 0.25  # [m²] smaller components are floaters, false surfaces in the air
 
 
@@ -97,6 +98,7 @@ def build_assets(
         np.savez(out / "route.npz", xy=route, z=ground.at(route), **others)  # type: ignore[arg-type]
         path = np.concatenate([every_second(line) for line in lines])
     poles = poles or Poles.none()
+    poles = replace(poles, height=np.minimum(poles.height, _MAX_POLE))
     inside = (poles.foot[:, :2] > box[0, :2]) & (poles.foot[:, :2] < box[1, :2])
     posts = solids.pole_parts(poles.select(np.flatnonzero(inside.all(1))), corridor, ground)
     fused = _fuse_sections(views, ground, corridor, path, box, settings)

@@ -341,8 +341,9 @@ def _rotation_matrices(quaternions: Array) -> Array:
 def _compile_kernels(model: Any, launch: Callable[[], None], device: str) -> None:
     """Compiles and loads the kernels that `launch` needs, one per core at a time.
 
-    Warp compiles a kernel when it is first launched. For the physics that would be some 80 kernels one after another,
-    which takes minutes on a machine that has not compiled them yet.
+    Warp compiles a kernel when it is first launched. For the physics that would be some 60 kernels one after another,
+    which takes minutes on a machine that has not compiled them yet. No other thread may launch kernels meanwhile. A few
+    whose block size depends on the GPU are compiled later.
     """
     needed: dict[tuple[Any, int], None] = {}
 
@@ -355,11 +356,12 @@ def _compile_kernels(model: Any, launch: Callable[[], None], device: str) -> Non
         note(kernel.module, None)
         return 256, 1
 
-    conditional = model.opt.graph_conditional
-    model.opt.graph_conditional = False  # else loops would read what was not computed
-    with patch.object(wp.Module, "load", note), patch.object(wp, "get_suggested_block_size", suggest):
+    with (
+        patch.object(wp.Module, "load", note),
+        patch.object(wp, "get_suggested_block_size", suggest),
+        patch.object(model.opt, "graph_conditional", False),  # else loops would read what was not computed
+    ):
         launch()
-    model.opt.graph_conditional = conditional
     with (
         runtime.bar("preparing physics on the GPU", len(needed), "kernel", after=1.0) as progress,
         ThreadPoolExecutor(available_cores()) as pool,

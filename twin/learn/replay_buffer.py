@@ -61,9 +61,9 @@ class ColorChanges(NamedTuple):
 
     def applied_on_gpu(self, stacks: torch.Tensor) -> torch.Tensor:
         """As `applied`, of a tensor; colors may differ by 1, as OpenCV rounds otherwise."""
-        (count, channels, height, width), device = stacks.shape, stacks.device
+        (channels, height, width), device = stacks.shape[1:], stacks.device
         curves = torch.as_tensor(self.curves, device=device).repeat(1, channels // 3, 1)
-        toned = curves.gather(2, stacks.reshape(count, channels, -1).long()).reshape(stacks.shape)
+        toned = curves.gather(2, stacks.flatten(2).long()).reshape(stacks.shape)
         knots = torch.as_tensor(self.knots, device=device)[:, None]
         shading = nn.functional.interpolate(knots, (height, width), mode="bicubic")
         out = (toned * shading).round().clamp(0, 255).to(torch.uint8)

@@ -127,7 +127,7 @@ def train(
     On SIGINT, SIGTERM and SIGHUP, it saves the state and raises `Stopped`, a KeyboardInterrupt.
 
     Args:
-        config: Must equal that of an existing run, except for `steps` and `success`.
+        config: Must equal that of an existing run, except for `steps`, `success` and `device`.
         processes: See `make_vector_env`, by default for `config.worlds`; the number does not change the result.
         referee: Plans the training; by default, the training is one segment of `config.steps`. With a referee, there
             are as many environments again for its tests.
@@ -138,8 +138,7 @@ def train(
             or is damaged, the folder is neither empty nor a run, or an error of `twin.load`.
         OSError: the disk is full; the last saved state is intact.
     """
-    if config.device == CUDA and not torch.cuda.is_available():
-        raise InputError(f"device = {CUDA!r}: no CUDA device is visible to torch; use --device cpu")
+    check_device(config)
     settings = run_settings(twin, config)
     pictures = folder / "state" / "pictures.bin"
     resume = has_state(folder / "state")
@@ -260,6 +259,12 @@ def cycle_rate(config: TrainConfig, step: int) -> float:
     return config.learning_rate * (_FINAL_RATE + (1.0 - _FINAL_RATE) * min(1.0, 2.0 * left))
 
 
+def check_device(config: TrainConfig) -> None:
+    """Raises InputError if networks shall be trained on a GPU and there is none."""
+    if config.device == CUDA and not torch.cuda.is_available():
+        raise InputError(f"device = {CUDA!r}: no CUDA device is visible to torch; use --device cpu")
+
+
 def prepare_folder(folder: Path) -> None:
     """Creates a run's folder and in it the folder `state`, which marks it as a run.
 
@@ -288,7 +293,7 @@ def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
 
 
 def check_same(folder: Path, settings: dict[str, Any]) -> None:
-    """Raises InputError if a run has other settings, apart from `steps` and `success`."""
+    """Raises InputError if a run has other settings, apart from `steps`, `success` and `device`."""
     with wrap_read_errors(folder / "config.json", "train anew under another name"):
         previous = dict(read_json(folder / "config.json"))
         previous["road"]
@@ -301,7 +306,7 @@ def check_same(folder: Path, settings: dict[str, Any]) -> None:
             "the sampling of episodes; give another --run"
         )
     for name in settings:
-        if name not in ("steps", "success") and previous.get(name) != settings[name]:
+        if name not in ("steps", "success", "device") and previous.get(name) != settings[name]:
             raise InputError(
                 f"{folder} was trained with {name} = {previous.get(name)!r}, not {settings[name]!r}; "
                 "resume with the same, or give another --run"

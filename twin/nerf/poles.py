@@ -301,25 +301,31 @@ def find_poles(pixels: TrainingPixels, camera_height: float) -> Poles:
             more, sums = _search(pictures, spots, poles)
             del pictures
             poles, evidence = Poles.join([poles, more]), np.append(evidence, sums)
+    read.clear()
     return _extended(pixels, kept, poles.select(_peaks(poles.foot[:, :2], evidence, 0.0, _APART)))
 
 
 def _extended(pixels: TrainingPixels, kept: NDArray[np.int64], poles: Poles) -> Poles:
     """Poles that reach the highest band by which they were found, continued upward as far as pictures show them."""
-    height, read = poles.height.copy(), dict[int, _Read]()
-    for i in np.flatnonzero(height > _BANDS[_JUDGED - 1][0]):
+    tall, height, read = poles.height > _BANDS[_JUDGED - 1][0], poles.height.copy(), dict[int, _Read]()
+    for i in np.flatnonzero(tall):
         away = np.linalg.norm(pixels.cameras.positions[kept, :2] - poles.foot[i, :2], axis=1)
         frames = _at_most(kept, (away > _HIGH_DEPTHS[0]) & (away < _HIGH_DEPTHS[1]), pixels)
         if len(frames) < _MIN_ALL:
             continue
-        pictures = _LevelPictures(pixels, frames, {i: read[i] for i in frames.tolist() if i in read}, _HIGH_DEPTHS[1])
+        read = {k: read[k] for k in frames.tolist() if k in read}
+        pictures = _LevelPictures(pixels, frames, read, _HIGH_DEPTHS[1])
         read = pictures.read
-        others = poles.select(np.delete(np.arange(len(poles)), i))
-        bars = pictures.bars(poles.foot[i : i + 1], (float(poles.radius[i]),), _BANDS[_JUDGED:], others)
-        quality, count = (one[0, 0] for one in _quality(bars))
-        sums = np.cumsum(np.where(count >= _MIN_ALL, quality - _CHANCE, 0.0))
-        if sums.max() > 0.0:
-            height[i] = _BANDS[_JUDGED + int(sums.argmax())][1]
+        others = poles.select(np.flatnonzero(tall & (np.arange(len(poles)) != i)))  # lower ones hide nothing there
+        thin = int(np.abs(np.array(_RADII) - poles.radius[i]).argmin())
+        bars = pictures.bars(poles.foot[i : i + 1], (_RADII[thin], _RADII[thin + _TWICE]), _BANDS[_JUDGED:], others)
+        quality, count = (one[0] for one in _quality(bars))
+        sums, thicker = np.cumsum(np.where(count >= _MIN_ALL, quality - _CHANCE, 0.0), 1)
+        top = int(sums.argmax())
+        good = sums[top] / (top + 1) + _CHANCE >= _MIN_QUALITY and thicker[top] <= _MAX_RATIO * sums[top]
+        if good and sums[top] > 0.0:
+            height[i] = _BANDS[_JUDGED + top][1]
+        del pictures
     return Poles(poles.foot, poles.radius, height)
 
 
