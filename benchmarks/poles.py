@@ -37,7 +37,7 @@ from twin.reality.truth import Truth, align_poses, load_parts, matched_poses, su
 _LEAST_HEIGHT, _MAX_RADIUS = 0.7, 0.16  # [m]
 _BESIDE = 10.0  # [m]
 _HEIGHTS, _DISTANCES = (0.3, 0.7, 1.1, 1.5, 1.9, 2.3), (0.0, 5.0, 10.0)
-"""Of samples [m], and least, best and largest distance of their frames [m]."""
+"""Heights of samples [m], and the least, best and largest distance of their frames [m]."""
 _HIGH, _HIGH_DISTANCES = (3.3, 3.8, 4.3, 4.8), (7.0, 12.0, 18.0)
 _SOLID_HEIGHTS = (0.2, 0.4, 0.6)  # [m]
 _TOLERANCE = 0.10  # [m]
