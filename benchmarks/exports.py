@@ -4,7 +4,9 @@
     python benchmarks/exports.py --scene scenes/demo --only splats    # the .ply in MuJoCo Warp's splat renderer
 
 `mesh` scores only pixels that show the mesh. The textured mesh and the one with colors per vertex have the same
-geometry, and thus cover the same pixels. The texture is read back from the exported file.
+geometry, and thus cover the same pixels. The texture is read back from the exported file. Exposure and white balance
+of the filmed frames vary, so pictures are also scored after a factor per color channel was fitted on the left half of
+a frame; then only the right half is scored.
 """
 
 # mypy: disable-error-code="index, attr-defined"
@@ -103,7 +105,7 @@ def score_mesh(twin: Twin, lighting: str, size: tuple[int, int]) -> None:
     texture = read.visual.material.baseColorTexture
     print(f"{lighting}: texture {texture.size[0]}×{texture.size[1]}, {len(content) / 1e6:.1f} MB, {seconds:.0f} s")
     drawings = {"colors per vertex": MeshDrawing(plain), "texture": MeshDrawing(read)}
-    scores: dict[tuple[str, int], list[float]] = {}
+    scores: dict[tuple[str, int, bool], list[float]] = {}
     for i, pose, rays, photo in held_out_frames(twin, lighting, size):
         shown = {
             name: drawing.draw(pose[:3, 3], rays.reshape(-1, 3) @ pose[:3, :3].T) for name, drawing in drawings.items()
@@ -113,13 +115,23 @@ def score_mesh(twin: Twin, lighting: str, size: tuple[int, int]) -> None:
         pictures["field"] = (
             field.render(cameras.select(np.array([i])), lighting, size).rgb[0].astype(np.float64) * 255.0
         )
-        for k in (1, 4):  # at full size, and averaged over 4 × 4 pixels, as policies see it
-            for name, rgb in pictures.items():
-                value = psnr(_averaged(rgb, k) / 255.0, _averaged(photo, k) / 255.0, _averaged(hit, k) == 1.0)
-                scores.setdefault((name, k), []).append(value)
-    for (name, k), values in scores.items():
+        left = np.arange(size[0])[None] < size[0] // 2
+        for name, rgb in pictures.items():
+            for fitted in (False, True):
+                shown_rgb = np.clip(rgb * _exposure(rgb, photo, hit & left), 0.0, 255.0) if fitted else rgb
+                scored = hit & ~left if fitted else hit
+                for k in (1, 4):  # at full size, and averaged over 4 × 4 pixels, as policies see it
+                    a, b = _averaged(shown_rgb, k) / 255.0, _averaged(photo, k) / 255.0
+                    scores.setdefault((name, k, fitted), []).append(psnr(a, b, _averaged(scored, k) == 1.0))
+    for (name, k, fitted), values in scores.items():
         where = f"{len(values)} held-out frames of {size[0] // k}×{size[1] // k}"
-        print(f"{lighting}: {name}: {np.mean(values):.2f} dB over {where}")
+        how = ", exposure fitted on the left half" if fitted else ""
+        print(f"{lighting}: {name}: {np.mean(values):.2f} dB over {where}{how}")
+
+
+def _exposure(rgb: np.ndarray, photo: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Factors (3,) of the color channels that bring rgb nearest to a photo, both (h, w, 3), at pixels of a mask."""
+    return (rgb[where] * photo[where]).sum(0) / np.maximum((rgb[where] ** 2).sum(0), 1.0)
 
 
 def _averaged(image: np.ndarray, k: int) -> np.ndarray:
