@@ -19,10 +19,10 @@ import mujoco
 import numpy as np
 from scipy.spatial import cKDTree
 
+from twin.env.env_factory import EnvFactory, episode_spec
 from twin.env.obstacles import ground_height
 from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import RouteSegment
-from twin.env.suite import EnvFactory, episode_spec
 from twin.env.task import control
 from twin.mjcf.world import PART_GROUP, World, heading_error, nearest_on_route, point_at
 from twin.robot import BASE_HEIGHT

@@ -78,7 +78,7 @@ def audit(scene: Path, quick: bool) -> dict[str, Any]:
     """Exploit audit (`audit.py`): control steps with each event in one hour of simulated time."""
     from audit import audit as run
 
-    from twin.env.suite import EnvFactory
+    from twin.env.env_factory import EnvFactory
 
     found = run(EnvFactory.open(scene, standard_tasks(scene)[-1], {"pixels": False}), 0.02 if quick else 1.0).summary()
     out = {f"audit.{key}": found[key] for key in ("simulated_s", "wall_s", "steps_touching", "false_successes")}

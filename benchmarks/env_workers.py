@@ -171,7 +171,7 @@ def soak(scene: Path, steps: int) -> dict[str, Any]:
     """Non-finite values and memory growth over random steps of eight environments."""
     import psutil
 
-    from twin.env.suite import EnvFactory
+    from twin.env.env_factory import EnvFactory
     from twin.env.vector_env_local import LocalVectorEnv
 
     count = 8
@@ -229,7 +229,7 @@ def host(scene: Path, count: int) -> dict[str, Any]:
 
     import warp
 
-    from twin.env.suite import EnvFactory
+    from twin.env.env_factory import EnvFactory
     from twin.env.vector_env_gpu import GpuSimulation, GpuVectorEnv
     from twin.nerf.baked import BakedField
 

@@ -1,7 +1,7 @@
 """Intervals with the place, or the pair of trainings, as the unit.
 
-As in `twin.evaluation.jackknife`, the estimand is the mean of a statistic over repeated experiments; here each
-repetition also has new places. A place is left out with all its policies and days.
+As in `twin.evaluation.statistic_intervals`, the estimand is the mean of a statistic over repeated experiments; here
+each repetition also has new places. A place is left out with all its policies and days.
 """
 
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import t as student
 
-from twin.evaluation.jackknife import PairedCells, Statistic, interval_ends, jackknife_variance
+from twin.evaluation.statistic_intervals import PairedCells, Statistic, interval_ends, jackknife_variance
 from twin.evaluation.statistics import CONFIDENCE, UndefinedStatistic
 from twin.types import Array
 

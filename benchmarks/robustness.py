@@ -51,8 +51,8 @@ def endurance(steps: int, folder: Path) -> dict[str, Any]:
     from tiny_twin import tiny_twin
 
     from twin.config import TRAINING
+    from twin.env.env_factory import EnvFactory
     from twin.env.picture_effects import CameraOptions
-    from twin.env.suite import EnvFactory
     from twin.env.vector_env_local import LocalVectorEnv
 
     camera = CameraOptions(vibration=0.3, exposure=0.1, shutter=0.02, blur_samples=2)
@@ -160,7 +160,7 @@ def _results(root: Path, stages: tuple[str, ...]) -> dict[str, str]:
 
 
 def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[str, Any]:
-    from twin.scene import STAGES, SceneDir
+    from twin.scene import STAGE_FOLDERS, SceneDir
 
     root = _filmed(folder)
     scene = SceneDir(root)
@@ -172,7 +172,7 @@ def _killed_builds(times: int, folder: Path, rng: np.random.Generator) -> dict[s
     sfm_until = times // 5  # the first fifth of the kills hits builds from scratch
     while killed < times:
         from_start = killed < sfm_until
-        for name in list(STAGES)[0 if from_start else 3 :]:
+        for name in list(STAGE_FOLDERS)[0 if from_start else 3 :]:
             shutil.rmtree(scene.stage(name), ignore_errors=True)
         while killed < times and _killed_after(_build_command(root), float(rng.uniform(2.0, 8.0 + 1.3 * longest))):
             killed += 1
@@ -347,7 +347,7 @@ def full_build(folder: Path) -> dict[str, str]:
 
     Returns "ok" or the fault of each run, by name.
     """
-    from twin.scene import STAGES, SceneDir
+    from twin.scene import STAGE_FOLDERS, SceneDir
 
     out: dict[str, str] = {}
     source = _filmed(folder)
@@ -356,7 +356,7 @@ def full_build(folder: Path) -> dict[str, str]:
         root = mounted / "filmed"
         shutil.copytree(source, root)
         expected = _results(root, ("capture",))
-        for name in reversed(STAGES):
+        for name in reversed(STAGE_FOLDERS):
             shutil.rmtree(SceneDir(root).stage(name))
             for leave in (0, 64 << 10):
                 out[f"build, {name}, {leave >> 10} KiB left"] = _fault_or_ok(mounted, leave, _build_command(root), root)

@@ -11,11 +11,11 @@ import twin
 from twin import runtime
 from twin.config import Condition, TaskConfig
 from twin.config_file import load_config
-from twin.env import suite
+from twin.env import env_factory
 from twin.env.drivers import follow_route
+from twin.env.env_factory import EnvFactory, fingerprint
 from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import scene_tasks
-from twin.env.suite import EnvFactory, fingerprint
 from twin.errors import InputError
 from twin.geometry.route import BRANCH
 from twin.mjcf.scene_xml import run
@@ -126,7 +126,7 @@ def test_obstacles_stand_on_their_own_route(root):
 
 def test_digests_of_episodes_on_the_route_do_not_depend_on_branches(root, tmp_path, monkeypatch):
     """Validations of builds that are older than branches store these digests."""
-    monkeypatch.setattr(suite, "stage_result", lambda scene, stage: stage)
+    monkeypatch.setattr(env_factory, "stage_result", lambda scene, stage: stage)
     cone = BRANCHED[BRANCHED.index("[[obstacle]]") : BRANCHED.rindex("[[obstacle]]")]
     before = tiny_twin(tmp_path / "place", more=cone)
     old, new = (fingerprint(twin.load_scene(place), "ahead", Condition("day")) for place in (before, root))

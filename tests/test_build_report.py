@@ -40,7 +40,7 @@ from twin.report.html import (
     pick,
     render,
 )
-from twin.scene import STAGES, SceneDir
+from twin.scene import STAGE_FOLDERS, SceneDir
 
 REPORT: dict[str, Any] = {
     "scene": "road",
@@ -51,7 +51,7 @@ REPORT: dict[str, Any] = {
     "inputs": {"input/day.mp4": "ab" * 32},
     "stages": {
         name: {"seconds": 10.0 * k, "peak_memory_bytes": 2**30, "skipped": k == 0, "config": {"fps": 2.0}}
-        for k, name in enumerate(STAGES)
+        for k, name in enumerate(STAGE_FOLDERS)
     },
     "capture": {"frames": 160, "train": 140, "held_out": 20, "sources": {"day": {"kept": 160, "damaged": 0}}},
     "cameras": {

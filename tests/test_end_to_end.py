@@ -16,7 +16,7 @@ import twin
 from twin import build as verb
 from twin.reality.__main__ import TINY, film
 from twin.reality.__main__ import main as reality
-from twin.scene import STAGES
+from twin.scene import STAGE_FOLDERS
 
 QUICK = (
     "nerf.steps=120",
@@ -53,7 +53,7 @@ def built(tmp_path_factory):
 def test_every_stage_ran_and_the_report_has_its_keys(built):
     root, printed = built
     report = json.loads((root / "build/report.json").read_text())
-    assert list(report["stages"]) == list(STAGES) and all(s["seconds"] > 0 for s in report["stages"].values())
+    assert list(report["stages"]) == list(STAGE_FOLDERS) and all(s["seconds"] > 0 for s in report["stages"].values())
     assert report["cameras"]["registered"] >= 0.9 * report["cameras"]["total"]
     assert report["cameras"]["reprojection_error_px"] < 1.5
     assert report["metric"]["scale_source"] == "camera_height"

@@ -16,12 +16,12 @@ from twin import runtime
 from twin.config import HELD_OUT, TRAINING, TaskConfig
 from twin.env.domain_randomization import EVALUATION_RANGES, NominalModel, RandomizationSample, Ranges
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
+from twin.env.env_factory import EnvFactory, episode_spec
 from twin.env.episode import record_episode
 from twin.env.episode_lighting import EpisodeLighting, LightingSets, sample_lighting
 from twin.env.options import parse_options
 from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import find_task, scene_tasks
-from twin.env.suite import EnvFactory, episode_spec
 from twin.env.trust import Trust
 from twin.env.vector_env import make_vector_env
 from twin.errors import InputError

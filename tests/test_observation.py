@@ -15,10 +15,10 @@ from twin import runtime
 from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
 from twin.env.domain_randomization import NominalModel, RandomizationSample, Ranges
+from twin.env.env_factory import DriveEnvironment, EnvFactory
 from twin.env.mujoco_renderer import RayCaster, SceneRenderer
 from twin.env.options import NERF, SIMULATOR
 from twin.env.physics import camera_pose
-from twin.env.suite import DriveEnvironment, EnvFactory
 from twin.geometry.cameras import Viewpoints
 from twin.warp_runtime import wp
 

@@ -8,7 +8,7 @@ from tiny_twin import tiny_twin
 import twin
 from twin.assets.gaussians import Gaussians
 from twin.config import ObstacleConfig
-from twin.env.suite import EnvFactory
+from twin.env.env_factory import EnvFactory
 from twin.errors import InputError
 
 RED = (0.9, 0.1, 0.1)

@@ -16,9 +16,9 @@ from twin.assets.ground import Ground
 from twin.assets.views import Views
 from twin.capture.capture_data import Capture
 from twin.env.domain_randomization import RandomizationSample, Ranges
+from twin.env.env_factory import EnvFactory
 from twin.env.irradiance import IrradianceEstimator
 from twin.env.picture_effects import Weather
-from twin.env.suite import EnvFactory
 from twin.errors import InputError
 from twin.files import load_arrays
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject

@@ -211,7 +211,7 @@ def test_trials_add_up_and_a_bag_counts_once(place, tmp_path):
         one.message.header.stamp.sec += 1000
     bags = [bag_of(drives["ahead"], tmp_path / "a"), write(tmp_path / "b", later)]
     for bag in (bags[0], bags[1], bags[0]):
-        trial.record_trial(scene, bag, "ahead", "ahead", "dusk", out, "day+randomised", frame="scene")
+        trial.evaluate_trial(scene, bag, "ahead", "ahead", "dusk", out, "day+randomised", frame="scene")
     (cell,) = read_results([out], [Cell("ahead", "ahead", "day+randomised", 20, 10)])
     assert (cell.trials, cell.successes, cell.lighting) == (2, 1, "dusk")
 
@@ -223,7 +223,7 @@ def test_a_table_written_by_hand_is_not_lost(place, tmp_path):
     with pytest.raises(
         InputError, match=r"10 trials of ahead under day, of which real_trials\.csv has 0; give another"
     ):
-        trial.record_trial(
+        trial.evaluate_trial(
             scene, bag_of(drives["ahead"], tmp_path / "bag"), "ahead", "ahead", "day", out, frame="scene"
         )
     assert out.read_text().endswith("10,8\n")
@@ -235,11 +235,11 @@ def test_the_operator_says_what_poses_do_not_show(place, tmp_path):
     bag, out = write(tmp_path / "cut", cut), tmp_path / "real.csv"
     common = (scene, bag, "ahead", "ahead", "day", out)
     with pytest.raises(InputError, match=r"ends after 1\.9 s and \d\.\d m without an outcome; .*--cause collision"):
-        trial.record_trial(*common, frame="scene")
-    row, _, _ = trial.record_trial(*common, cause="collision", frame="scene")
+        trial.evaluate_trial(*common, frame="scene")
+    row, _, _ = trial.evaluate_trial(*common, cause="collision", frame="scene")
     assert row.cause == "collision" and not row.success and row.steps == 19
     with pytest.raises(InputError, match="expected a cause of failure"):
-        trial.record_trial(*common, cause="goal", frame="scene")
+        trial.evaluate_trial(*common, cause="goal", frame="scene")
     (action,) = [a for a in parser_of("trial")._actions if a.dest == "cause"]
     assert {"goal", *action.choices} == set(CAUSES)
 

@@ -16,12 +16,12 @@ from twin import load_scene, runtime, validate
 from twin.config import Condition
 from twin.env import episode_lighting
 from twin.env.domain_randomization import EVALUATION_RANGES, condition_options
-from twin.env.suite import EnvFactory, fingerprint
+from twin.env.env_factory import EnvFactory, fingerprint
 from twin.errors import InputError
 from twin.evaluation.trials import Trial, compare_pairs, read_trials, success_rate, summarize
 from twin.learn import policy_evaluation
 from twin.learn.policy import Control, load_policy, save_policy
-from twin.learn.policy_evaluation import EpisodeChunk, campaign, run_chunk, with_sampled_lighting
+from twin.learn.policy_evaluation import EpisodeChunk, run_chunk, run_chunks, with_sampled_lighting
 from twin.loading import Twin
 from twin.report.validation_report import summary_lines
 from twin.robot import HuskyParams
@@ -74,7 +74,7 @@ def test_an_episode_equals_that_of_a_single_environment(scene):
 
 def test_processes_give_the_same_results(scene):
     chunks = [chunk(scene, [0, 1]), chunk(scene, [2]), chunk(scene, [0], "night")]
-    assert list(campaign(chunks, processes=2)) == list(campaign(chunks))
+    assert list(run_chunks(chunks, processes=2)) == list(run_chunks(chunks))
 
 
 def test_a_policy_trained_again_is_driven_anew(scene):
@@ -83,7 +83,7 @@ def test_a_policy_trained_again_is_driven_anew(scene):
     for name in ("ahead", "left"):
         shutil.rmtree(again, ignore_errors=True)
         shutil.copytree(scene / "runs" / name, again)
-        assert list(campaign([chunk(scene, [0], name="again")])) == list(campaign([chunk(scene, [0], name=name)]))
+        assert list(run_chunks([chunk(scene, [0], name="again")])) == list(run_chunks([chunk(scene, [0], name=name)]))
     shutil.rmtree(again)
 
 
@@ -95,7 +95,7 @@ def test_the_rounds_of_a_search_open_the_scene_once(fresh, monkeypatch):
     rounds = [search.drive([("ahead", "drawn_0", seeds)], "search") for seeds in ([0], [0], [1, 2])]
     assert len(opened) == 1
     seeds = [trial.seed for trials in rounds for trial in trials]
-    (alone,) = campaign([chunk(fresh, [0, 1, 2], "drawn_0")])
+    (alone,) = run_chunks([chunk(fresh, [0, 1, 2], "drawn_0")])
     assert len(opened) == 2  # files may have changed since
     assert seeds == [0, 0, 1, 2] and [t.steps for t in rounds[0] + rounds[2]] == [one.steps for one in alone]
 

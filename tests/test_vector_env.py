@@ -13,8 +13,8 @@ from tiny_twin import tiny_twin
 
 import twin
 from twin import runtime
+from twin.env.env_factory import EnvFactory
 from twin.env.gym_env import DriveVectorEnv
-from twin.env.suite import EnvFactory
 from twin.env.vector_env import ProcessVectorEnv, _Child, make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError

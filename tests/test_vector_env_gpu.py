@@ -16,9 +16,9 @@ import twin
 from twin import runtime
 from twin.config import ObstacleConfig
 from twin.env.domain_randomization import Ranges
+from twin.env.env_factory import EnvFactory
 from twin.env.observation import GpuPixelObserver, PixelObserver
 from twin.env.picture_effects import CameraOptions
-from twin.env.suite import EnvFactory
 from twin.env.task import control
 from twin.env.vector_env_gpu import GpuVectorEnv, _compile_kernels
 from twin.env.vector_env_local import LocalVectorEnv

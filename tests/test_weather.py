@@ -16,9 +16,9 @@ from twin.env.domain_randomization import (
     Ranges,
     condition_options,
 )
+from twin.env.env_factory import EnvFactory, fingerprint
 from twin.env.episode_lighting import LightingSets, sample_lighting
 from twin.env.picture_effects import CastShadows, DirectionalRelighting, FogSample, Weather, _solid_shadows
-from twin.env.suite import EnvFactory, fingerprint
 from twin.env.task import WEATHER, DriveTask
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.nerf.lightings import AddedLighting, Fog
@@ -210,7 +210,7 @@ def test_known_weather_weakens_the_randomization(photos, lighting):
 def test_fingerprint_covers_the_known_weather_fraction(photos, monkeypatch):
     names = ("foggy", "foggy+randomised", "day+randomised")
     before = [fingerprint(photos, "ahead", Condition.parse(name)) for name in names]
-    monkeypatch.setattr("twin.env.suite.KNOWN_WEATHER_FRACTION", 0.5)
+    monkeypatch.setattr("twin.env.env_factory.KNOWN_WEATHER_FRACTION", 0.5)
     after = [fingerprint(photos, "ahead", Condition.parse(name)) for name in names]
     assert [a == b for a, b in zip(before, after, strict=True)] == [True, False, True]
 

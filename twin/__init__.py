@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 if TYPE_CHECKING:
-    from twin.env.suite import load
+    from twin.env.env_factory import load
     from twin.errors import InputError
     from twin.geometry.cameras import Viewpoints
     from twin.loading import Twin, load_scene
@@ -18,7 +18,7 @@ _MODULES = {
     "InputError": "twin.errors",
     "Twin": "twin.loading",
     "Viewpoints": "twin.geometry.cameras",
-    "load": "twin.env.suite",
+    "load": "twin.env.env_factory",
     "load_scene": "twin.loading",
 }
 

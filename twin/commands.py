@@ -13,7 +13,7 @@ from typing import Any
 
 from twin.command_line import HelpFormatter, Parser, run
 from twin.config import HELD_OUT, QUALITIES, Condition
-from twin.scene import STAGES
+from twin.scene import STAGE_FOLDERS
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ a scene.toml of your own road:
 twin new SCENE VIDEO... writes such a folder.
 """
     add("scene", type=Path, help="folder with scene.toml and input/")
-    add("--until", choices=STAGES, metavar="STAGE", help=f"last stage to run: {', '.join(STAGES)}")
-    add("--force", choices=STAGES, metavar="STAGE", action="append", default=[], help="stage to run again")
+    add("--until", choices=STAGE_FOLDERS, metavar="STAGE", help=f"last stage to run: {', '.join(STAGE_FOLDERS)}")
+    add("--force", choices=STAGE_FOLDERS, metavar="STAGE", action="append", default=[], help="stage to run again")
     add("--quality", choices=tuple(QUALITIES), help="sharpness of the field; default: as in scene.toml, or standard")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="override scene.toml, as in nerf.steps=4000")
     add("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")

@@ -25,8 +25,8 @@ from twin import commands, runtime
 from twin.config import STEERING, Condition
 from twin.env.domain_randomization import condition_options
 from twin.env.drivers import Driver, PolicyDriver, RouteDriver
+from twin.env.env_factory import load
 from twin.env.episode import Episode, record_episode
-from twin.env.suite import load
 from twin.env.vector_env_local import sampled_text
 from twin.errors import InputError
 from twin.files import new_folder, require_absent, require_parent

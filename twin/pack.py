@@ -40,7 +40,7 @@ from twin.nerf.baked import section_file, stored_layouts
 from twin.nerf.baked_arrays import BrickLayout, samples_read
 from twin.nerf.lightings import lighting_files
 from twin.nerf.road import ROAD_FILE
-from twin.scene import STAGES, SceneDir, Stamp, package_versions, require_stage, stage_result
+from twin.scene import STAGE_FOLDERS, SceneDir, Stamp, package_versions, require_stage, stage_result
 
 LEVELS = 256
 """Default of `--levels`: the number of values of a byte, with which the field is not rounded."""
@@ -201,7 +201,7 @@ def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
         digests = {name: unpack.digest(content) for name, content in kept.items()}
         stamp = replace(stamp, result=results[stage], depends={}, metrics={}, files=sizes, sha256=digests)
         kept["stamp.json"] = stamp.content()
-        files |= {f"build/{STAGES[stage]}/{name}": content for name, content in kept.items()}
+        files |= {f"build/{STAGE_FOLDERS[stage]}/{name}": content for name, content in kept.items()}
     return results["field"]
 
 

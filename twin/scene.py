@@ -38,7 +38,7 @@ from twin.files import (
     write_bytes,
 )
 
-STAGES: dict[str, str] = {
+STAGE_FOLDERS: dict[str, str] = {
     "capture": "1_capture",
     "cameras": "2_cameras",
     "metric": "2_metric",
@@ -47,7 +47,7 @@ STAGES: dict[str, str] = {
     "mjcf": "5_mjcf",
     "review": "6_review",
 }
-"""Stage name → folder under `build/`, in running order."""
+"""Stage name → folder under `build/`, in running order. `twin.build.PIPELINE` defines the stages."""
 
 PACK_JSON = "pack.json"
 """File that marks a scene folder as unpacked from a pack (`twin.unpack`); such a folder has only what driving needs."""
@@ -69,11 +69,11 @@ class SceneDir:
 
     def stage(self, name: str) -> Path:
         """The finished folder of a stage."""
-        return self.build / STAGES[name]
+        return self.build / STAGE_FOLDERS[name]
 
     def partial(self, name: str) -> Path:
         """The folder to which a running stage writes."""
-        return self.build / f"{STAGES[name]}.partial"
+        return self.build / f"{STAGE_FOLDERS[name]}.partial"
 
     @property
     def report_json(self) -> Path:
@@ -253,13 +253,11 @@ def _verified_once(folder: Path, _stamped: tuple[int, int]) -> Stamp:
 
 def _verified_stamp(scene: SceneDir, stage: str) -> Stamp:
     folder = scene.stage(stage).resolve()
-    path = folder / "stamp.json"
+    path, name = folder / "stamp.json", STAGE_FOLDERS[stage]
     if not path.exists() and (scene.root / PACK_JSON).exists():
-        raise InputError(
-            f"{scene.root} comes from a pack, which has neither {STAGES[stage]} nor films; ask its sender for them"
-        )
+        raise InputError(f"{scene.root} comes from a pack, which has neither {name} nor films; ask its sender for them")
     if not path.exists():
-        raise InputError(f"{scene.root} has no {STAGES[stage]} yet; run twin build {scene.root}")
+        raise InputError(f"{scene.root} has no {name} yet; run twin build {scene.root}")
     facts = regular_file(path).stat()
     return _verified_once(folder, (facts.st_mtime_ns, facts.st_size))
 
@@ -299,7 +297,7 @@ def commit_stage(scene: SceneDir, stage: str) -> None:
 
 def recover_stages(scene: SceneDir) -> None:
     """Cleans up after a killed build: removes partial folders, and restores results that were being replaced."""
-    for stage in STAGES:
+    for stage in STAGE_FOLDERS:
         final = scene.stage(stage)
         old = final.with_name(final.name + ".old")
         if old.exists() and not final.exists():

@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 
 from twin import commands, runtime
 from twin.config import Condition
-from twin.env.suite import EnvFactory
+from twin.env.env_factory import EnvFactory
 from twin.errors import InputError
 from twin.evaluation.trial_judge import JudgedTrial, TrialViews, judge, replay, view
-from twin.evaluation.trials import Trial, recorded_trials, write_real_trials
+from twin.evaluation.trials import Trial, read_real_trials, write_real_trials
 from twin.files import write_json
 from twin.learn.policy import Policy, find_policy, load_policy
 from twin.loading import load_writable
@@ -49,7 +49,7 @@ _OWN = 0.5  # if the policy repeats a smaller share of the commands, another one
 _START_OFFSET, _START_HEADING = 0.3, 10.0  # [m], [°] largest deviations from the route at a trial's start in the twin
 
 
-def record_trial(
+def evaluate_trial(
     root: Path,
     bag: Path,
     policy_name: str,
@@ -84,7 +84,7 @@ def record_trial(
     recording = read_trial(bag, topics)
     out = out or root / "real.csv"
     table = out.with_name(f"{out.stem}_trials.csv")
-    known = recorded_trials(table, out)
+    known = read_real_trials(table, out)
     compared = twin_lighting or lighting
     factory = EnvFactory.open(scene, task, policy.options())
     if factory.field is None:
@@ -228,7 +228,7 @@ def _figures(
 
 
 def summary(row: Trial, figures: dict[str, Any]) -> str:
-    """The printed summary of a trial; `figures` are those of `record_trial`."""
+    """The printed summary of a trial; `figures` are those of `evaluate_trial`."""
     frame, replayed, seen, policy = (figures[name] for name in ("frame", "replay", "pictures", "policy"))
     lines = [
         f"{row.policy}, {row.task}, {row.lighting}: {row.cause} after {row.progress:.1f} m and "
@@ -284,7 +284,7 @@ def command(options: argparse.Namespace) -> None:
     for name in ("policy", "lighting"):
         if not getattr(options, name):
             raise InputError(f"a trial needs --{name}; without a policy, --lerobot DIR records drives to learn from")
-    row, figures, folder = record_trial(
+    row, figures, folder = evaluate_trial(
         *(options.scene, options.bag[0], options.policy, options.task, options.lighting, options.out),
         *(options.twin_lighting, options.cause, options.frame, topics),
     )

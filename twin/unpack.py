@@ -40,7 +40,7 @@ from twin.files import digest_file, exists, is_file, parse_json, read_json, requ
 from twin.geometry.cameras import Cameras
 from twin.mjcf.world import SCENE_XML
 from twin.runtime import exclusive_lock
-from twin.scene import PACK_JSON, STAGES, SceneDir
+from twin.scene import PACK_JSON, STAGE_FOLDERS, SceneDir
 
 SUFFIX = ".twin"
 _SEARCHED = (
@@ -65,10 +65,10 @@ _CHUNK = 4 << 20  # [bytes]
 _N = r"\w[\w.+-]{0,99}"  # a name in a path; it cannot begin with a dot, so ".." is excluded
 PLACES = re.compile(
     rf"scene\.toml|robot\.toml|positions\.csv|lightings/{_N}\.json"
-    rf"|build/{STAGES['metric']}/(cameras\.(json|npz)|stamp\.json)"
-    rf"|build/{STAGES['field']}/(baked\.json|baked(_[1-9][0-9]{{0,3}})?\.safetensors|road\.safetensors|stamp\.json)"
-    rf"|build/{STAGES['mesh']}/({_N}\.(npz|png)|stamp\.json)"
-    rf"|build/{STAGES['mjcf']}/(scene\.xml|world\.json|stamp\.json|assets/{_N}\.(obj|png|bin))"
+    rf"|build/{STAGE_FOLDERS['metric']}/(cameras\.(json|npz)|stamp\.json)"
+    rf"|build/{STAGE_FOLDERS['field']}/(baked\.json|baked(_[1-9][0-9]{{0,3}})?\.safetensors|road\.safetensors|stamp\.json)"
+    rf"|build/{STAGE_FOLDERS['mesh']}/({_N}\.(npz|png)|stamp\.json)"
+    rf"|build/{STAGE_FOLDERS['mjcf']}/(scene\.xml|world\.json|stamp\.json|assets/{_N}\.(obj|png|bin))"
     rf"|runs/{_N}/(checkpoints/{_N}/)?policy\.(json|safetensors|onnx)|policies/{_N}\.(onnx|zip)"
 )
 """Pattern of the names that files of a pack may have."""

@@ -20,8 +20,8 @@ from twin import commands, runtime
 from twin.config import HELD_OUT, Condition
 from twin.config_file import load_config
 from twin.env.domain_randomization import condition_options, measured_parameters
+from twin.env.env_factory import fingerprint
 from twin.env.route_segments import find_task
-from twin.env.suite import fingerprint
 from twin.errors import InputError
 from twin.evaluation.training_curves import read_episodes, training_summaries
 from twin.evaluation.trials import (
@@ -37,7 +37,7 @@ from twin.evaluation.trials import (
 )
 from twin.files import digest_file, digest_json, read_json, wrap_read_errors, write_bytes, write_json, write_text
 from twin.learn.policy import JSON, find_policy, load_policy
-from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, campaign, campaign_on_ray
+from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, run_chunks, run_chunks_on_ray
 from twin.loading import Twin, load_writable
 from twin.report.policy_card import write_policy_cards
 from twin.report.validation_report import failure_map, summary_lines, write_validation_page
@@ -86,7 +86,7 @@ class Campaign:
                 chunks.append((name, EpisodeChunk(*road, self._sources[name], self._trust, condition, part)))
         with runtime.bar(what, len(keys), "episode") as bar:
             bar.update(len(keys) - sum(len(chunk.seeds) for _, chunk in chunks))
-            driven = self._campaign([chunk for _, chunk in chunks])
+            driven = self._run([chunk for _, chunk in chunks])
             for (name, chunk), outcomes in zip(chunks, driven, strict=True):
                 drive = name, self.task, str(chunk.condition)
                 trials = [
@@ -96,11 +96,11 @@ class Campaign:
                 bar.update(len(trials))
         return [self._done[key] for key in keys]
 
-    def _campaign(self, chunks: list[EpisodeChunk]) -> Iterator[list[EpisodeResult]]:
+    def _run(self, chunks: list[EpisodeChunk]) -> Iterator[list[EpisodeResult]]:
         if self._ray and chunks:
-            return campaign_on_ray(chunks, self._ray)
+            return run_chunks_on_ray(chunks, self._ray)
         fresh, self._fresh = self._fresh, self._fresh and not chunks  # later rounds keep what the first one loads
-        return campaign(chunks, self._processes, fresh)
+        return run_chunks(chunks, self._processes, fresh)
 
     def _append(self, trials: Sequence[Trial]) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)

@@ -22,7 +22,6 @@ import numpy as np
 from place_record import FAILURE, POLICIES, PlaceRecord, read_place
 from protocol import Protocol
 
-from twin.evaluation.jackknife import STATISTICS, PairedCells, Statistic
 from twin.evaluation.probability_scores import (
     brier,
     calibration,
@@ -31,6 +30,7 @@ from twin.evaluation.probability_scores import (
     shuffled_days,
     twin_probabilities,
 )
+from twin.evaluation.statistic_intervals import STATISTICS, PairedCells, Statistic
 from twin.evaluation.statistics import UndefinedStatistic, rate_over_days, winner
 from twin.files import read_json
 from twin.types import Array

@@ -1,9 +1,9 @@
 """COLMAP camera models: validation, scaling, intrinsics and undistortion.
 
 A *lens* is a camera model with its parameters at one image size. Its *intrinsics* are fx, fy, cx, cy [px]; the other
-parameters are its *distortion*. A *raw* image has the distortion; the *pinhole* image shows the same view without it.
-The pinhole's focal length is just large enough that every pinhole pixel lies inside the raw image, so that no
-pixel is extrapolated.
+parameters are its *distortion*. `twin.config.CAMERA_MODELS` lists the models; pycolmap computes the projections. A
+*raw* image has the distortion; the *pinhole* image shows the same view without it. The pinhole's focal length is just
+large enough that every pinhole pixel lies inside the raw image, so that no pixel is extrapolated.
 """
 
 import math

@@ -6,9 +6,10 @@ The randomized quantities are:
 - pictures: fog, directional relighting and cast shadows (see `picture_effects.py`);
 - place: distractor objects beside the corridor.
 
-`Ranges` contains the bounds, a `RandomizationSample` the values of one episode. Each value is uniform in its range and
-independent of the others. With `Ranges.hold_known`, measured parameters of the robot are not sampled, and the weather
-is randomized less when a photo of the day is available.
+`Ranges` contains the bounds, a `RandomizationSample` the values of one episode; the sun's direction and color and the
+pattern of shadows are drawn in `picture_effects.Weather`. Each value is uniform in its range and independent of the
+others. With `Ranges.hold_known`, measured parameters of the robot are not sampled, and the weather is randomized less
+when a photo of the day is available.
 """
 
 from dataclasses import asdict, dataclass, fields, replace
@@ -22,7 +23,7 @@ from twin.config import Condition
 from twin.errors import InputError, short_repr
 from twin.robot import HuskyParams
 
-Range = tuple[float, float]
+Interval = tuple[float, float]
 
 PAYLOAD = "payload"
 """Name of a body on the top plate; its mass is zero until an episode sets a payload."""
@@ -74,29 +75,29 @@ _MODEL_FIELDS = ("geom_friction", "geom_size", "geom_rbound", "geom_aabb", "bvh_
 class Ranges:
     """Lowest and highest value of each quantity. Equal bounds hold it fixed."""
 
-    friction: Range = (0.7, 1.3)
+    friction: Interval = (0.7, 1.3)
     """Factor by which the robot's own tire friction is multiplied."""
-    payload: Range = (0.0, 20.0)
+    payload: Interval = (0.0, 20.0)
     """Mass on the top plate [kg]."""
-    latency: Range = (0.0, 0.1)
+    latency: Interval = (0.0, 0.1)
     """Delay of commands, in addition to the robot's own `command_latency` [s]."""
-    camera_shift: Range = (-0.02, 0.02)
+    camera_shift: Interval = (-0.02, 0.02)
     """Translation of the front camera along each of its axes [m]."""
-    camera_turn: Range = (-1.0, 1.0)
+    camera_turn: Interval = (-1.0, 1.0)
     """Rotation of the front camera about each of its axes [°]."""
-    wheel_radius: Range = (0.98, 1.02)
+    wheel_radius: Interval = (0.98, 1.02)
     """Factor by which the robot's own wheel radius is multiplied; the controller always uses the nominal radius."""
-    wheel_difference: Range = (-0.006, 0.006)
+    wheel_difference: Interval = (-0.006, 0.006)
     """Right minus left wheel radius, relative to their mean; with a difference, the robot does not drive straight."""
-    extinction: Range = (0.0, 0.05)
+    extinction: Interval = (0.0, 0.05)
     """Extinction of the fog [1/m], in addition to the film's haze; 0.05 is a visibility of 60 m."""
-    airlight: Range = (0.85, 1.15)
+    airlight: Interval = (0.85, 1.15)
     """Ratio of the fog's brightness to that of the sky at the horizon."""
-    sunlight: Range = (0.0, 0.7)
-    """Strength of `weather.DirectionalRelighting`."""
-    shade: Range = (0.0, 0.75)
-    """Strength of `weather.CastShadows`: fraction of a color lost in full shadow."""
-    bystanders: Range = (0, 4)
+    sunlight: Interval = (0.0, 0.7)
+    """Strength of `picture_effects.DirectionalRelighting`."""
+    shade: Interval = (0.0, 0.75)
+    """Strength of `picture_effects.CastShadows`: fraction of a color lost in full shadow."""
+    bystanders: Interval = (0, 4)
     """Number of distractor objects beside the corridor: cones, boxes, bollards in any color."""
     hold_known: bool = False
     """True: measured parameters of the robot are held fixed (see `for_robot`). Under lightings fitted to a photo, the
@@ -119,7 +120,7 @@ class Ranges:
                     f"randomise: {name} = {short_repr(pair)}; expected (lowest, highest), from {expected} to {most:,g}"
                 )
 
-    def by_name(self) -> dict[str, Range]:
+    def by_name(self) -> dict[str, Interval]:
         """All ranges by name."""
         return {one.name: getattr(self, one.name) for one in fields(self) if one.name != "hold_known"}
 

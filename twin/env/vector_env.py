@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import runtime
+from twin.env.env_factory import EnvFactory
 from twin.env.options import CPU, check_actions, parse_options
-from twin.env.suite import EnvFactory
 from twin.env.vector_env_local import LocalVectorEnv, StepResult, frame_stack
 from twin.errors import InputError
 from twin.loading import Twin

@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from twin import runtime
 from twin.env.controller import SubstepSchedules, VectorController
+from twin.env.env_factory import EnvFactory
 from twin.env.observation import GpuPixelObserver
 from twin.env.obstacles import ObstacleMotion
 from twin.env.physics import TIME_TOLERANCE
-from twin.env.suite import EnvFactory
 from twin.env.task import DrivePhysics, DriveTask, Motion, RewardAndTermination, control
 from twin.env.vector_env_local import LocalVectorEnv, StepResult
 from twin.geometry.cameras import opencv_to_mujoco

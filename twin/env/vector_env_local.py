@@ -15,10 +15,10 @@ import dm_env
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.env.env_factory import EnvFactory
 from twin.env.episode_lighting import EpisodeLighting
 from twin.env.observation import PixelObserver
 from twin.env.options import check_actions
-from twin.env.suite import EnvFactory
 from twin.env.task import DrivePhysics, DriveTask, control
 from twin.nerf.baked import BakedField
 from twin.nerf.lightings import Lightings

@@ -27,7 +27,6 @@ from twin.evaluation.agreement import (
     missing_data,
     unit_counts,
 )
-from twin.evaluation.jackknife import training_of
 from twin.evaluation.rate_model import (
     MARGIN,
     MIN_RATE_DAYS,
@@ -39,6 +38,7 @@ from twin.evaluation.rate_model import (
     rank_probabilities,
     trials_needed,
 )
+from twin.evaluation.statistic_intervals import training_of
 from twin.evaluation.statistics import (
     CONFIDENCE,
     MIN_POLICIES,

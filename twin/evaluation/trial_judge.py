@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.env.suite import EnvFactory
+from twin.env.env_factory import EnvFactory
 from twin.env.task import Motion, RewardAndTermination
 from twin.errors import InputError
 from twin.geometry.cameras import Rendering, Viewpoints

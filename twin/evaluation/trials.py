@@ -52,7 +52,7 @@ _VALIDATE_COMMAND = "twin validate"
 
 @dataclass(frozen=True)
 class Trial:
-    """One drive in the twin."""
+    """One drive, in the twin or on the road."""
 
     policy: str
     task: str
@@ -140,7 +140,7 @@ def cells_csv(cells: Iterable[Cell]) -> str:
     return csv_text(CELL_COLUMNS, rows)
 
 
-def recorded_trials(table: Path, out: Path) -> list[Trial]:
+def read_real_trials(table: Path, out: Path) -> list[Trial]:
     """The real trials in `table`, if it exists.
 
     Raises InputError: the results table `out` has further trials, which `write_real_trials` would lose.

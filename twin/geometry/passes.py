@@ -1,4 +1,4 @@
-"""Passes: the segments of a filmed path that a robot can drive without interruption.
+"""Passes: the smoothed segments of a filmed path that a robot can drive without interruption.
 
 A filming camera may go down a road twice, come back in the other lane, stop or back up; a film may be cut. The path is
 divided at *jumps* (a cut, or frames that lie far apart), at *turns* (the camera comes back the way it came) and at

@@ -2,7 +2,8 @@
 
 By default, passes of the same lighting that continue each other are joined, and the longest line so formed is the
 route; `[route]` in scene.toml chooses passes, their direction, or way points. *Station* [m] is the arc length along the
-route. The *corridor* is the area within a half width of the route; it is free, since the camera passed through it.
+route. `passes.py` smooths the filmed paths. The *corridor* is the area within a half width of the route; it is free,
+since the camera passed through it.
 """
 
 from dataclasses import dataclass

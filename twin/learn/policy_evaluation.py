@@ -22,7 +22,7 @@ import numpy as np
 
 from twin.config import Condition
 from twin.env.domain_randomization import Ranges, condition_options
-from twin.env.suite import EnvFactory
+from twin.env.env_factory import EnvFactory
 from twin.env.vector_env import ProcessVectorEnv
 from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError
@@ -119,7 +119,7 @@ def run_episodes(
     return [done[number] for number in range(len(seeds))]
 
 
-def campaign(chunks: Sequence[EpisodeChunk], processes: int = 1, fresh: bool = True) -> Iterator[list[EpisodeResult]]:
+def run_chunks(chunks: Sequence[EpisodeChunk], processes: int = 1, fresh: bool = True) -> Iterator[list[EpisodeResult]]:
     """Drives chunks on this machine, in several worker processes or in this one; yields the chunks' results in order.
 
     In this process, policies and scenes that an earlier call has loaded are loaded again, since their files may have
@@ -194,7 +194,7 @@ _CORES = 2  # number of CPU cores that a chunk uses
 _CONNECT_TIMEOUT = 5.0  # [s]
 
 
-def campaign_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[list[EpisodeResult]]:
+def run_chunks_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[list[EpisodeResult]]:
     """Does the same as `campaign` on a Ray cluster; the address `auto` stands for the cluster on this machine.
 
     Every node needs `twin`, and scene and policies under the same paths as here. Raises InputError: Ray is not

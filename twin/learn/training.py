@@ -35,8 +35,8 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from twin import runtime
 from twin.config import Condition
+from twin.env.env_factory import fingerprint
 from twin.env.options import CUDA
-from twin.env.suite import fingerprint
 from twin.env.vector_env import default_processes
 from twin.errors import InputError
 from twin.evaluation.training_curves import CHOICE_FILE

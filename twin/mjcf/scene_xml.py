@@ -1,6 +1,7 @@
 """Stage `mjcf`: writes `scene.xml`, its `assets/` and `world.json` from cameras, ground, convex parts and visual mesh.
 
-The wheels' height field is the ground of stage `mesh` in cells of `mjcf.hfield_cell`.
+The wheels' height field is the ground of stage `mesh` in cells of `mjcf.hfield_cell`. The ground has no friction of its
+own: the tires' contact parameters apply (`priority` in `husky.py`; values in `twin.robot.HuskyParams`).
 
 Geom groups: 0 ground, 1 visual geoms of the robot, 2 visual mesh (no contacts), 3 convex parts `part_0000`...,
 4 collision geoms of the robot. Route, corridor and goal are sites of group 4. All paths in the XML are relative, so

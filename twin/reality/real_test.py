@@ -23,7 +23,7 @@ import numpy as np
 
 from twin.config import HELD_OUT, Condition
 from twin.errors import InputError
-from twin.evaluation.trials import Trial, recorded_trials, write_real_trials
+from twin.evaluation.trials import Trial, read_real_trials, write_real_trials
 from twin.files import digest_file, read_json, wrap_read_errors, write_json
 from twin.learn.policy import JSON, Policy, load_policy
 from twin.reality import REALITY_VERSION
@@ -238,7 +238,7 @@ def run(
     with exclusive_lock(out.with_name(f".{out.stem}.lock"), f"{out} is being written"):
         _check_setup(setup, table, out.with_name(f"{out.stem}_setup.json"))
         _check_policy_digests(loaded, policies, out.with_name(f"{out.stem}_policies.json"))
-        done = recorded_trials(table, out)
+        done = read_real_trials(table, out)
         known = {(one.policy, one.task, one.lighting, one.seed) for one in done}
         for policy in {one.name: one for one in loaded}.values():
             test = RealTest(task_for(policy, task, setup.place, setup.length), setup, policy.size)

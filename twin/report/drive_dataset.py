@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 from twin import runtime
 from twin.assets.ground import Ground
 from twin.config import TWIST
+from twin.env.env_factory import EnvFactory
 from twin.env.episode import Episode
-from twin.env.suite import EnvFactory
 from twin.errors import InputError
 from twin.evaluation.trial_judge import judge
 from twin.files import new_folder, require_absent, write_json

@@ -19,10 +19,10 @@ from scipy.optimize import brentq
 from twin.config import OBSTACLE_KINDS, ObstacleConfig
 from twin.config_file import load_config
 from twin.env.drivers import Driver, PolicyDriver, RouteDriver
+from twin.env.env_factory import DriveEnvironment, EnvFactory
 from twin.env.episode_lighting import EpisodeLighting
 from twin.env.obstacles import EpisodeObstacles, ObstacleMotion, ground_height, obstacle_pose, place
 from twin.env.route_segments import RouteSegment, find_task
-from twin.env.suite import DriveEnvironment, EnvFactory
 from twin.env.task import DrivePhysics, DriveTask, control
 from twin.errors import InputError
 from twin.files import toml_value

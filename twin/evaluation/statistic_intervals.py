@@ -1,4 +1,4 @@
-"""Jackknife intervals of statistics over policies. The units left out are trainings and days.
+"""Intervals of statistics that compare rates in the twin and on the road, by a jackknife over trainings and days.
 
 The *estimand* of an interval is the mean of the statistic over repeated experiments at the same place, each with the
 same numbers of new trainings, days and trials. For a mean rate or a bias, this is the value in the population. For a
