@@ -7,18 +7,16 @@
 The last command drives by `act`, with the weights in `imitation.safetensors`.
 """
 
-import argparse
 import functools
-import json
+import sys
 from pathlib import Path
 
 import numpy as np
 import torch
-from pyarrow import parquet
 from safetensors.torch import load_model, save_model
 from torch import nn
 
-from twin.report.video_writer import read_frames
+from twin.report.drive_dataset import read_drives
 
 WEIGHTS = Path(__file__).with_name("imitation.safetensors")
 STACK = 4  # pictures that a policy sees, the newest last
@@ -41,24 +39,12 @@ def act(pixels: np.ndarray) -> np.ndarray:
     return trained()(torch.as_tensor(pixels[None]).float() / 255.0 - 0.5)[0].numpy()
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("dataset", type=Path)
-    parser.add_argument("--steps", type=int, default=2000)
-    given = parser.parse_args(arguments)
-
-    ranges = json.loads((given.dataset / "meta/info.json").read_text())["twin"]["action_range"]
-    if len(ranges) != 2:
-        parser.error(f"{given.dataset}: its actions are {list(ranges)}; expected speed and yaw rate")
-    low, high = torch.tensor(list(ranges.values())).T
-    rows = parquet.read_table(given.dataset / "data/chunk-000/file-000.parquet").to_pydict()
-    films = sorted(given.dataset.glob("videos/observation.images.front/chunk-*/*.mp4"))
-    pictures = torch.as_tensor(np.concatenate([list(read_frames(film)) for film in films])).permute(0, 3, 1, 2)
-    actions = 2.0 * (torch.tensor(rows["action"]) - low) / (high - low) - 1.0
-    frame = torch.tensor(rows["frame_index"])
+def train(dataset: Path, steps: int = 2000) -> None:
+    pictures, actions, frame = (torch.as_tensor(values) for values in read_drives(dataset))
+    pictures = pictures.permute(0, 3, 1, 2)
     model, generator = network(), torch.Generator().manual_seed(0)
     optimizer = torch.optim.Adam(model.parameters(), 1e-3)
-    for step in range(given.steps):
+    for step in range(steps):
         some = torch.randint(len(actions), (64,), generator=generator)
         # At the start of a drive, the stack has the first picture several times, as in the environment.
         stack = [pictures[some - frame[some].clamp(max=back)] for back in reversed(range(STACK))]
@@ -66,10 +52,10 @@ def main(arguments: list[str] | None = None) -> None:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        if step % 200 == 0 or step == given.steps - 1:
+        if step % 200 == 0 or step == steps - 1:
             print(f"step {step}: mean squared error {loss.item():.4f}")
     save_model(model, WEIGHTS)
 
 
 if __name__ == "__main__":
-    main()
+    train(Path(sys.argv[1]))

@@ -1,41 +1,17 @@
 """SAC in one file, in the manner of CleanRL: python examples/sac.py scenes/demo --steps 20000
 
-The algorithm is that of Haarnoja et al., arXiv 1812.05905, with one convolutional encoder that the critics train.
-Network layers, distribution and replay buffer are those of stable-baselines3: pip install 'twin[learn]'
+The algorithm is that of Haarnoja et al., arXiv 1812.05905. Networks, their optimizers and the replay buffer are those
+of stable-baselines3: pip install 'twin[learn]'
 """
 
 import argparse
-from copy import deepcopy
 
 import gymnasium
-import numpy as np
 import torch
 from safetensors.torch import save_model
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
-from stable_baselines3.common.torch_layers import NatureCNN, create_mlp
 from stable_baselines3.common.utils import polyak_update
-from torch import nn
-
-
-class Agent(nn.Module):
-    def __init__(self, space: gymnasium.spaces.Box, actions: int) -> None:
-        super().__init__()
-        self.encoder = nn.Sequential(NatureCNN(space, 64), nn.LayerNorm(64), nn.Tanh())
-        self.actor = nn.Sequential(*create_mlp(64, 2 * actions, [256]))
-        self.critics = nn.ModuleList(nn.Sequential(*create_mlp(64 + actions, 1, [256])) for _ in range(2))
-        self.log_alpha, self.squashed = nn.Parameter(torch.tensor(-2.0)), SquashedDiagGaussianDistribution(actions)
-
-    def see(self, pictures: np.ndarray | torch.Tensor) -> torch.Tensor:
-        return self.encoder(torch.as_tensor(pictures).float() / 255.0)
-
-    def act(self, seen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        mean, deviation = self.actor(seen).chunk(2, -1)
-        action, log_probability = self.squashed.log_prob_from_params(mean, deviation.clamp(-5, 1))
-        return action, log_probability[:, None]
-
-    def values(self, seen: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        return torch.cat([critic(torch.cat([seen, action], -1)) for critic in self.critics], -1)
+from stable_baselines3.sac.policies import CnnPolicy
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -50,18 +26,15 @@ def main(arguments: list[str] | None = None) -> None:
 
     rewards = {"progress": 1.0, "cross_track": -0.1}
     world = gymnasium.make("twin:twin/Drive-v0", scene=given.scene, task=given.task, rewards=rewards)
-    space, size = world.observation_space, world.action_space.shape[0]
-    agent = Agent(space, size)
-    target = deepcopy(agent)
-    critics = torch.optim.Adam([*agent.encoder.parameters(), *agent.critics.parameters()], 3e-4)
-    actor = torch.optim.Adam([*agent.actor.parameters(), agent.log_alpha], 3e-4)
-    buffer = ReplayBuffer(min(given.steps, 5_000), space, world.action_space, handle_timeout_termination=False)
+    policy = CnnPolicy(world.observation_space, world.action_space, lambda _: 3e-4)
+    policy.actor.features_extractor = policy.critic.features_extractor  # one encoder, in the critics' optimizer only
+    log_alpha = torch.tensor(-2.0, requires_grad=True)
+    alpha_optimizer = torch.optim.Adam([log_alpha], 3e-4)
+    buffer = ReplayBuffer(min(given.steps, 5_000), world.observation_space, world.action_space)
     picture, _ = world.reset(seed=0)
     world.action_space.seed(0)
     for step in range(given.steps):
-        with torch.no_grad():
-            action = agent.act(agent.see(picture[None]))[0][0].numpy()
-        action = world.action_space.sample() if step < given.warmup else action
+        action = world.action_space.sample() if step < given.warmup else policy.predict(picture)[0]
         following, reward, terminated, truncated, info = world.step(action)
         buffer.add(picture, following, action, reward, terminated, [info])
         picture = following
@@ -72,23 +45,25 @@ def main(arguments: list[str] | None = None) -> None:
             continue
 
         batch = buffer.sample(given.batch)
-        alpha = agent.log_alpha.exp().detach()
+        alpha = log_alpha.exp().detach()
         with torch.no_grad():
-            action, log_probability = agent.act(agent.see(batch.next_observations))
-            best = target.values(target.see(batch.next_observations), action).min(-1, True).values
-            wanted = batch.rewards + 0.99 * (1 - batch.dones) * (best - alpha * log_probability)
-        seen = agent.see(batch.observations)
-        critics.zero_grad()
-        (agent.values(seen, batch.actions) - wanted).square().mean().backward()
-        critics.step()
-        action, log_probability = agent.act(seen.detach())
-        value = agent.values(seen.detach(), action).min(-1, True).values
-        entropy_loss = -(agent.log_alpha.exp() * (log_probability.detach() - size)).mean()
-        actor.zero_grad()
-        ((alpha * log_probability - value).mean() + entropy_loss).backward()
-        actor.step()
-        polyak_update(agent.parameters(), target.parameters(), 0.01)
-    save_model(agent, given.out)
+            action, log_probability = policy.actor.action_log_prob(batch.next_observations)
+            best = torch.cat(policy.critic_target(batch.next_observations, action), 1).amin(1, True)
+            wanted = batch.rewards + 0.99 * (1 - batch.dones) * (best - alpha * log_probability[:, None])
+        values = policy.critic(batch.observations, batch.actions)
+        descend(policy.critic.optimizer, sum((value - wanted).square().mean() for value in values))
+        action, log_probability = policy.actor.action_log_prob(batch.observations)
+        value = torch.cat(policy.critic(batch.observations, action), 1).amin(1)
+        descend(policy.actor.optimizer, (alpha * log_probability - value).mean())
+        descend(alpha_optimizer, -(log_alpha.exp() * (log_probability.detach() - len(action[0]))).mean())
+        polyak_update(policy.critic.parameters(), policy.critic_target.parameters(), 0.01)
+    save_model(policy, given.out)
+
+
+def descend(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
 
 
 if __name__ == "__main__":

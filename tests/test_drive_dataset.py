@@ -9,7 +9,7 @@ import pytest
 from twin.env.episode import Episode
 from twin.errors import InputError
 from twin.files import read_json
-from twin.report.drive_dataset import CAMERA, DriveDataset
+from twin.report.drive_dataset import CAMERA, DriveDataset, read_drives
 from twin.report.video_writer import read_frames
 
 pyarrow = pytest.importorskip("pyarrow", reason="needs pyarrow")
@@ -155,3 +155,17 @@ def test_lerobot_reads_it(written):
         np.testing.assert_array_equal(item["action"].numpy(), np.float32(episode.actions[frame]))
         shown = item[CAMERA].numpy().transpose(1, 2, 0) * 255
         assert np.abs(shown - pictures[frame]).mean() < 2.0
+
+
+def test_drives_are_read_back_as_an_environment_takes_them(written, tmp_path):
+    """Actions are scaled to [-1, 1]; pictures are within the video's loss; every drive begins with frame 0."""
+    folder, drives = written
+    pictures, actions, frame = read_drives(folder)
+    shown = np.concatenate([one[1][:-1] for one in drives]).astype(float)
+    assert pictures.shape == shown.shape and np.abs(pictures - shown).mean() < 2.0
+    given = np.concatenate([episode.actions[:-1] for episode, _, _ in drives])
+    assert np.allclose(actions[:, 0], given[:, 0] / 0.4 - 1.0, atol=1e-5)  # 0 to 0.8 m/s
+    assert np.allclose(actions[:, 1], given[:, 1] / 0.5, atol=1e-5)  # -0.5 to 0.5 rad/s
+    assert frame.tolist() == [*range(LENGTHS[0] - 1), *range(LENGTHS[1] - 1)]
+    with pytest.raises(InputError, match="info.json"):
+        read_drives(tmp_path)

@@ -47,7 +47,7 @@ def test_imitation_drives_as_it_was_shown(scene, tmp_path, monkeypatch, capsys):
     assert film([root, "--task", "ahead", "--lerobot", str(drives), "--episodes", "2", "--quiet"]) == 0
     module = example("imitation")
     monkeypatch.setattr(module, "WEIGHTS", tmp_path / "imitation.safetensors")
-    module.main([str(drives), "--steps", "60"])
+    module.train(drives, steps=60)
     errors = [float(line.split()[-1]) for line in capsys.readouterr().out.splitlines() if "error" in line]
     assert errors[-1] < 0.3 * errors[0]
     observed = twin.load(scene, "ahead", 0).reset().observation["pixels"]

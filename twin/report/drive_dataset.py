@@ -27,10 +27,10 @@ from twin.env.env_factory import EnvFactory
 from twin.env.episode import Episode
 from twin.errors import InputError
 from twin.evaluation.trial_judge import judge
-from twin.files import new_folder, require_absent, write_json
+from twin.files import new_folder, read_json, require_absent, wrap_read_errors, write_json
 from twin.learn.policy import find_policy, load_policy
 from twin.loading import load_scene
-from twin.report.video_writer import VideoWriter
+from twin.report.video_writer import VideoWriter, read_frames
 from twin.scene import require_stage
 from twin.types import Array, Image
 from twin_policy import Rectifier
@@ -231,6 +231,36 @@ class DriveDataset:
                 "twin": {"action_range": {name: list(ends) for name, ends in self.actions.items()}},
             },
         )
+
+
+def read_drives(folder: Path) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
+    """Reads the n frames of a dataset that `DriveDataset` wrote.
+
+    Returns:
+        Pictures (n, h, w, 3).
+        The actions that followed, (n, 2), scaled to [-1, 1], as an environment takes them.
+        Index of each frame within its drive, (n,).
+
+    Raises:
+        InputError: the folder is no such dataset; or its actions are not speed and yaw rate.
+    """
+    require_pyarrow()
+    from pyarrow import parquet
+
+    info = folder / "meta" / "info.json"
+    ranges = read_json(info).get("twin", {}).get("action_range", {})
+    if len(ranges) != 2:
+        raise InputError(
+            f"{info}: actions are {list(ranges)}; expected speed and yaw rate, as `twin film --lerobot` writes"
+        )
+    with wrap_read_errors(folder, "record the drives again"):
+        tables = [parquet.read_table(path) for path in sorted(folder.glob("data/*/*.parquet"))]
+        films = sorted(folder.glob(f"videos/{CAMERA}/*/*.mp4"))
+        pictures = np.concatenate([list(read_frames(film)) for film in films])
+        action = np.concatenate([np.array(table["action"].to_pylist(), np.float32) for table in tables])
+        frame = np.concatenate([table["frame_index"].to_numpy() for table in tables])
+    low, high = np.array(list(ranges.values()), np.float32).T
+    return pictures, 2.0 * (action - low) / (high - low) - 1.0, frame
 
 
 def drive_instruction(scene: Path, task: str) -> str:
