@@ -167,5 +167,5 @@ def test_drives_are_read_back_as_an_environment_takes_them(written, tmp_path):
     assert np.allclose(actions[:, 0], given[:, 0] / 0.4 - 1.0, atol=1e-5)  # 0 to 0.8 m/s
     assert np.allclose(actions[:, 1], given[:, 1] / 0.5, atol=1e-5)  # -0.5 to 0.5 rad/s
     assert frame.tolist() == [*range(LENGTHS[0] - 1), *range(LENGTHS[1] - 1)]
-    with pytest.raises(InputError, match="info.json"):
+    with pytest.raises(InputError, match=r"info\.json"):
         read_drives(tmp_path)
