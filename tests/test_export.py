@@ -2,6 +2,7 @@
 
 import io
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,19 @@ def test_splats_and_mesh_have_the_lighting(out, scene) -> None:
     assert b"KHR_materials_unlit" in head and b"image/jpeg" in head and mesh.visual.uv is not None
 
 
+def test_compressed_splats_are_those_of_the_ply(out, tmp_path) -> None:
+    spz = pytest.importorskip("gsply.spz", reason="needs gsply")
+    splats = read_ply(out / "p.ply")
+    splats.write_spz(tmp_path / "p.spz")
+    read, wanted = spz.read_spz(tmp_path / "p.spz"), splats.stored()
+    assert (tmp_path / "p.spz").stat().st_size < (out / "p.ply").stat().st_size / 4
+    assert np.abs(read.means - wanted["means"]).max() < 2**-12
+    assert np.abs(read.sh0 - wanted["sh0"]).max() < 0.02 and np.abs(read.scales - wanted["scales"]).max() < 0.04
+    assert np.abs(1 / (1 + np.exp(-read.opacities)) - splats.opacity).max() < 0.005
+    unit = splats.rotations / np.linalg.norm(splats.rotations, axis=1, keepdims=True)
+    assert np.abs((read.quats * unit).sum(1)).min() > 0.9999  # the same rotation, up to the sign
+
+
 # ---- texture
 
 
@@ -177,7 +191,11 @@ def test_a_task_file_has_the_scenes_line_and_rules(scene, out) -> None:
         (["--usd", "a.obj"], "expected a file ending in .usdz"),
         (["--glb", "a.gltf"], "a.gltf: expected a file ending in .glb"),
         (["--ply", "a.spz"], "a.spz: expected a file ending in .ply"),
-        (["--colmap", "a", "--lighting", "night"], "--lighting night: only --usd, --glb and --ply have a lighting"),
+        (["--spz", "a.ply"], "a.ply: expected a file ending in .spz"),
+        (
+            ["--colmap", "a", "--lighting", "night"],
+            "--lighting night: only --usd, --glb, --ply and --spz have a lighting",
+        ),
         (["--usd", "folder.usd"], "is a folder; give a file"),
         (["--colmap", "folder"], "is there already"),
         (["--nerfstudio", "file"], "is there already"),
@@ -201,7 +219,8 @@ def test_an_unknown_lighting_is_refused(scene, tmp_path, capsys) -> None:
     assert "noon" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
-def test_usd_without_its_package_is_told(scene, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pxr", None)
-    assert main([str(scene), "--usd", str(tmp_path / "a.usdz")]) == 2
-    assert "pip install 'twin[usd]'" in capsys.readouterr().err
+@pytest.mark.parametrize(("package", "option", "name"), [("pxr", "usd", "a.usdz"), ("gsply", "spz", "a.spz")])
+def test_a_missing_package_is_named(scene, tmp_path, monkeypatch, capsys, package, option, name) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    assert main([str(scene), f"--{option}", str(tmp_path / name)]) == 2
+    assert f"pip install 'twin[{option}]'" in capsys.readouterr().err and not list(tmp_path.iterdir())

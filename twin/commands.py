@@ -278,13 +278,14 @@ def _export(parser: argparse.ArgumentParser) -> None:
     )
     add("--glb", type=Path, metavar="FILE", help="write the visual mesh, textured (binary glTF, y up)")
     add("--ply", type=Path, metavar="FILE", help="write Gaussians as 3DGS viewers read them (z up)")
+    add("--spz", type=Path, metavar="FILE", help="write them compressed (z up); needs the extra spz")
     add("--nerfstudio", type=Path, metavar="DIR", help="write transforms.json, frames, masks and sparse points")
     add("--colmap", type=Path, metavar="DIR", help="write a COLMAP model with its frames and masks")
     add("--task-file", type=Path, metavar="FILE", help="write the rules of --task as JSON, for evaluation elsewhere")
     add("--task", metavar="NAME", help="a task of the scene, such as straight")
     add(
         "--lighting",
-        help="lighting of --glb and --ply, and the first one in --usd: a name, or a mixture sun:night:0.5; default: "
+        help="lighting of --glb, --ply and --spz, and the first one in --usd: a name, or a mixture sun:night:0.5; default: "
         "first filmed one",
     )
     add("--quiet", action="store_true", help="no progress, no summary")

@@ -1,7 +1,7 @@
 """`twin export`: writes a built scene for other programs.
 
     twin export scenes/demo --usd road.usdz
-    twin export scenes/demo --glb road.glb --ply road.ply --lighting night
+    twin export scenes/demo --glb road.glb --ply road.ply --spz road.spz --lighting night
     twin export scenes/demo --nerfstudio road_ns --colmap road_colmap
     twin export scenes/demo --task straight --task-file straight.json
 
@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from twin import commands
-from twin.assets.gaussians import gaussians_by_lighting, views_by_lighting
+from twin.assets.gaussians import gaussians_by_lighting, require_spz, views_by_lighting
 from twin.assets.views import render_views
 from twin.config_file import load_config
 from twin.env.options import Options
@@ -35,12 +35,12 @@ from twin.mjcf.world import SCENE_XML
 from twin.scene import PACK_JSON, require_stage
 
 _MEGABYTE = 1e6
-_SUFFIXES = (".usdz", ".usd", ".usdc"), (".glb",), (".ply",)  # of --usd, --glb and --ply
+_SUFFIXES = (".usdz", ".usd", ".usdc"), (".glb",), (".ply",), (".spz",)  # of --usd, --glb, --ply and --spz
 
 
 def command(given: argparse.Namespace) -> None:
     """Runs `twin export` with the options parsed by `twin.commands`."""
-    paths = given.usd, given.glb, given.ply, given.nerfstudio, given.colmap
+    paths = given.usd, given.glb, given.ply, given.spz, given.nerfstudio, given.colmap
     lines = export(given.scene, given.lighting, *paths, given.task_file, given.task)
     if not given.quiet:
         print("\n".join(lines))
@@ -52,6 +52,7 @@ def export(
     usd_file: Path | None = None,
     glb: Path | None = None,
     ply: Path | None = None,
+    spz: Path | None = None,
     nerfstudio: Path | None = None,
     colmap: Path | None = None,
     task_file: Path | None = None,
@@ -64,15 +65,15 @@ def export(
             task is unknown, a lighting is given for files that have none, a file has another suffix than its format,
             an output folder does not exist, or a folder to write exists already.
     """
-    files, folders = [one for one in (usd_file, glb, ply) if one], [one for one in (nerfstudio, colmap) if one]
+    files, folders = [one for one in (usd_file, glb, ply, spz) if one], [one for one in (nerfstudio, colmap) if one]
     task_files = [task_file] if task_file else []
     if not files and not folders and not task_files:
-        raise InputError("nothing to write; give --usd, --glb, --ply, --nerfstudio, --colmap or --task-file")
+        raise InputError("nothing to write; give --usd, --glb, --ply, --spz, --nerfstudio, --colmap or --task-file")
     if (task_file is None) != (task is None):
         raise InputError("--task and --task-file belong together; give both, such as --task straight --task-file FILE")
     if lighting and not files:
-        raise InputError(f"--lighting {lighting}: only --usd, --glb and --ply have a lighting; leave it out")
-    for file, suffixes in zip((usd_file, glb, ply), _SUFFIXES, strict=True):
+        raise InputError(f"--lighting {lighting}: only --usd, --glb, --ply and --spz have a lighting; leave it out")
+    for file, suffixes in zip((usd_file, glb, ply, spz), _SUFFIXES, strict=True):
         if file is not None and file.suffix.lower() not in suffixes:
             raise InputError(f"{file}: expected a file ending in {', '.join(suffixes)}")
     for path in (*files, *task_files):
@@ -83,8 +84,10 @@ def export(
         require_absent(path)
     if usd_file is not None:
         _require_usd()
+    if spz is not None:
+        require_spz()
     twin = load_scene(scene)
-    lines = _field_files(twin, lighting, usd_file, glb, ply) if files else []
+    lines = _field_files(twin, lighting, usd_file, glb, ply, spz) if files else []
     if task_file and task:
         if not twin.scene.has_route:
             raise InputError(f"{twin.scene.root}: has no route, so no tasks; set mjcf.route = true and build it again")
@@ -115,7 +118,7 @@ def _require_usd() -> None:
 
 
 def _field_files(
-    twin: Twin, lighting: str | None, usd_file: Path | None, glb: Path | None, ply: Path | None
+    twin: Twin, lighting: str | None, usd_file: Path | None, glb: Path | None, ply: Path | None, spz: Path | None
 ) -> list[str]:
     """Writes the files with colors rendered from the radiance field; returns their summary lines."""
     field, cameras = twin.field(), twin.cameras()
@@ -123,13 +126,17 @@ def _field_files(
     field.embedding(lighting)  # raises InputError early if the name is unknown
     lines = []
     mesh = load_arrays(require_stage(twin.scene, "mesh") / "visual.npz") if usd_file or glb else {}
-    if usd_file or ply:
+    if usd_file or ply or spz:
         names = dict.fromkeys([lighting, *field.lightings]) if usd_file else [lighting]
         views = views_by_lighting(field, cameras, list(names))
         splats = gaussians_by_lighting(views)
         if ply:
             write_bytes(ply, splats[lighting].to_ply())
             lines.append(f"{ply}: {len(splats[lighting].rgb)} gaussians under {lighting}, z up [m]")
+        if spz:
+            splats[lighting].write_spz(spz)
+            size = f"{spz.stat().st_size / _MEGABYTE:.1f} MB"
+            lines.append(f"{spz}: {len(splats[lighting].rgb)} gaussians under {lighting}, {size}, z up [m]")
         if usd_file:
             from twin.export.usd import write_usd
 
