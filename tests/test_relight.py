@@ -256,7 +256,7 @@ def test_fog_of_a_hazy_photo_is_stored_and_printed(scene, monkeypatch, capsys):
     relit = PhotoFit("day", np.zeros(8, np.float32), air, (image, image, image), 16.3, 25.3, 24.0, 12.34)
     monkeypatch.setattr("twin.relight.fit_photo", lambda *_: relit)
     assert main([str(scene.root), str(scene.root / "photo.png"), "--name", "hazy"]) == 0
-    assert "visibility 100 m; without fog those halves have 12.3 dB" in capsys.readouterr().out
+    assert "visibility 100 m; 12.3 dB on the other half without fog" in capsys.readouterr().out
     assert added_lightings(scene, 8)[2]["hazy"] == air
 
 
