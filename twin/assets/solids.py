@@ -37,7 +37,7 @@ _MAX_GAP = 0.45  # [m] narrower gaps in the solid are closed
 _SMOOTHING = 0.7  # [voxels] σ of the low-pass of the distance field
 _EROSION = 0.06  # [m] inward offset of surfaces: blur moves edges outwards, and convex hulls add volume
 _CERTAIN_DEPTH = 0.02  # [m] voxels deeper than this behind a seen surface are never eroded
-_PRISM_SIDES = 8  # of a pole's collision shape
+_PRISM_SIDES = 8  # number of sides of a pole's collision shape
 _CORRIDOR_SLACK = 0.02  # [m] added to the corridor's half width, against rounding in later stages
 
 

@@ -174,7 +174,7 @@ def _with_regions(edges: Mask, variation: NDArray[np.float32]) -> Mask:
 
 
 def _islands(variation: NDArray[np.float32], brightness: NDArray[Any]) -> Mask:
-    """Mask (h, w) of the islands that do not touch a border; bright ones are left out, since they show the sky."""
+    """Mask (h, w) of the islands that do not touch a border; bright ones are left out: they are gaps with sky."""
     found = np.zeros(variation.shape, bool)
     calm = (variation < 0.5 * cv2.blur(variation, (61, 61))).astype(np.uint8)
     for island in _components(np.asarray(cv2.morphologyEx(calm, cv2.MORPH_OPEN, _disk(1)), bool)):

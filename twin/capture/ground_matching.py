@@ -83,7 +83,7 @@ def join(a: Part, b: Part, read_frame: FrameReader) -> Similarity | None:
     poses_a, poses_b = level_a.poses(a.camera_to_world), level_b.poses(b.camera_to_world)
     common = set(a.lightings) & set(b.lightings)
     pairs = [(one, one) for one in common] or [(one, two) for one in set(a.lightings) for two in set(b.lightings)]
-    found: list[tuple[Array, Array, Array, Array]] = []  # of two pictures: matched points (k, 2) and rays (k, 6)
+    found: list[tuple[Array, Array, Array, Array]] = []  # matched points (k, 2), rays (k, 6) of pairs of pictures
     for one, two in sorted(pairs):
         picture_a = _ground_picture(a, poses_a, one, read_frame)
         picture_b = _ground_picture(b, poses_b, two, read_frame)

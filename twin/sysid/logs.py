@@ -246,7 +246,7 @@ def cut_windows(columns: dict[str, Array], where: str) -> Windows:
 
 
 def _informative(windows: Windows, where: str) -> Windows:
-    """Leaves out windows that lose poses while the wheels turn, and windows in which wheels and commands are zero.
+    """Leaves out windows that lose poses while the wheels turn, and windows in which wheels and commands are at rest.
 
     Raises InputError: poses are lost in more than half of the windows in which the wheels turn.
     """
