@@ -187,7 +187,7 @@ def test_until_keeps_later_stages_in_the_report_if_they_are_up_to_date(pipeline)
 
 
 def test_a_stage_forced_beyond_the_last_one_is_refused(pipeline):
-    with pytest.raises(verb.InputError, match="--force field with --until cameras"):
+    with pytest.raises(verb.InputError, match="--force field: --until cameras ends before"):
         verb.build(pipeline.root, until="cameras", force=("field",))
 
 

@@ -307,7 +307,7 @@ def test_results_from_elsewhere_are_not_overwritten(gray, tmp_path):
     out = tmp_path / "real.csv"
     out.write_text(text := "policy,lighting,trials,successes,twin_lighting\nmine,monday,10,8,held-out\n")
     with pytest.raises(
-        InputError, match=r"10 trials of mine under monday, of which real_trials\.csv has 0; give another"
+        InputError, match=r"10 trials of mine under monday, but real_trials\.csv has 0 of them; give another"
     ):
         real_test.run([written(tmp_path / "left", 0.9)], "straight", ["rain"], 1, out)
     assert out.read_text() == text

@@ -221,7 +221,7 @@ def test_a_table_written_by_hand_is_not_lost(place, tmp_path):
     out = tmp_path / "real.csv"
     out.write_text("policy,lighting,trials,successes\nahead,day,10,8\n")
     with pytest.raises(
-        InputError, match=r"10 trials of ahead under day, of which real_trials\.csv has 0; give another"
+        InputError, match=r"10 trials of ahead under day, but real_trials\.csv has 0 of them; give another"
     ):
         trial.evaluate_trial(
             scene, bag_of(drives["ahead"], tmp_path / "bag"), "ahead", "ahead", "day", out, frame="scene"

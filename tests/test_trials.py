@@ -128,7 +128,7 @@ def test_results_find_their_cell(tmp_path: Path) -> None:
         ("policy,lighting,trials,successes,\n", "column 5 has no name; delete it"),
         (HEADER + "nerf,sun,10,5\n" + HEADER, "line 3 repeats the header; delete it"),
         (HEADER + 'nerf,sun,10,5\nnerf,"sun,10,5\nnerf,sun,10,5\n', "line 3: 2 fields; expected 4"),
-        (DAYS + "nerf,monday,10,5,sun\nnerf,Monday,10,5,sun\n", "results.csv line 2; write the two alike"),
+        (DAYS + "nerf,monday,10,5,sun\nnerf,Monday,10,5,sun\n", "results.csv line 2; use one spelling"),
         (HEADER + "varied,dawn,10,5\n", "lighting 'dawn' is not in the twin; did you mean 'dawn+randomised'?"),
         ("policy,lighting,trials\nnerf,sun,10\n", "no column successes"),
         ("policy,lighting,trials,successes,note\n", "unknown column 'note'"),

@@ -255,7 +255,7 @@ _VIEW = {"time": 0.0, "camera_to_world": np.eye(4).tolist(), "fov": 60.0, "light
         ([_VIEW, {**_VIEW, "time": 1.0, "lighting": [1.0]}], "expected a name, 4 numbers"),
         ([_VIEW, {**_VIEW, "time": 1.0, "lighting": {"from": "day", "to": "night", "share": 2.0}}], "share 2.0 is not"),
         ([_VIEW, {**_VIEW, "time": 1.0, "fov": 179.0}], "fov 179"),
-        ([_VIEW, {**_VIEW, "time": 1.0, "camera_to_world": (2.0 * np.eye(4)).tolist()}], "no rotation"),
+        ([_VIEW, {**_VIEW, "time": 1.0, "camera_to_world": (2.0 * np.eye(4)).tolist()}], "not a rotation"),
         ([_VIEW, {**_VIEW, "time": 1.0, "camera_to_world": [[1.0]]}], "4×4"),
         ([_VIEW, {"time": 1.0}], "camera_to_world"),
         ("views", "expected a list"),

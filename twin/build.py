@@ -63,8 +63,8 @@ PIPELINE = (
 _ON_DEVICE = ("field", "mesh")  # stages that run on the device of --device
 _WRITTEN = ("build", "runs", "validation", "forecast", "lightings")  # folders to which twin writes; never inputs
 # Durations [s] for the demo with 2 cores. Only their ratios matter: they are scaled by the measured durations of
-# earlier stages. The remaining time is shown once the typical durations of these stages exceed `_LEAST_TIMED` [s]; the
-# first stage alone is too short to determine the speed.
+# earlier stages. The remaining time is shown once the typical durations of the earlier stages add up to more than
+# `_LEAST_TIMED` [s]; the first stage alone is too short to determine the speed.
 _TYPICAL = {"capture": 5.0, "cameras": 90.0, "metric": 1.0, "field": 280.0, "mesh": 70.0, "mjcf": 3.0, "review": 45.0}
 _LEAST_TIMED = 30.0
 
@@ -92,7 +92,7 @@ def build(
     config = load_config(scene.config_file, overrides)
     names = [stage.name for stage in PIPELINE]
     if late := [name for name in force if until and names.index(name) > names.index(until)]:
-        raise InputError(f"--force {late[0]} with --until {until}, which ends before; leave one of them out")
+        raise InputError(f"--force {late[0]}: --until {until} ends before this stage; leave one of them out")
     if device:
         from twin.nerf.buffers import resolve_device
 
@@ -126,8 +126,8 @@ def build(
 
 
 def _changes(depends: dict[str, Any], before: dict[str, Any]) -> list[str]:
-    """The settings, input files and other things by which the dependencies of a stage differ from earlier ones."""
-    now = json.loads(json.dumps(depends))  # as read from a stamp: with lists in place of tuples
+    """Names of the settings, input files and other dependencies of a stage that differ from those of a stamp."""
+    now = json.loads(json.dumps(depends))  # JSON turns tuples into lists, as in the stamp
 
     def changed(a: Any, b: Any, name: str) -> list[str]:
         if a == b or not isinstance(a, dict) or not isinstance(b, dict):
@@ -161,8 +161,9 @@ def _announce(stage: Stage, done: dict[str, float], until: str | None, why: str)
 def input_digests(scene: SceneDir, config: SceneConfig) -> dict[str, str]:
     """SHA-256 of every file of the sources, by path relative to the scene.
 
-    All files of a source folder are hashed, except twin's own output. Only the files that the build reads are hashed if
-    the folder contains the scene itself, or is a posed image set given by a relative path that leaves the scene.
+    All files of a source folder are hashed, except twin's own output. There are two exceptions: a folder that contains
+    the scene itself, and a posed image set given by a relative path that leads out of the scene. Of these, only the
+    files that the build reads are hashed.
 
     Raises:
         InputError: a source is missing, or neither a file nor a folder.

@@ -285,8 +285,8 @@ def _export(parser: argparse.ArgumentParser) -> None:
     add("--task", metavar="NAME", help="a task of the scene, such as straight")
     add(
         "--lighting",
-        help="lighting of --glb, --ply and --spz, and the first one in --usd: a name, or a mixture sun:night:0.5; default: "
-        "first filmed one",
+        help="lighting of --glb, --ply and --spz, and the first one in --usd: a name, or a mixture sun:night:0.5; "
+        "default: first filmed one",
     )
     add("--quiet", action="store_true", help="no progress, no summary")
 

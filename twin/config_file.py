@@ -215,7 +215,7 @@ def _check_source(source: SourceConfig) -> None:
     _require(source.path, "a [[source]] has no path; give the video or the image folder")
     for key in ("path", "images", "mask"):
         value = getattr(source, key)
-        _require("\0" not in value, f"{key} = {value!r}; expected a path, which has no NUL")
+        _require("\0" not in value, f"{key} = {value!r}; expected a path without NUL characters")
     what = f"of [[source]] {source.path!r}"
     _check_choice(source.kind, KINDS, "kind")
     if source.lighting:
@@ -321,7 +321,7 @@ def _check_name(name: str, what: str) -> None:
     _require(
         valid and len(name) <= MAX_NAME and len(name.encode()) <= 2 * MAX_NAME,
         f"{what} = {name!r}; files are named after it: expected at most {MAX_NAME} characters without slashes "
-        "and line ends, and no dot to begin with",
+        "and line ends; the first must not be a dot",
     )
 
 
@@ -337,7 +337,7 @@ def _check_segments(parts: tuple[tuple[float, ...], ...], what: str) -> None:
         _require(
             len(part) == 2 and end <= part[0] < part[1],
             f"{what} = {short_repr([list(one) for one in parts])}; expected pairs [from, to] in seconds, "
-            "0 ≤ from < to, in order and apart, such as [[0, 62.5]]",
+            "0 ≤ from < to, in order of time and without overlap, such as [[0, 62.5]]",
         )
         end = part[1]
 

@@ -51,7 +51,7 @@ def command(given: argparse.Namespace) -> None:
     task = chosen_task(twin, given.task, policy, given.trust)
     if given.view:
         if given.out:
-            raise InputError("--out names a film, and --view records none; leave out one of them")
+            raise InputError("--out names a film, but --view records no film; leave out one of them")
         from twin.view.__main__ import serve
 
         view = {"task": task, "policy": policy, "host": "127.0.0.1", "port": given.port}

@@ -94,7 +94,7 @@ def parse_json(text: str, where: object) -> Any:
     try:
         return json.loads(text, parse_int=_json_integer, parse_float=_json_float, parse_constant=_json_float)
     except RecursionError:
-        raise InputError(f"{where}: nested too deep; expected JSON as twin or another tool writes it") from None
+        raise InputError(f"{where}: nested too deep; expected JSON with fewer nested values") from None
     except ValueError as error:
         raise InputError(f"{where}: no valid JSON: {error}") from None
 

@@ -66,7 +66,7 @@ def film(
         options: See `twin.env.options.Options`; by default those of the policy.
 
     Raises:
-        InputError: the scene, task, policy or an option is unknown, the seed is negative, `out` is no mp4, or
+        InputError: the scene, task, policy or an option is unknown, the seed is negative, `out` is not an mp4, or
             rerun-sdk is needed but not installed.
     """
     if out and (out.suffix.lower() != ".mp4" or out.is_dir()):
@@ -194,7 +194,7 @@ def command(given: argparse.Namespace) -> None:
     driven = (given.task, given.policy, given.seed)
     if given.lerobot:
         if given.out:
-            raise InputError("--out names a film, and --lerobot DIR records none; leave out --out")
+            raise InputError("--out names a film, but --lerobot DIR writes a dataset instead; leave out --out")
         if given.rerun:
             raise InputError("--rerun records one drive, and --lerobot DIR several; leave out one of them")
         drives = record_dataset(given.scene, given.lerobot, given.episodes, *driven, given.trust, **options)

@@ -8,9 +8,9 @@ and cameras, tasks, robot, and lightings fitted to photos. It contains no films,
 Private data are left out: comments and paths of `scene.toml`, photos, dependencies in stamps and, unless asked for, GPS
 positions. `twin.unpack` describes the format.
 
-Driving in a pack gives the same results as in the scene, bit for bit: only those samples of the radiance field are
-replaced that no ray reads (`baked_arrays.samples_read`). With `--levels` below 256, the field's features are rounded to
-that number of values, which makes the pack smaller and changes the field.
+Driving in a pack gives the same results as in the scene, bit for bit: the radiance field differs only in samples that
+no ray reads (`baked_arrays.samples_read`). With `--levels` below 256, the field's features are rounded to that number
+of values, which makes the pack smaller and changes the field.
 """
 
 import argparse
@@ -43,8 +43,8 @@ from twin.nerf.road import ROAD_FILE
 from twin.scene import STAGE_FOLDERS, SceneDir, Stamp, package_versions, require_stage, stage_result
 
 LEVELS = 256
-"""Default of `--levels`: the number of values of a byte, with which the field is not rounded."""
-_ZERO = 128  # byte that stands for 0 in the detail; rounding gives values at multiples of the step from it
+"""Default of `--levels`: the number of values of a byte, so nothing is rounded."""
+_ZERO = 128  # byte that encodes 0 in the detail; bytes are rounded to this plus multiples of the step
 _FINER = 4  # step of features / step of density; density is rounded less because it determines surfaces
 _VERTEX_STEP = 2  # step of the hash grid's vertices / step of features
 _CHUNK = 1 << 20  # [bytes] written between two updates of the progress bar
@@ -52,7 +52,7 @@ _PACKED = {"metric": ("cameras.json", "cameras.npz"), "field": ("baked.json", "b
 _IS_BAKED = re.compile(r"/baked(_\d+)?\.safetensors$")
 _MESH = ("ground.npz", "parts.npz", "visual.npz")
 _TEXT = """\
-A pack of {name}, made by twin {version}: a place to drive in, on MuJoCo, as `twin build` made it from films.
+A pack of {name}, made by twin {version}: a MuJoCo simulation of a place, which `twin build` made from films.
 
   pip install twin                       the program, see its README
   twin drive {file}     the Husky drives in it{driver}
@@ -179,8 +179,8 @@ def _positions(twin: Twin) -> bytes:
 def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
     """Adds the files of each stage that driving needs, with a stamp for these files; returns the field's result.
 
-    The stamps keep the build's results (content digests), so that lightings and tables remain valid; only a rounded
-    field gets another result.
+    The stamps keep the build's results (content digests), so that lightings and tables remain valid. The exception is a
+    rounded field, which gets another digest.
     """
     results = {}
     for stage in unpack.STAGES_PACKED:
@@ -274,7 +274,7 @@ def _write(out: Path, files: dict[str, bytes], head: dict[str, Any]) -> dict[str
             if coded[name] == unpack.DIFFERENCES:
                 content = unpack.encode_differences(content)
             entry = _entry(name)
-            entry.file_size = len(content)  # known before its content, as the zip's header needs it
+            entry.file_size = len(content)  # the zip's header needs the size before the content is written
             with archive.open(entry, "w") as packed:
                 for start in range(0, len(content), _CHUNK):
                     progress.update(packed.write(content[start : start + _CHUNK]))

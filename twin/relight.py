@@ -41,11 +41,11 @@ _CLEAR = Fog()
 _MAX_WIDTH = 480  # [px] longer side of the fitted image, as for training frames
 _STEPS = 300
 _RAYS = 10_000  # the fit uses about this many rays, evenly spaced over the image
-_START_RAYS = 1000  # number of rays by which the most similar filmed frame is chosen
-_FOG_GAIN = 0.2  # [dB] by which fog must improve the half of the image that is not fitted
-_SUN_GAIN = 0.3  # [dB] by which a sun found in the photo must improve the half of the image that is not fitted
+_START_RAYS = 1000  # number of rays used to choose the most similar filmed frame
+_FOG_GAIN = 0.2  # [dB] least gain in the half of the image that is not fitted, for fog to be kept
+_SUN_GAIN = 0.3  # [dB] the same for a sun found in the photo
 SEARCH = "search"
-"""Value of the option `--sun` with which the direction of the sun is searched in the photo."""
+"""Value of the option `--sun` that searches the direction of the sun in the photo."""
 _GAP = 4  # [px] between the images
 _LABEL_SIZE = 13  # [px] text size in the images; usual labels fit into an upright photo 270 px wide
 
@@ -163,9 +163,10 @@ class SunSource:
 
 
 def with_sun(field, relit: PhotoFit, casters: ShadowCasters, source: SunSource) -> PhotoFit:
-    """The fit with a sun if a sun improves the half of the photo that is not fitted; else `relit` with the reason.
+    """Adds a sun to a fit if that improves the half of the photo that is not fitted.
 
-    A sun that is found in the photo must improve that half by `_SUN_GAIN`.
+    A sun that is found in the photo must improve that half by `_SUN_GAIN`. If no sun is added, `sun_from` of the result
+    has the reason.
     """
     from twin.nerf.buffers import single_threaded_torch
     from twin.nerf.sun_fit import fit_sun
@@ -325,7 +326,7 @@ def relight(
     source = find_sun(scene, sun, time, location, heading)
     casters = None
     if source:
-        require_stage(scene, "mesh")  # before the baked field is read
+        require_stage(scene, "mesh")  # checked first, since reading the baked field takes time
         casters = shadow_casters(scene, BakedField.load(scene.stage("field")))
     image, facts = load_photo(photo, None)
     try:
@@ -371,15 +372,15 @@ def relight(
 def summary(lighting: AddedLighting) -> str:
     f, fog = lighting.figures, lighting.air
     neither = " and sun" if lighting.sun else ""
-    clear = f"without fog{neither} those halves have {f['psnr_clear_other_half']:.1f} dB"
+    clear = f"{f['psnr_clear_other_half']:.1f} dB on the other half without fog{neither}"
     x, y, z = np.array(f["camera_to_world"])[:3, 3]
     return (
         f"registered with {f['inliers']} inliers of {f['matches']} matches at ({x:.2f}, {y:.2f}, {z:.2f}) m, "
         f"{f['from_path_m']:.2f} m from the nearest frame; reprojection error {f['reprojection_error_px']:.2f} px; "
         f"focal length {f['focal_px']:.0f} px ({f['focal_from']})\n"
         f"{lighting.name}: {f['psnr_nearest']:.1f} dB under the nearest filmed lighting ({f['nearest']}), "
-        f"{f['psnr_fitted']:.1f} dB fitted; each half of the image under the other half's fit "
-        f"{f['psnr_other_half']:.1f} dB\n"
+        f"{f['psnr_fitted']:.1f} dB fitted; {f['psnr_other_half']:.1f} dB on the other half (fitted to one half of the "
+        "image)\n"
         + (f"visibility {3.0 / fog.extinction:.0f} m; {clear}" if fog.extinction else "no fog")
         + _sun_line(f)
     )
@@ -390,8 +391,8 @@ def _sun_line(figures: dict) -> str:
     if "sun_azimuth_deg" in figures:
         return (
             f"\nsun at azimuth {figures['sun_azimuth_deg']:.0f}° (counterclockwise from the x axis), elevation "
-            f"{figures['sun_elevation_deg']:.0f}°, {figures['sun_from']}; without a sun those halves have "
-            f"{figures['psnr_no_sun_other_half']:.1f} dB"
+            f"{figures['sun_elevation_deg']:.0f}°, {figures['sun_from']}; "
+            f"{figures['psnr_no_sun_other_half']:.1f} dB on the other half without a sun"
         )
     return f"\nno sun: {figures['sun_from']}" if "sun_from" in figures else ""
 
@@ -413,13 +414,13 @@ def command(options: argparse.Namespace) -> None:
 
 _VIEWS, _WIDTH = 40, 96  # number of rendered poses, and their width [px]
 _REACH = 45.0  # [m] greatest depth
-_MAX_DEPTH_RATIO = 1.15  # between the depths of a triangle's corners; with a larger one, it connects different surfaces
+_MAX_DEPTH_RATIO = 1.15  # largest ratio of a triangle's depths; beyond it, the triangle would connect two surfaces
 _LEAST_HEIGHT = 1.0  # [m] lowest height above the ground outside the mesh's box
-_OVERLAP = 0.5  # [m] by which the triangles begin below the top of the mesh's box, and within its sides
+_OVERLAP = 0.5  # [m] overlap of the triangles with the mesh's box, at its top and its sides
 
 
 def shadow_casters(scene: SceneDir, field: RenderableField) -> ShadowCasters:
-    """The surfaces of a scene that cast shadows: its visual mesh and, above and around it, depth of the field.
+    """Surfaces that cast shadows: the visual mesh and, above and around it, triangles from rendered depth.
 
     Raises InputError if its mesh is damaged or was not built."""
     stage = require_stage(scene, "mesh")

@@ -107,7 +107,7 @@ def log_line(line: str) -> None:
 
 # ---- signals
 
-_AGAIN = 0.05  # [s] until a signal is sent again whose exception was dropped
+_AGAIN = 0.05  # [s] if the exception of a signal was dropped, the signal is sent again after this time
 _STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 

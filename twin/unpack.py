@@ -47,7 +47,7 @@ _SEARCHED = (
     Path(),
     Path("scenes"),
     Path(__file__).resolve().parents[1] / "scenes",
-)  # folders of packs that have a name
+)  # folders in which a pack given by its name is searched
 FORMAT, VERSION = "twin pack", 1
 MANIFEST, README = "manifest.json", "README.txt"
 PLAIN, DIFFERENCES = "plain", "differences"
@@ -79,8 +79,8 @@ _XML_PATHS = (
     *("fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"),
 )
 _XML_REFUSED = ("include", "plugin", "extension", "model", "attach")  # elements that load other files or code
-_PARTIAL, _TOKEN = ".partial", 8  # suffix of a folder that is being filled, and the letters before it
-_HEADER = 8  # [bytes] of a safetensors file before its header; they contain the header's length
+_PARTIAL, _TOKEN = ".partial", 8  # suffix of an unfinished folder, and number of random characters in its name
+_HEADER = 8  # [bytes] size of the number at the start of a safetensors file: the header's length
 
 
 def digest(content: bytes) -> str:
@@ -185,7 +185,7 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
                     _extract(archive, name, facts, target)
             _check_contents(partial, path)
             (partial / PACK_JSON).write_bytes(json.dumps(manifest, indent=1).encode())
-            if is_there:  # it may be the working folder, or a link, so it is filled
+            if is_there:  # not replaced, since it may be the working folder or a link
                 for one in list(partial.iterdir()):
                     one.rename(folder / one.name)
             else:
@@ -193,7 +193,7 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
                 partial.rename(folder)
     except InputError as error:
         if isinstance(error.__cause__, OSError):
-            raise error.__cause__ from None  # such as a full disk: the pack is not damaged
+            raise error.__cause__ from None  # the disk failed, for example it is full; the pack is not damaged
         raise
     return manifest
 

@@ -99,7 +99,7 @@ class Campaign:
     def _run(self, chunks: list[EpisodeChunk]) -> Iterator[list[EpisodeResult]]:
         if self._ray and chunks:
             return run_chunks_on_ray(chunks, self._ray)
-        fresh, self._fresh = self._fresh, self._fresh and not chunks  # later rounds keep what the first one loads
+        fresh, self._fresh = self._fresh, self._fresh and not chunks  # later rounds reuse the loaded scene and policies
         return run_chunks(chunks, self._processes, fresh)
 
     def _append(self, trials: Sequence[Trial]) -> None:

@@ -34,7 +34,7 @@ _MAX_COACD_FACES = 400  # larger meshes are decimated for CoACD, which is slow w
 # Results are checked, so a coarser search than CoACD's defaults suffices.
 _SEARCH = {"resolution": 100, "mcts_nodes": 5, "mcts_iterations": 10, "mcts_max_depth": 2}
 _TIME_LIMIT = 120.0  # [s] per piece; far more than a piece needs, so that a slow machine does not change the result
-_MAX_PROCESSES = 16  # of 150 MB each
+_MAX_PROCESSES = 16  # each takes 150 MB
 _MAX_HULL_VERTICES = 32
 _SAMPLE_SPACING = 0.06  # [m] between test points on surfaces
 _MAX_UNCOVERED = 0.08

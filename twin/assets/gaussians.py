@@ -28,7 +28,7 @@ FAR = 100.0  # [m] geometry at a larger depth becomes background
 _BACKGROUND = 150.0  # [m] distance of the background's splats
 _MIN_SKY, _MAX_SKY = 500, 50_000  # least and about the largest number of pixels in the fit of the sky's color
 # A pixel shows the sky if it differs from the sky's color by less than this (rms over lightings and channels).
-_SKY_TOLERANCE = 30.0  # of 255
+_SKY_TOLERANCE = 30.0  # [1/255]
 # Within this reach [px] of such a pixel, the larger blend tolerance [of 255] holds.
 _BLEND_TOLERANCE, _BLEND_REACH = 60.0, 3
 _MIN_CELL = 0.01  # [m] side of the smallest thinning cell; each cell keeps one Gaussian
@@ -63,7 +63,7 @@ class Gaussians:
         }
 
     def stored(self) -> dict[str, NDArray[np.float32]]:
-        """What 3DGS files store: `means`, `quats`, `sh0` (harmonics), `opacities` (logits) and `scales` (logarithms)."""
+        """Columns of 3DGS files: `means`, `quats`, `sh0` (harmonics), `opacities` (logits), `scales` (logarithms)."""
         return {
             "means": self.positions,
             "quats": self.rotations,

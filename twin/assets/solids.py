@@ -26,7 +26,7 @@ from twin.nerf.poles import Poles
 from twin.types import Array
 
 HEADROOM = 1.5  # [m] height of the corridor above the ground
-_GROUND_CLEARANCE = 0.1  # [m] what lies below this height above the height field is ground
+_GROUND_CLEARANCE = 0.1  # [m] points less than this above the height field belong to the ground
 _MAX_GROUND_GAP = 0.6  # [m] smaller gaps to the ground are closed, so that nothing hovers
 _EMBEDDING = 0.15  # [m] depth to which parts extend below the ground
 _TILE_SIZE = 3.0  # [m] large obstacles are divided into square columns with this side
@@ -37,7 +37,7 @@ _MAX_GAP = 0.45  # [m] narrower gaps in the solid are closed
 _SMOOTHING = 0.7  # [voxels] σ of the low-pass of the distance field
 _EROSION = 0.06  # [m] inward offset of surfaces: blur moves edges outwards, and convex hulls add volume
 _CERTAIN_DEPTH = 0.02  # [m] voxels deeper than this behind a seen surface are never eroded
-_PRISM_SIDES = 8  # of a pole's collision shape
+_PRISM_SIDES = 8  # number of sides of a pole's collision shape
 _CORRIDOR_SLACK = 0.02  # [m] added to the corridor's half width, against rounding in later stages
 
 
@@ -88,7 +88,7 @@ class SolidVoxels:
 
 def frame_width(voxel: float) -> int:
     """Distance [voxels] over which `solid_voxels` depends on the volume around a voxel."""
-    filters = 4.0 * (1.0 + _SMOOTHING) + 2.0  # SciPy's Gaussian filters end at 4 σ; 2 for rounding
+    filters = 4.0 * (1.0 + _SMOOTHING) + 2.0  # SciPy truncates Gaussian filters at 4 σ; 2 voxels allow for rounding
     return int(np.ceil((_HIDDEN_DEPTH + _MAX_GAP) / voxel + filters)) + 2 * BLOCK
 
 
@@ -198,7 +198,7 @@ def _components(key: NDArray[np.int64]) -> NDArray[np.int64]:
         return np.zeros(0, np.int64)
     start, end = [], []
     offsets = np.argwhere(np.ones((3, 3, 3), bool)) - 1
-    for step in _keys(offsets[14:]) - _keys(offsets[13:14]):  # to 13 of 26 neighbors; the others link to this voxel
+    for step in _keys(offsets[14:]) - _keys(offsets[13:14]):  # 13 of the 26 neighbors, since links are symmetric
         at = np.minimum(np.searchsorted(key, key + step), len(key) - 1)
         found = np.flatnonzero(key[at] == key + step)
         start.append(found)
@@ -219,7 +219,7 @@ def _keys(index: NDArray[np.int64]) -> NDArray[np.int64]:
 def _values_around(
     voxels: SolidVoxels, mine: NDArray[np.int64], first: NDArray[np.int64], last: NDArray[np.int64], voxel: float
 ) -> NDArray[np.float32]:
-    """Distance field between two corners of the lattice, in which only the voxels `mine` (k, 3) are solid."""
+    """Distance field in the box from `first` to `last` of the lattice; only the voxels `mine` (k, 3) are solid."""
     values = np.full(last - first, 0.5 * voxel, np.float32)
     # The voxels are sorted by x, then y, so those of a row of columns are adjacent.
     key = voxels.key
@@ -278,7 +278,7 @@ def _block_piece(values: NDArray, corner: Array, voxel: float, start: NDArray) -
 
 
 def pole_parts(poles: Poles, corridor: Corridor | None, ground: Ground) -> list[ConvexPart]:
-    """A prism around each pole, from below the ground to the pole's top; without poles that reach into the corridor."""
+    """A prism around each pole, from below the ground to the pole's top; poles in the corridor are left out."""
     if corridor is not None:
         distance = corridor.distance(poles.foot[:, :2], corridor.reach + 1.0)
         poles = poles.select(np.flatnonzero(distance > corridor.reach + _CORRIDOR_SLACK + poles.radius))

@@ -1,8 +1,8 @@
 """Fusion of depth maps into a truncated signed distance field (TSDF), and triangle meshes from it.
 
 *Signed distance* [m]: positive in free space, negative behind a surface, valid within ± `band` of it. At each voxel a
-view votes `near` if the surface that it sees is within ± `band`, and `free` if it sees farther. (This is the method of
-Curless & Levoy 1996, eqs. 3 and 4, with votes for free space added.) So the many views through a *floater*, a false
+view votes `near` if the surface that it sees is within ± `band`, and `free` if it sees farther. This is the method of
+Curless & Levoy 1996, eqs. 3 and 4, with votes for free space added. So the many views through a *floater*, a false
 surface in the air, outvote the few that show it. At a depth edge the radiance field has a false, slanted surface
 between the near and the far surface. The view sees it edge-on, so the view's `near` votes have little weight, and views
 from elsewhere outvote them.
@@ -30,7 +30,7 @@ from twin.warp_runtime import wp
 
 FREE_SPACE_REACH = 2.5  # free votes reach this many times as far as surface votes
 _HALF_WEIGHT_DEPTH = 5.0  # [m] a vote at this depth has half weight, since pixels and errors grow with depth
-_CLEARANCE = 0.1  # beyond `far`, a view votes `free` only if the surface is this fraction of the depth behind the voxel
+_CLEARANCE = 0.1  # beyond `far`, a view votes `free` only if (surface depth / voxel depth − 1) exceeds this
 _SAME_SURFACE_RATIO = 1.1  # largest depth ratio of neighboring pixels on one surface
 
 
@@ -240,8 +240,8 @@ def views_of_box(views: Views, low: Array, high: Array, reach: float) -> NDArray
     )
     height, width = views.depth.shape[1:]
     fx, fy, cx, cy = views.intrinsics.T[..., None]
-    # All corners are outside one plane of the view's frustum, and so is the box. For z < 0 the signs are not those of
-    # pixels, but points behind the lens are outside, too.
+    # A box is outside the view's frustum if all its corners are outside one plane of it. For z < 0, u and v have the
+    # opposite signs, but these points are behind the lens and outside anyway.
     left, right = fx * x + (cx + _PIXEL_SLACK) * z < 0, fx * x + (cx - width - _PIXEL_SLACK) * z > 0
     above, below = fy * y + (cy + _PIXEL_SLACK) * z < 0, fy * y + (cy - height - _PIXEL_SLACK) * z > 0
     outside = [one.all(1) for one in (z < 0, z > 1.001 * reach, left, right, above, below)]
@@ -261,7 +261,7 @@ _FREE_MAJORITY = 0.75  # a surface is removed if a larger fraction of votes is `
 
 @dataclass(frozen=True)
 class VolumeSection:
-    """A box of voxels, part of the lattice of a place. All indices are of the lattice, along x, y, z.
+    """A box of voxels, part of the lattice of a place. Indices are those of lattice points along x, y, z.
 
     A section is processed with a frame of voxels around it, so that filters give the same values at its border as in
     the sections beside it.
@@ -376,7 +376,7 @@ def zero_level(distance: NDArray, origin: Array, voxel: float) -> tuple[Array, N
 
 def section_surface(volume: Volume) -> tuple[Array, NDArray[np.int64]]:
     """Zero level of a section without frame; at the border, its vertices are also those of the section beside it."""
-    # The cells between the section's last voxels and the first ones after it belong to the section.
+    # The section includes the cells between its last voxels and the next section's first voxels.
     x, y, z = volume.section.inner
     inner = slice(x.start, x.stop + 1), slice(y.start, y.stop + 1), z
     origin = volume.origin + volume.voxel * (volume.section.low - volume.section.start)

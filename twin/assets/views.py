@@ -16,7 +16,7 @@ from twin.types import Array
 
 _BATCH = 8
 _METERS_PER_RADIAN = 3.0  # [m per rad] weight of direction in the distance between views
-_FLYING_PIXEL_STEP = 0.06  # a pixel with larger relative steps of inverse depth to both neighbors is on no surface
+_FLYING_PIXEL_STEP = 0.06  # a pixel is between surfaces if inverse depth differs relatively by more to both neighbors
 _MIN_OPACITY = 0.5
 _MIN_SLANT = 0.12  # smaller slants are set to this, since normals from depth are unreliable there
 _MIN_DEPTH = 0.3  # [m] from the lens; nearer depth is discarded

@@ -9,12 +9,12 @@ Topics are found by message type:
 
 - commands: geometry_msgs/Twist or TwistStamped
 - wheel speeds: sensor_msgs/JointState, with joints named like a Husky's wheels
-- poses: nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped; topics with a word of `FROM_WHEELS`
-  in their name, and a Husky's filter of wheels and IMU, are used only if no other topic has `MIN_POSES` messages
+- poses: nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped; odometry from the wheels (see
+  `is_from_wheels`) is used only if no other topic has `MIN_POSES` messages
 - accelerations: sensor_msgs/Imu
 - pictures: sensor_msgs/Image or CompressedImage
-- calibration: the sensor_msgs/CameraInfo topic whose name has the longest common beginning with that of the pictures'
-  topic, counted in parts between slashes
+- calibration: the sensor_msgs/CameraInfo topic whose name shares the most leading parts (between slashes) with the name
+  of the pictures' topic
 
 Times are nanoseconds.
 """
@@ -58,9 +58,9 @@ MIN_POSES = 10
 many."""
 # A topic with one of these words in its name is used for pictures only if it is given explicitly.
 _OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")
-# [ns] If header and recording times differ by more than this in the median, the header times are of another clock.
+# [ns] If the median difference between header and recording times exceeds this, the headers use another clock.
 _CLOCK = 1_000_000_000
-_SET_BACK = 10 * _CLOCK  # [ns] times that decrease by more, in the order of the file, are of a clock that was set back
+_SET_BACK = 10 * _CLOCK  # [ns] if a time is earlier than one before it in the file by more, the clock was set back
 _MAX_METADATA = 16 << 20  # [bytes] largest accepted metadata.yaml
 _MAX_CHUNK = 1 << 30  # [bytes] largest accepted MCAP chunk, uncompressed
 
@@ -100,7 +100,8 @@ class Bag:
         """
         for topic in sorted(topics):
             times = np.array([*_times_in_file(self._reader, topic)], np.int64).reshape(-1, 2)
-            # A jump within a chunk shows in the next chunk only when compared with the one before.
+            # If the clock jumps within a chunk, that chunk spans both times. So a chunk is also compared with the one
+            # two before it.
             for lag in (1, 2):
                 back = int((times[:-lag] - times[lag:]).min(1, initial=2**62).max(initial=0))
                 if back > _SET_BACK:
@@ -172,7 +173,7 @@ def _times_in_file(reader: Any, topic: str) -> Iterator[tuple[int, int]]:
 
 
 _COMPRESSED = re.compile(r"compression_mode: *['\"]?[A-Za-z]")
-"""Matches the text of a bag's `METADATA` if its messages or files are compressed, which nothing else says."""
+"""Matches the text of a bag's `METADATA` if messages or files are compressed; only this text has that information."""
 
 
 @contextmanager
@@ -235,13 +236,13 @@ def choose_camera_info(connections: Iterable[Any], pictures: str) -> str | None:
 
 
 def _common(one: str, other: str) -> int:
-    """Number of equal parts, separated by slashes, with which the names of two topics begin."""
+    """Number of leading parts, separated by slashes, that the names of two topics share."""
     pairs = list(zip(one.split("/"), other.split("/"), strict=False))
     return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
 
 
 def choose_topics(connections: Iterable[Any], path: Path, kinds: Sequence[str] = tuple(TYPES)) -> dict[str, str]:
-    """Maps each of `kinds`, keys of `TYPES`, to its best topic. Raises InputError if any but imu has none."""
+    """Maps each of `kinds`, keys of `TYPES`, to its best topic. Raises InputError if one has no topic, except imu."""
     chosen = {}
     for kind in kinds:
         counts = messages_by_topic(connections, TYPES[kind])
@@ -255,7 +256,7 @@ def choose_topics(connections: Iterable[Any], path: Path, kinds: Sequence[str] =
 
 
 def _order(kind: str, counted: tuple[str, int]) -> tuple[int, ...]:
-    """Sort key of a topic of a kind, given with its number of messages; the best topic has the least."""
+    """Sort key of a topic for a kind; `counted` is (topic, number of messages). The best topic has the least key."""
     topic, count = counted
     if kind == "commands":  # prefer the velocity controller's input to the multiplexer's inputs
         return (not topic.endswith("cmd_vel"), -count)
@@ -267,7 +268,7 @@ def _order(kind: str, counted: tuple[str, int]) -> tuple[int, ...]:
 
 
 def is_from_wheels(topic: str) -> bool:
-    """True for a topic with a word of `FROM_WHEELS` in its name, and for a Husky's filter of wheels and IMU."""
+    """True if the name contains a word of `FROM_WHEELS`, or is that of a Husky's fused wheel and IMU odometry."""
     return any(word in topic for word in FROM_WHEELS) or topic.endswith("odometry/filtered")
 
 
@@ -297,8 +298,8 @@ def header_time(message: Any) -> int:
 def message_times(times: NDArray[np.int64], topic: str, path: Path) -> NDArray[np.int64]:
     """Times of a topic's messages [ns], shape (n,), from their header and recording times, shape (n, 2).
 
-    The header times are used, or the recording times if the headers have no times, or times of another clock or of one
-    that was set back.
+    The header times are used. The recording times replace them if the headers have no times, or if their clock is
+    another one or was set back.
     """
     header, recorded = times.reshape(-1, 2).T
     if not header.any():

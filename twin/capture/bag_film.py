@@ -225,16 +225,16 @@ def _values(kind: str, message: Any) -> tuple[float, ...]:
 def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Positions and stamps of the pictures whose stamp is later than all stamps before it.
 
-    The others are left out. Raises InputError if they are more than one and more than the fraction `_MAX_UNORDERED`.
+    The others are left out. Raises InputError if two or more are left out, and more than the fraction `_MAX_UNORDERED`.
     """
     latest = np.maximum.accumulate(times)
     late = np.append(False, times[1:] <= latest[:-1])
     if late.sum() > max(1.0, _MAX_UNORDERED * len(times)):
         back = float((latest[:-1] - times[1:]).max() * 1e-9)
         raise InputError(
-            f"{where}: {late.sum()} of {len(times)} pictures have stamps that are not later than that of a picture "
-            f"before them in the bag, but up to {back:.3f} s earlier; expected increasing stamps: give the topic of "
-            "one camera, and record with one clock"
+            f"{where}: the stamps of {late.sum()} of {len(times)} pictures equal that of a picture before them in the "
+            f"bag, or are earlier by up to {back:.3f} s; expected increasing stamps: give the topic of one camera, and "
+            "record with one clock"
         )
     position = np.flatnonzero(~late)
     return position, times[position]

@@ -104,7 +104,7 @@ def _intact_frames(path: Path, count: FilmStatistics) -> Iterator[tuple[float | 
     """
     with open_film(path) as (container, stream):
         stream.thread_type = "AUTO"
-        pending: list[av.VideoFrame] = []  # B frames, until the frame that they depend on is decoded without damage
+        pending: list[av.VideoFrame] = []  # B frames that wait for the undamaged frame on which they depend
         broken = False
         for packet in _packets(container, stream):
             frames: list[av.VideoFrame | None] = []
@@ -172,7 +172,7 @@ def upright(frame: av.VideoFrame) -> Image:
     """A frame as SDR RGB, rotated and mirrored by its display matrix in multiples of 90°."""
     transfer = hdr_transfer(frame)
     image = hdr_to_sdr(frame, transfer) if transfer else np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
-    # `frame.side_data` would keep the container in the frame, a cycle: many large frames would wait for the collector.
+    # `frame.side_data` would make a reference cycle, so many large frames would stay until garbage is collected.
     side = SideDataContainer(frame).get(SideData.DISPLAYMATRIX)  # type: ignore[call-arg]
     if side is None:
         return image

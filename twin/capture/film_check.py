@@ -33,7 +33,7 @@ from twin.types import Array, Image
 Mask = NDArray[np.bool_]
 
 MIN_FRAMES = 12
-_MAX_FRAMES = 40  # of more frames, every second or fewer are used, which saves time
+_MAX_FRAMES = 40  # if there are more frames, only every second, third, ... is used, which saves time
 _MAX_SHARE = 0.4  # largest fraction of the picture that is masked
 _MIN_GRADIENT = 2.0  # [gray levels per px] smallest gradient of an edge
 # A persistent edge exceeds the smallest gradient in 90 % of the frames, a likely one in 70 %. Edges of the scene that
@@ -44,7 +44,7 @@ _MIN_ACROSS = 0.1  # smallest mean cos² between an object's gradients and the r
 _MIN_DISTANCE = 0.06  # smallest rms distance of such a point from the edges' tangents, as a fraction of the width
 _MAX_COHERENCE = 0.5  # largest |median gradient| / mean |gradient| of the scene; larger if the camera hardly moves
 _CALMER = 0.6  # a region between persistent edges is fixed if it varies less than this fraction of its surroundings
-_JOIN, _MARGIN = 4, 2  # [px] edges closer than twice the first are joined; the mask is wider by the second
+_JOIN, _MARGIN = 4, 2  # [px] gaps between edges up to twice the first are closed; masks are widened by the second
 # Islands: fewest pixels, largest variation [gray levels], smallest ratios of the variation around an island to the
 # median and to the 80 % quantile inside, and smallest brightness [gray levels], since black night hardly varies.
 _ISLAND_AREA, _ISLAND_VARIATION, _AROUND_MEDIAN, _AROUND_MOST, _NIGHT = 40, 15.0, 3.0, 2.5, 15.0
@@ -174,7 +174,7 @@ def _with_regions(edges: Mask, variation: NDArray[np.float32]) -> Mask:
 
 
 def _islands(variation: NDArray[np.float32], brightness: NDArray[Any]) -> Mask:
-    """The islands (h, w) that touch no border, except bright ones, which are gaps through which the sky shows."""
+    """Mask (h, w) of the islands that do not touch a border; bright ones are left out: they are gaps with sky."""
     found = np.zeros(variation.shape, bool)
     calm = (variation < 0.5 * cv2.blur(variation, (61, 61))).astype(np.uint8)
     for island in _components(np.asarray(cv2.morphologyEx(calm, cv2.MORPH_OPEN, _disk(1)), bool)):
@@ -241,7 +241,7 @@ def check_film(path: Path) -> FilmCheck:
             "interlaced: the build deinterlaces the film, at a loss of detail; film in a progressive mode (p, not i)"
         )
     if max(first.width, first.height) < _MIN_SIDE:
-        notes.append(f"{first.width}x{first.height}: small pictures make a soft twin; film in 1920x1080")
+        notes.append(f"{first.width}x{first.height}: small pictures give a blurred twin; film in 1920x1080")
     static = static_parts(small)
     mask = None
     if static.mask is not None:
@@ -269,7 +269,7 @@ def timing_notes(timing: FilmTiming) -> list[str]:
 
 
 def _samples(path: Path, skip: Literal["NONKEY", "DEFAULT"]) -> tuple[av.VideoFrame | None, list[Image]]:
-    """The first frame, and upright pictures of frames spread over the film, fewer than twice `_SAMPLES`.
+    """The first frame, and fewer than 2 · `_SAMPLES` upright pictures of frames spread over the film.
 
     With `skip` = NONKEY only key frames are decoded. The pictures are `_WIDTH` wide: 120 frames of 4K take 2 GB.
     """

@@ -26,18 +26,18 @@ from twin.types import Array
 
 _PIXEL, _MAX_PIXEL = 0.02, 0.05  # side of a ground picture's pixel; it is larger on a long road
 _NEAR, _FAR, _ASIDE = 1.0, 5.0, 3.5  # the ground that is taken from a frame: range ahead; width to each side
-_MAX_PIXELS = 1.2e7  # of a ground picture; SIFT takes 0.24 GB per million pixels
+_MAX_PIXELS = 1.2e7  # largest size of a ground picture; SIFT takes 0.24 GB per million pixels
 _FEATURES = 20_000  # most SIFT features of a ground picture
 _CONTRAST = 0.015  # SIFT's threshold; asphalt has little contrast
 _RATIO = 0.85  # largest distance of the best match, relative to the second best one
 _TOLERANCE = 0.35  # largest error of a match under a similarity of the maps; relief displaces the two views oppositely
-_MIN_MATCHES = 25  # fewer matches under one similarity occur by chance
+_MIN_MATCHES = 25  # fewer matches may agree on a similarity by chance
 _MIN_EXTENT = 5.0  # least extent of the matches; one manhole cover looks like another
 _STEEPEST = 0.5  # ground that seems to rise or fall by more than this within a frame is left out
 _MAX_SCALE = 1.3  # largest ratio of the two camera heights
-_RAY_SIGMA, _HEIGHT_SIGMA = 0.02, 0.01  # standard deviations: distance of two rays; height of the road below a camera
+_RAY_SIGMA, _HEIGHT_SIGMA = 0.02, 0.01  # standard deviations of the distance of two rays and of the road's height
 _AROUND, _MIN_AROUND = 1.5, 4  # radius and least number of the road points that give the height of a ground point
-_SAME_RAY = 1e-3  # [focal lengths] error of a ray that is projected and unprojected
+_SAME_RAY = 1e-3  # [focal lengths] largest change of a ray that is projected and then unprojected
 _OUTLIER = 3.0  # [standard deviations] scale of the robust loss
 
 FrameReader = Callable[[int], tuple[NDArray[np.uint8], NDArray[np.uint8] | None]]
@@ -83,7 +83,7 @@ def join(a: Part, b: Part, read_frame: FrameReader) -> Similarity | None:
     poses_a, poses_b = level_a.poses(a.camera_to_world), level_b.poses(b.camera_to_world)
     common = set(a.lightings) & set(b.lightings)
     pairs = [(one, one) for one in common] or [(one, two) for one in set(a.lightings) for two in set(b.lightings)]
-    found: list[tuple[Array, Array, Array, Array]] = []  # of two pictures: matched points (k, 2) and rays (k, 6)
+    found: list[tuple[Array, Array, Array, Array]] = []  # matched points (k, 2), rays (k, 6) of pairs of pictures
     for one, two in sorted(pairs):
         picture_a = _ground_picture(a, poses_a, one, read_frame)
         picture_b = _ground_picture(b, poses_b, two, read_frame)
@@ -199,7 +199,7 @@ def _project(points: Array, pose: Array, camera: pycolmap.Camera) -> Array:
     if not len(front):
         return out
     pixels = np.asarray(camera.img_from_cam(local[front])).reshape(-1, 2)
-    # Far outside the picture, a distortion model may map rays back into it; the way back gives another ray then.
+    # A distortion model may project rays from far outside the picture into it. Unprojection then gives another ray.
     rays = np.asarray(camera.cam_from_img(pixels)).reshape(-1, 2)
     same = np.abs(rays - local[front, :2] / local[front, 2:]).max(1) < _SAME_RAY
     out[front[same]] = pixels[same]
@@ -258,7 +258,7 @@ def _rays(picture: _GroundPicture, xy: Array, poses: Array, road: Array) -> Arra
     for k, near in enumerate(cKDTree(road[:, :2]).query_ball_point(xy, _AROUND)):
         if len(near) >= _MIN_AROUND:
             height[k] = np.median(road[near, 2])
-    # The ray stays the same: its point moves to the other height.
+    # The point moves along its ray to the height of the road.
     direction = np.column_stack([xy, drawn]) - center
     return np.concatenate([center, center + direction * ((height - center[:, 2]) / direction[:, 2])[:, None]], 1)
 
@@ -275,7 +275,7 @@ def _meeting_similarity(a: Array, b: Array, planar: Array) -> Similarity:
     middle = np.array([*(b[:, 3:5] @ planar[:2, :2].T + planar[:2, 2]).mean(0), 0.0])
 
     def similarity(x: Array) -> Similarity:
-        """From log scale, rotation vector (tilt, turn) and translation; the tilt turns about the middle of the road."""
+        """The similarity with parameters x: log scale, tilt about the middle of the road, turn, translation."""
         tilt = Rotation.from_rotvec([x[1], x[2], 0.0]).as_matrix()
         rotation = tilt @ Rotation.from_rotvec([0.0, 0.0, x[3]]).as_matrix()
         return Similarity(float(np.exp(x[0])), rotation, tilt @ (x[4:] - middle) + middle)

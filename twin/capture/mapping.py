@@ -5,7 +5,7 @@ COLMAP's global mapping (Pan et al. 2024), then incremental mapping, which gets 
 little texture, global mapping may tear a film apart: the long tracks of points on the skyline, which constrain
 rotations alone, outnumber the short tracks of near points. The pieces of a torn model share no points that fix their
 scale, so it is recognized. Frames off the path of their neighbors are removed and registered once more against all
-others, and left out if they are again off the path.
+others. They are left out if they are then still off the path.
 """
 
 import itertools
@@ -36,18 +36,18 @@ _NEAR_PAIRS = 4  # largest number of near pairs per frame
 # The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.
 _REMAPPING_FRACTION = 0.05
 _SHARED_POINTS = 8  # points in common that connect two frames of a model
-_MANY_MATCHES = 40  # verified matches of two successive frames, which must then share points
+_MANY_MATCHES = 40  # successive frames with this many verified matches must share points
 # The nearest points of a frame measure its scale: in sound models the distance between two frames with common points is
 # up to 22 times the distance of the nearest points; between pieces of a torn model it is 10³ to 10⁷ times.
-_NEAREST_FRACTION = 0.1  # fraction of a frame's points that are nearer than its nearest points are said to be
+_NEAREST_FRACTION = 0.1  # the distance of a frame's nearest points is this quantile of the distances of its points
 _MAX_DISTANCE = 60.0  # [distance of the nearest points] largest distance between two connected frames
 _COHERENT_FRACTION = 0.95  # a model is torn if its largest connected part has a smaller fraction of its frames
-_FAR_ANGLE = np.radians(0.8)  # points that two frames see from less different directions do not fix their scale
+_FAR_ANGLE = np.radians(0.8)  # points whose rays from two frames differ by less do not fix the relative scale
 _AVERAGINGS = 2  # bundle adjustments of averaged poses, each after a triangulation
-# Four in five positions of models that agree are nearer to each other than the median step. Torn models are many steps
-# apart, sound ones with somewhat different focal lengths up to one step.
+# Two models agree if at least this fraction of positions differ by less than this distance [median steps]. Torn models
+# differ by many steps, sound ones with somewhat different focal lengths by up to one step.
 _AGREEMENT, _AGREEING_FRACTION = 1.0, 0.8
-_TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; saves 40 % of its time, others are added later
+_TRACKS_PER_VIEW = 300  # point tracks per view in the first solution; this limit saves 40 % of its time
 _MAX_ERROR = 2.0  # [px] observations with larger errors are excluded from the last bundle adjustment
 _MIN_ANGLE = 0.5  # [°] smallest angle between two rays to a point
 _LOSS_SCALE = 0.5  # [px] scale of the Cauchy loss in the last bundle adjustment
@@ -61,8 +61,8 @@ def reconstruct(matcher: Matcher, job: dict[str, Any], work: Path, summary: dict
         matcher: Its matches are complete but for near pairs, which are added.
         job: Settings of the stage, see `sfm.solve_mapping`.
         work: Folder for COLMAP's files.
-        summary: Gets the mapper's name, the number of near pairs, the frames left out, and the films whose scale may
-            drift, since all models of global mapping were torn.
+        summary: Receives the mapper's name, the number of near pairs, the frames left out, and the films whose scale
+            may drift, because all models of global mapping were torn.
 
     Raises:
         InputError: no frame could be registered.
@@ -102,11 +102,11 @@ def coherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> set[int
 def connections(model: pycolmap.Reconstruction, matcher: Matcher) -> tuple[NDArray[np.int64], csr_matrix]:
     """Registered frames (n,), and a matrix (n, n) that is True for connected pairs.
 
-    Two frames are connected if they share points that fix the scale of one to that of the other: eight points that a
-    third frame sees, too, and that the two see from different directions. In addition the frames must lie near each
-    other and have about the same scale: frames that were thrown far off the path may share points that are even farther
-    away, and a piece that shrank lies on one spot. A film is cut where two successive frames have many
-    matches, but share few points: the model contradicts these matches, so one of its sides is misplaced.
+    Two frames are connected if they share points that fix their relative scale: eight points that the two see from
+    different directions, and that a third frame sees, too. In addition, the frames must be near each other and have
+    about the same scale. This excludes misplaced frames far off the path, which may share points that are even farther
+    away, and pieces of the model that collapsed to one spot. A film is cut where two successive frames have many
+    matches, but share few points: the model contradicts these matches, so the part on one side is misplaced.
     """
     frames, poses = registered_poses(model, matcher)
     row = {int(matcher.image_ids[i]): k for k, i in enumerate(frames)}
@@ -163,7 +163,7 @@ class Mapper:
     def best(self, summary: dict[str, Any]) -> pycolmap.Reconstruction:
         """The largest coherent model of a few attempts; the other frames are deregistered.
 
-        A model that was averaged is replaced by a larger one only if the two agree.
+        A larger model replaces the one from averaged poses only if the two agree.
 
         Raises:
             InputError: no attempt gave a model.
@@ -350,7 +350,7 @@ def triangulated(matcher: Matcher, model: pycolmap.Reconstruction, work: Path) -
 def _agree(
     first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, frames: list[int], matcher: Matcher
 ) -> bool:
-    """True if two models have about the same camera positions in common frames, but for scale and coordinates."""
+    """True if a similarity maps the camera positions of two models in common frames to about the same points."""
     if len(frames) < MIN_FRAMES:
         return False
     known, poses = registered_poses(first, matcher)
@@ -382,7 +382,7 @@ def _off_path_frames(model: pycolmap.Reconstruction, matcher: Matcher, limit: fl
 
 
 def _incoherent_frames(model: pycolmap.Reconstruction, matcher: Matcher) -> list[int]:
-    """Registered frames outside of the largest connected part, if there are points enough to tell."""
+    """Registered frames outside of the largest connected part; none if there are too few points to decide."""
     coherent = coherent_frames(model, matcher)
     registered = set(registered_poses(model, matcher)[0].tolist())
     return sorted(registered - coherent) if len(coherent) >= MIN_FRAMES else []

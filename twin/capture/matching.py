@@ -33,11 +33,11 @@ Pair = tuple[int, int]
 SEQUENCE_STEPS = (1, 2, 3, 4, 6, 8, 12)
 """Distances [frames] of sequence pairs within a source: short ones for neighbors, long ones against drift.
 
-Frames that are farther apart mostly match by what is infinitely far, which misleads global mapping.
+Matches between frames that are farther apart are mostly on very distant objects, which mislead global mapping.
 """
 PROBE_INLIERS = 25
-"""Verified matches with which a pair counts as evidence of a common view; fewer than 20 occur by chance."""
-_LINKING_PAIRS = 8  # pairs with a consistent rotation that link two sources; for short ones, half of their frames
+"""Least number of verified matches that proves a common view of a pair; fewer than 20 occur by chance."""
+_LINKING_PAIRS = 8  # pairs with a consistent rotation that link two sources; in short sources, half as many as frames
 _WORDS = 32  # visual words of the VLAD descriptor
 _SAMPLES_PER_FRAME = 150
 _PROBES_PER_SOURCE = 20
@@ -242,7 +242,7 @@ class Matcher:
             median = float(np.median(counts[self.capture.source_index == s]))
             if median < _MIN_FEATURES:
                 raise InputError(
-                    f"source {source.name!r}: {median:.0f} features per frame in the median (need {_MIN_FEATURES}); "
+                    f"source {source.name!r}: a median of {median:.0f} features per frame (need {_MIN_FEATURES}); "
                     "film a scene with more texture and light, in focus, or mask less of the picture"
                 )
 
@@ -283,7 +283,7 @@ class Matcher:
         return pair_geometries(self.database, self.seed, self.known)
 
     def geometries_among(self, pairs: set[Pair], cameras: Mapping[int, pycolmap.Camera]) -> list[PairGeometry]:
-        """Geometry of those of some pairs of frames that are verified, with the cameras of a model."""
+        """Geometry of the verified ones of the given pairs of frames, with the cameras of a model."""
         images = {ordered_pair(int(self.image_ids[i]), int(self.image_ids[j])) for i, j in pairs}
         return pair_geometries(self.database, self.seed, self.known, images, cameras)
 
@@ -298,7 +298,7 @@ class Matcher:
         for i, j in consistent_pairs(self.geometries(), self.frame_of(), source):
             consistent[source[i], source[j]] += 1
         frames = np.bincount(source, minlength=count)
-        # One pair alone agrees with itself.
+        # At least two, since a single pair is always consistent with itself.
         enough = np.clip(np.minimum(frames, frames[:, None]) / 2, 2, _LINKING_PAIRS)
         linked = csr_matrix(consistent + consistent.T >= enough)
         group = connected_components(linked, directed=False)[1]

@@ -32,7 +32,7 @@ from twin.types import Array
 _INITIAL_FRACTION = 0.08
 """Fraction of the first source's path, from its start, that gives the initial driving direction."""
 _MAX_OFFSET = 10_000.0  # [m] largest coordinate of a camera; later stages compute in single precision
-_FLOOR_QUANTILE = 0.02  # quantile of the points' heights at which the floor is, if no road is found
+_FLOOR_QUANTILE = 0.02  # if no road is found, the floor is at this quantile of the points' heights
 
 
 def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:

@@ -21,14 +21,14 @@ from twin.types import Array
 _MIN_MATCHES = 15  # least number of matches of a pair
 _PIXEL_ERROR = 0.5  # [px] standard deviation of the epipolar error of a correct match
 _OUTLIER = 4.0  # [standard deviations] matches with a larger epipolar error are wrong
-_MUCH_WORSE = 1.1  # ratio of the costs of two poses of a pair
+_MUCH_WORSE = 1.1  # a pose is refused if its cost exceeds that of the best pose of the pair by this factor
 _NEAR_ANGLE = 4.0  # [standard deviations of the epipolar error] smallest angle between the rays to a near point
-_EPIPOLE = 20.0  # [standard deviations] the epipolar error of rays nearer to the epipole is not magnified further
+_EPIPOLE = 20.0  # [standard deviations] angles to the epipole below this count as this, which bounds the error's scale
 _WIDE = 4.0  # the first steps use a loss that is wider by this factor
 _WIDE_STEPS, _STEPS = 5, 12  # largest number of Gauss–Newton steps
 _SAME_START = np.radians(0.3)  # poses that differ less lead to the same minimum
 _ROTATION_TRIALS, _TRANSLATION_TRIALS = 60, 120  # random pairs of matches that propose a rotation and a translation
-_SAME_CAMERA = 1e-3  # largest difference of the directions [rad] of pixels of cameras that count as the same
+_SAME_CAMERA = 1e-3  # [rad] cameras count as the same if the directions of their pixels differ by at most this
 _SAME_ROTATION = np.radians(0.2)  # largest deviation of a far point from the rotation that most points share
 _FOCAL_PAIRS, _FOCAL_MATCHES = 24, 300  # largest numbers of pairs and of their matches that a focal length is fitted to
 _FOCAL_STEPS = 3  # [frames] largest distance of these pairs

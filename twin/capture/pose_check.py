@@ -18,7 +18,7 @@ from twin.capture.pair_geometry import PairGeometry
 from twin.capture.pose_averaging import unit_equations
 from twin.types import Array
 
-_REACH = 3  # [steps] between the frames of a pair that is used
+_REACH = 3  # [steps] largest distance between the frames of a pair that is used
 _MAX_TURN = np.radians(1.0)  # deviation from a pair's rotation that contradicts it, at least
 _MAX_DIRECTION = np.radians(10.0)  # deviation from a pair's direction that contradicts it, at least
 _MAX_RATIO = 0.25  # deviation of the logarithm of a ratio of two distances that contradicts it, at least

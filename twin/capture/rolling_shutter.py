@@ -7,8 +7,8 @@ Structure from motion assumes that all frames of a film have the same pinhole ca
   [rad] of the camera, in its axes, between the first line and the last one. To first order, a point with the camera
   coordinates X in the middle of the readout has the coordinates X − s ω × X while its line is read. A *corrected* frame
   shows what the camera would have seen without this rotation. Only the fast part of the rotation is corrected, which
-  shake causes: a skew that lasts, like the camera's translation during the readout, has almost the same effect as a
-  change of the place's shape, so that the reconstruction fits it.
+  is due to camera shake. The slow part, like the camera's translation during the readout, is not corrected: it has
+  almost the same effect as a change of the place's shape, so the reconstruction already explains it.
 - Stabilization moves the lens or the cropped part of the picture, and with it the frame's principal point. The *shift*
   is that motion [focal lengths]. Stabilized films are found, but not corrected.
 
@@ -32,21 +32,21 @@ from twin.geometry.cameras import unproject
 from twin.types import Array
 
 _MIN_POINTS = 40  # least number of points in a frame from which its skew is fitted
-_MIN_FRAMES = 8  # least number of such frames from which a film is judged
-_JUDGED_FRAMES = 60  # most frames of a film from which it is judged
+_MIN_FRAMES = 8  # least number of such frames for a decision on a film
+_JUDGED_FRAMES = 60  # largest number of a film's frames that are used for the decision
 _MIN_DEPTH = 0.01  # [median depth of the points] points nearer to the camera are not used
 _LOSS_SCALE = 0.5  # [px] scale of the Cauchy loss
 _REWEIGHTINGS = 6
 # Fits of all skews are followed by bundle adjustment, and repeated until a fit moves pixels by less than _SETTLED
 # (median over frames).
 _MAX_ROUNDS, _SETTLED = 8, 0.1  # [px]
-_MAX_SKEW = 0.05  # [rad] a larger skew is not believed: in 30 ms a hand turns a camera by 0.01 rad
+_MAX_SKEW = 0.05  # [rad] larger skews are implausible: in 30 ms a hand turns a camera by 0.01 rad
 _SLOW = 5.0  # [frames] standard deviation of the Gaussian that separates the slow part of the skews
-_MAX_ZOOMS = 10  # most steps to the focal length of corrected images; two or three are needed
+_MAX_ZOOMS = 10  # largest number of iterations for the focal length of corrected images; two or three are usual
 _NODE_PIXELS = 8  # [px] distance of the pixels at which pixel maps are computed
 _MIN_GAIN = 0.02  # see `_gain`
-# Standard deviations of an observation [px], and of a skew [rad] or shift [focal lengths] a priori. The prior keeps
-# small what the points of a frame do not determine.
+# Standard deviation of an observation [px]; prior standard deviation of a skew [rad] or shift [focal lengths]. The
+# prior keeps skews and shifts small where a frame's points do not determine them.
 _NOISE, _PRIOR = 0.4, 0.01
 
 Effect = Literal["zoom", "rows", "columns", "shift"]
@@ -110,7 +110,7 @@ class _Frame:
         used = (x[:, 2] > _MIN_DEPTH * typical) & np.isfinite(rays).all(1) & (rays[:, 2] > 0)
         seen, x, rays = seen[used], x[used], rays[used]
         focal = self._camera.mean_focal_length()
-        jacobian = np.zeros((len(x), 2, 3))  # of the projection, by X
+        jacobian = np.zeros((len(x), 2, 3))  # d(projection) / d(camera coordinates)
         jacobian[:, 0, 0] = jacobian[:, 1, 1] = focal / x[:, 2]
         jacobian[:, :, 2] = -focal * x[:, :2] / x[:, 2:] ** 2
         by_rotation = jacobian @ np.stack([np.cross(unit, x) for unit in np.eye(3)], 2)
@@ -221,16 +221,17 @@ def _effects(frames: list[_Frame]) -> tuple[Effect | None, bool]:
 
 
 def _gain(equations: list[tuple[Array, Array]], extra: int) -> float:
-    """By how much the last `extra` parameters reduce a film's median reprojection error, as a share of it.
+    """Relative reduction of a film's median reprojection error if each frame has its own last `extra` parameters.
 
-    All parameters are fitted to every second point, and judged by the other points. The comparison has the median of
-    those parameters in all frames, or zeros if that is better: a lens with another distortion than assumed changes all
-    frames equally, which shake does not. `equations` are those of the film's frames, see `_Frame.equations`.
+    The baseline has the same values of these parameters in all frames: their median, or zeros if that is better. So an
+    error of the lens model, which affects all frames equally, is not mistaken for shake. Parameters are fitted to every
+    second point, and errors are measured at the other points. `equations` are those of the film's frames, see
+    `_Frame.equations`.
     """
     fitted = [_solution(matrix[::2], error[::2]) for matrix, error in equations]
 
     def median_error(common: Array | None) -> float:
-        """With the parameters `common` in all frames; if None, each frame has its own."""
+        """Median error with the last parameters equal to `common` in all frames; None: each frame has its own."""
         errors = []
         for (matrix, error), solution in zip(equations, fitted, strict=True):
             if common is not None:

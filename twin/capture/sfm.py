@@ -56,7 +56,8 @@ from twin.types import Array
 _MAX_THREADS = 16
 # [px] Points with a larger reprojection error are left out, such as those that bundle adjustment moved behind a camera.
 _MAX_POINT_ERROR = 20.0
-# One model of two weakly linked groups: fraction of the frames of each, and connections between them.
+# A model of two weakly linked groups is accepted if it has at least this fraction of the frames of each group, and this
+# number of connections between the groups.
 _TOGETHER_FRACTION, _TOGETHER_PAIRS = 0.8, 20
 _POSED_PAIRS = 10  # largest number of pairs per frame if poses are given
 

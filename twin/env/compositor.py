@@ -31,7 +31,7 @@ from twin.warp_runtime import wp
 # ---- objects
 
 _NEAR_PLANE = 0.02  # [m] geoms whose z-depth is smaller than this everywhere are not drawn
-_SMALL_MASK = 800  # [px] up to this size of the area that objects may cover, all pixels get four rays, which is faster
+_SMALL_MASK = 800  # [px] if objects may cover at most this area, all its pixels get four rays, which is then faster
 _SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # [px] offsets of a pixel's four rays
 
 
@@ -182,7 +182,7 @@ class ObjectRenderer:
     def _cast(self, rays: Array32) -> tuple[NDArray[np.int32], Array32, Array32]:
         """Casts rays (n, 3); returns the indices in `geoms` of the geoms hit (−1: none), normals and z-depths [m]."""
         count, most = len(rays), self._caster.max_rays
-        if count > most:  # more rays than fit into one cast
+        if count > most:  # too many rays for one call
             parts = [self._cast(rays[k : k + most]) for k in range(0, count, most)]
             geom, normals, depth = (np.concatenate(part) for part in zip(*parts, strict=True))
             return geom, normals, depth
@@ -301,7 +301,7 @@ class Compositor:
     ):
         """
         Args:
-            model: Contains the camera, and the route that `add_obstacles` stores even if there are no obstacles.
+            model: Contains the camera and the route. `add_obstacles` stores the route, also without obstacles.
             field: Radiance field of the place.
             size: Width, height of the pictures [px].
             max_envs: Largest number of envs per call of `render`.

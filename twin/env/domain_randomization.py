@@ -29,7 +29,7 @@ PAYLOAD = "payload"
 """Name of a body on the top plate; its mass is zero until an episode sets a payload."""
 
 VERSION = 4
-"""Version of a sample's effects. Increase it whenever a change of the code gives the same sample other pictures."""
+"""Version of a sample's effects. Increase it whenever a change of the code changes the pictures of a sample."""
 
 KNOWN_WEATHER_FRACTION = 0.6
 """When a photo of the day is available, the strengths of sun and shadows are multiplied by this fraction.

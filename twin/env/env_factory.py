@@ -75,7 +75,7 @@ class EnvFactory:
         here = tuple(one for one in config.obstacle if one.route == segment.route)
         wanted = here if isinstance(parsed.obstacles, str) else parsed.obstacles
         if not isinstance(wanted, int) and any(one.route not in ("", segment.route) for one in wanted):
-            raise InputError(f"obstacles: one is on another route than the task {task!r}; leave out its `route`")
+            raise InputError(f"obstacles: one has another `route` than the task {task!r}; leave out its `route`")
         beside = round(parsed.randomise.bystanders[1]) if parsed.randomise else 0
         half_width = parsed.half_width or world.half_width
         obstacles = EpisodeObstacles(wanted, dataclasses.replace(world, half_width=half_width), segment, beside)
@@ -120,7 +120,7 @@ class EnvFactory:
                 return GpuPixelObserver(self.field, self.trust, self.options, envs)
             compositor = Compositor(self.model, self.field, size, count, lit=(self.segment.start, self.segment.end))
             return PixelObserver(compositor, self.field, self.trust, self.options, envs)
-        spec = self.world.spec(keeps_part=lambda name: False)  # parts are not drawn
+        spec = self.world.spec(keeps_part=lambda name: False)  # collision parts are not drawn
         add_obstacles(spec, self.obstacles.pool, self.world)
         splats = read_ply(Path(self.options.splats)) if self.options.splats else None
         renderer = SceneRenderer(spec.compile(), size, count, splats)
@@ -139,7 +139,7 @@ def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
     """
     config = load_config(twin.scene.config_file)
     segment = find_task(task, twin.world(), config.task)
-    ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # of training and of evaluation
+    ranges = [dataclasses.asdict(one) for one in (Ranges(), EVALUATION_RANGES)]  # for training, for evaluation
     randomization = {"version": VERSION, "ranges": ranges} if condition.randomised else {}
     photos = [
         path for name in condition.lighting.split(":") if (path := twin.scene.lightings / f"{name}.json").exists()

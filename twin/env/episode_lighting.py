@@ -27,12 +27,13 @@ from twin.nerf.sun import Sunlight, mixed_sunlight
 from twin.types import Array32
 
 VERSION = 2
-"""Version of `LightingSets.sample`. Increase it whenever a change of the code gives a seed other lightings."""
+"""Version of `LightingSets.sample`. Increase it whenever a change of the code changes the lightings of a seed."""
 
 _SEED = 20_240_315  # fixed random seed of `Anchors`: all runs with a build have the same sets
 _POOL_SIZE = 200  # number of lightings among which anchors are chosen
 _EXTRA_ANCHORS = 8  # number of anchors besides the filmed lightings
-_MARGIN = 1.25  # a lighting is in a set if the other's nearest anchor is more than this many times as far as its own
+# A lighting is in a set if (distance to the other set's nearest anchor) / (distance to its own) exceeds this.
+_MARGIN = 1.25
 _MAX_TRIES = 60  # largest number of proposals per sample; about one in ten is near the chosen anchor
 
 
@@ -41,7 +42,7 @@ class EpisodeLighting:
     """Lighting of one episode: an appearance embedding with its fog and suns, or a drift from one to another."""
 
     name: str
-    """Name of the lighting or its set, `<name> → <name>` with drift; without a field, the option `observe`."""
+    """Name of the lighting or its set, `<name> → <name>` with drift; the option `observe` if there is no field."""
     start: Array32
     """Embedding at the beginning, shape (dim,)."""
     end: Array32 | None = None
@@ -59,7 +60,7 @@ class EpisodeLighting:
 
     @property
     def is_sampled(self) -> bool:
-        """The name is that of a set of lightings from which this one was sampled."""
+        """True if the lighting was sampled from a set of lightings; `name` is then the set's."""
         return not set(self.name.split(" → ")).isdisjoint(RESERVED_LIGHTINGS)
 
     def at(self, time: float) -> Array32:
@@ -101,9 +102,9 @@ class LightingSets:
     The distance of two lightings is the rms difference of the colors that they give to the field's *probes* (rays with
     stored features, see `nerf/lightings.py`). The first anchors are the filmed lightings; they belong to the
     training set. More are chosen one by one from random lightings of a fixed seed, each as far as possible from all
-    anchors before it. Every second one of these, from the first on, belongs to the held-out set. A lighting belongs to
-    the set of its nearest anchor, or to no set if an anchor of the other set is nearly as near. All anchors of a set
-    are sampled equally often; otherwise a lighting unlike all others, such as night, would be rare.
+    anchors before it; the first, third, fifth, ... of these belong to the held-out set. A lighting belongs to the set
+    of its nearest anchor, or to no set if an anchor of the other set is nearly as near. All anchors of a set are
+    sampled equally often; otherwise a lighting unlike all others, such as night, would be rare.
     """
 
     def __init__(self, field: BakedField) -> None:

@@ -126,9 +126,9 @@ class DriveEnv(gymnasium.Env):
             render_mode: None or rgb_array.
             render_size: Width and height of the pictures of `render` [px]; None: the size of the observed images, or
                 640 × 360 for the chase view.
-            render_view: `robot`, the default with pixels, shows the view of the robot's camera. `chase`, the default
-                without, shows MuJoCo's picture of the scene from behind the robot, with collision parts, as in the
-                videos of `twin film`.
+            render_view: `robot` shows the view of the robot's camera; `chase` shows MuJoCo's picture of the scene from
+                behind the robot, with collision parts, as in the videos of `twin film`. None: `robot` with pixels,
+                `chase` without.
             options: See `twin.env.options.Options`.
         """
         self.render_mode = _check_render_mode(render_mode)
@@ -193,7 +193,7 @@ class DriveEnv(gymnasium.Env):
 
     @property
     def _local(self) -> LocalVectorEnv:
-        assert isinstance(self.vector_env, LocalVectorEnv)  # `make_vector_env` returns one for one environment
+        assert isinstance(self.vector_env, LocalVectorEnv)  # true for a single environment
         return self.vector_env
 
     def close(self) -> None:

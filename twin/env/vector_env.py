@@ -36,7 +36,7 @@ from twin.runtime import available_cores
 
 _MIN_ENVS, _MAX_PROCESSES = 2, 16  # defaults: least number of environments per process; largest number of processes
 _CHILD_CODE = "from twin.env.vector_env import serve; serve()"  # not -m, which would pickle classes as part of __main__
-_PARENT_CHECK_PERIOD = 2.0  # [s] between two checks whether the parent still runs
+_PARENT_CHECK_PERIOD = 2.0  # [s] time between two checks that the parent is still running
 
 
 @dataclass(frozen=True)

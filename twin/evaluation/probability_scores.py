@@ -24,7 +24,7 @@ CALIBRATION_EDGES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 """Ends of the bins of predicted probability in a calibration curve."""
 
 SCORE_DIFFERENCE = replace(STATISTICS["bias"], low=-np.inf, high=np.inf)
-"""Mean over policies of the difference of two scores, as a `Statistic` for `jackknife_interval` on a `score_pair`."""
+"""Mean over policies of the difference of two scores; `jackknife_interval` takes it with data from `score_pair`."""
 
 _LEAST = 0.005  # log scores and recalibration clip probabilities to between this and 1 minus this
 _RIDGE = 0.1  # weight of a recalibration's prior, which favors unchanged probabilities
@@ -104,9 +104,9 @@ def shuffled_days(probability: Array, weight: Array, rate: Array, score: Callabl
 def other_trainings(data: PairedCells, groups: Indices) -> Array:
     """Baseline: for each policy, the mean real rate of policies of the same group in other trainings, shape (n,).
 
-    This mean includes, with the weight of one policy, the mean rate of all policies of other trainings. `groups`
-    contains the group of each policy, such as its training setup; if all are equal, all policies of other trainings
-    count alike.
+    The mean rate of all policies of other trainings is included with the weight of one policy. `groups` contains the
+    group of each policy, such as its training setup. If there is only one group, this is the mean over all policies of
+    other trainings.
     """
     real = data.rates()["real"]
     out = np.full(data.policies, 0.5)

@@ -19,8 +19,8 @@ intervals too narrow where leaving out a unit changes ranks, and subtracting not
 
 The interval is the estimate ± Student's t times √V, on a scale on which the statistic is less skewed. The degrees of
 freedom are Satterthwaite's, but at least (trainings − 1) / 2, since few days made intervals too wide, and at most
-trainings + days − 2. There is no interval for fewer units than those for which its coverage was tested. There is also
-none if leaving units out changes nothing, since the variance cannot be estimated then.
+trainings + days − 2. There is no interval for fewer units than its coverage was tested for, nor if leaving units
+out changes nothing, since the variance cannot be estimated then.
 
 90 % intervals by a bootstrap had a coverage of only 0.5 to 0.8: policies that it samples twice raise correlations, and
 trials that it resamples lower the agreement of twin and real rates.
@@ -37,7 +37,7 @@ from twin.evaluation.trials import Cell
 from twin.types import Array, Indices
 
 MIN_TRAININGS, MIN_DAYS = 8, 4
-"""Numbers of trainings and days below which a statistic has no interval, except for those below."""
+"""Least numbers of trainings and days for an interval. Pearson's correlation and the bias have their own, see below."""
 MIN_PEARSON_TRAININGS = 12
 """Number of trainings below which Pearson's correlation has no interval, since a single policy may determine it."""
 MIN_BIAS_TRAININGS, MIN_BIAS_DAYS = 5, 3
@@ -184,8 +184,9 @@ the best policy alone."""
 def jackknife_interval(statistic: Statistic, data: PairedCells) -> tuple[Array, Array]:
     """Ends of the interval of a statistic at one place, shapes (...).
 
-    Among experiments along leading axes, those whose units do not determine a variance get nan. Raises
-    UndefinedStatistic: there are too few units; or, for a single experiment, the variance is not determined.
+    If the variance cannot be estimated, the ends are nan for one of several experiments (leading axes).
+
+    Raises UndefinedStatistic: there are too few units; or, for a single experiment, the variance cannot be estimated.
     """
     trainings, days = data.trainings, data.days
     lacking = [
@@ -217,7 +218,8 @@ def jackknife_variance(left_out: Array) -> Array:
 def interval_ends(statistic: Statistic, value: Array, variance: Array, freedom: Array) -> tuple[Array, Array]:
     """Ends of a statistic's interval by Student's t, from variance and degrees of freedom on its scale, shapes (...).
 
-    Raises UndefinedStatistic: a single variance is zero or nan. Ends of others are nan.
+    Where the variance is zero or nan, the ends are nan. Raises UndefinedStatistic in that case if `variance` is a
+    scalar.
     """
     variance = np.where(variance > 1e-18, variance, np.nan)
     if np.ndim(variance) == 0 and np.isnan(variance):

@@ -31,9 +31,10 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
         policies: Names, `run` or `run/checkpoint`.
 
     Returns:
-        By policy, JSON-able: its run; the step at which it was saved; the training's task, observe and lighting; the
-        `rate_summary` of the last `RECENT_EPISODES` episodes of `read_episodes` up to that step; `first_step`, at which
-        the first of them ended; and `test`, the run's final test if this policy drove in it, else None.
+        A JSON-able dict for each policy: its run; the step at which it was saved; the training's task, observe and
+        lighting; the `rate_summary` of the last `RECENT_EPISODES` episodes of `read_episodes` up to that step;
+        `first_step`, the step at which the first of these episodes ended; and `test`, the run's final test if it tested
+        this policy, else None.
     """
     digests = validated_digests(root)
     out = {}
@@ -72,7 +73,7 @@ def _final_test(folder: Path) -> dict[str, Any] | None:
         step, won, trials = (int(chosen[name]) for name in ("step", "successes", "trials"))
         if not 0 <= won <= trials or not trials:
             raise ValueError(f"{won} successes in {trials} trials")
-        condition = str(chosen.get("condition", ""))  # older runs store none
+        condition = str(chosen.get("condition", ""))  # older runs do not store it
         return {"step": step, "condition": condition, **rate_summary(won, trials)}
 
 
@@ -86,7 +87,7 @@ def validated_digests(root: Path) -> dict[str, Any]:
 
 
 def _is_there(path: Path) -> bool:
-    """True for an existing regular file; False also for a policy name from a table that cannot be a file name."""
+    """True for an existing regular file; False otherwise, also if the path is not a valid file name."""
     try:
         return bool(regular_file(path))
     except InputError:

@@ -19,7 +19,7 @@ from twin.mjcf.world import heading_at, heading_error
 from twin.robot import PixelCamera
 from twin.types import Array, Image
 
-_PROBES = 8  # largest number of pictures by which a lighting is chosen
+_PROBES = 8  # largest number of pictures used to choose a lighting
 
 
 @dataclass(frozen=True)

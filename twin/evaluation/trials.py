@@ -152,8 +152,8 @@ def read_real_trials(table: Path, out: Path) -> list[Trial]:
         mine = explained[key].trials if key in explained else 0
         if trials > mine:
             raise InputError(
-                f"{out}: {trials} trials of {key[0]} under {key[2]}, of which {table.name} has {mine}; give another "
-                "--out, and join the two by hand"
+                f"{out}: {trials} trials of {key[0]} under {key[2]}, but {table.name} has {mine} of them; give another "
+                "--out, and join the two files by hand"
             )
     return known
 
@@ -218,14 +218,14 @@ def read_trials(path: Path) -> list[Trial]:
 def read_results(paths: Sequence[Path], twin: Sequence[Cell]) -> list[Cell]:
     """Reads results tables and checks that the twin has a cell to compare with each real cell.
 
-    Raises InputError: no such file, a wrong header, or a line with an unknown name, an impossible count or a duplicate,
-    also of a line in another table.
+    Raises InputError: no such file, a wrong header, or a line with an unknown name or an impossible count, or a line
+    that repeats another one of any of the tables.
     """
     for path in paths:
         if not path.exists():
             raise InputError(f"{path} does not exist; write one, with the columns {','.join(RESULT_COLUMNS)}")
     cells: dict[tuple[str, str, str], Cell] = {}
-    places: dict[tuple[str, str, str], str] = {}  # where each cell is
+    places: dict[tuple[str, str, str], str] = {}  # cell key → file and line
     known, spelled = {cell.key for cell in twin}, dict[str, tuple[str, str]]()
     for where, row in chain.from_iterable(_rows(path, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS) for path in paths):
         policy, task = _policy_and_task(where, row, twin)
@@ -245,7 +245,7 @@ def read_results(paths: Sequence[Path], twin: Sequence[Cell]) -> list[Cell]:
         # A forecast counts days by their names, so a day written in two ways would make intervals too narrow.
         alike, place = spelled.setdefault(cell.lighting.casefold(), (cell.lighting, where))
         if alike != cell.lighting and not {alike, cell.lighting} <= {key[-1] for key in known}:
-            raise InputError(f"{where}: lighting {cell.lighting!r} is {alike!r} in {place}; write the two alike")
+            raise InputError(f"{where}: lighting {cell.lighting!r}, but {alike!r} in {place}; use one spelling")
         cells[cell.key], places[cell.key] = cell, where
     return list(cells.values())
 
@@ -326,7 +326,8 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
             raise InputError(f"{path}: header {','.join(header)!r}: {faults[0]}; expected {wanted}")
         count, end = 0, reader.line_num
         for fields in reader:
-            where, end = f"{path} line {end + 1}", reader.line_num  # the first line of a row that has several
+            # A row may span several lines, because of a quoted field; the message has its first one.
+            where, end = f"{path} line {end + 1}", reader.line_num
             if not any(field.strip() for field in fields):
                 continue
             count += 1
@@ -399,7 +400,7 @@ def summarize(trials: Sequence[Trial]) -> dict[str, Any]:
 
 
 def compare_pairs(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """Compares every two policies of a task on the episodes that both drove, unless there are none."""
+    """Compares the policies of each task in pairs, on the episodes that both drove; omits pairs without any."""
     by_policy: dict[tuple[str, str], dict[tuple[str, int], bool]] = {}
     for t in trials:
         by_policy.setdefault((t.task, t.policy), {})[t.lighting, t.seed] = t.success

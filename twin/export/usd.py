@@ -38,7 +38,9 @@ from twin.types import Array
 _DOUBLE = UsdGeom.XformOp.PrecisionDouble
 _APERTURE = 20.955  # [tenths of a meter] width of a camera's sensor; only its ratio to the focal length has an effect
 _CLIPPING = 0.01, 1000.0  # [m] nearest and farthest depth that cameras show
-_RING, _SHOULDER, _SHOULDER_OFFSET = 32, 16, 0.6  # vertices at a tire's middle, per shoulder; shoulder's y / half width
+# Numbers of a tire's vertices around its middle and around each shoulder; distance of a shoulder from the middle / half
+# width of the tire.
+_RING, _SHOULDER, _SHOULDER_OFFSET = 32, 16, 0.6
 _CURVE_WIDTH, _GOAL_RADIUS = 0.05, 0.2  # [m]
 _SUN_INTENSITY, _SKY_INTENSITY = 1500.0, 600.0  # [nit]
 _SPLAT_EXTENT = 3.0  # [standard deviations of a splat] half size of its bounding box

@@ -29,7 +29,7 @@ HEIF_SUFFIXES = (".heic", ".heif")
 _HEIF = "HEIF"  # Pillow's name of HEIF and HEIC
 _CURE = "replace or remove it"
 warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # Pillow warns from MAX_PIXELS / 2 on
-warnings.filterwarnings("ignore", module="PIL")  # about flawed headers, whose values count as unknown
+warnings.filterwarnings("ignore", module="PIL")  # warnings about flawed headers; these values count as unknown
 
 
 def to_uint8(rgb: NDArray) -> NDArray[np.uint8]:

@@ -27,7 +27,7 @@ _DEPARTURE_RADIUS = 1.6  # [m] beyond this radius the camera has left, and a lat
 _JUMP_RATIO = 8.0  # [typical steps] least length of a jump; uneven timing and sudden starts cause at most 4
 _MIN_JUMP = 5.0  # [m] least length of a jump
 _LONG_JUMP, _LONG_RATIO = 12.0, 3.0  # [m], [typical steps]; a step longer than both is a jump in any case
-_JUMP_WINDOW = 4  # steps before and after from which the typical step is computed
+_JUMP_WINDOW = 4  # number of steps before and after a step that determine its typical step
 _MAX_MISSING = 20.0  # [frame intervals] longer gaps in time do not raise the allowed step further
 _BESIDE = 5.0  # [m] a path this close to an earlier part of itself retraces it; a U-turn of 6 m radius is 12 m wide
 _ALONGSIDE = 0.5  # [m] largest offset along the path between a point and the earlier one that it retraces
@@ -39,7 +39,7 @@ _MIN_PASS = 1.0  # [m] shorter passes are dropped
 _CHORD = 1.0  # [m] length over which headings are measured
 _MIN_PATH_FRAMES = 6
 _MAX_OUTLIER_FRACTION = 0.25  # if more frames of a path look wrong, the path is not smooth and no frame is removed
-_MAX_ROUGHNESS = 0.3  # a path with a larger median residual [median steps] is that of unordered photos, not of a film
+_MAX_ROUGHNESS = 0.3  # [median steps] a larger median residual means unordered photos rather than a film
 _OUTLIER_SIGMAS = 8.0  # an outlier's residual exceeds this many robust standard deviations of all residuals
 _MAX_TURN = np.radians(5.0)  # [rad] smaller deviations from the predicted direction are always allowed
 
@@ -55,7 +55,7 @@ class FilmedPass:
     frames: NDArray[np.int64]
     """Indices into the cameras, in order of time."""
     path: Array
-    """Points `SPACING` apart in the direction in which the camera looks, shape (m, 2) [m]."""
+    """Points `SPACING` apart, shape (m, 2) [m]; reversed in time if the camera looked backward."""
     ends_with: str
     """Reason why the pass ends: `end` (of the film), `jump`, `turn` or `lap`."""
 
@@ -100,9 +100,9 @@ def source_frames(cameras: Cameras) -> list[NDArray[np.int64]]:
 def path_jumps(positions: Array, times: Array, min_jump: float = _MIN_JUMP) -> NDArray[np.int64]:
     """Finds steps much longer than the typical step of a path, as between two passes filmed one after the other.
 
-    A jump is longer than 5 m and than 8 typical steps of its neighborhood (more where frames are missing), or longer
-    than 12 m and than 3 typical steps. Takes camera centers (n, d) [m] in order of time, with times [s] or indices
-    (n,); returns the indices i of jumps from i to i + 1. `min_jump` replaces the 5 m.
+    A step is a jump if it is longer than both 5 m and 8 typical steps of its neighborhood (more where frames are
+    missing), or longer than both 12 m and 3 typical steps. Takes camera centers (n, d) [m] in order of time, with times
+    [s] or indices (n,); returns the indices i of jumps from i to i + 1. `min_jump` replaces the 5 m.
     """
     if len(positions) < 3:
         return np.zeros(0, np.int64)
@@ -113,7 +113,7 @@ def path_jumps(positions: Array, times: Array, min_jump: float = _MIN_JUMP) -> N
     typical = np.full(len(step), np.median(pace))
     for i in range(len(step)):
         neighbors = np.concatenate([pace[max(i - _JUMP_WINDOW, 0) : i], pace[i + 1 : i + 1 + _JUMP_WINDOW]])
-        # The upper quartile, since a film may start, stop and speed up at any frame.
+        # The upper quartile ignores neighbors at which the camera stands or is slow.
         typical[i] = max(typical[i], float(np.quantile(neighbors, 0.75)))
     relative = (step > min_jump) & (step > typical * np.maximum(_JUMP_RATIO, 2.0 * intervals))
     return np.flatnonzero(relative | ((step > _LONG_JUMP) & (step > _LONG_RATIO * typical)))
@@ -132,7 +132,7 @@ def _between_jumps(cameras: Cameras, index: NDArray[np.int64]) -> list[tuple[NDA
 def _between_retraces(
     positions: Array, frames: NDArray[np.int64], ending: str
 ) -> list[tuple[NDArray[np.int64], Array, str]]:
-    """Frames, path and ending of each pass between the turns and laps of a part without jumps."""
+    """Divides a part without jumps at turns and laps; returns frames, path and reason for the end of each pass."""
     path = smooth_path(positions[frames])
     cuts = _retraces(path)
     if not cuts:
@@ -228,10 +228,10 @@ def path_inliers(positions: Array) -> NDArray[np.bool_]:
 
 
 def moving(xy: Array) -> list[int]:
-    """Indices of the points that remain of a path (n, 2) in order of time without stops and small motions to and fro.
+    """Indices of the points of a path (n, 2), in order of time, that are kept when stops and jitter are removed.
 
     After each kept point, the points within `_STATIONARY_RADIUS` of it are skipped, up to the path's last exit from
-    that disc. A return after the path was `_DEPARTURE_RADIUS` away is another pass and is kept.
+    that disc. Points are kept if the path returns after it was more than `_DEPARTURE_RADIUS` away, as on another pass.
     """
     kept, i = [0], 0
     while True:
@@ -324,8 +324,8 @@ def _piece_outliers(camera_to_world: Array, limit: float) -> NDArray[np.bool_]:
         worst = int(np.argmax(score))
         if score[worst] <= 1.0:
             return out
-        # An outlier also spoils its neighbors' predictions. So the worst frame and its neighbors are candidates, and
-        # the candidate without which the other frames agree best is removed.
+        # An outlier also spoils its neighbors' predictions. So the worst frame and its neighbors are candidates. The
+        # candidate is removed whose removal makes the other frames agree best.
         candidates = [k for k in range(max(worst - 2, 0), min(worst + 3, len(kept))) if score[k] > 0.5]
         out[kept[min(candidates, key=lambda k: _score_without(camera_to_world[kept], k, max_offset, max_turn))]] = True
         if out.sum() > _MAX_OUTLIER_FRACTION * n:

@@ -149,7 +149,7 @@ def _replace_policy(folder: Path, files: dict[str, bytes]) -> None:
         temporary = {name: stack.enter_context(atomic_path(folder / name)) for name in reversed(files)}
         for name, content in files.items():
             temporary[name].write_bytes(content)
-        (folder / JSON).unlink(missing_ok=True)  # the old one must never lie beside the new weights
+        (folder / JSON).unlink(missing_ok=True)  # the old description must not be beside the new weights
 
 
 def find_policy(root: Path, source: str) -> str:
@@ -158,7 +158,7 @@ def find_policy(root: Path, source: str) -> str:
     Existing paths become absolute, since nodes of a cluster have other working folders. `module:function` is returned
     unchanged.
 
-    Raises InputError: there is no such policy, but there are others.
+    Raises InputError: there is no such policy in `runs/`, which has others. If it has none, `source` is returned.
     """
     run, _, checkpoint = source.partition("/")
     folder = root / "runs" / run

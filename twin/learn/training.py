@@ -71,7 +71,7 @@ class Segment:
     until: int
     """Number of steps done at its end, where a checkpoint is saved."""
     settle_from: int | None
-    """Step from which the learning rate falls, to its lowest value at the segment's end; None: it follows its cycle."""
+    """From this step, the learning rate falls to its lowest value at the segment's end; None: it follows its cycle."""
     why: str = ""
     """Reason to end the training after this segment; empty: the training continues."""
 
@@ -151,10 +151,10 @@ def train(
         for stale in (folder / "episodes.csv", folder / "log.csv", pictures):
             stale.unlink(missing_ok=True)
         shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-    # Tests have environments of their own. Episodes that a test broke off would be missing in the success rate, mostly
-    # the long ones, which are the successes.
+    # Tests have separate environments. In shared ones, a test would break off training episodes, mostly long ones,
+    # which are the successes, so the success rate would be too low.
     spare = range(config.worlds, 2 * config.worlds) if referee else range(0)
-    # Only one half of the environments steps at a time, so the others need no processes of their own.
+    # The two sets of environments never step at the same time, so they share the processes.
     processes = default_processes(config.worlds) if processes is None else processes
     vec_env = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, len(spare), **config.options())
     for i in spare:
@@ -187,7 +187,7 @@ def train(
             whole = Segment(config.steps, None)
             while segment := plan(model.num_timesteps, drive):
                 left = segment.until - model.num_timesteps
-                if left <= 0:  # the training was stopped beyond the segment's end, or right at it
+                if left <= 0:  # a resumed training may already be at or beyond the segment's end
                     recorder.init_callback(model)
                     recorder.save_checkpoint()
                     continue
@@ -260,7 +260,7 @@ def cycle_rate(config: TrainConfig, step: int) -> float:
 
 
 def check_device(config: TrainConfig) -> None:
-    """Raises InputError if networks shall be trained on a GPU and there is none."""
+    """Raises InputError if the configuration needs a GPU and there is none."""
     if config.device == CUDA and not torch.cuda.is_available():
         raise InputError(f"device = {CUDA!r}: no CUDA device is visible to torch; use --device cpu")
 

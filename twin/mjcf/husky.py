@@ -55,7 +55,7 @@ _COLLISION_BOXES = (  # full size, center in the base [m]
 # which shakes the camera by 0.9 m/s² instead of 0.5 m/s²; with 1 mm, a scrubbing wheel flutters at a friction of 1.0.
 _WHEEL_SOLIMP = (0.0, 0.95, 0.0025, 0.5, 2.5)
 _WHEEL_SOLREF = (0.02, 2.0)  # twice the critical damping, which reduces shaking on a height field by 1/6
-_IMU_POSITION = (0.19, 0.0, 0.149)  # in the base [m]
+_IMU_POSITION = (0.19, 0.0, 0.149)  # [m] position in the base
 
 ROBOT_COLLISION_GROUP = 4
 """Group of the geoms that collide; that of visual geoms is `husky_visuals.ROBOT_VISUAL_GROUP`."""

@@ -81,9 +81,9 @@ def density_codes(samples: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def stored_skips(index: NDArray[np.int32], distance: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
     """Compresses a grid's skip distances to the arrays that the march reads.
 
-    `distance` has one value per block; each of its axes is 4 times as long as that of the brick `index`. Returns the
-    index with −d for bricks without a slot (d: least distance in the brick), and the distances in the stored bricks,
-    shape (slots, 64).
+    `distance` has one value per block; each of its axes is 4 times as long as that of the brick `index`. In the
+    returned index, bricks without a slot have the value −d, where d is the least distance in the brick. The returned
+    distances are those in the stored bricks, shape (slots, 64).
     """
     n0, n1, n2 = index.shape
     blocks = distance.reshape(n0, BLOCKS, n1, BLOCKS, n2, BLOCKS).transpose(0, 2, 4, 1, 3, 5).reshape(*index.shape, -1)
@@ -154,7 +154,7 @@ def check_arrays(layout: BrickLayout, arrays: dict[str, NDArray]) -> None:
 
 
 def check_networks(networks: dict[str, NDArray], dim: int) -> None:
-    """Raises ValueError if the networks do not fit together, or to embeddings of `dim` numbers."""
+    """Raises ValueError if the shapes of the networks do not match each other or embeddings of `dim` numbers."""
     hidden, background = networks["network.head.1"].shape[0], networks["network.backdrop.0"].shape[1]
     shapes = {
         "network.head.0": (CHANNELS - 1 + HARMONICS + dim, hidden),

@@ -97,7 +97,7 @@ class TrainingPixels:
         self.unmasked = unmasked
         """True for the pixels to train on, in the order of `colors`."""
         self.frames = np.arange(len(chosen))
-        """Indices of the frames from which `batch` samples, ascending; all frames, but see `of_frames`."""
+        """Indices of the frames from which `batch` samples, ascending; all frames unless made by `of_frames`."""
         self.points = self._depths_of_points(points, chosen)
         self.path = self._depths_of_path(camera_height) if camera_height > 0.0 else join_depths([])
         self.stereo = join_depths([])  # set from `stereo.stereo_depths`
@@ -183,8 +183,8 @@ class TrainingPixels:
     def batch(self, rng: np.random.Generator, shards: int, triples: int, singles: int, supervised: int) -> RayBatch:
         """Samples random rays, shard after shard (a shard is a part of a batch, see `buffers.py`).
 
-        Each shard holds `triples` × 3 rays, a triple through equally spaced pixels in a line; then `singles` rays
-        through random pixels; then `supervised` rays in equal shares from the available kinds of depth supervision.
+        Each shard holds, in this order: `triples` × 3 rays (a triple goes through three equally spaced pixels in a
+        line), `singles` rays through random pixels, and `supervised` rays with depth, equally many of each kind.
         """
         kinds = [pool for pool in (self.points, self.path, self.stereo) if len(pool.frame)]
         if not kinds:
@@ -298,7 +298,8 @@ _HEIGHT_SPREAD = 0.1  # a camera height that varies by more than this share is n
 def free_segments(cameras: Cameras, near_plane: float) -> NDArray[np.float64]:
     """Straight segments of the camera path, shape (k, 2, 3) [m]; space closer to them than `near_plane` is empty.
 
-    A segment of 3 times its film's median length or more is a jump between photos, so only its ends count.
+    A segment of at least 3 times its film's median length is a jump between photos. It is left out, but the camera
+    positions at its ends are included as segments of length 0.
     """
     pieces = [np.repeat(cameras.positions[:, None], 2, 1)] if near_plane > 0 else []
     for source in dict.fromkeys(cameras.sources):

@@ -41,7 +41,7 @@ from twin.nerf.kernels.color_head import HARMONICS
 from twin.nerf.road import RoadSections, undivided_road
 from twin.warp_runtime import wp
 
-_FORMAT, _FORMAT_OF_SECTIONS = 1, 2  # format with one section, and with several
+_FORMAT, _FORMAT_OF_SECTIONS = 1, 2  # format of a field with one section, and of one with several
 QUERY_POINTS = 65536
 """Points per batch of `FieldSection.query`."""
 _RENDER_RAYS = 4096  # rays per batch when rendering

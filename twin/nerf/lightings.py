@@ -73,9 +73,9 @@ _GAMMA = 2.2  # approximate tone curve of the films
 _MAX_MISFIT = 0.06  # greatest rms color difference from the nearest sum of lights [full scale = 1]
 _OUTLIER_ERROR = 0.2  # color difference above which a probe is an outlier [full scale = 1]
 _MAX_OUTLIER_SHARE = 0.02  # greatest share of outliers among the probes
-_RANGE_MARGIN = (0.02, 0.1)  # at both ends, filmed ranges grow by the first value plus the second times their width
+_RANGE_MARGIN = (0.02, 0.1)  # a filmed range of width w is extended at both ends by the first value plus the second · w
 _CLIPPED = (0.02, 0.98)  # all channels below the first value: black; all above the second: burnt out
-_CONCENTRATION = 0.7  # of the Dirichlet distribution of mixtures; values below 1 favor single lightings
+_CONCENTRATION = 0.7  # parameter of the Dirichlet distribution of mixtures; values below 1 favor single lightings
 _RESIDUAL_SCALE = 2.0  # scale of sampled frame residuals; the rule rejects implausible ones
 _MAX_TRIES = 200
 

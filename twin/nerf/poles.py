@@ -3,16 +3,19 @@
 Stereo and the density grid are too coarse for a pole of 6 cm, so a field loses it, or shows it at the depth of what is
 behind it. But its shape is known: a *spot* on the ground, a radius and a height. A spot, a radius and a *band* of
 heights project to an upright bar in every picture of a level camera. The films show a pole there if the bar differs
-from what is left and right of it in each picture, and has the same color in all pictures of one film; where nothing
-stands, the bar shows the changing background. From the other side, as in a film that comes back, a pole may be darker.
+from the pixels left and right of it in each picture, and has the same color in all pictures of one film. Without a
+pole, the bar shows the changing background. Colors of different films are not compared: seen from the other side, as in
+a film that comes back, a pole may be darker.
 
 The *quality* of a bar is contrast / (contrast + deviation + noise), with means over pictures. The *evidence* for a pole
 is the sum over its bands, from the ground up, of quality − `_CHANCE`; the pole ends where the sum is largest. The spots
-with the most evidence come first. A spot is then judged without the pictures in which a pole that was already found
-covers it: beside a pole, bars show this pole, from a part of the cameras. Lastly, all pictures must agree on the pole's
-place: its bar, moved by a few pixels in each picture to where its contrast is greatest, must stand on one spot.
+with the most evidence come first. The evidence for a spot excludes the pictures in which a pole that was already found
+covers it, since beside a pole, some cameras see this pole in the spot's bars. Lastly, all pictures must agree on the
+pole's place: in each picture, its bar is moved by a few pixels to where its contrast is greatest, and these bars must
+stand on one spot.
 
-Poles that reach the highest band by which they are judged are followed upward in pictures that are further away.
+Poles are found by the lowest `_JUDGED` bands. Those that reach the highest of these are followed upward in pictures
+that are further away.
 """
 
 import math
@@ -43,16 +46,16 @@ _BESIDE = 1.2, 10.0  # [m] least and greatest distance of a spot from the path o
 _DEPTHS = 1.2, 13.0  # [m] depths at which pictures are used
 _FRAME_SPACING = 0.4  # [m] pictures of a film that are closer to each other add nothing
 _TILE = 20.0  # [m] side of the squares that are searched one after the other
-_MAX_PIXELS = 300 * 640 * 360  # of the pictures around a square, which bounds memory
+_MAX_PIXELS = 300 * 640 * 360  # largest number of pixels of the pictures around a square, to bound memory
 _LEAST_WIDTH = 640  # [px] pictures are read up to this width even if those of training are smaller
 
 _RADII = (0.02, 0.028, 0.037, 0.048, 0.062, 0.08, 0.1, 0.125, 0.16, 0.2, 0.25)  # [m]
-_THIN = 8  # number of radii, the first ones, that a pole may have; the others compete with them
-_TWICE = 3  # this many radii further, the radius is twice as large
+_THIN = 8  # a pole has one of the first radii, this many; the others are for comparison
+_TWICE = 3  # number of steps in the list of radii that double the radius
 _BAND = 0.2  # [m] height of a band
 _BANDS = tuple((0.1 + _BAND * k, 0.1 + _BAND * (k + 1)) for k in range(35))  # [m] above the ground
-_JUDGED = 15  # the first ones, by which poles are found
-_HIGH_DEPTHS = 6.0, 18.0  # [m] distances from which pictures show the others; they are above nearer pictures
+_JUDGED = 15  # number of the lowest bands, by which poles are found
+_HIGH_DEPTHS = 6.0, 18.0  # [m] depths of the pictures used for the higher bands, which nearer pictures do not show
 
 _COARSE_CELL = 0.05  # [m] spacing of the first search
 _COARSE_RADII, _COARSE_BANDS = (0.03, 0.055, 0.1), ((0.1, 0.4), (0.4, 0.7))
@@ -61,28 +64,28 @@ _FINE_SPANS = (0.04, 0.02)  # [m] half widths of the grids of 5 × 5 spots aroun
 _FINE_BANDS = ((0.1, 0.3), (0.3, 0.5), (0.5, 0.7))
 _FINE_QUALITY = 0.42
 _LAST_STEPS = tuple(0.015 * k for k in range(-4, 5))  # [m] steps in x and y to the most evident spot
-_LAST_ROUNDS = 4  # such steps follow each other until the spot remains
+_LAST_ROUNDS = 4  # largest number of such steps; they end when the spot does not change
 
 _NOISE = 3.0  # [gray levels]
 _SPREAD = 1.5  # weight of the color's standard deviation over pictures
-_MIN_PICTURES = 4  # of a lighting; and `_MIN_ALL` together
-_MIN_ALL = 5
-_CHANCE = 0.42  # quality that bars reach where nothing stands
+_MIN_PICTURES = 4  # least number of pictures of a film; those of shorter films of a lighting are combined
+_MIN_ALL = 5  # least number of pictures in all
+_CHANCE = 0.42  # quality of bars where there is no pole
 _MIN_EVIDENCE = 0.6
 _MIN_QUALITY = 0.57  # mean over a pole's bands
 _MIN_SPREAD = 8.0  # [°] between the bearings from which pictures show a pole
 _MAX_RATIO = 0.9  # evidence for twice the radius / evidence for the radius: a thicker thing has a larger one
-_APART = 0.5  # [m] between two poles
+_APART = 0.5  # [m] least distance between two poles
 
 _OFFSET_WINDOW, _OFFSET_STEP = (1.0, 2.5), 0.25  # [px] search for a bar's place in a picture
-_OFFSET_SCALE = 0.01  # [m] of offsets; larger ones are outliers
-_OFFSET_CONTRAST = 40.0  # [gray levels] from which all pictures weigh the same
+_OFFSET_SCALE = 0.01  # [m] scale of the Cauchy loss of offsets
+_OFFSET_CONTRAST = 40.0  # [gray levels] pictures with at least this contrast have the same weight
 _MAX_OFFSET = 0.009  # [m] largest median offset of a pole
-_AGREES, _MIN_AGREEING = 0.02, 0.83  # [m] offsets of at least this fraction of the pictures are smaller
+_AGREES, _MIN_AGREEING = 0.02, 0.83  # [m] offsets below the first in at least this fraction of the pictures
 
-_POINT_SPACING = 0.04  # [m] between the points of a pole that get depth supervision
-_MIN_CONTRAST = 6.0  # [gray levels] in the picture
-_LEAST_ALIKE = 3  # pictures of a film whose median is the usual color
+_POINT_SPACING = 0.04  # [m] spacing of the points of a pole that get depth supervision
+_MIN_CONTRAST = 6.0  # [gray levels] least contrast of a bar in a picture that supervises depth
+_LEAST_ALIKE = 3  # least number of pictures of a film that determine the bar's median color
 _MAX_CHANGE = 0.7  # largest difference from the bar's median color, as a multiple of its median contrast
 
 

@@ -73,7 +73,7 @@ class SectionOnDevice:
     """Bricks and detail of a section as the kernels read them."""
 
     def __init__(self, layout: BrickLayout, arrays: dict[str, NDArray], device: str):
-        """For the arrays see `BakedSection`."""
+        """Copies the arrays of a `BakedSection` to a device."""
         b: Any = Bricks()
         near_index, far_index = brick_indices(layout, arrays["near"], arrays["far"])
         near_index, near_skips = stored_skips(near_index, arrays["near_leap"])
@@ -150,7 +150,7 @@ class RenderTarget:
         height: int,
         stopped: bool,
     ):
-        """For n cameras, with at most `bands` bands; `stopped` if rays end at given depths."""
+        """Allocates buffers for n cameras and at most `bands` bands; with `stopped`, rays end at given depths."""
         self.shape, device = (n, height, width), compiled.device
         # The arrays live as long as the launches that read them. A reference to the section itself would be circular,
         # and a dropped section would stay in memory until the next garbage collection.
@@ -211,7 +211,7 @@ class RenderTarget:
             launch.launch()
 
     def images(self, features: bool, pool: ThreadPoolExecutor | None) -> RenderedImages:
-        """Copies of the images, as the buffers are reused; with or without features. `pool` shares the copying."""
+        """Copies of the images, as the buffers are reused; with or without features. The threads of `pool` copy."""
         arrays = [self.rgb, self.depth, self.opacity, *([self.features] if features else [])]
         shapes = [(*self.shape, 3), self.shape, self.shape, (self.shape[0], CHANNELS, *self.shape[1:])]
         sources = [array.numpy() for array in (self._staged(arrays) if self.rgb.device.is_cuda else arrays)]

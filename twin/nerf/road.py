@@ -2,7 +2,7 @@
 
 A section is the part of the filmed path that is nearer to its center than to those of the other sections. A camera is
 rendered by the section that has the nearest filmed position. Close to a border it is rendered by all sections that meet
-there, and the pictures are blended, so that no step shows when a robot drives across.
+there, and the pictures are blended, so that there is no visible seam when a robot drives across.
 """
 
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ ROAD_FILE = "road.safetensors"
 """File of a road of several sections."""
 OVERLAP = 12.0
 """Distance [m] from a section's own cameras up to which other cameras train it, too."""
-# The road's length is that of the shortest tree through filmed positions that are this far apart [m]. So a road that is
-# filmed twice, or in another lane, is no longer than one that is filmed once.
+# [m] The road's length is that of the minimum spanning tree of filmed positions at least this far apart. So a road that
+# is filmed twice, or in another lane, is no longer than one that is filmed once.
 _ANCHOR_SPACING = 5.0
 _JUMP = 25.0  # [m] a longer step of this tree does not count: it leads to a frame that was placed wrong
-_CENTER_SPACING = 1.0  # [m] spacing of the filmed positions whose medians are the centers
+_CENTER_SPACING = 1.0  # [m] least spacing of the filmed positions that k-medians clusters
 _MIN_FRAMES = 10  # least number of frames of a section
 _ROUNDS = 100  # greatest number of rounds in which centers move
-_BLEND = 2.0  # [m] a picture is blended if another section is less than this farther than the nearest one
+_BLEND = 2.0  # [m] sections are blended if their distances exceed that of the nearest section by less than this
 
 
 @dataclass(frozen=True)
@@ -88,14 +88,14 @@ class RoadSections:
         return share / share.sum(1, keepdims=True)
 
     def frames(self, positions: Array) -> list[NDArray[np.int64]]:
-        """For each section, the indices of those of the positions (n, 3) [m] whose cameras train it."""
+        """For each section, the indices of the cameras that train it, given their positions (n, 3) [m]."""
         if self.count == 1:
             return [np.arange(len(positions))]
         near = self.distances(positions) <= OVERLAP
         return [np.flatnonzero(column) for column in near.T]
 
     def segments(self, segments: Array) -> list[Array]:
-        """For each section, those of the segments (n, 2, 3) [m] of the filmed path whose ends are both near it."""
+        """For each section, the segments that have both ends near it, of segments (n, 2, 3) [m] of the filmed path."""
         start, end = self.frames(segments[:, 0]), self.frames(segments[:, 1])
         return [segments[np.intersect1d(a, b)] for a, b in zip(start, end, strict=True)]
 
@@ -111,7 +111,7 @@ def divide_road(positions: Array, length: float) -> RoadSections:
     The centers are those of k-medians: bends, crossings and films in both directions need no special treatment, and
     frames that were placed far off the road move no center.
     """
-    from scipy.sparse.csgraph import minimum_spanning_tree  # slow to import, as the next
+    from scipy.sparse.csgraph import minimum_spanning_tree  # scipy is slow to import
     from scipy.spatial.distance import pdist, squareform
 
     anchors = _thinned(positions, _ANCHOR_SPACING)
@@ -144,7 +144,7 @@ def _thinned(positions: Array, spacing: float) -> Array:
 
 
 def _far_apart(points: Array, count: int) -> Array:
-    """`count` points that are far from each other, of those points (n, 3) that have another one nearby."""
+    """Chooses `count` points far from each other from points (n, 3), but no isolated ones."""
     points = points[_tree(points).query(points, k=2)[0][:, 1] < _JUMP]
     chosen = [int(np.linalg.norm(points - np.median(points, 0), axis=1).argmax())]
     gap = np.full(len(points), np.inf)

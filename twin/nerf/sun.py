@@ -9,9 +9,9 @@ picture under the lighting's embedding times a gain. The gain of each color chan
 
 The coefficients `level` and `direct` differ if the ground lies in shadows of unfilmed objects, or if its color
 saturates. Here n is the normal of the surface, s the direction towards the sun, d the direction of view. The visibility
-comes from a shadow map (`geometry/mesh_rays.py`). From z-depth `_NEAR` to `_FAR`, the surface's sum passes into that
-of the far view. The coefficients are fitted to a photo (`sun_fit.py`). They are ratios to the light of the film, in the
-film's tone curve.
+comes from a shadow map (`geometry/mesh_rays.py`). Between the z-depths `_NEAR` and `_FAR`, the gain is interpolated
+between the sums for the surface and for the far view. The coefficients are fitted to a photo (`sun_fit.py`). They are
+ratios to the light of the film, in the film's tone curve.
 
 The direction of the sun may be computed from time and place. Compass angles are clockwise from north. The *heading* of
 a scene is the compass angle of its x axis. Azimuths in the scene are counterclockwise from its x axis.
@@ -33,10 +33,10 @@ TERMS = ("ambient", "direct", "base", "toward", "up", "level")
 """Names of the terms of the gain."""
 MIN_GAIN, MAX_GAIN = 0.1, 4.0
 """Limits of the gain."""
-_NEAR, _FAR = 30.0, 60.0  # [m] z-depth up to which only the sum for surfaces counts; from which only the far view's
+_NEAR, _FAR = 30.0, 60.0  # [m] z-depths: only the sum for surfaces counts below the first, only the far view's above
 _GLOW = 4  # exponent of the brightening towards the sun
 _SMOOTHING = 9 / 160  # [widths of the picture] window over which points are averaged before normals are computed
-_LEVEL = (0.75, 0.92)  # upward components of unit normals: up to the first, a surface is steep; from the second, level
+_LEVEL = (0.75, 0.92)  # upward component of unit normals: below the first, surfaces are steep; above the second, level
 _MAX_ENTRY = 100.0  # largest absolute coefficient in a file
 
 
@@ -135,7 +135,7 @@ class SeenSurfaces:
 
     @staticmethod
     def of(depth: Array32, rays: Array, pose: Array) -> "SeenSurfaces":
-        """Arguments as of `relit`."""
+        """The surfaces in a picture; arguments as for `relit`."""
         turned = (rays @ pose[:3, :3].T).astype(np.float32)
         around = turned * np.minimum(depth, np.float32(_FAR))[..., None]
         directions = turned / np.linalg.norm(turned, axis=-1, keepdims=True)

@@ -1,8 +1,9 @@
 """Fit of a sun to a photo: a search over directions, then a joint fit with the appearance embedding and the fog.
 
-The photo is compared with *bases*, pictures of the field under several embeddings, times the sun's gain (`sun.py`). For
-one base and one direction, the gain's coefficients are a linear least squares problem, so hundreds of directions can be
-tried. The best base and direction start a gradient descent on coefficients, embedding and fog.
+A *base* is the picture of the field under one embedding. The photo is compared with each of several bases times the
+sun's gain (`sun.py`). For one base and one direction, the gain's coefficients are a linear least squares problem, so
+hundreds of directions can be tried. The best base and direction are the start of a gradient descent on coefficients,
+embedding and fog.
 """
 
 import math
@@ -32,8 +33,8 @@ _ELEVATIONS = (8.0, 18.0, 32.0, 50.0)  # [°] elevations of the first directions
 _AZIMUTH_STEP = 22.5  # [°] step of the azimuths of the first directions
 _ELEVATION_RANGE = (3.0, 80.0)  # [°] range of elevations in a search
 _REFINEMENTS = (9.0, 5.0, 2.5)  # [°] steps of the further searches around the best directions
-_STARTS = 2  # number of first directions around which the search goes on
-_BASES = 2  # number of bases for which the search goes on, besides that of the embedding fitted without a sun
+_STARTS = 2  # number of directions of the grid that are refined
+_BASES = 2  # number of bases that are refined, in addition to that of the embedding fitted without a sun
 _RIDGE = 2e-4  # weight of the squared differences of coefficients from those without a sun
 _PLAIN = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # coefficients of the terms without a sun
 _LIGHT = np.array([True, True, False, False, False, True])  # terms with coefficients ≥ 0, since they are light
@@ -46,7 +47,7 @@ _PRIOR = 1e-2  # weight of the squared distance from the initial embedding
 
 @dataclass(frozen=True)
 class SunProblem:
-    """n pixels of a photo, with what the field shows in them."""
+    """n pixels of a photo, and the field's surfaces and colors in these pixels."""
 
     colors: Array32
     """Colors of the photo, shape (n, 3)."""
@@ -75,7 +76,7 @@ class LinearFit:
 
 
 def search_directions(problem: SunProblem, casters: ShadowCasters, fog: Fog) -> list[LinearFit]:
-    """Best fit of each base over a grid of directions, and for promising bases over refinements of the best ones."""
+    """Best fit of each base over a grid of directions; for the best bases, the best directions are then refined."""
     known: dict[tuple[float, float], list[LinearFit]] = {}
 
     def fits(azimuth: float, elevation: float) -> list[LinearFit]:
@@ -245,8 +246,8 @@ def fit_sun(
 ) -> SunFit:
     """Fits a sun to a photo.
 
-    The base is the filmed lighting, or the embedding fitted without a sun, whose fits to each half of the photo explain
-    the other half best.
+    Bases are the filmed lightings and the embedding fitted without a sun. For each, the fit to one half of the photo is
+    scored on the other half; the base with the best score is used.
 
     Args:
         field: The field; it stays fixed.

@@ -203,7 +203,7 @@ _CRATES = (  # station, lateral, side [m]
     *((18.5, -5.0, 1.1), (18.6, -6.3, 0.9), (29.5, -5.6, 1.2)),
     *((45.5, 6.5, 1.0), (54.0, -5.3, 1.15), (65.0, -4.9, 1.0)),
 )
-_MIN_LATERAL = 2.15  # [m] least distance from the center line to which an object is displaced
+_MIN_LATERAL = 2.15  # [m] least distance of a displaced object from the center line
 _CARS = ((31.2, -5.2, "white"), (12.6, -4.9, "blue"), (66.0, 5.4, "red"))
 
 
@@ -236,7 +236,7 @@ def _displaced(
 ) -> tuple[float, float]:
     """Station and lateral, displaced at random by at most `along` and `across` [m]; unchanged without a generator.
 
-    An object nearer to the center line than `_MIN_LATERAL` comes no nearer; others stay at least that far away.
+    The result is at least `_MIN_LATERAL` from the center line, or as far as before if that is nearer.
     """
     if rng is None:
         return station, lateral
@@ -312,7 +312,7 @@ def build(route: RoadLine | None = None, displaced: bool = False) -> KnownPlace:
     """Builds the campus road; equal arguments give equal places.
 
     Args:
-        route: Center line; the default road where None.
+        route: Center line; None: the default road.
         displaced: True for the day of the trials: cones, bins, crates and cars have moved since the film.
     """
     place = KnownPlace(

@@ -52,8 +52,8 @@ def road(
 ) -> Array32:
     """The road's surface: rows from the left edge to the right, columns along the road; lengths and `pixel` [m].
 
-    `zebras` are the distances of zebra crossings from the first column [m]. Parts of one road share a `style`: equal
-    generators give an equal bond of pavers, equal lines and equal colors of leaves.
+    `zebras` are the distances of zebra crossings from the first column [m]. Parts of one road share a `style`, a
+    random generator that determines the bond of pavers, the lines and the colors of leaves.
     """
     style = style or rng
     shape = (round(section.width / pixel), round(length / pixel))
@@ -460,7 +460,7 @@ def _paint(
         return stream(spec.number, "surface", *key)
 
     def style(key: int) -> np.random.Generator | None:
-        """The generator of what the parts of a long road share; None for a road of one part."""
+        """The generator of the features that all parts of a long road share; None for a road of one part."""
         return stream(spec.number, "longer", key) if parts > 1 else None
 
     out: dict[str, NDArray[np.uint8]] = {}

@@ -229,7 +229,10 @@ def _roof(house: House, top: float) -> tuple[list[MeshPart], float, list[MeshPar
 def _openings(
     place: KnownPlace, house: House, floor: float, rng: np.random.Generator, lit_windows: float, trim: list[MeshPart]
 ) -> tuple[list[MeshPart], list[tuple[int, MeshPart]]]:
-    """Panes that stay dark, and (kind, pane) of those lit after dark; adds doors, sills and shutters to `trim`."""
+    """Returns the panes that are never lit, and (kind, pane) of the panes that are lit after dark.
+
+    Adds doors, sills and shutters to `trim`.
+    """
     panes: list[MeshPart] = []
     lit: list[tuple[int, MeshPart]] = []
     wide, tall = {

@@ -164,8 +164,8 @@ _HIGH_SUN, _LOW_SUN = (
     np.array([1.0, 0.94, 0.83]),
     np.array([1.0, 0.60, 0.34]),
 )  # colors of a high sun and of a sun at the horizon
-_REDDENING_ANGLE = 14.0  # [°] of elevation over which the red of a low sun falls to 1/e
-_MEAN_BRIGHTNESS = 0.3  # mean image value at which a day's exposure aims
+_REDDENING_ANGLE = 14.0  # [°] difference of elevation over which the redness of a low sun falls to 1/e
+_MEAN_BRIGHTNESS = 0.3  # mean image value for which a day's exposure is chosen
 
 
 def _day(number: int) -> Lighting:

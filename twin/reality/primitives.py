@@ -139,8 +139,8 @@ def leaves(
 ) -> MeshPart:
     """Leaves: small bent rhombi around centers, shape (n, 3).
 
-    Each leaf shows a window of the texture that is `uv_size` wide. `light`, shape (n,), places the window from the left
-    edge (0) to the right edge (1), with a random shift.
+    Each leaf shows a window of the texture that is `uv_size` wide. `light`, shape (n,), is the window's horizontal
+    position, from 0 (left edge) to 1 (right edge); a random shift is added.
     """
     n = len(centers)
     long, short = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))

@@ -170,7 +170,7 @@ class ShadowMap:
 
 @wp.func
 def _shadow_texel(shadows: ShadowMap, point: wp.vec3):
-    """Column and row of a point in the shadow map [texels], and 0."""
+    """Column and row of a point in the shadow map [texels]; the third component is 0."""
     o = shadows.left_bottom
     return wp.vec3(wp.dot(point, shadows.right) - o[0], wp.dot(point, shadows.up) - o[1], 0.0) / _SHADOW_TEXEL
 

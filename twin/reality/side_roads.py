@@ -15,20 +15,20 @@ from twin.reality.place_objects import DrivenLine, KnownPlace, PlaceObject
 from twin.reality.place_spec import MOUTH_REACH, LineSpec, Mouth, SectionSpec, SideRoad
 from twin.types import Array
 
-LEAD = 8.0  # [m] of the driven line in front of the turn, which both films show
+LEAD = 8.0  # [m] length of the driven line before the turn that both films show
 SIDE_VERGE = 2.2  # [m] width of a side road's verges
 _MIN_WIDTH = 4.0  # [m] least width of a side road, so that the corridor stays off the corner of the mouth
-_SWING = 1.6  # [m] by which the radius of the turn exceeds the smaller of the half widths of both roads
+_SWING = 1.6  # [m] radius of the turn minus the half width of the narrower road
 _DRIVEN = 25.0  # [m] filmed length of a side road from the curb of the driven road on
 _MIN_DRIVEN = 15.0  # [m] the same, at least
-_BEYOND = 20.0  # [m] of side road beyond the film's end, as far as there is room
-_SPARED = 4.0  # [m] of side road beyond the film's end, at least
+_BEYOND = 20.0  # [m] length of the side road beyond the film's end, if there is room
+_SPARED = 4.0  # [m] least length of the side road beyond the film's end
 _ROOM = 17.0  # [m] least distance of a side road from other parts of the driven line
 _NEAR_MOUTH = 0.75  # least distance from the driven line as a fraction of that along the axis, where this is less
 _APART = 14.0  # [m] least distance between two side roads
 _RISE = 1.5  # [m] over which curbs rise where side roads leave the verge, and verges blend into the land
-_STEP = 0.5  # [m] between vertices along a side road
-_LIFT = 0.01  # [m] of the surface above the ground
+_STEP = 0.5  # [m] spacing of the vertices along a side road
+_LIFT = 0.01  # [m] height of the surface above the ground
 
 
 class SideAxis:

@@ -139,12 +139,12 @@ def _add_material(model: mujoco.MjSpec, name: str, texture: str, emission: float
 # ---- renderers
 
 _STRETCH = 100.0  # [m] length of a stretch
-_SIGHT = 250.0  # [m] a house 8 m high is 11 pixels high there, in a picture 640 pixels and 85° wide
-_SHARP = 60.0  # [m] beyond it, `_SHRINK` texels of the road are finer than a pixel, and a leaf is about one pixel
+_SIGHT = 250.0  # [m] at this distance, a house 8 m high is 11 pixels high in a picture 640 pixels and 85° wide
+_SHARP = 60.0  # [m] beyond this distance, a pixel spans more than `_SHRINK` texels of the road, and about one leaf
 _SHRINK = 4  # ratio of the resolution of near textures to that of far ones, and of the numbers of leaves
 _LAMPS = 24  # shining lamps per stretch; renderers loop over all lamps for every pixel
 _SHADOWS = (20.0, 60.0)  # [m] of road before and after a stretch on which the rasterizer casts shadows
-_SHADOW_MARGIN = 14.0  # [m] from that road to the edges of `GroundLayout.field`
+_SHADOW_MARGIN = 14.0  # [m] margin around this part of the road, up to the edges of `GroundLayout.field`
 
 
 def is_long(place: KnownPlace) -> bool:
@@ -153,10 +153,10 @@ def is_long(place: KnownPlace) -> bool:
 
 
 class StretchRenderer:
-    """Renders a long place from poses near its line; its renderer is made anew where the camera enters a stretch."""
+    """Renders a long place from poses near its line; makes a new renderer whenever the camera enters a stretch."""
 
     def __init__(self, place: KnownPlace, make: Callable[[KnownPlace], PlaceRenderer]) -> None:
-        """`make` returns the renderer of a place, here of the part of `place` near a stretch."""
+        """`make` is called with the part of `place` near a stretch, and returns a renderer of it."""
         self._place, self._make = place, make
         self._stretch: int | None = None
         self._renderer: PlaceRenderer | None = None

@@ -55,7 +55,7 @@ def truth_section(report: dict[str, Any]) -> Section:
     shares = {kind: truth.get(f"mesh_completeness_10cm_{kind}") for kind in kinds}
     complete = [f"{number(share, '{:.0%}')} of {kinds[kind]}" for kind, share in shares.items() if share is not None]
     rigid = "after a rigid fit, without a change of scale"
-    seen = "of that seen within 10 m of the route"
+    seen = "share of the true surface that cameras saw within 10 m of the route"
     by_kind = join_names(complete) if complete else "completeness of the mesh"
     facts = facts_of(
         truth,

@@ -150,8 +150,8 @@ def place_map(
     """Map [m] of the sparse points, the cameras by source (held-out ones hollow), and the route with its corridor.
 
     Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (m, 3), `route` and `branches` (k, 2).
-    If a source has several passes (`twin.geometry.passes`), all passes are drawn as lines with their names. Steps that
-    the pictures contradict are given by both their cameras, and are drawn thick.
+    If a source has several passes (`twin.geometry.passes`), all passes are drawn as lines with their names. A step
+    between two cameras that the pictures contradict is given by the indices of both, and is drawn thick.
     """
     others = (branches or {}).values()
     figure, axes, low, high = _map_axes(
@@ -338,7 +338,7 @@ HALF_WIDTH, FULL_WIDTH = 4.8, 7.2
 """Figure widths [in] for half and for the full width of the page."""
 
 _ROW_HEIGHT = 0.28  # [in] per row
-_LETTER_WIDTH, _LABEL_HEIGHT = 0.075, 0.35  # [in] of a letter; of the axis label
+_LETTER_WIDTH, _LABEL_HEIGHT = 0.075, 0.35  # [in] width of a letter, height of the axis label
 _MAX_HORIZONTAL_LETTERS = 3  # longer column names are set vertically
 _MIN_ALPHA, _MAX_ALPHA = 0.08, 0.58  # opacity of a cell at strength 0 and 1; its text is legible in both modes
 _CELL_HALF_SIZE = np.array([0.48, 0.46])  # in units of the cell spacing

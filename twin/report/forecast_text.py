@@ -20,7 +20,7 @@ from twin.report.html import Caution, Verdict
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
 """Lowest rank correlations for the verdict that the twin ranks, or roughly ranks, policies as the road does."""
 SMALL_REGRET = 0.05  # up to this regret, the verdict is good
-_SMALL_GAP = 0.1  # if the order is reliable only for larger differences of rates in the twin, the verdict is not good
+_SMALL_GAP = 0.1  # the verdict is good only if the order is reliable for differences of rates in the twin up to this
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
@@ -32,8 +32,8 @@ STATISTICS = (
     (
         "coverage",
         "cells agree",
-        "share of the cells where the 90% interval of road minus twin contains 0; high for any guess if in most cells "
-        "all trials have the same outcome",
+        "share of the cells where the 90% interval of road minus twin contains 0; if all trials of most cells have the "
+        "same outcome, it is high even for a random guess",
     ),
     (
         "corrected_coverage",
@@ -52,7 +52,7 @@ PERCENT_STATISTICS = ("winner_regret", "bias", "coverage", "corrected_coverage",
 """Statistics shown in percent."""
 
 INTERVALS_NOTE = (
-    "Intervals (90%) hold for repetitions with other trainings and other days, of which these are a sample. They are "
+    "The intervals (90%) treat the days and trainings as samples: they hold for a repetition with new ones. They are "
     "computed by leaving out days and trainings in turn, not trials. More days and more trainings make them narrower; "
     "more checkpoints of one training, or more trials on the same day, hardly do. With too few days or trainings for a "
     "reliable interval, there is none."

@@ -144,7 +144,7 @@ def numbers(value: Any) -> dict[str, float]:
 Row = tuple[str, str, str, str]
 """Path of a number in the report, its name, its format, and its meaning."""
 Limit = tuple[str, float, str, str]
-"""Path of a number in the report, the limit of its magnitude, and the caution and its cure above the limit."""
+"""Path of a number in the report, limit of its magnitude, caution if it exceeds the limit, and cure."""
 
 
 def facts_of(report: dict[str, Any], *rows: Row) -> list[Fact]:

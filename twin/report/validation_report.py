@@ -207,8 +207,8 @@ def summary_lines(results: dict[str, Any]) -> list[str]:
         )
     for w in results.get("worst", []):
         out.append(
-            f"{w['policy']}, {w['task']}: of {w['of']} sampled lights the worst is {w['lighting']}; "
-            f"tested there again: {w['successes']}/{w['trials']} new episodes ({w['low']:.2f} to {w['high']:.2f})"
+            f"{w['policy']}, {w['task']}: the worst of {w['of']} sampled lightings is {w['lighting']}; success in new "
+            f"episodes there: {w['successes']}/{w['trials']} ({w['low']:.2f} to {w['high']:.2f})"
         )
     return out
 

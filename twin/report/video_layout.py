@@ -104,7 +104,7 @@ def draw_label(
 
 
 def colored(name: str, shares: NDArray) -> Image:
-    """Colors of shares (h, w) in [0, 1], from the matplotlib colormap `name`."""
+    """Colors of values (h, w) in [0, 1], from the matplotlib colormap `name`."""
     return to_uint8(colormaps[name](shares)[..., :3])
 
 
@@ -206,7 +206,7 @@ class FrameLayout:
         return out
 
     def draw_panels(self, canvas: Image, left: tuple[NDArray, str], right: tuple[NDArray, str] | None) -> None:
-        """Draws the panels: a picture and its label each; None leaves the right one empty."""
+        """Draws the panels, each given by a picture and its label; None leaves the right panel empty."""
         for box, panel in ((self.left, left), (self.right, right)):
             if panel:
                 paste(canvas, panel[0], box)

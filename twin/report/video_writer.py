@@ -18,8 +18,8 @@ from PIL import Image
 
 _BT709 = 1  # number of BT.709 in ITU-T H.273, for matrix, primaries and transfer
 _LIMITED_RANGE = 1  # AVCOL_RANGE_MPEG
-# Threads of x264. On a busy machine, 8 of 1,500 films had other bytes with four; with one it is rare, and the pictures
-# are the same.
+# Threads of x264. With four threads on a busy machine, the bytes of 8 of 1,500 films differed between runs. With one
+# thread this is rare, and the pictures are the same.
 _THREADS = 1
 _POSTER_WIDTH = 640  # [px]
 

@@ -1,4 +1,4 @@
-"""Reads drive logs from files: tables, windows as published with DRIVE, and bags.
+"""Reads drive logs from files: tables, windows in the format of the DRIVE dataset, and bags.
 
 A bag becomes a table with a row per joint state and the newest values of the other topics. If a bag has no joint
 states, the wheel speeds are computed from the wheels' odometry by the inverse of Clearpath's kinematics. Poses that
@@ -159,7 +159,7 @@ def read_bag(path: Path, filmed: FilmedPoses | None = None, poses: str = "") -> 
         begin = bag.begin
     for topic, count in lost.items():
         runtime.log_line(f"{path}: {count} messages on {topic} left out: not finite")
-    # Of the topics with joint states, those of an arm have no wheels.
+    # Some topics with joint states have no wheels, such as those of an arm.
     computed = next((use for use in uses if uses[use] is _wheels_of_odometry), None)
     if computed and any(rows[use] for use in uses if uses[use] is VALUES["wheels"]):
         del rows[computed]
@@ -185,9 +185,9 @@ def read_bag(path: Path, filmed: FilmedPoses | None = None, poses: str = "") -> 
 def _uses(
     connections: list[Any], path: Path, filmed: FilmedPoses | None, poses: str
 ) -> dict[tuple[str, str], Callable[[Any], Any]]:
-    """Kind and topic of what is read → function that extracts a message's numbers.
+    """The topics to read: (kind, topic) → function that extracts a message's numbers.
 
-    All topics with joint states are read, and the wheels' odometry.
+    They include all topics with joint states, and the topic with odometry from the wheels.
     """
     counts = messages_by_topic(connections, TYPES["poses"])
     if poses and poses not in counts:
@@ -211,7 +211,7 @@ def _uses(
     if from_wheels:
         uses["wheels", max(from_wheels, key=lambda name: from_wheels[name])] = _wheels_of_odometry
     elif not joints:
-        choose_topics(connections, path, ["wheels"])  # raises the error that names what is missing
+        choose_topics(connections, path, ["wheels"])  # raises InputError: no such topic
     return uses | {("wheels", topic): VALUES["wheels"] for topic in joints}
 
 

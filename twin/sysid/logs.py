@@ -31,7 +31,7 @@ from twin.types import Array
 PERIOD = 0.05  # [s] between two samples of a window
 DURATION = 2.0  # [s]
 SAMPLES = round(DURATION / PERIOD)
-MAX_POSE_AGE = 20  # largest number of samples from the measurement of a window's first pose to the window's start
+MAX_POSE_AGE = 20  # [samples] largest age of a window's first pose at the window's start
 
 TWIST = ("cmd_v", "cmd_yaw_rate")
 WHEEL_COMMANDS = ("cmd_left", "cmd_right")
@@ -46,9 +46,9 @@ _FAST = 1.75  # [samples] if the pose sensor's period is shorter, poses count as
 # delay that all poses share is not counted.
 _JITTER = 4
 _UNSTEADY = 0.1  # if a larger fraction of windows contradicts the period, the sensor counts as aperiodic
-_DROPOUT = 30  # [samples] windows without a fresh pose for longer are left out if the wheels turn
+_DROPOUT = 30  # [samples] a window is left out if the wheels turn and no pose is fresh for longer than this
 _TURNING = 0.5  # [rad/s] mean of both sides' wheel speeds above which the wheels count as turning
-_STANDING = 0.05  # [rad/s], [m/s]; windows in which wheels and commands never reach it are left out
+_STANDING = 0.05  # [rad/s], [m/s] a window is left out if all its wheel speeds and commands are below this
 _TICK = 1e-6  # [s] instants closer than this are the same
 _GROUP_WINDOWS = 3  # windows per group in a table without groups: six seconds
 _CONTINUES = 1.0  # [rad/s] largest change of wheel speeds between consecutive windows, summed over both sides
@@ -246,7 +246,7 @@ def cut_windows(columns: dict[str, Array], where: str) -> Windows:
 
 
 def _informative(windows: Windows, where: str) -> Windows:
-    """Leaves out windows that lose poses while the wheels turn, and windows in which the robot stands still on command.
+    """Leaves out windows that lose poses while the wheels turn, and windows in which wheels and commands are at rest.
 
     Raises InputError: poses are lost in more than half of the windows in which the wheels turn.
     """
@@ -329,7 +329,7 @@ def published_windows(columns: dict[str, Array], where: str) -> Windows:
 
 
 def resample_poses(poses: Array, late: Array, before: int) -> Array:
-    """Interpolates predicted poses from the time when a window's first pose was measured, `PERIOD` [s] apart.
+    """Interpolates predicted poses at times `PERIOD` [s] apart, starting when a window's first pose was measured.
 
     The result is relative to its first pose, shape (n, SAMPLES + MAX_POSE_AGE + 1, 3).
 
@@ -384,7 +384,7 @@ _MIN_TURNS = 10  # least number of windows that turn by more than `_TURN`; a qua
 _TURN = 0.25  # [rad]
 
 _MOVING = 0.15  # [m/s] of wheels or robot: slower windows are not used to check units
-_MAX_ACCELERATION = 3.0  # [m/s²] in the median; more is gravity along an axis that should be level
+_MAX_ACCELERATION = 3.0  # [m/s²] a larger median is due to gravity: an axis that should be level is not
 _DEGREE = np.pi / 180
 
 

@@ -127,9 +127,9 @@ def smooth_slopes(
 
 # ---- simulation
 
-MAX_POSE_LAG, MAX_POSE_LEAD = 4, 3  # samples by which poses may be behind and ahead of the wheel speeds
+MAX_POSE_LAG, MAX_POSE_LEAD = 4, 3  # [samples] largest delay and largest lead of poses relative to wheel speeds
 LEAD_SAMPLES = MAX_POSE_LAG + MAX_POSE_AGE  # samples before time zero in the result
-# [s] For the start of a fit; after 2 s, poses differ by up to 1 cm and 0.8° from those with the scene's time step.
+# [s] Time step for the start of a fit. After 2 s, poses differ by up to 1 cm and 0.8° from those with the scene's step.
 COARSE_TIMESTEP = 0.005
 
 _SETTLE = 1.0  # [s] at rest before a simulation
@@ -220,9 +220,10 @@ def _initial_states(model: mujoco.MjModel, params: HuskyParams, start: Array) ->
     for i, sides in enumerate(start):
         rolling = sides * params.wheel_radius
         data.qvel[0] = rolling.mean()
-        # Not divided by a track, this is about half of the yaw rate to which the robot settles. Published fits were
-        # made with it. It is the start, 0.8 s before the first pose: the settled rate would change poses by at most
-        # 1.2 mm and 0.02° with a friction of 0.3 or more, and by up to 3 cm and 1.1° with 0.05, a fit's lower bound.
+        # The initial yaw rate is not divided by a track, so it is about half of the rate to which the robot settles. It
+        # is kept because published fits were made with it, and because it is set 0.8 s before the first pose: the
+        # settled rate would change poses by at most 1.2 mm and 0.02° with a friction of 0.3 or more, and by up to 3 cm
+        # and 1.1° with 0.05, a fit's lower bound.
         data.qvel[5] = (rolling[1] - rolling[0]) / 2
         data.qvel[joints] = np.tile(sides, 2)
         if model.na:

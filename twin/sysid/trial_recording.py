@@ -44,7 +44,7 @@ from twin.sysid.camera_extrinsics import base_below_camera
 from twin.types import Array, Image
 from twin_policy import Camera, PictureError, Rectifier
 
-_STEP = 0.3  # [m] a satellite fix's heading is the direction of motion from this far before it to this far after it
+_STEP = 0.3  # [m] the heading at a satellite fix is the direction from a point this far before it to one as far after
 _TYPES = {
     "pictures": (RAW, COMPRESSED),
     "camera": (CAMERA_INFO,),
@@ -236,7 +236,7 @@ def _value(kind: str, message: Any) -> Any:
 
 
 def _poses(times: NDArray[np.int64], rows: list[Any], where: str) -> tuple[NDArray[np.int64], Array, Array]:
-    """Times, poses and uprightness in order, from planar poses with uprightness, or from satellite fixes."""
+    """Times, poses and uprightness, sorted by time; `rows` are planar poses with uprightness, or satellite fixes."""
     times, index = np.unique(times, return_index=True)
     table = np.array(rows, float)[index]
     keep = np.isfinite(table).all(1)
@@ -296,7 +296,7 @@ def scene_frame(
     """The frame of a recording's poses in a built scene.
 
     Args:
-        start: Time [ns] from which pictures are used.
+        start: Pictures from this time [ns] on are used.
 
     Raises:
         InputError: an error of `fit_frame`, or the pictures are missing or cannot be read.

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from twin.view.page import Page
 
 _HEAD_START = 6.0  # [s] longest wait for the first picture before the robot is loaded
-_MIN_SIDE, _MAX_SIDE, _MAX_FPS = 16, 4096, 120  # of a film: sides [px], frames per second
+_MIN_SIDE, _MAX_SIDE, _MAX_FPS = 16, 4096, 120  # limits of a film's sides [px] and frames per second
 
 
 def command(given: argparse.Namespace) -> None:
@@ -131,7 +131,7 @@ def open_page(
         gui.main_panel.dock_right()
         loading = gui.add_markdown("The scene is being loaded ...")
         announce(server.url)
-        # The browser loads the page during the rest.
+        # The imports and the loading below take time, during which the browser loads the page.
         from twin.view.camera_path import named_lighting
         from twin.view.page import Page
 

@@ -34,7 +34,7 @@ _CURE = "save the path again in twin view, or correct the file"
 
 @dataclass(frozen=True)
 class MixedLighting(EpisodeLighting):
-    """A lighting between two others, by which a path's file stores it: an embedding alone has neither fog nor sun."""
+    """A lighting between two others. A path's file stores these two, since an embedding alone has no fog and no sun."""
 
     parts: tuple[EpisodeLighting, EpisodeLighting] = field(kw_only=True)
     share: float = field(kw_only=True)
@@ -75,7 +75,7 @@ class CameraPath:
 
     def at(self, times: Array) -> list[tuple[Array, float, EpisodeLighting]]:
         """Pose (4, 4), vertical angle of view [°] and lighting at times after the start [s], shape (k,)."""
-        from scipy.interpolate import CubicSpline, PchipInterpolator  # slow to import, as the next
+        from scipy.interpolate import CubicSpline, PchipInterpolator  # scipy is slow to import
         from scipy.spatial.transform import Rotation, RotationSpline
 
         knots = np.array([view.time for view in self.views]) - self.views[0].time
@@ -157,7 +157,7 @@ def _parse_view(row: Any, number: int, field: BakedField) -> KeyView:
         raise ValueError(f"view {number}: camera_to_world of shape {pose.shape}; expected 4×4 finite numbers")
     turn = pose[:3, :3]
     if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0.0:
-        raise ValueError(f"view {number}: the upper left 3×3 of camera_to_world is no rotation")
+        raise ValueError(f"view {number}: the upper left 3×3 of camera_to_world is not a rotation")
     time, fov = float(row["time"]), float(row.get("fov", 60.0))
     if not np.isfinite(time) or not _MIN_FOV <= fov <= _MAX_FOV:
         raise ValueError(

@@ -35,10 +35,10 @@ from twin.view.scene_picture import ObjectState
 KEYS_DRIVER, SCRIPTED_DRIVER = "keys W A S D", "scripted driver"
 
 _PER_KIND = 4  # obstacles of each kind that may be added to those of scene.toml
-_REACH = 25.0  # [m] from the route, up to which convex parts block a robot that is driven by keys
+_REACH = 25.0  # [m] convex parts up to this distance from the route block a robot that is driven by keys
 _LONG = 1e6  # [s] time limit of a drive by keys
 _MAX_LAG = 0.5  # [s] largest lag behind real time that is caught up; the rest is dropped
-_STATION_STEP = 0.1  # [m] between the stations that `station_and_lateral` tries
+_STATION_STEP = 0.1  # [m] spacing of the stations that `station_and_lateral` tries
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,13 @@ class PlacedObstacles(EpisodeObstacles):
     """The obstacles that stand in the scene at present, taken from a pool with several of each kind."""
 
     def __init__(self, world: World, segment: RouteSegment, given: tuple[ObstacleConfig, ...]) -> None:
-        """`given`: obstacles of scene.toml, which stand from the beginning."""
+        """`given` are the obstacles of scene.toml, which are in the scene from the beginning."""
         super().__init__((), world, segment)
         self._world = world
         named = tuple(replace(one, name=one.name or f"{one.kind}_{k}") for k, one in enumerate(given))
         spare: list[ObstacleConfig] = []
         for kind in OBSTACLE_KINDS:
-            # scene.toml may have obstacles of an earlier page.
+            # The user may have copied obstacles that an earlier session added, with their names, to scene.toml.
             numbered = (f"added_{kind}_{k}" for k in range(_PER_KIND + len(named)))
             free = [name for name in numbered if all(name != one.name for one in named)]
             spare += [ObstacleConfig(name, kind, route=segment.route) for name in free[:_PER_KIND]]
@@ -287,7 +287,7 @@ class Driving:
         self._running.clear()
 
     def reset(self) -> None:
-        """Starts a new episode. Raises InputError, and pauses, if the robot cannot start, as on an obstacle."""
+        """Starts a new episode. If the robot cannot start, for example on an obstacle, pauses and raises InputError."""
         with self._lock:
             environment, self._step = self.environment, None
             try:

@@ -53,7 +53,7 @@ class Layer:
 
 
 def scene_layers(scene: viser.SceneApi, twin: Twin, field: BakedField) -> list[Layer]:
-    """The layers that a built scene has; a damaged one is an error when it is shown. `field` is for the trust map."""
+    """The layers of a built scene. A damaged layer raises an error when it is shown. `field` is for the trust map."""
     cameras = twin.cameras()
     out = [Layer(FILMED_CAMERAS, "click one to see its frame", lambda path: _frustums(scene, path, cameras))]
     mesh = twin.scene.stage("mesh")
@@ -119,7 +119,7 @@ def clicked_frame(cameras: Cameras, origin: Array, direction: Array) -> int | No
 
 
 def _visual_mesh(scene: viser.SceneApi, path: str, twin: Twin) -> viser.SceneNodeHandle:
-    import trimesh  # slow to import, as other imports within the functions of this file
+    import trimesh  # slow to import, like the other modules that functions of this file import
 
     mesh = load_arrays(require_stage(twin.scene, "mesh") / "visual.npz")
     linear = (255.0 * (mesh["colors"] / 255.0) ** _GAMMA + 0.5).astype(np.uint8)  # glTF stores linear colors

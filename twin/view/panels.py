@@ -155,7 +155,7 @@ def slider_lighting(field: BakedField, value: float) -> EpisodeLighting:
 # ---- film
 
 _TURNED = 0.02  # [rad] a larger turn of a page's camera, or a movement by more than MOVED, ends the comparison
-_ECHO_TIME = 1.0  # [s] after the server sets a camera pose, in which movements that a page reports are ignored
+_ECHO_TIME = 1.0  # [s] movements that a page reports are ignored for this time after the server sets a camera pose
 _FRAME_CACHE = 4
 
 
@@ -269,7 +269,7 @@ class PathPanel:
 
     def __init__(self, viewer: Viewer) -> None:
         self._viewer, root = viewer, viewer.twin.scene.root
-        self._root = Path.cwd() if is_cached(root) else root  # for results; a pack's cache may be deleted
+        self._root = Path.cwd() if is_cached(root) else root  # not the cache of a pack, which may be deleted
         self._keys: list[tuple[Array, float, EpisodeLighting]] = []
         self.nodes: list[viser.SceneNodeHandle] = []
         """The key views and the path between them, as the browser draws them."""
@@ -363,7 +363,7 @@ class PathPanel:
             threading.Thread(target=self._fly_along, args=(client, path), daemon=True).start()
 
     def _fly_along(self, client: viser.ClientHandle, path: CameraPath) -> None:
-        """Ends with the lighting from before, unless another was chosen in flight, which ends the flight."""
+        """Flies along a path, then restores the lighting. If the user chooses another lighting, the flight ends."""
         viewer = self._viewer
         before = shown = viewer.lighting
         began = time.monotonic()

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _CAMERA = "view"  # name of the free camera in the model
 _MAX_COMPOSITORS = (
-    8  # largest number that is kept: for coarse and fine pictures of four pages; making one takes seconds
+    8  # cached compositors: one for coarse and one for fine pictures of four pages; creating one takes seconds
 )
 
 
@@ -92,7 +92,7 @@ class ScenePicture:
             self._compositors.clear()
 
     def render(self, camera: FreeCamera, lighting: EpisodeLighting, objects: ObjectState | None = None) -> Rendering:
-        """Renders one picture, with the lighting's fog; `objects` need a principal point in the image center."""
+        """Renders one picture, with the lighting's fog. For `objects`, the principal point must be the image center."""
         with self._lock:
             if objects is None or self._model is None:
                 view = Viewpoints.of(camera.camera_to_world, camera.intrinsics, camera.size)

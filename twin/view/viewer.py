@@ -55,9 +55,9 @@ class Viewer:
         self._chase: ChaseCamera | None = None
         self._lock = threading.RLock()
         self._jobs = ThreadPoolExecutor(1, thread_name_prefix="jobs")
-        self._child: subprocess.Popen[str] | None = None  # of the running job
+        self._child: subprocess.Popen[str] | None = None  # the running job's process
         self._first = self.cameras.camera_to_world[0]
-        camera = self.server.initial_camera  # that of the first filmed frame
+        camera = self.server.initial_camera  # starts at the first filmed frame
         camera.position = self._first[:3, 3]
         camera.look_at = self._first[:3, 3] + 4.0 * self._first[:3, 2]
         camera.up = (0.0, 0.0, 1.0)
@@ -168,7 +168,7 @@ class Viewer:
     def close(self) -> None:
         self.closed.set()
         if self._child is not None:
-            self._child.terminate()  # the process would wait for the job
+            self._child.terminate()  # otherwise, this process would wait for the job
         self.loop.close()
         if self.driving is not None:
             self.driving.close()

@@ -1,9 +1,9 @@
 """Multi-resolution hash encoding (Müller et al. 2022, section 3): forward and backward pass, and optimizer.
 
 *Grid position*: see `kernels/space.py`. *Level*: one of several grids of vertices, from coarse to fine. *Table*:
-features of all levels, equally many rows each, `FEATURES` floats per row. A level with no more vertices than rows is
-stored densely, others are hashed. On a CPU, the trainer launches the backward pass once per level, so that the
-sums of each level are added in a fixed order.
+features of all levels, with the same number of rows for each, `FEATURES` floats per row. A level with no more vertices
+than rows is stored densely, others are hashed. On a CPU, the trainer launches the backward pass once per level, so that
+the sums of each level are added in a fixed order.
 """
 
 # Warp evaluates annotations, so they contain calls, which mypy does not accept.
