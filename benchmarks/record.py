@@ -104,7 +104,7 @@ def _reason_to_keep(path: Path, record: dict[str, Any]) -> str:
     try:
         old = read_json(path)
     except InputError:
-        return "is no record of figures"
+        return "is not a record of figures"
     gone = lost(old, _finite(record))
     if not gone:
         return ""

@@ -303,7 +303,7 @@ def test_a_clock_that_was_set_back(tmp_path: Path, capsys: pytest.CaptureFixture
     ]
     bag = write(tmp_path / "recorder", [camera_info(PINHOLE), *both], mcap, in_order=False)
     with pytest.raises(
-        InputError, match=r"/camera/image: the recorder's clock was set back by about (29\d|300) s.*anew"
+        InputError, match=r"/camera/image: the recorder's clock was set back by about (29\d|300) s.*again"
     ):
         read_contents(bag)
 
@@ -437,7 +437,7 @@ def test_a_topic_of_a_video_is_refused(tmp_path: Path) -> None:
     from filmed_wall import film
 
     film(tmp_path / "day.mp4", views(SHIFTS[:5]))
-    refused(tmp_path, SourceConfig(path="day.mp4", topic="/camera"), "topic = '/camera', but this is no bag")
+    refused(tmp_path, SourceConfig(path="day.mp4", topic="/camera"), "topic = '/camera', but this is not a bag")
     with pytest.raises(InputError, match=re.escape("none of the films is a bag")):
         from twin.new import new_scene
 

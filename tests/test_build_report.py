@@ -266,9 +266,9 @@ def test_the_headline_tells_contacts_on_branches_from_those_on_the_route() -> No
 
 def test_no_drive_says_why(scene: SceneDir) -> None:
     report = changed("review.follower", None)
-    report["review"]["not_applicable"] = "this is no drive"
-    assert follower_verdict(report).text == "No robot was driven here: this is no drive."
-    assert "Does not apply here: this is no drive." in read(page(scene, report)).text
+    report["review"]["not_applicable"] = "this is not a drive"
+    assert follower_verdict(report).text == "No robot was driven here: this is not a drive."
+    assert "Does not apply here: this is not a drive." in read(page(scene, report)).text
 
 
 CAUTIONS: list[tuple[str, str, Any, str]] = [
@@ -535,7 +535,7 @@ def test_the_page_says_what_to_do_next_in_commands_that_parse(scene: SceneDir) -
         VERBS[verb].define(parser)
         parser.parse_args(arguments)
     assert [line.split()[1] for line in commands] == ["view", "align", "build", "train", "validate"]
-    without = changed("review.not_applicable", "this is no drive")
+    without = changed("review.not_applicable", "this is not a drive")
     assert [line.split()[1] for line in next_commands(odd, without)] == ["view", "export"]
 
 

@@ -87,11 +87,11 @@ def test_a_failure_keeps_what_was_built(tmp_path, capsys, keep):
     assert (root / "build/1_capture/stamp.json").read_text() == before
 
 
-# ---- paths that are no files
+# ---- paths that are not files
 
 
 def _special(folder, what):
-    """A path below a folder that is no regular file."""
+    """A path below a folder that is not a regular file."""
     path = folder / "odd"
     if what == "pipe":
         os.mkfifo(path)

@@ -476,7 +476,7 @@ def test_the_verb_writes_all_files_and_prints_a_summary(tmp_path: Path, capsys: 
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["nowhere"], "is no folder"),
+        (["nowhere"], "is not a folder"),
         (["road", "--real", "none.csv"], "none.csv does not exist"),
         (["road", "--seed", "-1"], "--seed -1: expected 0 or more"),
         (["empty"], "drive the policies in the twin first"),

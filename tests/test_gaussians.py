@@ -158,7 +158,7 @@ def test_the_skys_color_on_a_crown_is_found() -> None:
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda b: b"solid" + b, "is no ply file"),
+        (lambda b: b"solid" + b, "is not a ply file"),
         (lambda b: b[:3000], "is cut off"),
         (lambda b: b.replace(b"binary_little_endian", b"ascii"), "has another format"),
         (lambda b: b.replace(b"float opacity", b"float opakity"), "lacks ['opacity']"),

@@ -72,7 +72,7 @@ def test_other_files_are_kept_and_non_finite_figures_become_null(scripts, tmp_pa
     file.write_text("my notes")
     assert save(file, {"a": 1.0}) == 2
     err = capsys.readouterr().err
-    assert "is no record of figures" in err and err.count("\n") == 1 and file.read_text() == "my notes"
+    assert "is not a record of figures" in err and err.count("\n") == 1 and file.read_text() == "my notes"
     other = tmp_path / "other.json"
     write_so_far(other, {"a": 1.0})
     assert not other.exists()

@@ -90,7 +90,7 @@ def test_a_bag_of_an_episode_is_judged_as_the_episode_was(place, tmp_path, name,
     assert (cell.trials, cell.successes) == (1, int(cause == "goal"))
     figures = json.loads((scene / "trials" / "monday" / "trial.json").read_text())
     assert figures["policy"] == {"commands": steps, "same": 1.0, "v_rms": 0.0, "yaw_rate_rms": 0.0}
-    # The replay settles on the ground anew, and pictures are rendered from a robot at rest.
+    # The replay settles on the ground again, and pictures are rendered from a robot at rest.
     assert figures["replay"]["end_m"] < 0.02 and abs(figures["replay"]["end_deg"]) < 1.0
     assert figures["pictures"]["psnr_median"] > 33.0 and figures["pictures"]["lighting"] == "day"
     film = video_info(scene / "trials" / "monday" / "trial.mp4")

@@ -86,7 +86,7 @@ def test_gpu_physics_agrees_with_mujoco(scene, device_name):
         np.testing.assert_allclose(one.data.mocap_pos, other.data.mocap_pos, atol=1e-9)
         assert one.speed > 0.1
     assert all(task.progress > 0.1 for task in device.tasks)
-    # One begins anew while it moves, and stands.
+    # One episode is reset while its robot moves; it then stands.
     for envs in (plain, device):
         envs.begin([0])
         envs.begin([])

@@ -850,7 +850,7 @@ def test_the_page_in_a_browser(scene):
             client = next(iter(viewer.server.get_clients().values()))
 
             def shows_the_field() -> bool:
-                # The camera is taken anew each time, since the browser may send it late.
+                # The camera is read each time, since the browser may send it late.
                 shot, seen = page.shot(client), (client.camera.image_width, client.camera.image_height)
                 camera = FreeCamera.of_fov(shot.camera_to_world, shot.fov, seen)
                 own = to_uint8(viewer.picture.render(camera, shot.lighting, shot.objects).rgb[0])

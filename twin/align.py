@@ -200,9 +200,9 @@ def _fitted(identified: dict[str, tuple[Any, Any]]) -> list[str]:
 def command(options: argparse.Namespace) -> None:
     """Runs `twin align` with the options parsed by `twin.commands`."""
     if options.camera and not is_bag(options.log):
-        raise InputError(f"{options.log} is no bag; leave out --camera, which is only for bags")
+        raise InputError(f"{options.log} is not a bag; leave out --camera, which is only for bags")
     if options.topic and not is_bag(options.log):
-        raise InputError(f"--topic {options.topic}: {options.log} is no bag; leave it out")
+        raise InputError(f"--topic {options.topic}: {options.log} is not a bag; leave it out")
     if options.camera or options.log.suffix.lower() in _FILM_SUFFIXES:
         if options.out or options.level:
             raise InputError(f"{options.log} is taken as a film; leave out --out and --level, which are for logs")

@@ -39,7 +39,7 @@ def forecast(root: Path, real: Sequence[Path] = (), seed: int = 0) -> Forecast:
     """
     scene = SceneDir(root)
     if not root.is_dir():
-        raise InputError(f"{root} is no folder; give the scene's folder, such as scenes/demo")
+        raise InputError(f"{root} is not a folder; give the scene's folder, such as scenes/demo")
     twin = tally(read_trials(scene.episodes_csv))
     cells = read_results(real, twin)
     trained = {

@@ -144,7 +144,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     refused.
     """
     if not is_file(path):
-        raise InputError(f"{path} is no file; {_NOT_A_PACK}")
+        raise InputError(f"{path} is not a file; {_NOT_A_PACK}")
     with wrap_read_errors(path, _NOT_A_PACK), zipfile.ZipFile(path) as archive:
         return _checked_manifest(archive, path)
 

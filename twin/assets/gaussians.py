@@ -130,7 +130,7 @@ def read_ply(path: Path) -> Gaussians:
     cure = "expected a 3D Gaussian splat .ply (binary, little endian), as 3DGS trainers write"
     head, found, _ = content[:_MAX_HEAD].partition(b"end_header\n")
     if not found or not head.startswith(b"ply"):
-        raise InputError(f"{path} is no ply file; {cure}")
+        raise InputError(f"{path} is not a ply file; {cure}")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     if ["format", "binary_little_endian", "1.0"] not in lines:
         raise InputError(f"{path} has another format; {cure}")

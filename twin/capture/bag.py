@@ -107,7 +107,7 @@ class Bag:
                 if back > _SET_BACK:
                     raise InputError(
                         f"{self._path}: {topic}: the recorder's clock was set back by about {back * 1e-9:.0f} s, so "
-                        "parts of the recording have the same times; record it anew after the clock has been set"
+                        "parts of the recording have the same times; record it again after the clock has been set"
                     )
 
     def on(self, *topics: str) -> list[Any]:
@@ -115,7 +115,7 @@ class Bag:
 
 
 @contextmanager
-def open_bag(path: Path, cure: str = "record it anew") -> Iterator[Bag]:
+def open_bag(path: Path, cure: str = "record it again") -> Iterator[Bag]:
     """Opens a bag.
 
     Raises InputError if rosbags is not installed, if the path is not a bag, or if the bag is damaged. The message on a

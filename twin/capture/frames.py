@@ -93,7 +93,7 @@ def source_files(path: Path, kind: str, images: Path | None = None) -> list[Path
     """All files that are read for a source, except the masks given in `scene.toml`.
 
     If an image set is damaged, only the files that can be determined are returned. `kind` may be auto; `images` is the
-    separate image folder of a posed set. Raises InputError if `path` is no source.
+    separate image folder of a posed set. Raises InputError if `path` is not a source.
     """
     kind = detect_kind(path) if kind == "auto" else kind
     if kind == "transforms":
@@ -160,7 +160,7 @@ def _read_source(
     path = root / source.path
     kind = detect_kind(path) if source.kind == "auto" else source.kind
     if source.topic and kind != "bag":
-        raise InputError(f"{path}: topic = {source.topic!r}, but this is no bag ({kind}); remove the topic")
+        raise InputError(f"{path}: topic = {source.topic!r}, but this is not a bag ({kind}); remove the topic")
     masks = root / source.mask if source.mask else None
     cure = "give as mask an image or a folder of images, 0 = ignore"
     if masks and is_folder(masks, cure) and not any(masks.iterdir()):

@@ -341,7 +341,7 @@ def posed_model(matcher: Matcher, frames: NDArray[np.int64], poses: Array) -> py
 
 
 def triangulated(matcher: Matcher, model: pycolmap.Reconstruction, work: Path) -> pycolmap.Reconstruction:
-    """The model with points triangulated anew from all verified matches, under its poses."""
+    """The model with points triangulated again from all verified matches, under its poses."""
     options, folder = pycolmap.IncrementalPipelineOptions(), fresh_folder(work, "triangulated")
     options.num_threads, options.random_seed = matcher.threads, matcher.seed
     return pycolmap.triangulate_points(model, matcher.database, matcher.images, folder, True, options, False)

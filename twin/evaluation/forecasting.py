@@ -154,11 +154,11 @@ class Forecast:
         path = folder / _FILE
         if not exists(path):
             raise InputError(f"{path} does not exist; run twin forecast SCENE")
-        with wrap_read_errors(path, "run twin forecast SCENE anew"):
+        with wrap_read_errors(path, "run twin forecast SCENE again"):
             try:
                 return parse_table(Forecast, _without_nulls(read_json(path)), str(path))
             except InputError as error:
-                raise InputError(f"{error}; run twin forecast SCENE anew") from None
+                raise InputError(f"{error}; run twin forecast SCENE again") from None
 
 
 def _without_nulls(value: Any) -> Any:

@@ -82,7 +82,7 @@ def validated_digests(root: Path) -> dict[str, Any]:
     record = SceneDir(root).validation / "validated.json"
     if not record.exists():
         return {}
-    with wrap_read_errors(record, f"move {record.parent} away and validate anew"):
+    with wrap_read_errors(record, f"move {record.parent} away and validate again"):
         return dict(read_json(record)["policies"])
 
 
@@ -102,7 +102,7 @@ def read_episodes(folder: Path) -> tuple[Indices, Indices]:
     """
     path = folder / "episodes.csv"
     text = read_text(path)
-    with wrap_read_errors(path, "delete its last lines, or train anew under another name"):
+    with wrap_read_errors(path, "delete its last lines, or train again under another name"):
         # Tables of older runs have no column start_m; all their episodes started at the beginning.
         whole = [row for row in csv.DictReader(io.StringIO(text)) if float(row.get("start_m") or 0.0) == 0.0]
         rows = [(int(row["step"]), int(row["success"])) for row in whole]

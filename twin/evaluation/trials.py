@@ -204,7 +204,7 @@ def read_trials(path: Path) -> list[Trial]:
         if row["success"] != str(int(row["cause"] == "goal")):
             raise InputError(
                 f"{where}: success = {row['success']!r} with cause {row['cause']!r}; expected 1 where the cause is "
-                f"goal, else 0; run {_VALIDATE_COMMAND} anew"
+                f"goal, else 0; run {_VALIDATE_COMMAND} again"
             )
         trust = _parse_float(where, row, "trust") if row["trust"] else None
         key = row["policy"], row["task"], row["lighting"], _parse_int(where, row, "seed")

@@ -218,7 +218,7 @@ def _from_folder(folder: Path) -> Policy:
     try:
         weights = safetensors_load(blob)
     except SafetensorError as error:
-        raise InputError(f"{path} is no safetensors file: {error}") from None
+        raise InputError(f"{path} is not a safetensors file: {error}") from None
     for name, shape in architecture.shapes().items():
         found = weights.get(name)
         if found is None or found.shape != shape or found.dtype != np.float32 or not np.isfinite(found).all():

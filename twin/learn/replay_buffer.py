@@ -197,7 +197,7 @@ class FrameReplayBuffer(ReplayBuffer):
             bytes_needed = int(np.prod(shape))
             if file.exists() and file.stat().st_size != bytes_needed:
                 raise InputError(
-                    f"{file} has {file.stat().st_size} bytes; expected {bytes_needed}; train anew under another name"
+                    f"{file} has {file.stat().st_size} bytes; expected {bytes_needed}; train again under another name"
                 )
             allocate(file, bytes_needed)  # a full disk causes an error now, not a SIGBUS hours later
             self.frames = np.memmap(file, np.uint8, "r+", shape=shape)

@@ -241,7 +241,7 @@ def has_state(folder: Path) -> bool:
 
 def saved_steps(folder: Path) -> int:
     """Number of control steps done when the state was saved."""
-    with wrap_read_errors(folder / _STATE, "train anew under another name"):
+    with wrap_read_errors(folder / _STATE, "train again under another name"):
         return int(read_json(folder / _STATE)["steps"])
 
 
@@ -251,7 +251,7 @@ def load_state(folder: Path, model: PixelSAC) -> dict[str, Any]:
     Raises InputError: files are missing or damaged, or belong to another network.
     """
     assert isinstance(model.replay_buffer, FrameReplayBuffer)
-    with wrap_read_errors(folder, "train anew under another name"):
+    with wrap_read_errors(folder, "train again under another name"):
         head = read_json(folder / _STATE)
         state = folder / Path(head["folder"]).name
         tensors = load_file(regular_file(state / _TENSORS))

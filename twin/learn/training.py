@@ -145,7 +145,7 @@ def train(
     if resume:
         check_same(folder, settings)
         if not pictures.exists():
-            raise InputError(f"{pictures} is missing; train anew under another name")
+            raise InputError(f"{pictures} is missing; train again under another name")
     else:
         prepare_folder(folder)
         for stale in (folder / "episodes.csv", folder / "log.csv", pictures):
@@ -294,7 +294,7 @@ def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
 
 def check_same(folder: Path, settings: dict[str, Any]) -> None:
     """Raises InputError if a run has other settings, apart from `steps`, `success` and `device`."""
-    with wrap_read_errors(folder / "config.json", "train anew under another name"):
+    with wrap_read_errors(folder / "config.json", "train again under another name"):
         previous = dict(read_json(folder / "config.json"))
         previous["road"]
     new = [name for name in settings if name not in previous]

@@ -52,7 +52,7 @@ def draw(number: int, length: float = 0.0, side_roads: bool = False) -> PlaceSpe
     """The description of the place with a number, always the same.
 
     If its line is shorter than `length` [m], it is lengthened to that. Section, materials, amounts and camera are then
-    those of the place, but what stands beside the road is placed anew. With `side_roads`, the place has side roads to
+    those of the place, but other objects stand beside the road. With `side_roads`, the place has side roads to
     drive into, where there is room.
 
     Raises:

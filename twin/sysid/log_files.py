@@ -70,11 +70,11 @@ def _read_csv(path: Path) -> dict[str, Array]:
         head, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row] or [[]]
         values = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
     except (ValueError, csv.Error) as error:
-        raise InputError(f"{path}: not a table of numbers under one line of names: {error}; export it anew") from None
+        raise InputError(f"{path}: not a table of numbers under one line of names: {error}; export it again") from None
     if not rows:
-        raise InputError(f"{path}: no row of numbers; expected one per instant, under a line of names; export it anew")
+        raise InputError(f"{path}: no row of numbers; expected one per instant, under a line of names; export it again")
     if values.ndim != 2 or values.shape[1] != len(head):
-        raise InputError(f"{path}: {len(head)} names in the first line, but rows of another length; export it anew")
+        raise InputError(f"{path}: {len(head)} names in the first line, but rows of another length; export it again")
     names = [name.strip() for name in head]
     twice = [name for name, count in Counter(names).items() if name and count > 1]
     if twice:
@@ -87,7 +87,7 @@ def _read_csv(path: Path) -> dict[str, Array]:
 def read_npz(path: Path) -> dict[str, Array]:
     """Numeric arrays of an .npz file by name."""
     arrays = load_arrays(path, _MAX_BYTES)
-    with wrap_read_errors(path, "expected plain arrays of numbers; save it anew with numpy.savez"):
+    with wrap_read_errors(path, "expected plain arrays of numbers; save it again with numpy.savez"):
         return {name: np.asarray(values, np.float64) for name, values in arrays.items()}
 
 
@@ -144,7 +144,7 @@ def read_bag(path: Path, filmed: FilmedPoses | None = None, poses: str = "") -> 
         InputError: rosbags is not installed, the bag is unreadable, a kind of message is missing, or the poses come
             from the wheels and `filmed` is None.
     """
-    with open_bag(path, "record it anew or give a .csv") as bag:
+    with open_bag(path, "record it again or give a .csv") as bag:
         uses = _uses(bag.connections, path, filmed, poses)
         rows: dict[tuple[str, str], list[tuple[float, ...]]] = {use: [] for use in uses}
         lost: Counter[str] = Counter()

@@ -242,7 +242,7 @@ class Pilot:
             self.stack = np.repeat(newest[None], self.policy.stack, 0)
             self._due = stamp
         # Pictures are due on a grid of control steps, since the camera's rate need not be a multiple of the policy's.
-        # After a missed step, the grid begins anew.
+        # After a missed step, the grid starts again.
         self._due += step
         if self._due <= stamp:
             self._due = stamp + step
