@@ -14,13 +14,15 @@ a frame; then only the right half is scored.
 import argparse
 import io
 import time
+from unittest import mock
 
 import mujoco
 import numpy as np
 import trimesh
 
+from twin.assets import gaussians
 from twin.assets.gaussians import FAR, VIEWS, WIDTH, gaussians_by_lighting, views_by_lighting
-from twin.assets.views import render_views
+from twin.assets.views import Views, render_views
 from twin.env.mujoco_renderer import RayCaster, mujoco_rays
 from twin.export import gltf
 from twin.files import load_arrays
@@ -142,27 +144,26 @@ def _averaged(image: np.ndarray, k: int) -> np.ndarray:
 
 
 def score_splats(twin: Twin, lighting: str, size: tuple[int, int], frames: int) -> None:
-    """Prints PSNR and processor time of the splats and of the field."""
+    """Prints PSNR and processor time of the splats and of the field; and the PSNR if sky on surfaces were kept."""
     field, cameras = twin.field(), twin.cameras()
-    splats = gaussians_by_lighting(views_by_lighting(field, cameras, [lighting]))[lighting]
-    spec = mujoco.MjSpec()
-    spec.worldbody.add_camera(name="eye")
-    spec.worldbody.add_geom(size=[0.01] * 3, pos=[0, 0, -1000])
-    spec.stat.extent = 20.0  # so MuJoCo draws up to 1 km, as in the scene
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    caster = RayCaster(model, data, cam_res=size, **splats.render_settings())
-    scores = {"splats": [], "field": []}
-    seconds = {"splats": [], "field": []}
+    with mock.patch.object(gaussians, "sky_on_surfaces", lambda views: np.zeros(views[0].depth.shape, bool)):
+        kept = views_by_lighting(field, cameras, [lighting])
+    pruned = views_by_lighting(field, cameras, [lighting])
+    moved = np.count_nonzero(kept[lighting].depth != pruned[lighting].depth)
+    near = np.count_nonzero((kept[lighting].depth > 0) & (kept[lighting].depth < FAR))
+    print(f"{lighting}: {moved} of {near} pixels on surfaces have the sky's color and become background")
+    casters = {"splats": _caster(pruned, lighting, size), "splats with sky on surfaces": _caster(kept, lighting, size)}
+    scores: dict[str, list[float]] = {name: [] for name in (*casters, "field")}
+    seconds: dict[str, list[float]] = {name: [] for name in (*casters, "field")}
     for i, pose, rays, photo in list(held_out_frames(twin, lighting, size))[:frames]:
-        start = time.process_time()
-        caster.set_rays(mujoco_rays(rays))
-        camera = opencv_to_mujoco(pose)
-        caster.set_poses(cam_xpos=camera[None, :3, 3], cam_xmat=camera[None, :3, :3])
-        rgb, _ = caster.cast()
-        seconds["splats"].append(time.process_time() - start)
-        scores["splats"].append(psnr(rgb.reshape(photo.shape) / 255.0, photo / 255.0))
+        for name, caster in casters.items():
+            start = time.process_time()
+            caster.set_rays(mujoco_rays(rays))
+            camera = opencv_to_mujoco(pose)
+            caster.set_poses(cam_xpos=camera[None, :3, 3], cam_xmat=camera[None, :3, :3])
+            rgb, _ = caster.cast()
+            seconds[name].append(time.process_time() - start)
+            scores[name].append(psnr(rgb.reshape(photo.shape) / 255.0, photo / 255.0))
         start = time.process_time()
         shown = field.render(cameras.select(np.array([i])), lighting, size)
         seconds["field"].append(time.process_time() - start)
@@ -172,6 +173,18 @@ def score_splats(twin: Twin, lighting: str, size: tuple[int, int], frames: int) 
             f"{lighting}: {name}: {np.mean(values):.2f} dB over {len(values)} held-out frames of {size[0]}×{size[1]}, "
             f"{np.median(seconds[name]):.2f} s of processor time each"
         )
+
+
+def _caster(views: dict[str, Views], lighting: str, size: tuple[int, int]) -> RayCaster:
+    """A ray caster that shows the splats of views and nothing else."""
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_camera(name="eye")
+    spec.worldbody.add_geom(size=[0.01] * 3, pos=[0, 0, -1000])
+    spec.stat.extent = 20.0  # so MuJoCo draws up to 1 km, as in the scene
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return RayCaster(model, data, cam_res=size, **gaussians_by_lighting(views)[lighting].render_settings())
 
 
 def main() -> None:

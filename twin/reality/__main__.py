@@ -90,8 +90,8 @@ def film(
         raise InputError("--side-roads with --traffic: walkers and cars keep to the main road; leave one of them out")
     spec = draw(number, length, side_roads) if number else None
     sides = _filmed_sides(spec, plan) if spec and side_roads else []
-    # The folder of the truth exists from the start, so that filming that was stopped can start again. What an older film
-    # left does not: new films with old settings would be another scene.
+    # The folder of the truth exists from the start, so that stopped filming can start again. What an older film left is
+    # deleted: new films with old settings would be another scene.
     (out / "truth").mkdir(parents=True, exist_ok=True)
     (out / "input").mkdir(exist_ok=True)
     for old in (out / "scene.toml", out / "truth" / "truth.json", out / "truth" / "truth.npz"):
