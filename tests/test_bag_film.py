@@ -21,7 +21,7 @@ from bag_of_film import (
     write_ros1,
 )
 from filmed_wall import HEIGHT, WIDTH, captured, refused, views
-from picture_bag import MESSAGES, TYPES, Recorded
+from picture_bag import MESSAGES, TYPES, Recorded, command
 from rosbags.rosbag2 import CompressionMode
 from scipy.spatial.transform import Rotation
 from test_metric import _path, _points, _similarity, _world
@@ -250,7 +250,8 @@ def test_new_takes_what_the_bag_has_and_says_so(tmp_path: Path, capsys: pytest.C
         "camera on the robot: 0.700 m above the ground, 0.300 m ahead, pitch 5.7°, by /tf_static",
     ):
         assert words in text, text
-    assert "fill in [metric]" not in text
+    assert "fill in [metric]" not in text and "metric scale: camera_height, gps and odometry" in text
+    assert "as a log for twin align it lacks commands (geometry_msgs/msg/Twist or" in text
     config = load_config(root / "scene.toml")
     assert config.source[0].topic == "/camera/image" and config.source[0].path == "input/drive"
     assert config.metric.camera_height == pytest.approx(0.7) and config.metric.gps and config.metric.odometry
@@ -259,6 +260,23 @@ def test_new_takes_what_the_bag_has_and_says_so(tmp_path: Path, capsys: pytest.C
     assert robot["camera_pitch"] == pytest.approx(np.degrees(0.1), abs=1e-3)
     assert new_main([str(tmp_path / "other"), str(bag), "--topic", "/rear/image"]) == 0
     assert load_config(tmp_path / "other/scene.toml").source[0].topic == "/rear/image"
+
+
+def test_new_says_whether_the_bag_is_also_a_log(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    moved = [command(1.0, 0.0, one.stamp) for one in whole() if one.topic == "/odom"]
+    for name, more, words in (
+        ("a", moved, "lacks wheels (sensor_msgs/msg/JointState)"),
+        ("b", [*moved, joints("/joints")], "also a log for twin align: commands /cmd_vel, wheels /joints, poses /odom"),
+    ):
+        bag = write(tmp_path / f"drive_{name}", [*whole(), *more])
+        assert new_main([str(tmp_path / f"scene_{name}"), str(bag)]) == 0
+        assert words in capsys.readouterr().err
+
+
+def joints(topic: str) -> Recorded:
+    none = np.zeros(0)
+    message = TYPES["sensor_msgs/msg/JointState"](MESSAGES.header(START), ["front_left_wheel_joint"], none, none, none)
+    return Recorded(topic, "sensor_msgs/msg/JointState", message, START)
 
 
 def test_new_names_a_set_clock_and_the_other_files_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -379,8 +379,9 @@ def test_headers_of_another_clock_are_replaced_by_times_of_recording(place, tmp_
 @pytest.mark.slow
 def test_the_played_robots_bag_has_what_its_pilot_saw(tmp_path, monkeypatch):
     """The pilot drives on JPEG pictures; the recorded commands are the policy's for the recorded pictures."""
+    from test_examples import example
+
     from twin.reality.recordings import write_robot_bag
-    from twin_policy import Limits, OnnxPolicy, Pilot
 
     weights = some_weights(SMALL)
     weights["mean.bias"][:] = np.arctanh(0.95)  # leaves the road soon
@@ -389,14 +390,9 @@ def test_the_played_robots_bag_has_what_its_pilot_saw(tmp_path, monkeypatch):
     assert row.cause in ("out_of_bounds", "collision") and row.policy == "left"
     found = read_trial(tmp_path / "bag")
     assert found.camera.size == (640, 360) and len(found.shutter) == len(found.commands) == row.steps + 15
-    now = 0
-    pilot = Pilot(OnnxPolicy(tmp_path / "left"), Limits(), None, lambda: now, lambda: now)
-    pilot.set_camera(found.camera)
-    given = []
-    for (stamp, picture), now in zip(found.pictures(found.shutter), found.arrival.tolist(), strict=True):  # noqa: B007
-        command = pilot.picture(picture, stamp)
-        given.append((command.v, command.yaw_rate))
-    np.testing.assert_array_equal(given, found.commands)
+    played = example("play_bag").play(tmp_path / "left", tmp_path / "bag")
+    np.testing.assert_array_equal([(command.v, command.yaw_rate) for _, command in played], found.commands)
+    assert [time for time, _ in played] == found.arrival.tolist()
     with pytest.raises(InputError, match="exists; give another --out"):
         write_robot_bag(tmp_path / "bag", None, "straight", "haze")
     monkeypatch.setattr("twin.reality.recordings.cv2.imencode", _interrupt)

@@ -527,7 +527,7 @@ def _reality(parser: argparse.ArgumentParser) -> None:
 
 
 VERBS = {
-    "new": Verb("start a scene folder from films or photos", _new, "twin.new"),
+    "new": Verb("start a scene folder from films, photos or bags", _new, "twin.new"),
     "build": Verb("turn a scene folder into a drivable twin, with a report and a review video", _build, "twin.build"),
     "relight": Verb("add a lighting to a built scene, from one photo", _relight, "twin.relight"),
     "align": Verb("fit the robot to a log of a real one, or its camera to a film", _align, "twin.align"),

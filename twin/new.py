@@ -107,7 +107,7 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
     bags: dict[Path, BagContents] = {}
     for k, film in enumerate(films):
         if not film.exists():
-            raise InputError(f"{film}: no such film; give the path of a video file or an image folder")
+            raise InputError(f"{film}: no such film; give the path of a video file, an image folder or a bag")
         if any(film.samefile(other) for other in films[:k]):
             raise InputError(f"{film} is given twice; each film is one lighting, so give it once")
         kind = detect_kind(film)
@@ -224,6 +224,11 @@ def _write_seat(path: Path, bag: BagContents) -> CameraSeat | None:
     return bag.seat
 
 
+def _short(way: float, needed: float) -> str:
+    """Note on a path [m] that is too short to determine the scale."""
+    return "" if way >= needed else f"; the scale needs {needed:.0f} m"
+
+
 def _taken(bag: BagContents) -> str:
     """Text that lists the data found in a bag."""
     rate = (len(bag.stamps) - 1) / max(bag.duration, 1e-9)
@@ -241,10 +246,11 @@ def _taken(bag: BagContents) -> str:
     if "fixes" in bag.topics:
         lines.append(
             f"  GPS: {bag.topics['fixes']}, {np.isfinite(bag.fixes[:, :2]).all(1).sum()} fixes, "
-            f"up to {_fix_way(bag):.1f} m from the first"
+            f"up to {_fix_way(bag):.1f} m from the first" + _short(_fix_way(bag), _MIN_FIX_WAY)
         )
     if "odometry" in bag.topics:
-        lines.append(f"  odometry: {bag.topics['odometry']}, a path of {_odometry_way(bag):.1f} m")
+        way = _odometry_way(bag)
+        lines.append(f"  odometry: {bag.topics['odometry']}, a path of {way:.1f} m{_short(way, _MIN_ODOMETRY_WAY)}")
     if bag.seat:
         ground = "" if bag.seat.ground_known else f" (base_link assumed {BASE_HEIGHT:.3f} m high, as on a Husky)"
         lines.append(
@@ -255,6 +261,7 @@ def _taken(bag: BagContents) -> str:
         static = bag.topics.get("transforms")
         why = f"its frame is not connected to base_link on {static}" if static else "no /tf_static"
         lines.append(f"  camera on the robot: not found, {why}")
+    lines.append(f"  {bag.log_note}")
     return "\n".join(lines)
 
 
@@ -366,7 +373,10 @@ def command(options: argparse.Namespace) -> None:
     """Runs `twin new` with the options parsed by `twin.commands`."""
     config = new_scene(options.scene, options.films, options.camera_height, options.topic or "")
     print(f"wrote {config}")
-    if not any(read_toml(config)["metric"].values()):
+    sources = [name for name, value in read_toml(config)["metric"].items() if value and "tolerance" not in name]
+    if sources:
+        print(f"metric scale: {join_names(sources)}")
+    else:
         print("fill in [metric] there: the build needs a metric scale")
     print(f"next: twin build {options.scene}")
 

@@ -33,6 +33,7 @@ from twin.capture.bag import (
     choose_topics,
     fix_of,
     header_time,
+    is_from_wheels,
     message_times,
     messages_by_topic,
     open_bag,
@@ -43,7 +44,7 @@ from twin.capture.camera_models import Lens, checked_lens, same_aspect
 from twin.capture.capture_data import nearest_longitudes
 from twin.capture.decoding import FilmStatistics
 from twin.capture.video import Film, FilmTiming
-from twin.errors import InputError
+from twin.errors import InputError, join_names
 from twin.robot import BASE_HEIGHT, CAMERA_AHEAD
 from twin.types import Array, Image
 
@@ -103,6 +104,8 @@ class BagContents:
     odometry: Array
     """Positions of the lens [m], shape (p, 3)."""
     seat: CameraSeat | None
+    log_note: str
+    """Topics by which the bag is a log for `twin align`, or those that it lacks."""
 
     @property
     def duration(self) -> float:
@@ -170,6 +173,7 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
                 rows[kind].times.extend((header_time(message), recorded))
                 rows[kind].values.extend(_values(kind, message))
         recorded = messages_by_topic(bag.connections, (RAW, COMPRESSED))[topics["pictures"]]
+        log_note = _log_note(bag.connections)
         others = tuple(name for name in picture_topics(bag.connections) if name != topics["pictures"])
     if not rows["pictures"].times:
         raise InputError(f"{path}: no message on {topics['pictures']}; record it")
@@ -190,8 +194,22 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
     encoding = getattr(picture, "encoding", None) or str(getattr(first["pictures"], "format", "")) or "compressed"
     return BagContents(
         *(path, topics, others, encoding, (width, height), recorded, stamps, position, lens, note, fix_times, fixes),
-        *(pose_times, _lens_positions(poses, arm), _seat(camera_to_base, transforms)),
+        *(pose_times, _lens_positions(poses, arm), _seat(camera_to_base, transforms), log_note),
     )
+
+
+def _log_note(connections: list[Any]) -> str:
+    """Says by which topics a bag is a log for `twin align` (`twin.sysid.log_files`), or which kind it lacks."""
+    found = {kind: messages_by_topic(connections, TYPES[kind]) for kind in ("commands", "wheels", "poses")}
+    from_wheels = {name: count for name, count in found["poses"].items() if is_from_wheels(name)}
+    used = {"commands": found["commands"], "wheels": found["wheels"] or from_wheels}
+    lacking = [f"{kind} ({' or '.join(TYPES[kind])})" for kind, topics in used.items() if not topics]
+    if lacking:
+        return f"as a log for twin align it lacks {join_names(lacking)}"
+    used["poses"] = {name: count for name, count in found["poses"].items() if name not in from_wheels}
+    given = [f"{kind} {join_names(topics, most=3)}" for kind, topics in used.items() if topics]
+    poses = "" if used["poses"] else "; poses come from its film, once the scene is built"
+    return f"also a log for twin align: {', '.join(given)}{poses}"
 
 
 def _topics(connections: list[Any], path: Path, topic: str) -> dict[str, str]:

@@ -203,7 +203,10 @@ def load_policy(source: str | Path, trust: bool = False) -> Policy:
         raise InputError(f"{path}: expected a policy folder, an .onnx file or a stable-baselines3 .zip")
     if ":" in str(source):
         return _from_callable(str(source))
-    raise InputError(f"no policy {source}; expected a run's folder, an .onnx file or module:function")
+    raise InputError(
+        f"no policy {source}; expected a run's folder, an .onnx file or module:function; "
+        "twin unpack demo FOLDER gives a trained one, FOLDER/runs/first"
+    )
 
 
 def _from_folder(folder: Path) -> Policy:

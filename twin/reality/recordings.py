@@ -257,7 +257,8 @@ def write_robot_bag(
         try:
             onnx = OnnxPolicy(policy)
         except ValueError as error:
-            raise InputError(str(error)) from None
+            more = "" if Path(policy).exists() else "; twin unpack demo FOLDER gives a policy, FOLDER/runs/first"
+            raise InputError(f"{error}{more}") from None
         limits = onnx.speed, onnx.max_yaw_rate, onnx.timestep
     size = _WIDTH, round(_WIDTH * native_size()[1] / native_size()[0])
     test = RealTest(task_of_place(setup.place, task, *limits, road_length=setup.length), setup, size)

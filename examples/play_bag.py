@@ -1,0 +1,37 @@
+"""Plays a ROS bag to a policy and prints the commands that it would give to a robot. Needs neither a robot nor ROS.
+
+    pip install 'twin[ros]'
+    twin unpack demo theirs
+    twin reality bag --policy theirs/runs/first --task straight --lighting haze --out haze_1
+    python examples/play_bag.py theirs/runs/first haze_1
+
+The bag needs pictures and camera_info. Time is that of the recording, so old pictures stop the robot as on the road.
+"""
+
+import sys
+from pathlib import Path
+
+from twin.capture.bag import choose_camera_info, choose_pictures, header_time, open_bag, picture_of
+from twin_policy import Camera, Command, OnnxPolicy, Pilot
+
+
+def play(policy: Path, path: Path) -> list[tuple[int, Command]]:
+    """Time [ns] and command of every picture of a bag."""
+    now, commands = 0, []
+    pilot = Pilot(OnnxPolicy(policy), clock=lambda: now, steady=lambda: now)
+    with open_bag(path) as bag:
+        pictures = choose_pictures(bag.connections, path)
+        calibration = choose_camera_info(bag.connections, pictures)
+        if calibration is None:
+            raise SystemExit(f"{path}: no camera_info for {pictures}; record it")
+        for connection, now, message in bag.messages(bag.on(pictures, calibration)):
+            if connection.topic == calibration:
+                pilot.set_camera(Camera.from_info(message, rectified="rect" in pictures))
+            else:
+                commands.append((now, pilot.picture(picture_of(message), header_time(message))))
+    return commands
+
+
+if __name__ == "__main__":
+    for time, command in play(Path(sys.argv[1]), Path(sys.argv[2])):
+        print(f"{time / 1e9:.2f} s: {command.v:.2f} m/s, {command.yaw_rate:+.2f} rad/s {command.cause}")
