@@ -21,13 +21,14 @@ from typing import Any
 
 import motor_currents
 import numpy as np
+from acceptance import REAR_HEAVY
 from numpy.typing import NDArray
 from record import record_parser, save
 from scipy.optimize import least_squares
 
 from twin import runtime
 from twin.align import align_to_log, summary
-from twin.robot import REAR_HEAVY, HuskyParams
+from twin.robot import HuskyParams
 from twin.sysid.estimation import fit_with_scales, robust_loss
 from twin.sysid.identification import identify
 from twin.sysid.kinematics import POSE_KINDS, IcrModel, Prediction, integrate, residuals

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).parents[1] / "ros2" / "twin_policy"))
 
 from twin.build import build
-from twin.capture.decoding import FilmStatistics, decode, upright
+from twin.capture.video import FilmStatistics, decode, upright
 from twin.errors import InputError
 from twin.files import digest_file, remove, toml_string, write_text
 from twin.geometry.cameras import Cameras

@@ -6,7 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from env_workers import standard_tasks
+from numpy.typing import NDArray
 from sections import run_worker
 
 
@@ -43,6 +45,14 @@ def memory(scene: Path, quick: bool) -> dict[str, Any]:
     return worker("memory", scene, 4 if quick else 64, cores=2)
 
 
+class BlindDriver:
+    """Drives straight at full speed, regardless of the images."""
+
+    def __call__(self, environment: Any, step: Any) -> NDArray[np.float64]:
+        spec = environment.action_spec()
+        return np.array([0.0]) if spec.shape == (1,) else np.array([spec.maximum[0], 0.0])
+
+
 def driver(scene: Path, quick: bool) -> dict[str, Any]:
     """Success rates of the scripted driver and of one that drives straight on (`blind`), without obstacles, by task.
 
@@ -50,7 +60,7 @@ def driver(scene: Path, quick: bool) -> dict[str, Any]:
     default ranges of domain randomization.
     """
     import twin
-    from twin.env.drivers import BlindDriver, RouteDriver
+    from twin.env.drivers import RouteDriver
 
     opened, count = twin.load_scene(scene), 3 if quick else 100
     tasks = standard_tasks(scene)

@@ -14,16 +14,17 @@ from typing import Any
 
 import numpy as np
 
+_STANDARD_TASKS = "straight", "right_turn"
 _STEPS = 60  # environment steps per timed run
 
 
 def standard_tasks(scene: Path) -> list[str]:
     """Standard tasks of a scene, `right_turn` last; `route` if it has none."""
-    from twin.env.route_segments import STANDARD_TASKS, scene_tasks
+    from twin.env.route_segments import scene_tasks
     from twin.loading import load_scene
 
     there = scene_tasks(load_scene(scene).world())
-    return [name for name in STANDARD_TASKS if name in there] or ["route"]
+    return [name for name in _STANDARD_TASKS if name in there] or ["route"]
 
 
 def one_obstacle() -> dict[str, Any]:

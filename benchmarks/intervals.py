@@ -38,14 +38,14 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from place_intervals import mean_difference_interval, place_interval
+from place_intervals import mean_difference_interval, place_interval, rate_over_days
 from record import record_parser, save
 from scipy.special import expit
 from scipy.stats import norm
 
 from twin.evaluation.rate_model import MIN_RATE_DAYS, RateModel
 from twin.evaluation.statistic_intervals import STATISTICS, PairedCells, jackknife_interval
-from twin.evaluation.statistics import MIN_PREDICTORS, UndefinedStatistic, leave_one_group_out, rate_over_days
+from twin.evaluation.statistics import MIN_PREDICTORS, UndefinedStatistic, leave_one_group_out
 
 WORLDS = 1000
 _MEAN_OVER = 6000  # worlds from which the mean of a statistic is estimated

@@ -1,20 +1,37 @@
-"""Intervals with the place, or the pair of trainings, as the unit.
+"""Intervals with the day, the place, or the pair of trainings, as the unit.
 
-As in `twin.evaluation.statistic_intervals`, the estimand is the mean of a statistic over repeated experiments; here
-each repetition also has new places. A place is left out with all its policies and days.
+For places, as in `twin.evaluation.statistic_intervals`, the estimand is the mean of a statistic over repeated
+experiments; here each repetition also has new places. A place is left out with all its policies and days.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
 from twin.evaluation.statistic_intervals import PairedCells, Statistic, interval_ends, jackknife_variance
-from twin.evaluation.statistics import CONFIDENCE, UndefinedStatistic
+from twin.evaluation.statistics import CONFIDENCE, UndefinedStatistic, wilson
 from twin.types import Array
 
 MIN_PLACES = 5
 """Number of places, or of pairs, below which there is no interval."""
+
+
+def rate_over_days(rates: ArrayLike) -> tuple[float, float, float]:
+    """Unweighted mean of the rates of k days, shape (k,), and the ends of its interval with the day as the unit.
+
+    Trials of one day share its lighting and weather. The interval assumes that all trials of a day have the same
+    outcome: with an intra-class correlation ρ of 1, the design effect 1 + (m − 1) ρ equals the number m of trials of a
+    day (Kish, Survey Sampling, 1965, section 5.4), so k days count as k trials in Wilson's interval. If the trials of
+    a day differ, the variance is smaller, so the interval is too wide rather than too narrow. It holds for further days
+    of the same policies, not for further policies. Raises ValueError: no rate, or a rate outside [0, 1].
+    """
+    days = np.asarray(rates, float)
+    if days.ndim != 1 or not len(days) or not ((days >= 0.0) & (days <= 1.0)).all():
+        raise ValueError(f"rates of shape {days.shape}: expected one in [0, 1] per day, (k,), k ≥ 1")
+    low, high = wilson(days.sum(), len(days))
+    return float(days.mean()), float(low), float(high)
 
 
 def place_interval(

@@ -30,9 +30,9 @@ from test_pictures import _mosaic  # a mosaic of `SMOOTH`
 from twin.capture.bag_film import lens_of, read_contents
 from twin.capture.camera_models import Lens, checked_lens
 from twin.capture.capture_data import Capture
-from twin.capture.decoding import FilmStatistics
 from twin.capture.frames import detect_kind, source_files
 from twin.capture.scale import scale_from_odometry
+from twin.capture.video import FilmStatistics
 from twin.config import CalibrationConfig, SourceConfig
 from twin.config_file import load_config, read_robot
 from twin.errors import InputError

@@ -11,8 +11,8 @@ from twin import runtime
 from twin.errors import InputError
 from twin.geometry.cameras import FAR, Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
-from twin.nerf.baked import BakedField, BakedSection
-from twin.nerf.baked_arrays import BrickLayout, brick_indices, skip_distances
+from twin.nerf.baked import BakedField
+from twin.nerf.baked_arrays import BakedSection, BrickLayout, brick_indices, skip_distances
 from twin.nerf.kernels import bricks
 from twin.nerf.lightings import Lightings
 

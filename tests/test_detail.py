@@ -11,8 +11,8 @@ from twin.errors import InputError
 from twin.geometry.cameras import SparsePoints, Viewpoints
 from twin.geometry.poses import look_at
 from twin.nerf.bake import bake
-from twin.nerf.baked import BakedField, BakedSection
-from twin.nerf.baked_arrays import Detail, detail_grid
+from twin.nerf.baked import BakedField
+from twin.nerf.baked_arrays import BakedSection, Detail, detail_grid
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.detail import fit_detail
 from twin.nerf.kernels import surface_detail as kernels

@@ -10,9 +10,20 @@ import numpy as np
 import pytest
 from filmed_wall import HEIGHT, WIDTH, captured, film, refused, views, wall
 
-from twin.capture.decoding import FilmStatistics, apply_display_matrix, decode, upright
 from twin.capture.frames import held_out_frames, source_names
-from twin.capture.video import FilmTiming, frame_index, is_static, median_motion, probe, sharpness, slot_of
+from twin.capture.video import (
+    FilmStatistics,
+    FilmTiming,
+    apply_display_matrix,
+    decode,
+    frame_index,
+    is_static,
+    median_motion,
+    probe,
+    sharpness,
+    slot_of,
+    upright,
+)
 from twin.config import CalibrationConfig, SourceConfig
 from twin.errors import InputError
 from twin.geometry.images import read_image, write_image

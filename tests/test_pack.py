@@ -30,7 +30,8 @@ from twin.drive import chosen_policy, chosen_task
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, Viewpoints
 from twin.geometry.poses import look_at
-from twin.nerf.baked import BakedField, BakedSection
+from twin.nerf.baked import BakedField
+from twin.nerf.baked_arrays import BakedSection
 from twin.nerf.lightings import AddedLighting, Fog
 from twin.nerf.road import RoadSections
 from twin.pack import pack, rounded

@@ -15,8 +15,15 @@ from twin.capture.pair_geometry import (
     pair_geometries,
     with_rotation,
 )
-from twin.capture.pose_averaging import Differences, _goes_along, averaged_poses, consistent_pairs, solve_differences
-from twin.capture.pose_check import PoseCheck, check_poses
+from twin.capture.pose_averaging import (
+    Differences,
+    PoseCheck,
+    _goes_along,
+    averaged_poses,
+    check_poses,
+    consistent_pairs,
+    solve_differences,
+)
 from twin.geometry.poses import umeyama
 from twin.types import Array
 

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from films import HLG, PQ, street, write_film, write_hdr_film
 
-from twin.capture.decoding import FilmStatistics, decode, upright
 from twin.capture.film_check import check_film
 from twin.capture.formats import image_files
 from twin.capture.photos import load_photo
-from twin.capture.video import damage_note, format_note, read_film, video_film
+from twin.capture.video import FilmStatistics, damage_note, decode, format_note, read_film, upright, video_film
 from twin.config import CaptureConfig
 from twin.errors import InputError
 from twin.geometry.images import read_image

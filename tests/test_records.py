@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from place_intervals import rate_over_days
 
 from twin.errors import InputError
-from twin.evaluation.statistics import rate_over_days, wilson
+from twin.evaluation.statistics import wilson
 
 ROOT = Path(__file__).parents[1]
 TABLE1 = ROOT / "benchmarks" / "table1"

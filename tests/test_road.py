@@ -19,7 +19,8 @@ from twin.geometry.poses import look_at
 from twin.nerf import baked as baked_module
 from twin.nerf import road as road_module
 from twin.nerf.bake import bake
-from twin.nerf.baked import BakedField, BakedSection
+from twin.nerf.baked import BakedField
+from twin.nerf.baked_arrays import BakedSection
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.detail import fit_detail
 from twin.nerf.evaluate import evaluate

@@ -5,6 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from acceptance import REAR_HEAVY
 from tiny_world import export, tiny_config, tiny_scene, tiny_world
 
 from twin.env import mujoco_renderer
@@ -16,7 +17,7 @@ from twin.geometry.poses import inverse_pose, look_at
 from twin.mjcf.husky import add_husky, set_options
 from twin.mjcf.world import GROUND_GROUP, PART_GROUP, World
 from twin.report.video_writer import frame_indices
-from twin.robot import REAR_HEAVY, HuskyParams
+from twin.robot import HuskyParams
 
 
 @pytest.fixture(scope="module")

@@ -36,8 +36,7 @@ from twin.errors import InputError, short_repr
 from twin.files import atomic_path, digest_json, json_bytes, load_tensors, read_bytes, read_json, read_toml, toml_value
 from twin.learn.policy import JSON, ONNX, WEIGHTS, find_policy, load_policy
 from twin.loading import Twin, load_scene
-from twin.nerf.baked import section_file, stored_layouts
-from twin.nerf.baked_arrays import BrickLayout, samples_read
+from twin.nerf.baked_arrays import BrickLayout, samples_read, section_file, stored_layouts
 from twin.nerf.lightings import lighting_files
 from twin.nerf.road import ROAD_FILE
 from twin.scene import STAGE_FOLDERS, SceneDir, Stamp, package_versions, require_stage, stage_result

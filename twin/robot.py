@@ -35,8 +35,6 @@ CAMERA_SIZE = (160, 90)
 """Width, height of a policy's images from the front camera [px]."""
 CAMERA_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Axes right, down and forward (columns) of a camera that looks straight ahead, in the base."""
-REAR_HEAVY = (-0.085, -0.00065, 0.062)
-"""The published center of mass of the chassis, with x and y exchanged [m]."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +94,9 @@ class HuskyParams:
     # Body.
     center_of_mass: Annotated[tuple[float, float, float], Range(-0.5, 0.5)] = (0.0, 0.0, 0.062)
     """Center of mass of the chassis in the base [m]. The published one, (−.00065, −.085, .062), lies 8.5 cm to the
-    right, although the robot is symmetric. With x and y exchanged (`REAR_HEAVY`), the robot turns with chi = 1.43. With
-    the default, which is centered, chi is 1.805, nearer to Clearpath's controller (1.82 to 1.875) and to logs of a real
-    robot (2.15 and more)."""
+    right, although the robot is symmetric. With x and y exchanged, the robot turns with chi = 1.43. With the default,
+    which is centered, chi is 1.805, nearer to Clearpath's controller (1.82 to 1.875) and to logs of a real robot (2.15
+    and more)."""
     payload_mass: Annotated[float, Range(0, 100)] = 0.0
     """Mass on the top plate [kg]."""
     payload_position: Annotated[tuple[float, float, float], Range(-2, 2)] = (0.0, 0.0, 0.35)

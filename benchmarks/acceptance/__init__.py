@@ -16,6 +16,8 @@ from acceptance.drives import Edit, Recording, drive, on_plane
 from twin.robot import CHASSIS_MASS, WHEEL_MASS, HuskyParams
 
 GRAVITY = 9.81  # [m/s²]
+REAR_HEAVY = (-0.085, -0.00065, 0.062)
+"""The published center of mass of the chassis, with x and y exchanged [m]."""
 MASS = CHASSIS_MASS + 4 * WHEEL_MASS  # [kg] without payload
 
 

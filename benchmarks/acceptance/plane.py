@@ -6,11 +6,11 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from acceptance import GRAVITY, MASS, Row, Subject
+from acceptance import GRAVITY, MASS, REAR_HEAVY, Row, Subject
 from acceptance.drives import drive, record, state_at_rest
 from twin.env.controller import Controller
 from twin.mjcf.husky import center_of_mass, coulomb_track_ratio
-from twin.robot import REAR_HEAVY, SIDES, TRACK, WHEEL_RADIUS, WHEEL_WIDTH, WHEELBASE, WHEELS, HuskyParams
+from twin.robot import SIDES, TRACK, WHEEL_RADIUS, WHEEL_WIDTH, WHEELBASE, WHEELS, HuskyParams
 
 _TURNS = (0.3, 1.0, 1.8)  # [rad/s] commanded
 

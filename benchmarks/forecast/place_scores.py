@@ -31,12 +31,12 @@ from twin.evaluation.probability_scores import (
     twin_probabilities,
 )
 from twin.evaluation.statistic_intervals import STATISTICS, PairedCells, Statistic
-from twin.evaluation.statistics import UndefinedStatistic, rate_over_days, winner
+from twin.evaluation.statistics import UndefinedStatistic, winner
 from twin.files import read_json
 from twin.types import Array
 
 sys.path.append(str(Path(__file__).parents[1]))
-from place_intervals import mean_difference_interval, place_interval
+from place_intervals import mean_difference_interval, place_interval, rate_over_days
 
 TWIN, HELD_OUT, SETUP = "twin, by a photo of each day", "twin, held-out lightings", "same setup at other places"
 MEAN, SHUFFLED = "mean of other places", "twin, its days shuffled"

@@ -144,7 +144,7 @@ def exif(case: Case) -> None:
 
 def bag(case: Case) -> None:
     from twin.capture.bag_film import read_contents
-    from twin.capture.decoding import FilmStatistics
+    from twin.capture.video import FilmStatistics
 
     rng, samples = case.rng, case.samples.bags
     kind = rng.choice((".mcap", ".mcap", ".db3", ".bag", "metadata.yaml"))

@@ -16,6 +16,7 @@ everything was fixed.
 """
 
 import argparse
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,12 +54,14 @@ from twin.evaluation.statistics import (
     mmrv,
     pearson,
     rate_difference,
-    rate_over_days,
     spearman,
     winner,
 )
 from twin.files import read_json
 from twin.reality.lighting import WEATHER
+
+sys.path.append(str(Path(__file__).parents[1]))
+from place_intervals import rate_over_days
 
 RESULTS = Path(__file__).with_name("results.json")
 _USED = 5  # number of sampled days that were examined before everything was fixed

@@ -42,8 +42,7 @@ from twin.capture.bag import (
 )
 from twin.capture.camera_models import Lens, checked_lens, same_aspect
 from twin.capture.capture_data import nearest_longitudes
-from twin.capture.decoding import FilmStatistics
-from twin.capture.video import Film, FilmTiming
+from twin.capture.video import Film, FilmStatistics, FilmTiming
 from twin.errors import InputError, join_names
 from twin.robot import BASE_HEIGHT, CAMERA_AHEAD
 from twin.types import Array, Image

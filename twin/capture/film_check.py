@@ -23,8 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.capture.decoding import HDR_NAMES, fitted_size, hdr_transfer, open_film, upright
-from twin.capture.video import FilmTiming, probe, sharpness
+from twin.capture.hdr import HDR_NAMES
+from twin.capture.video import FilmTiming, fitted_size, hdr_transfer, open_film, probe, sharpness, upright
 from twin.geometry.images import resize
 from twin.types import Array, Image
 

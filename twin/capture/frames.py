@@ -16,10 +16,9 @@ from twin import runtime
 from twin.capture.bag import BAG_SUFFIXES, bag_files, is_bag
 from twin.capture.bag_film import BagContents, read_contents
 from twin.capture.capture_data import NO_GPS, Capture, FrameWriter, KeptFrames, SourceTask, given_lens
-from twin.capture.decoding import FilmStatistics, first_size
 from twin.capture.formats import find_model, image_files, listed_files, read_colmap, read_image_folder, read_transforms
 from twin.capture.photos import load_photo, read_photos
-from twin.capture.video import damage_note, format_note, read_film, video_film
+from twin.capture.video import FilmStatistics, damage_note, first_size, format_note, read_film, video_film
 from twin.config import CaptureConfig, SceneConfig, SourceConfig
 from twin.config_file import MAX_NAME, check_lighting
 from twin.errors import InputError

@@ -19,8 +19,8 @@ from scipy.spatial import cKDTree
 
 from twin.capture.camera_models import Lens, camera_to_world, lens_from_json, same_aspect
 from twin.capture.capture_data import Capture
-from twin.capture.decoding import fitted_size
 from twin.capture.photos import PhotoExif, evenly_spaced
+from twin.capture.video import fitted_size
 from twin.capture.worker import run_worker, send_message
 from twin.errors import InputError
 from twin.files import read_json, write_json

@@ -21,7 +21,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from twin.capture.camera_models import camera_to_world
-from twin.capture.matching import SEQUENCE_STEPS, Matcher, Pair, near_pairs
+from twin.capture.matching import SEQUENCE_STEPS, Matcher, near_pairs
+from twin.capture.pair_geometry import Pair
 from twin.capture.pose_averaging import averaged_poses
 from twin.capture.worker import send_message
 from twin.errors import InputError

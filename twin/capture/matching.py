@@ -21,14 +21,12 @@ from scipy.sparse.csgraph import connected_components
 
 from twin.capture.camera_models import Lens
 from twin.capture.capture_data import Capture, SourceInfo
-from twin.capture.pair_geometry import PairGeometry, pair_geometries
+from twin.capture.pair_geometry import Pair, PairGeometry, ordered_pair, pair_geometries
 from twin.capture.pose_averaging import consistent_pairs
 from twin.capture.worker import send_message
 from twin.errors import InputError
 from twin.geometry.images import write_image
 from twin.types import Array
-
-Pair = tuple[int, int]
 
 SEQUENCE_STEPS = (1, 2, 3, 4, 6, 8, 12)
 """Distances [frames] of sequence pairs within a source: short ones for neighbors, long ones against drift.
@@ -50,10 +48,6 @@ _UNKNOWN_FOCAL = 1.2  # [longer side], COLMAP's default
 
 
 # ---- selection of pairs
-
-
-def ordered_pair(i: int, j: int) -> Pair:
-    return (i, j) if i < j else (j, i)
 
 
 def frames_by_source(source_index: NDArray[np.int64]) -> list[NDArray[np.int64]]:

@@ -18,6 +18,7 @@ from scipy.optimize import minimize
 from twin.capture.worker import send_message
 from twin.types import Array
 
+Pair = tuple[int, int]
 _MIN_MATCHES = 15  # least number of matches of a pair
 _PIXEL_ERROR = 0.5  # [px] standard deviation of the epipolar error of a correct match
 _OUTLIER = 4.0  # [standard deviations] matches with a larger epipolar error are wrong
@@ -36,6 +37,10 @@ _FOCAL_GRID = np.geomspace(0.3, 3.0, 16)  # [longer side] first guesses; the fir
 _MAX_DISTORTION = 0.3  # largest absolute value of the first distortion parameter
 _DISTORTION_PRIOR = 0.1  # standard deviation of the first distortion parameter
 _FOCAL_PRIOR = 0.5  # standard deviation of the logarithm of the focal length about COLMAP's guess
+
+
+def ordered_pair(i: int, j: int) -> Pair:
+    return (i, j) if i < j else (j, i)
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,8 @@ from PIL import ExifTags
 from twin import runtime
 from twin.capture.camera_models import Lens, same_aspect, undistorted
 from twin.capture.capture_data import QUEUE_SIZE, KeptFrames, SourceTask, read_mask
-from twin.capture.decoding import fitted_size
 from twin.capture.formats import ImageSet
-from twin.capture.video import BLANK_STD, in_segments
+from twin.capture.video import BLANK_STD, fitted_size, in_segments
 from twin.errors import InputError
 from twin.geometry.images import DECODE_ERRORS, decode_image, open_header, resize
 from twin.types import Array, Image

@@ -1,9 +1,16 @@
-"""Camera poses of all frames from the relative poses of pairs.
+"""Camera poses of all frames from the relative poses of pairs, and a check of any poses against these.
 
 Rotations are averaged first. The unit of length of a pair is the distance of its two cameras. Two pairs with a common
 frame that see the same near points there have known relative units, so the units of all pairs follow, and then the
 positions (as in Cui and Tan 2015). Far points affect rotations alone. Each of the three steps solves equations of
 differences, x[first] − x[second] = value, under a Cauchy loss, and starts from the tree of the most reliable equations.
+
+The check compares the poses of a model, or given ones, with pairs of near frames. A *step* leads from a frame of a film
+to the next one that has a pose. Each pair of frames that are at most `_REACH` steps apart tells how much the camera
+turned and in which direction it moved; this supports or contradicts the steps between them, and both frames. Two pairs
+that meet in a frame and see the same near points tell the ratio of their lengths; this supports or contradicts the step
+that begins there. Reprojection errors do not reveal wrong poses: the pieces of a film that was torn apart have small
+ones.
 """
 
 from dataclasses import dataclass
@@ -15,7 +22,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from twin.capture.pair_geometry import PairGeometry, with_rotation
+from twin.capture.pair_geometry import Pair, PairGeometry, ordered_pair, with_rotation
 from twin.types import Array
 
 _OUTLIER = 3.0  # [standard deviations] scale of the Cauchy loss
@@ -23,7 +30,7 @@ _STEPS = 50  # largest number of steps of a solution
 _MIN_ROTATION_ERROR = np.radians(0.02)  # standard deviation of a pair's rotation, at least
 _MAX_ROTATION_RESIDUAL = np.radians(0.5)  # pairs that deviate more from the averaged rotations are left out
 _STRAIGHT = 0.7  # |sum of the steps between two frames| / their number; above this, the film is straight there
-_MAX_TURN = np.radians(30.0)  # largest angle between the direction of two frames and that of the steps between
+_MAX_PATH_ANGLE = np.radians(30.0)  # largest angle between the direction of two frames and that of the steps between
 _MIN_SCALE_ERROR = 0.004  # standard deviation of the logarithm of a ratio of units, at least
 _MIN_DIRECTION_ERROR = 0.015  # [rad] standard deviation of the direction between two cameras, at least
 _MIN_NEAR = 8  # least number of near points of a pair whose unit of length is used
@@ -103,7 +110,7 @@ def _goes_along(
     length = np.linalg.norm(expected, axis=1)
     # A film that turns or stands still between two frames does not tell the direction.
     told = (film[first] == film[second]) & (length > _STRAIGHT * np.abs(second - first))
-    return ~told | ((expected * directions).sum(1) > np.cos(_MAX_TURN) * length)
+    return ~told | ((expected * directions).sum(1) > np.cos(_MAX_PATH_ANGLE) * length)
 
 
 def consistent_pairs(
@@ -288,3 +295,121 @@ def _weighted_step(system: csr_matrix, residual: Array, error: Array) -> Array:
     free = 1e-9 * normal.diagonal().max()  # the mean of a part is undetermined
     step = spsolve((normal + free * eye(system.shape[1])).tocsc(), system.T @ (weight[:, None] * residual))
     return np.reshape(step, (system.shape[1], -1))
+
+
+# ---- check of poses
+
+_REACH = 3  # [steps] largest distance between the frames of a pair that is used
+_MAX_TURN = np.radians(1.0)  # deviation from a pair's rotation that contradicts it, at least
+_MAX_DIRECTION = np.radians(10.0)  # deviation from a pair's direction that contradicts it, at least
+_MAX_RATIO = 0.25  # deviation of the logarithm of a ratio of two distances that contradicts it, at least
+_CERTAIN = 4.0  # [standard deviations] smaller deviations contradict nothing
+_STILL = 0.2  # [median step] cameras that are nearer to each other have no direction
+# A pair of frames some steps apart is left out if it deviates more from the pairs between, in turn or in direction.
+_MAX_CHAIN_TURN, _MAX_CHAIN_ANGLE = np.radians(2.0), np.radians(60.0)
+# A pair tells a direction and a ratio of distances only with `_MIN_NEAR` near points, at most so far away (median, in
+# distances of its cameras). With less parallax, moving things and a rolling shutter decide.
+_MAX_DEPTH = 30.0
+
+
+@dataclass(frozen=True)
+class PoseCheck:
+    """Steps of films that pairs of frames tell about."""
+
+    steps: int
+    """Number of steps that were checked."""
+    contradicted: list[tuple[int, int]]
+    """Both frames of each step that most pairs contradict."""
+
+
+def near_in_film(film: NDArray[np.int64], frames: NDArray[np.int64]) -> set[Pair]:
+    """The pairs of frames that `check_poses` uses: at most `_REACH` steps apart in a film. Arguments as there."""
+    within = [frames[film[frames] == one].tolist() for one in np.unique(film[frames])]
+    return {pair for one in within for k in range(1, _REACH + 1) for pair in zip(one[:-k], one[k:], strict=True)}
+
+
+def check_poses(
+    pairs: list[PairGeometry],
+    row_of: dict[int, int],
+    film: NDArray[np.int64],
+    frames: NDArray[np.int64],
+    camera_to_world: Array,
+) -> PoseCheck:
+    """Compares poses with the geometry of pairs.
+
+    Args:
+        pairs: Pairs with geometry.
+        row_of: Frame of each of COLMAP's images.
+        film: Film of each frame (n,), whose frames are in the order of time.
+        frames: Frames with a pose (k,), sorted.
+        camera_to_world: Their poses (k, 4, 4), in any unit of length.
+    """
+    near = near_in_film(film, frames)
+    place = {int(frame): k for k, frame in enumerate(frames)}
+    used, ends = [], []  # pairs, and both ends as indices of poses
+    for pair in pairs:
+        first, second = row_of[pair.matches.first], row_of[pair.matches.second]
+        if ordered_pair(first, second) in near:
+            used.append(pair)
+            ends.append((place[first], place[second]))
+    agreeing = _agree_with_chains(used, ends)
+    used, ends = [used[k] for k in agreeing], [ends[k] for k in agreeing]
+    if not used:
+        return PoseCheck(0, [])
+    # Supports and contradictions: of steps, by the frames where they begin, by turns and directions, and by ratios; and
+    # of frames, by the pairs that end in them.
+    votes = np.zeros((3, len(frames), 2), np.int64)
+    position = camera_to_world[:, :3, 3]
+    same = film[frames[1:]] == film[frames[:-1]]
+    step = float(np.median(np.linalg.norm(np.diff(position, axis=0), axis=1)[same]))
+    distance = np.array([np.linalg.norm(position[j] - position[i]) for i, j in ends])
+    for (i, j), pair, apart in zip(ends, used, distance, strict=True):
+        relative = camera_to_world[j, :3, :3].T @ camera_to_world[i, :3, :3]
+        turn = float(Rotation.from_matrix(pair.rotation.T @ relative).magnitude())
+        wrong = turn > max(_MAX_TURN, _CERTAIN * pair.rotation_error)
+        if apart > _STILL * step and _has_parallax(pair):
+            direction = camera_to_world[j, :3, :3].T @ (position[i] - position[j]) / apart
+            angle = float(np.arccos(np.clip(direction @ pair.translation, -1.0, 1.0)))
+            wrong = wrong or angle > max(_MAX_DIRECTION, _CERTAIN * pair.direction_error)
+        votes[0, min(i, j) : max(i, j), int(wrong)] += 1
+        votes[2, [i, j], int(wrong)] += 1
+    scaled = [k for k, pair in enumerate(used) if _has_parallax(pair)]
+    for first, second, ratio, error, _ in unit_equations([used[k] for k in scaled]):
+        one, other = scaled[first], scaled[second]
+        # Where the scale changes, the pairs on both sides of a frame contradict each other; other pairs lie across.
+        before, after = sorted([sorted(ends[one]), sorted(ends[other])])
+        if before[1] == after[0] and max(distance[one], distance[other]) > _STILL * step:
+            found = np.log(max(distance[one], 1e-12) / max(distance[other], 1e-12))
+            votes[1, after[0], int(abs(found - ratio) > max(_MAX_RATIO, _CERTAIN * error))] += 1
+    checked = votes[:2].sum((0, 2)) > 0
+    torn, misplaced = (votes[:2, :, 1] > votes[:2, :, 0]).any(0), votes[2, :, 1] > votes[2, :, 0]
+    torn |= checked & (misplaced | np.roll(misplaced, -1))  # the steps to and from a misplaced frame
+    return PoseCheck(
+        int(np.count_nonzero(checked)), [(int(frames[k]), int(frames[k + 1])) for k in np.flatnonzero(torn)]
+    )
+
+
+def _agree_with_chains(pairs: list[PairGeometry], ends: list[tuple[int, int]]) -> list[int]:
+    """Indices of the pairs that agree with those of the successive frames between them, where these are known.
+
+    Frames that are some steps apart may match by a repeated pattern, such as a row of houses or paving stones.
+    """
+    successive: dict[int, PairGeometry] = {i: p for (i, j), p in zip(ends, pairs, strict=True) if j == i + 1}
+    kept = []
+    for k, ((i, j), pair) in enumerate(zip(ends, pairs, strict=True)):
+        rotation, path = np.eye(3), np.zeros(3)  # from frame i; the path in its coordinates, if all steps are as long
+        chain = [successive.get(step) for step in range(i, j)]
+        for one in chain:
+            if one is not None:
+                path = path - rotation.T @ one.rotation.T @ one.translation
+                rotation = one.rotation @ rotation
+        direction = -pair.rotation.T @ pair.translation
+        turn = Rotation.from_matrix(pair.rotation @ rotation.T).magnitude()
+        agrees = turn < _MAX_CHAIN_TURN and direction @ path > np.cos(_MAX_CHAIN_ANGLE) * np.linalg.norm(path)
+        if j <= i + 1 or None in chain or agrees or not _has_parallax(pair):
+            kept.append(k)
+    return kept
+
+
+def _has_parallax(pair: PairGeometry) -> bool:
+    return len(pair.features) >= _MIN_NEAR and float(np.median(pair.depths)) <= _MAX_DEPTH

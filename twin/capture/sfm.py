@@ -42,7 +42,7 @@ from twin.capture.matching import (
     sequence_pairs,
 )
 from twin.capture.pair_geometry import estimate_focal_lengths
-from twin.capture.pose_check import check_poses, near_in_film
+from twin.capture.pose_averaging import check_poses, near_in_film
 from twin.capture.rolling_shutter import RollingShutter, correct_model, corrected_map, corrected_pinhole
 from twin.capture.worker import run_worker, send_message
 from twin.config import CamerasConfig, SceneConfig

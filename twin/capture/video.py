@@ -1,15 +1,17 @@
-"""Reads films in one pass with little memory: selects the sharpest frames at regular spacing, without duplicates.
+"""Reads films in one pass with little memory: decodes them, and selects the sharpest frames at regular spacing.
 
-A *film* is a video file (`decoding.py`), or the pictures of a bag (`bag_film.py`). A *slot* is one of n equal time
-spans of a film; the sharpest frame of each slot is its *candidate*. A candidate in which the image hardly moved since
-the last kept frame is a *duplicate* and is dropped. A frame's *index* is its position in the film, counted from 0 in
-order of presentation; its *time* [s] is measured from the first frame. If only *segments* of the film are kept, the
-slots divide these segments as if the rest were cut out; indices and times remain those of the whole film.
+A *film* is a video file, or the pictures of a bag (`bag_film.py`). Damaged frames are skipped, interlaced ones are
+deinterlaced, HDR is converted to SDR (`hdr.py`), and frames are turned upright. A *slot* is one of n equal time spans
+of a film; the sharpest frame of each slot is its *candidate*. A candidate in which the image hardly moved since the
+last kept frame is a *duplicate* and is dropped. A frame's *index* is its position in the film, counted from 0 in order
+of presentation; its *time* [s] is measured from the first frame. If only *segments* of the film are kept, the slots
+divide these segments as if the rest were cut out; indices and times remain those of the whole film.
 """
 
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 
@@ -18,18 +20,13 @@ import av.error
 import av.filter
 import cv2
 import numpy as np
+from av.sidedata.sidedata import SideDataContainer
+from av.sidedata.sidedata import Type as SideData
+from av.video.frame import PictureType
 from numpy.typing import NDArray
 
 from twin import runtime
-from twin.capture.decoding import (
-    HDR_NAMES,
-    FilmStatistics,
-    decode,
-    fitted_size,
-    hdr_transfer,
-    open_film,
-    upright,
-)
+from twin.capture.hdr import HDR_NAMES, hdr_to_sdr
 from twin.config import CaptureConfig
 from twin.errors import InputError
 from twin.files import regular_file
@@ -46,6 +43,170 @@ _STILL_DIFFERENCE = 1.5
 BLANK_STD = 2.0  # an image with a smaller standard deviation of its brightness [gray levels] counts as blank
 _LUMA_FIRST = ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray")
 _MIN_DECODED_FRACTION = 0.98  # the user gets a note if a smaller fraction of the declared frames can be decoded
+
+
+# ---- decoding
+
+_DEINTERLACE = "mode=send_frame:parity=auto:deint=interlaced"
+
+
+@dataclass
+class FilmStatistics:
+    """Counts of decoded and dropped frames, and properties of the film; filled while it is read."""
+
+    decoded: int = 0
+    damaged: int = 0
+    duplicates: int = 0
+    blank: int = 0
+    interlaced: bool = False
+    hdr: str = ""  # HLG or PQ; empty for SDR
+    declared: int = 0
+    duration: float = 0.0
+    size: tuple[int, int] = (0, 0)  # upright width and height of the input [px]
+    sharpness: list[float] = field(default_factory=list)
+
+
+def decode(path: Path, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:
+    """Yields a tuple per undamaged frame of a film, in order: its time stamp in the stream [s] or None, and the frame.
+
+    Interlaced frames are deinterlaced, because their two fields show the scene at different instants.
+    """
+    graph: av.filter.Graph | None = None
+    for stamp, frame in _intact_frames(path, count):
+        if graph is None and not frame.interlaced_frame:
+            yield stamp, frame
+            continue
+        try:
+            if graph is None:
+                count.interlaced = True
+                graph = _deinterlacer(frame)
+            graph.push(frame)
+        except (av.error.FFmpegError, ValueError) as error:
+            raise InputError(f"{path}: cannot be deinterlaced ({error}); convert it to progressive frames") from None
+        yield from _pulled(graph)
+    if graph is not None:
+        graph.push(None)
+        yield from _pulled(graph)
+
+
+def _deinterlacer(frame: av.VideoFrame) -> av.filter.Graph:
+    """A filter that makes a progressive frame of each interlaced frame, and passes progressive frames unchanged."""
+    graph = av.filter.Graph()
+    base = frame.time_base or Fraction(1, 1000)
+    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=base)
+    graph.link_nodes(source, graph.add("bwdif", _DEINTERLACE), graph.add("buffersink")).configure()
+    return graph
+
+
+def _pulled(graph: av.filter.Graph) -> Iterator[tuple[float | None, av.VideoFrame]]:
+    """Yields the frames that a filter has ready, each with its time [s] or None."""
+    with contextlib.suppress(av.error.BlockingIOError, av.error.EOFError):
+        while True:
+            frame = graph.pull()
+            assert isinstance(frame, av.VideoFrame)
+            yield frame.time, frame
+
+
+def _intact_frames(path: Path, count: FilmStatistics) -> Iterator[tuple[float | None, av.VideoFrame]]:
+    """Frames that are not damaged, and do not depend on damaged ones.
+
+    A decoder conceals a damaged frame by a guess and predicts later frames from it. Therefore all frames from a
+    damaged one to the next key frame are skipped, and so are the B frames before it that depend on it.
+    """
+    with open_film(path) as (container, stream):
+        stream.thread_type = "AUTO"
+        pending: list[av.VideoFrame] = []  # B frames that wait for the undamaged frame on which they depend
+        broken = False
+        for packet in _packets(container, stream):
+            frames: list[av.VideoFrame | None] = []
+            try:
+                frames.extend(packet.decode())
+            except av.error.FFmpegError:
+                frames.append(None)
+            for frame in frames:
+                if frame is None or frame.is_corrupt or (broken and not frame.key_frame):
+                    count.damaged += 1 + len(pending)
+                    pending.clear()
+                    broken = True
+                    continue
+                broken = False
+                pending.append(frame)
+                if frame.pict_type != PictureType.B:
+                    yield from ((intact.time, intact) for intact in pending)
+                    pending.clear()
+        yield from ((intact.time, intact) for intact in pending)
+
+
+def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.Packet]:
+    """A stream's packets and a final empty packet, which flushes the decoder; a truncated file just ends earlier."""
+    last: av.Packet | None = None
+    with contextlib.suppress(av.error.FFmpegError):
+        for last in container.demux(stream):
+            yield last
+    if last is None or last.size:
+        end = av.Packet()
+        end.stream = stream
+        if stream.time_base is not None:
+            end.time_base = stream.time_base
+        yield end
+
+
+@contextlib.contextmanager
+def open_film(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+    """Opens a film file and its first video stream. Raises InputError: no such stream, or none that can be decoded."""
+    # Without the prefix, FFmpeg takes the beginning of a name such as `17:30.mp4` for a protocol.
+    with av.open(f"file:{path}") as container:
+        if not container.streams.video:
+            raise InputError(f"{path}: no video stream in this file; give a film, an image folder or a posed image set")
+        stream = container.streams.video[0]
+        if stream.codec_context is None:
+            raise InputError(f"{path}: FFmpeg does not know this film's codec; convert it to H.264 or H.265")
+        yield container, stream
+
+
+def first_size(path: Path) -> tuple[int, int] | None:
+    """Width and height [px] of a film's first frame, upright; None if none can be decoded."""
+    with contextlib.suppress(av.error.FFmpegError, ValueError), open_film(path) as (container, stream):
+        for frame in container.decode(stream):
+            height, width = upright(frame).shape[:2]
+            return width, height
+    return None
+
+
+def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
+    """Width and height [px] scaled down to a longer side of at most `max_size`."""
+    scale = min(1.0, max_size / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def upright(frame: av.VideoFrame) -> Image:
+    """A frame as SDR RGB, rotated and mirrored by its display matrix in multiples of 90°."""
+    transfer = hdr_transfer(frame)
+    image = hdr_to_sdr(frame, transfer) if transfer else np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+    # `frame.side_data` would make a reference cycle, so many large frames would stay until garbage is collected.
+    side = SideDataContainer(frame).get(SideData.DISPLAYMATRIX)  # type: ignore[call-arg]
+    if side is None:
+        return image
+    matrix = np.frombuffer(bytes(side), np.int32, 9).reshape(3, 3)[:2, :2] / 65536.0
+    return apply_display_matrix(image, matrix) if np.abs(np.linalg.det(matrix)) > 1e-3 else image
+
+
+def apply_display_matrix(image: Image, matrix: Array) -> Image:
+    """Applies a display matrix [[a, b], [c, d]] to an image: x' = a x + c y, y' = b x + d y."""
+    (a, b), (c, d) = matrix
+    if abs(a) < abs(c):  # x' depends on y: a quarter turn
+        image, sign_x, sign_y = image.swapaxes(0, 1), c, b
+    else:
+        sign_x, sign_y = a, d
+    image = image[:, ::-1] if sign_x < 0 else image
+    image = image[::-1] if sign_y < 0 else image
+    return np.ascontiguousarray(image)
+
+
+def hdr_transfer(frame: av.VideoFrame) -> int | None:
+    """`HLG` or `PQ` for an HDR frame, None for an SDR one."""
+    transfer = int(frame.color_trc or 0)
+    return transfer if transfer in HDR_NAMES else None
 
 
 # ---- sharpness and motion, on small gray images (uint8, shape (h, w)) so that a frame takes about a millisecond

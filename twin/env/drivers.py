@@ -233,14 +233,6 @@ class RouteDriver:
         return np.array([yaw_rate]) if task.options.action == STEERING else np.array([v, yaw_rate])
 
 
-class BlindDriver:
-    """Drives straight at full speed, regardless of the images."""
-
-    def __call__(self, environment: "control.Environment", step: "dm_env.TimeStep") -> Array:
-        spec = environment.action_spec()
-        return np.array([0.0]) if spec.shape == (1,) else np.array([spec.maximum[0], 0.0])
-
-
 class PolicyDriver:
     """Takes its actions from a policy that receives the images."""
 

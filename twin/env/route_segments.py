@@ -44,7 +44,6 @@ _STANDARD_SPECS = {
     "straight": _StandardTask(30.0, (-np.deg2rad(15), np.deg2rad(15)), np.deg2rad(10)),
     "right_turn": _StandardTask(60.0, (-np.deg2rad(120), -np.deg2rad(60)), np.deg2rad(20)),
 }
-STANDARD_TASKS = tuple(_STANDARD_SPECS)
 
 _LENGTH_TOLERANCE = 0.05  # relative shortfall allowed in standard tasks, as smoothing and scale errors shorten routes
 _STEP = 0.25  # [m] between tested starts

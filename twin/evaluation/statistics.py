@@ -77,22 +77,6 @@ def rate_summary(won: int, trials: int) -> dict[str, Any]:
     return {"successes": won, "trials": trials, "rate": won / trials, "low": float(low), "high": float(high)}
 
 
-def rate_over_days(rates: ArrayLike) -> tuple[float, float, float]:
-    """Unweighted mean of the rates of k days, shape (k,), and the ends of its interval with the day as the unit.
-
-    Trials of one day share its lighting and weather. The interval assumes that all trials of a day have the same
-    outcome: with an intra-class correlation ρ of 1, the design effect 1 + (m − 1) ρ equals the number m of trials of a
-    day (Kish, Survey Sampling, 1965, section 5.4), so k days count as k trials in Wilson's interval. If the trials of
-    a day differ, the variance is smaller, so the interval is too wide rather than too narrow. It holds for further days
-    of the same policies, not for further policies. Raises ValueError: no rate, or a rate outside [0, 1].
-    """
-    days = np.asarray(rates, float)
-    if days.ndim != 1 or not len(days) or not ((days >= 0.0) & (days <= 1.0)).all():
-        raise ValueError(f"rates of shape {days.shape}: expected one in [0, 1] per day, (k,), k ≥ 1")
-    low, high = wilson(days.sum(), len(days))
-    return float(days.mean()), float(low), float(high)
-
-
 def rate_difference(
     *,
     twin_successes: ArrayLike,

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from twin.errors import InputError
 from twin.geometry.cameras import pixel_grid
 from twin.nerf import network
-from twin.nerf.baked import BakedField, BakedSection
-from twin.nerf.baked_arrays import BrickLayout, brick_indices, skip_distances
+from twin.nerf.baked import BakedField
+from twin.nerf.baked_arrays import BakedSection, BrickLayout, brick_indices, skip_distances
 from twin.nerf.buffers import (
     CameraArrays,
     Workspace,

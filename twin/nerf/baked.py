@@ -2,15 +2,18 @@
 
 `kernels/bricks.py` defines the bricks, `baked_arrays.py` all arrays. The two per-ray networks, head and background
 (`network.py`), are stored beside them. A lighting is one vector, so one baked field renders the place under every
-lighting. A long road has several sections (`road.py`), which are read from disk when a camera needs them.
+lighting. A long road has several sections (`road.py`), which are read from disk when a camera needs them. A *render
+target* has the buffers of images, and the launches that render a section into them.
 """
 
 import copy
+import itertools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +24,23 @@ from safetensors.numpy import save as to_bytes
 from twin.errors import InputError, short_repr
 from twin.files import check_shapes, load_tensors, read_json, require_text, wrap_read_errors, write_json
 from twin.geometry.cameras import PosedCameras, Rendering, intrinsics_for_size
-from twin.nerf.baked_arrays import BrickLayout, Detail, check_arrays, check_networks
+from twin.nerf.baked_arrays import (
+    BLOCK_DIM,
+    BakedSection,
+    Detail,
+    RenderKernels,
+    SectionOnDevice,
+    check_arrays,
+    check_networks,
+    section_file,
+    stored_layouts,
+)
+from twin.nerf.kernels import march as kernels
+from twin.nerf.kernels import surface_detail as detail_kernels
+from twin.nerf.kernels.color_head import LANES as HEAD_LANES
+from twin.nerf.kernels.color_head import Vec8
 from twin.nerf.kernels.volume import CHANNELS
 from twin.nerf.lightings import Fog, Lightings, Probes
-from twin.nerf.render_target import CameraBatch, RenderedImages, RenderKernels, RenderTarget, SectionOnDevice
 from twin.nerf.road import RoadSections, undivided_road
 from twin.nerf.sun import Sun, Sunlight
 from twin.runtime import available_cores
@@ -36,32 +52,140 @@ _FORMAT, _FORMAT_OF_SECTIONS = 2, 3  # format with one section, and with several
 # recently used one is dropped. A vector env renders either all its envs or those that reset, whose number varies.
 _MAX_TARGETS = 4
 _MAX_RESIDENT = 8  # sections that are kept in memory, about 150 MB each
+_COPIED = 8  # images that are copied together
 
 
-class BakedSection:
-    """Bricks and detail of one section of the road, in memory or in a file that is read on demand."""
+# ---- render targets
 
-    def __init__(self, layout: BrickLayout, arrays: dict[str, NDArray] | None = None, file: Path | None = None):
-        """
-        Args:
-            layout: Sizes and bounds.
-            arrays: `near` and `far` (the stored bricks in their grids, (s, 3)), `features` (s, 729, CHANNELS) bytes,
-                near bricks first, `low` and `step` (CHANNELS,) of the quantization, `near_leap` and `far_leap` (see
-                `baked_arrays.skip_distances`), and those of `Detail.arrays`.
-            file: A file with these arrays, if they are not given.
-        """
-        self.layout, self._arrays, self._file = layout, arrays, file
 
-    @property
-    def arrays(self) -> dict[str, NDArray]:
-        """The arrays. Raises InputError if the file is damaged."""
-        if self._arrays is not None:
-            return self._arrays
-        assert self._file is not None
-        arrays = load_tensors(self._file)
-        with wrap_read_errors(self._file, "build the scene again"):
-            check_arrays(self.layout, arrays)
-        return arrays
+@dataclass(frozen=True)
+class CameraBatch:
+    """n cameras to render."""
+
+    pose: NDArray[np.float64]
+    """Camera to world, shape (n, 4, 4)."""
+    intrinsics: NDArray[np.float64]
+    """Shape (n, 4)."""
+    size: tuple[int, int]
+    """Width, height [px]."""
+    bias: Array32
+    """See `BakedField.head_biases`."""
+    stop: NDArray | None
+    """See `BakedField.render`."""
+
+    def subset(self, rows: NDArray[np.int64]) -> "CameraBatch":
+        """Some of the cameras."""
+        stop = None if self.stop is None else self.stop[rows]
+        return CameraBatch(self.pose[rows], self.intrinsics[rows], self.size, self.bias[rows], stop)
+
+
+@dataclass(frozen=True)
+class RenderedImages:
+    """Images of n cameras, with or without features."""
+
+    rendering: Rendering
+    features: Array32 | None
+    """Opacity (channel 0) and composited features, shape (n, CHANNELS, height, width)."""
+
+
+class RenderTarget:
+    """Buffers for images of one size, and recorded launches that render them in horizontal bands, in parallel."""
+
+    def __init__(
+        self,
+        compiled: RenderKernels,
+        section: SectionOnDevice,
+        bands: int,
+        n: int,
+        width: int,
+        height: int,
+        stopped: bool,
+    ):
+        """Allocates buffers for n cameras and at most `bands` bands; with `stopped`, rays end at given depths."""
+        self.shape, device = (n, height, width), compiled.device
+        # The arrays live as long as the launches that read them. A reference to the section itself would be circular,
+        # and a dropped section would stay in memory until the next garbage collection.
+        self.arrays = section.bricks, section.detail
+        across, down, pixels = -(-width // kernels.TILE), -(-height // kernels.TILE), width * height
+
+        def new(shape: tuple[int, ...], dtype: Any = wp.float32) -> Any:
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        image: Any = kernels.ImageBuffers()
+        image.rotation, image.position = new((n,), wp.mat33f), new((n,), wp.vec3f)
+        image.intrinsics = new((n,), wp.vec4f)
+        image.stop = new((n, pixels) if stopped else (0, 0))
+        image.width, image.height, image.across = width, height, across
+        self.image, self.bias = image, new((n, len(compiled.first_bias[0]) // 8), Vec8)
+        self.depth, self.opacity, self.rgb = new((n, pixels)), new((n, pixels)), new((n, pixels), wp.vec3f)
+        self.features = new((n, CHANNELS, pixels))
+        self.staging: list[Any] = []
+        start = new((n, across * down))
+        edges = np.unique(np.linspace(0, down, bands + 1).round().astype(int)).tolist()
+        self.bands = range(len(edges) - 1)
+        self.launches = []
+        for first, last in itertools.pairwise(edges):
+            recorded = partial(wp.launch, device=device, record_cmd=True, block_dim=BLOCK_DIM)
+            tiles = (last - first) * across
+            top, bottom = first * kernels.TILE * width, min(last * kernels.TILE, height) * width
+            packets = tiles * kernels.TILE**2 // kernels.LANES[device]
+            runs = -(-(bottom - top) // HEAD_LANES[device])
+            launches = [
+                recorded(kernels.cone_march, (n, tiles), [section.bricks, image, first * across], [start]),
+                recorded(
+                    *(compiled.march, (n, packets), [section.bricks, image, first * across, start]),
+                    [self.features, self.depth],
+                ),
+            ]
+            if section.has_detail:
+                run = detail_kernels.RUN[device]
+                dim, inputs = (n, -(-(bottom - top) // run)), [image, top, bottom, run, self.depth]
+                launches.append(recorded(detail_kernels.add_detail, dim, [*section.detail, *inputs], [self.features]))
+            inputs = [compiled.weights, self.bias, image, top, bottom, self.features]
+            outputs = [self.depth, self.rgb, self.opacity]
+            launches.append(recorded(compiled.color_head, (n, runs), inputs, outputs))
+            self.launches.append(launches)
+
+    def set_cameras(self, views: CameraBatch) -> None:
+        """Sets the cameras of the next images, as many as the target has."""
+        image = self.image
+        image.rotation.assign(views.pose[:, :3, :3].astype(np.float32))
+        image.position.assign(views.pose[:, :3, 3].astype(np.float32))
+        image.intrinsics.assign(views.intrinsics.astype(np.float32))
+        self.bias.assign(np.ascontiguousarray(views.bias, np.float32).reshape(len(views.bias), -1, 8))
+        if views.stop is not None:
+            image.stop.assign(np.asarray(views.stop, np.float32).reshape(image.stop.shape))
+
+    def render_band(self, band: int) -> None:
+        """Renders a band of all images; bands may be rendered at the same time."""
+        for launch in self.launches[band]:
+            launch.launch()
+
+    def images(self, features: bool, pool: ThreadPoolExecutor | None) -> RenderedImages:
+        """Copies of the images, as the buffers are reused; with or without features. The threads of `pool` copy."""
+        arrays = [self.rgb, self.depth, self.opacity, *([self.features] if features else [])]
+        shapes = [(*self.shape, 3), self.shape, self.shape, (self.shape[0], CHANNELS, *self.shape[1:])]
+        sources = [array.numpy() for array in (self._staged(arrays) if self.rgb.device.is_cuda else arrays)]
+        out = [np.empty(shape, np.float32) for shape, _ in zip(shapes, sources, strict=False)]
+        pairs = [(to, source.reshape(to.shape)) for to, source in zip(out, sources, strict=True)]
+        # The first write to new memory takes longer than the transfer from a GPU, unless many threads write.
+        slices = [slice(i, i + _COPIED) for i in range(0, len(out[0]), _COPIED)]
+        parts = [(to[some], source[some]) for to, source in pairs for some in slices]
+        copying = pool.map if pool and len(slices) > 1 else map
+        list(copying(np.copyto, *zip(*parts, strict=True)))
+        return RenderedImages(Rendering(*out[:3]), out[3] if features else None)
+
+    def _staged(self, arrays: list[Any]) -> list[Any]:
+        """Copies on the host of arrays on a GPU, in page-locked memory, where transfers are faster."""
+        for array in arrays[len(self.staging) :]:
+            self.staging.append(wp.empty(array.shape, dtype=array.dtype, device="cpu", pinned=True))
+        for staged, array in zip(self.staging, arrays, strict=False):
+            wp.copy(staged, array)
+        wp.synchronize_device(arrays[0].device)
+        return self.staging[: len(arrays)]
+
+
+# ---- the field
 
 
 class BakedField:
@@ -397,17 +521,3 @@ class BakedField:
             road = RoadSections.load(folder, len(layouts))
             lightings = Lightings(names, vectors, frames, frame_vectors)
             return BakedField(sections, lightings, networks, device, about, road)
-
-
-def section_file(k: int) -> str:
-    """Name of the file with the arrays of section k; that of section 0 also has those that all sections share."""
-    return f"baked_{k}.safetensors" if k else "baked.safetensors"
-
-
-def stored_layouts(head: dict[str, Any]) -> list[BrickLayout]:
-    """Layouts of the sections in `baked.json`."""
-    layouts = []
-    for one in (head["layout"], *head.get("more_layouts", ())):
-        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in one.items()}
-        layouts.append(BrickLayout(**fields))
-    return layouts

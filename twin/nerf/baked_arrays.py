@@ -1,4 +1,4 @@
-"""Arrays of a baked field: its bricks and networks, and its detail, with checks of what is read from files.
+"""Arrays of a baked field: its bricks, networks and detail, in files with checks, and on a device with their kernels.
 
 `kernels/bricks.py` defines bricks, blocks, slots and indices; the march in `kernels/march.py` reads the arrays. The
 *detail* consists of features at surfaces: `kernels/surface_detail.py` defines texels, tiles and the hash grid, and adds
@@ -6,17 +6,23 @@ the features to rays; `detail.py` fits them.
 """
 
 import itertools
+from collections import OrderedDict
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.files import check_shapes
+from twin.files import check_shapes, load_tensors, wrap_read_errors
+from twin.nerf.kernels import march as kernels
 from twin.nerf.kernels import surface_detail
-from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, HALF_CORNERS
-from twin.nerf.kernels.color_head import HARMONICS
-from twin.nerf.kernels.volume import CHANNELS
+from twin.nerf.kernels.bricks import BLOCKS, CELLS, CORNERS, HALF_CORNERS, Bricks, Bytes
+from twin.nerf.kernels.color_head import HARMONICS, Vec8, color_head_kernel
+from twin.nerf.kernels.color_head import LANES as HEAD_LANES
+from twin.nerf.kernels.volume import CHANNELS, Channels
+from twin.runtime import bar
 from twin.types import Array32
 from twin.warp_runtime import wp
 
@@ -268,3 +274,129 @@ def detail_grid(detail: Detail, device: str) -> Any:
     grid.heights = wp.array(detail.heights.ravel(), dtype=wp.float32, device=device)
     grid.tiles = wp.array(index.ravel(), dtype=wp.int32, device=device)
     return grid
+
+
+# ---- a section in files
+
+
+class BakedSection:
+    """Bricks and detail of one section of the road, in memory or in a file that is read on demand."""
+
+    def __init__(self, layout: BrickLayout, arrays: dict[str, NDArray] | None = None, file: Path | None = None):
+        """
+        Args:
+            layout: Sizes and bounds.
+            arrays: `near` and `far` (the stored bricks in their grids, (s, 3)), `features` (s, 729, CHANNELS) bytes,
+                near bricks first, `low` and `step` (CHANNELS,) of the quantization, `near_leap` and `far_leap` (see
+                `skip_distances`), and those of `Detail.arrays`.
+            file: A file with these arrays, if they are not given.
+        """
+        self.layout, self._arrays, self._file = layout, arrays, file
+
+    @property
+    def arrays(self) -> dict[str, NDArray]:
+        """The arrays. Raises InputError if the file is damaged."""
+        if self._arrays is not None:
+            return self._arrays
+        assert self._file is not None
+        arrays = load_tensors(self._file)
+        with wrap_read_errors(self._file, "build the scene again"):
+            check_arrays(self.layout, arrays)
+        return arrays
+
+
+def section_file(k: int) -> str:
+    """Name of the file with the arrays of section k; that of section 0 also has those that all sections share."""
+    return f"baked_{k}.safetensors" if k else "baked.safetensors"
+
+
+def stored_layouts(head: dict[str, Any]) -> list[BrickLayout]:
+    """Layouts of the sections in `baked.json`."""
+    layouts = []
+    for one in (head["layout"], *head.get("more_layouts", ())):
+        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in one.items()}
+        layouts.append(BrickLayout(**fields))
+    return layouts
+
+
+# ---- on a device
+
+BLOCK_DIM = 128
+"""Threads of a block on a GPU; with 256, it renders 10 % fewer pictures a second."""
+
+
+def on_device(array: NDArray, dtype: Any, device: str) -> Any:
+    """A copy of an array on a device."""
+    if device == "cpu":  # NumPy allocates large arrays on huge pages, where random reads cost less
+        own = np.empty(array.shape, array.dtype)
+        own[...] = array
+        return wp.array(own, dtype=dtype, device=device, copy=False)
+    return wp.array(np.ascontiguousarray(array), dtype=dtype, device=device)
+
+
+class SectionOnDevice:
+    """Bricks and detail of a section as the kernels read them."""
+
+    def __init__(self, layout: BrickLayout, arrays: dict[str, NDArray], device: str):
+        """For the arrays see `BakedSection`."""
+        b: Any = Bricks()
+        near_index, far_index = brick_indices(layout, arrays["near"], arrays["far"])
+        near_index, near_skips = stored_skips(near_index, arrays["near_leap"])
+        far_index, far_skips = stored_skips(far_index, arrays["far_leap"])
+        b.near_index, b.far_index = (on_device(index.ravel(), wp.int32, device) for index in (near_index, far_index))
+        b.skips = on_device(np.concatenate([near_skips, far_skips]).ravel(), wp.uint8, device)
+        b.near_blocks = wp.vec3i(*(BLOCKS * n for n in layout.near_shape))
+        b.far_blocks = wp.vec3i(*(BLOCKS * n for n in layout.far_shape))
+        b.densities = on_device(density_codes(arrays["features"][..., 0]), wp.uint8, device)
+        b.features = on_device(arrays["features"].reshape(-1, CHANNELS), Bytes, device)
+        b.low, b.step = Channels(*arrays["low"].tolist()), Channels(*arrays["step"].tolist())
+        b.center = wp.vec3f(*layout.centre)
+        b.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
+        b.near_cell, b.far_cell = layout.near_cell, layout.far_cell
+        b.unit, b.near_plane = layout.density_unit, layout.near_plane
+        self.bricks = b
+        detail = Detail.of_arrays(arrays)
+        stored: Any = surface_detail.DetailBytes()
+        stored.texels = wp.array(detail.texels, dtype=Bytes, device=device)
+        stored.vertices = wp.array(detail.vertices, dtype=Bytes, device=device)
+        stored.texel_step, stored.vertex_step = (
+            Channels(*step.tolist()) for step in (detail.texel_step, detail.vertex_step)
+        )
+        self.detail = detail_grid(detail, device), stored
+        self.has_detail = bool(len(detail.tiles) or len(detail.vertices))
+        self.targets: WeakKeyDictionary[Any, OrderedDict[tuple, Any]] = WeakKeyDictionary()
+        """`RenderTarget`s of every `BakedField` object that shares this section; they are dropped with it."""
+
+
+class RenderKernels:
+    """Kernels that render a field, and the weights of its networks, on a device."""
+
+    def __init__(self, network: dict[str, NDArray], device: str):
+        """`network` has the arrays of the color head and the background network, see `BakedField.network`."""
+        self.device = device
+        self.march = kernels.march_kernel(kernels.LANES[device])
+        self.color_head, weights = color_head_kernel(
+            HEAD_LANES[device], network["head.1"].shape[0], network["backdrop.0"].shape[1]
+        )
+        rows = CHANNELS - 1 + HARMONICS
+        self.weights = w = weights()
+
+        def as_vec8(matrix: NDArray) -> Any:
+            """Packs a matrix (units, m) as vectors of eight units: array (units / 8, m), flat."""
+            return on_device(matrix.reshape(len(matrix) // 8, 8, -1).transpose(0, 2, 1).reshape(-1, 8), Vec8, device)
+
+        w.head_0, w.head_1, w.head_2 = (
+            as_vec8(network["head.0"][:rows].T),
+            as_vec8(network["head.1"].T),
+            as_vec8(network["head.2"]),
+        )
+        w.head_1_bias, w.head_2_bias = as_vec8(network["head.1.bias"]), wp.vec3f(*network["head.2.bias"].tolist())
+        for name in ("backdrop.0", "backdrop.0.bias", "backdrop.1"):
+            setattr(w, name.replace(".", "_"), on_device(network[name].ravel(), wp.float32, device))
+        self.first_bias = network["head.0.bias"], network["head.0"][rows:]
+        needed = kernels.cone_march, self.march, surface_detail.add_detail, self.color_head
+        # Loaded here, so that no two threads load them at once.
+        with bar("compiling the renderer (first use only)", len(needed), "part", after=1.0) as progress:
+            for kernel in needed:
+                wp.force_load(device, [kernel.module], BLOCK_DIM)
+                progress.update()

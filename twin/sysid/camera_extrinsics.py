@@ -24,9 +24,8 @@ from twin.assets.ground import Ground
 from twin.capture.bag import is_bag
 from twin.capture.bag_film import read_contents
 from twin.capture.camera_models import Lens, same_aspect, undistorted
-from twin.capture.decoding import FilmStatistics
 from twin.capture.localize import FilmRegistration, register_film
-from twin.capture.video import read_film, video_film
+from twin.capture.video import FilmStatistics, read_film, video_film
 from twin.config import CaptureConfig
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, opencv_to_mujoco
