@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from twin.geometry.cameras import Cameras
 from twin.geometry.poses import umeyama
-from twin.reality.place_sampling import draw
+from twin.reality.place_sampling import sample_place
 from twin.scene import SceneDir
 
 
@@ -70,7 +70,16 @@ def main() -> int:
         folder = given.work / f"place_{place}"
         if not (folder / "scene.toml").exists() and (
             error := _run(
-                *("twin.reality", "film", "--place", place, "--out", folder, "--lightings", draw(place).lights[0].name)
+                *(
+                    "twin.reality",
+                    "film",
+                    "--place",
+                    place,
+                    "--out",
+                    folder,
+                    "--lightings",
+                    sample_place(place).lights[0].name,
+                )
             )
         ):
             print(f"place {place}: {error}", file=sys.stderr)

@@ -43,8 +43,8 @@ from record import record_parser, save
 from scipy.special import expit
 from scipy.stats import norm
 
+from twin.evaluation.agreement_intervals import STATISTICS, PairedCells, jackknife_interval
 from twin.evaluation.rate_model import MIN_RATE_DAYS, RateModel
-from twin.evaluation.statistic_intervals import STATISTICS, PairedCells, jackknife_interval
 from twin.evaluation.statistics import MIN_PREDICTORS, UndefinedStatistic, leave_one_group_out
 
 WORLDS = 1000

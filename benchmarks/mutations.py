@@ -42,24 +42,24 @@ MUTATIONS = (
     ),
     Mutation(
         "intervals have a confidence of 0.5",
-        "twin/evaluation/statistic_intervals.py",
+        "twin/evaluation/agreement_intervals.py",
         "ppf(0.5 + CONFIDENCE / 2, freedom)",
         "ppf(0.5 + 0.5 / 2, freedom)",
-        ("statistic_intervals",),
+        ("agreement_intervals",),
     ),
     Mutation(
         "intervals over places are those of a normal distribution",
         "benchmarks/place_intervals.py",
         "np.asarray(len(places) - 1.0)",
         "np.asarray(1e6)",
-        ("statistic_intervals",),
+        ("agreement_intervals",),
     ),
     Mutation(
         "intervals of differences are those of a normal distribution",
         "benchmarks/place_intervals.py",
         "student.ppf(0.5 + CONFIDENCE / 2, n - 1)",
         "student.ppf(0.5 + CONFIDENCE / 2, 1e6)",
-        ("statistic_intervals",),
+        ("agreement_intervals",),
     ),
     Mutation(
         "more than the largest number of trials is recommended",

@@ -1,6 +1,6 @@
 """Intervals with the day, the place, or the pair of trainings, as the unit.
 
-For places, as in `twin.evaluation.statistic_intervals`, the estimand is the mean of a statistic over repeated
+For places, as in `twin.evaluation.agreement_intervals`, the estimand is the mean of a statistic over repeated
 experiments; here each repetition also has new places. A place is left out with all its policies and days.
 """
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
-from twin.evaluation.statistic_intervals import PairedCells, Statistic, interval_ends, jackknife_variance
+from twin.evaluation.agreement_intervals import PairedCells, Statistic, interval_ends, jackknife_variance
 from twin.evaluation.statistics import CONFIDENCE, UndefinedStatistic, wilson
 from twin.types import Array
 

@@ -25,10 +25,10 @@ from twin.geometry.images import psnr, write_image
 from twin.loading import load_scene
 from twin.mjcf.world import nearest_on_route
 from twin.reality import campus_road, filming, true_world
-from twin.reality.drawn_place import build
-from twin.reality.place_sampling import draw
+from twin.reality.place_sampling import sample_place
 from twin.reality.rasterizer import Rasterizer
 from twin.reality.road_task import true_route
+from twin.reality.sampled_place import build
 from twin.reality.sky import apply_haze
 from twin.reality.truth import Truth, align_poses, matched_poses
 from twin.runtime import track
@@ -82,7 +82,7 @@ def contact_sheet(path: Path) -> None:
     width, height = 240, 135
     frames = []
     for number in track(list(range(1, 31)), "contact sheet", unit="place"):
-        spec = draw(number)
+        spec = sample_place(number)
         place, plan = build(spec), replace(filming.FilmingPlan.of(spec), width=width, height=height)
         lighting = plan.lightings[number % len(plan.lightings)]
         poses = filming.trajectory(plan, place.route, lighting)[1]

@@ -30,8 +30,8 @@ from matplotlib.figure import Figure
 from record import record_parser, save
 
 from twin.config import Condition
+from twin.evaluation.agreement_intervals import training_of
 from twin.evaluation.rate_model import RateModel
-from twin.evaluation.statistic_intervals import training_of
 from twin.evaluation.statistics import prediction_powered_mean
 from twin.files import read_json
 

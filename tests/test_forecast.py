@@ -14,9 +14,9 @@ from scipy.special import expit
 from twin.config import CAUSES
 from twin.errors import InputError
 from twin.evaluation.agreement import OTHERS, SHUFFLED, TWIN, Estimate
+from twin.evaluation.agreement_intervals import STATISTICS as WITH_INTERVAL
+from twin.evaluation.agreement_intervals import jackknife_interval, pair_cells
 from twin.evaluation.forecasting import ALL_TASKS, Forecast, make_forecast
-from twin.evaluation.statistic_intervals import STATISTICS as WITH_INTERVAL
-from twin.evaluation.statistic_intervals import jackknife_interval, pair_cells
 from twin.evaluation.statistics import (
     MIN_POLICIES,
     mean_rate,

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from test_statistic_intervals import cells_of
+from test_agreement_intervals import cells_of
 
+from twin.evaluation.agreement_intervals import jackknife_interval, mean_bias
 from twin.evaluation.probability_scores import (
     SCORE_DIFFERENCE,
     brier,
@@ -17,7 +18,6 @@ from twin.evaluation.probability_scores import (
     shuffled_days,
     twin_probabilities,
 )
-from twin.evaluation.statistic_intervals import jackknife_interval, mean_bias
 
 
 @pytest.mark.parametrize("score", [brier, log_score])

@@ -18,7 +18,7 @@ from twin.geometry.cameras import Cameras
 from twin.reality.__main__ import film as film_place
 from twin.reality.__main__ import main as reality
 from twin.reality.filming import FilmingPlan
-from twin.reality.place_sampling import draw
+from twin.reality.place_sampling import sample_place
 from twin.reality.truth import align_poses, matched_poses
 from twin.scene import SceneDir
 from twin.types import Array
@@ -208,7 +208,7 @@ def test_impossible_films_are_refused(option: str, value: str, tmp_path: Path, c
 @pytest.mark.slow
 def test_a_shaky_film_with_a_rolling_shutter_is_built(tmp_path: Path) -> None:
     """The rotations of the cameras are wrong by 0.44° (median) without the correction."""
-    plan = replace(FilmingPlan.of(draw(49)), lightings=("sun",), readout=0.03, shake=8.0)
+    plan = replace(FilmingPlan.of(sample_place(49)), lightings=("sun",), readout=0.03, shake=8.0)
     truth = film_place(plan, tmp_path, 49)
     assert "--place 49 --readout 0.03 --shake 8 --out" in (tmp_path / "scene.toml").read_text()
     build(tmp_path, until="metric")

@@ -14,10 +14,10 @@ from twin.geometry.mesh_rays import Surface
 from twin.mjcf.world import World
 from twin.reality import __main__ as verb
 from twin.reality import filming
-from twin.reality.drawn_place import build
-from twin.reality.drawn_road import DrawnRoad
-from twin.reality.place_sampling import draw
+from twin.reality.place_sampling import sample_place
 from twin.reality.place_spec import FREE_HALF_WIDTH, MOUTH_REACH
+from twin.reality.sampled_place import build
+from twin.reality.sampled_road import SampledRoad
 from twin.reality.side_roads import LEAD, SIDE_VERGE, SideAxis, SideLine, occupied, turn_end
 from twin.reality.true_world import near_stretch
 from twin.reality.truth import HALF_WIDTH, Truth, corridor
@@ -29,7 +29,7 @@ NUMBERS = range(1, 50)
 
 @pytest.fixture(scope="module")
 def spec():
-    return draw(PLACE, side_roads=True)
+    return sample_place(PLACE, side_roads=True)
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +38,15 @@ def place(spec):
 
 
 def _lines(number):
-    spec = draw(number, side_roads=True)
-    road = DrawnRoad(spec)
+    spec = sample_place(number, side_roads=True)
+    road = SampledRoad(spec)
     return road, [(one, SideLine(road, one)) for one in spec.line.side_roads]
 
 
 def test_all_but_the_line_is_that_of_the_place():
     found = 0
     for number in NUMBERS:
-        plain, spec = draw(number), draw(number, side_roads=True)
+        plain, spec = sample_place(number), sample_place(number, side_roads=True)
         found += len(spec.line.side_roads)
         assert not plain.line.side_roads and replace(spec, line=plain.line) == plain
         assert replace(spec.line, side_roads=(), mouths=plain.line.mouths) == plain.line
@@ -61,8 +61,8 @@ def test_all_but_the_line_is_that_of_the_place():
 def test_no_other_side_road_crosses_one(numbers, length):
     """Side roads that are not filmed are in the place, too."""
     for number in numbers:
-        spec = draw(number, length, side_roads=True)
-        road, filmed = DrawnRoad(spec), [one.mouth for one in spec.line.side_roads]
+        spec = sample_place(number, length, side_roads=True)
+        road, filmed = SampledRoad(spec), [one.mouth for one in spec.line.side_roads]
         for mouth in (one for one in spec.line.mouths if one not in filmed):
             edge = (spec.section.left if mouth.side > 0 else spec.section.right) + spec.section.kerb_width
             across = mouth.station + 0.5 * mouth.width * np.linspace(-1.0, 1.0, 9)
@@ -131,7 +131,7 @@ def test_what_stood_beside_the_driven_line_stands_there_still(place, spec):
     def centers(one):
         return np.array([solid.center[:2] for obj in one.objects for solid in obj.solids])
 
-    plain, now = centers(build(draw(PLACE))), centers(place)
+    plain, now = centers(build(sample_place(PLACE))), centers(place)
     kept = np.linalg.norm(plain[:, None] - now, axis=-1).min(1) < 1e-6
     axes = [SideAxis(place.route, one) for one in spec.line.side_roads]
     away = np.min([np.abs(axis.project(plain)[1]) for axis in axes], axis=0)
@@ -161,7 +161,7 @@ def test_the_ground_mesh_is_the_true_ground(place, spec):
 
 def test_a_long_road_has_textures_for_its_side_roads():
     """Parts of a long place that are rendered alone have all the textures that they use."""
-    spec = draw(PLACE, 160.0, side_roads=True)
+    spec = sample_place(PLACE, 160.0, side_roads=True)
     assert spec.line.side_roads and spec.line.length == 160.0
     part = near_stretch(build(spec), 0.0, 50.0)
     used = {obj.texture for obj in part.objects} - {"lamp_glass", "windows_by_day", "windows_by_night"}

@@ -11,10 +11,10 @@ from twin.files import read_json
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.reality import filming
 from twin.reality.__main__ import main, scene_task, scene_toml
-from twin.reality.drawn_place import build
-from twin.reality.drawn_road import DrawnRoad
-from twin.reality.place_sampling import MAX_FRAMES, draw
+from twin.reality.place_sampling import MAX_FRAMES, sample_place
 from twin.reality.place_spec import GRADE_STEP, LONGEST_DRAWN, RUN_IN, RUN_OUT
+from twin.reality.sampled_place import build
+from twin.reality.sampled_road import SampledRoad
 from twin.reality.true_world import StretchRenderer, is_long, near_stretch
 from twin.reality.truth import TrueFilm, Truth
 
@@ -28,13 +28,13 @@ def _area(part):
 
 @pytest.fixture(scope="module")
 def place():
-    return build(draw(PLACE, LENGTH))
+    return build(sample_place(PLACE, LENGTH))
 
 
 @pytest.mark.parametrize(("length", "numbers"), [(100.0, range(1, 41)), (300.0, range(1, 41)), (2000.0, range(1, 5))])
 def test_a_lengthened_line_begins_as_drawn_and_does_not_come_back(length, numbers):
     for number in numbers:
-        short, spec = draw(number), draw(number, length)
+        short, spec = sample_place(number), sample_place(number, length)
         known = len(short.line.pieces)
         assert spec.line.length == length and spec.section == short.section and spec.lights == short.lights
         assert spec.line.pieces[:known] == short.line.pieces
@@ -45,7 +45,7 @@ def test_a_lengthened_line_begins_as_drawn_and_does_not_come_back(length, number
         for piece in spec.line.pieces:
             assert piece.curvature == 0.0 or 6.0 <= 1.0 / abs(piece.curvature) <= 40.0, number
         stations = np.arange(-RUN_IN, length + RUN_OUT)
-        xy = DrawnRoad(spec).at(stations)
+        xy = SampledRoad(spec).at(stations)
         drawn = sum(piece.length for piece in short.line.pieces)
         for k in np.flatnonzero(stations > drawn).tolist():
             before = xy[stations < stations[k] - 65.0]
@@ -56,17 +56,19 @@ def test_a_lengthened_line_begins_as_drawn_and_does_not_come_back(length, number
 
 def test_without_a_length_nothing_changes():
     for number in range(1, 41):
-        assert draw(number, 20.0) == draw(number, draw(number).line.length) == draw(number), number
-        assert draw(number).line.length <= LONGEST_DRAWN
-    assert not is_long(build(draw(PLACE)))
+        assert (
+            sample_place(number, 20.0) == sample_place(number, sample_place(number).line.length) == sample_place(number)
+        ), number
+        assert sample_place(number).line.length <= LONGEST_DRAWN
+    assert not is_long(build(sample_place(PLACE)))
 
 
 def test_a_long_film_takes_no_more_frames_than_its_speed_asks_for():
     for number in range(1, 41):
-        film = draw(number, 300.0).film
-        wanted = 300.0 * len(film.passes) * len(draw(number).lights) / MAX_FRAMES
+        film = sample_place(number, 300.0).film
+        wanted = 300.0 * len(film.passes) * len(sample_place(number).lights) / MAX_FRAMES
         assert film.spacing <= 2.01 and (film.fps == np.ceil(film.speed / 2.0) or film.spacing > 0.66 * wanted), number
-        assert film.size == draw(number).film.size
+        assert film.size == sample_place(number).film.size
 
 
 def test_things_stand_as_densely_far_along_as_at_the_start(place):
@@ -116,7 +118,7 @@ def test_a_stretch_has_what_is_near_and_sharp_textures_there(place, monkeypatch)
 
 def test_a_frame_far_along_shows_the_road_and_things_beside_it(place):
     """At 130 m, the road is below the horizon, solid objects are beside it, and the depth equals that of cast rays."""
-    plan = replace(filming.FilmingPlan.of(draw(PLACE, LENGTH)), width=160, height=92, oversize=1.0)
+    plan = replace(filming.FilmingPlan.of(sample_place(PLACE, LENGTH)), width=160, height=92, oversize=1.0)
     lighting = plan.lightings[0]
     _, poses = filming.trajectory(plan, place.route, lighting)
     pose = poses[np.argmin(np.abs(place.route.project(poses[:, :2, 3])[0] - 130.0))]
@@ -136,16 +138,16 @@ def test_a_frame_far_along_shows_the_road_and_things_beside_it(place):
 
 
 def test_the_truth_of_a_long_place_has_its_length(place, tmp_path):
-    plan = filming.FilmingPlan.of(draw(PLACE, LENGTH))
+    plan = filming.FilmingPlan.of(sample_place(PLACE, LENGTH))
     times, poses = filming.trajectory(plan, place.route, "sun")
     film = TrueFilm(times, poses, np.zeros(0, np.int64), np.zeros((0, 9, 16), np.float16))
-    road = DrawnRoad(draw(PLACE, LENGTH))
+    road = SampledRoad(sample_place(PLACE, LENGTH))
     truth = Truth(road, 0.0, LENGTH, 1.5, plan.intrinsics, (640, 360), {"sun": film}, PLACE, {"sun": "sun"})
     truth.save(tmp_path / "truth")
     assert read_json(tmp_path / "truth" / "truth.json")["road_length"] == LENGTH
     back = Truth.load(tmp_path / "truth")
     assert back.route.length == back.road_length == LENGTH and back.length == LENGTH
-    assert f"--place {PLACE} --length 160 --out" in scene_toml(plan, "x", draw(PLACE, LENGTH), back.road_length)
+    assert f"--place {PLACE} --length 160 --out" in scene_toml(plan, "x", sample_place(PLACE, LENGTH), back.road_length)
     with pytest.raises(InputError, match="a road of 160 m, this place another; give --length 160"):
         scene_task("task.json", tmp_path, PLACE)
 

@@ -32,7 +32,7 @@ from twin.evaluation.trials import Trial, read_trials
 from twin.reality.__main__ import film, scene_task
 from twin.reality.filming import FilmingPlan
 from twin.reality.lighting import weather
-from twin.reality.place_sampling import draw
+from twin.reality.place_sampling import sample_place
 from twin.reality.real_test import RealTest, Setup, load_policy_file, task_for
 from twin.reality.road_task import place_on_test_day
 
@@ -162,7 +162,7 @@ def _repeat(protocol: Protocol, given: argparse.Namespace) -> None:
 
 def _film(given: argparse.Namespace) -> None:
     """Films a place under its lightings; each lighting has its own process of Cycles."""
-    plan = FilmingPlan.of(draw(given.place)) if given.place else FilmingPlan()
+    plan = FilmingPlan.of(sample_place(given.place)) if given.place else FilmingPlan()
     running: list[CyclesRenderer] = []
 
     def renderer_of(lighting: str, place: Any) -> CyclesRenderer:

@@ -22,6 +22,7 @@ import numpy as np
 from place_record import FAILURE, POLICIES, PlaceRecord, read_place
 from protocol import Protocol
 
+from twin.evaluation.agreement_intervals import STATISTICS, PairedCells, Statistic
 from twin.evaluation.probability_scores import (
     brier,
     calibration,
@@ -30,7 +31,6 @@ from twin.evaluation.probability_scores import (
     shuffled_days,
     twin_probabilities,
 )
-from twin.evaluation.statistic_intervals import STATISTICS, PairedCells, Statistic
 from twin.evaluation.statistics import UndefinedStatistic, winner
 from twin.files import read_json
 from twin.types import Array

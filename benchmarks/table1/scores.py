@@ -5,7 +5,7 @@
 Prints, by groups of days: success on the road; how well the twin's rates rank the policies; proper scores of the twin's
 predictions of single days, beside those of baselines that do not use the twin; and the twin's false alarms and missed
 failures. Rates on the road have intervals over days. Ranking and scores have jackknife intervals, as in
-`twin forecast`, which hold for further trainings and days on this street (`twin/evaluation/statistic_intervals.py`).
+`twin forecast`, which hold for further trainings and days on this street (`twin/evaluation/agreement_intervals.py`).
 `benchmarks/intervals.py` measures their coverage for these numbers of trainings and days. The *rule* is a baseline of
 the ranking that does not use the twin; see `rule`.
 
@@ -26,6 +26,14 @@ import numpy as np
 from plan import SETUPS, SHARES, STEPS, TASKS
 
 from twin.config import Condition
+from twin.evaluation.agreement_intervals import (
+    STATISTICS,
+    PairedCells,
+    Statistic,
+    jackknife_interval,
+    mean_bias,
+    training_of,
+)
 from twin.evaluation.probability_scores import (
     SCORE_DIFFERENCE,
     brier,
@@ -38,14 +46,6 @@ from twin.evaluation.probability_scores import (
     score_pair,
     shuffled_days,
     twin_probabilities,
-)
-from twin.evaluation.statistic_intervals import (
-    STATISTICS,
-    PairedCells,
-    Statistic,
-    jackknife_interval,
-    mean_bias,
-    training_of,
 )
 from twin.evaluation.statistics import (
     MIN_POLICIES,

@@ -1,4 +1,4 @@
-"""Fusion of depth maps into a truncated signed distance field (TSDF), and triangle meshes from it.
+"""Fusion of depth maps into a truncated signed distance field (TSDF), and triangle meshes from it by marching cubes.
 
 *Signed distance* [m]: positive in free space, negative behind a surface, valid within ± `band` of it. At each voxel a
 view votes `near` if the surface that it sees is within ± `band`, and `free` if it sees farther. This is the method of

@@ -1,9 +1,10 @@
 """Stage `capture`: converts films and image sets to kept frames of one size with masks, times and a held-out split.
 
-A *source* is one input under one lighting; its *kind* is video, bag, images, colmap or transforms. A *kept* frame is
-upright and scaled to `capture.max_size`, and still has the lens's distortion; a posed image may remain as stored, and
-is undistorted if distortions differ within its source. A frame's name is `<source>/<index>`, where the index is its
-position in the whole film, or among all images of the set in natural order. *Held-out* frames are never trained on.
+`video.py` decodes films and selects their frames. A *source* is one input under one lighting; its *kind* is video, bag,
+images, colmap or transforms. A *kept* frame is upright and scaled to `capture.max_size`, and still has the lens's
+distortion; a posed image may remain as stored, and is undistorted if distortions differ within its source. A frame's
+name is `<source>/<index>`, where the index is its position in the whole film, or among all images of the set in natural
+order. *Held-out* frames are never trained on.
 """
 
 from pathlib import Path

@@ -1,11 +1,11 @@
 """Maps the frames of linked films with COLMAP, and keeps the part of the result that holds together.
 
-A *model* is a COLMAP reconstruction. Poses averaged from pairs of frames are tried first (`pose_averaging.py`), then
-COLMAP's global mapping (Pan et al. 2024), then incremental mapping, which gets stuck on forward motion. On a road with
-little texture, global mapping may tear a film apart: the long tracks of points on the skyline, which constrain
-rotations alone, outnumber the short tracks of near points. The pieces of a torn model share no points that fix their
-scale, so it is recognized. Frames off the path of their neighbors are removed and registered once more against all
-others. They are left out if they are then still off the path.
+A *model* is a COLMAP reconstruction, refined by bundle adjustment. Poses averaged from pairs of frames are tried first
+(`pose_averaging.py`), then COLMAP's global mapping (Pan et al. 2024), then incremental mapping, which gets stuck on
+forward motion. On a road with little texture, global mapping may tear a film apart: the long tracks of points on the
+skyline, which constrain rotations alone, outnumber the short tracks of near points. The pieces of a torn model share no
+points that fix their scale, so it is recognized. Frames off the path of their neighbors are removed and registered once
+more against all others. They are left out if they are then still off the path.
 """
 
 import itertools

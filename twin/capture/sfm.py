@@ -1,8 +1,9 @@
 """Stage `cameras`: camera poses and sparse points by structure from motion, and images without lens distortion.
 
 The output has the coordinate system of the reconstruction. Its rotation, origin and scale are arbitrary, unless the
-input has poses. The stage runs `solve_mapping` in a worker process. Films without a common view, such as those that go
-down the road in opposite directions, are reconstructed separately, and joined by the ground if that is possible.
+input has poses. The stage runs `solve_mapping` in a worker process: `matching.py` matches features, `mapping.py`
+reconstructs. Films without a common view, such as those that go down the road in opposite directions, are reconstructed
+separately, and joined by the ground if that is possible.
 """
 
 import os

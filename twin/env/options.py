@@ -1,4 +1,4 @@
-"""Options of an environment with their checks, and the check of actions.
+"""Options of an environment with their checks, among them the reward's terms (`Rewards`); and the check of actions.
 
 Defaults are those of DriveEnv-NeRF (arXiv 2403.15791) where the paper states them.
 """

@@ -1,9 +1,10 @@
 """Driving along a route segment in dm_control, without images: physics, start, state, reward and termination.
 
-In an *episode*, the robot starts at rest near the segment's start; the episode ends with one of `CAUSES`. The discount
-at the end is 0, or 1 after a timeout, which truncates the episode. An episode's seed determines all its randomness, so
-that policies can be compared on the same episodes. Start, robot, lighting, obstacles, camera and weather have separate
-random generators: a change in the sampling of one leaves the others unchanged.
+`options.Rewards` has the weights of the reward. In an *episode*, the robot starts at rest near the segment's start; the
+episode ends with one of `CAUSES`. The discount at the end is 0, or 1 after a timeout, which truncates the episode. An
+episode's seed determines all its randomness, so that policies can be compared on the same episodes. Start, robot,
+lighting, obstacles, camera and weather have separate random generators: a change in the sampling of one leaves the
+others unchanged.
 """
 
 import math

@@ -4,7 +4,7 @@ A *group* is the policies of one task, or of all tasks, that were driven on the 
 policy on one task under one lighting. A *day* is a lighting of the real trials; a *training* is a run, with all its
 checkpoints. A statistic is an `Estimate`: a value with its sample size, or the reason why there is no value. A value
 has a 90 % interval only if `benchmarks/intervals.py` confirmed this coverage. Intervals hold for the population from
-which the trainings and days are a sample, not for the measured cells (see `statistic_intervals` and `rate_model`).
+which the trainings and days are a sample, not for the measured cells (see `agreement_intervals` and `rate_model`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +14,15 @@ from typing import Any
 import numpy as np
 
 from twin.errors import join_names
+from twin.evaluation.agreement_intervals import (
+    STATISTICS,
+    PairedCells,
+    Statistic,
+    jackknife_interval,
+    mean_bias,
+    pair_cells,
+    policy_rows,
+)
 from twin.evaluation.probability_scores import (
     SCORE_DIFFERENCE,
     CalibrationBin,
@@ -28,15 +37,6 @@ from twin.evaluation.probability_scores import (
     score_pair,
     shuffled_days,
     twin_probabilities,
-)
-from twin.evaluation.statistic_intervals import (
-    STATISTICS,
-    PairedCells,
-    Statistic,
-    jackknife_interval,
-    mean_bias,
-    pair_cells,
-    policy_rows,
 )
 from twin.evaluation.statistics import (
     MIN_POLICIES,

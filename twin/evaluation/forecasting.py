@@ -3,7 +3,8 @@
 A *candidate* is a policy on a task. Its twin score is the mean of its success rates in the twin under the *compared
 lightings*: those with which the task's real trials are compared, or all lightings if there are no real trials. A
 candidate is *driven* if it has real trials. A *day* is a lighting of the real trials; a *training* is a run, with all
-its checkpoints. `agreement` compares the driven candidates of one task, or of all tasks, with the twin.
+its checkpoints. `rate_model.py` gives the intervals of driven candidates, `statistics.LinearCorrection` predicts the
+rates of the others. `agreement` compares the driven candidates of one task, or of all tasks, with the twin.
 """
 
 from collections import Counter
@@ -27,6 +28,7 @@ from twin.evaluation.agreement import (
     missing_data,
     unit_counts,
 )
+from twin.evaluation.agreement_intervals import training_of
 from twin.evaluation.rate_model import (
     MARGIN,
     MIN_RATE_DAYS,
@@ -38,7 +40,6 @@ from twin.evaluation.rate_model import (
     rank_probabilities,
     trials_needed,
 )
-from twin.evaluation.statistic_intervals import training_of
 from twin.evaluation.statistics import (
     CONFIDENCE,
     MIN_POLICIES,

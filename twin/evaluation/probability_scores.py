@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from twin.evaluation.agreement_intervals import STATISTICS, PairedCells
 from twin.evaluation.rate_model import RateModel
-from twin.evaluation.statistic_intervals import STATISTICS, PairedCells
 from twin.types import Array, Indices
 
 CALIBRATION_EDGES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)

@@ -6,7 +6,7 @@ on day j, policy i succeeds yᵢⱼ times:
     rᵢⱼ | pᵢ ~ Beta with mean pᵢ and intra-class correlation ρ        the rate on day j
     yᵢⱼ | rᵢⱼ ~ Binomial(m, rᵢⱼ)
     pᵢ ~ Beta with mean μᵢ and intra-class correlation τ              the policy's rate over days
-    logit μᵢ = logit μ + β xᵢ                                        xᵢ: a covariate such as the twin's rate, or none
+    logit μᵢ = logit μ + β xᵢ                                        xᵢ: a covariate; the forecast has none
 
 A Beta distribution with mean p and intra-class correlation ρ is Beta(p/ρ − p, (1 − p)/ρ − (1 − p)). With ρ = 1, all
 trials of a day have the same outcome; with ρ = 0, they are independent. τ has a uniform prior, and μ has Jeffreys'. For

@@ -31,16 +31,16 @@ from twin.geometry.cameras import Cameras
 from twin.loading import load_scene
 from twin.reality import campus_road, real_test, recordings
 from twin.reality.campus_road import RoadLine
-from twin.reality.drawn_place import build_number
-from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, depth_maps, film_name, film_pass, parked_cars
 from twin.reality.lighting import LIGHTINGS, WEATHER
 from twin.reality.place_objects import DrivenLine, KnownPlace
-from twin.reality.place_sampling import check_length, draw
+from twin.reality.place_sampling import check_length, sample_place
 from twin.reality.place_spec import PlaceSpec, SideRoad, tasks
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_test import Setup
 from twin.reality.road_task import RoadTask, read_task
+from twin.reality.sampled_place import build_number
+from twin.reality.sampled_road import SampledRoad
 from twin.reality.side_roads import SideLine, turn_end
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, align_poses, compare, matched_poses
 from twin.scene import SceneDir, require_stage
@@ -76,8 +76,8 @@ def film(
 
     With `traffic`, walkers and cars move through every film, and the films of all lightings but the last show parked
     cars. The truth contains none of them. `renderer_of` returns the renderer for a lighting and a place; the default is
-    `filming.Renderer`, the only one that shows moving traffic. `length` [m] is that for `place_sampling.draw`. With
-    `side_roads`, every side road into which a line turns off the filmed length gets films of its own.
+    `filming.Renderer`, the only one that shows moving traffic. `length` [m] is that for `place_sampling.sample_place`.
+    With `side_roads`, every side road into which a line turns off the filmed length gets films of its own.
 
     Raises:
         InputError: `out` is not empty and has no folder `truth`; there is no such side road, or `traffic` with them.
@@ -88,7 +88,7 @@ def film(
         raise InputError("--side-roads: the demo's street has none; give a --place from 1 on")
     if side_roads and traffic:
         raise InputError("--side-roads with --traffic: walkers and cars keep to the main road; leave one of them out")
-    spec = draw(number, length, side_roads) if number else None
+    spec = sample_place(number, length, side_roads) if number else None
     sides = _filmed_sides(spec, plan) if spec and side_roads else []
     # The folder of the truth exists from the start, so that stopped filming can start again. What an older film left is
     # deleted: new films with old settings would be another scene.
@@ -97,7 +97,7 @@ def film(
     for old in (out / "scene.toml", out / "truth" / "truth.json", out / "truth" / "truth.npz"):
         old.unlink(missing_ok=True)
     place = build_number(number, length=length, side_roads=side_roads) if number else campus_road.build()
-    assert isinstance(place.route, RoadLine | DrawnRoad)
+    assert isinstance(place.route, RoadLine | SampledRoad)
     lines: list[tuple[FilmingPlan, DrivenLine]] = [(plan, place.route)]
     lines += [(one_plan, SideLine(place.route, one)) for one, one_plan in sides]
     parked = parked_cars(place, plan.start, plan.length) if traffic else []
@@ -141,13 +141,13 @@ _TINY_SIDE = 20.0  # [m] of a side road's line that `--tiny` films
 def _filmed_sides(spec: PlaceSpec, plan: FilmingPlan) -> _Sides:
     """The side roads into which a line turns off the filmed length. Raises InputError if there are none."""
     tiny = plan.length < spec.line.length
-    road, out = DrawnRoad(spec), []
+    road, out = SampledRoad(spec), []
     for one in _within(spec, plan.length):
         length = SideLine(road, one).length
         out.append((one, plan.side(one.name, min(length, _TINY_SIDE) if tiny else length)))
     if not out:
         reach = plan.length if tiny else float("inf")
-        known = [str(n) for n in range(1, _DEVELOPMENT + 1) if _within(draw(n, side_roads=True), reach)]
+        known = [str(n) for n in range(1, _DEVELOPMENT + 1) if _within(sample_place(n, side_roads=True), reach)]
         raise InputError(
             f"--side-roads: no side road in the first {plan.length:g} m of place {spec.number} has room for a film; "
             f"choose one of the places {', '.join(known)}"
@@ -217,7 +217,7 @@ def command(options: argparse.Namespace) -> None:
     if options.command == "film":
         plan = TINY if options.tiny else FilmingPlan()
         if options.place:
-            plan = FilmingPlan.of(draw(options.place, options.length))
+            plan = FilmingPlan.of(sample_place(options.place, options.length))
             plan = _tiny(plan) if options.tiny else plan
         _check_lightings(options.lightings or [], plan.lightings if options.place else LIGHTINGS)
         plan = replace(plan, lightings=tuple(dict.fromkeys(options.lightings))) if options.lightings else plan
@@ -288,7 +288,7 @@ def scene_task(given: str, scene: Path | None, place: int, length: float = 0.0) 
         raise InputError(f"{scene} is a film of place {truth.number}; give --place {truth.number}")
     if truth.side_roads:
         raise InputError(f"{scene} was filmed with --side-roads, which twin reality drive does not have; film without")
-    if place and truth.route.length != draw(place, length).line.length:
+    if place and truth.route.length != sample_place(place, length).line.length:
         cure = f"give --length {truth.road_length:g}" if truth.road_length else "leave --length out"
         raise InputError(f"{scene} has a road of {truth.route.length:g} m, this place another; {cure}")
     cameras = Cameras.load(require_stage(root, "metric"))

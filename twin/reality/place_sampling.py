@@ -1,8 +1,8 @@
 """Samples the descriptions of places, with the place's number as seed.
 
-`draw(number)` returns the description of a place from number 1 on; place 0 is designed, see `campus_road.py`. Every
-aspect of a place, such as the surface or the trees, has its own random stream, see `place_spec.stream`. The line is
-sampled in `drawn_road.py`. The *setting*, such as `village`, sets probabilities and ranges of all aspects.
+`sample_place(number)` returns the description of a place from number 1 on; place 0 is designed, see `campus_road.py`.
+Every aspect of a place, such as the surface or the trees, has its own random stream, see `place_spec.stream`. The line
+is sampled in `sampled_road.py`. The *setting*, such as `village`, sets probabilities and ranges of all aspects.
 """
 
 import colorsys
@@ -13,7 +13,6 @@ from typing import TypeVar
 import numpy as np
 
 from twin.errors import InputError
-from twin.reality.drawn_road import DrawnRoad, lengthen, sample_line
 from twin.reality.place_spec import (
     SETTINGS,
     BoundarySpec,
@@ -33,6 +32,7 @@ from twin.reality.place_spec import (
     TreesSpec,
     stream,
 )
+from twin.reality.sampled_road import SampledRoad, lengthen, sample_line
 from twin.reality.side_roads import with_side_roads
 
 T = TypeVar("T")
@@ -41,14 +41,14 @@ MAX_FRAMES = 420  # upper bound of the number of frames in all films of a place 
 
 
 def check_length(number: int, length: float) -> None:
-    """Raises InputError: a length [m] for `draw` below that of the place's road."""
-    if length < (sampled := draw(number).line.length):
+    """Raises InputError: a length [m] for `sample_place` below that of the place's road."""
+    if length < (sampled := sample_place(number).line.length):
         raise InputError(
             f"--length {length:g}: the road of place {number} has {sampled:g} m; give more, or leave --length out"
         )
 
 
-def draw(number: int, length: float = 0.0, side_roads: bool = False) -> PlaceSpec:
+def sample_place(number: int, length: float = 0.0, side_roads: bool = False) -> PlaceSpec:
     """The description of the place with a number, always the same.
 
     If its line is shorter than `length` [m], it is lengthened to that. Section, materials, amounts and camera are then
@@ -86,7 +86,7 @@ def draw(number: int, length: float = 0.0, side_roads: bool = False) -> PlaceSpe
     )
     if not side_roads:
         return spec
-    road = DrawnRoad(spec)
+    road = SampledRoad(spec)
     return replace(spec, line=with_side_roads(line, fitted, road, road.start, road.end))
 
 

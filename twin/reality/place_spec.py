@@ -1,6 +1,6 @@
 """Descriptions of randomly sampled places: plain numbers and names, which `place_sampling.py` samples; random streams.
 
-`drawn_place.py` builds a place from its description. The *driven line* is the line that the first film and the
+`sampled_place.py` builds a place from its description. The *driven line* is the line that the first film and the
 robot's tasks follow; the road need not be symmetrical about it. Stations and laterals are those of `campus_road.py`.
 """
 

@@ -58,7 +58,7 @@ class Setup:
     robot: int = 0
     camera: int = 0
     length: float = 0.0
-    """Length to which the place's road is lengthened [m], see `place_sampling.draw`."""
+    """Length to which the place's road is lengthened [m], see `place_sampling.sample_place`."""
 
     def __post_init__(self) -> None:
         """Raises InputError: no such robot or camera, or a length below that of the place's road."""

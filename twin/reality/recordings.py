@@ -23,7 +23,6 @@ from twin.evaluation.trials import Trial
 from twin.files import remove
 from twin.geometry.images import write_image
 from twin.reality import SEED
-from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import Lighting, weather, weather_index
 from twin.reality.place_objects import DrivenLine
@@ -31,6 +30,7 @@ from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of, nat
 from twin.reality.real_robot import RealRobot, draw_robot
 from twin.reality.real_test import RealTest, Setup
 from twin.reality.road_task import place_on_test_day, task_of_place
+from twin.reality.sampled_road import SampledRoad
 from twin.reality.true_world import rasterizer_of
 from twin.runtime import bar, track
 from twin.types import Array
@@ -192,7 +192,7 @@ def _stays_inside(line: DrivenLine, pose: Array, command: Array, ahead: float) -
     xy = pose[:2] + np.cumsum(np.stack([np.cos(heading[:-1]), np.sin(heading[:-1])], 1) * step[:, None], 0)
     station, lateral = line.project(xy)
     bound = _MAX_LATERAL
-    if isinstance(line, DrawnRoad):
+    if isinstance(line, SampledRoad):
         bound = min(bound, max(0.9, min(line.section.left, line.section.right) - 0.2))
     inside = (np.abs(lateral) <= bound) & (station >= _LOG_STATIONS[0]) & (station <= _LOG_STATIONS[1])
     return bool(inside.all())

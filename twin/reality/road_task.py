@@ -24,11 +24,11 @@ from twin.geometry.passes import path_length, smooth_path
 from twin.geometry.poses import Similarity
 from twin.reality import campus_road
 from twin.reality.campus_road import RoadLine
-from twin.reality.drawn_place import build_number
 from twin.reality.filming import FilmingPlan, trajectory
 from twin.reality.place_objects import DrivenLine, KnownPlace
-from twin.reality.place_sampling import draw
+from twin.reality.place_sampling import sample_place
 from twin.reality.place_spec import tasks
+from twin.reality.sampled_place import build_number
 from twin.types import Array
 
 CAMPUS_TASKS = {"straight": (0.0, 30.0), "right_turn": (0.25, 60.0), "route": (0.0, 60.349)}
@@ -167,14 +167,14 @@ def true_route(plan: FilmingPlan | None = None, line: DrivenLine | None = None) 
 
 @cache
 def place_on_test_day(number: int = 0, length: float = 0.0) -> KnownPlace:
-    """The place with a number on the day of the trials; `length` [m] as for `place_sampling.draw`."""
+    """The place with a number on the day of the trials; `length` [m] as for `place_sampling.sample_place`."""
     return build_number(number, displaced=True, length=length) if number else campus_road.build(displaced=True)
 
 
 @cache
 def _filmed_line(number: int, length: float) -> Array:
     place = place_on_test_day(number, length)
-    return true_route(FilmingPlan.of(draw(number, length)) if number else None, place.route)[:, :2]
+    return true_route(FilmingPlan.of(sample_place(number, length)) if number else None, place.route)[:, :2]
 
 
 def task_of_place(
@@ -187,12 +187,12 @@ def task_of_place(
 ) -> RoadTask:
     """A task of a place on its filmed path, for a policy's speed [m/s], yaw rate [rad/s] and control step [s].
 
-    `road_length` [m] as the length for `place_sampling.draw`.
+    `road_length` [m] as the length for `place_sampling.sample_place`.
 
     Raises:
         InputError: no such task in this place.
     """
-    offered = tasks(draw(number, road_length).line) if number else CAMPUS_TASKS
+    offered = tasks(sample_place(number, road_length).line) if number else CAMPUS_TASKS
     if name not in offered:
         raise InputError(f"task {name!r}: place {number} has {', '.join(offered)}")
     start, length = offered[name]

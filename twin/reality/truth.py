@@ -30,12 +30,12 @@ from twin.geometry.route import BRANCH
 from twin.nerf.baked import BakedField
 from twin.reality import SEED, campus_road
 from twin.reality.campus_road import RoadLine
-from twin.reality.drawn_place import build_number
-from twin.reality.drawn_road import DrawnRoad
 from twin.reality.filming import CAMERA_HEIGHT
 from twin.reality.place_objects import DrivenLine, KnownPlace
-from twin.reality.place_sampling import draw
+from twin.reality.place_sampling import sample_place
 from twin.reality.place_spec import FREE_HALF_WIDTH
+from twin.reality.sampled_place import build_number
+from twin.reality.sampled_road import SampledRoad
 from twin.reality.side_roads import SideLine
 from twin.scene import SceneDir, stage_result
 from twin.types import Array
@@ -61,7 +61,7 @@ class TrueFilm:
 class Truth:
     """The truth of one filmed scene."""
 
-    route: RoadLine | DrawnRoad
+    route: RoadLine | SampledRoad
     start: float
     """Station where the films start [m]."""
     length: float
@@ -118,7 +118,7 @@ class Truth:
             number = int(head.get("place", 0))
             side_roads = {name: float(length) for name, length in head.get("side_roads", {}).items()}
             truth = Truth(
-                DrawnRoad(draw(number, head.get("road_length", 0.0), bool(side_roads)))
+                SampledRoad(sample_place(number, head.get("road_length", 0.0), bool(side_roads)))
                 if number
                 else RoadLine(**head["route"]),
                 head["start"],
@@ -140,7 +140,7 @@ class Truth:
     @property
     def road_length(self) -> float:
         """Length of the driven line [m] if it was lengthened, else 0."""
-        return self.route.length if self.number and self.route.length > draw(self.number).line.length else 0.0
+        return self.route.length if self.number and self.route.length > sample_place(self.number).line.length else 0.0
 
     @cached_property
     def place(self) -> KnownPlace:
@@ -153,7 +153,7 @@ class Truth:
     def lines(self) -> dict[str, tuple[DrivenLine, float, float]]:
         """The filmed lines by name, "" for the driven line: line, first station, filmed length [m]."""
         out: dict[str, tuple[DrivenLine, float, float]] = {"": (self.route, self.start, self.length)}
-        if isinstance(self.route, DrawnRoad):
+        if isinstance(self.route, SampledRoad):
             sides = {one.name: one for one in self.route.line.side_roads}
             out |= {name: (SideLine(self.route, sides[name]), 0.0, length) for name, length in self.side_roads.items()}
         return out

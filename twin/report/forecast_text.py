@@ -10,9 +10,9 @@ import numpy as np
 
 from twin.errors import join_names
 from twin.evaluation.agreement import OTHERS, SHUFFLED, Agreement, Estimate
+from twin.evaluation.agreement_intervals import MIN_DAYS, MIN_TRAININGS, training_of
 from twin.evaluation.forecasting import ALL_TASKS, Forecast, TrialAllocation
 from twin.evaluation.rate_model import MAX_TRIALS
-from twin.evaluation.statistic_intervals import MIN_DAYS, MIN_TRAININGS, training_of
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.evaluation.trials import csv_text
 from twin.report.html import Caution, Verdict

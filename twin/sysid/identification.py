@@ -1,4 +1,7 @@
-"""System identification of a robot from a log, and the text of `robot.toml`.
+"""Runs the system identification of a robot from a log, and writes the text of `robot.toml`.
+
+`drivetrain.py` fits limits, latency and lag of the motors; `tires.py` fits friction, center of mass, wheel radii and
+servo gain; `estimation.py` is the estimator.
 
 `robot.toml` keeps its previous fields and gets a line with value and standard error for each identified field. Fields
 that it lacks have their published values or those of `scene.toml`. `align.json` has all numbers.

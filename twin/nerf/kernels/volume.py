@@ -1,4 +1,4 @@
-"""Volume rendering along rays: samples, compositing of features with a backward pass, and regularizers.
+"""Volume rendering of a field in training: samples, compositing of features with a backward pass, and regularizers.
 
 A ray has K strata, bounded by K + 1 edges [m]; stratum i has length δᵢ [contracted m] and a sample at distance tᵢ [m].
 The network output of a sample holds *raw density* in channel 0 and features in the others. The weight of sample i is

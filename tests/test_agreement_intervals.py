@@ -8,7 +8,7 @@ from intervals import KINDS, Shape, expected, simulate
 from place_intervals import MIN_PLACES, mean_difference_interval, place_interval
 from scipy import stats
 
-from twin.evaluation.statistic_intervals import (
+from twin.evaluation.agreement_intervals import (
     MIN_DAYS,
     MIN_TRAININGS,
     STATISTICS,

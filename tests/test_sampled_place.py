@@ -10,10 +10,10 @@ from twin.geometry.cameras import pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.reality import filming
 from twin.reality.__main__ import scene_toml
-from twin.reality.drawn_place import build
-from twin.reality.drawn_road import DrawnRoad
-from twin.reality.place_sampling import draw
+from twin.reality.place_sampling import sample_place
 from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, SETTINGS, tasks
+from twin.reality.sampled_place import build
+from twin.reality.sampled_road import SampledRoad
 from twin.reality.truth import TrueFilm, Truth, fingerprint
 
 NUMBERS = range(1, 201)  # descriptions alone
@@ -22,13 +22,13 @@ BUILT = (2, 3, 5, 12)
 
 @pytest.fixture(scope="module")
 def places():
-    return {number: build(draw(number)) for number in BUILT}
+    return {number: build(sample_place(number)) for number in BUILT}
 
 
 def test_descriptions_are_within_their_ranges():
     settings = set()
     for number in NUMBERS:
-        spec = draw(number)
+        spec = sample_place(number)
         settings.add(spec.setting)
         section, film = spec.section, spec.film
         assert 2.4 < section.width <= 7.001 and section.right >= 1.2, number
@@ -49,12 +49,12 @@ def test_descriptions_are_within_their_ranges():
             assert start >= 0.0 and start + length <= 0.97 * spec.line.length
     assert settings == set(SETTINGS)
     with pytest.raises(InputError, match="place 0: expected 1 or more"):
-        draw(0)
+        sample_place(0)
 
 
 def test_a_number_is_one_place_and_two_numbers_are_two(places):
-    assert draw(7) == draw(7) and draw(7) != draw(8)
-    again = build(draw(5))
+    assert sample_place(7) == sample_place(7) and sample_place(7) != sample_place(8)
+    again = build(sample_place(5))
     assert fingerprint(again) == fingerprint(places[5]) != fingerprint(places[3])
     for one, other in zip(again.objects, places[5].objects, strict=True):
         assert one.name == other.name and np.array_equal(one.part.vertices, other.part.vertices)
@@ -62,7 +62,7 @@ def test_a_number_is_one_place_and_two_numbers_are_two(places):
 
 def test_the_line_is_smooth_and_projects_back():
     for number in range(1, 31):
-        road = DrawnRoad(draw(number))
+        road = SampledRoad(sample_place(number))
         stations = np.arange(-5.0, road.end, 0.05)
         steps = np.diff(road.at(stations), axis=0)
         assert np.allclose(np.linalg.norm(steps, axis=1), 0.05, rtol=1e-3)
@@ -74,8 +74,8 @@ def test_the_line_is_smooth_and_projects_back():
 
 def test_slope_and_crossfall_are_as_drawn():
     for number in range(1, 31):
-        spec = draw(number)
-        road = DrawnRoad(spec)
+        spec = sample_place(number)
+        road = SampledRoad(spec)
         stations = np.arange(0.0, spec.line.length, 0.5)
         height = road.ground_height(road.at(stations))
         slope = np.gradient(height, stations)
@@ -95,7 +95,7 @@ def test_slope_and_crossfall_are_as_drawn():
 def test_nothing_stands_in_the_way(places, number):
     """Solid shapes keep off the road, the free corridor and the mouths of side roads; obstacles are solid."""
     place = places[number]
-    road, spec = place.route, draw(number)
+    road, spec = place.route, sample_place(number)
     for obj in place.objects:
         for solid in obj.solids:
             half = np.array(solid.half[:2]) if solid.kind == "box" else np.full(2, solid.half[0])
@@ -120,7 +120,7 @@ def test_nothing_stands_in_the_way(places, number):
 @pytest.mark.parametrize("number", BUILT)
 def test_the_ground_mesh_is_the_true_ground(places, number):
     """A ray straight down meets the mesh at the ground's stated height, on road and verge."""
-    place, spec = places[number], draw(number)
+    place, spec = places[number], sample_place(number)
     parts = [obj.part for obj in place.objects if obj.kind == "ground"]
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
@@ -138,7 +138,7 @@ def test_the_ground_mesh_is_the_true_ground(places, number):
 
 def test_the_films_of_a_place_have_their_height_and_passes(places):
     for number, place in places.items():
-        spec = draw(number)
+        spec = sample_place(number)
         plan = filming.FilmingPlan.of(spec)
         for one in plan.passes:
             _, poses = filming.trajectory(plan, place.route, "sun", one)
@@ -160,7 +160,7 @@ def test_the_films_of_a_place_have_their_height_and_passes(places):
 def test_depth_agrees_with_rays_onto_the_ground(places):
     """Points of the road in a small picture lie on the true ground."""
     place = places[5]
-    plan = replace(filming.FilmingPlan.of(draw(5)), width=160, height=90, oversize=1.0)
+    plan = replace(filming.FilmingPlan.of(sample_place(5)), width=160, height=90, oversize=1.0)
     lighting = plan.lightings[0]
     _, poses = filming.trajectory(plan, place.route, lighting)
     pose = poses[len(poses) // 3]
@@ -175,7 +175,7 @@ def test_depth_agrees_with_rays_onto_the_ground(places):
 
 
 def test_truth_of_a_drawn_place_survives_saving(places, tmp_path):
-    spec = draw(2)
+    spec = sample_place(2)
     films = {}
     plan = filming.FilmingPlan.of(spec)
     for one in plan.passes:
@@ -184,7 +184,7 @@ def test_truth_of_a_drawn_place_survives_saving(places, tmp_path):
         films[name] = TrueFilm(times, poses, np.zeros(0, np.int64), np.zeros((0, 9, 16), np.float16))
     names = dict.fromkeys(films, "sun")
     truth = Truth(
-        DrawnRoad(spec), 0.0, plan.length, 1.5, plan.intrinsics, spec.film.size, films, 2, names, plan.camera_height
+        SampledRoad(spec), 0.0, plan.length, 1.5, plan.intrinsics, spec.film.size, films, 2, names, plan.camera_height
     )
     truth.save(tmp_path)
     back = Truth.load(tmp_path)

@@ -40,7 +40,7 @@ _CHUNK = 40_000  # most points whose land height is computed together
 _CHUNK_DISTANCES = 4_000_000  # most distances between points and line that are computed together
 
 
-class DrawnRoad:
+class SampledRoad:
     """The driven line and the ground of a sampled place, as a `place_objects.DrivenLine`."""
 
     def __init__(self, spec: PlaceSpec) -> None:
@@ -246,7 +246,7 @@ def land_boxes(line: Array, tiled: bool) -> dict[str, tuple[float, float, float,
     return out
 
 
-def add_road(place: KnownPlace, road: DrawnRoad, stations: Array, suffix: str) -> None:
+def add_road(place: KnownPlace, road: SampledRoad, stations: Array, suffix: str) -> None:
     """Adds road, curbs and verges along consecutive stations; `suffix` ends the names of objects and textures."""
     section = road.section
 
@@ -295,7 +295,7 @@ def add_road(place: KnownPlace, road: DrawnRoad, stations: Array, suffix: str) -
         strip(f"verge_{name}", f"verge_{name}", np.sort(across)[::-1], gaps=sign)
 
 
-def add_side_roads(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
+def add_side_roads(place: KnownPlace, road: SampledRoad, stations: Array) -> None:
     """Adds the side roads that are not filmed; `stations` are those of the vertices along the road."""
     section = road.section
     filmed = [one.mouth for one in road.line.side_roads]
@@ -317,7 +317,7 @@ def add_side_roads(place: KnownPlace, road: DrawnRoad, stations: Array) -> None:
         place.objects.append(PlaceObject(f"side_road_{k}", "ground", part, "side_road"))
 
 
-def add_land(place: KnownPlace, road: DrawnRoad, name: str, box: tuple[float, float, float, float]) -> None:
+def add_land(place: KnownPlace, road: SampledRoad, name: str, box: tuple[float, float, float, float]) -> None:
     """Adds land in an x and y range [m], lowered under road, verges and side roads."""
     section = road.section
     x0, x1, y0, y1 = box

@@ -352,7 +352,7 @@ def roof(rng: np.random.Generator, houses: HousesSpec, color: Rgb, shape: tuple[
     return np.clip(image, 0.02, 1.0)
 
 
-DRAWN_CELLS = (
+SAMPLED_CELLS = (
     *CELLS,
     *(f"paint{k}" for k in range(6)),
     *("boundary_left", "boundary_right", "chimney", "shutter", "cabinet", "stone", "pole", "birch"),
@@ -412,10 +412,10 @@ def _atlas_image(spec: PlaceSpec) -> NDArray[np.uint8]:
         window=spec.houses.window,
         frames=np.array([spec.houses.trim]),
     )
-    return to_uint8(paint_atlas(lambda k: stream(spec.number, "furniture", 4, k), DRAWN_CELLS, colors))
+    return to_uint8(paint_atlas(lambda k: stream(spec.number, "furniture", 4, k), SAMPLED_CELLS, colors))
 
 
-def drawn_textures(
+def sampled_textures(
     spec: PlaceSpec, layout: GroundLayout, houses: dict[str, tuple[House, str, Rgb, Rgb]]
 ) -> dict[str, NDArray[np.uint8]]:
     """All textures of a place by name, uint8 RGB."""

@@ -14,14 +14,14 @@ import numpy as np
 
 from twin.reality import SEED
 from twin.reality import street_furniture as furniture
-from twin.reality.drawn_road import STEP, DrawnRoad, add_land, add_road, add_side_roads, land_boxes
-from twin.reality.drawn_textures import DRAWN_CELLS, drawn_textures
 from twin.reality.houses import House, add_house
 from twin.reality.lighting import place_lightings
 from twin.reality.place_objects import Atlas, GroundLayout, KnownPlace
-from twin.reality.place_sampling import draw
+from twin.reality.place_sampling import sample_place
 from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, PlaceSpec, Rgb, stream
 from twin.reality.plants import add_bare_tree, add_conifer, add_crowned_tree, add_shrub, add_tufts
+from twin.reality.sampled_road import STEP, SampledRoad, add_land, add_road, add_side_roads, land_boxes
+from twin.reality.sampled_textures import SAMPLED_CELLS, sampled_textures
 from twin.reality.side_roads import SIDE_VERGE, SideLine, add_side_road, begin_of_verges, occupied
 from twin.reality.sky import place_sky
 from twin.reality.street_furniture import BAY, add_boundary, thickness
@@ -40,7 +40,7 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
         spec: The description.
         displaced: True for the day of the trials: cones, bins, crates and cars have moved since the film.
     """
-    road = DrawnRoad(spec)
+    road = SampledRoad(spec)
     stations = np.arange(road.start, road.end + STEP / 2, STEP)
     parts = max(1, round((stations[-1] - stations[0]) / _PART_LENGTH))
     ends = np.linspace(0, len(stations) - 1, parts + 1).round().astype(int).tolist()
@@ -75,12 +75,12 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
     place = KnownPlace(
         road,
         layout,
-        partial(drawn_textures, spec, layout, names),
+        partial(sampled_textures, spec, layout, names),
         place_lightings(spec),
         partial(place_sky, spec),
         number=spec.number,
         seed=(SEED, 100, spec.number, 1000),
-        atlas=Atlas(DRAWN_CELLS),
+        atlas=Atlas(SAMPLED_CELLS),
     )
     for part, first, last in zip(names_of_parts, ends, ends[1:], strict=False):
         add_road(place, road, stations[first : last + 1], part)
@@ -99,8 +99,8 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
 
 @cache
 def build_number(number: int, displaced: bool = False, length: float = 0.0, side_roads: bool = False) -> KnownPlace:
-    """Builds the place with a number, 1 or more; `length` [m] and `side_roads` as for `draw`."""
-    return build(draw(number, length, side_roads), displaced)
+    """Builds the place with a number, 1 or more; `length` [m] and `side_roads` as for `sample_place`."""
+    return build(sample_place(number, length, side_roads), displaced)
 
 
 # ---- placement
@@ -112,7 +112,7 @@ class Site:
     A footprint is a rectangle: its center [m], half sizes [m] and the direction of its first axis [rad].
     """
 
-    def __init__(self, road: DrawnRoad) -> None:
+    def __init__(self, road: SampledRoad) -> None:
         self._road = road
         self._side_lines = [SideLine(road, one) for one in road.line.side_roads]
         self._taken: list[tuple[float, float, float, Array]] = []  # x, y, radius, corners
