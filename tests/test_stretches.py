@@ -148,7 +148,7 @@ def test_the_truth_of_a_long_place_has_its_length(place, tmp_path):
     back = Truth.load(tmp_path / "truth")
     assert back.route.length == back.road_length == LENGTH and back.length == LENGTH
     assert f"--place {PLACE} --length 160 --out" in scene_toml(plan, "x", sample_place(PLACE, LENGTH), back.road_length)
-    with pytest.raises(InputError, match="a road of 160 m, this place another; give --length 160"):
+    with pytest.raises(InputError, match="a road of 160 m, the given place a longer or shorter one; give --length 160"):
         scene_task("task.json", tmp_path, PLACE)
 
 

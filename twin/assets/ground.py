@@ -236,8 +236,9 @@ def bias_to_path(data: HeightData, path: HeightData) -> float:
 
 # ---- fit
 
-_COARSE_CELL, _COARSE_NODES, _FINE_NODES = 0.5, 40_000, 200_000  # [m]; greatest numbers of nodes of the two grids,
-# unless they are near a long line
+_COARSE_CELL = 0.5  # [m]
+# Largest numbers of nodes of the two grids. With a line there is no limit: only nodes near the line are fitted.
+_COARSE_NODES, _FINE_NODES = 40_000, 200_000
 _BESIDE_LINE = 2.0  # [m] width of the ground that is fitted beyond `MeshConfig.margin` beside a long line
 _MAX_CELLS = 3_000_000
 _SMOOTHING_LENGTH = 0.5  # [m] structures shorter than this are smoothed away as noise

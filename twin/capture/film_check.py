@@ -42,12 +42,12 @@ _PERSISTENT, _LIKELY, _SOLID = 0.1, 0.3, 0.5
 _MIN_EDGE = 16  # [px] fewest persistent pixels of an object
 _MIN_ACROSS = 0.1  # smallest mean cos² between an object's gradients and the rays from any possible vanishing point
 _MIN_DISTANCE = 0.06  # smallest rms distance of such a point from the edges' tangents, as a fraction of the width
-_MAX_COHERENCE = 0.5  # largest |median gradient| / mean |gradient| of the scene; larger if the camera hardly moves
+_MAX_COHERENCE = 0.5  # with a larger |median gradient| / mean |gradient| of the scene, the camera hardly moves
 _CALMER = 0.6  # a region between persistent edges is fixed if it varies less than this fraction of its surroundings
 _JOIN, _MARGIN = 4, 2  # [px] gaps between edges up to twice the first are closed; masks are widened by the second
-# Islands: fewest pixels, largest variation [gray levels], smallest ratios of the variation around an island to the
-# median and to the 80 % quantile inside, and smallest brightness [gray levels], since black night hardly varies.
-_ISLAND_AREA, _ISLAND_VARIATION, _AROUND_MEDIAN, _AROUND_MOST, _NIGHT = 40, 15.0, 3.0, 2.5, 15.0
+_ISLAND_AREA, _ISLAND_VARIATION = 40, 15.0  # [px], [gray levels] least area of an island, largest variation inside
+_AROUND_MEDIAN, _AROUND_MOST = 3.0, 2.5  # least variation around an island / median and 80 % quantile of that inside
+_NIGHT = 15.0  # [gray levels] least brightness of an island, since black night hardly varies
 _NOISE = 2.0  # [gray levels] added to the variation inside before the ratio is formed
 
 
@@ -271,7 +271,8 @@ def timing_notes(timing: FilmTiming) -> list[str]:
 def _samples(path: Path, skip: Literal["NONKEY", "DEFAULT"]) -> tuple[av.VideoFrame | None, list[Image]]:
     """The first frame, and fewer than 2 · `_SAMPLES` upright pictures of frames spread over the film.
 
-    With `skip` = NONKEY only key frames are decoded. The pictures are `_WIDTH` wide: 120 frames of 4K take 2 GB.
+    With `skip` = NONKEY only key frames are decoded. The pictures are scaled to `_WIDTH`, since 120 frames of 4K take
+    3 GB.
     """
     first: av.VideoFrame | None = None
     small: list[Image] = []

@@ -158,7 +158,7 @@ def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
 
 
 def _without_route(one: RouteSegment | ObstacleConfig) -> dict[str, Any]:
-    """The fields; without `route` if it is empty, so that digests by versions without branches stay valid."""
+    """The fields; an empty `route` is left out, so that digests from before there were branches stay valid."""
     fields = dataclasses.asdict(one)
     return fields if fields["route"] else {name: value for name, value in fields.items() if name != "route"}
 

@@ -36,8 +36,8 @@ from twin.types import Array
 
 GROUND_ALBEDO = 0.37
 """Assumed color of the ground along the route under irradiance 1: worn asphalt reflects about 11 % of the light, which
-the tone curve of a film (exponent 1 / 2.2) shows as 0.37. With 0.38 (12 %), obstacles at night missed the threshold of
-`benchmarks/overlay.py` (PSNR 6 dB above unshaded obstacles), so that benchmark does not test 0.37 independently."""
+the tone curve of a film (exponent 1 / 2.2) shows as 0.37. With 0.38 (12 %), obstacles at night failed the test of
+`benchmarks/overlay.py` (PSNR 6 dB above unshaded obstacles). So this test chose the value and does not confirm it."""
 
 SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 """Horizontal directions for which the incoming light is estimated, shape (4, 3)."""
@@ -45,7 +45,7 @@ SIDE_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], 
 _CAMERA_HEIGHT, _CAMERA_PITCH = 1.0, 8.0  # [m], [°] height and downward pitch of the views from which probes are taken
 _CAMERA_STEP = 2.0  # [m] distance along the route between two views, or more if there would be more than `_MAX_VIEWS`
 _MAX_VIEWS = 100
-_BEYOND = 10.0  # [m] length of a long route before and after the driven segment of which views are taken
+_BEYOND = 10.0  # [m] on a long route, views are also taken up to this far before and after the driven segment
 _VIEW_SIZE, _FOCAL = (96, 54), 50.0  # [px]; nearly 90° wide
 _MAX_GROUND_DEPTH, _MAX_DEPTH = 7.0, 12.0  # [m] largest z-depth of ground probes and of all probes
 _GROUND_TOLERANCE = 0.12  # [m] largest height difference of ground probes from the route, plus 5 % of their distance

@@ -175,7 +175,7 @@ def missing_data(real: Sequence[Cell], twin: Cells) -> list[str]:
 
 
 def unit_counts(rows: Sequence[Sequence[Cell]], by_day: bool) -> tuple[Indices, Indices]:
-    """Successes and trials of each policy's independent units, shapes (n, k): cells if `by_day`, else trials."""
+    """Successes and trials of each policy's independent units, shapes (n, k): cells if `by_day`, or else trials."""
     units = [[(c.successes, c.trials) for c in row] for row in rows]
     if not by_day:
         totals = [np.sum(row, 0) for row in units]

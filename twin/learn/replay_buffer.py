@@ -60,7 +60,7 @@ class ColorChanges(NamedTuple):
         return out
 
     def applied_on_gpu(self, stacks: torch.Tensor) -> torch.Tensor:
-        """As `applied`, of a tensor; colors may differ by 1, as OpenCV rounds otherwise."""
+        """Like `applied`, for a tensor; colors may differ by 1, since OpenCV rounds differently."""
         (channels, height, width), device = stacks.shape[1:], stacks.device
         curves = torch.as_tensor(self.curves, device=device).repeat(1, channels // 3, 1)
         toned = curves.gather(2, stacks.flatten(2).long()).reshape(stacks.shape)

@@ -18,8 +18,8 @@ class DriveVecEnv(VecEnv):
     observation.
 
     Every `info` has the privileged `state`; at the end of an episode, it also has `first_state`, the state at the start
-    of the next episode. `lighting` is the name of the lighting in tables; `sampled_lighting` adds the sampled mixture,
-    as `lighting` does in the `info` of the Gymnasium environments.
+    of the next episode. `lighting` is the name in tables, such as `training`; `sampled_lighting` adds the sampled
+    mixture. (The `info` of the Gymnasium environments has this longer text as `lighting`.)
 
     `vector_env` has `spare` further environments after these; a step does not advance them.
     """

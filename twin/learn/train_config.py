@@ -35,7 +35,7 @@ def _numbers(value: Any) -> list[Any]:
 class TrainConfig:
     """Configuration of a training. The defaults are the preset for a CPU.
 
-    Beyond the ranges, arithmetic fails, memory runs out, or a training never ends.
+    Each field has a valid `Range`: with values outside it, arithmetic fails, memory runs out, or a training never ends.
     """
 
     task: str = "straight"
@@ -97,7 +97,7 @@ class TrainConfig:
     test_every: Annotated[int, Range(1, 10**10)] = 3_000
     """Number of steps between two tests of the policy (`selection.py`)."""
     settle: Annotated[int, Range(1, 10**10)] = 2_000
-    """Number of steps, with a falling learning rate, after tests have ended a training (`selection.py`)."""
+    """Number of further steps, with a falling learning rate, once tests end a training (`selection.py`)."""
     save_every: Annotated[int, Range(1, 10**10)] = 4_000
     """Number of steps between two saved states."""
     device: str = CPU

@@ -157,7 +157,7 @@ class FieldSection:
         """Loss gradients of opacity, features and Σwᵢ/tᵢ per ray → loss gradients of network outputs.
 
         The samples of a ray have weights wᵢ and distances tᵢ [m]. The last four arguments are weights and scales of two
-        regularizers, see `composite.composite_backward`.
+        regularizers, see `volume.composite_backward`.
         """
         wp.launch(
             volume.composite_backward,
@@ -417,7 +417,7 @@ def _check_tensors(
             shapes[f"{_prefix(k)}grid.{name}"] = shape
     check_shapes({name: (arrays[name], shape, "f") for name, shape in shapes.items()})
     if frame_lighting.shape != (frames,) or not np.isin(frame_lighting, np.arange(lightings)).all():
-        raise ValueError(f"frame_lighting is not one of {lightings} lightings for each of {frames} frames")
+        raise ValueError(f"frame_lighting: expected {frames} numbers from 0 to {lightings - 1}, one for each frame")
 
 
 def untrained_field(

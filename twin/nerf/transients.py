@@ -175,8 +175,8 @@ def mover_masks(pixels: TrainingPixels, depths: list[Array32]) -> list[NDArray[n
     cells = [frame_cells(pixels, i, side, depth) for i, depth in enumerate(depths)]
     static = [replace(one, depth=depth) for one, depth in zip(cells, static_depths(pixels, cells), strict=True)]
 
-    # The field's depths are wrong where it contains the mover, the median depths at thin objects. So a mover must
-    # differ under both.
+    # The field's depths are wrong where the field contains the mover; the median depths are wrong at thin objects. So
+    # a mover must differ with either kind of depth.
     def find(i: int) -> NDArray[np.bool_]:
         excess = np.fmin(difference(pixels, cells, i), difference(pixels, static, i))
         return cleaned(excess > 1.0, excess > _WEAK)
@@ -205,7 +205,7 @@ def _enlarged(cells: NDArray[np.bool_], side: int, width: int, height: int) -> N
 
 
 def difference(pixels: TrainingPixels, cells: list[Cells], i: int) -> Array32:
-    """Difference of frame i's cells from what other frames show there / least difference of a mover, (rows, columns).
+    """Color difference of frame i's cells from other frames, divided by the least one of a mover, (rows, columns).
 
     Errors of depths and poses are unlikely to give values above 1. It is 0 where too few frames see the surface.
     """

@@ -12,7 +12,7 @@
 `film` writes a scene folder: `scene.toml`, `input/*.mp4` and `truth/`. `compare` measures a build against that truth.
 `drive` drives policies in weather that was not filmed. `log` writes a drive log, for `twin.align`. `onboard` writes a
 film by the robot's camera, also for `twin.align`. `bag` writes a robot's recording of a trial, for `twin.trial`.
-`photo` writes a photo in the weather of a trial, for `twin.relight`. The same command writes the same files.
+`photo` writes a photo in the weather of a trial, for `twin.relight`. A repeated command writes identical files.
 """
 
 import argparse
@@ -77,10 +77,11 @@ def film(
     With `traffic`, walkers and cars move through every film, and the films of all lightings but the last show parked
     cars. The truth contains none of them. `renderer_of` returns the renderer for a lighting and a place; the default is
     `filming.Renderer`, the only one that shows moving traffic. `length` [m] is that for `place_sampling.sample_place`.
-    With `side_roads`, every side road into which a line turns off the filmed length gets films of its own.
+    With `side_roads`, every side road whose turn begins within the filmed length gets films of its own.
 
     Raises:
-        InputError: `out` is not empty and has no folder `truth`; there is no such side road, or `traffic` with them.
+        InputError: `out` is not empty and has no folder `truth`; there is no such side road; or `traffic` is given
+            with `side_roads`.
     """
     if out.is_dir() and any(out.iterdir()) and not (out / "truth").is_dir():
         raise InputError(f"{out} is not empty and has no truth/, so this command did not write it; give another --out")
@@ -90,8 +91,8 @@ def film(
         raise InputError("--side-roads with --traffic: walkers and cars keep to the main road; leave one of them out")
     spec = sample_place(number, length, side_roads) if number else None
     sides = _filmed_sides(spec, plan) if spec and side_roads else []
-    # The folder of the truth exists from the start, so that stopped filming can start again. What an older film left is
-    # deleted: new films with old settings would be another scene.
+    # The folder of the truth exists from the start, so that filming can start again after an interruption. Settings and
+    # truth of an older film are deleted, since they would not fit the new films.
     (out / "truth").mkdir(parents=True, exist_ok=True)
     (out / "input").mkdir(exist_ok=True)
     for old in (out / "scene.toml", out / "truth" / "truth.json", out / "truth" / "truth.npz"):
@@ -139,7 +140,7 @@ _TINY_SIDE = 20.0  # [m] of a side road's line that `--tiny` films
 
 
 def _filmed_sides(spec: PlaceSpec, plan: FilmingPlan) -> _Sides:
-    """The side roads into which a line turns off the filmed length. Raises InputError if there are none."""
+    """The side roads whose turn begins within the filmed length. Raises InputError if there are none."""
     tiny = plan.length < spec.line.length
     road, out = SampledRoad(spec), []
     for one in _within(spec, plan.length):
@@ -157,7 +158,7 @@ def _filmed_sides(spec: PlaceSpec, plan: FilmingPlan) -> _Sides:
 
 
 def _within(spec: PlaceSpec, length: float) -> list[SideRoad]:
-    """The side roads into which a line turns off the first `length` meters of the road."""
+    """The side roads whose turn begins within the first `length` meters of the road."""
     return [one for one in spec.line.side_roads if one.mouth.station - one.radius <= length]
 
 
@@ -287,10 +288,14 @@ def scene_task(given: str, scene: Path | None, place: int, length: float = 0.0) 
     if truth.number != place:
         raise InputError(f"{scene} is a film of place {truth.number}; give --place {truth.number}")
     if truth.side_roads:
-        raise InputError(f"{scene} was filmed with --side-roads, which twin reality drive does not have; film without")
+        raise InputError(
+            f"{scene} was filmed with --side-roads, which twin reality drive does not support; film without"
+        )
     if place and truth.route.length != sample_place(place, length).line.length:
         cure = f"give --length {truth.road_length:g}" if truth.road_length else "leave --length out"
-        raise InputError(f"{scene} has a road of {truth.route.length:g} m, this place another; {cure}")
+        raise InputError(
+            f"{scene} has a road of {truth.route.length:g} m, the given place a longer or shorter one; {cure}"
+        )
     cameras = Cameras.load(require_stage(root, "metric"))
     return read_task(Path(given), align_poses(cameras.camera_to_world, matched_poses(truth, cameras)))
 

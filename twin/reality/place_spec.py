@@ -160,7 +160,7 @@ class HousesSpec:
     density: float
     """Buildings per 100 m and side; 0 for none."""
     setback: tuple[float, float]
-    """Range of the distance of the fronts from the line 1 m inside the verge's outer edge [m]."""
+    """Least and largest distance [m] of a front from the verge's outer edge, measured from 1 m inside this edge."""
     front: tuple[float, float]
     """Range of the width along the road [m]."""
     storeys: tuple[int, int]

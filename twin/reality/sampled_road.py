@@ -1,4 +1,4 @@
-"""The road of a sampled place: samples of the driven line, height of the ground on and around it, meshes of both.
+"""The road of a sampled place: sampling of the driven line, the ground's height on and around it, and their meshes.
 
 In plan, the line consists of straights and bends. A *lengthened* line begins with the sampled one and goes on with
 further elements of the same kinds. Along the line, the height follows the sampled grades and a slight unevenness;
@@ -36,8 +36,8 @@ _SWELL_LENGTHS = (25.0, 80.0)  # [m] range of wavelengths of the land's swells
 _LAND_SAMPLE = 2.0  # [m] between points of the line whose heights determine the land
 _LAND_SMOOTHING = 3.0  # [m] length over which these heights are smoothed
 _DROP_LENGTH = 0.8  # [m] over which a curb drops beside a side road
-_CHUNK = 40_000  # most points whose land height is computed together
-_CHUNK_DISTANCES = 4_000_000  # most distances between points and line that are computed together
+_CHUNK = 40_000  # largest number of points whose land heights are computed at once
+_CHUNK_DISTANCES = 4_000_000  # largest number of distances from points to the line computed at once
 
 
 class SampledRoad:
@@ -340,12 +340,15 @@ def add_land(place: KnownPlace, road: SampledRoad, name: str, box: tuple[float, 
 
 # ---- samples of the line
 
-_SEPARATION = 28.0  # [m] least distance in plan of points that are more than twice this far apart along the line
+_SEPARATION = 28.0  # [m] points more than twice this far apart along the line are at least this far apart in plan
 _LONG_SEPARATION = 30.0  # [m] the same between a point of the lengthening and any other
-# Headings this close to one direction make 60 m along the line at least 30 m in plan, hence `_LONG_SEPARATION`.
+# If all headings are this close to one direction, points 60 m apart along the line are at least 60 · cos 58° = 32 m
+# apart in plan, so `_LONG_SEPARATION` can be kept.
 _HEADING_BOUND = float(np.deg2rad(58.0))  # [rad]
 _BEND_ROOM = 2.0  # [m] least distance from a verge's outer edge to the center of a bend of the lengthening
-_MOUTH_ROOM = 30.0  # [m] from the road's edge; there, a side road of the lengthening is far from the rest of the road
+_MOUTH_ROOM = (
+    30.0  # [m] a further side road must be far from the rest of the road at this distance from the road's edge
+)
 
 
 def sample_line(rng: np.random.Generator, setting: str, section: SectionSpec) -> LineSpec:
@@ -400,7 +403,7 @@ def _pieces(rng: np.random.Generator, setting: str, section: SectionSpec, length
 def lengthen(rng: np.random.Generator, line: LineSpec, setting: str, section: SectionSpec, length: float) -> LineSpec:
     """The line, lengthened to `length` [m].
 
-    `section` is the section that the line's tightest bends leave; further bends leave it, too.
+    The verges of `section` already end before the centers of the line's bends. Further bends are wide enough for them.
     """
     while True:  # until no part of the line comes near another
         pieces = _further(rng, line.pieces, setting, section, length + RUN_OUT)
@@ -487,7 +490,7 @@ def _point_count(piece: Piece) -> int:
 
 
 def _points(pieces: tuple[Piece, ...]) -> tuple[Array, float]:
-    """Points along the pieces about 1 m apart, from the end of the first meter on [m], and the last heading [rad]."""
+    """Points about every 1 m along the pieces [m], the first one 1 m after the start, and the last heading [rad]."""
     heading, point, points = 0.0, np.zeros(2), []
     for piece in pieces:
         count = _point_count(piece)

@@ -336,7 +336,7 @@ def _task_table(tasks: list[str]) -> "pyarrow.Table":
 
 # ---- bags
 
-_SPEED_SPAN = 0.2  # [s] before an instant, over which speed is measured; later poses would show later commands
+_SPEED_SPAN = 0.2  # [s] time before an instant over which speed is measured; poses after it show later commands
 _MAX_GAP = 0.5  # [s] longest time without a picture; also the time after which the robot stops without a command
 
 
@@ -459,8 +459,8 @@ def _pictures_at(recording: "TrialRecording", rectify: Rectifier, stamps: NDArra
     if ages.max() > _MAX_GAP:
         at = float((stamps[ages.argmax()] - stamps[0]) * 1e-9)
         raise InputError(
-            f"{recording.path}: {recording.topics['pictures']} has no picture within {ages.max():.1f} s of {at:.1f} s "
-            f"after the first command; expected one every {_MAX_GAP:g} s at least"
+            f"{recording.path}: {at:.1f} s after the first command, the nearest picture on "
+            f"{recording.topics['pictures']} is {ages.max():.1f} s away; expected at most {_MAX_GAP:g} s"
         )
     pictures: dict[int, Image] = {}
     with runtime.bar("pictures", len(np.unique(newest)), "picture") as progress:

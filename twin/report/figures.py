@@ -150,8 +150,8 @@ def place_map(
     """Map [m] of the sparse points, the cameras by source (held-out ones hollow), and the route with its corridor.
 
     Shapes: `positions` (n, 3), `held_out` (n,), `points` and `point_rgb` (m, 3), `route` and `branches` (k, 2).
-    If a source has several passes (`twin.geometry.passes`), all passes are drawn as lines with their names. A step
-    between two cameras that the pictures contradict is given by the indices of both, and is drawn thick.
+    If a source has several passes (`twin.geometry.passes`), all passes are drawn as lines with their names.
+    `contradicted` has index pairs of cameras whose relative pose contradicts the pictures; thick lines join them.
     """
     others = (branches or {}).values()
     figure, axes, low, high = _map_axes(

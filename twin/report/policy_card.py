@@ -90,7 +90,7 @@ def card(policy: Policy, folder: Path, cells: Sequence[Cell], known: Sequence[Ca
             "",
             "## Limits",
             "",
-            "Success in the twin forecasts success on the road; it is no measurement of it. The rates hold for the "
+            "Success in the twin forecasts success on the road; it is not a measurement of it. The rates hold for the "
             "place, route, robot and camera of the twin. Nothing here was tested near people or other traffic.",
             "",
         ]

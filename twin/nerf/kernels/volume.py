@@ -166,7 +166,7 @@ def composite_backward(
 # ---- samples
 
 BINS = 256
-_FAR = 100.0  # unit positions beyond this count as the horizon
+_FAR = 100.0  # a ray ends at this unit position; what is farther is the horizon
 _MAX_OPACITY = 0.99  # greatest opacity of a cell
 _STEP = 0.75  # bin length [cells]
 _BINS_BEHIND = 2  # bins that the march takes after the ray is blocked
