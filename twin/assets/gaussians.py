@@ -91,7 +91,7 @@ class Gaussians:
         return head.encode() + rows.tobytes()
 
     def write_spz(self, path: Path) -> None:
-        """Writes the compressed `.spz` (version 3), about a tenth of the `.ply`; positions are rounded to 0.24 mm.
+        """Writes the compressed `.spz` (version 3), a fifth of the `.ply`; positions are rounded to 0.24 mm.
 
         Raises InputError: the package gsply is missing.
         """
