@@ -108,6 +108,7 @@ def score_mesh(twin: Twin, lighting: str, size: tuple[int, int]) -> None:
     print(f"{lighting}: texture {texture.size[0]}×{texture.size[1]}, {len(content) / 1e6:.1f} MB, {seconds:.0f} s")
     drawings = {"colors per vertex": MeshDrawing(plain), "texture": MeshDrawing(read)}
     scores: dict[tuple[str, int, bool], list[float]] = {}
+    exposures: list[np.ndarray] = []
     for i, pose, rays, photo in held_out_frames(twin, lighting, size):
         shown = {
             name: drawing.draw(pose[:3, 3], rays.reshape(-1, 3) @ pose[:3, :3].T) for name, drawing in drawings.items()
@@ -118,6 +119,10 @@ def score_mesh(twin: Twin, lighting: str, size: tuple[int, int]) -> None:
             field.render(cameras.select(np.array([i])), lighting, size).rgb[0].astype(np.float64) * 255.0
         )
         left = np.arange(size[0])[None] < size[0] // 2
+        if min(np.count_nonzero(hit & left), np.count_nonzero(hit & ~left)) < 100 * 4 * 4:
+            print(f"{lighting}: frame {i} shows too little of the mesh and is left out")
+            continue
+        exposures.append(_exposure(pictures["field"], photo, hit))
         for name, rgb in pictures.items():
             for fitted in (False, True):
                 shown_rgb = np.clip(rgb * _exposure(rgb, photo, hit & left), 0.0, 255.0) if fitted else rgb
@@ -125,6 +130,7 @@ def score_mesh(twin: Twin, lighting: str, size: tuple[int, int]) -> None:
                 for k in (1, 4):  # at full size, and averaged over 4 × 4 pixels, as policies see it
                     a, b = _averaged(shown_rgb, k) / 255.0, _averaged(photo, k) / 255.0
                     scores.setdefault((name, k, fitted), []).append(psnr(a, b, _averaged(scored, k) == 1.0))
+    print(f"{lighting}: exposure of the frames varies by {np.std(exposures, axis=0).mean():.1%} (standard deviation)")
     for (name, k, fitted), values in scores.items():
         where = f"{len(values)} held-out frames of {size[0] // k}×{size[1] // k}"
         how = ", exposure fitted on the left half" if fitted else ""

@@ -1,27 +1,31 @@
 """Coverage of the stated uncertainty of the metric scale over simulated captures.
 
-    python benchmarks/scale.py [--first 1] [--count 200]
+    python benchmarks/scale.py [--gps] [--first 1] [--count 200]
 
 A capture is a simulated drive with known truth: the camera's height is measured with an error; the road has slope,
 crossfall, a crown and a curb; structure from motion bends the path and scatters points. The number of a capture seeds
 it: 1 to 999 are for development; those from 1,000 on are for reports, each used once. Prints how often the truth lies
-within one and two standard deviations, and the median error. The errors of structure from motion are simulated, so this
-does not replace tests with reconstructed captures.
+within one and two standard deviations, and the median error. With --gps, the scale comes from GPS fixes in one to three
+films, whose error drifts (an Ornstein-Uhlenbeck process; a fix every 0.4 to 1.5 s). The errors of structure from motion
+are simulated, so this does not replace tests with reconstructed captures.
 """
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from twin.capture.gravity import up_from_ground
-from twin.capture.scale import Scale, scale_from_height
+from twin.capture.scale import Scale, scale_from_gps, scale_from_height
 from twin.config import MetricConfig
+from twin.errors import InputError
 from twin.geometry.cameras import Cameras
 from twin.geometry.poses import look_at
 from twin.types import Array
 
+_EARTH = 6_378_137.0  # [m] radius at the equator
 _TOLERANCE = 0.01  # [m] standard deviation of the error of the measured height
 
 
@@ -76,6 +80,29 @@ def draw_capture(number: int) -> tuple[Cameras, Array, float]:
     return cameras, points, height + _TOLERANCE * float(rng.standard_normal())
 
 
+def estimate_by_gps(number: int) -> Scale:
+    """The scale of a simulated capture by GPS whose error drifts; the true scale is 1."""
+    film, _, _ = draw_capture(number)
+    rng = np.random.default_rng([2027, number, 1])
+    films, n = int(rng.integers(1, 4)), len(film)
+    size, jitter = rng.uniform(0.5, 3.0), rng.uniform(0.0, 0.3)
+    # Time in which the error changes [s], at 1 m/s; at most one fix per frame.
+    time = float(np.exp(rng.uniform(np.log(3.0), np.log(300.0))))
+    kept = np.exp(-float(np.median(np.linalg.norm(np.diff(film.positions, axis=0), axis=1))) / time)
+    fixes = []
+    for _ in range(films):
+        steps = rng.standard_normal((n, 2))
+        error = steps[:1] * size
+        for step in steps[1:]:
+            error = np.concatenate([error, error[-1:] * kept + step * size * np.sqrt(1.0 - kept**2)])
+        fixes.append(film.positions[:, :2] + error + jitter * rng.standard_normal((n, 2)))
+    cameras = film.select(np.tile(np.arange(n), films))
+    cameras = replace(cameras, sources=tuple(f"film_{k}" for k in range(films) for _ in range(n)))
+    degrees = np.degrees(np.concatenate(fixes) / _EARTH)  # at the equator east and north are alike
+    gps = np.column_stack([degrees[:, 1], degrees[:, 0], np.zeros(len(degrees))])
+    return scale_from_gps(cameras, np.array([0.0, 0.0, 1.0]), gps, rng)[0]
+
+
 def estimate(number: int) -> Scale:
     """The estimated scale of a simulated capture; the true scale is 1."""
     cameras, points, measured = draw_capture(number)
@@ -85,21 +112,28 @@ def estimate(number: int) -> Scale:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--gps", action="store_true", help="scale by GPS fixes instead of the camera's height")
     parser.add_argument("--first", type=int, default=1, help="number of the first capture (default %(default)s)")
     parser.add_argument("--count", type=int, default=200, help="number of captures (default %(default)s)")
     options = parser.parse_args()
-    scales = [estimate(number) for number in range(options.first, options.first + options.count)]
+    numbers = range(options.first, options.first + options.count)
+    scales = []
+    for number in numbers:
+        try:
+            scales.append((estimate_by_gps if options.gps else estimate)(number))
+        except InputError:  # GPS does not spread beyond its error
+            continue
     error = np.array([np.log(one.value) for one in scales])
     sigma = np.array([one.uncertainty for one in scales])
-    parts = {
-        key: np.median([one.notes["scale_uncertainty_of"][key] for one in scales])
-        for key in ("height_as_measured", "repeatability", "tilt", "left_against_right")
-    }
+    keys = () if options.gps else ("height_as_measured", "repeatability", "tilt", "left_against_right")
+    parts = {key: np.median([one.notes["scale_uncertainty_of"][key] for one in scales]) for key in keys}
+    print(f"captures with a scale          {len(scales)} of {len(numbers)}")
     print(f"within one standard deviation  {np.mean(np.abs(error) < sigma):6.1%}")
     print(f"within two                     {np.mean(np.abs(error) < 2 * sigma):6.1%}")
     print(f"median error                   {np.median(np.abs(error)):7.2%}, mean {error.mean():+.2%}")
     print(f"median uncertainty             {np.median(sigma):7.2%}")
-    print("  of which " + ", ".join(f"{key} {value:.2%}" for key, value in parts.items()))
+    if parts:
+        print("  of which " + ", ".join(f"{key} {value:.2%}" for key, value in parts.items()))
     return 0
 
 

@@ -7,8 +7,8 @@
 The last command drives by `act`, with the weights in `imitation.safetensors`.
 """
 
+import argparse
 import functools
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -58,4 +58,7 @@ def train(dataset: Path, steps: int = 2000) -> None:
 
 
 if __name__ == "__main__":
-    train(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("--steps", type=int, default=2000)
+    train(**vars(parser.parse_args()))

@@ -1,7 +1,7 @@
 """SAC in one file, in the manner of CleanRL: python examples/sac.py scenes/demo --steps 20000
 
-The algorithm is that of Haarnoja et al., arXiv 1812.05905. Networks, their optimizers and the replay buffer are those
-of stable-baselines3: pip install 'twin[learn]'
+The algorithm is that of Haarnoja et al., arXiv 1812.05905. Networks with their optimizers and the replay buffer are
+those of stable-baselines3: pip install 'twin[learn]'
 """
 
 import argparse
@@ -30,7 +30,7 @@ def main(arguments: list[str] | None = None) -> None:
     policy.actor.features_extractor = policy.critic.features_extractor  # one encoder, in the critics' optimizer only
     log_alpha = torch.tensor(-2.0, requires_grad=True)
     alpha_optimizer = torch.optim.Adam([log_alpha], 3e-4)
-    buffer = ReplayBuffer(min(given.steps, 5_000), world.observation_space, world.action_space)
+    buffer = ReplayBuffer(min(given.steps, 5_000), world.observation_space, world.action_space, policy.device)
     picture, _ = world.reset(seed=0)
     world.action_space.seed(0)
     for step in range(given.steps):

@@ -265,12 +265,18 @@ def test_new_takes_what_the_bag_has_and_says_so(tmp_path: Path, capsys: pytest.C
 def test_new_says_whether_the_bag_is_also_a_log(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     moved = [command(1.0, 0.0, one.stamp) for one in whole() if one.topic == "/odom"]
     for name, more, words in (
-        ("a", moved, "lacks wheels (sensor_msgs/msg/JointState)"),
+        ("a", moved, "lacks joint states (sensor_msgs/msg/JointState) or odometry of the wheels"),
         ("b", [*moved, joints("/joints")], "also a log for twin align: commands /cmd_vel, wheels /joints, poses /odom"),
+        ("c", [*moved, *odometry_on("/platform/odom/filtered")], "lacks joint states"),
+        ("d", [*moved, *odometry_on("/platform/odom")], "commands /cmd_vel, wheels /platform/odom, poses /odom"),
     ):
         bag = write(tmp_path / f"drive_{name}", [*whole(), *more])
         assert new_main([str(tmp_path / f"scene_{name}"), str(bag)]) == 0
         assert words in capsys.readouterr().err
+
+
+def odometry_on(topic: str) -> list[Recorded]:
+    return [replace(one, topic=topic) for one in whole() if one.topic == "/odom"]
 
 
 def joints(topic: str) -> Recorded:

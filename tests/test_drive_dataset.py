@@ -1,6 +1,7 @@
 """Drives as a LeRobot dataset: what its readers need, on made-up drives."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -169,3 +170,13 @@ def test_drives_are_read_back_as_an_environment_takes_them(written, tmp_path):
     assert frame.tolist() == [*range(LENGTHS[0] - 1), *range(LENGTHS[1] - 1)]
     with pytest.raises(InputError, match=r"info\.json"):
         read_drives(tmp_path)
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    (copy / f"videos/{CAMERA}/chunk-000/file-001.mp4").unlink()
+    with pytest.raises(InputError, match="11 pictures and 17 actions; expected 17 of each"):
+        read_drives(copy)
+    whole = read_json(copy / "meta/info.json")
+    for twin in (None, {"action_range": 3}, {"action_range": {"angular_velocity": [-1.0, 1.0]}}):
+        (copy / "meta/info.json").write_text(json.dumps(whole | {"twin": twin}))
+        with pytest.raises(InputError, match="expected a dataset of twin film"):
+            read_drives(copy)

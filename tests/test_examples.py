@@ -3,12 +3,18 @@
 import importlib.util
 from pathlib import Path
 
+import numpy as np
 import pytest
+from picture_bag import START, camera_info, image, write
+from test_policy import some_weights
+from tiny_runs import SMALL
 from tiny_twin import tiny_twin
 
 import twin
 from twin import runtime
+from twin.errors import InputError
 from twin.film import main as film
+from twin.learn.policy import Control, save_policy
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -53,3 +59,17 @@ def test_imitation_drives_as_it_was_shown(scene, tmp_path, monkeypatch, capsys):
     observed = twin.load(scene, "ahead", 0).reset().observation["pixels"]
     action = module.act(observed.transpose(0, 3, 1, 2).reshape(-1, *observed.shape[1:3]))
     assert action.shape == (2,) and action[0] > 0.5  # ahead
+
+
+def test_a_played_bag_stops_where_pictures_are_missing(tmp_path):
+    """20 pictures at 10 Hz, half a second without any, 5 more: one stop, 0.3 s after the last picture."""
+    save_policy(tmp_path / "policy", SMALL, Control(), some_weights(SMALL), {})
+    size, stamps = (64, 36), [START + k * 100_000_000 for k in (*range(20), *range(26, 31))]
+    info = camera_info((50.0, 50.0, 32.0, 18.0), size, START)
+    picture = np.full((size[1], size[0], 3), 90, np.uint8)
+    bag = write(tmp_path / "bag", [info, *(image(picture, stamp) for stamp in stamps)])
+    played = example("play_bag").play(tmp_path / "policy", bag)
+    stops = [(time - START) / 1e9 for time, command in played[1:] if command.cause]
+    assert len(played) == len(stamps) + 1 and played[0][1].drives and 2.2 < stops[0] < 2.3
+    with pytest.raises(InputError, match="no camera_info"):
+        example("play_bag").play(tmp_path / "policy", write(tmp_path / "bare", [image(picture, START)]))

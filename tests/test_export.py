@@ -3,6 +3,7 @@
 import io
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +127,10 @@ def test_compressed_splats_are_those_of_the_ply(out, tmp_path) -> None:
     assert np.abs(1 / (1 + np.exp(-read.opacities)) - splats.opacity).max() < 0.005
     unit = splats.rotations / np.linalg.norm(splats.rotations, axis=1, keepdims=True)
     assert np.abs((read.quats * unit).sum(1)).min() > 0.9999  # the same rotation, up to the sign
+    far = replace(splats, positions=splats.positions + np.float32(2500.0), opacity=np.ones_like(splats.opacity))
+    far.write_spz(tmp_path / "far.spz")
+    assert np.abs(spz.read_spz(tmp_path / "far.spz").means - far.positions).max() < 2**-10
+    assert np.isfinite(far.stored()["opacities"]).all()
 
 
 # ---- texture

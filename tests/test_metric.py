@@ -11,7 +11,7 @@ import pytest
 from twin.capture import metric
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.capture.gravity import find_road, up_from_ground
-from twin.capture.scale import Scale, combine_scales, local_east_north_up, scale_from_marker
+from twin.capture.scale import Scale, combine_scales, local_east_north_up, scale_from_gps, scale_from_marker
 from twin.config import DistanceConfig, MarkerConfig, MetricConfig, SceneConfig
 from twin.errors import InputError
 from twin.files import read_json
@@ -284,6 +284,29 @@ def test_gps_gives_metres_and_east(tmp_path: Path) -> None:
     assert metrics["gps_inliers"] <= metrics["gps_frames"] - 1 == 38
     fit = umeyama(cameras.positions, film[:, :3, 3])
     assert abs(fit.scale - 1) < 0.02 and abs(fit.scale - 1) < 4 * metrics["scale_uncertainty"]
+
+
+@pytest.mark.parametrize(("kept", "films"), [(0.0, 1), (0.97, 1), (0.97, 3)])
+def test_the_stated_uncertainty_of_drifting_gps_holds(kept: float, films: int) -> None:
+    """`kept` is the correlation of the errors of neighboring frames; with 0.97, a third of the film is alike."""
+    rng, inside, sigmas = np.random.default_rng(5), 0, []
+    film = _path(count=40)
+    cameras = Cameras(
+        *(tuple(f"{k:03d}" for k in range(40 * films)), np.tile(film, (films, 1, 1)), np.ones((40 * films, 4))),
+        *(np.ones((40 * films, 2), int), ("day",) * (40 * films), tuple(np.repeat(list("abc")[:films], 40))),
+        *(np.arange(40.0 * films), np.zeros(40 * films, bool), Path()),
+    )
+    count = 40 if films == 1 else 14
+    for _ in range(count):
+        errors = rng.normal(0, 1, (films, 40, 3))
+        for k in range(1, 40):
+            errors[:, k] = kept * errors[:, k - 1] + np.sqrt(1 - kept**2) * errors[:, k]
+        gps = _to_gps(cameras.positions + errors.reshape(-1, 3))
+        scale, _ = scale_from_gps(cameras, np.array([0.0, 0.0, 1.0]), gps, rng)
+        inside += abs(scale.value - 1.0) < scale.uncertainty
+        sigmas.append(scale.uncertainty)
+    assert 0.5 * count <= inside <= (1.0 if not kept else 0.93) * count
+    assert np.median(sigmas) < 0.12
 
 
 def test_gps_that_does_not_spread_is_refused(tmp_path: Path) -> None:

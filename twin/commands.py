@@ -278,7 +278,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
     )
     add("--glb", type=Path, metavar="FILE", help="write the visual mesh, textured (binary glTF, y up)")
     add("--ply", type=Path, metavar="FILE", help="write Gaussians as 3DGS viewers read them (z up)")
-    add("--spz", type=Path, metavar="FILE", help="write them compressed (z up); needs the extra spz")
+    add("--spz", type=Path, metavar="FILE", help="write the Gaussians compressed (z up); needs the extra spz")
     add("--nerfstudio", type=Path, metavar="DIR", help="write transforms.json, frames, masks and sparse points")
     add("--colmap", type=Path, metavar="DIR", help="write a COLMAP model with its frames and masks")
     add("--task-file", type=Path, metavar="FILE", help="write the rules of --task as JSON, for evaluation elsewhere")

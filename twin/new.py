@@ -226,7 +226,7 @@ def _write_seat(path: Path, bag: BagContents) -> CameraSeat | None:
 
 def _short(way: float, needed: float) -> str:
     """Note on a path [m] that is too short to determine the scale."""
-    return "" if way >= needed else f"; the scale needs {needed:.0f} m"
+    return "" if way >= needed else f" (less than {needed:.0f} m, so not used for the scale)"
 
 
 def _taken(bag: BagContents) -> str:

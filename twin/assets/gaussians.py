@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
+from scipy.special import logit
 
 from twin.assets.views import ColorField, Views, render_views
 from twin.errors import InputError
@@ -68,7 +69,7 @@ class Gaussians:
             "means": self.positions,
             "quats": self.rotations,
             "sh0": (self.rgb - np.float32(0.5)) / np.float32(SH_CONSTANT),
-            "opacities": np.log(self.opacity / (1.0 - self.opacity)),
+            "opacities": logit(np.clip(self.opacity, 1e-6, 1.0 - 1e-6)),
             "scales": np.log(self.scales),
         }
 
@@ -91,7 +92,7 @@ class Gaussians:
         return head.encode() + rows.tobytes()
 
     def write_spz(self, path: Path) -> None:
-        """Writes the compressed `.spz` (version 3), a fifth of the `.ply`; positions are rounded to 0.24 mm.
+        """Writes the compressed `.spz` (version 3), a fifth of the `.ply`; positions are rounded to 0.24 mm up to 2 km.
 
         Raises InputError: the package gsply is missing.
         """
@@ -99,7 +100,10 @@ class Gaussians:
         stored = {name: np.ascontiguousarray(values, np.float32) for name, values in self.stored().items()}
         higher = np.zeros((len(self.rgb), 0, 3), np.float32)  # the color does not depend on the direction
         with atomic_path(path) as partial:
-            spz.write_spz(partial, spz.GSData(**stored, shN=higher))
+            # 24 bits for a coordinate and its sign: beyond 2 km, fewer of them are left for its fraction.
+            reach = float(np.abs(self.positions).max(initial=1.0)) + 1.0
+            bits = min(12, 23 - int(np.ceil(np.log2(reach))))
+            spz.write_spz(partial, spz.GSData(**stored, shN=higher), fractional_bits=bits)
 
 
 def require_spz() -> Any:

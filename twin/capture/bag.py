@@ -272,6 +272,18 @@ def is_from_wheels(topic: str) -> bool:
     return any(word in topic for word in FROM_WHEELS) or topic.endswith("odometry/filtered")
 
 
+def wheel_odometry(connections: Iterable[Any]) -> dict[str, int]:
+    """Topics with odometry of the wheels alone (filters also use the IMU), and their numbers of messages."""
+    odometry = messages_by_topic(connections, (ODOMETRY,))
+    return {name: count for name, count in odometry.items() if is_from_wheels(name) and "filtered" not in name}
+
+
+def independent_poses(connections: Iterable[Any]) -> dict[str, int]:
+    """Topics with at least `MIN_POSES` poses that do not come from the wheels, and their numbers of messages."""
+    counts = messages_by_topic(connections, TYPES["poses"])
+    return {name: count for name, count in counts.items() if count >= MIN_POSES and not is_from_wheels(name)}
+
+
 def log_topics(path: Path, topics: dict[str, str]) -> None:
     """Logs which topic of a bag is used for what."""
     runtime.log_line(f"{path}: " + ", ".join(f"{kind} {topic}" for kind, topic in topics.items()))

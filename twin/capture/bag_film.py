@@ -33,12 +33,13 @@ from twin.capture.bag import (
     choose_topics,
     fix_of,
     header_time,
-    is_from_wheels,
+    independent_poses,
     message_times,
     messages_by_topic,
     open_bag,
     picture_of,
     picture_topics,
+    wheel_odometry,
 )
 from twin.capture.camera_models import Lens, checked_lens, same_aspect
 from twin.capture.capture_data import nearest_longitudes
@@ -199,16 +200,15 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
 
 def _log_note(connections: list[Any]) -> str:
     """Says by which topics a bag is a log for `twin align` (`twin.sysid.log_files`), or which kind it lacks."""
-    found = {kind: messages_by_topic(connections, TYPES[kind]) for kind in ("commands", "wheels", "poses")}
-    from_wheels = {name: count for name, count in found["poses"].items() if is_from_wheels(name)}
-    used = {"commands": found["commands"], "wheels": found["wheels"] or from_wheels}
-    lacking = [f"{kind} ({' or '.join(TYPES[kind])})" for kind, topics in used.items() if not topics]
-    if lacking:
-        return f"as a log for twin align it lacks {join_names(lacking)}"
-    used["poses"] = {name: count for name, count in found["poses"].items() if name not in from_wheels}
-    given = [f"{kind} {join_names(topics, most=3)}" for kind, topics in used.items() if topics]
-    poses = "" if used["poses"] else "; poses come from its film, once the scene is built"
-    return f"also a log for twin align: {', '.join(given)}{poses}"
+    commands, joints = (messages_by_topic(connections, TYPES[kind]) for kind in ("commands", "wheels"))
+    wheels = wheel_odometry(connections) or joints
+    if not commands:
+        return f"as a log for twin align it lacks commands ({' or '.join(TYPES['commands'])})"
+    if not wheels:
+        return f"as a log for twin align it lacks joint states ({TYPES['wheels'][0]}) or odometry of the wheels"
+    poses = join_names(independent_poses(connections), most=3) or "from its film, once the scene is built"
+    topics = f"commands {join_names(commands, most=3)}, wheels {join_names(wheels, most=3)}, poses {poses}"
+    return f"also a log for twin align: {topics}"
 
 
 def _topics(connections: list[Any], path: Path, topic: str) -> dict[str, str]:

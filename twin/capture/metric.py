@@ -64,7 +64,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     rows = [row[name] for name in cameras.names]
     if given.gps:
         rng = np.random.default_rng(config.seed)
-        scales["gps"], east = scale_from_gps(cameras.positions, up.direction, capture.gps[rows], rng)
+        scales["gps"], east = scale_from_gps(cameras, up.direction, capture.gps[rows], rng)
     if given.odometry:
         if capture.odometry is None:
             raise InputError(

@@ -6,6 +6,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from twin import runtime
 from twin.capture.gravity import Gravity, Road, below_path, heights_above_road
@@ -18,6 +20,7 @@ from twin.types import Array
 
 _PIXEL_ERROR = 1.0  # [px] standard deviation of a point marked by hand
 _GPS_TRIALS = 400
+_GPS_FRAMES = 400  # about the largest number of frames from which the drift of GPS is estimated
 _STRETCH = 2.0  # [m] length of the compared stretches of odometry; the heading hardly drifts over this length
 _STRAIGHT = 0.7  # smallest ratio of end-to-end distance to length of a compared stretch
 _MIN_STRETCHES = 5
@@ -236,16 +239,16 @@ def local_east_north_up(gps: Array) -> Array:
     return np.asarray(pycolmap.GPSTransform().ellipsoid_to_enu(gps, *gps[0]))
 
 
-def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generator) -> tuple[Scale, Array]:
+def scale_from_gps(cameras: Cameras, up: Array, gps: Array, rng: np.random.Generator) -> tuple[Scale, Array]:
     """Scale and horizontal east axis (3,) from GPS positions by a robust similarity fit in the horizontal plane.
 
     Altitudes are not used: they are several times less accurate than latitude and longitude, and up is known already.
-    `gps` (n, 3) holds latitude [°], longitude [°] and altitude [m] per camera center, NaN where unknown. `rng` draws
-    the pairs of cameras for the first fits.
+    `gps` (n, 3) holds latitude [°], longitude [°] and altitude [m] per camera, NaN where unknown. `rng` draws the pairs
+    of cameras for the first fits. For the uncertainty see `_drift_uncertainty`.
 
     Raises InputError: fewer than 3 positions, or positions that do not spread beyond their own error.
     """
-    known = np.all(np.isfinite(gps[:, :2]), axis=1)
+    centers, known = cameras.positions, np.all(np.isfinite(gps[:, :2]), axis=1)
     if known.sum() < 3:
         raise InputError(
             f"metric.gps: {known.sum()} registered frames have a position (need 3); give the scale another way"
@@ -280,8 +283,8 @@ def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generat
         inliers = again
     residual = np.abs(target - offset - fit * source)[inliers]
     extent = float(np.std(source[inliers]) * abs(fit))
-    # Neighboring frames share the drifting GPS error: about three frames count as one independent position.
-    sigma = float(np.sqrt(np.mean(residual**2) / 2) / (extent * np.sqrt(max(inliers.sum() / 3.0, 1.0))))
+    films = np.array(cameras.sources)[known][inliers]
+    sigma = _drift_uncertainty(source[inliers], target[inliers], films) / float(abs(fit))
     if not np.isfinite(sigma) or sigma > 0.3:
         raise InputError(
             f"metric.gps: positions fit within {np.median(residual):.1f} m but spread over {extent:.1f} m only; film "
@@ -297,6 +300,37 @@ def scale_from_gps(centers: Array, up: Array, gps: Array, rng: np.random.Generat
         "gps_residual_median_m": float(np.median(residual)),
     }
     return Scale(float(abs(fit)), sigma, notes), east
+
+
+def _drift_uncertainty(source: NDArray, target: NDArray, films: NDArray) -> float:
+    """Standard deviation of |factor| in the least-squares fit target = factor · source + offset, complex numbers (n,).
+
+    Errors of GPS drift: those of neighboring frames are alike, and a fit absorbs much of a slow drift, so residuals are
+    smaller than the errors. Model: a fraction ν of the errors' variance is independent, the rest has the correlation
+    exp(−distance in frames / τ) within a film and none between films. ν and τ are averaged over a grid, weighted by
+    the restricted likelihood (Patterson and Thompson, Biometrika 58, 1971), which accounts for what the fit absorbs.
+    """
+    some = np.unique(np.linspace(0, len(source) - 1, min(len(source), _GPS_FRAMES)).astype(int))
+    source, target, films, n = source[some], target[some], films[some], len(some)
+    order = np.arange(n)
+    apart = np.where(films[:, None] == films, np.abs(order[:, None] - order), np.inf)
+    design = np.stack([source - source.mean(), np.ones(n)], 1)
+    pseudo = np.linalg.pinv(design)
+    scores, variances = [], []
+    for tau in np.geomspace(0.3, 10.0 * n, 14):
+        for nu in (0.0, 0.02, 0.1, 0.3, 0.6):
+            correlation = (1.0 - nu) * np.exp(-apart / tau) + nu * np.eye(n)
+            factor = np.linalg.cholesky(correlation + 1e-9 * np.eye(n))
+            x, y = (solve_triangular(factor, one, lower=True) for one in (design, target))
+            q, r = np.linalg.qr(x)
+            rest = float(np.sum(np.abs(y - q @ (q.conj().T @ y)) ** 2))
+            # Real and imaginary parts count as two observations each, hence no factors 1 / 2.
+            log_determinants = 2.0 * np.log(np.diag(factor)).sum() + 2.0 * np.log(np.abs(np.diag(r))).sum()
+            scores.append(-(n - 2) * np.log(max(rest, 1e-300)) - log_determinants)
+            spread = (pseudo[0] @ correlation @ pseudo[0].conj()).real
+            variances.append(rest / (2.0 * max(n - 2, 1)) * spread)  # along the factor, not across it
+    weight = np.exp(np.array(scores) - max(scores))
+    return float(np.sqrt(np.sum(weight * variances) / weight.sum()))
 
 
 def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> Scale:

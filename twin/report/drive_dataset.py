@@ -234,7 +234,7 @@ class DriveDataset:
 
 
 def read_drives(folder: Path) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
-    """Reads the n frames of a dataset that `DriveDataset` wrote.
+    """Reads the n frames of a dataset that `DriveDataset` wrote, with speed and yaw rate as actions.
 
     Returns:
         Pictures (n, h, w, 3).
@@ -242,24 +242,28 @@ def read_drives(folder: Path) -> tuple[NDArray[np.uint8], NDArray[np.float32], N
         Index of each frame within its drive, (n,).
 
     Raises:
-        InputError: the folder is no such dataset; or its actions are not speed and yaw rate.
+        InputError: the folder is not such a dataset, is incomplete, or has other actions.
     """
     require_pyarrow()
     from pyarrow import parquet
 
-    info = folder / "meta" / "info.json"
-    ranges = read_json(info).get("twin", {}).get("action_range", {})
-    if len(ranges) != 2:
-        raise InputError(
-            f"{info}: actions are {list(ranges)}; expected speed and yaw rate, as `twin film --lerobot` writes"
-        )
+    cure = "expected a dataset of twin film --lerobot or twin trial --lerobot with speed and yaw rate as actions"
+    info = read_json(folder / "meta" / "info.json")
+    with wrap_read_errors(folder, cure):
+        ranges = np.array(list(info["twin"]["action_range"].values()), np.float32)
+        frames = int(info["total_frames"])
+    if ranges.shape != (2, 2) or not (ranges[:, 0] < ranges[:, 1]).all():
+        raise InputError(f"{folder}: {len(ranges)} actions with ranges {ranges.tolist()}; {cure}")
     with wrap_read_errors(folder, "record the drives again"):
         tables = [parquet.read_table(path) for path in sorted(folder.glob("data/*/*.parquet"))]
         films = sorted(folder.glob(f"videos/{CAMERA}/*/*.mp4"))
         pictures = np.concatenate([list(read_frames(film)) for film in films])
         action = np.concatenate([np.array(table["action"].to_pylist(), np.float32) for table in tables])
         frame = np.concatenate([table["frame_index"].to_numpy() for table in tables])
-    low, high = np.array(list(ranges.values()), np.float32).T
+    if not len(pictures) == len(action) == len(frame) == frames:
+        counts = f"{len(pictures)} pictures and {len(action)} actions; expected {frames} of each"
+        raise InputError(f"{folder}: {counts}; copy the dataset again")
+    low, high = ranges.T
     return pictures, 2.0 * (action - low) / (high - low) - 1.0, frame
 
 

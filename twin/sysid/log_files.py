@@ -20,18 +20,17 @@ from numpy.typing import NDArray
 from twin import runtime
 from twin.assets.ground import Ground
 from twin.capture.bag import (
-    MIN_POSES,
-    ODOMETRY,
     TYPES,
     VALUES,
     bag_files,
     choose_topics,
+    independent_poses,
     is_bag,
-    is_from_wheels,
     log_topics,
     messages_by_topic,
     open_bag,
     topic_names,
+    wheel_odometry,
 )
 from twin.capture.bag_film import read_contents
 from twin.capture.frames import source_names
@@ -193,7 +192,7 @@ def _uses(
     if poses and poses not in counts:
         raise InputError(f"{path}: no poses on topic {poses}; expected one of {join_names(counts, most=12)}")
     topics = choose_topics(connections, path, [kind for kind in TYPES if kind not in ("wheels", "poses")])
-    if poses or any(count >= MIN_POSES and not is_from_wheels(name) for name, count in counts.items()):
+    if poses or independent_poses(connections):
         topics["poses"] = poses or choose_topics(connections, path, ("poses",))["poses"]
     elif filmed is None:
         raise InputError(
@@ -205,9 +204,7 @@ def _uses(
         runtime.log_line(f"{path}: {len(filmed.times)} poses in the built scene are taken from its pictures")
     uses = {(kind, topic): VALUES[kind] for kind, topic in topics.items()}
     joints = messages_by_topic(connections, TYPES["wheels"])
-    # A filter's yaw rate comes from the IMU, too.
-    odometry = messages_by_topic(connections, (ODOMETRY,))
-    from_wheels = {name: n for name, n in odometry.items() if is_from_wheels(name) and "filtered" not in name}
+    from_wheels = wheel_odometry(connections)
     if from_wheels:
         uses["wheels", max(from_wheels, key=lambda name: from_wheels[name])] = _wheels_of_odometry
     elif not joints:
