@@ -275,6 +275,14 @@ def test_new_says_whether_the_bag_is_also_a_log(tmp_path: Path, capsys: pytest.C
         assert words in capsys.readouterr().err
 
 
+def test_new_says_when_odometry_is_too_short_for_the_scale(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    bag = write(tmp_path / "short", [one for one in whole() if one.topic != "/odom" or one.stamp < START + 10**9])
+    assert new_main([str(tmp_path / "scene"), str(bag)]) == 0
+    said = capsys.readouterr()
+    assert "(less than 15 m, so not used for the scale)" in said.err
+    assert "metric scale: camera_height and gps\n" in said.out
+
+
 def odometry_on(topic: str) -> list[Recorded]:
     return [replace(one, topic=topic) for one in whole() if one.topic == "/odom"]
 
