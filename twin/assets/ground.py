@@ -237,7 +237,7 @@ def bias_to_path(data: HeightData, path: HeightData) -> float:
 # ---- fit
 
 _COARSE_CELL = 0.5  # [m]
-# Largest numbers of nodes of the two grids. With a line there is no limit: only nodes near the line are fitted.
+# Largest numbers of nodes of the two grids; for more, cells grow, or only nodes near a given line are fitted.
 _COARSE_NODES, _FINE_NODES = 40_000, 200_000
 _BESIDE_LINE = 2.0  # [m] width of the ground that is fitted beyond `MeshConfig.margin` beside a long line
 _MAX_CELLS = 3_000_000
