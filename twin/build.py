@@ -247,6 +247,7 @@ def _run(stage: Stage, scene: SceneDir, config: SceneConfig, depends: dict[str, 
     out = scene.partial(stage.name)
     out.mkdir()
     start = time.perf_counter()
+    runtime.return_memory()
     try:
         with PeakMemory() as peak:
             choice = {"device": device} if device and stage.name in _ON_DEVICE else {}

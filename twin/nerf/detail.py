@@ -154,7 +154,15 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
     rng = np.random.default_rng([seed, 7])
     total = int((pixels.width * pixels.height)[pixels.frames].sum())
     share = min(1.0, _MAX_HITS / max(1, int(0.7 * total)))
-    parts: list[list[NDArray[Any]]] = []
+    # Untouched memory is free, and parts to be joined later would set the build's peak memory.
+    columns: list[NDArray[Any]] = [
+        np.empty((total, 4), np.float32),
+        np.empty((total, volume.CHANNELS - 1), np.float16),
+        np.empty((total, 3), np.float16),
+        np.empty((total, 3), np.uint8),
+        np.empty(total, np.int32),
+    ]
+    count = 0
     with bar("surface points", len(pixels.frames), "frame") as progress:
         for i in pixels.frames.tolist():
             width, height = int(pixels.width[i]), int(pixels.height[i])
@@ -184,13 +192,14 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
             local = np.stack([(u + 0.5 - k[2]) / k[0], (v + 0.5 - k[3]) / k[1], np.ones(len(at), "f4")], 1)
             ray = local @ pose[:3, :3].T
             ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-            base = features[0].reshape(volume.CHANNELS, -1)[1:, at].T.astype(np.float16)
-            frame = np.full(len(at), i, np.int32)
-            parts.append([hit[at], base, ray.astype(np.float16), pixels.colors[rows][at], frame])
+            base = features[0].reshape(volume.CHANNELS, -1)[1:, at].T
+            more = slice(count, count + len(at))
+            for column, values in zip(columns, (hit[at], base, ray, pixels.colors[rows][at], i), strict=True):
+                column[more] = values
+            count = more.stop
             progress.update()
-    order = rng.permutation(sum(len(part[0]) for part in parts))
-    # Joins one column at a time: a second copy of all columns would set the build's peak memory.
-    return SurfacePixels(*(np.concatenate([part.pop(0) for part in parts])[order] for _ in range(5)))
+    order = rng.permutation(count)
+    return SurfacePixels(*(columns.pop(0)[:count][order] for _ in range(5)))  # one at a time is copied
 
 
 def _choose_tiles(hits: NDArray[np.float32], map_shape: tuple[int, ...]) -> tuple[NDArray[np.int32], float]:

@@ -45,7 +45,7 @@ from twin.nerf.road import divide_road
 from twin.nerf.stereo import stereo_depths
 from twin.nerf.transients import LeftObject, cell_depths, left_objects, mover_masks, object_masks
 from twin.nerf.transients import picture as excluded_picture
-from twin.runtime import bar
+from twin.runtime import bar, return_memory
 from twin.scene import SceneDir
 from twin.warp_runtime import wp
 
@@ -476,11 +476,13 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
     # A capture around an object has no road to divide.
     nerf = config.nerf if config.mjcf.route else replace(config.nerf, section_length=0.0)
     field, metrics, cameras, excluded, poles = train_field(cameras, points, nerf, config.seed, height, device)
+    return_memory()
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
     if any(mask.any() for mask in excluded):
         pixels.exclude(excluded)
         write_image(out / "excluded.jpg", excluded_picture(pixels, excluded))
     baked, metrics["bake"] = bake(field, pixels, config.seed, config.nerf.bake_steps, config.nerf.max_bricks)
+    return_memory()
     if config.nerf.detail_passes > 0.0:
         metrics["detail"] = fit_detail(baked, field.appearance, pixels, config.seed, config.nerf.detail_passes)
     metrics |= evaluate(field, cameras, config.nerf.max_width, baked=baked)
