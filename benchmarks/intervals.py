@@ -43,6 +43,7 @@ from record import record_parser, save
 from scipy.special import expit
 from scipy.stats import norm
 
+from twin.evaluation.agreement import within
 from twin.evaluation.agreement_intervals import STATISTICS, PairedCells, jackknife_interval
 from twin.evaluation.rate_model import MIN_RATE_DAYS, RateModel
 from twin.evaluation.statistics import MIN_PREDICTORS, UndefinedStatistic, leave_one_group_out
@@ -111,6 +112,7 @@ KINDS = {
     "graded": Kind((-1.5, 0.0, 1.5), 1.0, 0.5, 1.0, 0.5, 1.0, 0.5, 1.0, 1.0, 0.5, 0.5),
     "poor twin": Kind((-3.0, 0.0, 3.0), 2.0, 1.0, 2.0, 1.0, 2.0, 0.3, 1.0, 1.0, 0.5, 4.0),
     "good policies": Kind((3.0, 4.0, 5.0), 2.0, 1.0, 2.0, 2.0, 4.0, 0.8, 1.0, 1.0, 0.0, 0.5),
+    "shared weather": Kind((3.0, 4.0, 5.0), 2.0, 1.0, 2.0, 4.5, 0.0, 0.8, 1.0, 1.0, 0.0, 0.5),
 }
 
 
@@ -349,7 +351,9 @@ def _predicted(worlds: Worlds) -> Hits:
             _, low, high = leave_one_group_out(twin=f, real=y, groups=data.training.tolist())
         except UndefinedStatistic:
             continue
-        out[i] = np.mean((low - 1e-9 <= y) & (y <= high + 1e-9))
+        known = np.isfinite(low)
+        if known.any():
+            out[i] = within(low, y, high)[known].mean()
     return {"predicted": out}
 
 

@@ -98,7 +98,7 @@ def test_variance_equals_enumeration() -> None:
     ]
     training, day, both = ((len(p) - 1) * np.var(p) for p in parts)
     variance = training + day - both / 2
-    variance = variance if variance > 0 else max(training, day)
+    variance = max(variance, 0.7 * max(training, day))
     freedom = np.clip(variance**2 / (training**2 / 8 + day**2 / 4), 4.0, 12.0)
     half = stats.t.ppf(0.95, freedom) * np.sqrt(variance)
     center = value(rows, days)

@@ -574,7 +574,8 @@ def test_the_twin_is_scored_against_guesses_without_it() -> None:
     scores = {it.predictor: it for it in group.scores}
     own, others, shuffled = scores[TWIN], scores[OTHERS], scores[SHUFFLED]
     assert own.gain.value is None and others.gain.value == pytest.approx(others.log.value - own.log.value)
-    assert others.gain.low > 0.0 and shuffled.gain.value > 0.0  # days differ, and the twin predicts how
+    assert others.gain.value > 0.0 and shuffled.gain.value > 0.0  # days differ, and the twin predicts how
+    assert others.gain.low is None and others.gain.no_interval
     assert sum(it.cells for it in group.calibration) == group.cells == 45
     assert [it.day for it in group.errors] == [f"day{k}" for k in range(5)]
     rates = {c.key: c.rate for c in real}
@@ -596,6 +597,11 @@ def test_the_first_sentence_says_what_may_be_believed() -> None:
     rates = pair_cells(real, {c.key: c for c in twin}).rates()
     different = sum(abs(a - b) > 1e-9 for i, a in enumerate(rates["real"]) for b in rates["real"][:i])
     assert sum(it.pairs for it in group.ordered) == different
+    # Pairs that are tied in the twin are no evidence for an order.
+    tied = [replace(c, successes=10) for c in twin]
+    group = make_forecast("road", tied, real).groups[0]
+    assert [(it.low, it.high, it.right) for it in group.ordered] == [(0.0, 0.0, different / 2)]
+    assert verdicts(make_forecast("road", tied, real))[0].mood == "bad"
     # A twin with the reverse order must not be believed, however large its differences.
     worse = [replace(c, successes=c.trials - c.successes) for c in twin]
     first = verdicts(make_forecast("road", worse, real))[0]

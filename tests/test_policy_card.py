@@ -86,3 +86,10 @@ def test_a_policy_that_was_trained_further_is_not_validated(scene):
     save_policy(scene.root / "runs/first", ARCHITECTURE, Control(), weights, {"task": "straight", "step": 24000})
     (path,) = write_policy_cards(scene, ["first"])
     assert "Not validated" in path.read_text()
+
+
+def test_a_forecast_of_another_version_does_not_stop_the_cards(scene, capsys):
+    scene.forecast.mkdir(exist_ok=True)
+    (scene.forecast / "forecast.json").write_text('{"old_field": 1}')
+    (path,) = write_policy_cards(scene, ["first"])
+    assert "## On the road" in path.read_text() and "lack the forecast" in capsys.readouterr().err

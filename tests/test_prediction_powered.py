@@ -93,7 +93,15 @@ def test_predictions_are_rates_and_keep_their_width() -> None:
     assert value[0] == low[0] == 0.0 < high[0]
     assert 0.0 <= value[1] <= high[1] <= 1.0
     flat = LinearCorrection.fit(twin=np.full(6, 0.5), real=Y)
-    assert flat.slope == 0.0 and float(flat.predict(0.9)[0]) == pytest.approx(Y.mean())
+    assert flat.slope == 0.0 and float(flat.predict(0.5)[0]) == pytest.approx(Y.mean())
+
+
+def test_what_the_scores_do_not_determine_is_not_predicted() -> None:
+    same = LinearCorrection.fit(twin=np.ones(8), real=np.ones(8))
+    value, low, high = same.predict([0.0, 1.0])
+    assert np.isnan(value[0]) and value[1] == 1.0 and np.isnan([low, high]).all()
+    on_a_line = LinearCorrection.fit(twin=F, real=F).predict(F)
+    assert np.allclose(on_a_line[0], F) and np.isnan(on_a_line[1:]).all()
 
 
 def test_left_out_predictions_do_not_depend_on_their_target() -> None:

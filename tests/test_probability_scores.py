@@ -69,9 +69,9 @@ def test_recalibration_removes_a_bias() -> None:
 
 def test_the_gain_is_the_difference_of_mean_scores() -> None:
     rng = np.random.default_rng(1)
-    real = rng.random((8, 5))
+    real = rng.random((12, 10))
     data = cells_of(real, real)
-    one, other = rng.random((2, 8, 5))
+    one, other = rng.random((2, 12, 10))
     pair = score_pair(data, one, other)
     assert mean_bias(**pair.rates()) == pytest.approx(mean_score(data, other) - mean_score(data, one))
     low, high = jackknife_interval(SCORE_DIFFERENCE, pair)

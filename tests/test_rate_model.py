@@ -87,7 +87,7 @@ def test_a_covariate_pulls_a_rate_towards_itself() -> None:
 
 def test_samples_follow_the_posterior() -> None:
     won = np.array([[5, 5, 0, 5], [0, 1, 0, 0], [5, 4, 5, 5]])
-    model = RateModel.fit(won, np.full(won.shape, 5))
+    model = RateModel.fit(won, np.full(won.shape, 5), shared_days=False)
     samples = model.sample(np.random.default_rng(0), 20_000)
     assert np.allclose(samples.mean(0), model.mean(), atol=0.01)
     low, high = model.interval()
@@ -123,7 +123,15 @@ def test_padding_changes_nothing_and_wrong_counts_are_refused() -> None:
             RateModel.fit(successes, driven)
 
 
-@pytest.mark.parametrize("kind", ["recorded", "graded"])
+def test_more_policies_on_the_same_days_do_not_replace_days() -> None:
+    def lowest(policies: int, days: int) -> float:
+        won = np.full((policies, days), 5)
+        return float(RateModel.fit(won, won).interval()[0][0])
+
+    assert lowest(36, 4) < lowest(1, 20) and lowest(8, 4) < 0.97
+
+
+@pytest.mark.parametrize("kind", ["recorded", "graded", "shared weather"])
 def test_intervals_cover_the_rates_over_days(kind: str) -> None:
     """100 worlds of 8 policies only; `benchmarks/intervals.py` has the precise figures."""
     shape = Shape(places=1, setups=0, trainings=8, checkpoints=1, days=4, twin_trials=5)
@@ -132,4 +140,4 @@ def test_intervals_cover_the_rates_over_days(kind: str) -> None:
     for won, true in zip(worlds.real[:, 0], worlds.policy_rates()[:, 0], strict=True):
         low, high = RateModel.fit(won, np.full(won.shape, 5)).interval()
         held.append((low <= true) & (true <= high))
-    assert 0.82 <= np.mean(held) <= 0.98, np.mean(held)
+    assert (0.75 if kind == "shared weather" else 0.82) <= np.mean(held) <= 0.98, np.mean(held)

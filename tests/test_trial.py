@@ -216,6 +216,34 @@ def test_trials_add_up_and_a_bag_counts_once(place, tmp_path):
     assert (cell.trials, cell.successes, cell.lighting) == (2, 1, "dusk")
 
 
+def test_a_trial_with_a_corrected_name_counts_once(place, tmp_path):
+    scene, drives = place
+    out = tmp_path / "real.csv"
+    bag = bag_of(drives["ahead"], tmp_path / "a")
+    for lighting in ("mondy", "monday"):
+        trial.evaluate_trial(scene, bag, "ahead", "ahead", lighting, out, "day+randomised", frame="scene")
+    assert [line.split(",")[1:3] for line in out.read_text().splitlines()[1:]] == [["monday", "1"]]
+    with pytest.raises(InputError, match=r"are compared with 'day\+randomised', not with 'held-out'"):
+        trial.evaluate_trial(scene, bag, "ahead", "ahead", "monday", out, "held-out", frame="scene")
+    _, figures, _ = trial.evaluate_trial(scene, bag, "ahead", "ahead", "monday", out, frame="scene")
+    assert figures["twin_lighting"] == "day+randomised"
+
+
+def test_bags_of_the_same_name_have_folders_of_their_own(place, tmp_path):
+    scene, drives = place
+    later = [replace(one, stamp=one.stamp + 10**12) for one in deepcopy(drives["ahead"]) if one.topic]
+    for one in later:
+        one.message.header.stamp.sec += 1000
+    (tmp_path / "tuesday").mkdir()
+    bags = [bag_of(drives["ahead"], tmp_path / "run"), write(tmp_path / "tuesday" / "run", later)]
+    out = tmp_path / "real.csv"
+    folders = [
+        trial.evaluate_trial(scene, bag, "ahead", "ahead", "dusk", out, "day+randomised", frame="scene")[2]
+        for bag in (*bags, *bags)
+    ]
+    assert folders[:2] == folders[2:] and folders[0] != folders[1]
+
+
 def test_a_table_written_by_hand_is_not_lost(place, tmp_path):
     scene, drives = place
     out = tmp_path / "real.csv"

@@ -156,6 +156,21 @@ def test_several_tables_are_one_without_doubled_trials(tmp_path: Path) -> None:
         read_results(tables, TWIN)
 
 
+@pytest.mark.parametrize("other", ["D\u0061\u0308mmerung 1", "dämmerung  1"])
+def test_a_day_has_one_spelling(tmp_path: Path, other: str) -> None:
+    rows = f"nerf,Dämmerung 1,10,9,sun\nsimulator,{other},10,9,sun\n"
+    twin = [cell for cell in TWIN if cell.task == "straight"]
+    with pytest.raises(InputError, match="use one spelling"):
+        read_results([write(tmp_path, DAYS + rows)], twin)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_ends_of_lines_and_empty_lines_do_not_matter(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "results.csv"
+    path.write_bytes(f"\n{HEADER}nerf,sun,10,9\n".replace("\n", end).encode())
+    assert read_results([path], TWIN)[0].successes == 9
+
+
 def test_lightings_of_the_twin_may_differ_in_case_alone(tmp_path: Path) -> None:
     twin = [Cell("nerf", "straight", name, 10, 5) for name in ("Day", "day")]
     rows = read_results([write(tmp_path, HEADER + "nerf,Day,10,5\nnerf,day,10,5\n")], twin)

@@ -31,14 +31,15 @@ from twin.config import Condition
 from twin.env.env_factory import EnvFactory
 from twin.errors import InputError
 from twin.evaluation.trial_judge import JudgedTrial, TrialViews, judge, replay, view
-from twin.evaluation.trials import Trial, read_real_trials, write_real_trials
-from twin.files import write_json
+from twin.evaluation.trials import Trial, read_real_trials, recorded_twin_lighting, write_real_trials
+from twin.files import read_json, wrap_read_errors, write_json
 from twin.learn.policy import Policy, find_policy, load_policy
 from twin.loading import load_writable
 from twin.report.drive_dataset import drives_summary, write_bag_dataset
 from twin.report.drive_video import write_trial_video
 from twin.report.review_video import load_ground_and_parts
 from twin.robot import PixelCamera
+from twin.runtime import exclusive_lock
 from twin.sysid.trial_recording import FrameFit, PosesFrame, TrialRecording, read_trial, scene_frame
 from twin.types import Array, Image
 from twin_policy import Limits, Pilot, Rectifier
@@ -70,8 +71,9 @@ def evaluate_trial(
         task: See `twin.load`.
         lighting: Name of the day or light in `real.csv`.
         out: Path of `real.csv`; by default in the scene's folder.
-        twin_lighting: The lighting of the twin that the trial is counted under, by default `lighting`. Pictures are
-            compared with it or, if the field has none of that name, with the lighting that matches them best.
+        twin_lighting: The lighting of the twin that the trial is counted under, by default that of the same cell in
+            `out`, or `lighting`. Pictures are compared with it or, if the field has none of that name, with the
+            lighting that matches them best.
         cause: The cause of the recording's end, as stated by the operator.
         frame: See `twin.sysid.trial_recording.PosesFrame`.
         topics: Topics of the bag; see `read_trial`.
@@ -83,47 +85,77 @@ def evaluate_trial(
     policy = load_policy(find_policy(root, policy_name))
     recording = read_trial(bag, topics)
     out = out or root / "real.csv"
-    table = out.with_name(f"{out.stem}_trials.csv")
-    known = read_real_trials(table, out)
-    compared = twin_lighting or lighting
-    factory = EnvFactory.open(scene, task, policy.options())
-    if factory.field is None:
-        raise InputError(f"{root}: has no field to compare pictures with; build it")
-    name = Condition.parse(compared).lighting
-    chosen = name if name in factory.field.lightings else None
-    own = policy.trained.get("camera") or factory.world.camera.resized(factory.options.size).intrinsics
-    rectify = recording.rectifier(factory.options.size, own)
-    begin = recording.start()
-    fit = scene_frame(recording, frame, begin, scene.scene, factory.world.robot)
-    times, poses, upright = recording.motion_at_steps(begin, factory.options.control_timestep)
-    trial = judge(factory, times, fit(poses), upright).with_cause(cause, bag)
-    end = begin + round(float(trial.times[-1]) * 1e9)
+    with exclusive_lock(out.with_name(f".{out.stem}.lock"), f"{out} is being written"):
+        table = out.with_name(f"{out.stem}_trials.csv")
+        known = read_real_trials(table, out)
+        factory = EnvFactory.open(scene, task, policy.options())
+        if factory.field is None:
+            raise InputError(f"{root}: has no field to compare pictures with; build it")
+        cell = policy.name, factory.segment.name, lighting
+        recorded = recorded_twin_lighting(out, cell)
+        if recorded and twin_lighting and recorded != twin_lighting:
+            raise InputError(
+                f"{out}: trials of {cell[0]} under {lighting} are compared with {recorded!r}, not with "
+                f"{twin_lighting!r}; give --twin-lighting {recorded}, or change the table"
+            )
+        compared = recorded or twin_lighting or lighting
+        name = Condition.parse(compared).lighting
+        chosen = name if name in factory.field.lightings else None
+        own = policy.trained.get("camera") or factory.world.camera.resized(factory.options.size).intrinsics
+        rectify = recording.rectifier(factory.options.size, own)
+        begin = recording.start()
+        fit = scene_frame(recording, frame, begin, scene.scene, factory.world.robot)
+        times, poses, upright = recording.motion_at_steps(begin, factory.options.control_timestep)
+        trial = judge(factory, times, fit(poses), upright).with_cause(cause, bag)
+        end = begin + round(float(trial.times[-1]) * 1e9)
 
-    since = np.asarray((recording.command_times - begin) * 1e-9, np.float64)
-    replayed = replay(factory, trial.poses[0], trial.times, since, recording.commands)
-    used, pictures, apart = _pictures(recording, rectify, policy, begin, end)
-    width, height = rectify.pinhole.size
-    camera = PixelCamera(rectify.pinhole.intrinsics, (width, height))
-    views = view(factory, fit(recording.poses_at(used)), pictures, camera, chosen)
+        since = np.asarray((recording.command_times - begin) * 1e-9, np.float64)
+        replayed = replay(factory, trial.poses[0], trial.times, since, recording.commands)
+        used, pictures, apart = _pictures(recording, rectify, policy, begin, end)
+        width, height = rectify.pinhole.size
+        camera = PixelCamera(rectify.pinhole.intrinsics, (width, height))
+        views = view(factory, fit(recording.poses_at(used)), pictures, camera, chosen)
 
-    folder = root / "trials" / bag.stem
-    folder.mkdir(parents=True, exist_ok=True)
-    steps = len(trial.times) - 1
-    row = Trial(
-        *(policy.name, factory.segment.name, lighting, begin // 10**6, trial.cause, float(trial.progress[-1]), steps),
-        float(views.trust.mean()),
-    )
-    head = {"bag": str(bag), "name": row.policy, "task": row.task, "lighting": lighting, "twin_lighting": compared}
-    figures = head | _figures(recording, trial, replayed, fit, views, apart)
-    half_width = factory.options.half_width or factory.world.half_width
-    limits = factory.segment.start, factory.segment.end
-    place = factory.world, half_width, limits, load_ground_and_parts(scene.scene)
-    seconds = np.asarray((used - begin) * 1e-9, np.float64)
-    title = f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}"
-    write_json(folder / "trial.json", figures)
-    write_real_trials([*(one for one in known if one.key != row.key), row], table, out, compared)
-    write_trial_video(folder / "trial.mp4", trial, replayed, pictures, seconds, views, place, title)
-    return row, figures, folder
+        steps = len(trial.times) - 1
+        row = Trial(*cell, begin // 10**6, trial.cause, float(trial.progress[-1]), steps, float(views.trust.mean()))
+        folder = _folder(root, bag, row.seed)
+        folder.mkdir(parents=True, exist_ok=True)
+        head = {
+            "bag": str(bag),
+            "started_ms": row.seed,
+            "name": row.policy,
+            "task": row.task,
+            "lighting": lighting,
+            "twin_lighting": compared,
+        }
+        figures = head | _figures(recording, trial, replayed, fit, views, apart)
+        half_width = factory.options.half_width or factory.world.half_width
+        limits = factory.segment.start, factory.segment.end
+        place = factory.world, half_width, limits, load_ground_and_parts(scene.scene)
+        seconds = np.asarray((used - begin) * 1e-9, np.float64)
+        title = f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}"
+        write_json(folder / "trial.json", figures)
+        for one in known:
+            if one.seed == row.seed and one.cell != row.cell:
+                was, now = ", ".join(one.cell), ", ".join(row.cell)
+                runtime.log_line(f"this trial was counted as {was}; now it is counted as {now}")
+        write_real_trials([*(one for one in known if one.seed != row.seed), row], table, out, compared)
+        write_trial_video(folder / "trial.mp4", trial, replayed, pictures, seconds, views, place, title)
+        return row, figures, folder
+
+
+def _folder(root: Path, bag: Path, started: int) -> Path:
+    """Folder for the results of a trial that started at a time [ms].
+
+    Its name ends with this time if another trial, of a bag of the same name, has the folder.
+    """
+    folder = root / "trials" / (bag.name if bag.is_dir() else bag.stem)
+    path = folder / "trial.json"
+    if path.exists():
+        with wrap_read_errors(path, "delete it"):
+            if read_json(path).get("started_ms", started) != started:
+                return folder.with_name(f"{folder.name}_{started}")
+    return folder
 
 
 class _PolicyOfPictures:

@@ -9,6 +9,7 @@ stopped validation. `validation/validation.html` shows the results.
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
@@ -334,7 +335,7 @@ def _drop_partial_row(path: Path) -> None:
         blob = path.read_bytes()
         if not blob.endswith(b"\n"):
             whole = blob[: blob.rfind(b"\n") + 1]
-            path.write_bytes(whole) if whole else path.unlink()
+            os.truncate(path, len(whole)) if whole else path.unlink()  # a kill here must not lose the rows
 
 
 def _read_table(path: Path) -> list[Trial]:

@@ -26,6 +26,7 @@ import numpy as np
 from plan import SETUPS, SHARES, STEPS, TASKS
 
 from twin.config import Condition
+from twin.evaluation.agreement import within
 from twin.evaluation.agreement_intervals import (
     STATISTICS,
     PairedCells,
@@ -322,7 +323,8 @@ def _corrected(
             _, low, high = leave_one_group_out(twin=twin[of], real=real[of], groups=groups)
         except UndefinedStatistic:
             continue
-        held += ((low <= real[of]) & (real[of] <= high)).tolist()
+        known = np.isfinite(low)
+        held += within(low, real[of], high)[known].tolist()
     return sum(held), len(held)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.errors import join_names
 from twin.evaluation.agreement_intervals import (
@@ -57,6 +58,7 @@ from twin.types import Array, Indices
 DEPENDENT = "none: policies, and their predictions, depend on each other"
 """Reason why a mean over policies or cells, or a fraction of them, has no interval."""
 
+_ROUNDING = 1e-9
 _MAXIMUM = "none for a single place, since the value depends on the best policy alone"
 
 Cells = Mapping[tuple[str, str, str], Cell]
@@ -107,7 +109,10 @@ class PredictorScore:
 
 @dataclass(frozen=True)
 class OrderedPairs:
-    """Pairs of policies of one task whose real rates differ, and whose twin scores differ by `low` to `high`."""
+    """Pairs of policies of one task whose real rates differ, and whose twin scores differ by `low` to `high`.
+
+    Pairs that are tied in the twin are counted apart: there both limits are 0.
+    """
 
     low: float
     high: float
@@ -275,10 +280,17 @@ def _corrected_coverage(data: PairedCells) -> Estimate:
             _, low, high = leave_one_group_out(twin=f, real=y, groups=groups.tolist())
         except UndefinedStatistic:
             continue
-        hits += list((low <= y) & (y <= high))
+        known = np.isfinite(low)
+        hits += list(within(low, y, high)[known])
     if not hits:
-        return Estimate(missing=f"each policy needs {MIN_PREDICTORS} policies of other trainings on its task")
+        few = f"each policy needs {MIN_PREDICTORS} policies of other trainings on its task, whose rates scatter"
+        return Estimate(missing=few)
     return Estimate(int(sum(hits)) / len(hits), n=len(hits), no_interval=DEPENDENT)
+
+
+def within(low: Array, value: Array, high: Array) -> NDArray[np.bool_]:
+    """True where a value lies in an interval, with a tolerance for rounding."""
+    return np.asarray((low - _ROUNDING <= value) & (value <= high + _ROUNDING))
 
 
 def _mean_real(data: PairedCells, further: Sequence[float]) -> Estimate:
@@ -351,7 +363,6 @@ def _twin_probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) ->
 
 
 _GAPS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)  # edges of the bins of `OrderedPairs`
-_ROUNDING = 1e-9
 
 
 def _ordered(data: PairedCells) -> tuple[OrderedPairs, ...]:
@@ -366,8 +377,9 @@ def _ordered(data: PairedCells) -> tuple[OrderedPairs, ...]:
                 gaps.append(abs(float(gap)))
                 right.append(0.5 if abs(gap) < _ROUNDING else float((gap > 0) == (y[i] > y[j])))
     index = np.clip(np.searchsorted(_GAPS, np.array(gaps) + _ROUNDING, "right") - 1, 0, len(_GAPS) - 2)
+    index[np.array(gaps) < _ROUNDING] = -1
     return tuple(
-        OrderedPairs(_GAPS[b], _GAPS[b + 1], int(of.sum()), float(np.array(right)[of].sum()))
-        for b in range(len(_GAPS) - 1)
+        OrderedPairs(_GAPS[max(b, 0)], _GAPS[b + 1], int(of.sum()), float(np.array(right)[of].sum()))
+        for b in range(-1, len(_GAPS) - 1)
         if (of := index == b).any()
     )

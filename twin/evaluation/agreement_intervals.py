@@ -15,7 +15,9 @@ clustering (Cameron, Gelbach and Miller, J. Bus. Econ. Stat. 29, 2011); each par
 V_both is the variance from leaving out one training on one day; V_training and V_day each contain it. For a linear
 statistic of many units, such as the bias, all of V_both is subtracted. For the other statistics, subtracting all made
 intervals too narrow where leaving out a unit changes ranks, and subtracting nothing made them too wide
-(`benchmarks/intervals.py`). If V ≤ 0, V is the larger of V_training and V_day.
+(`benchmarks/intervals.py`). V cannot be smaller than V_training or V_day, but its estimate may be, or even be negative,
+which would make intervals much too narrow. So V is at least 0.7 times the larger of V_training and V_day; with the
+factor 1, intervals were too wide.
 
 The interval is the estimate ± Student's t times √V, on a scale on which the statistic is less skewed. The degrees of
 freedom are Satterthwaite's, but at least (trainings − 1) / 2, since few days made intervals too wide, and at most
@@ -44,6 +46,7 @@ MIN_BIAS_TRAININGS, MIN_BIAS_DAYS = 5, 3
 """Numbers of trainings and days below which a mean difference at one place has no interval."""
 
 _SHARE_OF_BOTH = 0.5  # fraction of V_both that is subtracted; see the module's docstring
+_LEAST_SHARE = 0.7  # smallest variance, as a fraction of the larger of V_training and V_day
 _LARGEST = 0.999  # correlations are clipped to ± this before Fisher's transform
 
 
@@ -203,7 +206,7 @@ def jackknife_interval(statistic: Statistic, data: PairedCells) -> tuple[Array, 
         each = [[statistic.of(**data.rates(kept)) for kept in units] for units in (of_training, of_day, both)]
         parts = [jackknife_variance(np.stack([statistic.scale(value) for value in values])) for values in each]
         variance = parts[0] + parts[1] - (1.0 if statistic.linear else _SHARE_OF_BOTH) * parts[2]
-        variance = np.where(variance > 0, variance, np.maximum(parts[0], parts[1]))
+        variance = np.maximum(variance, _LEAST_SHARE * np.maximum(parts[0], parts[1]))
         freedom = variance**2 / (parts[0] ** 2 / (trainings - 1) + parts[1] ** 2 / (days - 1))
     freedom = np.clip(freedom, (trainings - 1) / 2, trainings + days - 2)
     return interval_ends(statistic, statistic.of(**data.rates()), variance, freedom)

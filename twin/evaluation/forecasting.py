@@ -27,6 +27,7 @@ from twin.evaluation.agreement import (
     measure_agreement,
     missing_data,
     unit_counts,
+    within,
 )
 from twin.evaluation.agreement_intervals import training_of
 from twin.evaluation.rate_model import (
@@ -298,7 +299,13 @@ def _corrected(
             line = LinearCorrection.fit(twin=[f for f, _ in others], real=[y for _, y in others])
             score = scores[i][0] if i in scores else _score_over_days(mine, days)
             value, low, high = map(float, line.predict(np.array(score)))
-            if line.n < MIN_PREDICTORS:
+            if np.isnan(value):
+                same = f"all driven policies of other trainings have the rate {line.twin_mean:.2g} in the twin"
+                out.append(Estimate(missing=f"{same}, which says nothing about other rates"))
+            elif np.isnan(low):
+                on_line = "no interval: the driven policies' rates lie on one line, so their scatter is not known"
+                out.append(Estimate(value, n=line.n, no_interval=on_line))
+            elif line.n < MIN_PREDICTORS:
                 few = f"too few for an interval: {line.n} policies of other trainings, {MIN_PREDICTORS} are needed"
                 out.append(Estimate(value, n=line.n, no_interval=few))
             else:
@@ -360,11 +367,22 @@ def _left_out(task: str, real: Sequence[Cell], twin: Cells) -> list[LeftOutLight
             continue
         line = LinearCorrection.fit(twin=twin_rate[~mine], real=real_rate[~mine])
         value, low, high = line.predict(twin_rate[mine])
-        inside = (low <= real_rate[mine]) & (real_rate[mine] <= high)
-        means = np.abs(twin_rate - real_rate)[mine].mean(), np.abs(value - real_rate[mine]).mean(), inside.sum() / n
-        estimates = (Estimate(float(mean), n=n, no_interval=DEPENDENT) for mean in means)
-        out.append(LeftOutLighting(task, name, n, *estimates))
+        inside = within(low, real_rate[mine], high)
+        parts = (
+            np.abs(twin_rate - real_rate)[mine],
+            np.abs(value - real_rate[mine]),
+            np.where(np.isfinite(low), inside, np.nan),
+        )
+        out.append(LeftOutLighting(task, name, n, *map(_mean_of_known, parts)))
     return out
+
+
+def _mean_of_known(values: Array) -> Estimate:
+    """Mean over the cells whose value is not nan."""
+    known = values[~np.isnan(values)]
+    if not len(known):
+        return Estimate(missing="the rates under the other lightings do not determine a prediction")
+    return Estimate(float(known.mean()), n=len(known), no_interval=DEPENDENT)
 
 
 def _allocation(task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int) -> TrialAllocation:

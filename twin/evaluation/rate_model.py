@@ -21,7 +21,10 @@ Bayesian Data Analysis, section 5.3.
 Policies of one experiment drive on the same days, and a bad day is bad for all of them. So their cells are not
 independent, and the product of their likelihoods is a *composite* likelihood. It is raised to the power
 (2k − 1) / (2k + 1) for k days (for such scaling see Ribatet, Cooley and Davison, Statistica Sinica 22, 2012). Without
-this power, 90 % intervals from two days had coverages of 0.72 to 0.92.
+this power, 90 % intervals from two days had coverages of 0.72 to 0.92. Besides, n − 1 other policies tell less about a
+policy's rate than as many independent ones: their likelihood is raised to the power 1 / (1 + 0.3 (n − 1)), as if the
+outcomes of two policies on one day had a correlation of 0.3. Without it, eight policies on four days of a weather that
+affects all alike had a coverage of 0.71, and the more policies drove, the narrower were intervals from the same days.
 
 The estimand of `interval` is the rate over the *population* of days like those driven, and that of `mean_interval` is
 the rate over the population of policies and days. `cell_means` estimates rates on the days that were driven. For the
@@ -48,6 +51,7 @@ _EDGES = np.concatenate([[0.0], expit(np.linspace(-7.5, 7.5, 47)), [1.0]])
 """Edges of the grid of rates."""
 _RATES = np.concatenate([[_EDGES[1] / 3], expit((logit(_EDGES[1:-2]) + logit(_EDGES[2:-1])) / 2), [1 - _EDGES[1] / 3]])
 _CORRELATIONS = (np.arange(10) + 0.5) / 10  # grid of ρ and τ; values of τ are equally likely
+_SHARED = 0.3  # assumed correlation between two policies' outcomes on one day
 _ROAD_PRIOR = 4.0  # exponent of the density of Beta(5, 1), the prior of ρ
 _MEANS = np.sin(np.pi / 2 * (np.arange(15) + 0.5) / 15) ** 2  # grid of μ: quantiles of Jeffreys' prior Beta(½, ½)
 _SLOPES = (0.0, 0.5, 1.0)  # grid of β, equally likely
@@ -72,6 +76,10 @@ class RateModel:
     """Posterior mass of each h and ρ, shape (h, r)."""
     means: Array
     """μ of each h, shape (h,)."""
+    correlations: Array
+    """Prior mass of each ρ, up to a factor, shape (r,)."""
+    power: float
+    """Power of the other policies' likelihood in a policy's posterior."""
 
     @staticmethod
     def fit(
@@ -105,8 +113,10 @@ class RateModel:
         prior = np.diff(betainc(a[..., None], b[..., None], _EDGES), axis=-1)
         evidence = np.maximum(np.matmul(prior, likelihood), 1e-300)
         log = np.log(evidence).sum(0)
-        weight = np.exp(log - log.max()) * _CORRELATIONS ** (_ROAD_PRIOR if road else 0.0)
-        return RateModel(won, driven, likelihood, prior, evidence, weight / weight.sum(), mean)
+        correlations = _CORRELATIONS ** (_ROAD_PRIOR if road else 0.0)
+        weight = np.exp(log - log.max()) * correlations
+        power = 1.0 / (1.0 + _SHARED * (len(won) - 1)) if shared_days else 1.0
+        return RateModel(won, driven, likelihood, prior, evidence, weight / weight.sum(), mean, correlations, power)
 
     def posterior(self) -> Array:
         """Mass of the grid's rates for each policy, shape (n, g)."""
@@ -114,7 +124,9 @@ class RateModel:
 
     def _joint(self) -> Array:
         """Mass of the grid's rates and ρ for each policy, shape (n, g, r)."""
-        scaled = self.weight / self.evidence
+        log = np.log(self.evidence)
+        others = self.power * (log.sum(0) - log)
+        scaled = np.exp(others - others.max((1, 2), keepdims=True)) * self.correlations
         prior = np.broadcast_to(self.prior, (len(scaled), *self.prior.shape[1:]))
         mass = np.matmul(np.swapaxes(prior, 1, 2), scaled) * self.likelihood
         return np.asarray(mass / mass.sum((-1, -2), keepdims=True))

@@ -9,6 +9,7 @@ Functions raise `UndefinedStatistic` if the data do not determine a statistic. F
 work over leading axes, for resampling, and raise nothing; a correlation that is not determined is nan.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,7 @@ MIN_TRIALS = 5
 _MIN_POINTS = 3  # smallest number of policies for a correlation
 _DECIMALS = 12  # scores equal to this many decimals are tied; further decimals depend on the order of summation
 _MIN_VARIANCE = 1e-12  # scores with a smaller variance count as equal
+_LEAST_SPREAD = 0.01  # a smaller standard deviation about a line is chance: it vanishes if all policies succeed
 
 
 class UndefinedStatistic(ValueError):
@@ -280,13 +282,18 @@ class LinearCorrection:
 
         Returns values and ends of their intervals, clipped to [0, 1], each of the shape of `twin`. The interval is the
         prediction interval of simple regression (Draper and Smith, Applied Regression Analysis, section 3.1). It is
-        centered on the clipped value, so that it does not vanish where the line leaves [0, 1].
+        centered on the clipped value, so that it does not vanish where the line leaves [0, 1]. What the fitted scores
+        do not determine is nan: the ends if all of them lie on the line, and the value for a twin score other than
+        theirs if these are all equal.
         """
         f = np.asarray(twin, float)
-        middle = np.clip(self.real_mean + self.slope * (f - self.twin_mean), 0, 1)
-        squares = self.sum_of_squares
-        lever = (f - self.twin_mean) ** 2 / squares if squares > _MIN_VARIANCE else np.zeros_like(f)
-        half = student.ppf(0.5 + confidence / 2, self.n - 2) * self.residual_std * np.sqrt(1.0 + 1.0 / self.n + lever)
+        away, squares = f - self.twin_mean, self.sum_of_squares
+        middle = np.clip(self.real_mean + self.slope * away, 0, 1)
+        lever = away**2 / max(squares, _MIN_VARIANCE)
+        if squares <= _MIN_VARIANCE:
+            middle = np.where(np.abs(away) > math.sqrt(_MIN_VARIANCE), np.nan, middle)
+        spread = self.residual_std if self.residual_std >= _LEAST_SPREAD else np.nan
+        half = student.ppf(0.5 + confidence / 2, self.n - 2) * spread * np.sqrt(1.0 + 1.0 / self.n + lever)
         return middle, np.clip(middle - half, 0, 1), np.clip(middle + half, 0, 1)
 
 
@@ -295,8 +302,8 @@ def leave_one_group_out(
 ) -> tuple[Array, Array, Array]:
     """Predicts each real score by the line fitted to all other groups: values and ends of intervals, shapes (n,).
 
-    `groups` contains the group of each score, such as its policy or lighting. Raises UndefinedStatistic: fewer than 5
-    scores remain without one of the groups.
+    They are nan where `LinearCorrection.predict` says so. `groups` contains the group of each score, such as its policy
+    or lighting. Raises UndefinedStatistic: fewer than 5 scores remain without one of the groups.
     """
     f, y = np.asarray(twin, float), np.asarray(real, float)
     out = np.empty((3, len(y)))

@@ -17,6 +17,7 @@ test. It takes two counts: the episodes in which only policy A succeeded, and th
 import csv
 import gzip
 import io
+import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -158,6 +159,14 @@ def read_real_trials(table: Path, out: Path) -> list[Trial]:
     return known
 
 
+def recorded_twin_lighting(out: Path, cell: tuple[str, str, str]) -> str | None:
+    """The twin's lighting with which the results table `out` compares a cell (policy, task, lighting), if it has it."""
+    for _, row in _rows(out, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS) if _has_rows(out) else ():
+        if (row["policy"], row.get("task", ""), row["lighting"]) == cell:
+            return row.get("twin_lighting") or row["lighting"]
+    return None
+
+
 def write_real_trials(
     trials: Sequence[Trial],
     table: Path,
@@ -243,11 +252,16 @@ def read_results(paths: Sequence[Path], twin: Sequence[Cell]) -> list[Cell]:
                 "if these are other trials, replace the two lines by one with their sums, else delete one"
             )
         # A forecast counts days by their names, so a day written in two ways would make intervals too narrow.
-        alike, place = spelled.setdefault(cell.lighting.casefold(), (cell.lighting, where))
+        alike, place = spelled.setdefault(_spelling(cell.lighting), (cell.lighting, where))
         if alike != cell.lighting and not {alike, cell.lighting} <= {key[-1] for key in known}:
             raise InputError(f"{where}: lighting {cell.lighting!r}, but {alike!r} in {place}; use one spelling")
         cells[cell.key], places[cell.key] = cell, where
     return list(cells.values())
+
+
+def _spelling(name: str) -> str:
+    """A name without what the eye does not see: case, repeated spaces and the encoding of accents."""
+    return " ".join(unicodedata.normalize("NFC", name).casefold().split())
 
 
 def read_counts(path: Path) -> dict[tuple[str, str, str], tuple[int, int]]:
@@ -308,7 +322,7 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
     reader = csv.reader(io.StringIO(_table_text(path)))
     wanted = ",".join(needed) + "".join(f"[,{name}]" for name in optional)
     try:
-        header = [name.strip() for name in next(reader, [])]
+        header = [name.strip() for name in next((row for row in reader if any(map(str.strip, row))), [])]
         if not header:
             raise InputError(f"{path} is empty; its first line must be {wanted}")
         missing = [name for name in needed if name not in header]
@@ -347,11 +361,13 @@ def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterabl
 
 
 def _table_text(path: Path) -> str:
-    """Text of a table, which may be compressed. Raises InputError: the file is damaged."""
+    """Text of a table, which may be compressed, with line ends `\\n`. Raises InputError: the file is damaged."""
     if path.suffix != ".gz":
-        return read_text(path)
-    with wrap_read_errors(path, "restore it"):
-        return gzip.decompress(path.read_bytes()).decode()
+        text = read_text(path)
+    else:
+        with wrap_read_errors(path, "restore it"):
+            text = gzip.decompress(path.read_bytes()).decode()
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _parse_int(where: str, row: dict[str, str], name: str) -> int:

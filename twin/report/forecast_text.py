@@ -20,7 +20,9 @@ from twin.report.html import Caution, Verdict
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
 """Lowest rank correlations for the verdict that the twin ranks, or roughly ranks, policies as the road does."""
 SMALL_REGRET = 0.05  # up to this regret, the verdict is good
-_SMALL_GAP = 0.1  # the verdict is good only if the order is reliable for differences of rates in the twin up to this
+_SMALL_GAP = (
+    0.1  # verdicts are good only if the order is reliable for such differences of rates, and errors are smaller
+)
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
@@ -119,10 +121,11 @@ def verdicts(forecast: Forecast) -> list[Verdict]:
 
 def believable(group: Agreement) -> Verdict:
     """Verdict on the smallest difference of two policies' rates in the twin at which the road confirms their order."""
-    pairs = [(it.low, it.pairs, it.right) for it in group.ordered]
+    ties = sum(it.pairs for it in group.ordered if not it.high)
+    pairs = [(it.low, it.pairs, it.right) for it in group.ordered if it.high]
     many, days = _count(group.trainings, "training"), _count(group.days, "day")
     where = f"measured on {days} and {many}"
-    if not pairs:
+    if not pairs and not ties:
         return Verdict(
             f"These policies do not differ on the road, so no order in the twin could be confirmed ({where}).", "bad"
         )
@@ -131,7 +134,7 @@ def believable(group: Agreement) -> Verdict:
         n, right = sum(n for n, _ in beyond), sum(right for _, right in beyond)
         if n >= _ENOUGH_PAIRS and right >= _RELIABLE * n:
             closer = [(m, r) for low, m, r in pairs if low < start]
-            m, r = sum(m for m, _ in closer), sum(r for _, r in closer)
+            m, r = sum(m for m, _ in closer) + ties, sum(r for _, r in closer) + ties / 2
             gap = f"that differ by {100 * start:.0f} percentage points or more" if start else "that differ at all"
             rest = f", and in {r:g} of {m} closer pairs" if m else ""
             text = (
@@ -140,7 +143,7 @@ def believable(group: Agreement) -> Verdict:
             )
             enough = group.trainings >= MIN_TRAININGS and group.days >= MIN_DAYS
             return Verdict(text, "good" if enough and start <= _SMALL_GAP else "mixed")
-    n, right = sum(n for _, n, _ in pairs), sum(right for _, _, right in pairs)
+    n, right = sum(n for _, n, _ in pairs) + ties, sum(right for _, _, right in pairs) + ties / 2
     text = f"No order of two policies in the twin may be believed yet: the road agrees in {right:g} of {n} pairs"
     return Verdict(f"{text} ({where}).", "bad")
 
@@ -181,14 +184,21 @@ def _bias(group: Agreement) -> Verdict:
         return Verdict("The bias of the twin’s rates is not known.", "bad")
     single = f"for a single policy, the twin’s rate is off by {percentage_points(off.value)} on average"
     much = "high" if bias.value < 0 else "low"
+    mean = f"The twin’s rates are {percentage_points(bias.value)} too {much} on average"
+    if abs(bias.value) < 5e-4:
+        mean = "On average, the twin’s rates are right"
     if bias.low is None or bias.high is None:
-        mean = f"The twin’s rates are {percentage_points(bias.value)} too {much} on average"
         return Verdict(f"{mean} ({bias.no_interval}); {single}.", "mixed")
-    if bias.low <= 0.0 <= bias.high:
-        return Verdict(
-            f"The twin has no significant bias: road minus twin is {format_estimate(bias, True)}; {single}.", "good"
-        )
-    return Verdict(f"The twin’s rates are {percentage_points(bias.value)} too {much} on average; {single}.", "mixed")
+    if not bias.low <= 0.0 <= bias.high:
+        return Verdict(f"{mean}; {single}.", "mixed")
+    known = bias.low >= -_SMALL_GAP and bias.high <= _SMALL_GAP
+    told = (
+        "The twin has no significant bias"
+        if known
+        else "It is not certain that the twin has a bias, nor that it has none"
+    )
+    mood = "good" if known and off.value <= _SMALL_GAP else "mixed"
+    return Verdict(f"{told}: road minus twin is {format_estimate(bias, True)}; {single}.", mood)
 
 
 def _skill(group: Agreement) -> list[Verdict]:
@@ -200,7 +210,7 @@ def _skill(group: Agreement) -> list[Verdict]:
     if gain.low is None or gain.high is None:
         better = "better" if gain.value > 0 else "worse"
         how = f"{better} than the mean of other trainings"
-        text = f"In these trials the twin predicts single days {how}; {gain.no_interval}."
+        text = f"In these trials the twin predicts single days {how} (log scores; {gain.no_interval})."
         return [Verdict(text, "mixed")]
     if gain.low > 0:
         text = "The twin predicts success on single days better than the mean of other trainings does"

@@ -9,6 +9,8 @@ import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from twin import runtime
+from twin.errors import InputError
 from twin.evaluation.forecasting import Candidate, Forecast
 from twin.evaluation.statistics import CONFIDENCE, rate_summary
 from twin.evaluation.training_curves import validated_digests
@@ -26,11 +28,17 @@ _CHOICE = "choice.json"
 def write_policy_cards(scene: SceneDir, runs: Iterable[str]) -> list[Path]:
     """Writes the cards of runs and returns their paths.
 
-    Names that do not belong to runs of the scene, such as `module:function`, are skipped. Raises InputError if a record
-    is damaged.
+    Names that do not belong to runs of the scene, such as `module:function`, are skipped. A forecast that cannot be
+    read, such as one of an earlier version, is left out, and a line says so. Raises InputError if another record is
+    damaged.
     """
     cells = tally(read_trials(scene.episodes_csv)) if exists(scene.episodes_csv) else []
-    forecast = Forecast.load(scene.forecast) if exists(scene.forecast / "forecast.json") else None
+    forecast = None
+    if exists(scene.forecast / "forecast.json"):
+        try:
+            forecast = Forecast.load(scene.forecast)
+        except InputError as error:
+            runtime.log_line(f"the cards of policies lack the forecast: {error}")
     digests = validated_digests(scene.root)
     written = []
     for run in dict.fromkeys(runs):
