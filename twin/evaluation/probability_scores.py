@@ -26,8 +26,8 @@ CALIBRATION_EDGES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 SCORE_DIFFERENCE = replace(STATISTICS["bias"], low=-np.inf, high=np.inf, trainings=12, days=10)
 """Mean over policies of the difference of two scores; `jackknife_interval` takes it with data from `score_pair`.
 
-With fewer units it has no interval: from four days, the coverage was only 0.6 to 0.9, since baselines are fitted to the
-same trials; from ten days of twelve trainings it is 0.81 to 0.99.
+With fewer units it has no interval: its coverage would be as low as 0.54, since the baselines are fitted to the same
+trials (`benchmarks/intervals.py --better-by`).
 """
 
 _LEAST = 0.005  # log scores and recalibration clip probabilities to between this and 1 minus this
