@@ -400,11 +400,17 @@ def huge_shape(content: bytes) -> bytes:
     return struct.pack("<Q", len(text)) + text + content[8 + length :]
 
 
+def masks_in(folder: str):
+    return lambda content: json.dumps(json.loads(content) | {"masks": folder}).encode()
+
+
 def wrong_digest(manifest, _):
     manifest["files"]["scene.toml"]["sha256"] = "0" * 64
 
 
-FIELD, XML = "build/3_field/baked.safetensors", "build/5_mjcf/scene.xml"
+FIELD, XML, CAMERAS = "build/3_field/baked.safetensors", "build/5_mjcf/scene.xml", "build/2_metric/cameras.json"
+# To a parser without entities, the document is the entity's text; to one with them, it is what follows.
+ENTITY = b"""<!DOCTYPE m [<!ENTITY a "><mujoco><include file='/a.xml'/></mujoco><!--"> ]><!-- x -->"""
 HOSTILE = {
     "traversal": (add("../../evil.toml"), "is not a file of a scene"),
     "absolute": (add("/tmp/evil.toml"), "is not a file of a scene"),
@@ -430,6 +436,9 @@ HOSTILE = {
     "include": (edit(XML, lambda b: b.replace(b"<asset>", b'<include file="/a"/><asset>', 1)), "names a file"),
     "path": (edit(XML, lambda b: b.replace(b'meshdir="assets"', b'meshdir="/etc"', 1)), "names a file"),
     "sky": (edit(XML, lambda b: b.replace(b"<asset>", b'<asset><texture fileback="/a.png"/>', 1)), "names a file"),
+    "entity": (edit(XML, lambda b: ENTITY + b), "scene.xml has <!DOCTYPE; expected"),
+    "masks": (edit(CAMERAS, masks_in("/etc")), "etc' names a file"),
+    "masks above": (edit(CAMERAS, masks_in("1_capture/../../../x")), "x' names a file"),
     "config": (edit("scene.toml", lambda b: b + b"surprise = 1\n"), "surprise"),
     "untrusted": (add("policies/a.zip"), "if you trust its sender, twin unpack --trust"),
 }  # fmt: skip

@@ -79,6 +79,7 @@ _XML_PATHS = (
     *("fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"),
 )
 _XML_REFUSED = ("include", "plugin", "extension", "model", "attach")  # elements that load other files or code
+_XML_ENTITIES = (b"<!DOCTYPE", b"<!ENTITY")
 _PARTIAL, _TOKEN = ".partial", 8  # suffix of an unfinished folder, and number of random characters in its name
 _HEADER = 8  # [bytes] size of the number at the start of a safetensors file: the header's length
 
@@ -295,19 +296,25 @@ def _extract(archive: zipfile.ZipFile, name: str, facts: dict[str, Any], target:
 
 
 def _check_contents(root: Path, path: Path) -> None:
-    """Raises InputError if a file of the scene refers to a file outside it."""
+    """Raises InputError if a file of the scene refers to a file outside it, or if `scene.xml` has entities."""
     scene = SceneDir(root)
     try:
         load_config(scene.config_file)
         cameras = Cameras.load(scene.stage("metric"))
-        read = [os.path.relpath(cameras.images, scene.build.resolve()), *cameras.names]
+        folders = [os.path.relpath(one, scene.build.resolve()) for one in (cameras.images, cameras.masks) if one]
     except ValueError as error:  # also InputError
         raise InputError(f"{path}: {str(error).replace(f'{root}{os.sep}', '')}") from None
+    read = (*folders, *cameras.names)
     bad = next((one for one in read if one.startswith("/") or ".." in one.split("/")), None)
     xml = scene.stage("mjcf") / SCENE_XML
     if bad is None and xml.exists():
+        content = xml.read_bytes()
+        for mark in _XML_ENTITIES:
+            # MuJoCo's parser does not expand entities, so it would read another document than the one checked here.
+            if mark in content:
+                raise InputError(f"{path}: {SCENE_XML} has {mark.decode()}; expected a document without; {_CURE}")
         with wrap_read_errors(path, _CURE):
-            for element in ElementTree.parse(xml).getroot().iter():
+            for element in ElementTree.fromstring(content).iter():
                 paths = [element.get(key, "x") for key in _XML_PATHS]
                 if element.tag in _XML_REFUSED or not all(re.fullmatch(_N, one) for one in paths):
                     bad = f"<{element.tag}> of {SCENE_XML}"
