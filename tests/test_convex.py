@@ -179,3 +179,15 @@ def test_a_part_beside_a_bend_loses_only_its_corner():
     assert clipped == 1
     # A third of a meter of one corner is in the way.
     assert sum(_volume(rest) for _, rest in kept) > 0.9 * _volume(part)
+
+
+def test_a_part_inside_a_long_bend_keeps_what_is_free():
+    angle = np.arange(0.0, 6.0, 0.25 / 4.0)
+    corridor = Corridor((4.0 * np.column_stack([np.cos(angle), np.sin(angle)]),), 2.0)
+    ring = 2.3 * np.column_stack([np.cos(angle), np.sin(angle)])  # 0.3 m of it is in the way all around
+    part = ConvexPart.hull(np.concatenate([np.insert(ring, 2, z, 1) for z in (-0.1, 1.0)]))
+    assert part is not None
+    kept, clipped = clear_corridor([part], corridor, _flat())
+    assert clipped == 1 and sum(_volume(rest) for _, rest in kept) > 0.7 * _volume(part)
+    for _, rest in kept:
+        assert corridor.distance(rest.vertices[:, :2], 9.0).min() > 2.0

@@ -49,7 +49,7 @@ PIPELINE = (
     Stage("cameras", "twin.capture.sfm", 5, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 2, ("metric",), ("capture", "cameras")),
     Stage("field", "twin.nerf.trainer", 8, ("nerf", "mjcf.route"), ("cameras", "metric")),
-    Stage("mesh", "twin.assets.mesh", 6, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
+    Stage("mesh", "twin.assets.mesh", 7, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.scene_xml", 4, ("mjcf", "robot"), ("metric", "mesh")),
     Stage(
         "review",

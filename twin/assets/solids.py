@@ -315,7 +315,7 @@ def clear_corridor(
         if upper is not None:
             out.append((i, upper))
         lower: ConvexPart | None = clip_part(part, np.array([0.0, 0.0, 1.0]), ceiling)
-        for _ in range(12):
+        for _ in range(len(points) + 1):  # each cut clears the part of one more point
             if lower is None:
                 break
             depth, point, side = _intrusion(lower, points, reach, ground)
