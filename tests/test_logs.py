@@ -43,6 +43,23 @@ BAD = {
         lambda t: _bad(t, cmd_yaw_rate=np.degrees(t["cmd_yaw_rate"])),
         r"cmd_yaw_rate looks like degrees",
     ),
+    "clockwise": (lambda t: _bad(t, y=-t["y"], yaw=-t["yaw"]), r"yaw is clockwise \(NED\): negate y and yaw"),
+    "clockwise yaw alone": (lambda t: _bad(t, yaw=-t["yaw"]), r"yaw is clockwise: negate it"),
+    "axes swapped": (lambda t: _bad(t, x=t["y"], y=t["x"]), r"x and y are swapped"),
+    "yaw to the left": (
+        lambda t: _bad(t, yaw=t["yaw"] + np.pi / 2),
+        r"yaw is not the angle from x to the robot's front",
+    ),
+    "wheels swapped": (
+        lambda t: _bad(t, left_wheel_vel=t["right_wheel_vel"], right_wheel_vel=t["left_wheel_vel"]),
+        r"turns -0\.\d+ times as fast .* left and right wheels are swapped",
+    ),
+    "wheels backward": (
+        lambda t: _bad(t, **{n: -t[n] for n in logs.WHEEL_SPEEDS}),
+        r"moves -\d.* m along yaw .* wheel speeds have the wrong sign",
+    ),
+    "command backward": (lambda t: _bad(t, cmd_v=-t["cmd_v"]), r"cmd_v has the wrong sign"),
+    "command clockwise": (lambda t: _bad(t, cmd_yaw_rate=-t["cmd_yaw_rate"]), r"cmd_yaw_rate is clockwise"),
     "missing": (lambda t: {k: v for k, v in t.items() if k != "left_wheel_vel"}, r"no column left_wheel_vel among"),
     "axes": (
         lambda t: _bad(t, acceleration_y=t["acceleration_y"] - 9.81),

@@ -386,10 +386,12 @@ _TURN = 0.25  # [rad]
 _MOVING = 0.15  # [m/s] of wheels or robot: slower windows are not used to check units
 _MAX_ACCELERATION = 3.0  # [m/s²] a larger median is due to gravity: an axis that should be level is not
 _DEGREE = np.pi / 180
+_MIN_SIGNED = 5  # least number of windows from which a sign is taken
+_ALONG = 0.5  # least component along yaw of the motion in straight windows, as a fraction
 
 
 def check_log(windows: Windows, where: str) -> None:
-    """Raises InputError if a log is too short, turns too little or has implausible units."""
+    """Raises InputError if a log is too short, turns too little, or has implausible units, signs or axes."""
     driving = windows.fresh[windows.turning].sum(1)
     if len(driving) and np.median(driving) < 2:
         raise InputError(
@@ -411,6 +413,7 @@ def check_log(windows: Windows, where: str) -> None:
             )
     for ratio, expected, message, cures in _unit_ratios(windows):
         _check_ratio(ratio, expected, where, message, cures)
+    _check_directions(windows, where)
     turned = windows.poses[windows.fitting, -1, 2]
     left, right = int((turned > _TURN).sum()), int((turned < -_TURN).sum())
     if left + right < _MIN_TURNS or min(left, right) < _MIN_TURNS / 4:
@@ -466,6 +469,66 @@ def _check_ratio(
     close = abs(np.log(max(ratio, 1e-9) / nearest)) < np.log(6)
     cure = cures[nearest] if close else "check the units of the columns"
     raise InputError(f"{where}: {message.format(ratio)}; expected {low:g} to {high:g}; {cure}")
+
+
+def _check_directions(windows: Windows, where: str) -> None:
+    """Raises InputError if poses, wheel speeds and commands contradict each other in direction.
+
+    The combination of negative ratios shows which columns are wrong.
+    """
+    path, ahead, turn, speed, difference = _signed_ratios(windows)
+    bends = f"the path turns {path:.2g} times as far as yaw; expected more than 0"
+    moves = (
+        f"the robot moves {ahead:.2g} m along yaw for each meter in its wheels' direction; expected at least {_ALONG}"
+    )
+    turns = f"the robot turns {turn:.2g} times as fast as its wheels would have it without slip; expected more than 0"
+    rolls = f"the wheels roll {speed:.2g} times as fast as commanded; expected more than 0"
+    differ = f"the wheels' difference is {difference:.2g} times the commanded one; expected more than 0"
+    forward, sideways = ("cmd_v has", "cmd_yaw_rate is clockwise: negate it")
+    if not windows.twist:
+        forward, sideways = ("cmd_left and cmd_right have", "cmd_left and cmd_right are swapped")
+    cases = (
+        (path < 0 and turn < 0, bends, "yaw is clockwise: negate it"),
+        (path < 0, bends, "x and y are swapped, or one of them has the wrong sign"),
+        (ahead < -_ALONG and not turn > 0, moves, "wheel speeds have the wrong sign"),
+        (ahead < _ALONG, moves, "x and y are swapped, or yaw is not the angle from x to the robot's front"),
+        (turn < 0 and difference < 0, turns, "left and right wheels are swapped"),
+        (turn < 0, turns, "yaw is clockwise (NED): negate y and yaw"),
+        (speed < 0, rolls, f"{forward} the wrong sign"),
+        (difference < 0, differ, sideways),
+    )
+    for wrong, found, cure in cases:
+        if wrong:
+            raise InputError(f"{where}: {found}; {cure}")
+
+
+def _signed_ratios(windows: Windows) -> tuple[float, ...]:
+    """Medians over suitable windows, positive in a consistent log; NaN with fewer than `_MIN_SIGNED` windows.
+
+    They are: turn of the path / turn of yaw; motion along yaw / motion in the wheels' direction; turn of yaw / turn of
+    the wheels without slip; measured / commanded mean of the sides' speeds; the same of their difference.
+    """
+    half = windows.wheels.shape[1] // 2
+    halves = np.stack([one.mean((1, 2)) for one in (windows.wheels[:, :half], windows.wheels[:, half:])]) * WHEEL_RADIUS
+    sides = windows.wheels.mean(1) * WHEEL_RADIUS
+    measured = np.stack([sides.mean(1), (sides[:, 1] - sides[:, 0]) / 2], -1)  # [m/s]
+    commanded = windows.commanded_speeds.mean(1) * WHEEL_RADIUS
+    mean, difference = measured.T
+    before, end, yaw = windows.poses[:, half, :2], windows.poses[:, -1, :2], windows.poses[:, -1, 2]
+    after = end - before
+    bend = np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], (before * after).sum(1))
+    slowest = np.minimum(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)) / (DURATION / 2)
+    steady = (halves.prod(0) > 0) & (np.minimum(slowest, np.abs(halves).min(0)) > _MOVING)  # without reversing
+    distance = np.linalg.norm(end, axis=1)
+    straight = (np.minimum(np.abs(mean), distance / DURATION) > _MOVING) & (np.abs(difference) < 0.3 * np.abs(mean))
+    obeyed = np.minimum(np.abs(measured), np.abs(commanded)) > 0.5 * _MOVING
+    ratios = (
+        (2 * bend, yaw, steady & (np.abs(yaw) > 2 * _TURN)),
+        (end[:, 0], distance * np.sign(mean), straight),
+        (yaw * TRACK / 2, difference * DURATION, np.abs(difference) > _MOVING),
+        *((measured[:, i], commanded[:, i], obeyed[:, i]) for i in (0, 1)),
+    )
+    return tuple(float(np.median(a[u] / b[u])) if u.sum() >= _MIN_SIGNED else np.nan for a, b, u in ratios)
 
 
 def _median(values: Array) -> float | None:
