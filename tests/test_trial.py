@@ -280,6 +280,17 @@ def _standing(messages: list[Recorded]) -> list[Recorded]:
     return [command(0.0, 0.0, one.stamp) if one.topic == "/cmd_vel" else one for one in messages]
 
 
+def _scaled(messages: list[Recorded], scale: float) -> list[Recorded]:
+    """The messages with the quaternions of all poses multiplied by `scale`."""
+    out = deepcopy(messages)
+    for one in out:
+        if one.topic == "/odom":
+            q = one.message.pose.pose.orientation
+            for name in ("x", "y", "z", "w"):
+                object.__setattr__(q, name, scale * getattr(q, name))
+    return out
+
+
 BAD = {
     "no pictures": (_without("/camera/image"), r"no topic with pictures among /camera/camera_info, /cmd_vel, /odom"),
     "no camera": (_without("camera_info"), r"no topic of sensor_msgs/msg/CameraInfo among"),
@@ -290,6 +301,7 @@ BAD = {
         lambda m: [camera_info((0.0, 0.0, 0.5, 0.5), (64, 36), START) if o.topic == CAMERA_INFO else o for o in m],
         r"is the camera calibrated",
     ),
+    "no orientation": (lambda m: _scaled(m, 0.0), r"/odom: (\d+) of \1 poses have no orientation; .* by --poses"),
     "short": (lambda m: [o for o in m if o.topic != "/odom" or o.stamp <= START], r"1 usable poses; expected many"),
 }
 
@@ -319,6 +331,16 @@ def test_a_topic_of_another_kind_is_refused(kind, topic, tmp_path):
     assert len(read_trial(bag).poses) == 3
     with pytest.raises(InputError, match=rf"{topic} \({kind}\) has \w+/msg/\w+; expected \w+/msg/\w+"):
         read_trial(bag, {kind: topic})
+
+
+@pytest.mark.parametrize("scale", [0.9, 2.0, -1.0])
+def test_the_scale_of_a_quaternion_does_not_matter(place, tmp_path, scale):
+    messages = [one for one in place[1]["left"] if one.topic]
+    true, scaled = (read_trial(write(tmp_path / f"bag_{s}", _scaled(messages, s))) for s in (1.0, scale))
+    np.testing.assert_allclose(scaled.poses, true.poses, atol=1e-9)
+    np.testing.assert_allclose(scaled.uprightness, true.uprightness, atol=1e-9)
+    missing = [_scaled([one], 0.0)[0] if one.stamp // STEP % 3 == 0 else one for one in messages]
+    assert 0.5 < len(read_trial(write(tmp_path / "bag", missing)).poses) / len(true.poses) < 0.8
 
 
 def test_a_topic_that_was_published_twice_is_read_whole(tmp_path, capsys):

@@ -62,6 +62,7 @@ _OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")
 _CLOCK = 1_000_000_000
 _SET_BACK = 10 * _CLOCK  # [ns] if a time is earlier than one before it in the file by more, the clock was set back
 _MAX_METADATA = 16 << 20  # [bytes] largest accepted metadata.yaml
+_MIN_NORM = 0.5  # a quaternion with a smaller norm is no orientation
 _MAX_CHUNK = 1 << 30  # [bytes] largest accepted MCAP chunk, uncompressed
 
 
@@ -334,6 +335,14 @@ def fix_of(message: Any) -> tuple[float, float, float]:
     return (message.latitude, message.longitude, message.altitude) if good else (np.nan,) * 3
 
 
+def unit_quaternion(message: Any) -> tuple[float, float, float, float]:
+    """x, y, z, w of a Quaternion, normalized; NaN if its norm is below 0.5, as that of a pose without orientation."""
+    q = np.array([message.x, message.y, message.z, message.w], np.float64)
+    norm = float(np.linalg.norm(q))
+    x, y, z, w = (q / norm if norm >= _MIN_NORM else np.full(4, np.nan)).tolist()
+    return x, y, z, w
+
+
 def _twist(message: Any) -> tuple[float, ...]:
     twist = getattr(message, "twist", message)
     return twist.linear.x, twist.angular.z
@@ -348,8 +357,8 @@ def _wheels(message: Any) -> tuple[float, ...] | None:
 def _pose(message: Any) -> tuple[float, ...]:
     pose = message.pose
     pose = getattr(pose, "pose", pose)
-    p, q = pose.position, pose.orientation
-    return p.x, p.y, float(np.arctan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)))
+    x, y, z, w = unit_quaternion(pose.orientation)
+    return pose.position.x, pose.position.y, float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
 def _imu(message: Any) -> tuple[float, ...]:
@@ -361,6 +370,6 @@ VALUES: dict[str, Callable[[Any], Any]] = {"commands": _twist, "wheels": _wheels
 
 - commands: linear [m/s] and angular speed [rad/s]
 - wheels: mean speed of the left and of the right wheels [rad/s], or None if a side is missing
-- poses: x, y [m] and yaw [rad]
+- poses: x, y [m] and yaw [rad], NaN without orientation
 - imu: accelerations along x and y [m/s²]
 """

@@ -39,6 +39,7 @@ from twin.capture.bag import (
     open_bag,
     picture_of,
     picture_topics,
+    unit_quaternion,
     wheel_odometry,
 )
 from twin.capture.camera_models import Lens, checked_lens, same_aspect
@@ -234,8 +235,8 @@ def _values(kind: str, message: Any) -> tuple[float, ...]:
     if kind == "odometry":
         pose = message.pose
         pose = getattr(pose, "pose", pose)
-        p, q = pose.position, pose.orientation
-        return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+        p = pose.position
+        return p.x, p.y, p.z, *unit_quaternion(pose.orientation)
     return ()
 
 
@@ -392,9 +393,9 @@ def _add_transforms(transforms: dict[str, tuple[str, Array]], message: Any) -> N
     for one in message.transforms:
         if len(transforms) >= _MAX_FRAMES:
             return
-        p, q = one.transform.translation, one.transform.rotation
-        values = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
-        if not np.isfinite(values).all() or np.linalg.norm(values[3:]) < 0.5:
+        p = one.transform.translation
+        values = np.array([p.x, p.y, p.z, *unit_quaternion(one.transform.rotation)])
+        if not np.isfinite(values).all():
             continue
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
@@ -436,11 +437,11 @@ def _is_named(frame: str, name: str) -> bool:
 
 
 def _lens_positions(poses: Array, arm: Array) -> Array:
-    """Positions of the lens, shape (p, 3); NaN for impossible poses.
+    """Positions of the lens, shape (p, 3); NaN for poses that are not finite.
 
     `poses` (p, 7) holds position and quaternion of the base; `arm` (3,) is the position of the lens in the base frame.
     """
-    good = np.isfinite(poses).all(1) & (np.linalg.norm(poses[:, 3:], axis=1) > 0.5)
+    good = np.isfinite(poses).all(1)
     out = np.full((len(poses), 3), np.nan)
     if good.any():
         out[good] = poses[good, :3] + Rotation.from_quat(poses[good, 3:]).apply(arm)

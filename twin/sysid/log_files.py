@@ -133,7 +133,8 @@ def _are_same(one: Path, other: Path) -> bool:
 
 
 def read_bag(path: Path, filmed: FilmedPoses | None = None, poses: str = "") -> dict[str, Array]:
-    """Reads a bag into the columns that `twin.sysid.logs` describes. Messages that are not finite are left out.
+    """Reads a bag into the columns that `twin.sysid.logs` describes. Messages that are not finite, and poses
+    without orientation, are left out.
 
     Args:
         filmed: Poses to use if the bag has only poses that come from the wheels.

@@ -33,6 +33,7 @@ from twin.capture.bag import (
     open_bag,
     picture_of,
     topic_names,
+    unit_quaternion,
 )
 from twin.capture.camera_models import Lens
 from twin.capture.localize import register_film
@@ -230,16 +231,25 @@ def _value(kind: str, message: Any) -> Any:
         return fix_of(message)
     if kind == "poses":
         pose = getattr(message.pose, "pose", message.pose)
-        q = pose.orientation
-        return (*(VALUES["poses"](message) or ()), 1.0 - 2.0 * (q.x * q.x + q.y * q.y))
+        x, y, _, _ = unit_quaternion(pose.orientation)
+        return (*(VALUES["poses"](message) or ()), 1.0 - 2.0 * (x * x + y * y))
     return VALUES[kind](message)
 
 
 def _poses(times: NDArray[np.int64], rows: list[Any], where: str) -> tuple[NDArray[np.int64], Array, Array]:
-    """Times, poses and uprightness, sorted by time; `rows` are planar poses with uprightness, or satellite fixes."""
+    """Times, poses and uprightness, sorted by time; `rows` are planar poses with uprightness, or satellite fixes.
+
+    Rows that are not finite are left out. Raises InputError if fewer than two are left, or if most have no orientation.
+    """
     times, index = np.unique(times, return_index=True)
     table = np.array(rows, float)[index]
     keep = np.isfinite(table).all(1)
+    turned = np.isfinite(table[:, 2])
+    if table.shape[1] == 4 and turned.mean() < 0.5:
+        raise InputError(
+            f"{where}: {len(turned) - turned.sum()} of {len(turned)} poses have no orientation; expected a quaternion "
+            "of norm 1 in each: give the topic of other poses or of satellite fixes by --poses"
+        )
     if keep.sum() < 2:
         raise InputError(f"{where}: {keep.sum()} usable poses; expected many: record odometry or RTK, 10 Hz or more")
     times, table = times[keep], table[keep]
