@@ -142,6 +142,14 @@ def test_distortion_is_opencvs(model):
     np.testing.assert_allclose(row - 0.5, theirs[1], atol=2e-3)
 
 
+@pytest.mark.parametrize("d", [(), (0.0,) * 4])
+def test_a_fisheye_without_coefficients_is_no_pinhole(d):
+    camera, x = Camera((1280, 720), LENS, "equidistant", d), np.array([0.0, 0.5, 1.5])
+    column, _ = camera.project(x, 0.0 * x)
+    np.testing.assert_allclose(column, LENS[0] * np.arctan(x) + LENS[2])  # the radius is the angle from the axis
+    assert camera.is_distorted and not Rectifier(camera, camera.without_distortion(), 0.5).is_identity
+
+
 @pytest.mark.parametrize("model", BENT)
 def test_a_distorted_picture_becomes_the_pinhole_cameras(model):
     """A smooth pattern is a function of the rays; photographed through the lens and rectified, it is that function

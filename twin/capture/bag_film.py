@@ -355,7 +355,7 @@ def lens_of(info: Any, rectified: bool, where: str) -> Lens:
         raise InputError(f"{where}: {error}; add `camera = ...` under this [[source]] of scene.toml") from None
     width, height = camera.size
     d = (*camera.distortion, *(0.0,) * (8 - len(camera.distortion)))
-    if not any(d):
+    if not camera.is_distorted:
         return checked_lens("PINHOLE", camera.intrinsics, width, height, where)
     if camera.model == "equidistant":
         return checked_lens("OPENCV_FISHEYE", (*camera.intrinsics, *d[:4]), width, height, where)

@@ -113,7 +113,7 @@ class Camera:
     model: str = ""
     """plumb_bob, rational_polynomial, equidistant (fisheye), or empty for no distortion."""
     distortion: tuple[float, ...] = ()
-    """Coefficients in the order of CameraInfo: k1, k2, p1, p2, k3, ..., or k1 to k4 of equidistant."""
+    """Coefficients in the order of CameraInfo: k1, k2, p1, p2, k3, ..., or k1 to k4 of equidistant; empty: zeros."""
 
     def __post_init__(self) -> None:
         numbers = np.array([*self.size, *self.intrinsics, *self.distortion], float)
@@ -154,6 +154,11 @@ class Camera:
         cut = (self.size[1] * scale - size[1]) / 2
         return Camera(size, (fx, fy, cx, cy - cut), self.model, self.distortion)
 
+    @property
+    def is_distorted(self) -> bool:
+        """False for a pinhole camera; a fisheye is distorted also if its coefficients are zero."""
+        return self.model == "equidistant" or any(self.distortion)
+
     def without_distortion(self) -> "Camera":
         return Camera(self.size, self.intrinsics)
 
@@ -166,7 +171,7 @@ class Camera:
     def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels of rays (x, y, 1), OpenCV axes; arrays of one shape."""
         fx, fy, cx, cy = self.intrinsics
-        if any(self.distortion):
+        if self.is_distorted:
             x, y = (_fisheye if self.model == "equidistant" else _radial_tangential)(x, y, self.distortion)
         return fx * x + cx, fy * y + cy
 
@@ -185,7 +190,8 @@ def _fisheye(x: np.ndarray, y: np.ndarray, d: tuple[float, ...]) -> tuple[np.nda
     r = np.hypot(x, y)
     t = np.arctan(r)
     t2 = t * t
-    bent = t * (1 + t2 * (d[0] + t2 * (d[1] + t2 * (d[2] + t2 * d[3]))))
+    k1, k2, k3, k4 = (*d, *[0.0] * 4)[:4]
+    bent = t * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
     scale = np.where(r > 1e-9, bent / np.maximum(r, 1e-9), 1.0)
     return x * scale, y * scale
 
@@ -210,7 +216,7 @@ class Rectifier:
         self.camera, self.pinhole = camera, pinhole
         (fx, fy, cx, cy), (width, height) = pinhole.intrinsics, pinhole.size
         same = np.abs(np.subtract(camera.intrinsics, pinhole.intrinsics)).max() < _EXACT
-        self.is_identity = bool(camera.size == pinhole.size and same and not any(camera.distortion))
+        self.is_identity = bool(camera.size == pinhole.size and same and not camera.is_distorted)
         if self.is_identity:
             return
         fine = int(np.clip(round(camera.intrinsics[0] / fx), 1, _MAX_OVERSAMPLING))
