@@ -197,6 +197,16 @@ def test_compressed_pictures_and_bad_calibrations(rig):
     r.calibrate()
     r.node._on_compressed(r.stamped(message))
     assert len(r.commands()) == 1
+    r.node._on_camera_info(r.module.CameraInfo())  # the driver was started again without its calibration
+    r.node._watch()
+    assert r.commands() == [(0.0, 0.0)] and "is the camera calibrated?" in r.node.pilot.command().cause
+    r.wait(1100)
+    r.node._on_compressed(r.stamped(message))
+    assert r.commands() == []
+    r.calibrate()
+    r.wait(100)
+    r.node._on_compressed(r.stamped(message))
+    assert len(r.commands()) == 1
 
 
 def test_bad_parameters_are_one_error(rig):

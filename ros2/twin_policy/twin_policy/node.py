@@ -98,7 +98,7 @@ class PolicyNode(Node):
         try:
             self.pilot.set_camera(Camera.from_info(message, self._rectified))
         except PictureError as error:
-            self.pilot.no_camera = str(error)
+            self.pilot.lose_camera(f"camera_info: {error}")
             self.get_logger().error(f"camera_info: {error}", throttle_duration_sec=5.0)
 
     def _on_joy(self, message: Any) -> None:

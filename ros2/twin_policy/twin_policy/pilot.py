@@ -132,6 +132,13 @@ class Pilot:
             self.no_camera = str(error)
             raise
 
+    def lose_camera(self, cause: str) -> None:
+        """Forgets the camera and stops the robot, which waits until a valid one is set; the stop has this cause."""
+        self.no_camera = cause
+        if self._rectifier is not None:
+            self._rectifier = None
+            self._stop(cause)
+
     def press(self, held: bool = True) -> None:
         """Handles a message of the deadman switch; has no effect if there is none."""
         if held:
