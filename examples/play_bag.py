@@ -11,7 +11,7 @@ The bag needs pictures and camera_info. Time is that of the recording, so old or
 import argparse
 from pathlib import Path
 
-from twin.capture.bag import choose_camera_info, choose_pictures, header_time, open_bag, picture_of
+from twin.capture.bag import choose_camera_info, choose_pictures, header_time, is_rectified, open_bag, picture_of
 from twin.errors import InputError
 from twin_policy import Camera, Command, OnnxPolicy, PictureError, Pilot
 
@@ -34,7 +34,7 @@ def play(policy: Path, path: Path) -> list[tuple[int, Command]]:
                     commands.append((now, command))
             now = time
             if connection.topic == calibration:
-                pilot.set_camera(Camera.from_info(message, rectified="rect" in pictures))
+                pilot.set_camera(Camera.from_info(message, is_rectified(pictures)))
             else:
                 commands.append((now, pilot.picture(picture_of(message), header_time(message))))
     return commands

@@ -16,6 +16,7 @@ from tiny_twin import tiny_twin
 
 import twin
 from twin import trial
+from twin.capture.bag_film import read_contents
 from twin.commands import parser_of
 from twin.config import CAUSES
 from twin.errors import InputError
@@ -341,6 +342,28 @@ def test_the_scale_of_a_quaternion_does_not_matter(place, tmp_path, scale):
     np.testing.assert_allclose(scaled.uprightness, true.uprightness, atol=1e-9)
     missing = [_scaled([one], 0.0)[0] if one.stamp // STEP % 3 == 0 else one for one in messages]
     assert 0.5 < len(read_trial(write(tmp_path / "bag", missing)).poses) / len(true.poses) < 0.8
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/front_direct/image_raw", False),
+        ("/camera/unrectified", False),
+        ("/front/image_rect", True),
+        ("/front/image_rect_color/compressed", True),
+        ("/front/rectified/image", True),
+    ],
+)
+def test_pictures_are_rectified_if_a_word_of_their_topic_says_so(topic, rectified, tmp_path):
+    info = camera_info((50.0, 50.0, 32.0, 18.0), (64, 36), START)
+    info.message.distortion_model, info.message.d = "plumb_bob", np.array([-0.1, 0.0, 0.0, 0.0, 0.0])
+    info.message.p[[0, 5]] = 40.0
+    shown = image(np.zeros((36, 64, 3), np.uint8), START)
+    poses = [odometry(np.eye(4), START + k * STEP) for k in range(3)]
+    bag = write(tmp_path / "bag", [info, replace(shown, topic=topic), *poses, *_twists([START])])
+    camera, lens = read_trial(bag).camera, read_contents(bag).lens
+    assert lens is not None and camera.is_distorted == lens.is_distorted == (not rectified)
+    assert camera.intrinsics[0] == lens.intrinsics[0] == (40.0 if rectified else 50.0)
 
 
 def test_a_topic_that_was_published_twice_is_read_whole(tmp_path, capsys):

@@ -58,6 +58,7 @@ MIN_POSES = 10
 many."""
 # A topic with one of these words in its name is used for pictures only if it is given explicitly.
 _OTHER_IMAGES = ("depth", "confidence", "disparity", "mask", "infra")
+_RECTIFIED = re.compile(r"(?<![^/_])rect(ified)?(?![^/_])")  # words end at slashes and underscores
 # [ns] If the median difference between header and recording times exceeds this, the headers use another clock.
 _CLOCK = 1_000_000_000
 _SET_BACK = 10 * _CLOCK  # [ns] if a time is earlier than one before it in the file by more, the clock was set back
@@ -234,6 +235,11 @@ def choose_camera_info(connections: Iterable[Any], pictures: str) -> str | None:
     """The CameraInfo topic whose name is most like that of the pictures, see `_common`; None without a CameraInfo."""
     found = messages_by_topic(connections, (CAMERA_INFO,))
     return max(found, key=lambda topic: _common(topic, pictures), default=None)
+
+
+def is_rectified(topic: str) -> bool:
+    """True if `rect` or `rectified` is a word of the topic's name, as in `image_rect`, `image_rect_color`."""
+    return bool(_RECTIFIED.search(topic))
 
 
 def _common(one: str, other: str) -> int:

@@ -34,6 +34,7 @@ from twin.capture.bag import (
     fix_of,
     header_time,
     independent_poses,
+    is_rectified,
     message_times,
     messages_by_topic,
     open_bag,
@@ -376,7 +377,7 @@ def _lens(info: Any, topics: dict[str, str], frame: str, size: tuple[int, int], 
             f"{topic} is of another camera (frame {info.header.frame_id}, pictures have {frame}); the camera is "
             "calibrated from the film"
         )
-    lens = lens_of(info, "rect" in topics["pictures"], f"{path}: {topic}")
+    lens = lens_of(info, is_rectified(topics["pictures"]), f"{path}: {topic}")
     if not same_aspect((lens.width, lens.height), size):
         raise InputError(
             f"{path}: {topic} is for {lens.width}x{lens.height}, but the pictures are {size[0]}x{size[1]}; expected "

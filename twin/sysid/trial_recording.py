@@ -27,6 +27,7 @@ from twin.capture.bag import (
     choose_topics,
     fix_of,
     header_time,
+    is_rectified,
     log_topics,
     message_times,
     messages_by_topic,
@@ -176,7 +177,7 @@ def read_trial(path: Path, given: dict[str, str] | None = None) -> TrialRecordin
         if not values[kind]:
             raise InputError(f"{path}: no message on {topic} ({kind}); record it")
     try:
-        camera = Camera.from_info(values["camera"][0], "rect" in topics["pictures"])
+        camera = Camera.from_info(values["camera"][0], is_rectified(topics["pictures"]))
     except PictureError as error:
         raise InputError(f"{path}: {topics['camera']}: {error}") from None
     stamps = {kind: message_times(np.array(times[kind], np.int64), topics[kind], path) for kind in times}
