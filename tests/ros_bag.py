@@ -27,7 +27,7 @@ def write_bag(
     """Writes a table of `twin.sysid.logs` as a bag, with the `poses` on this topic.
 
     The wheels' poses stand still, the camera's IMU has optical axes, and the arm has no wheels, so that a test notices
-    if they are used. Camera and arm write each message twice.
+    if they are used. Camera and arm write each message twice. Rows whose `cmd_v` is NaN have no command.
     """
     store = get_typestore(Stores.LATEST)
     t = store.types
@@ -83,7 +83,7 @@ def write_bag(
                 "arm": joints(header, ["shoulder"], [0.0]),
             }
             for kind, message in messages.items():
-                if kind in topics:
+                if kind in topics and not (kind == "commands" and np.isnan(row["cmd_v"])):
                     connection = topics[kind]
                     for _ in range(2 if kind in _OFTEN else 1):
                         writer.write(connection, stamp, store.serialize_cdr(message, connection.msgtype))

@@ -84,6 +84,17 @@ def test_messages_that_are_not_finite_are_left_out(table, tmp_path: Path, capsys
     assert len(read_bag(write_bag(tmp_path / "no_imu", gap, without=("camera's imu",)))["time"]) == ROWS
 
 
+def test_a_command_ends_when_the_controller_times_out(table, tmp_path: Path) -> None:
+    silent = table["cmd_v"].copy()
+    silent[101:140] = np.nan  # two seconds
+    found = read_bag(write_bag(tmp_path / "bag", table | {"cmd_v": silent}))
+    since = table["time"][101:140] - table["time"][100]
+    for name in ("cmd_v", "cmd_yaw_rate"):
+        held = np.where(since < 0.51, table[name][100], 0.0)
+        np.testing.assert_allclose(found[name][101:140], held, atol=1e-9)
+        np.testing.assert_allclose(np.delete(found[name], range(101, 140)), np.delete(table[name], range(101, 140)))
+
+
 def test_the_poses_of_pictures_are_those_of_the_base_below_the_cameras(tmp_path: Path) -> None:
     scene = tiny_scene(tmp_path / "scene")
     robot = HuskyParams(camera_height=0.7, camera_pitch=8.0, camera_yaw=3.0)

@@ -1,6 +1,7 @@
 """Reads drive logs from files: tables, windows in the format of the DRIVE dataset, and bags.
 
-A bag becomes a table with a row per joint state and the newest values of the other topics. If a bag has no joint
+A bag becomes a table with a row per joint state and the newest values of the other topics; a command older than the
+controllers' longest time-out counts as 0. If a bag has no joint
 states, the wheel speeds are computed from the wheels' odometry by the inverse of Clearpath's kinematics. Poses that
 come from the wheels are not used, since they hide the wheels' slip. If a bag has no other poses, but a scene was built
 from its pictures, the poses are those of a robot at rest below the reconstructed cameras.
@@ -38,7 +39,7 @@ from twin.config import SceneConfig
 from twin.errors import InputError, join_names
 from twin.files import digest_file, exists, load_arrays, read_text, wrap_read_errors
 from twin.geometry.cameras import Cameras
-from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
+from twin.robot import CONTROLLERS, TRACK, WHEEL_RADIUS, HuskyParams
 from twin.scene import SceneDir, require_stage
 from twin.sysid.camera_extrinsics import base_below_camera
 from twin.sysid.logs import ACCELERATION, POSE, TWIST, WHEEL_SPEEDS, Windows, cut_windows, published_windows
@@ -220,16 +221,24 @@ def _wheels_of_odometry(message: Any) -> tuple[float, float]:
     return (v - half) / WHEEL_RADIUS, (v + half) / WHEEL_RADIUS
 
 
+_MAX_COMMAND_AGE = max(timing.timeout for timing in CONTROLLERS.values())  # [s]
 _NAMES = {"commands": TWIST, "wheels": WHEEL_SPEEDS, "poses": POSE, "imu": ACCELERATION}
 
 
 def _columns(tables: dict[str, Array]) -> dict[str, Array]:
-    """Columns with a row per joint state, from the time at which every topic has had a message."""
+    """Columns with a row per joint state, from the time at which every topic has had a message.
+
+    A command counts until the next one, but not longer than `_MAX_COMMAND_AGE`: then the robot stops by itself. Robots
+    on ROS 1 stop earlier, after 0.25 s; for them, the last command counts a quarter of a second too long.
+    """
     begin = max(table[0, 0] for table in tables.values())
     time = np.unique(tables["wheels"][:, 0])
     time = time[time >= begin]
     columns = {"time": time - (time[0] if len(time) else 0.0)}
     for kind, table in tables.items():
         newest = np.searchsorted(table[:, 0], time, side="right") - 1
-        columns |= {name: table[newest, i + 1] for i, name in enumerate(_NAMES[kind])}
+        values = table[newest, 1:]
+        if kind == "commands":
+            values[time - table[newest, 0] > _MAX_COMMAND_AGE] = 0.0
+        columns |= {name: values[:, i] for i, name in enumerate(_NAMES[kind])}
     return columns
