@@ -313,6 +313,34 @@ def test_two_processes_open_a_pack_at_once(packed, cache):
     assert _open(str(packed)) == a and (Path(a) / "scene.toml").stat().st_mtime_ns == before
 
 
+def break_file(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("name", ["build/3_field/baked.safetensors", "scene.toml", unpack.PACK_JSON])
+@pytest.mark.parametrize("harm", [break_file, Path.unlink])
+def test_a_damaged_pack_in_the_cache_is_unpacked_again(packed, cache, name, harm, capsys):
+    folder = open_scene(packed)
+    before = {one: one.read_bytes() for one in folder.rglob("*") if one.is_file()}
+    (folder / "build" / "more.txt").write_text("")  # not of the pack, so it does no harm
+    assert open_scene(packed) == folder and (folder / "build" / "more.txt").exists()
+    assert "is damaged" not in capsys.readouterr().err
+    harm(folder / name)
+    assert open_scene(packed) == folder
+    assert {one: one.read_bytes() for one in folder.rglob("*") if one.is_file()} == before
+    assert [one.name for one in cache.iterdir()] == [folder.name]
+    assert f"{packed} is unpacked again" in capsys.readouterr().err
+
+
+def test_the_cure_of_a_damaged_unpacked_scene_is_its_pack(packed, tmp_path):
+    unpack.unpack(packed, tmp_path / "there")
+    break_file(tmp_path / "there" / "build" / "5_mjcf" / "scene.xml")
+    with pytest.raises(InputError, match=r"scene\.xml is damaged .*; remove .*/there and unpack its pack again$"):
+        twin.load_scene(tmp_path / "there").world()
+
+
 _KILLED = """
 import os, signal, sys
 from pathlib import Path

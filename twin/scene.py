@@ -151,8 +151,8 @@ def run_folder(scene: SceneDir, name: str) -> Path:
 
 # ---- stamps
 
-_CURE = "build the scene again"
-_MAX_HASHED = 256 << 20  # [bytes] largest file that is hashed when a scene is opened
+MAX_HASHED = 256 << 20
+"""Largest file that is hashed when a scene is opened [bytes]."""
 _PACKAGES = ("twin", "numpy", "torch", "warp-lang", "mujoco", "mujoco-warp", "pycolmap", "coacd", "av", "scipy")
 
 
@@ -200,27 +200,33 @@ class Stamp:
 
         Files larger than `max_hashed` [bytes] are compared by size only.
         """
-        path = folder / "stamp.json"
-        with wrap_read_errors(path, _CURE):
+        path, cure = folder / "stamp.json", _cure(folder)
+        with wrap_read_errors(path, cure):
             read = read_json(path)
             stamp = Stamp(**read)
             if stamp.itself and stamp.itself != stamp._digest():
                 raise ValueError("it is not as it was written")
             for name, size in stamp.files.items():
-                stamp._check(folder / name, name, int(size), max_hashed)
+                stamp._check(folder / name, name, int(size), max_hashed, cure)
             if not stamp.sha256 and digest_folder(folder)[0] != stamp.result:
-                raise InputError(f"{folder} is damaged (its files are not as they were written); {_CURE}")
+                raise InputError(f"{folder} is damaged (its files are not as they were written); {cure}")
         return stamp
 
-    def _check(self, file: Path, name: str, size: int, max_hashed: int | None) -> None:
+    def _check(self, file: Path, name: str, size: int, max_hashed: int | None, cure: str) -> None:
         if not file.is_file():
-            raise InputError(f"{file} is missing; {_CURE}")
+            raise InputError(f"{file} is missing; {cure}")
         small = max_hashed is None or size <= max_hashed
         if file.stat().st_size != size or (name in self.sha256 and small and digest_file(file) != self.sha256[name]):
-            raise InputError(f"{file} is damaged (it is not as it was written); {_CURE}")
+            raise InputError(f"{file} is damaged (it is not as it was written); {cure}")
 
     def _digest(self) -> str:
         return digest_json({name: value for name, value in asdict(self).items() if name != "itself"})
+
+
+def _cure(folder: Path) -> str:
+    """The advice on a damaged stage folder."""
+    root = folder.resolve().parents[1]
+    return f"remove {root} and unpack its pack again" if (root / PACK_JSON).exists() else "build the scene again"
 
 
 def digest_folder(folder: Path) -> tuple[str, dict[str, int], dict[str, str]]:
@@ -248,7 +254,7 @@ def write_stamp(folder: Path, stage: str, depends: dict[str, Any] | None = None,
 
 @lru_cache(maxsize=64)
 def _verified_once(folder: Path, _stamped: tuple[int, int]) -> Stamp:
-    return Stamp.verified(folder, _MAX_HASHED)
+    return Stamp.verified(folder, MAX_HASHED)
 
 
 def _verified_stamp(scene: SceneDir, stage: str) -> Stamp:

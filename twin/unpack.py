@@ -33,14 +33,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from twin import commands
+from twin import commands, runtime
 from twin.config_file import load_config
 from twin.errors import InputError, short_repr
-from twin.files import digest_file, exists, is_file, parse_json, read_json, require_text, wrap_read_errors
+from twin.files import digest_file, exists, is_file, parse_json, read_json, remove, require_text, wrap_read_errors
 from twin.geometry.cameras import Cameras
 from twin.mjcf.world import SCENE_XML
 from twin.runtime import exclusive_lock
-from twin.scene import PACK_JSON, STAGE_FOLDERS, SceneDir
+from twin.scene import MAX_HASHED, PACK_JSON, STAGE_FOLDERS, SceneDir
 
 SUFFIX = ".twin"
 _SEARCHED = (
@@ -205,13 +205,18 @@ def _partial_folder(beside: Path, name: str) -> Iterator[Path]:
 
     A lock tells other processes that it is in use, see `_remove_abandoned`.
     """
-    partial = beside / f".{name}.{secrets.token_hex(_TOKEN // 2)}{_PARTIAL}"
+    partial = _partial_path(beside, name)
     with exclusive_lock(partial.with_suffix(".lock"), f"{partial} is being written"):
         try:
             partial.mkdir(0o700)
             yield partial
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+
+
+def _partial_path(beside: Path, name: str) -> Path:
+    """A new name in `beside` that `_remove_abandoned` finds."""
+    return beside / f".{name}.{secrets.token_hex(_TOKEN // 2)}{_PARTIAL}"
 
 
 def _remove_abandoned(beside: Path, name: str) -> None:
@@ -328,8 +333,8 @@ def _check_contents(root: Path, path: Path) -> None:
 def open_scene(path: Path) -> Path:
     """Returns the folder of a scene: `path` itself; for a pack or its name, the cache folder into which it is unpacked.
 
-    A pack is unpacked once, into a folder in `$XDG_CACHE_HOME/twin/packs` that is named after its digest. Several
-    processes may do so at once.
+    A pack is unpacked once, into a folder in `$XDG_CACHE_HOME/twin/packs` that is named after its digest; again if that
+    folder has been damaged. Several processes may do so at once.
 
     Raises InputError: see `unpack`.
     """
@@ -337,6 +342,11 @@ def open_scene(path: Path) -> Path:
     if pack is None:
         return path
     folder = _cache() / f"{pack.stem[:60]}-{digest_file(pack)[:32]}"
+    if exists(folder) and not _is_whole(folder):
+        runtime.log_line(f"{folder} is damaged; {pack} is unpacked again")
+        damaged = _partial_path(folder.parent, folder.name[:80])
+        folder.rename(damaged)  # at once, so that no other process sees half of it
+        remove(damaged)
     if not (folder / PACK_JSON).exists():
         _remove_abandoned(folder.parent, "*")
         try:
@@ -345,6 +355,19 @@ def open_scene(path: Path) -> Path:
             if not (folder / PACK_JSON).exists():  # else another process was faster
                 raise
     return folder
+
+
+def _is_whole(folder: Path) -> bool:
+    """True if a folder has the files of its pack as they were packed; those above `MAX_HASHED` are compared by size."""
+    try:
+        files = read_json(folder / PACK_JSON)["files"]
+        for name, facts in files.items():
+            size = (folder / name).stat().st_size
+            if size != facts["bytes"] or (size <= MAX_HASHED and digest_file(folder / name) != facts["sha256"]):
+                return False
+    except (InputError, OSError, KeyError, TypeError, AttributeError):  # also for a damaged `PACK_JSON`
+        return False
+    return True
 
 
 def find_pack(path: Path) -> Path | None:
