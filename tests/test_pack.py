@@ -521,6 +521,26 @@ def test_an_empty_folder_is_filled_also_through_a_link_or_as_the_working_folder(
     assert unpack.PACK_JSON in names and names == {one.name for one in (tmp_path / "b").iterdir()}
 
 
+@pytest.mark.parametrize("moves", [0, 1, 2, 3])
+def test_an_interrupted_unpack_leaves_an_empty_folder_empty(packed, tmp_path, monkeypatch, moves):
+    there, rename, seen = tmp_path / "there", Path.rename, []
+    there.mkdir()
+
+    def interrupted(self, target):
+        if len(seen) == moves:
+            raise KeyboardInterrupt
+        seen.append(self.name)
+        return rename(self, target)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Path, "rename", interrupted)
+        unpack.unpack(packed, there)
+    assert seen[:1] == [unpack.PACK_JSON][:moves] and "scene.toml" not in seen
+    assert not list(there.iterdir())
+    unpack.unpack(packed, there)
+    assert (there / "scene.toml").exists()
+
+
 def test_a_file_that_cannot_be_written_is_no_damage_to_the_pack(packed, tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))

@@ -187,8 +187,7 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
             _check_contents(partial, path)
             (partial / PACK_JSON).write_bytes(json.dumps(manifest, indent=1).encode())
             if is_there:  # not replaced, since it may be the working folder or a link
-                for one in list(partial.iterdir()):
-                    one.rename(folder / one.name)
+                _move_contents(partial, folder)
             else:
                 partial.chmod(0o755)
                 partial.rename(folder)
@@ -197,6 +196,24 @@ def unpack(path: Path, folder: Path, trust: bool = False) -> dict[str, Any]:
             raise error.__cause__ from None  # the disk failed, for example it is full; the pack is not damaged
         raise
     return manifest
+
+
+def _move_contents(partial: Path, folder: Path) -> None:
+    """Moves everything in `partial` into an empty folder, or nothing if it is interrupted.
+
+    `scene.toml`, by which a folder is a scene, comes last, and `PACK_JSON` first, in case that the process is killed.
+    """
+    last = SceneDir(folder).config_file.name
+    names = sorted((one.name for one in partial.iterdir()), key=lambda name: (name == last, name != PACK_JSON))
+    moved = []
+    try:
+        for name in names:
+            moved.append(folder / name)
+            (partial / name).rename(folder / name)
+    except BaseException:
+        for one in moved:
+            remove(one)
+        raise
 
 
 @contextlib.contextmanager
