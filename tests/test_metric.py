@@ -256,18 +256,24 @@ def _to_gps(enu: np.ndarray) -> np.ndarray:
     """East, north, up [m] near Lund as latitude, longitude, altitude; accurate to millimeters over 100 m."""
     lat0, lon0, eps = 55.7, 13.2, 1e-4
     origin = np.array([[lat0, lon0, 50.0]])
-    north = local_east_north_up(np.concatenate([origin, origin + np.array([[eps, 0, 0]])]))[1, 1] / eps
-    east = local_east_north_up(np.concatenate([origin, origin + np.array([[0, eps, 0]])]))[1, 0] / eps
+    north = np.diff(local_east_north_up(np.concatenate([origin, origin + np.array([[eps, 0, 0]])])), axis=0)[0, 1] / eps
+    east = np.diff(local_east_north_up(np.concatenate([origin, origin + np.array([[0, eps, 0]])])), axis=0)[0, 0] / eps
     return np.stack([lat0 + enu[:, 1] / north, lon0 + enu[:, 0] / east, 50.0 + enu[:, 2]], 1)
 
 
 def test_east_north_up_of_a_known_place() -> None:
     # One minute of latitude is a nautical mile (1852 m by definition; 1855.8 m at 55.7° on WGS 84).
     enu = local_east_north_up(np.array([[55.7, 13.2, 10.0], [55.7 + 1 / 60, 13.2, 10.0], [55.7, 13.2, 17.0]]))
-    np.testing.assert_allclose(enu[1, :2], [0.0, 1855.8], atol=0.6)
-    np.testing.assert_allclose(enu[2], [0.0, 0.0, 7.0], atol=1e-6)
+    np.testing.assert_allclose(enu[1, :2] - enu[0, :2], [0.0, 1855.8], atol=0.6)
+    np.testing.assert_allclose(enu[2] - enu[0], [0.0, 0.0, 7.0], atol=1e-6)
     across = local_east_north_up(np.array([[0.0, 180.0 - 5e-5, 0.0], [0.0, 5e-5 - 180.0, 0.0]]))
-    np.testing.assert_allclose(across[1, :2], [11.132, 0.0], atol=1e-3)  # no jump at ±180°
+    np.testing.assert_allclose(across[1, :2] - across[0, :2], [11.132, 0.0], atol=1e-3)  # no jump at ±180°
+
+
+def test_a_wrong_first_position_distorts_no_other() -> None:
+    right = _to_gps(np.array([[0.0, 0.0, 0.0], [0.0, 90.0, 0.0], [60.0, 90.0, 0.0], [60.0, 0.0, 0.0]]))
+    wrong = local_east_north_up(np.concatenate([[[0.0, 0.0, 0.0]], right]))[1:]
+    np.testing.assert_allclose(np.diff(wrong, axis=0)[:, :2], [[0, 90], [60, 0], [0, -90]], atol=0.02)
 
 
 def test_gps_gives_metres_and_east(tmp_path: Path) -> None:

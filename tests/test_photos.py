@@ -9,7 +9,7 @@ import pytest
 from filmed_wall import HEIGHT, WIDTH, captured, film, refused, views
 from PIL import ExifTags, Image
 
-from twin.capture.photos import evenly_spaced, photo_times
+from twin.capture.photos import evenly_spaced, photo_times, read_exif
 from twin.config import SourceConfig
 from twin.geometry.images import read_image, write_image
 
@@ -47,6 +47,15 @@ def test_a_photo_is_turned_upright_and_its_header_is_used(tmp_path: Path) -> Non
     np.testing.assert_allclose(capture.sources[0].camera_params, (focal, HEIGHT / 2, WIDTH / 2, 0.0))
     assert capture.sources[0].camera_model == "SIMPLE_RADIAL" and not capture.sources[0].calibrated
     assert metrics["with_gps"] == 3
+
+
+def test_a_photo_at_zero_degrees_has_no_position(tmp_path: Path) -> None:
+    for east in (0.0, 9.0):
+        exif = Image.Exif()
+        gps = exif.get_ifd(ExifTags.IFD.GPSInfo)
+        gps[ExifTags.GPS.GPSLatitude], gps[ExifTags.GPS.GPSLongitude] = (0.0, 0.0, 0.0), (east, 0.0, 0.0)
+        Image.fromarray(views([0])[0]).save(tmp_path / "photo.jpg", exif=exif)
+        assert np.isfinite(read_exif(tmp_path / "photo.jpg").gps[:2]).all() == (east > 0.0)
 
 
 @pytest.mark.parametrize(("keep", "words"), [(0.0, "0 bytes"), (0.5, "cut off")])

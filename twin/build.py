@@ -47,7 +47,7 @@ _MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")  # the
 PIPELINE = (
     Stage("capture", "twin.capture.frames", 2, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 5, ("cameras",), ("capture",)),
-    Stage("metric", "twin.capture.metric", 2, ("metric",), ("capture", "cameras")),
+    Stage("metric", "twin.capture.metric", 3, ("metric",), ("capture", "cameras")),
     Stage("field", "twin.nerf.trainer", 8, ("nerf", "mjcf.route"), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 7, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.scene_xml", 4, ("mjcf", "robot"), ("metric", "mesh")),

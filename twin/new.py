@@ -198,7 +198,8 @@ def _fix_way(bag: BagContents) -> float:
     fixes = np.nan_to_num(bag.fixes[during & np.isfinite(bag.fixes[:, :2]).all(1)])
     if len(fixes) < 3:
         return 0.0
-    return float(np.linalg.norm(local_east_north_up(fixes)[:, :2], axis=1).max())
+    east_north = local_east_north_up(fixes)[:, :2]
+    return float(np.linalg.norm(east_north - east_north[0], axis=1).max())
 
 
 def _odometry_way(bag: BagContents) -> float:

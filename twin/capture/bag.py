@@ -336,8 +336,11 @@ def message_times(times: NDArray[np.int64], topic: str, path: Path) -> NDArray[n
 
 
 def fix_of(message: Any) -> tuple[float, float, float]:
-    """Latitude [°], longitude [°], altitude [m] of a NavSatFix; NaN if the receiver had no fix."""
-    good = message.status.status >= 0
+    """Latitude [°], longitude [°], altitude [m] of a NavSatFix; NaN if the receiver had no fix.
+
+    Exactly (0°, 0°) counts as no fix: some receivers report it before their first one.
+    """
+    good = message.status.status >= 0 and (message.latitude, message.longitude) != (0.0, 0.0)
     return (message.latitude, message.longitude, message.altitude) if good else (np.nan,) * 3
 
 

@@ -105,7 +105,8 @@ def _gps(gps: Any) -> tuple[float, float, float]:
     tag = ExifTags.GPS
     latitude = _degrees(gps.get(tag.GPSLatitude), gps.get(tag.GPSLatitudeRef), "S")
     longitude = _degrees(gps.get(tag.GPSLongitude), gps.get(tag.GPSLongitudeRef), "W")
-    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
+    # Cameras without a fix write zeros.
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0) or latitude == longitude == 0.0:
         return math.nan, math.nan, math.nan
     altitude = _finite(gps.get(tag.GPSAltitude), math.nan)
     below = gps.get(tag.GPSAltitudeRef) in (1, b"\x01")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from twin import runtime
+from twin.capture.capture_data import nearest_longitudes
 from twin.capture.gravity import Gravity, Road, below_path, heights_above_road
 from twin.config import DistanceConfig, MarkerConfig, MetricConfig
 from twin.errors import InputError
@@ -234,9 +235,11 @@ def _meeting_point(first: tuple[Array, Array], second: tuple[Array, Array]) -> A
 def local_east_north_up(gps: Array) -> Array:
     """East, north and up [m] (n, 3) of positions given as latitude [°], longitude [°], altitude [m] (WGS 84) (n, 3).
 
-    The first position is the origin.
+    The origin is the median of each coordinate: far from the tangent plane's origin lengths are distorted, so a single
+    wrong position, even the first, must not be the origin.
     """
-    return np.asarray(pycolmap.GPSTransform().ellipsoid_to_enu(gps, *gps[0]))
+    gps = np.column_stack([gps[:, 0], nearest_longitudes(gps[:, 1], float(gps[0, 1])), gps[:, 2]])
+    return np.asarray(pycolmap.GPSTransform().ellipsoid_to_enu(gps, *np.median(gps, axis=0)))
 
 
 def scale_from_gps(cameras: Cameras, up: Array, gps: Array, rng: np.random.Generator) -> tuple[Scale, Array]:

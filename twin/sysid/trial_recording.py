@@ -258,6 +258,7 @@ def _poses(times: NDArray[np.int64], rows: list[Any], where: str) -> tuple[NDArr
         table[:, 2] = np.unwrap(table[:, 2])
         return times, table[:, :3], table[:, 3]
     xy = local_east_north_up(table)[:, :2]
+    xy -= xy[0]
     return times, np.column_stack([xy, _headings(xy)]), np.ones(len(times))
 
 
