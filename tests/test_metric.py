@@ -11,7 +11,14 @@ import pytest
 from twin.capture import metric
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.capture.gravity import find_road, up_from_ground
-from twin.capture.scale import Scale, combine_scales, local_east_north_up, scale_from_gps, scale_from_marker
+from twin.capture.scale import (
+    Scale,
+    combine_scales,
+    fit_square,
+    local_east_north_up,
+    scale_from_gps,
+    scale_from_marker,
+)
 from twin.config import DistanceConfig, MarkerConfig, MetricConfig, SceneConfig
 from twin.errors import InputError
 from twin.files import read_json
@@ -386,7 +393,7 @@ def test_a_marker_gives_metres(tmp_path: Path) -> None:
     metrics = world.run(tmp_path / "out", marker=MarkerConfig("DICT_4X4_50", 7, side))
     fit = umeyama(Cameras.load(tmp_path / "out").positions, film[:, :3, 3])
     assert fit.scale == pytest.approx(1.0, abs=0.01)
-    assert metrics["marker_frames"] >= 10
+    assert metrics["marker_frames"] >= 10 and 0.0001 < metrics["scale_uncertainty"] < 0.01
     with pytest.raises(InputError, match="number 8 was found in 0 frames"):
         world.run(tmp_path / "out", marker=MarkerConfig("DICT_4X4_50", 8, side))
 
@@ -404,6 +411,24 @@ def test_a_marker_from_one_pose_is_refused(tmp_path: Path) -> None:
     cameras = dataclasses.replace(cameras, camera_to_world=np.tile(np.eye(4), (3, 1, 1)))
     with pytest.raises(InputError, match=r"metric\.marker: seen from one direction only"):
         scale_from_marker(cameras, MarkerConfig("DICT_4X4_50", 7, 0.4))
+
+
+def test_the_stated_uncertainty_of_a_marker_holds() -> None:
+    """Corners with an error of 0.3 px, seen while passing by: the side is unbiased, and its uncertainty is right."""
+    rng, views = np.random.default_rng(4), 4
+    square = np.array([[6.0, 1.65, 0.15], [6.0, 1.35, 0.15], [6.0, 1.35, -0.15], [6.0, 1.65, -0.15]])
+    poses = np.array([look_at(np.array([x, 0.0, 0.0]), np.array([x + 1.0, 0.0, 0.0])) for x in 0.5 * np.arange(views)])
+    lenses = np.tile([500.0, 500.0, 320.0, 180.0], (views, 1))
+    pixels = np.array([project(square, pose, lens)[0] for pose, lens in zip(poses, lenses, strict=True)])
+    assert fit_square(pixels, square + 0.02 * rng.normal(size=(4, 3)), poses, lenses)[0] == pytest.approx(0.3, rel=1e-6)
+    errors, sigmas = [], []
+    for _ in range(120):
+        start = square + 0.02 * rng.normal(size=(4, 3))
+        side, sigma = fit_square(pixels + rng.normal(0, 0.3, pixels.shape), start, poses, lenses)
+        errors.append(np.log(side / 0.3))
+        sigmas.append(sigma)
+    assert 0.58 < np.mean(np.abs(errors) < sigmas) < 0.78
+    assert abs(np.mean(errors)) < 0.25 * np.median(sigmas) and np.median(sigmas) < 0.01
 
 
 def test_metric_poses_are_taken_as_they_are(tmp_path: Path) -> None:

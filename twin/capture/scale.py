@@ -8,13 +8,15 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from twin import runtime
 from twin.capture.capture_data import nearest_longitudes
 from twin.capture.gravity import Gravity, Road, below_path, heights_above_road
 from twin.config import DistanceConfig, MarkerConfig, MetricConfig
 from twin.errors import InputError
-from twin.geometry.cameras import Cameras, unproject
+from twin.geometry.cameras import Cameras, project, unproject
 from twin.geometry.images import read_image
 from twin.geometry.poses import inverse_pose
 from twin.types import Array
@@ -28,6 +30,8 @@ _MIN_STRETCHES = 5
 _MAX_STRETCH_SPREAD = 0.3  # largest relative spread of the stretches' scales
 _MIN_SIDE = 10  # road points needed on each side of the path to compare the two sides
 _MIN_ANGLE = np.radians(2.0)  # [rad] smallest sufficient angle between the rays of two frames to a marker
+_CORNER_ERROR = 0.2  # [px] lower bound of the standard deviation of a marker's corners in an image
+_SQUARE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])  # corners in the detector's order, side 1
 
 
 @dataclass(frozen=True)
@@ -404,9 +408,9 @@ def _stretches(positions: Array) -> list[tuple[int, int]]:
 
 
 def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
-    """Scale from a printed square marker (ArUco or AprilTag) in the scene, whose corners are triangulated.
+    """Scale from a printed square marker (ArUco or AprilTag) in the scene: a square is fitted to its corners.
 
-    Raises InputError: a marker not seen from two directions, or unequal sides.
+    Raises InputError: a marker not seen from two directions, or a side that the corners determine to 20 % or worse.
     """
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, marker.family))
     settings = cv2.aruco.DetectorParameters()
@@ -427,39 +431,56 @@ def scale_from_marker(cameras: Cameras, marker: MarkerConfig) -> Scale:
             "nearer and from more than one place"
         )
     poses, intrinsics = cameras.camera_to_world[frames], cameras.intrinsics[frames]
-    square = np.array([_triangulate(np.array(corners)[:, k], poses, intrinsics) for k in range(4)])
+    pixels = np.array(corners)
+    square = np.array([_triangulate(pixels[:, k], poses, intrinsics) for k in range(4)])
     rays = square.mean(0) - poses[:, :3, 3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     if not np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)) >= _MIN_ANGLE:  # also if unknown
         raise InputError("metric.marker: seen from one direction only; film it while passing by")
-    sides = np.linalg.norm(square - np.roll(square, 1, axis=0), axis=1)
-    side = float(sides.mean())
-    sigma = float(sides.std() / side)
-    if sigma > 0.2:
+    side, sigma = fit_square(pixels, square, poses, intrinsics)
+    if not sigma <= 0.2:
         raise InputError(
-            f"metric.marker: its four sides differ by {sigma:.0%}; film it nearer, sharper and from more places"
+            f"metric.marker: the standard deviation of its side is {sigma:.0%} (expected at most 20%); film it "
+            "nearer, sharper and from more places"
         )
-    return Scale(marker.size / side, sigma / 2.0, {"marker_frames": len(frames)})
+    return Scale(marker.size / side, sigma, {"marker_frames": len(frames)})
+
+
+def fit_square(pixels: Array, start: Array, camera_to_world: Array, intrinsics: Array) -> tuple[float, float]:
+    """Side of the square whose corners are observed at `pixels` (n, 4, 2), and its relative standard deviation.
+
+    The square's position, rotation and side minimize the reprojection error, from the corners `start` (4, 3). Their
+    covariance is (JᵀJ)⁻¹ times the variance of the residuals, at least that of `_CORNER_ERROR`.
+    """
+    center = start.mean(0)
+    side = float(np.linalg.norm(start - np.roll(start, 1, axis=0), axis=1).mean())
+    first, second = _SQUARE.T @ (start - center)
+    axes = np.linalg.qr(np.stack([first, second], 1))[0]
+    axes *= np.sign([axes[:, 0] @ first, axes[:, 1] @ second])
+
+    def residuals(changes: Array) -> Array:
+        """`changes`: shift [start sides], rotation vector [rad], logarithm of side / start side."""
+        turned = Rotation.from_rotvec(changes[3:6]).apply(axes.T)
+        corners = center + side * (changes[:3] + np.exp(changes[6]) * _SQUARE @ turned)
+        seen = [project(corners, pose, lens)[0] for pose, lens in zip(camera_to_world, intrinsics, strict=True)]
+        return (np.array(seen) - pixels).ravel()
+
+    fit = least_squares(residuals, np.zeros(7), method="lm")
+    variance = max(2.0 * fit.cost / (pixels.size - 7), _CORNER_ERROR**2)
+    covariance = variance * np.linalg.pinv(fit.jac.T @ fit.jac)
+    return side * float(np.exp(fit.x[6])), float(np.sqrt(covariance[6, 6]))
 
 
 def _triangulate(pixels: Array, camera_to_world: Array, intrinsics: Array) -> Array:
     """Triangulates the point (3,) observed at `pixels` (n, 2), one per view; NaN if equal poses do not determine it.
 
-    A linear solution (Hartley & Zisserman 2004, sec. 12.2) is refined by Gauss-Newton on the reprojection error.
+    The linear solution of Hartley & Zisserman 2004, sec. 12.2.
     """
     world_to_camera = inverse_pose(camera_to_world)
-    rotation, translation = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
     fx, fy, cx, cy = intrinsics.T
     u, v = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
     if np.ptp(camera_to_world[:, :3, 3], axis=0).max() == 0.0:
         return np.full(3, np.nan)
     rows = [c[:, None] * world_to_camera[:, 2] - world_to_camera[:, k] for k, c in enumerate((u, v))]
     homogeneous = np.linalg.svd(np.concatenate(rows))[2][-1]
-    point = homogeneous[:3] / homogeneous[3]
-    for _ in range(10):
-        x, y, z = (np.einsum("nij,j->ni", rotation, point) + translation).T
-        residual = np.concatenate([(x / z - u) * fx, (y / z - v) * fy])
-        du = (rotation[:, 0] - (x / z)[:, None] * rotation[:, 2]) / z[:, None] * fx[:, None]
-        dv = (rotation[:, 1] - (y / z)[:, None] * rotation[:, 2]) / z[:, None] * fy[:, None]
-        point = point - np.linalg.lstsq(np.concatenate([du, dv]), residual, rcond=None)[0]
-    return point
+    return homogeneous[:3] / homogeneous[3]
