@@ -348,6 +348,26 @@ def test_distance_between_marked_points(tmp_path: Path, on_ground: bool) -> None
     assert 0 < metrics["scale_uncertainty"] < 0.1
 
 
+def test_a_distance_marked_in_a_hollow(tmp_path: Path) -> None:
+    """The ground there is 0.6 m lower than the median of the road."""
+
+    def ground(x: np.ndarray) -> np.ndarray:
+        return -0.6 * np.exp(-(((x - 20.0) / 6.0) ** 2))
+
+    film = _path(turn=False, pitch=0.3)
+    film[:, 2, 3] += ground(film[:, 0, 3])
+    points = _points(film, np.random.default_rng(0), on_road=1500)
+    points[:1500, 2] = ground(points[:1500, 0])
+    at = int(np.argmin(np.abs(film[:, 0, 3] - 16.0)))
+    ends = np.array([[20.0, 1.0, -0.6], [20.5, -1.2, ground(np.array(20.5))]])
+    (a, b), _ = project(ends, film[at], INTRINSICS)
+    metres = float(np.linalg.norm(ends[0] - ends[1]))
+    world = _world(tmp_path / "s", [film], points, _similarity(3))
+    metrics = world.run(tmp_path / "out", distance=DistanceConfig(metres, f"film0/{at:06d}", tuple(a), tuple(b)))
+    error = umeyama(Cameras.load(tmp_path / "out").positions, film[:, :3, 3]).scale - 1.0
+    assert abs(error) < 0.02 and abs(error) < 2.0 * metrics["scale_uncertainty"] < 0.1
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [

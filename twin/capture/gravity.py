@@ -34,7 +34,7 @@ _LAYER = 0.06  # half thickness of the road layer, for undulation, camber and no
 _MAX_TILT = np.radians(25.0)  # largest angle between the road's normal and the cameras' mean up axis [rad]
 MIN_ROAD_POINTS = 20  # road points needed for a reliable road
 _REACHES = (1.0, 2.0, 4.0, 8.0)  # largest offsets [drops] of the points of the road layer, tried in this order
-_MIN_AROUND = 6  # road points around a camera needed for its height in `heights_above_road`
+_MIN_AROUND = 6  # road points around a place needed for the height of the ground there
 _MIN_CAMERA_FRACTION = 0.2  # smallest fraction of the cameras that need a height in `heights_above_road`
 _DEEPER_THAN = 1.25  # points are far below a layer if their drop exceeds this multiple of the layer's drop
 _MAX_DEEPER_FRACTION = 0.1
@@ -196,3 +196,15 @@ def heights_above_road(points: Array, centers: Array, up: Array, drop: float) ->
         if len(near) >= _MIN_AROUND:
             heights[i] = float(np.median((centers[i] - points[near]) @ up))
     return heights if np.isfinite(heights).sum() >= max(3, _MIN_CAMERA_FRACTION * len(centers)) else None
+
+
+def local_ground(points: Array, position: Array, up: Array, radius: float) -> tuple[float, float] | None:
+    """Median height along `up` of the road points (k, 3) whose horizontal distance from a position (3,) is at most
+    `radius`, and the robust standard deviation of their heights; None if there are fewer than `_MIN_AROUND`."""
+    away = points - position
+    heights = away @ up
+    heights = heights[np.linalg.norm(away - np.outer(heights, up), axis=1) <= radius]
+    if len(heights) < _MIN_AROUND:
+        return None
+    middle = float(np.median(heights))
+    return middle + float(position @ up), 1.4826 * float(np.median(np.abs(heights - middle)))

@@ -55,11 +55,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     if max((given.camera_height, *heights.values())) > 0:
         scales["camera_height"] = scale_from_height(cameras, up, points.xyz, road, given, heights)
     if given.distance is not None:
-        if road is None and not given.distance.frame_b:
-            raise InputError(
-                "metric.distance: no ground was reconstructed; mark the points in a second image, too: frame_b, a2, b2"
-            )
-        scales["distance"] = scale_from_distance(cameras, up.direction, level, given.distance)
+        scales["distance"] = scale_from_distance(cameras, up.direction, points.xyz, road, given.distance)
     row = {name: i for i, name in enumerate(capture.names)}
     rows = [row[name] for name in cameras.names]
     if given.gps:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from twin import runtime
 from twin.capture.capture_data import nearest_longitudes
-from twin.capture.gravity import Gravity, Road, below_path, heights_above_road
+from twin.capture.gravity import Gravity, Road, below_path, heights_above_road, local_ground
 from twin.config import DistanceConfig, MarkerConfig, MetricConfig
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, project, unproject
@@ -22,6 +22,7 @@ from twin.geometry.poses import inverse_pose
 from twin.types import Array
 
 _PIXEL_ERROR = 1.0  # [px] standard deviation of a point marked by hand
+_GROUND_STEPS = 10  # intersections of a ray with the local ground; the road's slope is far below that of the ray
 _GPS_TRIALS = 400
 _GPS_FRAMES = 400  # about the largest number of frames from which the drift of GPS is estimated
 _STRETCH = 2.0  # [m] length of the compared stretches of odometry; the heading hardly drifts over this length
@@ -162,13 +163,19 @@ def _ground_errors(cameras: Cameras, up: Gravity, road: Array, drop: float) -> t
     return tilt, abs(float(np.median(left) - np.median(right))) / 2.0 / drop
 
 
-def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distance: DistanceConfig) -> Scale:
+def scale_from_distance(
+    cameras: Cameras, up: Array, points: Array, road: Road | None, distance: DistanceConfig
+) -> Scale:
     """Scale from two marked points [px of the pinhole images], triangulated from two frames or assumed on the ground.
 
-    `ground_level` is the height of the ground along `up` in the reconstruction's unit.
+    `points` (m, 3) are all sparse points. On the ground, the uncertainty includes the spread of the heights there.
 
-    Raises InputError: an unknown frame, a point outside its image, or rays that do not meet.
+    Raises InputError: an unknown frame, a point outside its image, rays that do not meet, or no ground and no frame_b.
     """
+    if road is None and not distance.frame_b:
+        raise InputError(
+            "metric.distance: no ground was reconstructed; mark the points in a second image, too: frame_b, a2, b2"
+        )
     marked = {"a": distance.frame_a, "b": distance.frame_a}
     if distance.frame_b:
         if distance.frame_a == distance.frame_b:
@@ -177,15 +184,26 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
     frames = [_marked_frame(cameras, key, frame, getattr(distance, key)) for key, frame in marked.items()]
     pixels = np.array([getattr(distance, key) for key in marked], np.float64)
 
-    def length(offset: Array) -> float:
-        rays = [_ray(cameras, f, p) for f, p in zip(frames, pixels + offset, strict=True)]
-        if distance.frame_b:
-            a, b = _meeting_point(rays[0], rays[2]), _meeting_point(rays[1], rays[3])
-        else:
-            a, b = (_on_ground(*ray, up, ground_level) for ray in rays)
-        return float(np.linalg.norm(a - b))
+    def rays(offset: Array) -> list[tuple[Array, Array]]:
+        return [_ray(cameras, f, p) for f, p in zip(frames, pixels + offset, strict=True)]
 
-    measured = length(np.zeros_like(pixels))
+    still = np.zeros_like(pixels)
+    grounds = [(0.0, 0.0)] * 2
+    if road is not None and not distance.frame_b:
+        grounds = [_ground_along(ray, up, points[road.points], road) for ray in rays(still)]
+
+    def length(offset: Array, raised: float = 0.0) -> float:
+        """`raised`: the rise of the ground [standard deviations of its height]."""
+        if distance.frame_b:
+            a, b, a2, b2 = rays(offset)
+            ends = _meeting_point(a, a2), _meeting_point(b, b2)
+        else:
+            a, b = rays(offset)
+            (level_a, spread_a), (level_b, spread_b) = grounds
+            ends = _on_ground(*a, up, level_a + raised * spread_a), _on_ground(*b, up, level_b + raised * spread_b)
+        return float(np.linalg.norm(ends[0] - ends[1]))
+
+    measured = length(still)
     if not np.isfinite(measured) or measured < 1e-9:
         raise InputError(
             "metric.distance: the points a and b coincide or do not lie before the camera; mark them again"
@@ -198,7 +216,8 @@ def scale_from_distance(cameras: Cameras, up: Array, ground_level: float, distan
         raise InputError(
             "metric.distance: an error of 1 px changes it by over 50 %; mark points further apart, or in other frames"
         )
-    return Scale(distance.metres / measured, sigma, {"distance_units": measured})
+    ground = 0.5 * (length(still, 1.0) - length(still, -1.0)) / measured
+    return Scale(distance.metres / measured, float(np.hypot(sigma, ground)), {"distance_units": measured})
 
 
 def _marked_frame(cameras: Cameras, key: str, frame: str, pixel: tuple[float, ...]) -> int:
@@ -225,6 +244,21 @@ def _on_ground(origin: Array, direction: Array, up: Array, level: float) -> Arra
     if descent > -1e-3:
         raise InputError("metric.distance: a marked point lies above the horizon, not on the ground; give frame_b")
     return origin + direction * (level - origin @ up) / descent
+
+
+def _ground_along(ray: tuple[Array, Array], up: Array, on_road: Array, road: Road) -> tuple[float, float]:
+    """Height along `up` of the ground where a ray meets it, and its standard deviation.
+
+    It is the median of the road points (k, 3) near that place, found by iteration from the ground below the camera.
+    """
+    origin = ray[0]
+    ground = local_ground(on_road, origin, up, road.drop) or (float(origin @ up) - road.drop, road.spread)
+    for _ in range(_GROUND_STEPS):
+        near = local_ground(on_road, _on_ground(*ray, up, ground[0]), up, road.drop)
+        if near is None:
+            break
+        ground = near
+    return ground
 
 
 def _meeting_point(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
