@@ -232,6 +232,16 @@ def test_lengths_of_odometry_give_metres_although_its_heading_drifts(tmp_path: P
         scale_from_odometry(cameras, rng.normal(0, 3, (80, 3)).cumsum(0), 0.03)
 
 
+def test_noise_of_odometry_does_not_lengthen_the_scale(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    world = _world(tmp_path / "s", [_path(count=80)], _points(_path(), rng), _similarity(7))
+    cameras = Cameras.load(world.scene.stage("cameras"))
+    noise = rng.normal(0, 0.2, (15, 80, 3)) * [1, 1, 0]
+    scales = [scale_from_odometry(cameras, world.truth[:, :3, 3] + one, 0.0) for one in noise]
+    errors = np.log([one.value * _similarity(7).scale for one in scales])
+    assert abs(errors.mean()) < 0.015 and np.mean(np.abs(errors) < [one.uncertainty for one in scales]) > 0.8
+
+
 # ---- the verb new
 
 

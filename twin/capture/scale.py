@@ -28,6 +28,7 @@ _GPS_FRAMES = 400  # about the largest number of frames from which the drift of 
 _STRETCH = 2.0  # [m] length of the compared stretches of odometry; the heading hardly drifts over this length
 _STRAIGHT = 0.7  # smallest ratio of end-to-end distance to length of a compared stretch
 _MIN_STRETCHES = 5
+_STRETCH_ROUNDS = 3  # the length of the stretches depends on the scale
 _MAX_STRETCH_SPREAD = 0.3  # largest relative spread of the stretches' scales
 _MIN_SIDE = 10  # road points needed on each side of the path to compare the two sides
 _MIN_ANGLE = np.radians(2.0)  # [rad] smallest sufficient angle between the rays of two frames to a marker
@@ -384,48 +385,57 @@ def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> 
 
     Raises InputError: too few stretches, or stretches that contradict each other.
     """
-    ratios, lengths = [], []
     sources = np.array(cameras.sources)
-    for name in dict.fromkeys(cameras.sources):
-        rows = np.flatnonzero(sources == name)
-        for first, last in _stretches(odometry[rows]):
-            moved = float(np.linalg.norm(odometry[rows[last]] - odometry[rows[first]]))
-            filmed = float(np.linalg.norm(cameras.positions[rows[last]] - cameras.positions[rows[first]]))
-            if filmed > 0.0:
-                ratios.append(moved / filmed)
-                lengths.append(moved)
-    if len(ratios) < _MIN_STRETCHES:
-        known = int(np.isfinite(odometry).all(1).sum())
-        raise InputError(
-            f"metric.odometry: {known} of {len(odometry)} registered frames have odometry, over {len(ratios)} "
-            f"stretches of {_STRETCH:g} m (need {_MIN_STRETCHES}); record odometry while filming, or give the scale "
-            "another way"
-        )
-    logs, weights = np.log(ratios), np.array(lengths)
-    middle = float(np.median(logs))
-    spread = 1.4826 * float(np.median(np.abs(logs - middle)))
+    films = [np.flatnonzero(sources == name) for name in dict.fromkeys(cameras.sources)]
+    filmed = np.where(np.isfinite(odometry), cameras.positions, np.nan)
+    value = _path_length(odometry, films) / max(_path_length(filmed, films), 1e-12)
+    for _ in range(_STRETCH_ROUNDS):  # noise lengthens the path by odometry, so the first value is too large
+        length = _STRETCH / max(value, 1e-12)
+        pairs = [(rows[a], rows[b]) for rows in films for a, b in _stretches(filmed[rows], length)]
+        first, last = np.array(pairs, int).reshape(-1, 2).T
+        moved = np.linalg.norm(odometry[last] - odometry[first], axis=1)
+        weights = np.linalg.norm(filmed[last] - filmed[first], axis=1)
+        usable = np.flatnonzero(moved)  # not where odometry stood still
+        moved, weights = moved[usable], weights[usable]
+        if len(moved) < _MIN_STRETCHES:
+            known = int(np.isfinite(odometry).all(1).sum())
+            raise InputError(
+                f"metric.odometry: {known} of {len(odometry)} registered frames have odometry, over {len(moved)} "
+                f"stretches of {_STRETCH:g} m (need {_MIN_STRETCHES}); record odometry while filming, or give the "
+                "scale another way"
+            )
+        logs = np.log(moved / weights)
+        middle = float(np.median(logs))
+        spread = 1.4826 * float(np.median(np.abs(logs - middle)))
+        inliers = np.abs(logs - middle) <= max(3.0 * spread, 1e-3)
+        # Isotropic noise of planar positions lengthens distances, but leaves the mean of their logarithms unchanged.
+        value = float(np.exp(np.average(logs[inliers], weights=weights[inliers])))
     if spread > _MAX_STRETCH_SPREAD:
         raise InputError(
             f"metric.odometry: length by odometry / reconstructed length varies by {spread:.0%} (expected at most "
             f"{_MAX_STRETCH_SPREAD:.0%}); check the stamps of pictures and odometry, or give the scale another way"
         )
-    inliers = np.abs(logs - middle) <= max(3.0 * spread, 1e-3)
-    value = float(np.exp(np.average(logs[inliers], weights=weights[inliers])))
     # Neighboring stretches share slip and reconstruction errors: about three count as one independent stretch.
     repeat = spread / np.sqrt(max(inliers.sum() / 3.0, 1.0))
     notes = {
-        "odometry_stretches": len(ratios),
+        "odometry_stretches": len(moved),
         "odometry_inliers": int(inliers.sum()),
-        "odometry_length_m": float(weights[inliers].sum()),
+        "odometry_length_m": float(moved[inliers].sum()),
         "odometry_spread_relative": spread,
     }
     return Scale(value, float(np.hypot(tolerance, repeat)), notes)
 
 
-def _stretches(positions: Array) -> list[tuple[int, int]]:
-    """First and last indices of consecutive stretches of length `_STRETCH` or more along positions (n, 3) in order.
+def _path_length(positions: Array, films: list[NDArray[np.int64]]) -> float:
+    """Length of the known parts of the films' paths along positions (n, 3)."""
+    return float(sum(np.nansum(np.linalg.norm(np.diff(positions[rows], axis=0), axis=1)) for rows in films))
 
-    Stretches contain no unknown position; winding ones are left out, see `_STRAIGHT`.
+
+def _stretches(positions: Array, length: float) -> list[tuple[int, int]]:
+    """First and last indices of consecutive stretches of at least `length` along reconstructed positions (n, 3).
+
+    Stretches contain no unknown position; winding ones are left out, see `_STRAIGHT`. They are not chosen by odometry:
+    its noise would end them early, and leave out those that it shortens.
     """
     out, first, way = [], 0, 0.0
     for last in range(1, len(positions)):
@@ -434,7 +444,7 @@ def _stretches(positions: Array) -> list[tuple[int, int]]:
             first, way = last, 0.0
             continue
         way += step
-        if way >= _STRETCH:
+        if way >= length:
             if np.linalg.norm(positions[last] - positions[first]) >= _STRAIGHT * way:
                 out.append((first, last))
             first, way = last, 0.0
