@@ -88,6 +88,16 @@ def test_frames_of_a_varying_rate_are_taken_by_their_times(tmp_path):
     assert len(kept) == 3 and kept[0] <= 0.12 and kept[1:] == [1.0, 3.0]  # by index they would be 0.04, 1 and 2.04 s
 
 
+def test_a_raw_stream_is_read_at_its_rate(tmp_path):
+    write_film(tmp_path / "robot.h264", street(8), bf="2")
+    film = video_film(tmp_path / "robot.h264")
+    assert len(film.timing.times) == 8 and np.ptp(np.diff(film.timing.times)) < 1e-9
+    kept = list(read_film(film, CaptureConfig(frames=8, min_motion=0.0), FilmStatistics(), lambda *_: None))
+    assert [one.index for one in kept] == list(range(8))
+    for one, picture in zip(kept, street(8), strict=True):
+        assert np.abs(one.image.astype(int) - picture).mean() < 6.0
+
+
 def test_a_trimmed_film_is_not_called_damaged(tmp_path):
     for keyframes in ("4", "40"):  # whole groups of pictures before the cut are no packets of the film
         write_film(tmp_path / "phone.mp4", street(20), [100 * k - 900 for k in range(20)], bf="0", g=keyframes)

@@ -303,6 +303,7 @@ def probe(path: Path) -> FilmTiming:
     Raises InputError: not a video, or too damaged to have a readable packet.
     """
     times: list[float] = []
+    unstamped = 0
     regular_file(path)
     try:
         with open_film(path) as (container, stream):
@@ -311,6 +312,7 @@ def probe(path: Path) -> FilmTiming:
                     stamp = packet.pts if packet.pts is not None else packet.dts
                     if stamp is not None and not packet.is_discard:
                         times.append(float(stamp * packet.time_base))
+                    unstamped += stamp is None and packet.size > 0
             # Without the frames outside the part that an edit list shows, as in a trimmed film.
             declared = sum(not entry.is_discard for entry in stream.index_entries) if stream.frames else 0
             rate = float(stream.average_rate or 25)
@@ -322,6 +324,8 @@ def probe(path: Path) -> FilmTiming:
             f"{path}: not a readable film ({path.stat().st_size} bytes: {reason}); "
             "copy it again from the camera or re-encode it"
         ) from None
+    if not times:
+        times = [k / rate for k in range(unstamped)]  # a raw stream has no time stamps
     if not times:
         raise InputError(f"{path}: the film has no readable frame; copy it again from the camera or re-encode it")
     at = np.sort(np.array(times))
