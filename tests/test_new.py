@@ -174,6 +174,16 @@ def test_any_film_name_becomes_a_valid_lighting(tmp_path, name):
     assert 1 <= len(config.source[0].lighting) <= 80
 
 
+def test_films_of_one_name_become_two_lightings(tmp_path, capsys):
+    folders = [tmp_path / name for name in ("9.30", "9.45", "x" * 81, "x" * 82)]
+    for folder in folders:
+        write_image(folder / "a.png", np.zeros((8, 8, 3), np.uint8))
+    day = film(tmp_path / "9.30.mp4", views([5 * i for i in range(4)]))
+    config = load_config(new_scene(tmp_path / "scene", [*folders, day], 1.2))
+    assert [one.lighting for one in config.source] == ["9.30", "9.45", "x" * 80, "x" * 78 + "_2", "9.30_2"]
+    assert f"{day}: another film is called 9.30, too, so its lighting is 9.30_2" in capsys.readouterr().err
+
+
 def test_an_option_whose_value_is_two_dashes_is_refused(tmp_path, capsys):
     """argparse alone would return an empty list."""
     with pytest.raises(SystemExit) as end:

@@ -13,6 +13,7 @@ folder that contains all of its files; they are copied with their paths relative
 
 import argparse
 import contextlib
+import itertools
 import os
 import shutil
 import sys
@@ -125,9 +126,17 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
     inputs.mkdir(parents=True, exist_ok=True)
     text = _HEAD.format(name=toml_string(root.resolve().name))
     notes: list[str] = []
+    lightings: list[str] = []
     for film in films:
         path = _import_film(film, inputs)
-        lighting = _lighting(path, detect_kind(film))
+        lighting = name = _lighting(inputs, path, detect_kind(film))
+        if name in lightings:
+            lighting = next(one for k in itertools.count(2) if (one := _shortened(name, f"_{k}")) not in lightings)
+            notes.append(
+                f"{film}: another film is called {name}, too, so its lighting is {lighting}; if both show the same "
+                "light, give both sources the same name in scene.toml"
+            )
+        lightings.append(lighting)
         chosen = f"topic = {toml_string(bags[film].topics['pictures'])}\n" if film in bags else ""
         path_text = toml_string(("input" / path).as_posix())
         mask = _NO_MASK
@@ -360,14 +369,21 @@ def _posed_files(film: Path) -> tuple[Path, list[Path]]:
     return root, list(dict.fromkeys(files))
 
 
-def _lighting(path: Path, kind: str) -> str:
-    """A lighting's name, derived from the film's file name or from the root folder of a posed image set."""
-    name = Path(path.parts[0] if kind in _POSED and path.parts else path.name).stem or "film"
+def _lighting(inputs: Path, path: Path, kind: str) -> str:
+    """A lighting's name, derived from that of the film `inputs/path` or of the root folder of a posed image set."""
+    file = inputs / path.parts[0] if kind in _POSED and path.parts else inputs / path
+    name = (file.name if file.is_dir() else file.stem) or "film"
     name = "".join(c if c.isprintable() and c not in ":/\\" else "_" for c in name).lstrip(".") or "film"
     name = name.replace(RANDOMIZED, RANDOMIZED.replace("+", "_"))
-    while len(name) > MAX_NAME or len(name.encode()) > 2 * MAX_NAME:
-        name = name[:-1]
+    name = _shortened(name)
     return f"{name}_light" if name in RESERVED_LIGHTINGS else name
+
+
+def _shortened(name: str, ending: str = "") -> str:
+    """The name with an ending, shortened to the largest length of a lighting's name."""
+    while len(name + ending) > MAX_NAME or len((name + ending).encode()) > 2 * MAX_NAME:
+        name = name[:-1]
+    return name + ending
 
 
 def command(options: argparse.Namespace) -> None:
