@@ -174,6 +174,30 @@ def test_any_film_name_becomes_a_valid_lighting(tmp_path, name):
     assert 1 <= len(config.source[0].lighting) <= 80
 
 
+def test_a_scene_inside_the_photo_folder_is_refused(tmp_path, capsys):
+    write_image(tmp_path / "photos/a.png", np.zeros((8, 8, 3), np.uint8))
+    for scene in ("photos", "photos/deep/scene"):
+        assert new_main([str(tmp_path / scene), str(tmp_path / "photos")]) == 2
+        error = capsys.readouterr().err
+        assert "inside the folder" in error and "choose another folder" in error and error.count("\n") == 1
+    assert [path.name for path in (tmp_path / "photos").iterdir()] == ["a.png"]
+
+
+@pytest.mark.parametrize("name", ["photos", "day.mp4"])
+def test_a_copy_that_fails_leaves_nothing(tmp_path, monkeypatch, name):
+    write_image(tmp_path / "photos/a.png", np.zeros((8, 8, 3), np.uint8))
+    film(tmp_path / "day.mp4", views([5 * i for i in range(4)]))
+
+    def full(source: Path, target: Path, **_: object) -> None:
+        Path(target).write_bytes(b"begun")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+    with pytest.raises(OSError, match="No space left"):
+        new_scene(tmp_path / "scene", [tmp_path / name], 1.2)
+    assert not list((tmp_path / "scene/input").iterdir())
+
+
 def test_films_of_one_name_become_two_lightings(tmp_path, capsys):
     folders = [tmp_path / name for name in ("9.30", "9.45", "x" * 81, "x" * 82)]
     for folder in folders:

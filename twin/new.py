@@ -34,7 +34,7 @@ from twin.capture.video import probe
 from twin.config import MAX_CAMERA_HEIGHT, RANDOMIZED, RESERVED_LIGHTINGS
 from twin.config_file import ROBOT_TOML, parse_table
 from twin.errors import InputError, join_names
-from twin.files import digest_file, exists, is_file, read_toml, toml_string, write_text
+from twin.files import atomic_path, digest_file, exists, is_file, new_folder, read_toml, toml_string, write_text
 from twin.geometry.images import write_image
 from twin.robot import BASE_HEIGHT, HuskyParams
 from twin.scene import MAX_NAME, SceneDir
@@ -112,6 +112,11 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
         if any(film.samefile(other) for other in films[:k]):
             raise InputError(f"{film} is given twice; each film is one lighting, so give it once")
         kind = detect_kind(film)
+        if kind not in _POSED and film.resolve() in (root / "input").resolve().parents:
+            raise InputError(
+                f"{root}: the scene would lie inside the folder {film}, which is copied into it; choose "
+                "another folder for the scene"
+            )
         if kind == "video":
             probe(film)
         elif kind == "bag":
@@ -290,13 +295,13 @@ def _copy_film(film: Path, inputs: Path) -> Path:
     while copy.exists() and not _is_same(film, copy):
         copy, number = inputs / f"{film.stem}_{number}{film.suffix}", number + 1
     if not copy.exists():
-        aside = copy.with_name(copy.name + ".partial")  # so that an interrupted copy does not count as a film
+        # Under another name until it is complete, so that an interrupted copy does not count as a film.
         if film.is_dir():
-            shutil.rmtree(aside, ignore_errors=True)
-            shutil.copytree(film, aside, ignore=_not_copied)
+            with new_folder(copy) as aside:
+                shutil.copytree(film, aside, ignore=_not_copied, dirs_exist_ok=True)
         else:
-            shutil.copyfile(film, aside)
-        aside.replace(copy)
+            with atomic_path(copy) as aside:
+                shutil.copyfile(film, aside)
     return copy.relative_to(inputs)
 
 
@@ -317,18 +322,15 @@ def _copy_image_set(film: Path, inputs: Path) -> Path:
     copy, number = inputs / root.name, 2
     while copy.exists():
         copy, number = inputs / f"{root.name}_{number}", number + 1
-    aside = copy.with_name(copy.name + ".partial")
-    shutil.rmtree(aside, ignore_errors=True)
-    for file in files:
-        target = aside / file.relative_to(root)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, target)
     within = film.relative_to(root)
-    outside = [path for path in _image_set(aside / within).paths if not path.is_relative_to(aside)]
-    if outside:
-        shutil.rmtree(aside)
-        raise InputError(f"{film}: names images by absolute paths, such as {outside[0]}; make them relative")
-    aside.replace(copy)
+    with new_folder(copy) as aside:
+        for file in files:
+            target = aside / file.relative_to(root)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, target)
+        outside = [path for path in _image_set(aside / within).paths if not path.is_relative_to(aside)]
+        if outside:
+            raise InputError(f"{film}: names images by absolute paths, such as {outside[0]}; make them relative")
     return Path(copy.name) / within
 
 
