@@ -183,6 +183,22 @@ def test_a_scene_inside_the_photo_folder_is_refused(tmp_path, capsys):
     assert [path.name for path in (tmp_path / "photos").iterdir()] == ["a.png"]
 
 
+def test_a_folder_is_copied_once(tmp_path):
+    """A second attempt uses the copy of the first; another folder of the same name is copied beside it."""
+    for folder, shade in (("9.30", 0), ("other/9.30", 9)):
+        write_image(tmp_path / folder / "deep/a.png", np.full((8, 8, 3), shade, np.uint8))
+        write_image(tmp_path / folder / "b.png", np.zeros((8, 8, 3), np.uint8))
+    _transforms(tmp_path / "fox")
+    for _ in range(2):
+        new_scene(tmp_path / "scene", [tmp_path / name for name in ("9.30", "other/9.30", "fox")], 1.2)
+        copies = {path.name for path in (tmp_path / "scene/input").iterdir()}
+        assert copies == {"9.30", "9.30_2", "fox"}
+        (tmp_path / "scene/scene.toml").unlink()
+    write_image(tmp_path / "9.30/c.png", np.zeros((8, 8, 3), np.uint8))
+    new_scene(tmp_path / "scene", [tmp_path / "9.30"], 1.2)
+    assert (tmp_path / "scene/input/9.30_3/c.png").exists()
+
+
 @pytest.mark.parametrize("name", ["photos", "day.mp4"])
 def test_a_copy_that_fails_leaves_nothing(tmp_path, monkeypatch, name):
     write_image(tmp_path / "photos/a.png", np.zeros((8, 8, 3), np.uint8))

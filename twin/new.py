@@ -293,7 +293,8 @@ def _copy_film(film: Path, inputs: Path) -> Path:
     """Copies a film or folder to `input/`, or reuses an identical copy; returns its relative path."""
     copy, number = inputs / film.name, 2
     while copy.exists() and not _is_same(film, copy):
-        copy, number = inputs / f"{film.stem}_{number}{film.suffix}", number + 1
+        name = f"{film.name}_{number}" if film.is_dir() else f"{film.stem}_{number}{film.suffix}"
+        copy, number = inputs / name, number + 1
     if not copy.exists():
         # Under another name until it is complete, so that an interrupted copy does not count as a film.
         if film.is_dir():
@@ -312,17 +313,35 @@ def _not_copied(folder: str, names: list[str]) -> list[str]:
 
 
 def _is_same(film: Path, copy: Path) -> bool:
+    """True for files of equal content, and for folders whose files have equal names and contents."""
+    if film.is_dir() and copy.is_dir():
+        return _same_files(_files_within(film), film, copy)
     both_files = film.is_file() and copy.is_file() and film.stat().st_size == copy.stat().st_size
     return both_files and digest_file(film) == digest_file(copy)
 
 
+def _same_files(files: list[Path], root: Path, copy: Path) -> bool:
+    """True if the folder `copy` has just the given files below `root`, with equal contents."""
+    names = {file.relative_to(root) for file in files}
+    return names == {file.relative_to(copy) for file in _files_within(copy)} and all(
+        _is_same(root / name, copy / name) for name in names
+    )
+
+
+def _files_within(folder: Path) -> list[Path]:
+    """The files that are copied with a folder, see `_not_copied`."""
+    return [Path(at, name) for at, _, names in os.walk(folder) for name in names if is_file(Path(at, name))]
+
+
 def _copy_image_set(film: Path, inputs: Path) -> Path:
-    """Copies a posed image set from its root to `input/` and returns its relative path."""
+    """Copies a posed image set from its root to `input/`, or reuses an identical copy; returns its relative path."""
     root, files = _posed_files(film)
     copy, number = inputs / root.name, 2
-    while copy.exists():
-        copy, number = inputs / f"{root.name}_{number}", number + 1
     within = film.relative_to(root)
+    while copy.exists():
+        if _same_files(files, root, copy):
+            return Path(copy.name) / within
+        copy, number = inputs / f"{root.name}_{number}", number + 1
     with new_folder(copy) as aside:
         for file in files:
             target = aside / file.relative_to(root)
