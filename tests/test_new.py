@@ -174,6 +174,20 @@ def test_any_film_name_becomes_a_valid_lighting(tmp_path, name):
     assert 1 <= len(config.source[0].lighting) <= 80
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("photo.png", "give the folder of all photos"), ("one.mp4", "give a longer film"), ("list.m3u8", "a playlist")],
+)
+def test_what_is_no_film_is_refused(tmp_path, capsys, name, words):
+    write_image(tmp_path / "photo.png", views([0])[0])
+    film(tmp_path / "one.mp4", views([0]))
+    film(tmp_path / "part.ts", views([5 * i for i in range(20)]))
+    (tmp_path / "list.m3u8").write_text("#EXTM3U\n#EXT-X-TARGETDURATION:2\n#EXTINF:2,\npart.ts\n#EXT-X-ENDLIST\n")
+    assert new_main([str(tmp_path / "scene"), str(tmp_path / name)]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1 and not (tmp_path / "scene").exists()
+
+
 def test_a_scene_inside_the_photo_folder_is_refused(tmp_path, capsys):
     write_image(tmp_path / "photos/a.png", np.zeros((8, 8, 3), np.uint8))
     for scene in ("photos", "photos/deep/scene"):

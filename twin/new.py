@@ -26,11 +26,11 @@ from twin import commands, runtime
 from twin.capture.bag import METADATA
 from twin.capture.bag_film import BagContents, CameraSeat, read_contents
 from twin.capture.film_check import FilmCheck, check_film, timing_notes
-from twin.capture.formats import ImageSet, find_model, listed_files, read_colmap, read_transforms
+from twin.capture.formats import ImageSet, find_model, is_image, listed_files, read_colmap, read_transforms
 from twin.capture.frames import detect_kind
 from twin.capture.photos import load_photo
 from twin.capture.scale import local_east_north_up
-from twin.capture.video import probe
+from twin.capture.video import open_film, probe
 from twin.config import MAX_CAMERA_HEIGHT, RANDOMIZED, RESERVED_LIGHTINGS
 from twin.config_file import ROBOT_TOML, parse_table
 from twin.errors import InputError, join_names
@@ -41,6 +41,7 @@ from twin.scene import MAX_NAME, SceneDir
 from twin.sysid.identification import toml_text
 
 _POSED = ("colmap", "transforms")
+_PLAYLISTS = ("hls", "dash", "concat")  # FFmpeg's names of formats that consist of other files
 _MIN_FIX_WAY = 20.0  # [m] from the first GPS fix to the farthest fix; with less, GPS does not determine the scale
 _MIN_ODOMETRY_WAY = 15.0  # [m] length of the path; with less, odometry does not determine the scale
 _SEAT_TOLERANCE = 0.02  # [m] standard deviation of a camera's height that comes from /tf_static
@@ -118,7 +119,7 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
                 "another folder for the scene"
             )
         if kind == "video":
-            probe(film)
+            _check_video(film)
         elif kind == "bag":
             bags[film] = read_contents(film, topic)
         elif kind in _POSED:
@@ -164,6 +165,20 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
     for note in (*map(_taken, bags.values()), *notes):
         runtime.log_line(note)
     return scene.config_file
+
+
+def _check_video(film: Path) -> None:
+    """Raises InputError: an unreadable film, a playlist, a photo, or a film of one frame."""
+    timing = probe(film)
+    with open_film(film) as (container, _):
+        if container.format.name in _PLAYLISTS:
+            raise InputError(
+                f"{film}: a playlist, which only names films; give the film, or join its parts by "
+                f"ffmpeg -i {film.name} -c copy {film.stem}.mp4"
+            )
+    if len(timing.times) < 2:
+        cure = "give the folder of all photos" if is_image(film) else "give a longer film, or a folder of photos"
+        raise InputError(f"{film}: one picture only (need 2, better 50); {cure}")
 
 
 def _mask_lines(check: FilmCheck, inputs: Path, path: Path) -> tuple[list[str], str]:
