@@ -88,6 +88,15 @@ def test_frames_of_a_varying_rate_are_taken_by_their_times(tmp_path):
     assert len(kept) == 3 and kept[0] <= 0.12 and kept[1:] == [1.0, 3.0]  # by index they would be 0.04, 1 and 2.04 s
 
 
+@pytest.mark.parametrize("height", [96, 720])
+def test_colors_of_an_untagged_film_are_those_that_players_show(height):
+    """A decoder gives no color matrix; players take BT.709 for HD."""
+    red = av.VideoFrame.from_ndarray(np.full((height, 64, 3), (200, 30, 20), np.uint8), format="rgb24")
+    coded = red.reformat(format="yuv420p", dst_colorspace="ITU709" if height >= 720 else "ITU601")
+    coded.colorspace = 2  # unknown
+    assert np.abs(upright(coded)[5, 5].astype(int) - (200, 30, 20)).max() <= 3
+
+
 def test_a_raw_stream_is_read_at_its_rate(tmp_path):
     write_film(tmp_path / "robot.h264", street(8), bf="2")
     film = video_film(tmp_path / "robot.h264")

@@ -45,7 +45,7 @@ class Stage:
 
 _MJCF_OF_MESH = ("mjcf.route", "mjcf.half_width", "mjcf.corridor_margin")  # the mjcf settings that stage mesh reads
 PIPELINE = (
-    Stage("capture", "twin.capture.frames", 2, ("source", "capture"), ()),
+    Stage("capture", "twin.capture.frames", 3, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 5, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 3, ("metric",), ("capture", "cameras")),
     Stage("field", "twin.nerf.trainer", 8, ("nerf", "mjcf.route"), ("cameras", "metric")),

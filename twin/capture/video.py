@@ -23,6 +23,7 @@ import numpy as np
 from av.sidedata.sidedata import SideDataContainer
 from av.sidedata.sidedata import Type as SideData
 from av.video.frame import PictureType
+from av.video.reformatter import Colorspace
 from numpy.typing import NDArray
 
 from twin import runtime
@@ -47,6 +48,8 @@ _MIN_DECODED_FRACTION = 0.98  # the user gets a note if a smaller fraction of th
 
 # ---- decoding
 
+_UNKNOWN = 2  # FFmpeg's AVCOL_SPC_UNSPECIFIED
+_HD_HEIGHT = 720  # [px] height from which frames of unknown color matrix are BT.709
 _DEINTERLACE = "mode=send_frame:parity=auto:deint=interlaced"
 
 
@@ -180,15 +183,22 @@ def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
 
 
 def upright(frame: av.VideoFrame) -> Image:
-    """A frame as SDR RGB, rotated and mirrored by its display matrix in multiples of 90°."""
+    """A frame as SDR RGB, rotated and mirrored by its display matrix in multiples of 90°.
+
+    If the color matrix is unknown it is that which players use: BT.709 from `_HD_HEIGHT` on, else BT.601.
+    """
     transfer = hdr_transfer(frame)
-    image = hdr_to_sdr(frame, transfer) if transfer else np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+    if transfer:
+        image = hdr_to_sdr(frame, transfer)
+    else:
+        matrix = Colorspace.ITU709 if frame.colorspace == _UNKNOWN and frame.height >= _HD_HEIGHT else None
+        image = np.asarray(frame.to_ndarray(format="rgb24", src_colorspace=matrix), np.uint8)
     # `frame.side_data` would make a reference cycle, so many large frames would stay until garbage is collected.
     side = SideDataContainer(frame).get(SideData.DISPLAYMATRIX)  # type: ignore[call-arg]
     if side is None:
         return image
-    matrix = np.frombuffer(bytes(side), np.int32, 9).reshape(3, 3)[:2, :2] / 65536.0
-    return apply_display_matrix(image, matrix) if np.abs(np.linalg.det(matrix)) > 1e-3 else image
+    turn = np.frombuffer(bytes(side), np.int32, 9).reshape(3, 3)[:2, :2] / 65536.0
+    return apply_display_matrix(image, turn) if np.abs(np.linalg.det(turn)) > 1e-3 else image
 
 
 def apply_display_matrix(image: Image, matrix: Array) -> Image:
