@@ -295,6 +295,7 @@ class FilmTiming:
     times: Array  # presentation times since the first frame [s], sorted, shape (n,)
     start: float  # time stamp of the first frame in its stream [s]
     declared: int  # number of frames that the container declares and shows; n if it declares none
+    consecutive: bool = False  # true if decoded frames have no presentation times; they are numbered one by one
 
     @property
     def interval(self) -> float:
@@ -326,6 +327,8 @@ def probe(path: Path) -> FilmTiming:
             # Without the frames outside the part that an edit list shows, as in a trimmed film.
             declared = sum(not entry.is_discard for entry in stream.index_entries) if stream.frames else 0
             rate = float(stream.average_rate or 25)
+            # AVI stores no presentation times. With B frames, those that FFmpeg gives are in the order of the file.
+            consecutive = container.format.name == "avi" and stream.codec_context.has_b_frames
     except InputError:
         raise
     except (av.error.FFmpegError, ValueError, OSError) as error:
@@ -341,12 +344,12 @@ def probe(path: Path) -> FilmTiming:
     at = np.sort(np.array(times))
     if len(at) > 1 and at[-1] == at[0]:  # a raw stream without time stamps
         at = np.arange(len(at)) / rate
-    return FilmTiming(at - at[0], float(at[0]), declared if declared > 0 else len(at))
+    return FilmTiming(at - at[0], float(at[0]), declared if declared > 0 else len(at), consecutive)
 
 
 def frame_index(time: float | None, timing: FilmTiming, last: int) -> int:
     """Index of a decoded frame from its time [s], always above the index `last`; damaged frames leave gaps."""
-    if time is None:
+    if time is None or timing.consecutive:
         return last + 1
     right = min(int(np.searchsorted(timing.times, time)), len(timing.times) - 1)
     left = max(right - 1, 0)
