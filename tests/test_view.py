@@ -670,10 +670,32 @@ def test_a_view_added_in_flight_keeps_fog_and_sun(page, field, tmp_path, monkeyp
     _wait(lambda: not panel._fly_button.disabled)
     assert 0.0 < added.fog.extinction < 0.2 and 0.0 < added.sunlight[0][1] < 1.0
     panel._save()
+    monkeypatch.setattr(panel, "_loaded", None)
     panel._load()
     again = panel._keys[-1][2]
     np.testing.assert_array_equal(again.start, added.start)
     assert (again.fog, again.sunlight) == (added.fog, added.sunlight)
+
+
+def test_a_loaded_path_keeps_its_times_until_it_is_changed(page, field, tmp_path, monkeypatch):
+    monkeypatch.setattr("twin.view.panels.is_cached", lambda root: True)
+    monkeypatch.chdir(tmp_path)
+    panel, file = PathPanel(page.viewer), tmp_path / "paths" / "path.json"
+    panel._keys = _views(field, 0.5)
+
+    def saved_times() -> list[float]:
+        panel._save()
+        return [view.time for view in CameraPath.load(file, field).views]
+
+    assert saved_times() == [0.0, 1.0]
+    by_script = file.read_text().replace('"time": 1.0', '"time": 8.5')
+    for change in (lambda: panel._remove_views(0), lambda: setattr(panel._speed, "value", 2.0)):
+        file.write_text(by_script)
+        panel._load()
+        assert "8.5 s" in panel._note.content and saved_times() == [0.0, 8.5]
+        change()
+        assert "1.0 s" in panel._note.content and saved_times() == [0.0, 1.0]
+    panel._remove_views(2)
 
 
 def test_a_path_that_cannot_be_shown_or_saved_is_a_notice(page, field, notices, monkeypatch):

@@ -271,6 +271,7 @@ class PathPanel:
         self._viewer, root = viewer, viewer.twin.scene.root
         self._root = Path.cwd() if is_cached(root) else root  # not the cache of a pack, which may be deleted
         self._keys: list[tuple[Array, float, EpisodeLighting]] = []
+        self._loaded: CameraPath | None = None  # the path of `_keys` as its file has it, until views or speed change
         self.nodes: list[viser.SceneNodeHandle] = []
         """The key views and the path between them, as the browser draws them."""
         gui = viewer.server.gui
@@ -279,7 +280,7 @@ class PathPanel:
         both = gui.add_button_group("views", ("remove last", "clear"))
         viewer.on_click(both, lambda event: self._remove_views(1 if both.value == "remove last" else len(self._keys)))
         self._speed = gui.add_slider("speed [m/s]", 0.2, 5.0, 0.1, _SPEED)
-        viewer.on_update(self._speed, self._show)
+        viewer.on_update(self._speed, self._changed)
         self._name = gui.add_text("Name", "path")
         self._fly_button = gui.add_button("Fly along it")
         viewer.on_click(self._fly_button, self._fly)
@@ -292,6 +293,8 @@ class PathPanel:
 
     def _path(self) -> CameraPath:
         """The path through the key views. Raises InputError: fewer than two, too many, or a path that is too long."""
+        if self._loaded is not None:
+            return self._loaded
         if len(self._keys) < 2:
             raise InputError(f"{len(self._keys)} views; add two or more: move the camera, then press Add this view")
         times = spaced_times([pose for pose, _, _ in self._keys], float(self._speed.value), _MIN_STEP)
@@ -309,10 +312,14 @@ class PathPanel:
             return
         view = camera_pose_of(client), float(np.rad2deg(client.camera.fov)), self._viewer.lighting
         self._keys.append(view)
-        self._show()
+        self._changed()
 
     def _remove_views(self, count: int) -> None:
         del self._keys[len(self._keys) - min(count, len(self._keys)) :]
+        self._changed()
+
+    def _changed(self) -> None:
+        self._loaded = None
         self._show()
 
     def _show(self) -> None:
@@ -351,7 +358,7 @@ class PathPanel:
         self._viewer.notify("Path saved", text, "green")
 
     def _load(self) -> None:
-        path = CameraPath.load(self._file(), self._viewer.field)
+        self._loaded = path = CameraPath.load(self._file(), self._viewer.field)
         self._keys = [(view.camera_to_world, view.fov, view.lighting) for view in path.views]
         self._show()
 
