@@ -428,6 +428,10 @@ def test_the_log_is_what_alignment_reads(tmp_path):
     assert np.ptp(table["cmd_v"]) > 0.8 and np.ptp(table["cmd_yaw_rate"]) > 1.5
     assert np.abs(table["y"]).max() < 2.2
     assert np.abs(np.diff(table["yaw"])).max() < 0.3
+    content = (tmp_path / "drive.csv").read_bytes()
+    with pytest.raises(ValueError):
+        recordings.write_log(tmp_path / "drive.csv", {**table, "yaw": table["yaw"][:3]})
+    assert (tmp_path / "drive.csv").read_bytes() == content and len(list(tmp_path.iterdir())) == 1
     first, again, other = (recordings.record_log(12.0, Setup(robot=number))["x"] for number in (0, 0, 1))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
     for duration in (3.0, np.inf):

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from twin.errors import InputError
 from twin.evaluation.trials import Trial
-from twin.files import remove
+from twin.files import atomic_path, remove
 from twin.geometry.images import write_image
 from twin.reality import SEED
 from twin.reality.filming import FilmingPlan, write_video
@@ -167,9 +167,9 @@ def record_log(duration: float, setup: Setup) -> dict[str, Array]:
 
 
 def write_log(path: Path, columns: dict[str, Array]) -> None:
-    """Writes a log as CSV with six decimals."""
+    """Writes a log as CSV with six decimals, atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8", newline="") as file:
+    with atomic_path(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows([f"{value:.6f}" for value in row] for row in np.stack(list(columns.values()), 1))
