@@ -29,6 +29,7 @@ from twin.reality.__main__ import main
 from twin.reality.campus_road import RoadLine
 from twin.reality.lighting import LIGHTINGS, WEATHER, weather, weather_index
 from twin.reality.real_camera import native_size
+from twin.reality.real_robot import RealRobot
 from twin.reality.real_test import RealTest, Setup, task_for
 from twin.reality.recordings import follow
 from twin.reality.road_task import CAMPUS_TASKS, parse_task, place_on_test_day, task_of_place, true_route
@@ -420,7 +421,7 @@ def test_a_photo_is_of_the_weather_asked_for(tmp_path, monkeypatch, capsys):
     assert "expected a .mp4 file" in capsys.readouterr().err
 
 
-def test_the_log_is_what_alignment_reads(tmp_path):
+def test_the_log_is_what_alignment_reads(tmp_path, monkeypatch, capsys):
     table = recordings.record_log(40.0, Setup())
     recordings.write_log(tmp_path / "drive.csv", table)
     windows = read_log(tmp_path / "drive.csv")
@@ -434,6 +435,10 @@ def test_the_log_is_what_alignment_reads(tmp_path):
     assert (tmp_path / "drive.csv").read_bytes() == content and len(list(tmp_path.iterdir())) == 1
     first, again, other = (recordings.record_log(12.0, Setup(robot=number))["x"] for number in (0, 0, 1))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
+    monkeypatch.setattr(RealRobot, "step", lambda *given: pytest.fail("the robot drives before --out is checked"))
+    for name in ("", "drive.txt", "drive"):
+        assert main(["log", "--out", str(tmp_path / name)]) == 2
+        assert "expected a .csv file" in capsys.readouterr().err
     for duration in (3.0, np.inf):
         with pytest.raises(InputError, match=f"duration = {duration:g} s; expected 10 to 36000"):
             recordings.record_log(duration, Setup())

@@ -242,6 +242,8 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
     """Runs a command that needs a robot: log, onboard, bag, photo or drive."""
     days = [f"day_{number}" for number in getattr(options, "day", None) or []]
     if options.command == "log":
+        if options.out.suffix != ".csv" or options.out.is_dir():
+            raise InputError(f"{options.out}: expected a .csv file to write, such as drive.csv")
         recordings.write_log(options.out, recordings.record_log(options.duration, setup))
     elif options.command == "onboard":
         recordings.write_film(options.out, setup)
