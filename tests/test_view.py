@@ -108,9 +108,10 @@ def _request(path: str = "/", **headers: str) -> Request:
 
 def test_without_a_token_only_this_machines_own_pages_are_answered():
     gate = Gate(8080, None)
-    for host in ("127.0.0.1:8080", "localhost:9000", "LOCALHOST", "[::1]:8080"):  # any port: there may be a tunnel
+    # Any port, since there may be a tunnel, and any loopback address, since `--host` may name it.
+    for host in ("127.0.0.1:8080", "localhost:9000", "LOCALHOST", "[::1]:8080", "127.0.0.2:8080"):
         assert gate.refusal(_request(Host=host)) is None
-    for host in ("evil.example", "127.0.0.1.evil.example:8080", "[::2]:8080", ""):
+    for host in ("evil.example", "127.0.0.1.evil.example:8080", "[::2]:8080", "128.0.0.1", "::1", "[::1", ""):
         assert gate.refusal(_request(Host=host)).status_code == HTTPStatus.FORBIDDEN
     assert gate.refusal(Request("/", Headers())).status_code == HTTPStatus.FORBIDDEN
     own, other = "http://localhost:8080", "http://evil.example"

@@ -49,7 +49,6 @@ _HELD_TIME = 0.35  # [s] for which a report of held keys is valid; the page repe
 _MAX_REPORT = 200  # characters
 _STOP_TIME = 3.0  # [s] longest wait for a thread of the server to end
 _PORTS = 50  # number of ports to try, from the given one on
-_LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 
 Check = Callable[[ServerConnection, Request], Response | None]
 
@@ -99,13 +98,13 @@ class Gate:
     """Decides which requests are answered."""
 
     def __init__(self, port: int, token: str | None) -> None:
-        """Without a token, only requests for this machine's loopback names are answered."""
+        """Without a token, only requests for `localhost` or a loopback address are answered."""
         self._token, self._cookie = token, f"twin_{port}"
 
     def refusal(self, request: Request) -> Response | None:
         """A refusal, or the redirect that stores the token as a cookie; None if the request is allowed."""
         host, origin = _header(request, "Host"), _header(request, "Origin")
-        if self._token is None and (host is None or _hostname(host) not in _LOOPBACK_NAMES):
+        if self._token is None and (host is None or not _is_loopback(_hostname(host))):
             return _plain(http.HTTPStatus.FORBIDDEN, "this page is for this machine only; see twin view --host\n")
         if _is_handshake(request) and origin is not None and (host is None or urlsplit(origin).netloc != host):
             return _plain(http.HTTPStatus.FORBIDDEN, "another site's page may not connect\n")
@@ -305,9 +304,9 @@ def _is_handshake(request: Request) -> bool:
 
 
 def _hostname(host: str) -> str:
-    """The host of a Host header, without its port, in lower case."""
+    """The host of a Host header, without its port and the brackets of IPv6, in lower case."""
     name = host.lower()
-    return name[: name.index("]") + 1] if name.startswith("[") and "]" in name else name.partition(":")[0]
+    return name[1 : name.index("]")] if name.startswith("[") and "]" in name else name.partition(":")[0]
 
 
 def _plain(status: http.HTTPStatus, text: str) -> Response:
