@@ -293,6 +293,14 @@ def test_a_path_becomes_a_film(root, field, tmp_path, capsys):
     assert errors[0, 0] < 12.0 and errors[1, 1] < 12.0 and min(errors[0, 1], errors[1, 0]) > 25.0
 
 
+def test_views_without_a_lighting_have_the_one_given(field, tmp_path):
+    views = [{k: v for k, v in _VIEW.items() if k != "lighting"}, {**_VIEW, "time": 1.0}]
+    (tmp_path / "path.json").write_text(json.dumps({"format": 1, "views": views}))
+    for given, names in ((None, ["day", "day"]), ("night", ["night", "day"])):
+        path = CameraPath.load(tmp_path / "path.json", field, given)
+        assert [view.lighting.name for view in path.views] == names
+
+
 @pytest.mark.parametrize(
     "given, said",
     [
@@ -301,6 +309,11 @@ def test_a_path_becomes_a_film(root, field, tmp_path, capsys):
         (["--path", "none.json", "--out", "a.mp4"], "none.json"),
         (["--path", "a", "--out", "a.mp4", "--size", "100x33"], "even sides"),
         (["--path", "a", "--out", "a.mp4", "--fps", "0"], "--fps 0"),
+        (["--path", "a", "--out", "a.mp4", "--lighting", "noon"], "'noon': unknown"),
+        (["--path", "a", "--out", "a.mp4", "--policy", "first"], "--policy first: only the page has it"),
+        (["--path", "a", "--out", "a.mp4", "--port", "0"], "--port 0: only the page has it"),
+        (["--size", "320x180", "--port", "70000"], "--size 320x180: only a film has it"),
+        (["--fps", "0", "--port", "70000"], "--fps 0: only a film has it"),
         (["--port", "70000"], "--port 70000"),
         (["--lighting", "noon"], "'noon': unknown"),
         (["--host", "203.0.113.9"], "--host '203.0.113.9'"),

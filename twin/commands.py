@@ -244,7 +244,10 @@ def _view(parser: argparse.ArgumentParser) -> None:
         "obstacles in its way, compare film and twin, place camera paths. Or render such a path to a film."
     )
     add("scene", type=Path, help="folder of a built scene, or a pack")
-    add("--lighting", help="a name, or a mixture sun:night:0.5; default: the first filmed one")
+    add(
+        "--lighting",
+        help="a name, or a mixture sun:night:0.5; default: the first filmed one; with --path, of views without one",
+    )
     add("--task", help="task of the driver: straight, right_turn, ... (default: route)")
     add("--policy", help="a run, a checkpoint, an ONNX file or module:function that may drive")
     add("--trust", action="store_true", help="load a policy file that may run code")

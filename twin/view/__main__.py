@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 _HEAD_START = 6.0  # [s] longest wait for the first picture before the robot is loaded
 _MIN_SIDE, _MAX_SIDE, _MAX_FPS = 16, 4096, 120  # limits of a film's sides [px] and frames per second
+_PAGE_OPTIONS: tuple[str, ...] = ("task", "policy", "seed", "host", "port")
+_FILM_OPTIONS: tuple[str, ...] = ("size", "fps")
 
 
 def command(given: argparse.Namespace) -> None:
@@ -37,17 +39,25 @@ def command(given: argparse.Namespace) -> None:
     twin = load_scene(given.scene)
     if (given.path is None) != (given.out is None):
         raise InputError("--path and --out belong together; give both, such as --path path.json --out film.mp4")
+    unused, cure = _FILM_OPTIONS, "only a film has it; give --path and --out, too"
     if given.path is not None:
-        film_path(twin, given.path, given.out, given.size, given.fps, given.quiet)
+        unused, cure = _PAGE_OPTIONS, "only the page has it, and --path renders a film; leave out one of them"
+    for name in unused:
+        if (value := getattr(given, name)) != commands.parser_of("view").get_default(name):
+            raise InputError(f"--{name} {value}: {cure}")
+    if given.path is not None:
+        film_path(twin, given.path, given.out, given.size, given.fps, given.quiet, given.lighting)
     else:
         serve(twin, given)
 
 
-def film_path(twin: Twin, path: Path, out: Path, size: str, fps: int, quiet: bool = False) -> None:
-    """Renders a camera path to an mp4.
+def film_path(
+    twin: Twin, path: Path, out: Path, size: str, fps: int, quiet: bool = False, lighting: str | None = None
+) -> None:
+    """Renders a camera path to an mp4; `lighting` is as for `CameraPath.load`.
 
     Raises:
-        InputError: the scene is not built, or `path`, `size`, `fps` or `out` is not valid.
+        InputError: the scene is not built, or `path`, `size`, `fps`, `out` or `lighting` is not valid.
     """
     width, height = parse_size(size)
     if not 1 <= fps <= _MAX_FPS:
@@ -58,7 +68,7 @@ def film_path(twin: Twin, path: Path, out: Path, size: str, fps: int, quiet: boo
     from twin.view.scene_picture import ScenePicture
 
     field = twin.field()
-    track = CameraPath.load(path, field)
+    track = CameraPath.load(path, field, lighting)
     with runtime.bar("film", len(path_frames(track, fps)), "frame") as progress:
         frames = write_path_film(
             out, track, ScenePicture(field), (width, height), fps, lambda done, total: progress.update()

@@ -4,8 +4,9 @@
 
 `time` [s] increases, `camera_to_world` is 4×4 with OpenCV axes in the scene's frame, `fov` [°] is the vertical angle of
 view, and `lighting` is a name or mixture as for `twin film`, an embedding as a list of numbers, or a mixture of two of
-these, {"from": ..., "to": ..., "share": 0.3}; by default it is the first filmed lighting. Positions follow a cubic
-spline, and rotations a rotation spline; angle of view, lighting and fog are interpolated linearly.
+these, {"from": ..., "to": ..., "share": 0.3}; by default it is that of `--lighting`, else the first filmed one.
+Positions follow a cubic spline, and rotations a rotation spline; angle of view, lighting and fog are interpolated
+linearly.
 """
 
 from collections.abc import Callable, Sequence
@@ -102,8 +103,13 @@ class CameraPath:
         return json_bytes({"format": _FORMAT, "views": [_view_row(view) for view in self.views]})
 
     @staticmethod
-    def load(path: Path, field: BakedField) -> "CameraPath":
-        """Reads a path's JSON file. Raises InputError: it is missing or damaged, or names an unknown lighting."""
+    def load(path: Path, field: BakedField, lighting: str | None = None) -> "CameraPath":
+        """Reads a path's JSON file; `lighting` is that of views without one, by default the first filmed one.
+
+        Raises InputError: the file is missing or damaged, or a lighting is unknown.
+        """
+        lighting = lighting or field.lightings[0]
+        named_lighting(field, lighting)  # raises for an unknown one, also if every view has its own
         head = read_json(path)
         with wrap_read_errors(path, _CURE):
             if not isinstance(head, dict) or head.get("format") != _FORMAT:
@@ -112,7 +118,7 @@ class CameraPath:
             rows = head["views"]
             if not isinstance(rows, list):
                 raise ValueError(f"views = {short_repr(rows)}, expected a list")
-            return CameraPath(tuple(_parse_view(row, k, field) for k, row in enumerate(rows)))
+            return CameraPath(tuple(_parse_view(row, k, field, lighting) for k, row in enumerate(rows)))
 
 
 def mixed_lighting(one: EpisodeLighting, other: EpisodeLighting, share: float) -> EpisodeLighting:
@@ -149,7 +155,7 @@ def _lighting_row(lighting: EpisodeLighting) -> Any:
     return [float(x) for x in lighting.start] if " " in lighting.name else lighting.name
 
 
-def _parse_view(row: Any, number: int, field: BakedField) -> KeyView:
+def _parse_view(row: Any, number: int, field: BakedField, lighting: str) -> KeyView:
     if not isinstance(row, dict):
         raise ValueError(f"view {number} is {short_repr(row)}, expected a table")
     pose = np.array(row["camera_to_world"], np.float64)
@@ -163,7 +169,7 @@ def _parse_view(row: Any, number: int, field: BakedField) -> KeyView:
         raise ValueError(
             f"view {number}: time {time}, fov {fov}; expected a finite time, and fov from {_MIN_FOV:g} to {_MAX_FOV:g}°"
         )
-    return KeyView(time, pose, fov, _parse_lighting(row.get("lighting", field.lightings[0]), number, field))
+    return KeyView(time, pose, fov, _parse_lighting(row.get("lighting", lighting), number, field))
 
 
 def _parse_lighting(given: Any, number: int, field: BakedField) -> EpisodeLighting:
