@@ -219,6 +219,16 @@ def test_the_last_word_of_a_training_in_varied_light_is_under_held_out_light(sce
     assert choice["chosen"]["condition"] == "held-out+randomised"
 
 
+@pytest.mark.parametrize(
+    "changes, text",
+    [({}, "day, robot randomized"), ({"randomise": False}, "day"), ({"observe": "simulator"}, "day, robot randomized")],
+)
+def test_the_last_test_of_a_training_in_one_lighting_is_called_what_it_is(scene, tmp_path, scripted, changes, text):
+    """Weather and objects are not randomized there, as they are under `day+randomised`."""
+    choice = learn(scene, tmp_path, replace(CONFIG, steps=40, **changes))
+    assert choice["chosen"]["condition"] == text
+
+
 def test_failures_are_summed_up_by_place_cause_and_light():
     assert selection.failure_summary([]) == ""
     near = [Failure("out_of_bounds", 21.0 + k, "training: night 0.6, sun 0.4") for k in range(3)]

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from twin import commands, runtime
-from twin.config import Condition
 from twin.env.domain_randomization import condition_options
 from twin.errors import InputError
 from twin.evaluation.statistics import wilson
@@ -103,7 +102,7 @@ def _train(
         choice = train_until_learnt(twin, folder, config, watch, processes, [log] if log else [])
         if log:
             chosen, path = choice["chosen"], folder / "drive.mp4"
-            options = condition_options(Condition.parse(chosen["condition"]))
+            options = condition_options(config.shown_condition)
             _, episode = film(twin.scene.root, config.task, folder.name, config.seed, path, **options)
             caption = f"step {chosen['step']:,}, {episode.lighting}: {episode.cause or 'cut off'}"
             log.show(choice["steps"], write_success_curve(folder), path, caption)

@@ -13,7 +13,7 @@ follow. The kept policy is the one with most successes among those that drove a 
 If no policy reached the required rate, the best `_FINALISTS` policies drive whole tests first. The best of several
 results is biased upwards by luck. So the kept policy drives fresh episodes, which no decision used, in a *final test*.
 If the lighting varies, these episodes have held-out lightings and everything randomized, as in `twin validate` by
-default.
+default; otherwise only the robot is randomized.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +27,6 @@ import numpy as np
 from stable_baselines3.common.logger import KVWriter
 
 from twin import runtime
-from twin.config import HELD_OUT, Condition
 from twin.env.domain_randomization import condition_options
 from twin.env.vector_env import make_vector_env
 from twin.evaluation.training_curves import CHOICE_FILE
@@ -51,6 +50,7 @@ _TEST_EPISODES = sum(_BATCHES)
 _BETTER = 0.02  # least improvement that counts: of the success rate (absolute), of the mean distance (relative)
 _FINALISTS = 3
 _STREAM = 7  # part of the seed of the test episodes; see `training._TRAINING_STREAM`
+_ROBOT_ONLY = ", robot randomized"  # end of the final test's condition if place and weather are as filmed
 _PLACE = 5.0  # [m] length of the route sections in which failures are counted
 
 
@@ -144,8 +144,8 @@ def train_until_learnt(
 
     Returns:
         The contents of `choice.json`: the steps done and allowed; the required success rate and whether it is reached;
-        the reason why the training ended; the tests; `chosen`, the final test, with its condition; and a sentence on
-        where and why episodes failed.
+        the reason why the training ended; the tests; `chosen`, the final test, with a text on its condition; and a
+        sentence on where and why episodes failed.
     """
     if before := earlier_choice(twin, folder, config):
         return before
@@ -189,8 +189,9 @@ def _choose(
             for one in ranked[-_FINALISTS:]
         ]
     best = max(finalists, key=lambda one: (one.successes, one.reward))
-    condition = Condition(HELD_OUT, True) if config.lighting_varies else Condition(config.lighting, config.randomise)
-    options = condition_options(condition) if config.lighting_varies else {}
+    options = condition_options(config.shown_condition) if config.lighting_varies else {}
+    # `Condition.randomised` also means weather and distractor objects, which a training in one lighting never has.
+    robot_only = config.randomise and not config.lighting_varies
     fresh = PolicyTest.of(best.step, drive(best.step, seeds[_TEST_EPISODES:], "final test", options))
     copy_policy(checkpoint_folder(folder, best.step), folder)
     by_step = {one.step: one for one in [*tests, *finalists]}
@@ -201,7 +202,7 @@ def _choose(
         "reached": best.reached(config.success),
         "why": why,
         "candidates": [asdict(one) for one in by_step.values()],
-        "chosen": {**asdict(fresh), "condition": str(condition)},
+        "chosen": {**asdict(fresh), "condition": str(config.shown_condition) + _ROBOT_ONLY * robot_only},
         "failures": failure_summary([*best.failures, *fresh.failures]),
     }
     write_json(folder / CHOICE_FILE, out)

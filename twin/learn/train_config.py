@@ -7,7 +7,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from twin.config import ANY, HELD_OUT, STEERING, TRAINING, TWIST
+from twin.config import ANY, HELD_OUT, STEERING, TRAINING, TWIST, Condition
 from twin.env.domain_randomization import Ranges
 from twin.env.options import CPU, CUDA, NERF, SIMULATOR, Rewards
 from twin.errors import InputError, short_repr
@@ -141,6 +141,11 @@ class TrainConfig:
     @property
     def lighting_varies(self) -> bool:
         return self.observe == NERF and self.lighting == TRAINING
+
+    @property
+    def shown_condition(self) -> Condition:
+        """Condition in which the trained policy is shown: that of `twin validate`, or the training's one lighting."""
+        return Condition(HELD_OUT, True) if self.lighting_varies else Condition(self.lighting)
 
     def options(self) -> dict[str, Any]:
         # The goal's reward equals the discounted sum of step rewards for ever; for less, a policy would linger before
