@@ -28,6 +28,7 @@ from twin.env.vector_env_local import LocalVectorEnv, mixture_text
 from twin.errors import InputError
 from twin.geometry.images import resize
 from twin.nerf.lightings import Lightings
+from twin.robot import HuskyParams
 
 SMALL = {"size": (32, 18)}
 OPTION_SETS = {
@@ -353,6 +354,22 @@ def test_unknown_tasks_and_options_are_refused(scene):
     for options in ({"action": "jump"}, {"stack": 0}, {"control_timestep": 0.5}, {"rewards": {"fame": 1.0}}):
         with pytest.raises(InputError):
             twin.load(scene, "bend", **options)
+
+
+def test_a_speed_that_leaves_too_little_time_is_refused_if_given(scene, tmp_path):
+    """The robot's limit is 1 m/s; the goal of the segment of 10 m is reached after 9.5 m."""
+    for speed, times in ((1.5, {}), (3.0, {"time_limit": 15.0})):
+        environment = twin.load(scene, "bend", seed=0, pixels=False, speed=speed, **times)
+        driven(environment, RouteDriver())
+        assert environment.task.cause == "goal"
+    with pytest.raises(InputError, match=r"speed = 3 m/s, but the robot's limit is 1 m/s: .* 6\.7 s.* at most 1, or a"):
+        twin.load(scene, "bend", pixels=False, speed=3.0)
+    slow = twin.load_scene(tiny_twin(tmp_path, robot=HuskyParams(max_speed=0.4)))
+    with pytest.raises(InputError, match=r"speed = 1 m/s, but the robot's limit is 0\.4 m/s"):
+        twin.load(slow, "bend", pixels=False, speed=1.0)
+    environment = twin.load(slow, "bend", seed=0, pixels=False)
+    driven(environment, RouteDriver())
+    assert environment.task.cause == "goal" and environment.task.options.speed == 0.4
 
 
 def test_the_sampled_lighting_is_named(scene):

@@ -82,6 +82,11 @@ class Motion:
     """Time since the start of the episodes [s], shape (k,)."""
 
 
+def default_time_limit(segment: RouteSegment, speed: float) -> float:
+    """Twice the time [s] that the route segment takes at a speed [m/s]."""
+    return 2.0 * segment.length / speed
+
+
 class RewardAndTermination:
     """Reward, termination and state of n drives along one route segment.
 
@@ -95,7 +100,7 @@ class RewardAndTermination:
         self.segment, self.options = segment, options
         self.half_width = options.half_width or world.half_width
         """Half width of the corridor [m]."""
-        self.time_limit = options.time_limit or 2.0 * segment.length / options.speed
+        self.time_limit = options.time_limit or default_time_limit(segment, options.speed)
         """[s]"""
         self.foot, self.cross_track = np.zeros(count), np.zeros(count)
         """Arc length of the foot, and signed distance from the route, positive to the left [m], shape (n,)."""
