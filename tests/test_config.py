@@ -91,6 +91,10 @@ def test_nested_table_and_integer_for_float(tmp_path):
             (_MINIMAL + f'[[task]]\nname = "{name}"\nlength = 5\n', "files are named after it")
             for name in ("a/b", "..", ".x", "a\\u0000", "x" * 81, " ", "\u6f22" * 60)
         ),
+        (
+            _MINIMAL + "[[task]]\nname = 'a'\nlength = 0.6\n",
+            "length ≥ 1 [m]: a shorter task would be done at once",
+        ),
         (_MINIMAL + 2 * '[[task]]\nname = "a"\nlength = 5\n', "two [[task]] are named 'a'"),
         (_MINIMAL + '[[obstacle]]\nkind = "cone"\nname = "a/b"\n', "files are named after it"),
         (_MINIMAL + '[[obstacle]]\nkind = "cone"\n[[obstacle]]\nkind = "box"\nname = "cone_0"\n', "named 'cone_0'"),

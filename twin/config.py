@@ -385,7 +385,7 @@ class TaskConfig:
     start: float = 0.0
     """Arc length on the route at which the segment starts [m]."""
     length: float = 0.0
-    """Length of the segment [m]."""
+    """Length of the segment [m], at least 1."""
     route: str = ""
     """Name of the [[branch]] that the task drives along; by default the route."""
 
