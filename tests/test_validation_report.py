@@ -351,6 +351,14 @@ def test_a_film_names_the_mixture_of_a_sampled_lighting(fresh, tmp_path, monkeyp
     assert episode.lighting == lighting and len(shown) == 1 and re.fullmatch(told, shown[0])
 
 
+def test_films_of_other_drivers_and_obstacles_have_other_names(fresh, monkeypatch):
+    monkeypatch.setattr(film, "write_episode_video", lambda *_: None)
+    drives = ({}, {"policy": "ahead"}, {"obstacles": 0})
+    names = [film.film(fresh, "ahead", seed=5, lighting="day", **one)[0].name for one in drives]
+    ends = ("scripted_driver_5", "ahead_5", "0_obstacles_scripted_driver_5")
+    assert names == [f"ahead_day_{end}.mp4" for end in ends]
+
+
 @pytest.mark.parametrize("count", [1, 4, 27, 1000])
 def test_a_curve_has_points_of_five_episodes_and_no_more_than_it_can_show(count):
     won = np.arange(count) % 3 == 0

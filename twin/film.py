@@ -59,8 +59,9 @@ def film(
         task: See `twin.load`.
         policy: A run's name, or a source as in `twin.learn.policy.load_policy`; None: the scripted driver.
         seed: Seed of the episode.
-        out: The mp4 file; by default `films/<task>_<lighting>_<seed>.mp4` in the scene's folder, or for a pack
-            `<pack>_<task>_<lighting>_<seed>.mp4` in the working folder.
+        out: The mp4 file; by default `films/<task>_<lighting>_<driver>_<seed>.mp4` in the scene's folder, or for a pack
+            `<pack>_<task>_<lighting>_<driver>_<seed>.mp4` in the working folder; with a number of random obstacles,
+            `<number>_obstacles` comes before the driver.
         trust: Allows a policy file to run code.
         rerun: A file for a Rerun recording, see `twin.report.rerun_recording`; None: no recording.
         options: See `twin.env.options.Options`; by default those of the policy.
@@ -91,7 +92,9 @@ def film(
     max_steps = round(environment.task.time_limit / environment.task.options.control_timestep)
     with runtime.bar("drive", max_steps, "step") as progress:
         episode = record_episode(environment, driver, watch)
-    name = film_name(task, episode.lighting, seed)
+    obstacles = options.get("obstacles")
+    standing = [f"{obstacles}_obstacles"] if isinstance(obstacles, int) else []
+    name = film_name(task, episode.lighting, *standing, driver_name, seed)
     in_cache = is_cached(scene.scene.root)
     path = out or (Path(f"{root.stem}_{name}") if in_cache else scene.scene.root / "films" / name)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -178,8 +181,9 @@ def _driver(
     return PolicyDriver(loaded), loaded.name, {**loaded.options(), **options}
 
 
-def film_name(task: str, lighting: str, seed: int) -> str:
-    return "".join(c if c.isalnum() or c in "-." else "_" for c in f"{task}_{lighting}_{seed}") + ".mp4"
+def film_name(*parts: str | int) -> str:
+    """Name of a film's file, made of what determines its episode, such as task, lighting and seed."""
+    return "".join(c if c.isalnum() or c in "-." else "_" for c in "_".join(map(str, parts))) + ".mp4"
 
 
 def command(given: argparse.Namespace) -> None:
