@@ -1,6 +1,8 @@
 """Environments: interfaces of dm_env, Gymnasium and stable-baselines3, rewards, starts and rendering."""
 
+import copy
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -333,6 +335,30 @@ def test_scene_obstacles_exist_and_move(tmp_path):
     none = twin.load(tmp_path, "bend", seed=0, pixels=False, obstacles=())
     none.reset()
     assert none.task.obstacles == ()
+
+
+@pytest.mark.parametrize("make", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_like_its_original(tmp_path, make):
+    """Commands under way, the controller, delayed pictures and moving obstacles are copied, too."""
+    walker = ObstacleConfig("walker", "pedestrian", station=6.0, lateral=-2.5, to=(6.0, 2.5), speed=1.0)
+    robot = HuskyParams(controller="ros2", command_latency=0.15, camera_latency=0.1)
+    options = {"pixels": False, "obstacles": [walker], "randomise": True, "control_timestep": 0.05}
+    env = DriveEnv(tiny_twin(tmp_path, robot=robot), "bend", **options)
+    env.reset(seed=1)
+    for _ in range(7):
+        env.step(np.array([1.0, 0.5]))
+    other = make(env)
+    before, copies = env.vector_env.physics[0], [other.vector_env.physics[0], env.vector_env.physics[0].copy()]
+    for _ in range(10):
+        one, another = env.step(np.array([1.0, -0.5])), other.step(np.array([1.0, -0.5]))
+        np.testing.assert_array_equal(one[0], another[0])
+        assert one[1:] == another[1:]
+        copies[1].robot.command(*env.vector_env.tasks[0].commands(np.array([[1.0, -0.5]]))[0])
+        copies[1].step(25)
+        for physics in copies:
+            np.testing.assert_array_equal(physics.data.qpos, before.data.qpos)
+            np.testing.assert_array_equal(physics.data.mocap_pos, before.data.mocap_pos)
+            np.testing.assert_array_equal(physics.camera_to_world, before.camera_to_world)
 
 
 def test_unknown_tasks_and_options_are_refused(scene):

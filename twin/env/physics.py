@@ -36,6 +36,15 @@ class _Snapshot(NamedTuple):
     mocap_quat: Array
 
 
+class EpisodeState(NamedTuple):
+    """State of an episode that MuJoCo's data does not contain; see `HuskyPhysics`."""
+
+    controller: Controller
+    steps_to_update: int
+    touched: set[int]
+    snapshots: list[_Snapshot]
+
+
 class HuskyPhysics:
     """Steps one Husky in one model."""
 
@@ -107,6 +116,14 @@ class HuskyPhysics:
         """Substeps until the controller's next update."""
         self._touched = self._contacts()
         self._snapshots = [self._snapshot()]
+
+    def episode_state(self) -> EpisodeState:
+        """State of the episode besides `data`; shared with this instance, so copy it before either steps on."""
+        return EpisodeState(self.controller, self.steps_to_update, self._touched, self._snapshots)
+
+    def set_episode_state(self, state: EpisodeState) -> None:
+        """Goes on with an episode whose state `data` contains already."""
+        self.controller, self.steps_to_update, self._touched, self._snapshots = state
 
     def _ground_height(self, xy: Array) -> Array:
         relief = self.model.hfield_size[self.model.geom_dataid[self._ground], 2]

@@ -7,6 +7,7 @@ lighting, obstacles, camera and weather have separate random generators: a chang
 others unchanged.
 """
 
+import copy
 import math
 import sys
 import warnings
@@ -26,7 +27,7 @@ from twin.config import CAUSES, STEERING, ObstacleConfig
 from twin.env.domain_randomization import NominalModel, RandomizationSample
 from twin.env.obstacles import EpisodeObstacles, ObstacleMotion
 from twin.env.options import STATE_SIZES, Options, check_actions
-from twin.env.physics import HuskyPhysics
+from twin.env.physics import EpisodeState, HuskyPhysics
 from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
 from twin.files import write_json
@@ -196,12 +197,13 @@ class DrivePhysics(dm_mujoco.Physics):
     @staticmethod
     def of(model: mujoco.MjModel, params: HuskyParams) -> "DrivePhysics":
         """Returns physics that steps `model` itself, not a copy; `episode_spec` must have made it for this robot."""
-        physics = DrivePhysics(wrapper.MjData(wrapper.MjModel(model)))
+        data = wrapper.MjData(wrapper.MjModel(model))
+        mujoco.mj_forward(model, data.ptr)
+        physics = DrivePhysics(data)
         physics.set_robot(params)
         return physics
 
     def _reload_from_data(self, data: Any) -> None:
-        mujoco.mj_forward(data.model.ptr, data.ptr)
         # Set before the call of super(), which calls `after_reset`.
         self.robot = HuskyPhysics(data.model.ptr, self._params, data.ptr)
         super()._reload_from_data(data)
@@ -215,15 +217,28 @@ class DrivePhysics(dm_mujoco.Physics):
 
     def copy(self, share_model: bool = False) -> "DrivePhysics":
         physics = super().copy(share_model)
-        physics.set_robot(self._params)
+        physics._continue(*copy.deepcopy(self._episode()))
         return physics
 
     def __getstate__(self) -> Any:
-        return self.data, self._params
+        return self.data, *self._episode()
 
     def __setstate__(self, state: Any) -> None:
-        data, self._params = state
+        data, *episode = state
         super().__setstate__(data)
+        self._continue(*episode)
+
+    def _episode(self) -> tuple[HuskyParams, tuple[ObstacleConfig, ...] | None, EpisodeState]:
+        """What a copy needs besides `data` to go on with the episode."""
+        moved = self.robot.move_obstacles
+        obstacles = moved.obstacles if isinstance(moved, ObstacleMotion) else None
+        return self._params, obstacles, self.robot.episode_state()
+
+    def _continue(self, params: HuskyParams, obstacles: tuple[ObstacleConfig, ...] | None, state: EpisodeState) -> None:
+        self.set_robot(params)
+        self.robot.set_episode_state(state)
+        if obstacles is not None:
+            self.robot.move_obstacles = ObstacleMotion(obstacles, self.data.ptr)
 
     def after_reset(self) -> None:
         super().after_reset()
