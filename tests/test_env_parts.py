@@ -379,6 +379,8 @@ def test_a_dataset_has_the_drives_that_are_filmed(scene, tmp_path, capsys):
     assert capsys.readouterr().out.startswith("2 drives, ")
     rows = parquet.read_table(out / "data/chunk-000/file-000.parquet").to_pydict()
     numbers, actions = np.array(rows["episode_index"]), np.float32(rows["action"])
+    kept = parquet.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
+    assert kept["twin.seed"] == [4, 5]  # those that repeat the drives below
     for k in range(2):
         environment, seen = twin.load(scene, "ahead", 4 + k), []
         episode = record_episode(environment, RouteDriver(), lambda step, seen=seen: seen.append(step.observation))

@@ -71,6 +71,7 @@ def test_a_recording_holds_the_drive(scene, tmp_path, capsys):
         assert decoded.shape == picture.shape and np.abs(decoded.astype(int) - picture).mean() < 8.0
     text = " ".join(np.ravel(values("/events", "text")).tolist())
     assert "goal after 3." in text and "lighting night" in text
+    assert "task ahead, seed 3" in text
 
 
 @pytest.mark.parametrize(

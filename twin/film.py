@@ -91,7 +91,7 @@ def film(
 
     max_steps = round(environment.task.time_limit / environment.task.options.control_timestep)
     with runtime.bar("drive", max_steps, "step") as progress:
-        episode = record_episode(environment, driver, watch)
+        episode = replace(record_episode(environment, driver, watch), seed=seed)
     obstacles = options.get("obstacles")
     standing = [f"{obstacles}_obstacles"] if isinstance(obstacles, int) else []
     name = film_name(task, episode.lighting, *standing, driver_name, seed)
@@ -162,7 +162,7 @@ def record_dataset(
             environment.task.seed(seed + k)
             pictures.clear()
             motion.clear()
-            recorded.append(record_episode(environment, driver, watch))
+            recorded.append(replace(record_episode(environment, driver, watch), seed=seed + k))
             dataset.add(recorded[-1], pictures, np.array(motion))
             progress.update()
         dataset.finish()

@@ -45,7 +45,7 @@ class Episode:
     lighting: str
     """Name of the lighting; empty without images."""
     seed: int
-    """Seed of this episode."""
+    """Seed of this episode, as sampled by the task; of a drive recorded by `twin film`, the seed to repeat it with."""
     randomisation: dict[str, Any]
     obstacles: tuple[ObstacleConfig, ...]
 
