@@ -371,6 +371,8 @@ def test_unknown_tasks_and_options_are_refused(scene):
     for name in ("obstacles", "state"):
         with pytest.raises(InputError, match=rf"{name} = array\(\[1, 2\]\); expected"):
             twin.load(scene, "bend", **{name: np.array([1, 2])})
+    with pytest.raises(InputError, match=r"9 obstacles on a route of 10\.0 m; expected at most [1-8]"):
+        twin.load(scene, "bend", obstacles=9)
     assert parse_options({"obstacles": np.int64(3)}) == parse_options({"obstacles": 3})
     with pytest.raises(InputError, match=r"control_timestep = 0\.015; expected a multiple of 0\.002 \[s\]"):
         twin.load(scene, "bend", control_timestep=0.015)

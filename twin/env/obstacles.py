@@ -338,10 +338,7 @@ def random_obstacles(
     Raises:
         InputError: the route is too short for `count` obstacles.
     """
-    length = float(arc_lengths(world.route)[-1])
-    room = length - sum(_FREE_ENDS)
-    if room <= 0.0 or count > room:
-        raise InputError(f"{count} obstacles on a route of {length:.1f} m; expected at most {max(0, int(room))}")
+    room = _room_for(count, world)
     spacing = min(_SPACING, 0.8 * room / max(count, 1))
     # Sorted uniform samples plus multiples of the spacing are uniform over all arrangements that keep this spacing.
     free = np.sort(rng.uniform(0.0, room - spacing * (count - 1), count)) if count else np.zeros(0)
@@ -355,6 +352,15 @@ def random_obstacles(
         yaw = float(rng.uniform(-180.0, 180.0)) if kind in STATIC_KINDS else 0.0
         out.append(ObstacleConfig(f"random_{k}", kind, float(station), float(lateral), yaw))
     return tuple(out)
+
+
+def _room_for(count: int, world: World) -> float:
+    """Length of the route's part for random obstacles [m]. Raises InputError: it is too short for `count` of them."""
+    length = float(arc_lengths(world.route)[-1])
+    room = length - sum(_FREE_ENDS)
+    if room <= 0.0 or count > room:
+        raise InputError(f"{count} obstacles on a route of {length:.1f} m; expected at most {max(0, int(room))}")
+    return room
 
 
 def random_distractors(world: World, rng: np.random.Generator, count: int) -> tuple[ObstacleConfig, ...]:
@@ -399,6 +405,9 @@ class EpisodeObstacles:
             world: Contains route and corridor.
             segment: Route segment along which random obstacles stand.
             beside: Largest number of distractor objects.
+
+        Raises:
+            InputError: the segment is too short for the random obstacles.
         """
         self._count = wanted if isinstance(wanted, int) else 0
         self._given = () if isinstance(wanted, int) else tuple(wanted)
@@ -406,6 +415,8 @@ class EpisodeObstacles:
         self._colors = np.random.default_rng(_COLOR_SEED).uniform(0.05, 0.9, (len(STATIC_KINDS), beside, 3))
         s = np.append(np.arange(segment.start, segment.end, _ROUTE_STEP), segment.end)
         self._segment_world, self._start = replace(world, route=point_at(world.route, s)), segment.start
+        if self._count:
+            _room_for(self._count, self._segment_world)
 
     @property
     def pool(self) -> tuple[ObstacleConfig, ...]:
