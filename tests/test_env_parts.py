@@ -152,6 +152,7 @@ def test_sampled_lightings_follow_the_option(field):
     np.testing.assert_allclose(mixed, 0.75 * field.embedding("day") + 0.25 * field.embedding("night"), atol=1e-6)
     names = {sample_lighting(("day", "night"), False, 1.0, sets, rng).name for _ in range(30)}
     assert names == {"day", "night"}
+    assert sample_lighting(("day",), True, 10.0, sets, rng).name == "day → night"
     drifting = sample_lighting("day", True, 10.0, sets, rng)
     assert drifting.name == "day → night"
     np.testing.assert_allclose(drifting.at(5.0), 0.5 * (field.embedding("day") + field.embedding("night")), atol=1e-6)

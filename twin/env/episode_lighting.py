@@ -180,6 +180,8 @@ def sample_lighting(
     Raises:
         InputError: a lighting is unknown, a set has no lighting, or there is no second lighting for the drift.
     """
+    if not isinstance(lighting, str) and len(lighting) == 1:
+        lighting = lighting[0]
     name, start, fog, suns = _sample_one(lighting, sets, rng)
     if not drift:
         return EpisodeLighting(name, start, fog=fog, sunlight=suns)
