@@ -578,6 +578,9 @@ def test_wrong_gymnasium_arguments_are_refused(scene):
     with pytest.raises(InputError, match="expected none: give them"):
         environment.reset(options={"lighting": "night"})
     environment.reset()
+    for action in (np.array([np.nan, 0.0]), np.zeros((1, 2)), None):
+        with pytest.raises(ValueError, match=r"^action .*; expected finite numbers of shape \(2,\)$"):
+            environment.step(action)
     assert environment.step(environment.action_space.sample())[3]
     with pytest.raises(gymnasium.error.ResetNeeded, match="after the end of an episode"):
         environment.step(environment.action_space.sample())

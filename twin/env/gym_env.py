@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from twin.env.mujoco_renderer import ChaseCamera, SceneCamera
 from twin.env.observation import PixelObserver
-from twin.env.options import IMAGE_SIZE, check_option, parse_options, state_size
+from twin.env.options import IMAGE_SIZE, check_actions, check_option, parse_options, state_size
 from twin.env.vector_env import ProcessVectorEnv, make_vector_env
 from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError, short_repr
@@ -157,7 +157,7 @@ class DriveEnv(gymnasium.Env):
     def step(self, action: NDArray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self._over or not self._started:
             raise ResetNeeded("step before reset, or after the end of an episode; call reset() first")
-        out = self.vector_env.step(np.asarray(action)[None])
+        out = self.vector_env.step(check_actions(action, (self.vector_env.action_size,))[None])
         if self._chase:
             self._chase_pose = self._chase.follow(self._local.physics[0].base_to_world)
         end = bool(out.terminated[0]), bool(out.truncated[0])
