@@ -197,6 +197,10 @@ def test_vector_environments_reset_in_the_same_step(scene):
         with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="is closed; make a new one"):
             call()
     vectors = DriveVecEnv(scene, "bend", 2, seed=1, **options)
+    vectors.set_options({"lighting": "night"})
+    with pytest.raises(InputError, match=r"options of reset = .*; expected none: give them to the constructor"):
+        vectors.reset()
+    vectors.set_options(None)
     np.testing.assert_array_equal(vectors.reset(), first)
     for _ in range(5):
         out, _, done, infos = vectors.step(np.zeros((2, 2), np.float32))

@@ -100,9 +100,10 @@ def _check_view(size: Any, view: str | None, pixels: bool) -> tuple[str, tuple[i
     return view, (int(size[0]), int(size[1]))
 
 
-def _check_reset_options(options: dict[str, Any] | None) -> None:
+def check_reset_options(options: dict[str, Any] | None) -> None:
+    """Raises InputError: there are options of `reset`; an environment gets its options when it is made."""
     if options:
-        raise InputError(f"options of reset = {short_repr(options)}; expected none: give them to gymnasium.make")
+        raise InputError(f"options of reset = {short_repr(options)}; expected none: give them to the constructor")
 
 
 class DriveEnv(gymnasium.Env):
@@ -142,7 +143,7 @@ class DriveEnv(gymnasium.Env):
         self.observation_space, self.action_space = make_spaces(self.vector_env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        _check_reset_options(options)
+        check_reset_options(options)
         super().reset(seed=seed)
         if seed is not None:
             self.vector_env.seed(0, seed)
@@ -229,7 +230,7 @@ class DriveVectorEnv(VectorEnv):
     ) -> tuple[Any, dict[str, Any]]:
         """Resets all environments; if `seed` is one number, environment i gets `seed` + i."""
         self._check_open()
-        _check_reset_options(options)
+        check_reset_options(options)
         if seed is None or isinstance(seed, int | np.integer):
             seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
         elif len(seeds := list(seed)) != self.num_envs:

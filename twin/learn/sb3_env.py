@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from twin.env.gym_env import make_spaces, observations, of_one
+from twin.env.gym_env import check_reset_options, make_spaces, observations, of_one
 from twin.env.vector_env import make_vector_env
 from twin.loading import Twin
 
@@ -46,6 +46,9 @@ class DriveVecEnv(VecEnv):
         self.seed(seed)
 
     def reset(self) -> Any:
+        """Resets all environments. Raises InputError: `set_options` gave options."""
+        for options in self._options:
+            check_reset_options(options)
         for i, seed in enumerate(self._seeds):
             if seed is not None:
                 self.vector_env.seed(i, seed)
