@@ -1,10 +1,10 @@
 """Reads drive logs from files: tables, windows in the format of the DRIVE dataset, and bags.
 
 A bag becomes a table with a row per joint state and the newest values of the other topics; a command older than the
-controllers' longest time-out counts as 0. If a bag has no joint
-states, the wheel speeds are computed from the wheels' odometry by the inverse of Clearpath's kinematics. Poses that
-come from the wheels are not used, since they hide the wheels' slip. If a bag has no other poses, but a scene was built
-from its pictures, the poses are those of a robot at rest below the reconstructed cameras.
+controllers' longest time-out counts as 0. If a bag has no joint states, the wheel speeds are computed from the wheels'
+odometry by the inverse of Clearpath's kinematics. Poses that come from the wheels are not used, since they hide the
+wheels' slip. If a bag has no other poses, but a scene was built from its pictures, the poses are those of a robot at
+rest below the reconstructed cameras.
 """
 
 import csv
