@@ -9,8 +9,9 @@ window *follows* the previous one if it begins when that one ends. A pose is *fr
 - bags, which it converts to the columns of a table;
 - a table (.csv, or .npz of equally long columns) with one row per instant: `time` [s]; commands, either `cmd_v` [m/s]
   and `cmd_yaw_rate` [rad/s], or `cmd_left` and `cmd_right` [rad/s at the wheels]; `left_wheel_vel`, `right_wheel_vel`
-  [rad/s]; `x`, `y` [m], `yaw` [rad] of the base in any fixed frame; optionally `acceleration_x`, `acceleration_y`
-  [m/s²], proper acceleration in the base (x forward, y left; an IMU's raw reading), and `group`;
+  [rad/s]; `x`, `y` [m], `yaw` [rad, counterclockwise from x] of the base in any fixed frame with z up; optionally
+  `acceleration_x`, `acceleration_y` [m/s²], proper acceleration in the base (x forward, y left; an IMU's raw reading),
+  and `group`;
 - windows as published with DRIVE (Samson et al., BSD-3): an .npz of arrays (n, 40) at 20 Hz.
 """
 
