@@ -56,7 +56,7 @@ from twin.view.guarded_server import Gate, HeldKeys, open_server
 from twin.view.layers import _trust_map, clicked_frame, scene_layers
 from twin.view.panels import PathPanel, slider_lighting
 from twin.view.picture_loop import COARSE_AREA, FilmedFrame, PictureLoop, Shot, add_film, film_camera, picture_size
-from twin.view.scene_picture import FreeCamera, ScenePicture
+from twin.view.scene_picture import FreeCamera, ObjectState, ScenePicture
 
 SIZE = (160, 90)
 INTRINSICS = np.array([100.0, 100.0, 80.0, 45.0])
@@ -691,27 +691,6 @@ def test_a_view_added_in_flight_keeps_fog_and_sun(page, field, tmp_path, monkeyp
     assert (again.fog, again.sunlight) == (added.fog, added.sunlight)
 
 
-def test_a_loaded_path_keeps_its_times_until_it_is_changed(page, field, tmp_path, monkeypatch):
-    monkeypatch.setattr("twin.view.panels.is_cached", lambda root: True)
-    monkeypatch.chdir(tmp_path)
-    panel, file = PathPanel(page.viewer), tmp_path / "paths" / "path.json"
-    panel._keys = _views(field, 0.5)
-
-    def saved_times() -> list[float]:
-        panel._save()
-        return [view.time for view in CameraPath.load(file, field).views]
-
-    assert saved_times() == [0.0, 1.0]
-    by_script = file.read_text().replace('"time": 1.0', '"time": 8.5')
-    for change in (lambda: panel._remove_views(0), lambda: setattr(panel._speed, "value", 2.0)):
-        file.write_text(by_script)
-        panel._load()
-        assert "8.5 s" in panel._note.content and saved_times() == [0.0, 8.5]
-        change()
-        assert "1.0 s" in panel._note.content and saved_times() == [0.0, 1.0]
-    panel._remove_views(2)
-
-
 def test_a_path_that_cannot_be_shown_or_saved_is_a_notice(page, field, notices, monkeypatch):
     viewer, panel = page.viewer, page._path
     monkeypatch.setattr(panel, "_keys", _views(field, 6000.0))
@@ -736,16 +715,57 @@ def test_results_of_a_pack_are_written_to_the_working_folder(page, field, tmp_pa
     assert len(CameraPath.load(tmp_path / "paths" / "path.json", field).views) == 2
 
 
+def test_a_loaded_path_keeps_its_times_until_it_is_changed(page, field, tmp_path, monkeypatch):
+    monkeypatch.setattr("twin.view.panels.is_cached", lambda root: True)
+    monkeypatch.chdir(tmp_path)
+    panel, file = PathPanel(page.viewer), tmp_path / "paths" / "path.json"
+    panel._keys = _views(field, 0.5)
+
+    def saved_times() -> list[float]:
+        panel._save()
+        return [view.time for view in CameraPath.load(file, field).views]
+
+    assert saved_times() == [0.0, 1.0]
+    by_script = file.read_text().replace('"time": 1.0', '"time": 8.5')
+    for change in (lambda: panel._remove_views(0), lambda: setattr(panel._speed, "value", 2.0)):
+        file.write_text(by_script)
+        panel._load()
+        assert "8.5 s" in panel._note.content and saved_times() == [0.0, 8.5]
+        change()
+        assert "1.0 s" in panel._note.content and saved_times() == [0.0, 1.0]
+    panel._remove_views(2)
+
+
 def test_pages_of_four_sizes_keep_their_compositors(scene, field, monkeypatch):
     made = []
-    monkeypatch.setattr("twin.env.compositor.Compositor", lambda *given, **more: made.append(given))
+
+    def make(*given, **more):
+        made.append(given)
+        return SimpleNamespace(set_intrinsics=lambda intrinsics: None)
+
+    monkeypatch.setattr("twin.env.compositor.Compositor", make)
     picture = ScenePicture(field)
     picture.add_objects(scene.world(), ())
-    for _ in range(2):
+    for fov in (1.0, 0.8):
         for width in (320, 330, 340, 350):
             for scale in (1, 4):
-                picture._compositor(FreeCamera.of_fov(np.eye(4), 1.0, (scale * width, scale * 180)))
+                picture._compositor(FreeCamera.of_fov(np.eye(4), fov, (scale * width, scale * 180)))
     assert len(made) == 8
+
+
+def test_a_picture_of_a_part_of_the_view_shows_its_objects(scene, field):
+    """The objects follow a camera whose angle of view and principal point change."""
+    picture, day = ScenePicture(field), named_lighting(field, "day")
+    picture.add_objects(scene.world(), ())
+    objects = ObjectState.of(picture._data)
+    robot = objects.qpos[:3]
+    pose = look_at(robot + np.array([-2.0, 0.5, 0.8]), robot)
+    whole = FreeCamera.of_fov(pose, 0.9, (320, 180))
+    part = FreeCamera(pose, whole.intrinsics - np.array([0.0, 0.0, 100.0, 60.0]), (160, 90))
+    picture.render(FreeCamera.of_fov(pose, 0.5, part.size), day, objects)
+    expected, alone = (picture.render(whole, day, shown).rgb[0, 60:150, 100:260] for shown in (objects, None))
+    changed = np.abs(picture.render(part, day, objects).rgb[0] - expected)
+    assert np.abs(expected - alone).mean() > 0.05 and changed.mean() < 0.001
 
 
 def test_a_page_that_closes_while_it_connects_is_not_rendered(page, monkeypatch):

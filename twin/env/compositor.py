@@ -66,7 +66,6 @@ class ObjectRenderer:
             size: Width, height of the picture [px].
         """
         self.size = size
-        self._intrinsics = camera_intrinsics(model, camera, size)
         colors = _geom_rgba(model)
         drawn = np.isin(model.geom_group, (OBSTACLE_GROUP, ROBOT_VISUAL_GROUP)) & (colors[:, 3] > 0.0)
         drawn[camera_mount_geoms(model, camera)] = False
@@ -75,9 +74,7 @@ class ObjectRenderer:
         self._bodies, self._owner = np.unique(owners, return_inverse=True)
         self._colors = colors[self.geoms, :3]
         self._centers, self._halves = model.geom_aabb[self.geoms, :3], model.geom_aabb[self.geoms, 3:]
-        fx, fy, cx, cy = self._intrinsics
-        # Inward normals of the view frustum's planes in the camera frame; the last plane lies `_NEAR_PLANE` ahead.
-        self._planes = np.array([[fx, 0, cx], [-fx, 0, size[0] - cx], [0, fy, cy], [0, -fy, size[1] - cy], [0, 0, 1.0]])
+        self.set_intrinsics(camera_intrinsics(model, camera, size))
         if len(self.geoms) == 0:
             return
         small = _geoms_only_model(model, self.geoms)
@@ -98,9 +95,17 @@ class ObjectRenderer:
             enable_emission=False,
         )
         self._cast(self._rays(pixel_grid(2, 2).reshape(-1, 2)))  # compiles the kernels
-        pixels = pixel_grid(*size).reshape(-1, 2)
-        self._center_rays = self._rays(pixels)
-        self._subpixel_rays = np.stack([self._rays(pixels + offset) for offset in _SUBPIXELS], 1)
+
+    def set_intrinsics(self, intrinsics: Array) -> None:
+        """Changes the camera's fx, fy, cx, cy [px], shape (4,)."""
+        self.intrinsics = intrinsics
+        (fx, fy, cx, cy), (width, height) = intrinsics, self.size
+        # Inward normals of the view frustum's planes in the camera frame; the last plane lies `_NEAR_PLANE` ahead.
+        self._planes = np.array([[fx, 0, cx], [-fx, 0, width - cx], [0, fy, cy], [0, -fy, height - cy], [0, 0, 1.0]])
+        if len(self.geoms):
+            pixels = pixel_grid(width, height).reshape(-1, 2)
+            self._center_rays = self._rays(pixels)
+            self._subpixel_rays = np.stack([self._rays(pixels + offset) for offset in _SUBPIXELS], 1)
 
     def visible_mask(self, data: mujoco.MjData, pose: Array) -> NDArray[np.bool_] | None:
         """Mask (height, width) of pixels that geoms may cover, seen from an OpenCV pose; None if no geom is in view."""
@@ -124,7 +129,7 @@ class ObjectRenderer:
         if (z < _NEAR_PLANE).any():
             mask[:] = True
             return mask
-        fx, fy, cx, cy = self._intrinsics
+        fx, fy, cx, cy = self.intrinsics
         u, v = fx * x / z + cx, fy * y / z + cy
         sides = np.stack([u.min(1) - 1, u.max(1) + 2, v.min(1) - 1, v.max(1) + 2], 1)
         sides = np.clip(sides, 0, [width, width, height, height]).astype(int)
@@ -177,7 +182,7 @@ class ObjectRenderer:
 
     def _rays(self, pixels: Array) -> Array32:
         """Unit rays through (u, v) [px] in MuJoCo's camera axes, shapes (n, 2) → (n, 3)."""
-        return mujoco_rays(unproject(pixels, self._intrinsics))
+        return mujoco_rays(unproject(pixels, self.intrinsics))
 
     def _cast(self, rays: Array32) -> tuple[NDArray[np.int32], Array32, Array32]:
         """Casts rays (n, 3); returns the indices in `geoms` of the geoms hit (−1: none), normals and z-depths [m]."""
@@ -324,6 +329,13 @@ class Compositor:
         self._estimator = IrradianceEstimator(field, *self._lit) if shaded and self._shadows.bodies else None
         self._rays = unproject(pixel_grid(*size), self.intrinsics)
 
+    def set_intrinsics(self, intrinsics: Array) -> None:
+        """Changes the camera's fx, fy, cx, cy [px], shape (4,); not while another thread renders."""
+        if not np.array_equal(intrinsics, self.intrinsics):
+            self.intrinsics, self._rays = intrinsics, unproject(pixel_grid(*self.size), intrinsics)
+            for worker in self._workers:
+                worker.renderer.set_intrinsics(intrinsics)
+
     def render(
         self,
         datas: Sequence[mujoco.MjData],
@@ -412,7 +424,7 @@ class _CompositorWorker:
 
     def __init__(self, model: mujoco.MjModel, field: BakedField, camera: int, size: tuple[int, int]):
         self.renderer = ObjectRenderer(model, camera, size)
-        self._field, self._intrinsics = field, camera_intrinsics(model, camera, size)
+        self._field = field
         self._fields: OrderedDict[tuple[int, int], BakedField] = OrderedDict()
 
     def foreground(self, pose: Array, drawn: RenderedObjects, lighting: Lighting) -> Rendering:
@@ -427,7 +439,7 @@ class _CompositorWorker:
             if len(self._fields) > _MAX_WINDOWS:
                 self._fields.popitem(last=False)
         self._fields.move_to_end((across, down))
-        view = Viewpoints.of(pose, self._intrinsics - np.array([0.0, 0.0, left, top]), (across, down))
+        view = Viewpoints.of(pose, self.renderer.intrinsics - np.array([0.0, 0.0, left, top]), (across, down))
         out = self._fields[across, down].render(view, lighting, stop=stop)
         inner = np.s_[0, :height, :width]
         return Rendering(out.rgb[inner], out.depth[inner], out.opacity[inner])

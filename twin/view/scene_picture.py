@@ -4,7 +4,6 @@ Without `add_objects`, only the field is rendered. After it, `twin.env.composito
 each picture for which an `ObjectState` with their positions is given.
 """
 
-import copy
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -48,11 +47,6 @@ class FreeCamera:
         focal = size[1] / 2.0 / np.tan(fov / 2.0)
         return FreeCamera(camera_to_world, np.array([focal, focal, size[0] / 2.0, size[1] / 2.0]), size)
 
-    @property
-    def fov(self) -> float:
-        """Vertical angle of view [rad]."""
-        return float(2.0 * np.arctan(self.size[1] / 2.0 / self.intrinsics[1]))
-
 
 @dataclass(frozen=True)
 class ObjectState:
@@ -74,7 +68,7 @@ class ScenePicture:
     def __init__(self, field: BakedField) -> None:
         self.field = field
         self._model: mujoco.MjModel | None = None
-        self._compositors: OrderedDict[tuple[int, int, float], Compositor] = OrderedDict()
+        self._compositors: OrderedDict[tuple[int, int], Compositor] = OrderedDict()
         self._lock = threading.Lock()
 
     def add_objects(self, world: World, obstacles: tuple[ObstacleConfig, ...]) -> None:
@@ -92,7 +86,7 @@ class ScenePicture:
             self._compositors.clear()
 
     def render(self, camera: FreeCamera, lighting: EpisodeLighting, objects: ObjectState | None = None) -> Rendering:
-        """Renders one picture, with the lighting's fog. For `objects`, the principal point must be the image center."""
+        """Renders one picture, with the lighting's fog."""
         with self._lock:
             if objects is None or self._model is None:
                 view = Viewpoints.of(camera.camera_to_world, camera.intrinsics, camera.size)
@@ -121,16 +115,14 @@ class ScenePicture:
     def _compositor(self, camera: FreeCamera) -> "Compositor":
         from twin.env.compositor import Compositor
 
-        key = (*camera.size, round(camera.fov, 4))
-        if key not in self._compositors:
-            model = copy.copy(self._model)
-            assert model is not None
-            model.cam_fovy[model.camera(_CAMERA).id] = np.rad2deg(camera.fov)
-            self._compositors[key] = Compositor(model, self.field, camera.size, camera=_CAMERA)
+        if camera.size not in self._compositors:
+            assert self._model is not None
+            self._compositors[camera.size] = Compositor(self._model, self.field, camera.size, camera=_CAMERA)
             if len(self._compositors) > _MAX_COMPOSITORS:
                 self._compositors.popitem(last=False)
-        self._compositors.move_to_end(key)
-        return self._compositors[key]
+        self._compositors.move_to_end(camera.size)
+        self._compositors[camera.size].set_intrinsics(camera.intrinsics)
+        return self._compositors[camera.size]
 
 
 @lru_cache(4)
