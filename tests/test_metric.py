@@ -368,6 +368,26 @@ def test_a_distance_marked_in_a_hollow(tmp_path: Path) -> None:
     assert abs(error) < 0.02 and abs(error) < 2.0 * metrics["scale_uncertainty"] < 0.1
 
 
+def test_a_distance_marked_up_a_ramp(tmp_path: Path) -> None:
+    """The ground rises nearly as steeply as the ray to the mark falls."""
+
+    def ground(x: np.ndarray) -> np.ndarray:
+        return 0.12 * np.clip(x - 17.0, 0.0, 5.0)
+
+    film = _path(turn=False, pitch=0.2)
+    film[:, 2, 3] += ground(film[:, 0, 3])
+    points = _points(film, np.random.default_rng(0), on_road=3000)
+    points[:3000, 2] = ground(points[:3000, 0])
+    at = int(np.argmin(np.abs(film[:, 0, 3] - 16.0)))
+    ends = np.array([[22.0, 1.0, ground(np.array(22.0))], [22.5, -1.2, ground(np.array(22.5))]])
+    (a, b), _ = project(ends, film[at], INTRINSICS)
+    metres = float(np.linalg.norm(ends[0] - ends[1]))
+    world = _world(tmp_path / "s", [film], points, _similarity(3))
+    metrics = world.run(tmp_path / "out", distance=DistanceConfig(metres, f"film0/{at:06d}", tuple(a), tuple(b)))
+    error = umeyama(Cameras.load(tmp_path / "out").positions, film[:, :3, 3]).scale - 1.0
+    assert abs(error) < 0.08 and abs(error) < 2.5 * metrics["scale_uncertainty"] < 0.25
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [

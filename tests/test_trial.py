@@ -89,12 +89,13 @@ def test_a_bag_of_an_episode_is_judged_as_the_episode_was(place, tmp_path, name,
     assert row.progress == pytest.approx(progress, abs=1e-3)
     (cell,) = read_results([out], [Cell(name, "ahead", "day", 20, 10)])
     assert (cell.trials, cell.successes) == (1, int(cause == "goal"))
-    figures = json.loads((scene / "trials" / "monday" / "trial.json").read_text())
+    folder = Path(printed.splitlines()[-1].removeprefix("look at ")).parent
+    figures = json.loads((folder / "trial.json").read_text())
     assert figures["policy"] == {"commands": steps, "same": 1.0, "v_rms": 0.0, "yaw_rate_rms": 0.0}
     # The replay settles on the ground again, and pictures are rendered from a robot at rest.
     assert figures["replay"]["end_m"] < 0.02 and abs(figures["replay"]["end_deg"]) < 1.0
     assert figures["pictures"]["psnr_median"] > 33.0 and figures["pictures"]["lighting"] == "day"
-    film = video_info(scene / "trials" / "monday" / "trial.mp4")
+    film = video_info(folder / "trial.mp4")
     assert film["fps"] == 10.0 and film["frames"] >= steps
 
 
@@ -243,6 +244,19 @@ def test_bags_of_the_same_name_have_folders_of_their_own(place, tmp_path):
         for bag in (*bags, *bags)
     ]
     assert folders[:2] == folders[2:] and folders[0] != folders[1]
+
+
+def test_trials_of_two_policies_that_start_at_once_both_count(place, tmp_path):
+    scene, drives = place
+    out = tmp_path / "real.csv"
+    for name in ("ahead", "left"):
+        trial.evaluate_trial(
+            scene, bag_of(drives[name], tmp_path / name), name, "ahead", "dusk", out, "day+randomised", frame="scene"
+        )
+    assert [line.split(",")[:3] for line in out.read_text().splitlines()[1:]] == [
+        ["ahead", "dusk", "1"],
+        ["left", "dusk", "1"],
+    ]
 
 
 def test_a_table_written_by_hand_is_not_lost(place, tmp_path):

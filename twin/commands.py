@@ -379,7 +379,9 @@ def _trial(parser: argparse.ArgumentParser) -> None:
     add("--policy", help="the policy that drove: a run, a checkpoint or an ONNX file")
     add("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
     add("--lighting", metavar="NAME", help="name of the day or lighting in real.csv")
-    add("--twin-lighting", metavar="NAME", help="the lighting of the twin that is compared; default: --lighting")
+    add(
+        "--twin-lighting", metavar="NAME", help="the twin's lighting to compare with; default: as before, or --lighting"
+    )
     add(
         "--cause",
         choices=("collision", "out_of_bounds", "timeout", "rollover", "stuck"),

@@ -182,7 +182,7 @@ def _driver(
 
 
 def film_name(*parts: str | int) -> str:
-    """Name of a film's file, made of what determines its episode, such as task, lighting and seed."""
+    """Name of a film's file, made of parts such as task, lighting, driver and seed."""
     return "".join(c if c.isalnum() or c in "-." else "_" for c in "_".join(map(str, parts))) + ".mp4"
 
 

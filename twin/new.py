@@ -133,8 +133,12 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
     text = _HEAD.format(name=toml_string(root.resolve().name))
     notes: list[str] = []
     lightings: list[str] = []
+    paths: list[Path] = []
     for film in films:
         path = _import_film(film, inputs)
+        if path in paths:
+            raise InputError(f"{film}: has the same content as a film before it; give it once")
+        paths.append(path)
         lighting = name = _lighting(inputs, path, detect_kind(film))
         if name in lightings:
             lighting = next(one for k in itertools.count(2) if (one := _shortened(name, f"_{k}")) not in lightings)

@@ -226,7 +226,8 @@ class Stamp:
 def _cure(folder: Path) -> str:
     """The advice on a damaged stage folder."""
     root = folder.resolve().parents[1]
-    return f"remove {root} and unpack its pack again" if (root / PACK_JSON).exists() else "build the scene again"
+    again = f"unpack the pack of {root} into another folder, and move your runs and results there"
+    return again if (root / PACK_JSON).exists() else "build the scene again"
 
 
 def digest_folder(folder: Path) -> tuple[str, dict[str, int], dict[str, str]]:

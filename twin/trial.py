@@ -83,9 +83,9 @@ def evaluate_trial(
     """
     scene = load_writable(root)
     policy = load_policy(find_policy(root, policy_name))
-    recording = read_trial(bag, topics)
     out = out or root / "real.csv"
     with exclusive_lock(out.with_name(f".{out.stem}.lock"), f"{out} is being written"):
+        recording = read_trial(bag, topics)
         table = out.with_name(f"{out.stem}_trials.csv")
         known = read_real_trials(table, out)
         factory = EnvFactory.open(scene, task, policy.options())
@@ -96,7 +96,7 @@ def evaluate_trial(
         if recorded and twin_lighting and recorded != twin_lighting:
             raise InputError(
                 f"{out}: trials of {cell[0]} under {lighting} are compared with {recorded!r}, not with "
-                f"{twin_lighting!r}; give --twin-lighting {recorded}, or change the table"
+                f"{twin_lighting!r}; give --twin-lighting {recorded}, or change the column twin_lighting of that row"
             )
         compared = recorded or twin_lighting or lighting
         name = Condition.parse(compared).lighting
@@ -118,7 +118,7 @@ def evaluate_trial(
 
         steps = len(trial.times) - 1
         row = Trial(*cell, begin // 10**6, trial.cause, float(trial.progress[-1]), steps, float(views.trust.mean()))
-        folder = _folder(root, bag, row.seed)
+        folder, before = _folder(root, bag, row.seed)
         folder.mkdir(parents=True, exist_ok=True)
         head = {
             "bag": str(bag),
@@ -135,27 +135,31 @@ def evaluate_trial(
         seconds = np.asarray((used - begin) * 1e-9, np.float64)
         title = f"{bag.stem}: {row.policy}, {row.task.replace('_', ' ')}"
         write_json(folder / "trial.json", figures)
-        for one in known:
-            if one.seed == row.seed and one.cell != row.cell:
-                was, now = ", ".join(one.cell), ", ".join(row.cell)
-                runtime.log_line(f"this trial was counted as {was}; now it is counted as {now}")
-        write_real_trials([*(one for one in known if one.seed != row.seed), row], table, out, compared)
+        if before and before != row.cell and any(one.key == (*before, row.seed) for one in known):
+            was, now = ", ".join(before), ", ".join(row.cell)
+            runtime.log_line(f"this trial was counted as {was}; now it is counted as {now}")
+        again = row.key, (*(before or row.cell), row.seed)
+        write_real_trials([*(one for one in known if one.key not in again), row], table, out, compared)
         write_trial_video(folder / "trial.mp4", trial, replayed, pictures, seconds, views, place, title)
         return row, figures, folder
 
 
-def _folder(root: Path, bag: Path, started: int) -> Path:
-    """Folder for the results of a trial that started at a time [ms].
+def _folder(root: Path, bag: Path, started: int) -> tuple[Path, tuple[str, str, str] | None]:
+    """Folder for the results of a trial that started at a time [ms], and the cell as which its bag was counted before.
 
-    Its name ends with this time if another trial, of a bag of the same name, has the folder.
+    The folder's name ends with this time if another trial, of a bag of the same name, has the usual one.
     """
-    folder = root / "trials" / (bag.name if bag.is_dir() else bag.stem)
-    path = folder / "trial.json"
-    if path.exists():
+    usual = root / "trials" / (bag.name if bag.is_dir() else bag.stem)
+    for folder in (usual, usual.with_name(f"{usual.name}_{started}")):
+        path = folder / "trial.json"
+        if not path.exists():
+            return folder, None
         with wrap_read_errors(path, "delete it"):
-            if read_json(path).get("started_ms", started) != started:
-                return folder.with_name(f"{folder.name}_{started}")
-    return folder
+            old = read_json(path)
+            same = Path(old["bag"]).resolve() == bag.resolve() and old.get("started_ms", started) == started
+            if same:
+                return folder, (old["name"], old["task"], old["lighting"])
+    return folder, None
 
 
 class _PolicyOfPictures:

@@ -360,10 +360,13 @@ def open_scene(path: Path) -> Path:
         return path
     folder = _cache() / f"{pack.stem[:60]}-{digest_file(pack)[:32]}"
     if exists(folder) and not _is_whole(folder):
-        runtime.log_line(f"{folder} is damaged; {pack} is unpacked again")
-        damaged = _partial_path(folder.parent, folder.name[:80])
-        folder.rename(damaged)  # at once, so that no other process sees half of it
-        remove(damaged)
+        with contextlib.suppress(InputError), exclusive_lock(folder.with_suffix(".lock"), f"{folder} is being mended"):
+            if exists(folder) and not _is_whole(folder):  # else another process was faster
+                runtime.log_line(f"{folder} is damaged; {pack} is unpacked again")
+                damaged = _partial_path(folder.parent, folder.name[:80])
+                with wrap_read_errors(folder, "remove it"):
+                    folder.rename(damaged)  # at once, so that no other process sees half of it
+                remove(damaged)
     if not (folder / PACK_JSON).exists():
         _remove_abandoned(folder.parent, "*")
         try:

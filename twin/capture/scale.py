@@ -22,7 +22,7 @@ from twin.geometry.poses import inverse_pose
 from twin.types import Array
 
 _PIXEL_ERROR = 1.0  # [px] standard deviation of a point marked by hand
-_GROUND_STEPS = 10  # intersections of a ray with the local ground; the road's slope is far below that of the ray
+_GROUND_STEP = 0.25  # [drops] step along a ray that searches the ground
 _GPS_TRIALS = 400
 _GPS_FRAMES = 400  # about the largest number of frames from which the drift of GPS is estimated
 _STRETCH = 2.0  # [m] length of the compared stretches of odometry; the heading hardly drifts over this length
@@ -248,18 +248,28 @@ def _on_ground(origin: Array, direction: Array, up: Array, level: float) -> Arra
 
 
 def _ground_along(ray: tuple[Array, Array], up: Array, on_road: Array, road: Road) -> tuple[float, float]:
-    """Height along `up` of the ground where a ray meets it, and its standard deviation.
+    """Height along `up` at which a ray first meets the ground, and the standard deviation of the ground's height there.
 
-    It is the median of the road points (k, 3) near that place, found by iteration from the ground below the camera.
+    The ground is the median of the road points (k, 3) around a place; if the ray meets none, that of all of them.
     """
-    origin = ray[0]
-    ground = local_ground(on_road, origin, up, road.drop) or (float(origin @ up) - road.drop, road.spread)
-    for _ in range(_GROUND_STEPS):
-        near = local_ground(on_road, _on_ground(*ray, up, ground[0]), up, road.drop)
-        if near is None:
-            break
-        ground = near
-    return ground
+    origin, direction = ray
+    heights = on_road @ up
+    middle = float(np.median(heights))
+    _on_ground(*ray, up, middle)  # raises an error for a ray above the horizon
+    end = (float(origin @ up) - float(heights.min()) + road.drop) / -float(direction @ up)
+    before = None
+    for distance in np.arange(0.0, end, _GROUND_STEP * road.drop):
+        place = origin + distance * direction
+        ground = local_ground(on_road, place, up, road.drop)
+        if ground is None:
+            continue
+        above = float(place @ up) - ground[0]
+        if above <= 0.0:
+            if before is not None:  # the ray crosses the ground between this place and the one before
+                distance -= (distance - before[0]) * above / (above - before[1])
+            return float((origin + distance * direction) @ up), ground[1]
+        before = distance, above
+    return middle, 1.4826 * float(np.median(np.abs(heights - middle)))
 
 
 def _meeting_point(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
@@ -388,8 +398,11 @@ def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> 
     sources = np.array(cameras.sources)
     films = [np.flatnonzero(sources == name) for name in dict.fromkeys(cameras.sources)]
     filmed = np.where(np.isfinite(odometry), cameras.positions, np.nan)
-    value = _path_length(odometry, films) / max(_path_length(filmed, films), 1e-12)
-    for _ in range(_STRETCH_ROUNDS):  # noise lengthens the path by odometry, so the first value is too large
+    steps = [np.linalg.norm(np.diff(one[rows], axis=0), axis=1) for rows in films for one in (odometry, filmed)]
+    by_odometry, reconstructed = np.concatenate(steps[::2]), np.concatenate(steps[1::2])
+    moving = (by_odometry > 0.0) & (reconstructed > 0.0)
+    value = float(np.median(by_odometry[moving] / reconstructed[moving])) if moving.any() else 1.0
+    for _ in range(_STRETCH_ROUNDS):  # noise lengthens the steps by odometry, so the first value is too large
         length = _STRETCH / max(value, 1e-12)
         pairs = [(rows[a], rows[b]) for rows in films for a, b in _stretches(filmed[rows], length)]
         first, last = np.array(pairs, int).reshape(-1, 2).T
@@ -424,11 +437,6 @@ def scale_from_odometry(cameras: Cameras, odometry: Array, tolerance: float) -> 
         "odometry_spread_relative": spread,
     }
     return Scale(value, float(np.hypot(tolerance, repeat)), notes)
-
-
-def _path_length(positions: Array, films: list[NDArray[np.int64]]) -> float:
-    """Length of the known parts of the films' paths along positions (n, 3)."""
-    return float(sum(np.nansum(np.linalg.norm(np.diff(positions[rows], axis=0), axis=1)) for rows in films))
 
 
 def _stretches(positions: Array, length: float) -> list[tuple[int, int]]:

@@ -49,7 +49,7 @@ _MIN_DECODED_FRACTION = 0.98  # the user gets a note if a smaller fraction of th
 # ---- decoding
 
 _UNKNOWN = 2  # FFmpeg's AVCOL_SPC_UNSPECIFIED
-_HD_HEIGHT = 720  # [px] height from which frames of unknown color matrix are BT.709
+_SD = 1280, 576  # [px] frames of unknown color matrix are BT.709 from this width on, or if they are higher than this
 _DEINTERLACE = "mode=send_frame:parity=auto:deint=interlaced"
 
 
@@ -185,13 +185,14 @@ def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
 def upright(frame: av.VideoFrame) -> Image:
     """A frame as SDR RGB, rotated and mirrored by its display matrix in multiples of 90°.
 
-    If the color matrix is unknown it is that which players use: BT.709 from `_HD_HEIGHT` on, else BT.601.
+    If the color matrix is unknown it is that which players use: BT.709 if the frame is larger than `_SD`, else BT.601.
     """
     transfer = hdr_transfer(frame)
     if transfer:
         image = hdr_to_sdr(frame, transfer)
     else:
-        matrix = Colorspace.ITU709 if frame.colorspace == _UNKNOWN and frame.height >= _HD_HEIGHT else None
+        large = frame.width >= _SD[0] or frame.height > _SD[1]
+        matrix = Colorspace.ITU709 if frame.colorspace == _UNKNOWN and large else None
         image = np.asarray(frame.to_ndarray(format="rgb24", src_colorspace=matrix), np.uint8)
     # `frame.side_data` would make a reference cycle, so many large frames would stay until garbage is collected.
     side = SideDataContainer(frame).get(SideData.DISPLAYMATRIX)  # type: ignore[call-arg]
@@ -348,7 +349,10 @@ def probe(path: Path) -> FilmTiming:
 
 
 def frame_index(time: float | None, timing: FilmTiming, last: int) -> int:
-    """Index of a decoded frame from its time [s], always above the index `last`; damaged frames leave gaps."""
+    """Index of a decoded frame from its time [s], always above the index `last`.
+
+    Damaged frames leave gaps, but not in films that are numbered one by one.
+    """
     if time is None or timing.consecutive:
         return last + 1
     right = min(int(np.searchsorted(timing.times, time)), len(timing.times) - 1)

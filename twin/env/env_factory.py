@@ -29,14 +29,7 @@ from twin.env.obstacles import EpisodeObstacles, add_obstacles
 from twin.env.options import CPU, NERF, Options, parse_options, state_size
 from twin.env.physics import camera_pose
 from twin.env.route_segments import RouteSegment, find_task
-from twin.env.task import (
-    BUMPER_OFFSET,
-    DrivePhysics,
-    DriveTask,
-    RewardAndTermination,
-    control,
-    default_time_limit,
-)
+from twin.env.task import DrivePhysics, DriveTask, RewardAndTermination, control
 from twin.env.trust import Trust
 from twin.errors import InputError
 from twin.files import digest_file, digest_json
@@ -44,7 +37,6 @@ from twin.loading import Twin, load_scene
 from twin.mjcf.husky import disable_fluid_drag
 from twin.mjcf.world import World, point_at
 from twin.nerf.baked import BakedField
-from twin.robot import HuskyParams
 from twin.scene import require_stage, stage_result
 from twin.types import Array
 
@@ -79,7 +71,6 @@ class EnvFactory:
             parsed = dataclasses.replace(parsed, randomise=parsed.randomise.for_robot(world.robot))
         config = load_config(twin.scene.config_file)
         segment = find_task(task, world, config.task)
-        parsed = _with_possible_speed(parsed, "speed" in options, segment, world.robot)
         world = world.along(segment.route)
         here = tuple(one for one in config.obstacle if one.route == segment.route)
         wanted = here if isinstance(parsed.obstacles, str) else parsed.obstacles
@@ -240,24 +231,6 @@ def load(
 # ---- model of an episode
 
 _REACH = 1.5  # [m] reach beyond the corridor's edge; exceeds half the robot's length plus its motion in a control step
-
-
-def _with_possible_speed(options: Options, is_given: bool, segment: RouteSegment, robot: HuskyParams) -> Options:
-    """Returns the options, with the robot's top speed in place of a default `speed` that leaves too little time.
-
-    Raises InputError: `speed` is given, and so high that the default time limit ends before the robot can arrive.
-    """
-    top = min(robot.max_speed, robot.max_wheel_speed)
-    limit = default_time_limit(segment, options.speed)
-    if options.time_limit is not None or (segment.length - BUMPER_OFFSET) / top < limit:
-        return options
-    if is_given:
-        raise InputError(
-            f"speed = {options.speed:g} m/s, but the robot's limit is {top:g} m/s: the time limit, twice the time that "
-            f"the route segment takes at `speed`, is {limit:.1f} s, too short to arrive; expected at most {top:g}, or "
-            "a time_limit"
-        )
-    return dataclasses.replace(options, speed=top)
 
 
 def episode_spec(world: World, start: float, end: float, half_width: float) -> mujoco.MjSpec:

@@ -103,7 +103,9 @@ def _check_view(size: Any, view: str | None, pixels: bool) -> tuple[str, tuple[i
 def check_reset_options(options: dict[str, Any] | None) -> None:
     """Raises InputError: there are options of `reset`; an environment gets its options when it is made."""
     if options:
-        raise InputError(f"options of reset = {short_repr(options)}; expected none: give them to the constructor")
+        raise InputError(
+            f"options of reset = {short_repr(options)}; expected none: give them to gymnasium.make or the constructor"
+        )
 
 
 class DriveEnv(gymnasium.Env):

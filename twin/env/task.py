@@ -83,9 +83,9 @@ class Motion:
     """Time since the start of the episodes [s], shape (k,)."""
 
 
-def default_time_limit(segment: RouteSegment, speed: float) -> float:
-    """Twice the time [s] that the route segment takes at a speed [m/s]."""
-    return 2.0 * segment.length / speed
+def default_time_limit(segment: RouteSegment, speed: float, robot: HuskyParams) -> float:
+    """Twice the time [s] that the route segment takes at a speed [m/s], or 1.5 times that at the robot's top speed."""
+    return segment.length * max(2.0 / speed, 1.5 / min(robot.max_speed, robot.max_wheel_speed))
 
 
 class RewardAndTermination:
@@ -101,7 +101,7 @@ class RewardAndTermination:
         self.segment, self.options = segment, options
         self.half_width = options.half_width or world.half_width
         """Half width of the corridor [m]."""
-        self.time_limit = options.time_limit or default_time_limit(segment, options.speed)
+        self.time_limit = options.time_limit or default_time_limit(segment, options.speed, world.robot)
         """[s]"""
         self.foot, self.cross_track = np.zeros(count), np.zeros(count)
         """Arc length of the foot, and signed distance from the route, positive to the left [m], shape (n,)."""

@@ -303,7 +303,9 @@ def _corrected(
                 same = f"all driven policies of other trainings have the rate {line.twin_mean:.2g} in the twin"
                 out.append(Estimate(missing=f"{same}, which says nothing about other rates"))
             elif np.isnan(low):
-                on_line = "no interval: the driven policies' rates lie on one line, so their scatter is not known"
+                on_line = (
+                    "no interval: the driven policies' rates lie within 1% of one line; their scatter is not known"
+                )
                 out.append(Estimate(value, n=line.n, no_interval=on_line))
             elif line.n < MIN_PREDICTORS:
                 few = f"too few for an interval: {line.n} policies of other trainings, {MIN_PREDICTORS} are needed"
@@ -341,6 +343,8 @@ def _rates_over_days(rows: Sequence[Sequence[Cell]], road: bool = True) -> list[
         if len(row) < MIN_RATE_DAYS:
             few = f"too few for an interval: {len(row)} day, {MIN_RATE_DAYS} are needed"
             out.append(Estimate(value, n=trials, no_interval=few))
+        elif np.isnan(low[i]):
+            out.append(Estimate(value, n=trials, no_interval="none: there are more trials than the model can hold"))
         else:
             out.append(Estimate(value, min(value, float(low[i])), max(value, float(high[i])), trials))
     return out

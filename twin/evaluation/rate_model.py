@@ -23,8 +23,8 @@ independent, and the product of their likelihoods is a *composite* likelihood. I
 (2k − 1) / (2k + 1) for k days (for such scaling see Ribatet, Cooley and Davison, Statistica Sinica 22, 2012). Without
 this power, 90 % intervals from two days had coverages of 0.72 to 0.92. Besides, n − 1 other policies tell less about a
 policy's rate than as many independent ones: their likelihood is raised to the power 1 / (1 + 0.3 (n − 1)), as if the
-outcomes of two policies on one day had a correlation of 0.3. Without it, eight policies on four days of a weather that
-affects all alike had a coverage of 0.71, and the more policies drove, the narrower were intervals from the same days.
+outcomes of two policies on one day had a correlation of 0.3. For eight policies on four days of a weather that affects
+all alike, this raises the coverage from 0.71 to 0.83. `sample` and `mean_interval` do not use this power.
 
 The estimand of `interval` is the rate over the *population* of days like those driven, and that of `mean_interval` is
 the rate over the population of policies and days. `cell_means` estimates rates on the days that were driven. For the
@@ -115,7 +115,8 @@ class RateModel:
         log = np.log(evidence).sum(0)
         correlations = _CORRELATIONS ** (_ROAD_PRIOR if road else 0.0)
         weight = np.exp(log - log.max()) * correlations
-        power = 1.0 / (1.0 + _SHARED * (len(won) - 1)) if shared_days else 1.0
+        others = max(int((driven.sum(-1) > 0).sum()) - 1, 0)
+        power = 1.0 / (1.0 + _SHARED * others) if shared_days else 1.0
         return RateModel(won, driven, likelihood, prior, evidence, weight / weight.sum(), mean, correlations, power)
 
     def posterior(self) -> Array:
@@ -146,7 +147,7 @@ class RateModel:
         return _shortest(mass, np.sin(np.pi / 2 * np.arange(len(_MEANS) + 1) / len(_MEANS)) ** 2)
 
     def sample(self, rng: np.random.Generator, samples: int) -> Array:
-        """Samples of the policies' rates over days, shape (samples, n)."""
+        """Samples of the policies' rates over days, shape (samples, n), for a model without shared days."""
         chosen = rng.choice(self.weight.size, samples, p=self.weight.ravel())
         h, r = np.unravel_index(chosen, self.weight.shape)
         out = np.empty((samples, len(self.likelihood)))

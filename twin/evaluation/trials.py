@@ -314,7 +314,7 @@ def _name_hint(name: str, valid: Sequence[str]) -> str:
 
 def _has_rows(path: Path) -> bool:
     """True if a table exists and has more than a header."""
-    return path.exists() and len(_table_text(path).splitlines()) > 1
+    return path.exists() and sum(bool(line.strip()) for line in _table_text(path).splitlines()) > 1
 
 
 def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterable[tuple[str, dict[str, str]]]:

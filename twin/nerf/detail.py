@@ -155,12 +155,13 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
     total = int((pixels.width * pixels.height)[pixels.frames].sum())
     share = min(1.0, _MAX_HITS / max(1, int(0.7 * total)))
     # Untouched memory is free, and parts to be joined later would set the build's peak memory.
+    room = min(total, int(1.05 * share * total) + 10_000)
     columns: list[NDArray[Any]] = [
-        np.empty((total, 4), np.float32),
-        np.empty((total, volume.CHANNELS - 1), np.float16),
-        np.empty((total, 3), np.float16),
-        np.empty((total, 3), np.uint8),
-        np.empty(total, np.int32),
+        np.empty((room, 4), np.float32),
+        np.empty((room, volume.CHANNELS - 1), np.float16),
+        np.empty((room, 3), np.float16),
+        np.empty((room, 3), np.uint8),
+        np.empty(room, np.int32),
     ]
     count = 0
     with bar("surface points", len(pixels.frames), "frame") as progress:

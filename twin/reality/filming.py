@@ -38,6 +38,7 @@ OUT = PassSpec("out", 0.0, False)
 _SIDE_SPEED = 1.0  # [m/s] highest speed in films of side roads
 _SIDE_SPACING = 0.5  # [m] largest distance between frames there
 _SKY_DISTANCE = 1.0e4  # [m] assumed depth of the sky, for the motion of its pixels
+_BT709 = 1  # FFmpeg's AVCOL_SPC_BT709
 _HD_HEIGHT = 720  # [px] films of at least this height are written as BT.709, as which they are played
 _OPEN_SAMPLES = 3  # instants over which a row's exposure is averaged
 
@@ -351,6 +352,8 @@ def write_video(frames: Iterable[NDArray[np.uint8]], plan: FilmingPlan, path: Pa
         stream = container.add_stream("libx264", rate=plan.fps, options=options)
         stream.width, stream.height, stream.pix_fmt = plan.width, plan.height, "yuv420p"
         matrix = Colorspace.ITU709 if plan.height >= _HD_HEIGHT else Colorspace.ITU601
+        if matrix == Colorspace.ITU709:
+            stream.codec_context.colorspace = _BT709
         for frame in frames:
             picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
             container.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace=matrix)))

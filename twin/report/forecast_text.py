@@ -134,17 +134,19 @@ def believable(group: Agreement) -> Verdict:
         n, right = sum(n for n, _ in beyond), sum(right for _, right in beyond)
         if n >= _ENOUGH_PAIRS and right >= _RELIABLE * n:
             closer = [(m, r) for low, m, r in pairs if low < start]
-            m, r = sum(m for m, _ in closer) + ties, sum(r for _, r in closer) + ties / 2
+            m, r = sum(m for m, _ in closer), sum(r for _, r in closer)
             gap = f"that differ by {100 * start:.0f} percentage points or more" if start else "that differ at all"
             rest = f", and in {r:g} of {m} closer pairs" if m else ""
+            rest += f"; {_count(ties, 'further pair')} had the same rate in the twin" if ties else ""
             text = (
                 f"What may be believed: the order of two policies {gap} in the twin. The road had the same order in "
                 f"{right:g} of {n} such pairs{rest} ({where})."
             )
             enough = group.trainings >= MIN_TRAININGS and group.days >= MIN_DAYS
             return Verdict(text, "good" if enough and start <= _SMALL_GAP else "mixed")
-    n, right = sum(n for _, n, _ in pairs) + ties, sum(right for _, _, right in pairs) + ties / 2
+    n, right = sum(n for _, n, _ in pairs), sum(right for _, _, right in pairs)
     text = f"No order of two policies in the twin may be believed yet: the road agrees in {right:g} of {n} pairs"
+    text += f", and {_count(ties, 'further pair')} had the same rate in the twin" if ties else ""
     return Verdict(f"{text} ({where}).", "bad")
 
 
@@ -192,11 +194,7 @@ def _bias(group: Agreement) -> Verdict:
     if not bias.low <= 0.0 <= bias.high:
         return Verdict(f"{mean}; {single}.", "mixed")
     known = bias.low >= -_SMALL_GAP and bias.high <= _SMALL_GAP
-    told = (
-        "The twin has no significant bias"
-        if known
-        else "It is not certain that the twin has a bias, nor that it has none"
-    )
+    told = "The twin has no significant bias" if known else "These trials leave open whether the twin has a bias"
     mood = "good" if known and off.value <= _SMALL_GAP else "mixed"
     return Verdict(f"{told}: road minus twin is {format_estimate(bias, True)}; {single}.", mood)
 

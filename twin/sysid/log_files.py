@@ -159,7 +159,7 @@ def read_bag(path: Path, filmed: FilmedPoses | None = None, poses: str = "") -> 
                         lost[topic] += 1
         begin = bag.begin
     for topic, count in lost.items():
-        runtime.log_line(f"{path}: {count} messages on {topic} left out: not finite")
+        runtime.log_line(f"{path}: {count} messages on {topic} left out: not finite, or poses without orientation")
     # Some topics with joint states have no wheels, such as those of an arm.
     computed = next((use for use in uses if uses[use] is _wheels_of_odometry), None)
     if computed and any(rows[use] for use in uses if uses[use] is VALUES["wheels"]):
@@ -179,8 +179,16 @@ def read_bag(path: Path, filmed: FilmedPoses | None = None, poses: str = "") -> 
         tables["poses"] = [(float(t), *pose) for t, pose in zip(since, filmed.poses.tolist(), strict=True)]
     empty = [kind for kind, found in tables.items() if not found]
     if empty:
-        raise InputError(f"{path}: no usable message of {', '.join(empty)}; expected at least one; record these topics")
-    return _columns({kind: np.array(found) for kind, found in tables.items()})
+        cure = "record these topics"
+        if "poses" in empty and lost[topics.get("poses", "")]:
+            cure = "its poses have no orientation (zeros): record poses with yaw, and name their topic by --topic"
+        raise InputError(f"{path}: no usable message of {', '.join(empty)}; expected at least one; {cure}")
+    columns, old = _columns({kind: np.array(found) for kind, found in tables.items()})
+    if old:
+        runtime.log_line(
+            f"{path}: {old:.0%} of the log has no command of the last {_MAX_COMMAND_AGE:g} s, counted as 0"
+        )
+    return columns
 
 
 def _uses(
@@ -225,8 +233,8 @@ _MAX_COMMAND_AGE = max(timing.timeout for timing in CONTROLLERS.values())  # [s]
 _NAMES = {"commands": TWIST, "wheels": WHEEL_SPEEDS, "poses": POSE, "imu": ACCELERATION}
 
 
-def _columns(tables: dict[str, Array]) -> dict[str, Array]:
-    """Columns with a row per joint state, from the time at which every topic has had a message.
+def _columns(tables: dict[str, Array]) -> tuple[dict[str, Array], float]:
+    """Columns with a row per joint state, from the time at which every topic has had a message; share of old commands.
 
     A command counts until the next one, but not longer than `_MAX_COMMAND_AGE`: then the robot stops by itself. Robots
     on ROS 1 stop earlier, after 0.25 s; for them, the last command counts a quarter of a second too long.
@@ -234,11 +242,12 @@ def _columns(tables: dict[str, Array]) -> dict[str, Array]:
     begin = max(table[0, 0] for table in tables.values())
     time = np.unique(tables["wheels"][:, 0])
     time = time[time >= begin]
-    columns = {"time": time - (time[0] if len(time) else 0.0)}
+    columns, share = {"time": time - (time[0] if len(time) else 0.0)}, 0.0
     for kind, table in tables.items():
         newest = np.searchsorted(table[:, 0], time, side="right") - 1
         values = table[newest, 1:]
         if kind == "commands":
-            values[time - table[newest, 0] > _MAX_COMMAND_AGE] = 0.0
+            old = time - table[newest, 0] > _MAX_COMMAND_AGE
+            values[old], share = 0.0, float(old.mean()) if len(old) else 0.0
         columns |= {name: values[:, i] for i, name in enumerate(_NAMES[kind])}
-    return columns
+    return columns, share

@@ -494,7 +494,7 @@ def _check_directions(windows: Windows, where: str) -> None:
         (ahead < -_ALONG and not turn > 0, moves, "wheel speeds have the wrong sign"),
         (ahead < _ALONG, moves, "x and y are swapped, or yaw is not the angle from x to the robot's front"),
         (turn < 0 and difference < 0, turns, "left and right wheels are swapped"),
-        (turn < 0, turns, "yaw is clockwise (NED): negate y and yaw"),
+        (turn < 0, turns, "yaw is clockwise (NED): negate y and yaw; or left and right are swapped in all columns"),
         (speed < 0, rolls, f"{forward} the wrong sign"),
         (difference < 0, differ, sideways),
     )
