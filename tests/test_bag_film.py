@@ -242,6 +242,14 @@ def test_noise_of_odometry_does_not_lengthen_the_scale(tmp_path: Path) -> None:
     assert abs(errors.mean()) < 0.015 and np.mean(np.abs(errors) < [one.uncertainty for one in scales]) > 0.8
 
 
+def test_a_misplaced_camera_does_not_spoil_the_scale_of_odometry(tmp_path: Path) -> None:
+    world = _world(tmp_path / "s", [_path(count=80)], _points(_path(), np.random.default_rng(3)), _similarity(7))
+    cameras = Cameras.load(world.scene.stage("cameras"))
+    cameras.camera_to_world[40, :3, 3] += 100.0
+    scale = scale_from_odometry(cameras, world.truth[:, :3, 3], 0.0)
+    assert scale.value * _similarity(7).scale == pytest.approx(1.0, abs=1e-3)
+
+
 # ---- the verb new
 
 
