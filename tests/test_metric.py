@@ -2,6 +2,7 @@
 
 import dataclasses
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -348,44 +349,42 @@ def test_distance_between_marked_points(tmp_path: Path, on_ground: bool) -> None
     assert 0 < metrics["scale_uncertainty"] < 0.1
 
 
-def test_a_distance_marked_in_a_hollow(tmp_path: Path) -> None:
-    """The ground there is 0.6 m lower than the median of the road."""
+def _hollow(x: np.ndarray) -> np.ndarray:
+    """Ground that is 0.6 m lower around x = 20 m than the median of the road."""
+    return -0.6 * np.exp(-(((x - 20.0) / 6.0) ** 2))
 
-    def ground(x: np.ndarray) -> np.ndarray:
-        return -0.6 * np.exp(-(((x - 20.0) / 6.0) ** 2))
 
-    film = _path(turn=False, pitch=0.3)
+def _ramp(x: np.ndarray) -> np.ndarray:
+    """Ground that rises nearly as steeply as the ray to the mark falls."""
+    return 0.12 * np.clip(x - 17.0, 0.0, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("ground", "pitch", "mark", "count", "largest", "sigmas", "spread"),
+    [(_hollow, 0.3, 20.0, 1500, 0.02, 2.0, 0.1), (_ramp, 0.2, 22.0, 3000, 0.08, 2.5, 0.25)],
+)
+def test_a_distance_on_uneven_ground(
+    tmp_path: Path,
+    ground: Callable[[np.ndarray], np.ndarray],
+    pitch: float,
+    mark: float,
+    count: int,
+    largest: float,
+    sigmas: float,
+    spread: float,
+) -> None:
+    film = _path(turn=False, pitch=pitch)
     film[:, 2, 3] += ground(film[:, 0, 3])
-    points = _points(film, np.random.default_rng(0), on_road=1500)
-    points[:1500, 2] = ground(points[:1500, 0])
+    points = _points(film, np.random.default_rng(0), on_road=count)
+    points[:count, 2] = ground(points[:count, 0])
     at = int(np.argmin(np.abs(film[:, 0, 3] - 16.0)))
-    ends = np.array([[20.0, 1.0, -0.6], [20.5, -1.2, ground(np.array(20.5))]])
+    ends = np.array([[mark, 1.0, ground(np.array(mark))], [mark + 0.5, -1.2, ground(np.array(mark + 0.5))]])
     (a, b), _ = project(ends, film[at], INTRINSICS)
     metres = float(np.linalg.norm(ends[0] - ends[1]))
     world = _world(tmp_path / "s", [film], points, _similarity(3))
     metrics = world.run(tmp_path / "out", distance=DistanceConfig(metres, f"film0/{at:06d}", tuple(a), tuple(b)))
     error = umeyama(Cameras.load(tmp_path / "out").positions, film[:, :3, 3]).scale - 1.0
-    assert abs(error) < 0.02 and abs(error) < 2.0 * metrics["scale_uncertainty"] < 0.1
-
-
-def test_a_distance_marked_up_a_ramp(tmp_path: Path) -> None:
-    """The ground rises nearly as steeply as the ray to the mark falls."""
-
-    def ground(x: np.ndarray) -> np.ndarray:
-        return 0.12 * np.clip(x - 17.0, 0.0, 5.0)
-
-    film = _path(turn=False, pitch=0.2)
-    film[:, 2, 3] += ground(film[:, 0, 3])
-    points = _points(film, np.random.default_rng(0), on_road=3000)
-    points[:3000, 2] = ground(points[:3000, 0])
-    at = int(np.argmin(np.abs(film[:, 0, 3] - 16.0)))
-    ends = np.array([[22.0, 1.0, ground(np.array(22.0))], [22.5, -1.2, ground(np.array(22.5))]])
-    (a, b), _ = project(ends, film[at], INTRINSICS)
-    metres = float(np.linalg.norm(ends[0] - ends[1]))
-    world = _world(tmp_path / "s", [film], points, _similarity(3))
-    metrics = world.run(tmp_path / "out", distance=DistanceConfig(metres, f"film0/{at:06d}", tuple(a), tuple(b)))
-    error = umeyama(Cameras.load(tmp_path / "out").positions, film[:, :3, 3]).scale - 1.0
-    assert abs(error) < 0.08 and abs(error) < 2.5 * metrics["scale_uncertainty"] < 0.25
+    assert abs(error) < largest and abs(error) < sigmas * metrics["scale_uncertainty"] < spread
 
 
 @pytest.mark.parametrize(

@@ -351,16 +351,16 @@ def open_scene(path: Path) -> Path:
     """Returns the folder of a scene: `path` itself; for a pack or its name, the cache folder into which it is unpacked.
 
     A pack is unpacked once, into a folder in `$XDG_CACHE_HOME/twin/packs` that is named after its digest; again if that
-    folder has been damaged. Several processes may do so at once.
+    folder has been damaged. Several processes may do so at once, but only one removes a damaged folder.
 
-    Raises InputError: see `unpack`.
+    Raises InputError: see `unpack`; or another process is removing the damaged folder.
     """
     pack = find_pack(path)
     if pack is None:
         return path
     folder = _cache() / f"{pack.stem[:60]}-{digest_file(pack)[:32]}"
     if exists(folder) and not _is_whole(folder):
-        with contextlib.suppress(InputError), exclusive_lock(folder.with_suffix(".lock"), f"{folder} is being mended"):
+        with exclusive_lock(folder.with_name(f".{folder.name}.lock"), f"{folder}, which is damaged, is being removed"):
             if exists(folder) and not _is_whole(folder):  # else another process was faster
                 runtime.log_line(f"{folder} is damaged; {pack} is unpacked again")
                 damaged = _partial_path(folder.parent, folder.name[:80])

@@ -199,8 +199,10 @@ def heights_above_road(points: Array, centers: Array, up: Array, drop: float) ->
 
 
 def local_ground(points: Array, position: Array, up: Array, radius: float) -> tuple[float, float] | None:
-    """Median height along `up` of the road points (k, 3) whose horizontal distance from a position (3,) is at most
-    `radius`, and the robust standard deviation of their heights; None if there are fewer than `_MIN_AROUND`."""
+    """Median height along `up` of the road points (k, 3) around a position (3,), and its robust standard deviation.
+
+    Points count up to a horizontal distance of `radius`. Returns None if they are fewer than `_MIN_AROUND`.
+    """
     away = points - position
     heights = away @ up
     heights = heights[np.linalg.norm(away - np.outer(heights, up), axis=1) <= radius]

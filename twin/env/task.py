@@ -229,7 +229,7 @@ class DrivePhysics(dm_mujoco.Physics):
         self._continue(*episode)
 
     def _episode(self) -> tuple[HuskyParams, tuple[ObstacleConfig, ...] | None, EpisodeState]:
-        """What a copy needs besides `data` to go on with the episode."""
+        """Robot, obstacles and state, which a copy needs besides `data` to go on with the episode."""
         moved = self.robot.move_obstacles
         obstacles = moved.obstacles if isinstance(moved, ObstacleMotion) else None
         return self._params, obstacles, self.robot.episode_state()

@@ -373,7 +373,7 @@ def _left_out(task: str, real: Sequence[Cell], twin: Cells) -> list[LeftOutLight
         value, low, high = line.predict(twin_rate[mine])
         inside = within(low, real_rate[mine], high)
         parts = (
-            np.abs(twin_rate - real_rate)[mine],
+            np.where(np.isfinite(value), np.abs(twin_rate - real_rate)[mine], np.nan),
             np.abs(value - real_rate[mine]),
             np.where(np.isfinite(low), inside, np.nan),
         )
