@@ -1,5 +1,6 @@
 """Relative poses of pairs, focal lengths, and camera poses averaged from or checked by pairs, on a simulated film."""
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from twin.capture import pair_geometry
 from twin.capture.pair_geometry import (
     PairGeometry,
     _is_near,
@@ -24,6 +26,7 @@ from twin.capture.pose_averaging import (
     consistent_pairs,
     solve_differences,
 )
+from twin.errors import InputError
 from twin.geometry.poses import umeyama
 from twin.types import Array
 
@@ -414,3 +417,24 @@ def test_pairs_that_contradict_those_between_their_frames_do_not_count(film: Fil
 def test_directions_with_little_parallax_do_not_count(film: Film, pairs: list[PairGeometry]) -> None:
     far = [_deflected(pair, depths=100.0 * pair.depths) for pair in pairs]
     assert _check(far, film.poses) == PoseCheck(FRAMES - 1, [])
+
+
+def test_several_processes_give_the_same_pairs(
+    film: Film, pairs: list[PairGeometry], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pair_geometry, "_MIN_PARALLEL", 1)
+    for one, other in zip(pair_geometries(film.database, 0, processes=2), pairs, strict=True):
+        assert one.matches is not other.matches  # it came from another process
+        np.testing.assert_equal(vars(one.matches), vars(other.matches))
+        np.testing.assert_equal(vars(one) | {"matches": 0}, vars(other) | {"matches": 0})
+
+
+def _abort(_: object) -> None:
+    os.abort()
+
+
+def test_a_killed_process_is_bad_input(film: Film, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pair_geometry, "_MIN_PARALLEL", 1)
+    monkeypatch.setattr(pair_geometry, "_geometry", _abort)
+    with pytest.raises(InputError, match="processes that compute relative poses was killed"):
+        pair_geometries(film.database, 0, processes=2)

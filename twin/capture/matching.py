@@ -274,12 +274,12 @@ class Matcher:
 
     def geometries(self) -> list[PairGeometry]:
         """Geometry of all verified pairs. The cameras' parameters must not change after the first call."""
-        return pair_geometries(self.database, self.seed, self.known)
+        return pair_geometries(self.database, self.seed, self.known, processes=self.threads)
 
     def geometries_among(self, pairs: set[Pair], cameras: Mapping[int, pycolmap.Camera]) -> list[PairGeometry]:
         """Geometry of the verified ones of the given pairs of frames, with the cameras of a model."""
         images = {ordered_pair(int(self.image_ids[i]), int(self.image_ids[j])) for i, j in pairs}
-        return pair_geometries(self.database, self.seed, self.known, images, cameras)
+        return pair_geometries(self.database, self.seed, self.known, images, cameras, self.threads)
 
     def linked_groups(self) -> list[NDArray[np.int64]]:
         """Groups of frames (k,) whose sources are linked, the largest first.

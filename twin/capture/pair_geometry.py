@@ -6,8 +6,13 @@ its matches under a Cauchy loss. There are many local minima, so the search has 
 which most matches agree: that of far points, such as those on the skyline.
 """
 
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from itertools import islice
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +21,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from twin.capture.worker import send_message
+from twin.errors import InputError
+from twin.runtime import die_with_parent
 from twin.types import Array
 
 Pair = tuple[int, int]
@@ -31,6 +38,8 @@ _SAME_START = np.radians(0.3)  # poses that differ less lead to the same minimum
 _ROTATION_TRIALS, _TRANSLATION_TRIALS = 60, 120  # random pairs of matches that propose a rotation and a translation
 _SAME_CAMERA = 1e-3  # [rad] cameras count as the same if the directions of their pixels differ by at most this
 _SAME_ROTATION = np.radians(0.2)  # largest deviation of a far point from the rotation that most points share
+_MIN_PARALLEL = 400  # with fewer pairs, starting processes takes longer than they save
+_BLOCK, _CHUNK = 256, 16  # pairs per process that are prepared at once, and that are sent at once
 _FOCAL_PAIRS, _FOCAL_MATCHES = 24, 300  # largest numbers of pairs and of their matches that a focal length is fitted to
 _FOCAL_STEPS = 3  # [frames] largest distance of these pairs
 _FOCAL_GRID = np.geomspace(0.3, 3.0, 16)  # [longer side] first guesses; the first and last limit the result
@@ -75,12 +84,17 @@ class PairGeometry:
     agreeing: float  # fraction of all matches that agree with the pose
 
 
+_Job = tuple[PairMatches, Array | None, int]
+"""Matches of a pair, COLMAP's rotation if it found one, and a seed."""
+
+
 def pair_geometries(
     database: Path,
     seed: int,
     known: dict[tuple[int, int], PairGeometry] | None = None,
     among: set[tuple[int, int]] | None = None,
     refined: Mapping[int, pycolmap.Camera] | None = None,
+    processes: int = 1,
 ) -> list[PairGeometry]:
     """Geometry of the verified pairs of a database.
 
@@ -88,6 +102,7 @@ def pair_geometries(
         known: Geometry of some pairs of images, which is not computed again; that of the others is added.
         among: Pairs of images, smaller id first, to which the result is restricted; by default all.
         refined: Cameras by COLMAP's ids that replace those of the database. Where they differ, `known` is not used.
+        processes: Number of worker processes for many pairs; their number does not change the result.
     """
     known = {} if known is None else known
     with pycolmap.Database.open(database) as opened:
@@ -108,23 +123,49 @@ def pair_geometries(
         send_message(bar="relative poses", total=len(fresh))
     rays = {image_id: camera_rays(cameras[camera_of[image_id]], xy) for image_id, xy in points.items()}
     errors = {i: _keypoint_errors(cameras[camera_of[i]], xy, rays[i]) for i, xy in points.items()}
-    for (first, second), geometry in fresh:
+
+    def jobs() -> Iterator[_Job]:
+        for (first, second), geometry in fresh:
+            matches = geometry.inlier_matches.astype(np.int64)
+            error = (errors[first][matches[:, 0]] + errors[second][matches[:, 1]]) / 2
+            matches, error = matches[np.isfinite(error)], error[np.isfinite(error)]  # some lenses cannot be inverted
+            if len(matches) < _MIN_MATCHES:
+                continue
+            two = cameras[camera_of[first]], cameras[camera_of[second]]
+            a, b = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
+            start = None
+            if pycolmap.estimate_two_view_geometry_pose(two[0], points[first], two[1], points[second], geometry):
+                assert geometry.cam2_from_cam1 is not None
+                start = geometry.cam2_from_cam1.rotation.matrix()
+            yield PairMatches(first, second, matches, a, b, error), start, seed
+
+    for one in _solved(jobs(), processes if len(fresh) >= _MIN_PARALLEL else 1):
+        known[one.matches.first, one.matches.second] = one
         send_message(step=1)
-        matches = geometry.inlier_matches.astype(np.int64)
-        error = (errors[first][matches[:, 0]] + errors[second][matches[:, 1]]) / 2
-        matches, error = matches[np.isfinite(error)], error[np.isfinite(error)]  # some lenses cannot be inverted
-        if len(matches) < _MIN_MATCHES:
-            continue
-        two = cameras[camera_of[first]], cameras[camera_of[second]]
-        rng = np.random.default_rng([seed, first, second])
-        a, b = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
-        pair = PairMatches(first, second, matches, a, b, error)
-        starts = [np.eye(3), common_rotation(a, b, rng)]
-        if pycolmap.estimate_two_view_geometry_pose(two[0], points[first], two[1], points[second], geometry):
-            assert geometry.cam2_from_cam1 is not None
-            starts.append(geometry.cam2_from_cam1.rotation.matrix())
-        known[first, second] = _described(pair, *relative_pose(a, b, starts, pair.error, rng))
     return [known[pair] for pair, _ in verified if pair in known]
+
+
+def _solved(jobs: Iterator[_Job], processes: int) -> Iterator[PairGeometry]:
+    """The geometry of each job's pair, in order."""
+    if processes == 1:
+        yield from map(_geometry, jobs)
+        return
+    # Spawned, since COLMAP's threads do not survive a fork.
+    try:
+        with ProcessPoolExecutor(processes, get_context("spawn"), die_with_parent, (os.getpid(),)) as pool:
+            while block := list(islice(jobs, _BLOCK * processes)):  # all jobs at once could take gigabytes
+                yield from pool.map(_geometry, block, chunksize=_CHUNK)
+    except BrokenProcessPool:
+        cure = "if memory ran out, lower cameras.features or capture.max_frames"
+        raise InputError(f"one of {processes} processes that compute relative poses was killed; {cure}") from None
+
+
+def _geometry(job: _Job) -> PairGeometry:
+    pair, start, seed = job
+    rng = np.random.default_rng([seed, pair.first, pair.second])
+    a, b = pair.first_rays, pair.second_rays
+    starts = [np.eye(3), common_rotation(a, b, rng)] + ([] if start is None else [start])
+    return _described(pair, *relative_pose(a, b, starts, pair.error, rng))
 
 
 def with_rotation(pair: PairGeometry, rotation: Array, seed: int) -> PairGeometry | None:

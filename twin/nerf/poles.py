@@ -155,11 +155,11 @@ class _LevelPictures:
         self.lightings = np.array(pixels.cameras.lightings)[frames]
         self.positions = pixels.cameras.positions[frames]
         self._turns = [_level(pixels.cameras.camera_to_world[i]) for i in frames]
-        known = known or {}
-        self.read = {
-            int(i): known[i] if i in known else self._read_frame(pixels, i, turn)
-            for i, turn in zip(frames, self._turns, strict=True)
-        }
+        known, numbers = known or {}, frames.tolist()
+        new = [k for k, i in enumerate(numbers) if i not in known]
+        fresh = parallel(lambda k: self._read_frame(pixels, numbers[k], self._turns[k]), new, "cpu")
+        known = known | {numbers[k]: one for k, one in zip(new, fresh, strict=True)}
+        self.read = {i: known[i] for i in numbers}
         self._intrinsics, self._tables = zip(*self.read.values(), strict=True)
 
     @staticmethod

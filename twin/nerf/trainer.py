@@ -6,7 +6,9 @@ Each step also penalizes density at *free points*: random points near the camera
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -34,7 +36,7 @@ from twin.nerf.buffers import (
     single_threaded_torch,
     warp_view,
 )
-from twin.nerf.dataset import TrainingPixels, constant_height, free_segments, join_depths, random_free_points
+from twin.nerf.dataset import RayBatch, TrainingPixels, constant_height, free_segments, join_depths, random_free_points
 from twin.nerf.detail import fit_detail
 from twin.nerf.evaluate import cross_lighting, evaluate
 from twin.nerf.field import FieldSection, RadianceField, untrained_field
@@ -147,6 +149,11 @@ class Trainer:
         self.free_points = _FREE_POINTS // self.shards
         """Free points per shard and step."""
         self.rays = -(-config.rays // self.shards) * self.shards
+        per_shard = self.rays // self.shards
+        self.supervised, self.triples = int(per_shard * config.sightings), int(per_shard * _TRIPLE_SHARE) // 3
+        """Per shard, the number of rays with depth, and of triples of rays."""
+        self._next: tuple[RayBatch, torch.Tensor | None] | None = None
+        """The next step's rays and free points, if they are drawn."""
         self.ws = Workspace(layouts[0], self.rays, config.samples, device, _FREE_POINTS, training=True)
         self.free = self.road.segments(free_segments(train, config.near_plane))
         """Segments of each section, see `free_segments`."""
@@ -200,36 +207,30 @@ class Trainer:
             self._exclude(movers)
         ws, device = self.ws, self.device
         section = self.steps_done % self.road.count
-        per_shard = self.rays // self.shards
-        supervised = int(per_shard * self.config.sightings)
-        triples = int(per_shard * _TRIPLE_SHARE) // 3
-        singles = per_shard - supervised - 3 * triples
-        batch = self.parts[section].batch(self.rng, self.shards, triples, singles, supervised)
+        batch, free = self._next or self._draw(self.steps_done)
         ws.camera.copy_(torch.from_numpy(batch.frame))
         ws.pixel.copy_(torch.from_numpy(batch.pixel))
         ws.targets.copy_(torch.from_numpy(batch.distance))
         color = torch.from_numpy(batch.color).to(device)
-        free = self._free_points(section, _FREE_POINTS)
         if free is not None:
             ws.positions[self.rays * ws.samples :].copy_(free)
 
         results = parallel(
-            lambda shard: self._shard(section, shard, color, triples, free is not None), range(self.shards), device
+            lambda shard: self._shard(section, shard, color, free is not None), range(self.shards), device
         )
-        rate = self.rate()
-        self._update(section, rate)
-        for tensor, *gradients in zip(self.torch_parameters.values(), *(r[1] for r in results), strict=True):
-            tensor.grad = torch.stack(gradients).sum(0) if len(gradients) > 1 else gradients[0]
-        for group in self.optimizer.param_groups:
-            group["lr"] = _NETWORK_RATE * rate * group["factor"]
-        self.optimizer.step()
-        if self._refines:
-            self.refinement.step(rate * self.frame_rate)  # type: ignore[union-attr]
+        self._update(section, [r[1] for r in results])
         self.steps_done += 1
         return torch.stack([r[0] for r in results])
 
+    def _draw(self, step: int) -> tuple[RayBatch, torch.Tensor | None]:
+        """The rays and free points of a step."""
+        section = step % self.road.count
+        singles = self.rays // self.shards - self.supervised - 3 * self.triples
+        batch = self.parts[section].batch(self.rng, self.shards, self.triples, singles, self.supervised)
+        return batch, self._free_points(section, _FREE_POINTS)
+
     def _shard(
-        self, section: int, shard: int, color: torch.Tensor, triples: int, free: bool
+        self, section: int, shard: int, color: torch.Tensor, free: bool
     ) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Runs a shard; returns its mean squared error, and its gradients in the order of `torch_parameters`."""
         f, s, ws, shards = self.field, self.field.sections[section], self.ws, self.shards
@@ -257,8 +258,9 @@ class Trainer:
         loss = loss + _RESIDUAL * (residuals[frame] ** 2).mean() / shards
         loss = loss + horizon_loss(composited[:, 0], ws.directions[rays, 2]) / shards
         inverse_depth = (ws.inverse_distance[rays] / ws.cosines[rays]).requires_grad_(True)
-        if triples:
-            loss = loss + _PLANE / shards * plane_loss(inverse_depth[: 3 * triples], color[rays][: 3 * triples])
+        if self.triples:
+            in_triples = slice(3 * self.triples)
+            loss = loss + _PLANE / shards * plane_loss(inverse_depth[in_triples], color[rays][in_triples])
         learned = [t for n, t in self.torch_parameters.items() if not n.startswith("trunk")]
         gradients = torch.autograd.grad(loss, [composited, inverse_depth, *learned], allow_unused=True)
         with torch.no_grad():
@@ -320,24 +322,40 @@ class Trainer:
         ws.outputs_grad[rows, 0] = _FREE / _FREE_POINTS * depth / (1.0 + depth)
         return self._trunk_backward(rows)
 
-    def _update(self, section: int, rate: float) -> None:
-        """Accumulates the gradients of the hash tables, takes an Adam step, and updates the opacity grids.
+    def _update(self, section: int, gradients: list[list[torch.Tensor]]) -> None:
+        """Takes a step of all optimizers, updates the opacity grids, and draws the next step's rays.
 
-        On a CPU, hash levels and two halves of the grids' cells are tasks that run in parallel.
+        These are independent tasks. On a CPU they run in parallel: hash levels and two halves of the grids' cells are
+        one task each, those that take longest first.
         """
-        levels = self.config.levels
-        if self.device != "cpu":
-            self._update_levels(section, 0, levels, rate)
-            self._update_grids(section, 0, 1)
-            return
+        rate, levels = self.rate(), self.config.levels
+        tasks: list[Callable[[], None]] = [self._draw_next]
+        if self.device == "cpu":
+            tasks += [partial(self._update_levels, section, level, 1, rate) for level in reversed(range(levels))]
+            tasks += [partial(self._update_grids, section, part, 2) for part in range(2)]
+        else:
+            tasks += [
+                partial(self._update_levels, section, 0, levels, rate),
+                partial(self._update_grids, section, 0, 1),
+            ]
+        tasks.append(partial(self._update_networks, gradients, rate))
+        parallel(lambda task: task(), tasks, self.device)
 
-        def work(task: int) -> None:
-            if task < levels:
-                self._update_levels(section, task, 1, rate)
-            else:
-                self._update_grids(section, task - levels, 2)
+    def _draw_next(self) -> None:
+        """Draws the next step's rays, unless that step excludes pixels first."""
+        following = self.steps_done + 1
+        waits = self.config.transients and following == self.movers_step
+        self._next = None if waits or following >= self.steps else self._draw(following)
 
-        parallel(work, range(levels + 2), self.device)
+    def _update_networks(self, gradients: list[list[torch.Tensor]], rate: float) -> None:
+        """Steps of the networks, the embeddings and the cameras; `gradients` are those of each shard."""
+        for tensor, *of_shards in zip(self.torch_parameters.values(), *gradients, strict=True):
+            tensor.grad = torch.stack(of_shards).sum(0) if len(of_shards) > 1 else of_shards[0]
+        for group in self.optimizer.param_groups:
+            group["lr"] = _NETWORK_RATE * rate * group["factor"]
+        self.optimizer.step()
+        if self._refines:
+            self.refinement.step(rate * self.frame_rate)  # type: ignore[union-attr]
 
     def _update_levels(self, section: int, first: int, count: int, rate: float) -> None:
         """Accumulates the gradients of `count` hash levels from `first` on, and takes an Adam step on them."""
