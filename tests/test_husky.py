@@ -107,8 +107,8 @@ def test_sensors_and_motor_currents_agree_with_the_motion():
     physics = HuskyPhysics(on_plane())
     for _ in range(5):
         physics.step()
-    np.testing.assert_allclose(physics.accelerometer, [0, 0, 9.81], atol=0.02)
-    before = physics.wheel_position
+    np.testing.assert_allclose(physics.data.sensor("imu_accelerometer").data, [0, 0, 9.81], atol=0.02)
+    before = physics.data.qpos[7:].copy()
     for _ in range(20):
         physics.command(0.0, 1.0)
         physics.step()
@@ -116,11 +116,10 @@ def test_sensors_and_motor_currents_agree_with_the_motion():
     physics.command(0.0, 1.0)
     physics.step()
     turned = (physics.planar_pose[2] - pose[2]) / 0.1
-    np.testing.assert_allclose(physics.gyro, [0, 0, turned], atol=0.01)
-    w, x, y, z = physics.orientation
+    np.testing.assert_allclose(physics.data.sensor("imu_gyro").data, [0, 0, turned], atol=0.01)
+    w, x, y, z = physics.data.sensor("imu_orientation").data
     assert np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) == pytest.approx(physics.planar_pose[2], abs=1e-6)
-    assert (np.sign(physics.wheel_position - before) == [-1, 1, -1, 1]).all()
-    np.testing.assert_allclose(physics.wheel_velocity, physics.data.qvel[6:])
+    assert (np.sign(physics.data.qpos[7:] - before) == [-1, 1, -1, 1]).all()
     # Coulomb: μ m g / 2 on the wheels of a side, at the arm that scrubbing leaves; at 79 · 0.035 N m per A.
     torque = 0.7 * MASS * 9.81 / 2 * WHEEL_RADIUS * np.sin(np.arctan(WHEELBASE / TRACK))
     np.testing.assert_allclose(physics.motor_torque, [-torque, torque], rtol=0.05)
@@ -132,7 +131,7 @@ def test_belt_couples_the_wheels_of_a_side():
     for _ in range(20):
         physics.command(0.5, 0.8)
         physics.step()
-    front, rear = physics.wheel_position[:2], physics.wheel_position[2:]
+    front, rear = physics.data.qpos[7:9], physics.data.qpos[9:]
     np.testing.assert_allclose(front, rear, atol=0.01)  # [rad]
 
 

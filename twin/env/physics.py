@@ -17,7 +17,7 @@ from twin.env.controller import CONTROL_PERIOD, Controller
 from twin.errors import InputError
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.mjcf.scene_xml import rest_pose
-from twin.robot import GEAR_RATIO, SIDES, WHEELS, HuskyParams
+from twin.robot import GEAR_RATIO, SIDES, HuskyParams
 from twin.types import Array
 
 TIME_TOLERANCE = 1e-6  # [s] simulation times that differ by less count as equal, because of rounding
@@ -66,9 +66,6 @@ class HuskyPhysics:
         self._body = model.body("base_link").id
         self._camera = model.camera("front").id
         self.actuators = np.array([model.actuator(side).id for side in SIDES])
-        wheels = [model.joint(f"{name}_wheel") for name in WHEELS]
-        self._wheel_angles = np.array([wheel.qposadr[0] for wheel in wheels])
-        self._wheel_dofs = np.array([wheel.dofadr[0] for wheel in wheels])
         self.is_robot = model.body_rootid[model.geom_bodyid] == self._body
         """Mask of the robot's geoms, shape (ngeom,)."""
         self._ground = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "ground")
@@ -285,16 +282,6 @@ class HuskyPhysics:
         return camera_pose(self.delayed_data, self._camera)
 
     @property
-    def wheel_position(self) -> Array:
-        """Encoder angles [rad], shape (4,) in the order of `twin.robot.WHEELS`."""
-        return self.data.qpos[self._wheel_angles].copy()
-
-    @property
-    def wheel_velocity(self) -> Array:
-        """[rad/s], shape (4,) in the order of `twin.robot.WHEELS`."""
-        return self.data.qvel[self._wheel_dofs].copy()
-
-    @property
     def motor_torque(self) -> Array:
         """Torques at the wheels of the left and right side [N m], shape (2,)."""
         return self.data.actuator_force[self.actuators].copy()
@@ -303,21 +290,6 @@ class HuskyPhysics:
     def motor_current(self) -> Array:
         """Current estimated from the torque [A], shape (2,): torque / (gear ratio · `motor_constant`)."""
         return self.motor_torque / (GEAR_RATIO * self.params.motor_constant)
-
-    @property
-    def gyro(self) -> Array:
-        """The IMU's angular velocity in the base frame [rad/s], shape (3,)."""
-        return self.data.sensor("imu_gyro").data.copy()
-
-    @property
-    def accelerometer(self) -> Array:
-        """The IMU's proper acceleration in the base frame [m/s²], shape (3,); 9.81 upwards at rest."""
-        return self.data.sensor("imu_accelerometer").data.copy()
-
-    @property
-    def orientation(self) -> Array:
-        """The IMU's attitude: quaternion w, x, y, z of base to world, shape (4,)."""
-        return self.data.sensor("imu_orientation").data.copy()
 
 
 def camera_pose(data: mujoco.MjData, camera: int) -> Array:
