@@ -24,7 +24,8 @@ from twin.env.obstacles import ground_height
 from twin.env.physics import HuskyPhysics
 from twin.env.route_segments import RouteSegment
 from twin.env.task import control
-from twin.mjcf.world import PART_GROUP, World, heading_error, nearest_on_route, point_at
+from twin.geometry.poses import wrap_angle
+from twin.mjcf.world import PART_GROUP, World, nearest_on_route, point_at
 from twin.robot import BASE_HEIGHT
 from twin.runtime import bar
 from twin.types import Array
@@ -262,5 +263,5 @@ class _Rammer:
 def _toward(pose: Array, target: Array) -> tuple[float, float]:
     """Command at full speed towards a point; a turn on the spot if the point is more than 1 rad aside."""
     x, y = target - pose[:2]
-    error = float(heading_error(np.arctan2(y, x), pose[2]))
+    error = float(wrap_angle(np.arctan2(y, x) - pose[2]))
     return (1.0 if abs(error) < 1.0 else 0.0), float(np.clip(2.0 * error, -1.0, 1.0))

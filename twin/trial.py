@@ -33,6 +33,7 @@ from twin.errors import InputError
 from twin.evaluation.trial_judge import JudgedTrial, TrialViews, judge, replay, view
 from twin.evaluation.trials import Trial, read_real_trials, recorded_twin_lighting, write_real_trials
 from twin.files import read_json, wrap_read_errors, write_json
+from twin.geometry.poses import wrap_angle
 from twin.learn.policy import Policy, find_policy, load_policy
 from twin.loading import load_writable
 from twin.report.drive_dataset import drives_summary, write_bag_dataset
@@ -224,7 +225,7 @@ def _figures(
     def at(seconds: float) -> float | None:
         return float(np.interp(seconds, trial.times, off)) if trial.times[-1] >= seconds else None
 
-    turned = (trial.poses[-1, 2] - replayed[-1, 2] + np.pi) % (2 * np.pi) - np.pi
+    turned = wrap_angle(trial.poses[-1, 2] - replayed[-1, 2])
     same = np.abs(apart).max(1, initial=0.0) < _SAME
     return {
         "cause": trial.cause,

@@ -24,7 +24,8 @@ from twin.env.controller import CONTROL_PERIOD
 from twin.env.options import check_actions
 from twin.env.physics import HuskyPhysics
 from twin.errors import InputError, short_repr
-from twin.mjcf.world import World, arc_lengths, heading_at, heading_error, nearest_on_route, point_at
+from twin.geometry.poses import wrap_angle
+from twin.mjcf.world import World, arc_lengths, heading_at, nearest_on_route, point_at
 from twin.types import Array
 
 if TYPE_CHECKING:  # not imported at run time: `follow_route` works without dm_control
@@ -200,7 +201,7 @@ def _pursuit_target(route: Array, s: float, length: float) -> Array:
 
 def _updated_gain(gain: float, previous: Array, pose: Array, command: tuple[float, float]) -> float:
     """Moves the gain towards the ratio of commanded to achieved curvature in the last control step."""
-    turned = float(heading_error(pose[2], previous[2])) / CONTROL_PERIOD
+    turned = float(wrap_angle(pose[2] - previous[2])) / CONTROL_PERIOD
     moved = float(np.linalg.norm(pose[:2] - previous[:2])) / CONTROL_PERIOD
     v, yaw_rate = command
     if abs(yaw_rate) < _GAIN_MIN_YAW_RATE or abs(turned) < _GAIN_MIN_YAW_RATE or yaw_rate * turned < 0 or moved < 0.2:

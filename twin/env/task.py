@@ -31,7 +31,8 @@ from twin.env.physics import EpisodeState, HuskyPhysics
 from twin.env.route_segments import RouteSegment
 from twin.errors import InputError
 from twin.files import write_json
-from twin.mjcf.world import World, heading_at, heading_error, nearest_on_route, point_at
+from twin.geometry.poses import wrap_angle
+from twin.mjcf.world import World, heading_at, nearest_on_route, point_at
 from twin.robot import HuskyParams
 from twin.types import Array
 
@@ -177,8 +178,8 @@ class RewardAndTermination:
         """
         foot = self.foot[which]
         heading = heading_at(self._route, foot)
-        turns = heading_error(heading_at(self._route, foot[:, None] + np.array(_LOOKAHEADS)), heading[:, None])
-        error = heading_error(motion.pose[:, 2], heading)
+        turns = wrap_angle(heading_at(self._route, foot[:, None] + np.array(_LOOKAHEADS)) - heading[:, None])
+        error = wrap_angle(motion.pose[:, 2] - heading)
         columns = (motion.speed, motion.yaw_rate, self.cross_track[which], error)
         return np.clip(np.column_stack([*columns, turns]).astype(np.float32), *self.state_bounds)
 

@@ -15,7 +15,8 @@ from twin.env.task import Motion, RewardAndTermination
 from twin.errors import InputError
 from twin.geometry.cameras import Rendering, Viewpoints
 from twin.geometry.images import psnr
-from twin.mjcf.world import heading_at, heading_error
+from twin.geometry.poses import wrap_angle
+from twin.mjcf.world import heading_at
 from twin.robot import PixelCamera
 from twin.types import Array, Image
 
@@ -81,7 +82,7 @@ def judge(factory: EnvFactory, times: Array, poses: Array, uprightness: Array) -
         if cause:
             break
     k = len(cross)
-    heading = float(heading_error(poses[0, 2], float(heading_at(factory.world.route[:, :2], foot[0]))))
+    heading = float(wrap_angle(poses[0, 2] - float(heading_at(factory.world.route[:, :2], foot[0]))))
     progress = np.array(foot) - factory.segment.start
     return JudgedTrial(times[:k], poses[:k], np.array(cross), progress, cause, heading, np.array(rewards))
 

@@ -77,6 +77,11 @@ def rotation_angle(rotation: Array) -> Array:
     return np.arctan2(np.linalg.norm(skew, axis=-1), np.trace(rotation, axis1=-2, axis2=-1) - 1.0)
 
 
+def wrap_angle(angle: Array | float) -> Array:
+    """The same angle in [−π, π) [rad]."""
+    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
+
+
 def look_at(eye: Array, target: Array) -> Array:
     """camera_to_world of an upright OpenCV camera at `eye` that looks at `target`, shape (4, 4)."""
     forward = (target - eye) / np.linalg.norm(target - eye)

@@ -230,8 +230,3 @@ def corridor_edges(route: Array, half_width: float) -> tuple[Array, Array]:
     heading = heading_at(route, arc_lengths(route))
     normal = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], -1) * half_width
     return route + normal, route - normal
-
-
-def heading_error(target: Array | float, actual: Array | float) -> Array:
-    """target − actual, wrapped to ±π [rad]."""
-    return (np.asarray(target) - actual + np.pi) % (2 * np.pi) - np.pi

@@ -33,6 +33,7 @@ from scipy.spatial import cKDTree
 
 from twin.files import load_arrays, save_arrays
 from twin.geometry.cameras import Cameras
+from twin.geometry.poses import wrap_angle
 from twin.nerf.buffers import parallel
 from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths, load_picture
 from twin.nerf.kernels import upright as kernels
@@ -194,7 +195,7 @@ class _LevelPictures:
             way = feet[index, :2] - self.positions[k, :2]
             bearing = np.arctan2(way[:, 1], way[:, 0])
             first[index] = np.where(np.isnan(first[index]), bearing, first[index])
-            turned = (bearing - first[index] + np.pi) % (2.0 * np.pi) - np.pi
+            turned = wrap_angle(bearing - first[index])
             low[index], high[index] = np.minimum(low[index], turned), np.maximum(high[index], turned)
         return high - low
 

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from twin.geometry.poses import wrap_angle
 from twin.robot import TRACK, WHEEL_RADIUS
 from twin.sysid.estimation import Kinds, fit_with_scales, robust_loss
-from twin.sysid.logs import MAX_POSE_AGE, PERIOD, SAMPLES, Windows, resample_poses, wrap_angle
+from twin.sysid.logs import MAX_POSE_AGE, PERIOD, SAMPLES, Windows, resample_poses
 from twin.types import Array
 
 POSE_KINDS: Kinds = (0, 0, 1)

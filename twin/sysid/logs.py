@@ -355,11 +355,6 @@ def relative_poses(poses: Array) -> Array:
     return np.stack([cos * x + sin * y, cos * y - sin * x, turned[..., 2]], -1)
 
 
-def wrap_angle(angle: Array) -> Array:
-    """The same angle in [−π, π) [rad]."""
-    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
-
-
 def _need(columns: dict[str, Array], names: tuple[str, ...], where: str) -> None:
     missing = [name for name in names if name not in columns]
     if missing:
