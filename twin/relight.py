@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import commands, runtime
-from twin.assets.ground import Ground
+from twin.assets.ground import Ground, lattice_faces
+from twin.assets.tsdf import compact
 from twin.assets.views import Views, render_views
 from twin.errors import InputError
 from twin.files import load_arrays
@@ -437,9 +438,7 @@ def rough_triangles(views: Views, ground: Ground, mesh_vertices: Array) -> tuple
     all_vertices, all_faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for i in range(len(views)):
         depth, points = views.depth[i], views.points(i)
-        number = np.arange(depth.size).reshape(depth.shape)
-        a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
-        faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+        faces = lattice_faces(*depth.shape)
         corners = depth.ravel()[faces]
         faces = faces[
             (corners.min(1) > 0.0)
@@ -450,10 +449,10 @@ def rough_triangles(views: Views, ground: Ground, mesh_vertices: Array) -> tuple
         height = middle[:, 2] - ground.at(middle[:, :2])
         inside = ((middle[:, :2] > low) & (middle[:, :2] < high)).all(1)
         faces = faces[height > np.where(inside, top, _LEAST_HEIGHT)]
-        used, index = np.unique(faces, return_inverse=True)
-        all_vertices.append(points.reshape(-1, 3)[used])
-        all_faces.append(index.reshape(-1, 3) + count)
-        count += len(used)
+        vertices, faces = compact(points.reshape(-1, 3), faces)
+        all_vertices.append(vertices)
+        all_faces.append(faces + count)
+        count += len(vertices)
     return np.concatenate(all_vertices), np.concatenate(all_faces)
 
 

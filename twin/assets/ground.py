@@ -65,10 +65,7 @@ class Ground:
         grid_c, grid_r = np.meshgrid(column, row)
         xy = self.origin + self.cell * np.stack([grid_c, grid_r], -1)
         vertices = np.concatenate([xy, self.height[grid_r, grid_c][..., None]], -1).reshape(-1, 3)
-        node = np.arange(len(vertices)).reshape(grid_r.shape)
-        a, b, c, d = node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]
-        faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-        return vertices, faces.astype(np.int64)
+        return vertices, lattice_faces(*grid_r.shape)
 
     def save(self, folder: Path) -> None:
         """Writes `ground.npz`."""
@@ -93,6 +90,13 @@ class Ground:
             if not (0.0 < ground.cell < np.inf and np.isfinite(ground.height).all() and rows * columns):
                 raise ValueError(f"cell = {ground.cell} m; expected > 0, and one or more heights, all finite")
         return ground
+
+
+def lattice_faces(rows: int, columns: int) -> NDArray[np.int64]:
+    """Triangles (f, 3) over a lattice of vertices numbered row by row; they face up if rows are along y, columns x."""
+    node = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]))
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
 def _interpolate(height: Array, origin: Array, cell: float, xy: Array, order: int) -> Array:

@@ -28,6 +28,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, UsdUtils, U
 from scipy.spatial import ConvexHull
 
 from twin.assets.gaussians import SH_CONSTANT, Gaussians
+from twin.assets.ground import lattice_faces
 from twin.errors import InputError
 from twin.files import atomic_path
 from twin.mjcf.scene_xml import Parts
@@ -220,11 +221,7 @@ def ground_triangles(model: mujoco.MjModel) -> tuple[NDArray[np.float32], NDArra
     height = model.hfield_data[start : start + rows * columns] * top
     y, x = np.meshgrid(np.linspace(-half_y, half_y, rows), np.linspace(-half_x, half_x, columns), indexing="ij")
     vertices = np.stack([x.ravel(), y.ravel(), height], -1) + geom.pos
-    corner = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (one.ravel() for one in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
-    return vertices.astype(np.float32), np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(
-        np.int32
-    )
+    return vertices.astype(np.float32), lattice_faces(rows, columns).astype(np.int32)
 
 
 def _add_robot(stage: Any, model: mujoco.MjModel, tires: Any, bare: Any) -> None:

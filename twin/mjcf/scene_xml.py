@@ -167,12 +167,6 @@ def covered_by_ground(vertices: NDArray, ground: Ground) -> NDArray[np.bool_]:
     return inside & (vertices[:, 2] - ground.at(vertices[:, :2]) < _GROUND_OVERLAP)
 
 
-def drop_unused_vertices(vertices: NDArray, colors: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Vertices, colors and faces without the vertices that no face uses."""
-    used, inverse = np.unique(faces, return_inverse=True)
-    return vertices[used], colors[used], inverse.reshape(faces.shape)
-
-
 def _add_sky_and_lights(spec: mujoco.MjSpec) -> None:
     spec.add_texture(
         name="sky",
@@ -249,12 +243,12 @@ def _add_visual(spec: mujoco.MjSpec, ground: Ground, path: Path, assets: Path) -
     data = load_arrays(path)
     vertices, faces, colors = data["vertices"], data["faces"], data["colors"]
     faces = faces[~covered_by_ground(vertices, ground)[faces].all(1)]
-    vertices, colors, faces = drop_unused_vertices(vertices, colors, faces)
     if len(faces) == 0:
         return 0
     texture, texcoords = face_texture(colors[faces])
     write_image(assets / "visual.png", texture)
-    write_obj(assets / "visual.obj", vertices, faces, texcoords)
+    used, index = np.unique(faces, return_inverse=True)
+    write_obj(assets / "visual.obj", vertices[used], index.reshape(faces.shape), texcoords)
     mesh = spec.add_mesh(name="visual", file="visual.obj")
     # SHELL: an open surface has no volume.
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
