@@ -9,8 +9,9 @@ import pytest
 from filmed_wall import HEIGHT, WIDTH, captured, film, refused, views
 from PIL import ExifTags, Image
 
-from twin.capture.photos import evenly_spaced, photo_times, read_exif
+from twin.capture.photos import photo_times, read_exif
 from twin.config import SourceConfig
+from twin.geometry.cameras import evenly_spaced
 from twin.geometry.images import read_image, write_image
 
 

@@ -28,10 +28,10 @@ from twin.report.review_chapters import (
     appearance_of_frame,
     comparison_row,
     error_colors,
-    evenly_spaced,
     frames_to_compare,
     gray_out,
     lighting_at,
+    spread_choice,
 )
 from twin.report.review_video import overview_pose, prefetched, write_review_video
 from twin.report.video_layout import (
@@ -206,8 +206,8 @@ def test_the_nearest_frame_is_at_the_same_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, []), (1, [5]), (2, [0, 9]), (3, [0, 4, 9]), (99, list(range(10)))])
-def test_evenly_spaced_picks_the_middle_or_both_ends(count: int, expected: list[int]) -> None:
-    assert evenly_spaced(range(10), count) == expected
+def test_a_spread_choice_has_the_middle_or_both_ends(count: int, expected: list[int]) -> None:
+    assert spread_choice(range(10), count) == expected
 
 
 def test_every_lighting_has_its_segment_of_the_drive() -> None:

@@ -19,12 +19,12 @@ from scipy.spatial import cKDTree
 
 from twin.capture.camera_models import Lens, camera_to_world, lens_from_json, same_aspect
 from twin.capture.capture_data import Capture
-from twin.capture.photos import PhotoExif, evenly_spaced
+from twin.capture.photos import PhotoExif
 from twin.capture.video import fitted_size
 from twin.capture.worker import run_worker, send_message
 from twin.errors import InputError
 from twin.files import read_json, write_json
-from twin.geometry.cameras import Cameras, SparsePoints, project
+from twin.geometry.cameras import Cameras, SparsePoints, evenly_spaced, project
 from twin.geometry.images import decode_image, resize, write_image
 from twin.scene import SceneDir
 from twin.types import Array, Image

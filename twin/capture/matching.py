@@ -25,6 +25,7 @@ from twin.capture.pair_geometry import Pair, PairGeometry, ordered_pair, pair_ge
 from twin.capture.pose_averaging import consistent_pairs
 from twin.capture.worker import send_message
 from twin.errors import InputError
+from twin.geometry.cameras import evenly_spaced
 from twin.geometry.images import write_image
 from twin.types import Array
 
@@ -113,7 +114,7 @@ def probe_pairs(source_index: NDArray[np.int64], signatures: Array) -> set[Pair]
     groups = frames_by_source(source_index)
     pairs: set[Pair] = set()
     for a, first in enumerate(groups):
-        probed = np.unique(np.linspace(0, len(first) - 1, min(_PROBES_PER_SOURCE, len(first))).round().astype(int))
+        probed = evenly_spaced(len(first), _PROBES_PER_SOURCE)
         for k in probed:
             i = int(first[k])
             far = first[np.abs(np.arange(len(first)) - k) > SEQUENCE_STEPS[-1]]

@@ -26,6 +26,7 @@ from twin.capture.capture_data import QUEUE_SIZE, KeptFrames, SourceTask, read_m
 from twin.capture.formats import ImageSet
 from twin.capture.video import BLANK_STD, fitted_size, in_segments
 from twin.errors import InputError
+from twin.geometry.cameras import evenly_spaced
 from twin.geometry.images import DECODE_ERRORS, decode_image, open_header, resize
 from twin.types import Array, Image
 
@@ -323,11 +324,6 @@ def photo_times(clock: list[float | None], index: list[int]) -> list[float]:
 def _strictly_rising(clock: list[float | None]) -> bool:
     known = [t for t in clock if t is not None]
     return len(known) == len(clock) and len(known) > 1 and all(b > a for a, b in itertools.pairwise(known))
-
-
-def evenly_spaced(count: int, limit: int) -> NDArray[np.int64]:
-    """Indices of at most `limit` of `count` items, evenly spaced, ends included."""
-    return np.arange(count) if count <= limit else np.round(np.linspace(0, count - 1, limit)).astype(np.int64)
 
 
 def _focal_prior(focals: list[float], size: tuple[int, int], name: str) -> Lens | None:

@@ -13,7 +13,7 @@ import numpy as np
 from twin.env.env_factory import EnvFactory
 from twin.env.task import Motion, RewardAndTermination
 from twin.errors import InputError
-from twin.geometry.cameras import Rendering, Viewpoints
+from twin.geometry.cameras import Rendering, Viewpoints, evenly_spaced
 from twin.geometry.images import psnr
 from twin.geometry.poses import wrap_angle
 from twin.mjcf.world import heading_at
@@ -154,7 +154,7 @@ def view(
         return field.render(Viewpoints.of(seen[i], intrinsics, camera.size), name)
 
     if lighting is None:
-        some = np.unique(np.linspace(0, len(seen) - 1, _PROBES).round().astype(int)).tolist()
+        some = evenly_spaced(len(seen), _PROBES).tolist()
         scores = {name: np.median([psnr(render(i, name).rgb[0], real[i]) for i in some]) for name in field.lightings}
         lighting = max(scores, key=lambda name: float(scores[name]))
     renderings = [render(i, lighting) for i in range(len(seen))]

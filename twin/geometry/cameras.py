@@ -104,6 +104,11 @@ class Cameras:
         return Cameras(**texts, **arrays, images=images, masks=masks)  # type: ignore[arg-type]
 
 
+def evenly_spaced(count: int, limit: int) -> NDArray[np.int64]:
+    """Indices of at most `limit` of `count` items, evenly spaced, ends included."""
+    return np.arange(count) if count <= limit else np.round(np.linspace(0, count - 1, limit)).astype(np.int64)
+
+
 def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:
     """Index of the frame under `lighting` whose pose is closest to frame i's; None if that lighting has no frame."""
     offset = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)

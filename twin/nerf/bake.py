@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from twin.errors import InputError
-from twin.geometry.cameras import pixel_grid
+from twin.geometry.cameras import evenly_spaced, pixel_grid
 from twin.nerf import network
 from twin.nerf.baked import BakedField
 from twin.nerf.baked_arrays import BakedSection, BrickLayout, brick_indices, skip_distances
@@ -116,7 +116,7 @@ def _surface_positions(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Grid positions of surface samples seen by the training cameras, (a, 3) in the near box and (b, 3) outside."""
     cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, section.device)
-    frames = pixels.frames[np.unique(np.linspace(0, len(pixels.frames) - 1, _VIEWS).round().astype(int))]
+    frames = pixels.frames[evenly_spaced(len(pixels.frames), _VIEWS)]
     spots: list[tuple[NDArray, NDArray]] = [(np.zeros((0, 3), "f4"),) * 2] * len(frames)
 
     with bar("finding surfaces", len(spots), "view") as progress:

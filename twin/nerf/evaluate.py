@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from twin.geometry.cameras import Cameras, RenderableField, nearest_frame, pixel_grid, unproject
+from twin.geometry.cameras import Cameras, RenderableField, evenly_spaced, nearest_frame, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, ssim
 from twin.nerf import network
 from twin.nerf.appearance import fit_appearance
@@ -136,9 +136,7 @@ def evaluate(
     frames = []
     for name in field.lightings:
         mine = [i for i in np.flatnonzero(cameras.held_out) if cameras.lightings[i] == name]
-        if len(mine) > max_frames:
-            mine = [mine[k] for k in np.linspace(0, len(mine) - 1, max_frames).round().astype(int)]
-        frames += [(name, int(i)) for i in mine]
+        frames += [(name, int(mine[k])) for k in evenly_spaced(len(mine), max_frames)]
     scores: dict[str, list[dict[str, float]]] = {name: [] for name in field.lightings}
     with single_threaded_torch():
         for name, i in track(frames, "held-out frames", unit="frame"):
@@ -193,8 +191,7 @@ def cross_lighting(field: RenderableField, cameras: Cameras, max_poses: int = _M
     poses = []
     for name in lightings:
         mine = [i for i, light in enumerate(trained.lightings) if light == name]
-        some = np.unique(np.linspace(0, len(mine) - 1, max(1, max_poses // len(lightings))).round().astype(int))
-        poses += [mine[k] for k in some]
+        poses += [mine[k] for k in evenly_spaced(len(mine), max(1, max_poses // len(lightings)))]
     light = np.array([lightings.index(trained.lightings[i]) for i in poses])
     shown = np.empty((len(poses), len(lightings), 3))
     moves = 0.0

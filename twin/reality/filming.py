@@ -18,7 +18,7 @@ from av.video.reformatter import Colorspace
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
+from twin.geometry.cameras import evenly_spaced, opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.reality import SEED, primitives, true_world
 from twin.reality.lighting import Lighting
@@ -369,7 +369,7 @@ def depth_maps(
     """
     part = 4 if plan.height % 4 == 0 else 3
     small = replace(plan, width=plan.width // part, height=plan.height // part, samples=1, oversize=1.0)
-    frames = np.unique(np.linspace(0, len(poses) - 1, 10).round().astype(np.int64))
+    frames = evenly_spaced(len(poses), 10)
     if is_long(place):
         # One ray per pixel, as in the renderer, but at the mesh of the whole place; a renderer may have a part of it.
         whole = primitives.join([one.part for one in place.objects])

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from twin.assets.ground import Ground
 from twin.errors import InputError
 from twin.files import load_arrays, read_json, wrap_read_errors, write_json
-from twin.geometry.cameras import Cameras, Viewpoints, pixel_grid, scaled_intrinsics, unproject
+from twin.geometry.cameras import Cameras, Viewpoints, evenly_spaced, pixel_grid, scaled_intrinsics, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, rotation_angle, umeyama
 from twin.geometry.route import BRANCH
@@ -351,7 +351,7 @@ def _surface_errors(mesh: Path, truth: Truth, to_truth: Similarity, true_poses: 
         return out
     parts = [(to_truth.points(v), f) for v, f in load_parts(mesh)]
     out["corridor_intrusions"] = sum(intrudes(v, f, truth) for v, f in parts)
-    viewpoints = true_poses[np.unique(np.linspace(0, len(true_poses) - 1, _MAX_CAMERAS).round().astype(int))]
+    viewpoints = true_poses[evenly_spaced(len(true_poses), _MAX_CAMERAS)]
     kinds = {
         kind: [t.part for t in truth.place.objects if t.kind == kind] for kind in ("ground", "obstacle", "foliage")
     }
@@ -470,7 +470,7 @@ def depth_errors(
         lighting = truth.lighting(name)
         if lighting not in field.lightings:
             continue
-        pick = np.unique(np.linspace(0, len(film.depth) - 1, 5).round().astype(int))[1:4]
+        pick = evenly_spaced(len(film.depth), 5)[1:4]
         poses = to_truth.inverse().poses(film.camera_to_world[film.depth_frames[pick]])
         height, width = film.depth.shape[1:]
         depth = field.render(Viewpoints.of(poses, truth.intrinsics, truth.size), lighting, (width, height)).depth

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from twin.env.drivers import RecordedDrive
 from twin.errors import join_names
 from twin.files import write_bytes
-from twin.geometry.cameras import Cameras, RenderableField, Rendering, Viewpoints, nearest_frame
+from twin.geometry.cameras import Cameras, RenderableField, Rendering, Viewpoints, evenly_spaced, nearest_frame
 from twin.geometry.images import psnr, read_image, resize, to_uint8
 from twin.mjcf.world import World, arc_lengths
 from twin.report.video_layout import (
@@ -136,13 +136,10 @@ def gray_out(image: Image, ignored: NDArray[np.bool_]) -> Image:
     return np.where(ignored[..., None], gray, image).astype(np.uint8)
 
 
-def evenly_spaced(indices: Sequence[int] | NDArray, count: int) -> list[int]:
+def spread_choice(indices: Sequence[int] | NDArray, count: int) -> list[int]:
     """At most `count` of the indices, evenly spaced from the first to the last; if `count` is 1, the middle one."""
-    if count >= len(indices):
-        return [int(i) for i in indices]
-    if count <= 1:
-        return [int(indices[len(indices) // 2])][:count]
-    return [int(indices[i]) for i in np.unique(np.linspace(0, len(indices) - 1, count).round().astype(int))]
+    some = [len(indices) // 2] if count == 1 and len(indices) else evenly_spaced(len(indices), max(0, count))
+    return [int(indices[i]) for i in some]
 
 
 def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
@@ -155,8 +152,8 @@ def frames_to_compare(cameras: Cameras, lighting: str, count: int) -> list[int]:
     mine = [i for i in of_lighting if cameras.sources[i] == longest]
     held_out = [i for i in mine if cameras.held_out[i]]
     trained = [i for i in mine if not cameras.held_out[i]]
-    unseen = evenly_spaced(held_out, max(1, count // 2))
-    return sorted([*unseen, *evenly_spaced(trained, count - len(unseen))])
+    unseen = spread_choice(held_out, max(1, count // 2))
+    return sorted([*unseen, *spread_choice(trained, count - len(unseen))])
 
 
 def appearance_of_frame(cameras: Cameras, i: int) -> str:

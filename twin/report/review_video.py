@@ -24,7 +24,7 @@ from twin.env.physics import HuskyPhysics
 from twin.env.trust import Trust
 from twin.errors import InputError
 from twin.files import write_json
-from twin.geometry.cameras import Cameras, RenderableField, Viewpoints
+from twin.geometry.cameras import Cameras, RenderableField, Viewpoints, evenly_spaced
 from twin.geometry.poses import look_at
 from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
@@ -36,11 +36,11 @@ from twin.report.review_chapters import (
     LIGHTING_STRIP,
     Studio,
     comparison_frames,
-    evenly_spaced,
     frame_timing,
     lighting_steps,
     rendered_instants,
     smoothed_speed,
+    spread_choice,
     write_comparison_chapter,
     write_drive_chapter,
     write_lighting_chapter,
@@ -190,7 +190,7 @@ def _compare_geometry(studio: Studio, scene: SceneDir, world: World, drive: Reco
     if not (folder / "ground.npz").exists():
         return None
     views = render_views(studio.field, world, view_poses(drive.camera_to_world), studio.field.lightings[0])
-    for number, k in enumerate(evenly_spaced(range(len(views.visual_depth)), _GAP_ROWS + 2)[1:-1]):
+    for number, k in enumerate(spread_choice(range(len(views.visual_depth)), _GAP_ROWS + 2)[1:-1]):
         row = gap_row(views, k)
         studio.save_picture(
             f"seen_{number}", "seen_touched", "the field and the collision geometry at the same pose", row, row.shape[1]
@@ -226,7 +226,7 @@ def _save_capture_pictures(studio: Studio) -> None:
     cameras = studio.cameras
     for number, lighting in enumerate(dict.fromkeys(cameras.lightings)):
         mine = [i for i, name in enumerate(cameras.lightings) if name == lighting]
-        row = [studio.real_frame(i) for i in evenly_spaced(mine, 4)]
+        row = [studio.real_frame(i) for i in spread_choice(mine, 4)]
         studio.save_picture(
             f"capture_{number}", "capture", f"{lighting}: frames from start to end", side_by_side(row, 180)
         )
@@ -254,7 +254,7 @@ def drive_metrics(drive: RecordedDrive) -> dict[str, Any]:
 
 def drive_trace(drive: RecordedDrive) -> dict[str, list[float]]:
     """A downsampled drive: distance along the route [m], cross-track error [m], speed [m/s]."""
-    index = np.unique(np.linspace(0, len(drive.times) - 1, _TRACE_SAMPLES).round().astype(int))
+    index = evenly_spaced(len(drive.times), _TRACE_SAMPLES)
     columns = {"progress_m": drive.progress, "cross_track_m": drive.cross_track, "speed_m_s": smoothed_speed(drive)}
     return {name: [round(float(v), 4) for v in values[index]] for name, values in columns.items()}
 
