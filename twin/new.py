@@ -36,6 +36,7 @@ from twin.config_file import ROBOT_TOML, parse_table
 from twin.errors import InputError, join_names
 from twin.files import atomic_path, digest_file, exists, is_file, new_folder, read_toml, toml_string, write_text
 from twin.geometry.images import write_image
+from twin.geometry.passes import path_length
 from twin.robot import BASE_HEIGHT, HuskyParams
 from twin.scene import MAX_NAME, SceneDir
 from twin.sysid.identification import toml_text
@@ -239,7 +240,7 @@ def _odometry_way(bag: BagContents) -> float:
     """Length of the path during a bag's film, by odometry [m]."""
     during = (bag.odometry_times >= bag.stamps[0]) & (bag.odometry_times <= bag.stamps[-1])
     some = bag.odometry[during & np.isfinite(bag.odometry).all(1)]
-    return float(np.linalg.norm(np.diff(some[:: max(1, len(some) // 1000)], axis=0), axis=1).sum())
+    return path_length(some[:: max(1, len(some) // 1000)])
 
 
 def _write_seat(path: Path, bag: BagContents) -> CameraSeat | None:

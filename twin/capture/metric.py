@@ -25,6 +25,7 @@ from twin.config import SceneConfig
 from twin.errors import InputError
 from twin.files import write_json
 from twin.geometry.cameras import Cameras, SparsePoints
+from twin.geometry.passes import path_length, path_stations
 from twin.geometry.poses import Similarity
 from twin.scene import SceneDir
 from twin.types import Array
@@ -130,7 +131,7 @@ def _level_frame(cameras: Cameras, up: Array, level: float, scale: float, east: 
 def _driving_direction(cameras: Cameras, up: Array) -> Array:
     """Horizontal direction of the first part of the first source's path; without motion, that of the first view."""
     centers = cameras.positions[np.array(cameras.sources) == cameras.sources[0]]
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centers, axis=0), axis=1))])
+    along = path_stations(centers)
     end = int(np.searchsorted(along, max(_INITIAL_FRACTION * along[-1], 1e-12)))
     direction = centers[min(max(end, 1), len(centers) - 1)] - centers[0]
     direction = direction - (direction @ up) * up
@@ -160,10 +161,7 @@ def _metrics(
             heights = local[np.isfinite(local)]
     spread = 1.4826 * float(np.median(np.abs(heights - np.median(heights))))
     sources = np.array(cameras.sources)
-    lengths = [
-        float(np.linalg.norm(np.diff(cameras.positions[sources == name], axis=0), axis=1).sum())
-        for name in dict.fromkeys(cameras.sources)
-    ]
+    lengths = [path_length(cameras.positions[sources == name]) for name in dict.fromkeys(cameras.sources)]
     return {
         "scale_source": scale_source,
         "scale": scale.value,

@@ -189,7 +189,7 @@ def _frame_stations(xy: Array, path: Array) -> Array:
     """Arc length [m] of frames (n, 2) along their own path; it never decreases, even where the path crosses itself."""
     total = path_length(path)
     kept = moving(xy)
-    raw = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy[kept], axis=0), axis=1))])
+    raw = path_stations(xy[kept])
     return np.interp(np.arange(len(xy)), kept, raw * (total / max(float(raw[-1]), 1e-9)))
 
 
@@ -244,8 +244,13 @@ def moving(xy: Array) -> list[int]:
         kept.append(i)
 
 
+def path_stations(path: Array) -> Array:
+    """Arc length [m] at each point of a polyline (m, d), shape (m,)."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+
+
 def path_length(path: Array) -> float:
-    """Length of a polyline (m, 2) [m]."""
+    """Length of a polyline (m, d) [m]."""
     return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
@@ -264,7 +269,7 @@ def smooth_line(corners: Sequence[Array] | Array) -> Array:
 
 def resample(xy: Array, curved: bool) -> Array:
     """Points about `SPACING` apart along a polyline (n ≥ 2, 2) or, if `curved`, along a curve through its points."""
-    station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+    station = path_stations(xy)
     # Equal steps close to the spacing, so that the last point is the end of the path.
     count = max(round(float(station[-1]) / SPACING), 1)
     at = np.linspace(0.0, station[-1], count + 1)

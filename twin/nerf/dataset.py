@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, SparsePoints, project, scaled_intrinsics
 from twin.geometry.images import read_image, resize
+from twin.geometry.passes import path_stations
 from twin.runtime import track
 
 _MAX_POINT_ERROR = 2.0  # [px] greatest reprojection error of a used point
@@ -163,7 +164,7 @@ class TrainingPixels:
         for source in dict.fromkeys(self.cameras.sources):
             frames = np.flatnonzero([s == source for s in self.cameras.sources])
             path = self.cameras.positions[frames]
-            arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+            arc = path_stations(path)
             for k, i in enumerate(frames):
                 s = arc[k] + np.linspace(0.5, _PATH_REACH, 40) * camera_height
                 s = s[s <= arc[-1]]

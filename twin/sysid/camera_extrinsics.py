@@ -30,6 +30,7 @@ from twin.config import CaptureConfig
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, opencv_to_mujoco
 from twin.geometry.images import psnr, write_image
+from twin.geometry.passes import path_length
 from twin.loading import load_scene
 from twin.mjcf.scene_xml import rest_pose
 from twin.robot import BASE_HEIGHT, CAMERA_AHEAD, HuskyParams, PixelCamera
@@ -74,7 +75,7 @@ def estimate_extrinsics(
         InputError: too few frames, or too short a path.
     """
     poses = np.asarray(camera_to_world, float)
-    way = float(np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1).sum())
+    way = path_length(poses[:, :2, 3])
     if len(poses) < _MIN_FRAMES or way < _MIN_WAY:
         raise InputError(
             f"{len(poses)} frames of the film were localized in the place, over {way:.1f} m; expected at least "

@@ -40,6 +40,7 @@ from twin.capture.camera_models import Lens
 from twin.capture.localize import register_film
 from twin.capture.scale import local_east_north_up
 from twin.errors import InputError
+from twin.geometry.passes import path_stations
 from twin.robot import HuskyParams
 from twin.scene import SceneDir, require_stage
 from twin.sysid.camera_extrinsics import base_below_camera
@@ -264,7 +265,7 @@ def _poses(times: NDArray[np.int64], rows: list[Any], where: str) -> tuple[NDArr
 
 def _headings(xy: Array) -> Array:
     """Heading of motion [rad] at positions (n, 2), from `_STEP` before to `_STEP` after; constant while standing."""
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1)))
+    way = path_stations(xy)
     ahead, behind = (np.stack([np.interp(way + d, way, c) for c in xy.T], -1) for d in (_STEP, -_STEP))
     return np.unwrap(np.arctan2(*(ahead - behind).T[::-1]))
 
@@ -318,7 +319,7 @@ def scene_frame(
     ground = Ground.load(require_stage(scene, "mesh"))
     stamps = recording.shutter[recording.shutter >= start]
     xy = recording.poses_at(stamps)[:, :2]
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))) if len(xy) else np.zeros(0)
+    way = path_stations(xy) if len(xy) else np.zeros(0)
     some = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], _LOCATED))) if len(way) else np.zeros(0, int)
     native = recording.camera.without_distortion()
     pictures = dict(recording.rectified(stamps[some], Rectifier(recording.camera, native, max_outside=1.0)))
