@@ -242,7 +242,7 @@ class Workspace:
     """
 
     def __init__(self, layout: Layout, rays: int, samples: int, device: str, extra: int = 0, training: bool = False):
-        self.rays, self.samples, self.extra, self.device = rays, samples, extra, device
+        self.rays, self.samples, self.device = rays, samples, device
         rows, channels = rays * samples + extra, volume.CHANNELS
         levels, width = layout.levels, layout.levels * hashgrid.FEATURES
 

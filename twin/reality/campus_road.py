@@ -326,12 +326,12 @@ def build(route: RoadLine | None = None, displaced: bool = False) -> KnownPlace:
     return place
 
 
-def _road_strip(route: DrivenLine, laterals: list[float], heights: list[float] | None, step: float) -> MeshPart:
-    """A mesh strip along the road, with vertices at the laterals [m], left first, and every `step` [m] along the road.
+def _road_strip(route: DrivenLine, laterals: list[float], heights: list[float] | None) -> MeshPart:
+    """A mesh strip along the road, with vertices at the laterals [m], left first, and every 0.5 m along the road.
 
     `heights` [m] are above the undulation; None puts the strip on the ground.
     """
-    stations = np.arange(START, END + step / 2, step)
+    stations = np.arange(START, END + 0.25, 0.5)
     across = np.asarray(laterals, float)
     xy = route.at(stations[None], across[:, None])
     z = undulation(xy) + (cross_profile(across) if heights is None else np.asarray(heights))[:, None]
@@ -346,7 +346,7 @@ def _road_strip(route: DrivenLine, laterals: list[float], heights: list[float] |
 def _add_ground(place: KnownPlace) -> None:
     route, edge = place.route, ROAD_HALF_WIDTH
     crossing = np.linspace(edge, -edge, 13)
-    place.objects.append(PlaceObject("road", "ground", _road_strip(route, list(crossing), None, 0.5), "road"))
+    place.objects.append(PlaceObject("road", "ground", _road_strip(route, list(crossing), None), "road"))
     low = float(cross_profile(edge))
     outer = edge + KERB_WIDTH
     high = float(cross_profile(outer))
@@ -355,9 +355,9 @@ def _add_ground(place: KnownPlace) -> None:
         verge = np.linspace(outer, outer + VERGE_WIDTH, 8)
         if side > 0:
             profile, verge = profile[::-1], verge[::-1]
-        kerb = _road_strip(route, [side * p[0] for p in profile], [p[1] for p in profile], 0.5)
+        kerb = _road_strip(route, [side * p[0] for p in profile], [p[1] for p in profile])
         place.objects.append(PlaceObject(f"kerb_{name}", "ground", kerb, "kerb"))
-        strip = _road_strip(route, [side * v for v in verge], None, 0.5)
+        strip = _road_strip(route, [side * v for v in verge], None)
         place.objects.append(PlaceObject(f"verge_{name}", "ground", strip, f"verge_{name}"))
     x0, x1, y0, y1 = LAND_RANGE
     x, y = np.meshgrid(np.arange(x0, x1 + 0.1, LAND_STEP), np.arange(y1, y0 - 0.1, -LAND_STEP))

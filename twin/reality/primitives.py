@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from twin.types import Array
 
+_LEAF_WINDOW = 0.08  # width of the window of its texture that a leaf shows
+
 
 @dataclass(frozen=True)
 class MeshPart:
@@ -134,13 +136,11 @@ def tube(
     return join([side, *lids])
 
 
-def leaves(
-    rng: np.random.Generator, centers: Array, size: tuple[float, float], light: Array, uv_size: float = 0.08
-) -> MeshPart:
+def leaves(rng: np.random.Generator, centers: Array, size: tuple[float, float], light: Array) -> MeshPart:
     """Leaves: small bent rhombi around centers, shape (n, 3).
 
-    Each leaf shows a window of the texture that is `uv_size` wide. `light`, shape (n,), is the window's horizontal
-    position, from 0 (left edge) to 1 (right edge); a random shift is added.
+    Each leaf shows a window of the texture. `light`, shape (n,), is the window's horizontal position, from 0 (left
+    edge) to 1 (right edge); a random shift is added.
     """
     n = len(centers)
     long, short = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
@@ -152,9 +152,9 @@ def leaves(
     droop = np.cross(long, short) * half * 0.25
     tips = [centers - half * long, centers + 0.55 * half * short + droop, centers + half * long]
     tips.append(centers - 0.55 * half * short + droop)
-    corner = rng.uniform(0.0, 1.0 - uv_size, (n, 1, 2))
-    corner[:, 0, 0] = np.clip(light + rng.normal(0.0, 0.1, n), 0.0, 1.0) * (1.0 - uv_size)
-    window = corner + uv_size * np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    corner = rng.uniform(0.0, 1.0 - _LEAF_WINDOW, (n, 1, 2))
+    corner[:, 0, 0] = np.clip(light + rng.normal(0.0, 0.1, n), 0.0, 1.0) * (1.0 - _LEAF_WINDOW)
+    window = corner + _LEAF_WINDOW * np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     base = 4 * np.arange(n)[:, None]
     faces = (base[:, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3).astype(np.int32)
     return MeshPart(np.stack(tips, 1).reshape(-1, 3), faces, window.reshape(-1, 2))

@@ -157,11 +157,6 @@ class SampledRoad:
             out = out + np.where(away > 0.0, kerb + side.slope * np.clip(away, 0.0, side.width), 0.0)
         return out
 
-    def grade(self, station: ArrayLike) -> Array:
-        """Sampled slope along the line, without the unevenness."""
-        knots = np.arange(len(self.line.grades)) * GRADE_STEP
-        return np.interp(np.asarray(station, float), knots, self.line.grades)
-
     def profile(self, station: ArrayLike) -> Array:
         """Height of the driven line [m]: the integral of the grades plus the unevenness."""
         s = np.asarray(station, float)
