@@ -6,11 +6,10 @@ positions (as in Cui and Tan 2015). Far points affect rotations alone. Each of t
 differences, x[first] − x[second] = value, under a Cauchy loss, and starts from the tree of the most reliable equations.
 
 The check compares the poses of a model, or given ones, with pairs of near frames. A *step* leads from a frame of a film
-to the next one that has a pose. Each pair of frames that are at most `_REACH` steps apart tells how much the camera
-turned and in which direction it moved; this supports or contradicts the steps between them, and both frames. Two pairs
-that meet in a frame and see the same near points tell the ratio of their lengths; this supports or contradicts the step
-that begins there. Reprojection errors do not reveal wrong poses: the pieces of a film that was torn apart have small
-ones.
+to the next one that has a pose. Each pair of frames that are at most `_REACH` steps apart gives the turn of the camera
+and the direction of its motion; this supports or contradicts the steps between them, and both frames. Two pairs that
+meet in a frame and see the same near points give the ratio of their lengths; this supports or contradicts the step that
+begins there. Reprojection errors do not reveal wrong poses: the pieces of a film that was torn apart have small ones.
 """
 
 from dataclasses import dataclass
@@ -108,9 +107,9 @@ def _goes_along(
     path = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
     expected = path[second] - path[first]
     length = np.linalg.norm(expected, axis=1)
-    # A film that turns or stands still between two frames does not tell the direction.
-    told = (film[first] == film[second]) & (length > _STRAIGHT * np.abs(second - first))
-    return ~told | ((expected * directions).sum(1) > np.cos(_MAX_PATH_ANGLE) * length)
+    # The direction is unknown if a film turns or stands still between two frames.
+    known = (film[first] == film[second]) & (length > _STRAIGHT * np.abs(second - first))
+    return ~known | ((expected * directions).sum(1) > np.cos(_MAX_PATH_ANGLE) * length)
 
 
 def consistent_pairs(
@@ -307,14 +306,14 @@ _CERTAIN = 4.0  # [standard deviations] smaller deviations contradict nothing
 _STILL = 0.2  # [median step] cameras that are nearer to each other have no direction
 # A pair of frames some steps apart is left out if it deviates more from the pairs between, in turn or in direction.
 _MAX_CHAIN_TURN, _MAX_CHAIN_ANGLE = np.radians(2.0), np.radians(60.0)
-# A pair tells a direction and a ratio of distances only with `_MIN_NEAR` near points, at most so far away (median, in
-# distances of its cameras). With less parallax, moving things and a rolling shutter decide.
+# A pair determines a direction and a ratio of distances only with `_MIN_NEAR` near points, at most so far away (median,
+# in distances of its cameras). With less parallax, moving things and a rolling shutter decide.
 _MAX_DEPTH = 30.0
 
 
 @dataclass(frozen=True)
 class PoseCheck:
-    """Steps of films that pairs of frames tell about."""
+    """Steps of films that pairs of frames support or contradict."""
 
     steps: int
     """Number of steps that were checked."""
