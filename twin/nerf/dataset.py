@@ -135,9 +135,13 @@ class TrainingPixels:
             )
         return out
 
+    def is_unmasked(self, frame: int | NDArray, pixel: NDArray) -> NDArray:
+        """Mask (k,) of the pixels (k, 2) that are used, in one frame or in frames (k,)."""
+        u, v = pixel.astype(int).T
+        return self.unmasked[self.start[frame] + v * self.width[frame] + u]
+
     def _on_unmasked(self, depths: DepthSupervision) -> DepthSupervision:
-        u, v = depths.pixel.astype(int).T
-        keep = self.unmasked[self.start[depths.frame] + v * self.width[depths.frame] + u]
+        keep = self.is_unmasked(depths.frame, depths.pixel)
         return DepthSupervision(depths.frame[keep], depths.pixel[keep], depths.distance[keep])
 
     def depths_in_frame(self, i: int, xyz: NDArray) -> DepthSupervision:
@@ -145,8 +149,7 @@ class TrainingPixels:
         pixel, depth = project(xyz, self.cameras.camera_to_world[i], self.intrinsics[i])
         inside = (depth > 0) & (pixel > 0.5).all(1) & (pixel < [self.width[i] - 0.5, self.height[i] - 0.5]).all(1)
         xyz, pixel = xyz[inside], pixel[inside]
-        u, v = pixel.astype(int).T
-        seen = self.unmasked[self.start[i] + v * self.width[i] + u]
+        seen = self.is_unmasked(i, pixel)
         distance = np.linalg.norm(xyz[seen] - self.cameras.positions[i], axis=1)
         return DepthSupervision(np.full(seen.sum(), i, np.int32), pixel[seen], distance.astype(np.float32))
 

@@ -126,8 +126,7 @@ def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[Depth
         q = _frame_part(planes, i, shape).numpy()[..., 0]
         row, column = np.nonzero(votes.numpy() >= min(_MIN_VOTES, len(sources[i])))
         pixel = np.stack([column, row], 1) * step + step // 2 + 0.5
-        u, v = pixel.astype(int).T
-        unmasked = pixels.unmasked[pixels.start[i] + v * pixels.width[i] + u]
+        unmasked = pixels.is_unmasked(i, pixel)
         pixel, depth = pixel[unmasked], 1.0 / q[row[unmasked], column[unmasked]]
         distance = depth * np.linalg.norm(unproject(pixel, pixels.intrinsics[i]), axis=1)
         depths = DepthSupervision(np.full(len(pixel), i, np.int32), pixel, distance.astype(np.float32))
