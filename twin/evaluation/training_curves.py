@@ -161,7 +161,7 @@ def write_success_curve(folder: Path) -> Path:
     if len(steps):
         plot_success_curve(axes, steps, success, "#1f77b4")
     if (folder / CHOICE_FILE).exists():
-        with wrap_read_errors(folder / CHOICE_FILE, "delete it, and the best policy is chosen again"):
+        with wrap_read_errors(folder / CHOICE_FILE, "delete it, and the best policy is selected again"):
             _plot_choice(axes, read_json(folder / CHOICE_FILE))
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)

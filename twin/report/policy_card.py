@@ -13,7 +13,7 @@ from twin import runtime
 from twin.errors import InputError
 from twin.evaluation.forecasting import Candidate, Forecast
 from twin.evaluation.statistics import CONFIDENCE, rate_summary
-from twin.evaluation.training_curves import validated_digests
+from twin.evaluation.training_curves import CHOICE_FILE, validated_digests
 from twin.evaluation.trials import Cell, read_trials, tally
 from twin.files import digest_file, exists, read_json, wrap_read_errors, write_text
 from twin.learn.policy import JSON, Policy, load_policy
@@ -21,8 +21,6 @@ from twin.report.forecast_text import format_estimate
 from twin.scene import SceneDir
 
 CARD = "README.md"
-
-_CHOICE = "choice.json"
 
 
 def write_policy_cards(scene: SceneDir, runs: Iterable[str]) -> list[Path]:
@@ -124,10 +122,10 @@ def _front_matter(policy: Policy, cells: Sequence[Cell]) -> str:
 
 def _selection(folder: Path) -> list[str]:
     """Lines on how the policy was selected, and on its success in fresh episodes."""
-    if not exists(folder / _CHOICE):
+    if not exists(folder / CHOICE_FILE):
         return []
-    with wrap_read_errors(folder / _CHOICE, "delete it, and the best policy is selected again"):
-        choice = read_json(folder / _CHOICE)
+    with wrap_read_errors(folder / CHOICE_FILE, "delete it, and the best policy is selected again"):
+        choice = read_json(folder / CHOICE_FILE)
         last, count = choice["chosen"], len(choice["candidates"])
         measured = rate_summary(int(last["successes"]), int(last["trials"]))
         under = f" under `{last['condition']}`" if "condition" in last else ""  # older runs store no condition
