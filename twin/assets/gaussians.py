@@ -84,12 +84,7 @@ class Gaussians:
             **{f"scale_{c}": stored["scales"][:, c] for c in range(3)},
             **{f"rot_{c}": stored["quats"][:, c] for c in range(4)},
         }
-        rows = np.empty(len(self.rgb), [(name, "<f4") for name in columns])
-        for name, values in columns.items():
-            rows[name] = values
-        properties = "".join(f"property float {name}\n" for name in columns)
-        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-        return head.encode() + rows.tobytes()
+        return ply_bytes(columns)
 
     def write_spz(self, path: Path) -> None:
         """Writes the compressed `.spz` (version 3), a fifth of the `.ply`; positions are rounded to 0.24 mm up to 2 km.
@@ -104,6 +99,19 @@ class Gaussians:
             reach = float(np.abs(self.positions).max(initial=1.0)) + 1.0
             bits = min(12, 23 - int(np.ceil(np.log2(reach))))
             spz.write_spz(partial, spz.GSData(**stored, shN=higher), fractional_bits=bits)
+
+
+def ply_bytes(columns: dict[str, NDArray]) -> bytes:
+    """A binary `.ply` with a vertex per row of the columns (n,); bytes are stored as `uchar`, others as `float`."""
+    kinds = {
+        name: ("uchar", "u1") if values.dtype == np.uint8 else ("float", "<f4") for name, values in columns.items()
+    }
+    rows = np.empty(len(next(iter(columns.values()))), [(name, kind) for name, (_, kind) in kinds.items()])
+    for name, values in columns.items():
+        rows[name] = values
+    properties = "".join(f"property {kind} {name}\n" for name, (kind, _) in kinds.items())
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    return head.encode() + rows.tobytes()
 
 
 def require_spz() -> Any:

@@ -25,13 +25,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from twin.assets.gaussians import ply_bytes
 from twin.files import new_folder, write_bytes, write_json, write_text
 from twin.geometry.cameras import Cameras, SparsePoints, opencv_to_mujoco, project
 from twin.geometry.images import write_image
 from twin.geometry.poses import inverse_pose
 
 _POINTS = "points.ply"
-_PLY_TYPES = dict.fromkeys("xyz", ("float", "<f4")) | dict.fromkeys(("red", "green", "blue"), ("uchar", "u1"))
 
 
 def _copy_frames(cameras: Cameras, folder: Path, mask_name: Callable[[str], str], white: bool = False) -> None:
@@ -115,7 +115,8 @@ def write_nerfstudio(out: Path, cameras: Cameras, points: SparsePoints) -> None:
     masked = any(cameras.mask_path(i) for i in everything)
     with new_folder(out) as folder:
         _copy_frames(cameras, folder, lambda name: f"{name}.png", white=masked)
-        write_bytes(folder / _POINTS, _points_ply(points))
+        columns = zip(("x", "y", "z", "red", "green", "blue"), (*points.xyz.T, *points.rgb.T), strict=True)
+        write_bytes(folder / _POINTS, ply_bytes(dict(columns)))
         write_json(folder / "transforms.json", _transforms(cameras, everything, masked))
         names = dict.fromkeys(cameras.lightings)
         for lighting in names if len(names) > 1 else ():
@@ -149,12 +150,3 @@ def _transforms(cameras: Cameras, frames: Sequence[int], masked: bool) -> dict[s
         **split,
         "frames": listed,
     }
-
-
-def _points_ply(points: SparsePoints) -> bytes:
-    rows = np.empty(len(points), [(name, kind) for name, (_, kind) in _PLY_TYPES.items()])
-    for name, values in zip(_PLY_TYPES, (*points.xyz.T, *points.rgb.T), strict=True):
-        rows[name] = values
-    properties = "".join(f"property {kind} {name}\n" for name, (kind, _) in _PLY_TYPES.items())
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-    return head.encode() + rows.tobytes()
