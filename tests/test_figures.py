@@ -5,6 +5,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from twin.assets.ground import Ground
 from twin.report import figures
@@ -139,3 +140,19 @@ def test_the_corridor_is_as_wide_as_it_says() -> None:
     x, y = outline.T
     area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
     assert area == pytest.approx(10 * 1.5)
+
+
+def test_a_legend_has_every_series_and_leaves_the_figure_its_size() -> None:
+    """Matplotlib omits labels that begin with an underscore, as names of many cameras' files do."""
+    names = ["_DSC0042", "_" + "long" * 20 + "1", *(f"film_{k:02d}" for k in range(20))]
+    few, many = (
+        figures.curve_chart({name: ([0, 1], [0.0, 1.0]) for name in shown}, "x", "y") for shown in (names[:2], names)
+    )
+    heights = []
+    for figure in (few, many):
+        FigureCanvasAgg(figure).draw()
+        assert figure.axes[0].get_position().width > 0.7
+        heights.append(figure.axes[0].get_position().height * figure.get_figheight())
+    assert heights[1] == pytest.approx(heights[0], abs=0.1)
+    labels = [text.get_text().strip() for text in many.legends[0].get_texts()]
+    assert len(labels) == len(names) and labels[0] == names[0] and labels[1].endswith("1")

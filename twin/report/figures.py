@@ -39,6 +39,7 @@ _RASTER_DPI = 200
 _MAP_MARGIN = 8.0  # [m] around the path
 _MAX_POINTS = 20_000  # largest number of points drawn in a map
 _LEGEND_LETTERS = 55  # letters per row of a legend; a marker counts as four letters
+_LEGEND_ROW = 0.175  # [in] height of a row of a legend
 _STYLE: dict[str, Any] = {
     "font.size": 8.5,
     "font.family": "sans-serif",
@@ -107,10 +108,17 @@ def new_figure(height: float, width: float = _WIDTH) -> tuple[Figure, Axes]:
 
 @styled
 def add_legend(figure: Figure) -> None:
-    """Adds a legend of the first axes. It is below the figure and has as many columns as fit."""
+    """Adds a legend of the first axes below the figure, which grows by its rows. It has as many columns as fit."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    fitting = max(1, _LEGEND_LETTERS // (max(map(len, labels)) + 4))
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(fitting, len(labels)))
+    fitting = min(len(labels), max(1, _LEGEND_LETTERS // (max(map(len, labels)) + 4)))
+    figure.set_figheight(figure.get_figheight() + _LEGEND_ROW * (-(-len(labels) // fitting) - 1))
+    figure.legend(handles, labels, loc="outside lower center", ncols=fitting)
+
+
+def legend_name(name: str) -> str:
+    """A series' label: its name, short enough for a legend, which would omit a label with an underscore first."""
+    name = shorten_name(name, _LEGEND_LETTERS - 4)
+    return f" {name}" if name.startswith("_") else name
 
 
 # ---- maps
@@ -172,7 +180,16 @@ def place_map(
         trained, unseen = positions[mine & ~held_out], positions[mine & held_out]
         # Films of one path overlap; later sources get smaller markers so that all remain visible.
         size = 16.0 / (1.0 + 0.8 * i)
-        axes.scatter(trained[:, 0], trained[:, 1], s=size, c=color, marker=marker, linewidths=0, label=source, zorder=4)
+        axes.scatter(
+            trained[:, 0],
+            trained[:, 1],
+            s=size,
+            c=color,
+            marker=marker,
+            linewidths=0,
+            label=legend_name(source),
+            zorder=4,
+        )
         hollow: dict[str, Any] = {"facecolors": "none", "edgecolors": color, "lw": 0.8}
         axes.scatter(unseen[:, 0], unseen[:, 1], s=size, marker=marker, zorder=4, **hollow)
     axes.scatter([], [], s=12, facecolors="none", edgecolors=MUTED, lw=0.9, label="held out")
@@ -264,7 +281,7 @@ def _draw_branches(axes: Axes, branches: Mapping[str, Array], half_width: float)
         if half_width > 0.0 and len(line) > 1:
             outline = corridor_outline(line, half_width)
             axes.add_collection(PolyCollection([outline], facecolors=SERIES[2], alpha=0.25))
-        axes.plot(*line.T, color=INK, lw=1.0, ls="--", label=f"branch {name}", zorder=3)
+        axes.plot(*line.T, color=INK, lw=1.0, ls="--", label=legend_name(f"branch {name}"), zorder=3)
         axes.plot(*line[0], "o", color=INK, ms=4, zorder=3)
         box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
         axes.annotate(name, line[-1], xytext=(5, 5), textcoords="offset points", fontsize=8, bbox=box, zorder=5)
@@ -287,7 +304,7 @@ def curve_chart(
     """
     figure, axes = new_figure(2.2)
     for i, (name, (x, y)) in enumerate(curves.items()):
-        axes.plot(x, y, _DASHES[i % len(_DASHES)], color=SERIES[i % len(SERIES)], label=name, lw=1.3)
+        axes.plot(x, y, _DASHES[i % len(_DASHES)], color=SERIES[i % len(SERIES)], label=legend_name(name), lw=1.3)
     for at in () if limit is None else (limit, -limit):
         axes.axhline(at, color=SERIES[1], ls="--", lw=1.0)
     axes.set(xlabel=x_label, ylabel=y_label)
@@ -426,7 +443,7 @@ def rate_chart(policies: Sequence[str], rates: Mapping[str, Sequence[Rate]], lab
         y = [policies.index(policy) + (k - (len(rates) - 1) / 2) * _RATE_SPACING for policy, *_ in mine]
         x, low, high = (np.array(column, float) for column in list(zip(*mine, strict=True))[1:])
         ends = np.maximum([x - low, high - x], 0.0)
-        axes.errorbar(x, y, xerr=ends, fmt=MARKERS[k], color=SERIES[k], ms=3.5, lw=1.1, label=name)
+        axes.errorbar(x, y, xerr=ends, fmt=MARKERS[k], color=SERIES[k], ms=3.5, lw=1.1, label=legend_name(name))
     axes.set_yticks(range(len(policies)), [shorten_name(policy) for policy in policies])
     axes.grid(False, axis="y")
     axes.set(ylim=(len(policies) - 0.5, -0.5), xlabel=label, **RATE_AXIS)
@@ -435,10 +452,10 @@ def rate_chart(policies: Sequence[str], rates: Mapping[str, Sequence[Rate]], lab
     return figure
 
 
-def shorten_name(name: str) -> str:
-    """Cuts a long name in its middle."""
-    half = _MAX_NAME_LENGTH // 2
-    return name if len(name) <= _MAX_NAME_LENGTH else f"{name[:half]}…{name[1 - half :]}"
+def shorten_name(name: str, most: int = _MAX_NAME_LENGTH) -> str:
+    """Cuts a name of more than `most` characters in its middle."""
+    half = most // 2
+    return name if len(name) <= most else f"{name[:half]}…{name[1 - half :]}"
 
 
 def lighting_labels(lightings: Sequence[str]) -> tuple[list[str], str]:

@@ -22,6 +22,7 @@ from twin.report.figures import (
     add_legend,
     difference_texts,
     heatmap,
+    legend_name,
     lighting_labels,
     matrix,
     new_figure,
@@ -67,7 +68,7 @@ def rates_against_road(forecast: Forecast, field: str = "twin", label: str = "su
             (x, x_ends), (y, y_ends) = (_error_bars([getattr(c, name) for c in mine]) for name in (field, "real"))
             color, marker = SERIES[i % len(SERIES)], MARKERS[i % len(MARKERS)]
             axes.errorbar(x, y, xerr=x_ends, yerr=y_ends, fmt="none", ecolor=color, elinewidth=0.8, alpha=0.5)
-            axes.plot(x, y, marker, color=color, ms=4.5, label=task, zorder=4)
+            axes.plot(x, y, marker, color=color, ms=4.5, label=legend_name(task), zorder=4)
     _label_outliers(axes, [(c.policy, getattr(c, field).value, c.real.value or 0.0) for c in driven])
     if driven:
         add_legend(figure)
