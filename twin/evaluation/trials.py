@@ -402,15 +402,19 @@ def success_rate(trials: Sequence[Trial]) -> dict[str, Any]:
 
 def summarize(trials: Sequence[Trial]) -> dict[str, Any]:
     """Counts successes and causes of failure per policy, task and lighting, and compares policies in pairs."""
+    by_cell: dict[tuple[str, str, str], list[Trial]] = {}
+    for trial in trials:
+        by_cell.setdefault(trial.cell, []).append(trial)
     cells = []
-    for cell in tally(trials):
-        own = [t for t in trials if t.cell == cell.key]
-        trusted = [t for t in own if t.trust is not None and t.trust >= TRUSTED]
+    for (policy, task, lighting), own in by_cell.items():
+        trusted, low = (
+            [t for t in own if (t.trust is not None and t.trust >= TRUSTED) == good] for good in (True, False)
+        )
         cells.append(
-            {"policy": cell.policy, "task": cell.task, "lighting": cell.lighting}
+            {"policy": policy, "task": task, "lighting": lighting}
             | success_rate(own)
             | {"causes": {c: n for c, n in Counter(t.cause for t in own).items() if c != "goal"}}
-            | {"trusted": success_rate(trusted), "low_trust": success_rate([t for t in own if t not in trusted])}
+            | {"trusted": success_rate(trusted), "low_trust": success_rate(low)}
         )
     return {"confidence": 0.9, "trusted_from": TRUSTED, "cells": cells, "pairs": compare_pairs(trials)}
 
