@@ -618,3 +618,8 @@ def test_numbers_are_shown_with_their_interval() -> None:
 def test_a_probability_is_never_rounded_to_certainty():
     said = [format_probability(p) for p in (0.0, 0.005, 0.0051, 0.5, 0.9949, 0.995, 1.0)]
     assert said == ["<1%", "<1%", "1%", "50%", "99%", ">99%", ">99%"]
+
+
+def test_words_in_tables_stay_whole_on_a_narrow_screen():
+    """The page breaks long words anywhere, but a column of a table would become one letter wide."""
+    assert "th, td { overflow-wrap:normal }" in forecast_page(make_forecast("road", *cells()))
