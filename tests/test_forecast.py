@@ -623,3 +623,8 @@ def test_a_probability_is_never_rounded_to_certainty():
 def test_words_in_tables_stay_whole_on_a_narrow_screen():
     """The page breaks long words anywhere, but a column of a table would become one letter wide."""
     assert "th, td { overflow-wrap:normal }" in forecast_page(make_forecast("road", *cells()))
+
+
+def test_one_is_singular():
+    html = forecast_page(make_forecast("road", [Cell("p0", "straight", "sun", 1, 1)], []))
+    assert "1 policy on one task: 1 trial in the twin, 0 on the road." in html

@@ -201,6 +201,7 @@ def test_numbers_have_intervals_and_what_is_missing_is_not_made_up(tmp_path):
     assert rate_text(rate_summary(3, 4)).startswith("75% (") and rate_text(success_rate([])) == "–"
     text = page(tmp_path, told([trial("my_module:act")])).text
     assert "not known" in text and "nan" not in text and "None" not in text
+    assert "1 policy, 1 lighting: 1 episode in the twin." in text
     assert "There is no such episode here" in text and "No videos" in text
     for absent in ("Which policy is better", "The worst lighting for", "How the policies were trained"):
         assert (absent in text) == (absent == "The worst lighting for")

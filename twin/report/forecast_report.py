@@ -44,7 +44,7 @@ from twin.report.forecast_text import (
     percentage_points,
     verdicts,
 )
-from twin.report.html import MAX_TABLE_ROWS, Chart, command, render
+from twin.report.html import MAX_TABLE_ROWS, Chart, command, counted, render
 
 # ---- figures
 
@@ -172,7 +172,7 @@ def write_forecast_page(forecast: Forecast, folder: Path) -> None:
 
 def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
     """The HTML of the page. `root` is the scene's folder, which the commands on the page contain."""
-    policies = len({c.policy for c in forecast.candidates})
+    policies = counted(len({c.policy for c in forecast.candidates}), "policy", "policies")
     tasks = f"{len(forecast.tasks)} tasks" if len(forecast.tasks) > 1 else "one task"
     measured = [group for group in forecast.groups if not group.missing]
     known = [c for c in forecast.candidates if c.corrected.value is not None]
@@ -207,7 +207,7 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
     return render(
         "forecast.html",
         title=f"{forecast.scene}: forecast",
-        kicker=f"{policies} policies on {tasks}: {forecast.twin_trials} trials in the twin, "
+        kicker=f"{policies} on {tasks}: {counted(forecast.twin_trials, 'trial')} in the twin, "
         f"{forecast.real_trials} on the road.",
         verdicts=verdicts(forecast),
         headings={

@@ -15,7 +15,7 @@ from twin.evaluation.forecasting import ALL_TASKS, Forecast, TrialAllocation
 from twin.evaluation.rate_model import MAX_TRIALS
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.evaluation.trials import csv_text
-from twin.report.html import Caution, Verdict
+from twin.report.html import Caution, Verdict, counted
 
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
 """Lowest rank correlations for the verdict that the twin ranks, or roughly ranks, policies as the road does."""
@@ -123,7 +123,7 @@ def believable(group: Agreement) -> Verdict:
     """Verdict on the smallest difference of two policies' rates in the twin at which the road confirms their order."""
     ties = sum(it.pairs for it in group.ordered if not it.high)
     pairs = [(it.low, it.pairs, it.right) for it in group.ordered if it.high]
-    many, days = _count(group.trainings, "training"), _count(group.days, "day")
+    many, days = counted(group.trainings, "training"), counted(group.days, "day")
     where = f"measured on {days} and {many}"
     if not pairs and not ties:
         return Verdict(
@@ -137,7 +137,7 @@ def believable(group: Agreement) -> Verdict:
             m, r = sum(m for m, _ in closer), sum(r for _, r in closer)
             gap = f"that differ by {100 * start:.0f} percentage points or more" if start else "that differ at all"
             rest = f", and in {r:g} of {m} closer pairs" if m else ""
-            rest += f"; {_count(ties, 'further pair')} had the same rate in the twin" if ties else ""
+            rest += f"; {counted(ties, 'further pair')} had the same rate in the twin" if ties else ""
             text = (
                 f"What may be believed: the order of two policies {gap} in the twin. The road had the same order in "
                 f"{right:g} of {n} such pairs{rest} ({where})."
@@ -146,12 +146,8 @@ def believable(group: Agreement) -> Verdict:
             return Verdict(text, "good" if enough and start <= _SMALL_GAP else "mixed")
     n, right = sum(n for _, n, _ in pairs), sum(right for _, _, right in pairs)
     text = f"No order of two policies in the twin may be believed yet: the road agrees in {right:g} of {n} pairs"
-    text += f", and {_count(ties, 'further pair')} had the same rate in the twin" if ties else ""
+    text += f", and {counted(ties, 'further pair')} had the same rate in the twin" if ties else ""
     return Verdict(f"{text} ({where}).", "bad")
-
-
-def _count(n: int, what: str) -> str:
-    return f"{n} {what}{'' if n == 1 else 's'}"
 
 
 def _agreement(group: Agreement) -> Verdict:
@@ -252,8 +248,8 @@ def limitations(forecast: Forecast) -> list[Caution]:
     if on_road:
         what = (
             f"Trials of one day or of one training tend to have the same outcome: the real sample is "
-            f"{_count(len(days), 'day')} and {_count(len(runs), 'training')}, "
-            f"not {_count(forecast.real_trials, 'trial')}."
+            f"{counted(len(days), 'day')} and {counted(len(runs), 'training')}, "
+            f"not {counted(forecast.real_trials, 'trial')}."
         )
         cure = "drive on further days, and train again with another --seed."
         out.append(Caution(what, cure))

@@ -101,6 +101,11 @@ def number(value: Any, form: str = "{:.3g}") -> str:
     return form.format(value).replace("-", "−") if value < 0 else form.format(value)
 
 
+def counted(n: int, one: str, many: str = "") -> str:
+    """A number with its noun; the noun's plural is `many`, or has an s."""
+    return f"{n} {one if n == 1 else many or f'{one}s'}"
+
+
 def duration(seconds: Any) -> str:
     """Formats seconds as "8.2 s" or "3 min 05 s"."""
     if (seconds := as_number(seconds)) is None:

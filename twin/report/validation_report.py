@@ -39,7 +39,7 @@ from twin.report.figures import (
     svg,
 )
 from twin.report.forecast_text import format_estimate
-from twin.report.html import MAX_TABLE_ROWS, Caution, Chart, Picture, Verdict, command, data_url, render
+from twin.report.html import MAX_TABLE_ROWS, Caution, Chart, Picture, Verdict, command, counted, data_url, render
 from twin.scene import SceneDir
 
 MAX_P_VALUE = 0.1
@@ -359,12 +359,11 @@ def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: S
         "unknown": "Limitations",
         "next": "What to do next",
     }
-    counts = ((len(policies), "policy", "policies"), (len(lights), "lighting", "lightings"))
-    counted = ", ".join(f"{n} {one if n == 1 else many}" for n, one, many in counts)
+    driven = f"{counted(len(policies), 'policy', 'policies')}, {counted(len(lights), 'lighting')}"
     return render(
         "validation.html",
         title=f"{scene}: validation",
-        kicker=f"{counted}: {sum(c['trials'] for c in cells)} episodes in the twin.",
+        kicker=f"{driven}: {counted(sum(c['trials'] for c in cells), 'episode')} in the twin.",
         verdicts=verdicts(results),
         headings={name: heading for name, heading in headings.items() if heading},
         files=["summary.json", "cells.csv", "episodes.csv"],
