@@ -430,6 +430,17 @@ def test_many_lightings_are_a_heatmap_with_the_mean_of_the_shared_ones():
     assert shades == sorted(set(shades))
 
 
+def test_the_heatmap_of_a_task_has_no_training_on_another_task(tmp_path):
+    trials = [
+        trial(seed=seed, task=task, light=f"day_{k}") for task in ("ahead", "bend") for k in range(6) for seed in (0, 1)
+    ]
+    trained = {"a": TRAINED | {"run": "a", "first_step": 20, "test": None} | rate_summary(96, 100)}
+    page(tmp_path, said := told(trials, training=trained))
+    html = validation_page("road", tmp_path, said, [])
+    charts = [svg[: svg.index("</svg>")] for svg in html.split("<svg")[1:]]
+    assert ["training’s result" in chart for chart in charts] == [True, False]
+
+
 def test_where_no_lighting_is_shared_there_is_no_mean():
     trials = [trial("ab"[k % 2], seed, light=f"day_{k}") for k in range(6) for seed in range(3)]
     drawn = tiles(rate_heatmap(summarize(trials)["cells"], {}))

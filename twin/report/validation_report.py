@@ -404,7 +404,9 @@ def _task(results: dict[str, Any], task: str) -> dict[str, Any]:
     if len({c["lighting"] for c in mine}) <= MAX_PLOTTED_LIGHTINGS:
         title, figure = f"Share of episodes that reached the goal, with 90% intervals ({each})", rate_figure(mine)
     else:
-        trained = {policy: (row["test"] or row)["rate"] for policy, row in results["training"].items()}
+        # A rate on another task says nothing about overfitting.
+        known = {policy: row for policy, row in results["training"].items() if row["task"] == task}
+        trained = {policy: (row["test"] or row)["rate"] for policy, row in known.items()}
         title = f"Episodes that reached the goal [%] ({each}); means: lightings that all policies drove in"
         figure = rate_heatmap(mine, trained)
     pair_title = (
