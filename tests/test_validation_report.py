@@ -304,6 +304,13 @@ def test_films_are_the_tables_episodes(fresh, episodes):
     assert validate.validate(fresh, ["ahead", "left"], "ahead", ["night", "held-out"], 3, films=True) == said
     assert validate.validate(fresh, ["left"], "ahead", ["night"], 2)["films"] == said["films"]
     assert len(episodes) == before
+    # A film that the user deleted is not on the page, and is made again on demand.
+    first = said["films"][0]
+    for name in ("file", "poster"):
+        (folder / first[name]).unlink()
+        assert validate.validate(fresh, ["left"], "ahead", ["night"], 2)["films"] == said["films"][1:]
+        assert validate.validate(fresh, ["ahead", "left"], "ahead", ["night", "held-out"], 3, films=True) == said
+        assert len(episodes) == (before := before + 1) and (folder / first[name]).exists()
 
 
 def test_a_film_that_ends_otherwise_than_the_table_is_refused(fresh, episodes):

@@ -196,7 +196,7 @@ def _write_films(root: Path, folder: Path, source: str, trust: bool, trials: Seq
     for trial, which in chosen.items():
         path = folder / "films" / trial.policy / film_name(trial.task, trial.lighting, trial.seed)
         poster = path.with_suffix(".jpg")
-        if not poster.exists():
+        if not (path.exists() and poster.exists()):
             episode = film(
                 root, trial.task, source, trial.seed, path, trust, **condition_options(Condition.parse(trial.lighting))
             )[1]
@@ -218,7 +218,7 @@ def _write_films(root: Path, folder: Path, source: str, trust: bool, trials: Seq
 
 
 def _read_films(folder: Path) -> list[dict]:
-    """The entries of `films.json`; empty if there is no such file. Raises InputError for an invalid file."""
+    """The entries of `films.json` whose films were not deleted. Raises InputError for an invalid file."""
     path = folder / "films" / "films.json"
     if not path.exists():
         return []
@@ -227,7 +227,7 @@ def _read_films(folder: Path) -> list[dict]:
         for one in films:
             _ = [one[name] + "" for name in ("policy", "task", "lighting", "cause", "file", "poster")]
             _ = int(one["seed"]), int(one["of"]), float(one["progress_m"]), [name + "" for name in one["which"]]
-    return films
+        return [one for one in films if all((folder / one[name]).is_file() for name in ("file", "poster"))]
 
 
 def lighting_seeds(lighting: str, episodes: int) -> range:
