@@ -6,6 +6,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
+from matplotlib.lines import Line2D
 
 from twin.assets.ground import Ground
 from twin.report import figures
@@ -156,3 +158,28 @@ def test_a_legend_has_every_series_and_leaves_the_figure_its_size() -> None:
     assert heights[1] == pytest.approx(heights[0], abs=0.1)
     labels = [text.get_text().strip() for text in many.legends[0].get_texts()]
     assert len(labels) == len(names) and labels[0] == names[0] and labels[1].endswith("1")
+
+
+def test_twenty_films_look_different() -> None:
+    names = [f"film_{k:02d}" for k in range(20)]
+    positions, none = np.zeros((20, 3)), np.zeros((0, 3))
+    figures_of = (
+        figures.place_map(positions, names, np.zeros(20, bool), none, none),
+        figures.curve_chart({name: ([0, 1], [0.0, 1.0]) for name in names}, "x", "y"),
+    )
+    for figure in figures_of:
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        looks = set()
+        for handle, label in zip(handles, labels, strict=True):
+            if label in names and isinstance(handle, Line2D):
+                looks.add((handle.get_color(), str(handle.get_linestyle()), str(handle._dash_pattern)))
+            elif label in names:
+                looks.add((to_hex(handle.get_facecolor()[0]), handle.get_paths()[0].vertices.tobytes()))
+                assert handle.get_sizes()[0] > 2.0
+        assert len(looks) == len(names)
+
+
+def test_bars_of_long_names_have_different_labels() -> None:
+    names = [f"afternoon_of_the_first_day_{k}" for k in range(3)]
+    figure = figures.bar_chart(dict.fromkeys(names, 20.0), {}, "dB", "PSNR [dB]")
+    assert len({text.get_text() for text in figure.axes[0].get_yticklabels()}) == 3

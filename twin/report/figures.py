@@ -28,9 +28,10 @@ from twin.types import Array
 # Placeholder colors that occur nowhere else in a figure; `svg` replaces them with the page's CSS variables.
 INK, MUTED, LINE, CARD = "#0a0b01", "#0a0b02", "#0a0b03", "#0a0b04"
 SERIES = ("#0a0b11", "#0a0b12", "#0a0b13", "#0a0b14", "#0a0b15", "#0a0b16")
-MARKERS = ("o", "s", "D", "^", "v", "P")
+# The numbers of markers and of dashes have no common divisor with that of the colors, so that pairs of them recur late.
+MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 """Marker of each series, for readers who cannot distinguish the colors."""
-_DASHES = ("-", "-.", ":")
+_DASHES = ("-", "-.", ":", "--", (0, (6, 1, 1, 1, 1, 1)))
 _VARIABLES = {INK: "--ink", MUTED: "--muted", LINE: "--line", CARD: "--card"}
 _VARIABLES |= {color: f"--c{i + 1}" for i, color in enumerate(SERIES)}
 
@@ -179,7 +180,7 @@ def place_map(
         color, marker = SERIES[i % len(SERIES)], MARKERS[i % len(MARKERS)]
         trained, unseen = positions[mine & ~held_out], positions[mine & held_out]
         # Films of one path overlap; later sources get smaller markers so that all remain visible.
-        size = 16.0 / (1.0 + 0.8 * i)
+        size = 16.0 / (1.0 + 0.8 * min(i, 5))
         axes.scatter(
             trained[:, 0],
             trained[:, 1],
@@ -304,7 +305,7 @@ def curve_chart(
     """
     figure, axes = new_figure(2.2)
     for i, (name, (x, y)) in enumerate(curves.items()):
-        axes.plot(x, y, _DASHES[i % len(_DASHES)], color=SERIES[i % len(SERIES)], label=legend_name(name), lw=1.3)
+        axes.plot(x, y, ls=_DASHES[i % len(_DASHES)], color=SERIES[i % len(SERIES)], label=legend_name(name), lw=1.3)
     for at in () if limit is None else (limit, -limit):
         axes.axhline(at, color=SERIES[1], ls="--", lw=1.0)
     axes.set(xlabel=x_label, ylabel=y_label)
@@ -324,7 +325,7 @@ def bar_chart(values: dict[str, float], counts: dict[str, int], unit: str, label
     for i, (name, value) in enumerate(values.items()):
         text = f"{value:.1f} {unit}" + (f" (n = {counts[name]})" if name in counts else "")
         axes.annotate(text, (value, i), (4, 0), textcoords="offset points", va="center", fontsize=8)
-    axes.set_yticks(range(len(values)), [name if len(name) < 20 else name[:18] + "…" for name in values])
+    axes.set_yticks(range(len(values)), [shorten_name(name) for name in values])
     axes.set(xlabel=label, xlim=(0, max([*values.values(), 1e-9]) * 1.35), ylim=(len(values) - 0.5, -0.5))
     return figure
 
