@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from twin.geometry.cameras import (
 )
 from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
+from twin.report import review_video
 from twin.report.review_chapters import (
     Studio,
     appearance_of_frame,
@@ -364,3 +366,19 @@ def test_labels_of_a_scale_do_not_overlap() -> None:
     ramp = np.zeros((1, 60, 3), np.uint8)
     crowded = scale_bar(80, ramp, [(0.0, "near"), (0.4, "between"), (0.5, "both"), (1.0, "far")])
     assert np.array_equal(crowded, scale_bar(80, ramp, [(0.0, "near"), (1.0, "far")]))
+
+
+@pytest.mark.parametrize("length", [3.0, 60.0, 300.0, 5000.0])
+def test_the_trust_map_of_a_long_route_is_legible(length: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its picture fits the page without being shrunk, and its labels do not overlap."""
+    drawn: list[tuple[int, int]] = []  # left and right end of the labels below the map
+
+    def draw(canvas: np.ndarray, text: str, x: int, y: int, size: int, *_: object, **__: object) -> None:
+        if y > canvas.shape[0] // 2 and text[0].isdigit():
+            drawn.append((x, x + text_width(text, size)))
+
+    monkeypatch.setattr(review_video, "draw_text", draw)
+    s, offsets = np.arange(0.0, length, 1.5), np.linspace(-4.0, 4.0, 9)
+    width = review_video.trust_picture(s, offsets, np.ones((9, len(s)))).shape[1]
+    assert width <= 1000 and len(drawn) >= 1 and drawn[-1][1] <= width
+    assert all(left > right for (_, right), (left, _) in pairwise(drawn))

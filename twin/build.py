@@ -54,7 +54,7 @@ PIPELINE = (
     Stage(
         "review",
         "twin.report.review_video",
-        4,
+        5,
         ("review", "mjcf.route"),
         ("cameras", "metric", "field", "mesh", "mjcf"),
     ),

@@ -301,8 +301,10 @@ _OFFSETS = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # [half widths of 
 _TRUST_SIZE = (80, 45)  # [px] of the rendered views
 _BATCH = 32
 _LOW_TRUST = 0.5  # views below this count as untrusted
-_CELL = (18, 16)  # [px] width (for 40 columns) and height of a cell
-_MARGIN_ROWS, _MARGIN_RIGHT = 26, 40  # [px] above and below; at the right, for the last label
+_MAP_WIDTH, _CELL_HEIGHT = 720, 16  # [px] of the whole map, and of a cell
+_LABEL_ROOM = 60  # [px] least distance between two labels
+_LABEL_STEPS = [step * 10**k for k in range(1, 9) for step in (1, 2, 5)]  # [m] between two labels
+_MARGIN_ROWS, _MARGIN_RIGHT = 26, 50  # [px] above and below; at the right, for the last label
 
 
 def trust_grid(field: RenderableField, cameras: Cameras, world: World) -> tuple[Array, Array, Array]:
@@ -341,17 +343,19 @@ def trust_metrics(s: Array, offsets: Array, trust: Array) -> dict[str, Any]:
 
 def trust_picture(s: Array, offsets: Array, trust: Array) -> Image:
     """Draws the result of `trust_grid`: arc length to the right, the route's left at the top, high trust bright."""
-    wide, high = max(2, _CELL[0] * 40 // max(len(s), 1)), _CELL[1]
+    high = _CELL_HEIGHT
     body = cv2.resize(
-        colored("viridis", trust[::-1]), (wide * len(s), high * len(offsets)), interpolation=cv2.INTER_NEAREST
+        colored("viridis", trust[::-1]), (_MAP_WIDTH, high * len(offsets)), interpolation=cv2.INTER_NEAREST
     )
     out = np.empty((body.shape[0] + 2 * _MARGIN_ROWS, body.shape[1] + 64 + _MARGIN_RIGHT, 3), np.uint8)
     out[:] = BACKGROUND
     out[_MARGIN_ROWS : _MARGIN_ROWS + body.shape[0], 64:-_MARGIN_RIGHT] = body
     for k, offset in enumerate(offsets[::-1]):
         draw_text(out, f"{offset:+.1f} m", 58, _MARGIN_ROWS + k * high + 1, 11, MUTED, align="right")
-    for at in np.arange(0, s[-1] + 1, 10):
-        draw_text(out, f"{at:.0f} m", 64 + round(at / _TRUST_STEP * wide), out.shape[0] - _MARGIN_ROWS + 5, 12, MUTED)
+    per_meter = _MAP_WIDTH / (len(s) * _TRUST_STEP)
+    step = next(step for step in _LABEL_STEPS if step * per_meter >= _LABEL_ROOM)
+    for at in np.arange(0, s[-1] + 1e-9, step):
+        draw_text(out, f"{at:.0f} m", 64 + round(at * per_meter), out.shape[0] - _MARGIN_ROWS + 5, 12, MUTED)
     draw_text(out, "trust from 0 (dark) to 1 (bright), along the route and beside it", 64, 5, 12, INK)
     return out
 
