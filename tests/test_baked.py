@@ -100,6 +100,14 @@ def test_opaque_wall_renders_at_its_distance():
     assert np.abs(out.depth - 4.0).max() < 1.5 * cell
 
 
+@pytest.mark.parametrize("x", [-3.0, 0.0, 3.5])
+def test_a_wall_just_beyond_an_empty_near_box_blocks_every_ray(x):
+    field = baked(lambda p: np.where((p[..., 0] >= 4.3) & (p[..., 0] < 5.5), 11.0, LOW))
+    out = field.render(Viewpoints.of(camera_at((x, 0.0, 0.0), (8.0, 0.0, 0.0)), K[None], SIZE), "day")
+    assert out.opacity.min() > 0.98
+    assert np.abs(out.depth - (4.3 - x)).max() < 0.3
+
+
 def test_empty_space_is_transparent_and_far():
     out = baked(lambda p: np.full(p.shape[:-1], LOW)).render(Viewpoints.of(camera_at(), K[None], SIZE), "day")
     assert out.opacity.max() < 0.05

@@ -48,7 +48,7 @@ PIPELINE = (
     Stage("capture", "twin.capture.frames", 3, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 5, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 3, ("metric",), ("capture", "cameras")),
-    Stage("field", "twin.nerf.trainer", 8, ("nerf", "mjcf.route"), ("cameras", "metric")),
+    Stage("field", "twin.nerf.trainer", 9, ("nerf", "mjcf.route"), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 7, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     Stage("mjcf", "twin.mjcf.scene_xml", 4, ("mjcf", "robot"), ("metric", "mesh")),
     Stage(

@@ -265,6 +265,7 @@ def cone_march(bricks: Bricks, image: ImageBuffers, first: wp.int32, start: wp.a
         q = p - wp.vec3f(float(i0 & -size), float(i1 & -size), float(i2 & -size))
         whole = float(size)
         margin = wp.vec3f(margin_blocks, margin_blocks, margin_blocks) + wp.min(q, wp.vec3f(whole, whole, whole) - q)
+        margin = wp.min(margin, wp.min(p, blocks - p))  # beyond the near box, far bricks may block rays
         ahead = (wp.min(wp.cw_div(margin, per_meter)) - t * chord) / (1.0 + chord)
         if skip == 0 or ahead < _MIN_CONE_STEP * bricks.near_cell:
             break
