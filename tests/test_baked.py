@@ -131,6 +131,15 @@ def test_march_stops_at_given_depths(distance, opacity):
     assert np.abs(out.opacity - opacity).max() < 0.05
 
 
+@pytest.mark.parametrize("logit", [-90.0, -100.0, -200.0, 200.0])
+def test_a_color_far_beyond_black_or_white_is_black_or_white(logit):
+    field = baked(wall(1.0, 11.0))
+    field.networks["network.head.2.bias"][:] = logit
+    dark = BakedField(field.sections, field.lightings_by_name, field.networks)
+    out = dark.render(Viewpoints.of(camera_at(), K[None], SIZE), "day")
+    assert np.abs(out.rgb - (logit > 0.0)).max() < 1e-6
+
+
 def slow_march(field: BakedField, eye: np.ndarray, directions: np.ndarray, step: float) -> np.ndarray:
     """Opacity and features along rays (k, 3) by small equal steps through the near box, shape (k, 16)."""
     layout, arrays = field.sections[0].layout, field.sections[0].arrays

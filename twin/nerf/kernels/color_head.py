@@ -69,7 +69,7 @@ def _harmonics(d: wp.vec3f) -> _Harmonics:
 
 @wp.func
 def sigmoid(x: wp.float32) -> wp.float32:
-    return 1.0 / (1.0 + fast_exp(-x))
+    return 1.0 / (1.0 + fast_exp(wp.min(-x, 80.0)))  # from −x = 88 on, the exponent of `fast_exp` overflows
 
 
 @cache
