@@ -9,7 +9,7 @@ from devices import DEVICES
 
 from twin import runtime
 from twin.errors import InputError
-from twin.geometry.cameras import FAR, Viewpoints, pixel_grid, unproject
+from twin.geometry.cameras import FAR, Viewpoints, intrinsics_for_size, pixel_grid, unproject
 from twin.geometry.poses import look_at
 from twin.nerf.baked import BakedField
 from twin.nerf.baked_arrays import BakedSection, BrickLayout, brick_indices, skip_distances
@@ -129,6 +129,14 @@ def test_march_stops_at_given_depths(distance, opacity):
     stop = np.full((1, SIZE[1], SIZE[0]), distance)
     out = baked(wall(1.0, 11.0)).render(Viewpoints.of(camera_at(), K[None], SIZE), "day", stop=stop)
     assert np.abs(out.opacity - opacity).max() < 0.05
+
+
+@pytest.mark.parametrize(("number", "at"), [(np.nan, 0), (np.inf, 0), (np.nan, 1), (0.0, 1)])
+def test_invalid_cameras_are_refused_before_a_kernel_reads_them(number, at):
+    pose, lens = camera_at(), K[None].copy()
+    (pose[:, :3, 3], lens)[at][0, 0] = number
+    with pytest.raises(InputError, match="not finite"):
+        intrinsics_for_size(Viewpoints.of(pose, lens, SIZE), None)
 
 
 @pytest.mark.parametrize("logit", [-90.0, -100.0, -200.0, 200.0])

@@ -151,9 +151,13 @@ def intrinsics_for_size(cameras: PosedCameras, size: tuple[int, int] | None) -> 
 
     The size is `size` if given, else the size that all cameras share.
 
-    Raises InputError: no size is given and the cameras' sizes differ.
+    Raises InputError: no size is given and the cameras' sizes differ, or a pose or a focal length is invalid: kernels
+    would read outside of their arrays.
     """
     own = np.asarray(cameras.sizes)
+    pose, lens = np.asarray(cameras.camera_to_world), np.asarray(cameras.intrinsics)
+    if not (np.isfinite(pose).all() and np.isfinite(lens).all() and (lens[..., :2] > 0.0).all()):
+        raise InputError("a camera's pose or intrinsics are not finite, or a focal length is not above 0; correct them")
     if size is None:
         if len(own) == 0 or (own != own[0]).any():
             raise InputError(
