@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -320,6 +321,24 @@ def test_another_file_under_a_known_name_is_refused(gray, tmp_path):
     written(left, 0.5)
     with pytest.raises(InputError, match="another file under the name 'left'"):
         real_test.run([left], "straight", ["rain"], 2, tmp_path / "results.csv")
+
+
+def test_trials_of_another_task_of_the_same_name_are_refused(gray, tmp_path):
+    """Else its trials would count as driven, or both tasks would be summed in one row."""
+    left, out, task = written(tmp_path / "left", 0.9), tmp_path / "results.csv", task_of_place(0, "straight")
+    real_test.run([left], task, ["rain"], 1, out)
+    record = out.with_name("results_tasks.json")
+    before = record.read_text()
+    # A line computed with other threads may differ in its last digits.
+    real_test.run([left], replace(task, line=task.line + 1e-9), ["rain"], 2, out)
+    for other in ("straight", replace(task, half_width=0.4), replace(task, line=task.line[:-1], goal=20.0)):
+        with pytest.raises(InputError, match=r"results_trials\.csv has trials of another task 'straight'; give"):
+            real_test.run([left], other, ["rain"], 2, out)
+    assert record.read_text() == before
+    real_test.run([left], "right_turn", ["rain"], 1, out)
+    assert [one.task for one in read_trials(tmp_path / "results_trials.csv")] == ["straight"] * 2 + ["right_turn"]
+    record.unlink()  # a table of an earlier version
+    real_test.run([left], "straight", ["rain"], 2, out)
 
 
 def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):

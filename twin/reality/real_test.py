@@ -213,7 +213,8 @@ def run(
         lightings: See `twin.reality.lighting.weather`.
         trials: Trials per policy and lighting.
         out: Results file as read by `twin.forecast`. `<name>_trials.csv` beside it has a row per trial,
-            `<name>_policies.json` the digests of the policy files, `<name>_setup.json` place, robot and camera.
+            `<name>_policies.json` the digests of the policy files, `<name>_setup.json` place, robot and camera,
+            `<name>_tasks.json` the numbers of the tasks.
         twin_lighting: Value of the column of this name in new rows.
         films: Folder for a film of every trial that is driven now, from the robot's camera.
         setup: Place, robot and camera, the same in all rows of a table.
@@ -223,8 +224,8 @@ def run(
 
     Raises:
         InputError: unknown names, `out` is a folder, unusable policy files, a different file under a known policy name,
-            a table of another setup, results of trials that the table lacks, or another process that writes the same
-            table.
+            a table of another setup, or of another task of this name, results of trials that the table lacks, or
+            another process that writes the same table.
     """
     setup = setup or Setup()
     for name in lightings:
@@ -242,6 +243,7 @@ def run(
         known = {(one.policy, one.task, one.lighting, one.seed) for one in done}
         for policy in {one.name: one for one in loaded}.values():
             test = RealTest(task_for(policy, task, setup.place, setup.length), setup, policy.size)
+            _check_task(task, table, out.with_name(f"{out.stem}_tasks.json"))
             for lighting in dict.fromkeys(lightings):
                 # Each weather has its own seeds: with shared ones, the starts in all weathers would be the same.
                 first = _FIRST_SEED + _SEEDS_PER_LIGHTING * weather_index(lighting)
@@ -273,6 +275,17 @@ def _check_setup(setup: Setup, table: Path, record: Path) -> None:
     record.parent.mkdir(parents=True, exist_ok=True)
     robot, camera = asdict(draw_robot(setup.robot)), asdict(draw_camera(setup.camera))
     write_json(record, {**given, "outside_training": setup.outside, "robot_values": robot, "camera_values": camera})
+
+
+def _check_task(task: str | RoadTask, table: Path, record: Path) -> None:
+    """Records a task's numbers; none for a task of the place. Raises InputError: the name has other numbers there."""
+    name, numbers = (task, []) if isinstance(task, str) else (task.name, task.numbers)
+    with wrap_read_errors(record, "give another --out"):
+        tasks = dict(read_json(record)) if record.exists() else {}
+        known = tasks.setdefault(name, numbers)
+        if len(known) != len(numbers) or not np.allclose(known, numbers, atol=1e-6):
+            raise InputError(f"{table} has trials of another task {name!r}; give another --out, or rename the task")
+    write_json(record, tasks)
 
 
 def _run_trial(test: RealTest, policy: Policy, lighting: str, seed: int, films: Path | None) -> Trial:

@@ -90,6 +90,11 @@ class RoadTask:
             raise InputError(f"task {self.name!r}: {wrong}")
 
     @property
+    def numbers(self) -> list[float]:
+        """All values but the name."""
+        return np.concatenate([np.ravel(value) for name, value in vars(self).items() if name != "name"]).tolist()
+
+    @property
     def knots(self) -> Array:
         """Station of each point of the line [m], shape (m,)."""
         return np.append(0.0, np.cumsum(np.hypot(*np.diff(self.line, axis=0).T)))
