@@ -220,7 +220,7 @@ def test_policies_are_frozen_before_anything_drives_and_a_repeat_changes_nothing
     before = {path.name: path.read_bytes() for path in one.record.iterdir()}
     forecast.command.run_place(one, None)
     assert before == {path.name: path.read_bytes() for path in one.record.iterdir()}
-    record = forecast.place_record.read_place(one.record, 106, SETUPS, one.days)
+    record = forecast.place_record.read_place(one.record, 106, one.protocol)
     assert record.real.shape == (6, 10, 2) and record.real[0].tolist() == [[5, 5]] * 10
     assert record.twin[1].tolist() == [[2, 5]] * 10 and record.held_out.tolist() == [[20, 20]] + [[10, 20]] * 5
 
@@ -243,8 +243,19 @@ def test_an_experiment_stopped_at_every_command_ends_with_the_same_record(foreca
 def test_a_day_whose_photo_cannot_be_placed_is_left_to_the_held_out_lightings(forecast, filmed, tmp_path):
     one = _place(forecast, tmp_path, StandIn(forecast, unplaced=("day_1063",)))
     forecast.command.run_place(one, None)
-    record = forecast.place_record.read_place(one.record, 106, SETUPS, one.days)
+    record = forecast.place_record.read_place(one.record, 106, one.protocol)
     assert record.twin[1, 2].tolist() == [10, 20] and record.twin[1, 3].tolist() == [2, 5]
+
+
+@pytest.mark.parametrize("name", ["trials.csv.gz", "episodes.csv.gz"])
+def test_a_place_that_was_stopped_within_a_day_is_not_scored(forecast, filmed, tmp_path, name):
+    one = _place(forecast, tmp_path, StandIn(forecast))
+    forecast.command.run_place(one, None)
+    trials = read_trials(one.record / name)
+    (one.record / name).unlink()
+    forecast.place_record.keep(one.record / name, trials[:-1])
+    assert forecast.place_record.read_place(one.record, 106, one.protocol) is None
+    assert forecast.place_scores.score(one.protocol, one.record.parents[1])["places"]["106"] == "trained"
 
 
 def test_a_record_never_loses_or_changes_a_row(forecast, filmed, tmp_path):

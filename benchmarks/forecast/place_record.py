@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from protocol import Protocol
 
 from twin.config import HELD_OUT, Condition
 from twin.errors import InputError
@@ -83,8 +84,9 @@ def keep(path: Path, trials: list[Trial]) -> None:
     write_bytes(path, out.getvalue())
 
 
-def read_place(folder: Path, place: int, policies: tuple[str, ...], days: list[str]) -> PlaceRecord | None:
-    """The record of a place; None if trials or episodes are missing."""
+def read_place(folder: Path, place: int, protocol: Protocol) -> PlaceRecord | None:
+    """The record of a place; None if trials or episodes of the protocol are missing."""
+    policies, days = tuple(protocol.setups), protocol.days_of(place)
     if not (folder / TRIALS).exists() or not (folder / EPISODES).exists():
         return None
     twin, real = _counts(read_trials(folder / EPISODES)), _counts(read_trials(folder / TRIALS))
@@ -96,8 +98,9 @@ def read_place(folder: Path, place: int, policies: tuple[str, ...], days: list[s
     ]
     driven = [[real.get((policy, day), (0, 0)) for day in days] for policy in policies]
     record = PlaceRecord(place, policies, tuple(days), np.array(photo), np.array(held_out), np.array(driven))
-    complete = all((counts[..., 1] > 0).all() for counts in (record.twin, record.held_out, record.real))
-    return record if complete else None
+    episodes = [protocol.episodes if placed.get(day, True) else protocol.held_out_episodes for day in days]
+    wanted = ((record.twin, episodes), (record.held_out, protocol.held_out_episodes), (record.real, protocol.trials))
+    return record if all((counts[..., 1] >= count).all() for counts, count in wanted) else None
 
 
 def _counts(trials: list[Trial]) -> dict[tuple[str, str], tuple[int, int]]:

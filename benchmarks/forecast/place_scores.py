@@ -45,10 +45,7 @@ MEAN, SHUFFLED = "mean of other places", "twin, its days shuffled"
 def score(protocol: Protocol, results: Path) -> dict[str, Any]:
     """Scores of the places that are complete, as a JSON object."""
     folder = results / protocol.name
-    places = {
-        place: read_place(folder / f"place_{place}", place, tuple(protocol.setups), protocol.days_of(place))
-        for place in protocol.places
-    }
+    places = {place: read_place(folder / f"place_{place}", place, protocol) for place in protocol.places}
     done = [one for one in places.values() if one]
     states = {str(place): _state(folder / f"place_{place}", one) for place, one in places.items()}
     out: dict[str, Any] = {"version": protocol.version, "places": states, "wanted": protocol.wanted}
