@@ -109,3 +109,13 @@ def test_cycles_and_the_rasterizer_see_the_same_place(cycles):
         assert all((gray[0] * one).sum() / np.linalg.norm(gray[0]) / np.linalg.norm(one) < here for one in shifted)
         assert 0.7 < other.mean() / own.mean() < 1.3
     renderer.close()
+
+
+def test_trials_are_drawn_from_a_complete_place_only(cycles, tmp_path):
+    """After an interruption, a draw from the recorded part would be another one than that from all trials."""
+    command = cycles.command
+    record = tmp_path / "version_2" / "place_106"
+    command.keep(record / command.TRIALS, [_trial("varied", "day_1061", 1, True)])
+    given = SimpleNamespace(minutes=1.0, places=[106], results=tmp_path)
+    with pytest.raises(InputError, match="place_106 is not complete; first run benchmarks/forecast at place 106 to"):
+        command._repeat(command.read_protocol(), given)

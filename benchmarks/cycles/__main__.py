@@ -38,7 +38,7 @@ from twin.reality.road_task import place_on_test_day
 
 sys.path.append(str(Path(__file__).parents[1]))
 sys.path.append(str(Path(__file__).parents[1] / "forecast"))
-from place_record import TRIALS, freeze, keep
+from place_record import TRIALS, freeze, keep, read_place
 from protocol import PROTOCOL, Protocol, read_protocol
 from record import add_record_options, save
 
@@ -135,8 +135,8 @@ def _repeat(protocol: Protocol, given: argparse.Namespace) -> None:
     end = time.monotonic() + 60.0 * min(given.minutes, 1e6)
     for place in given.places or protocol.places:
         record = given.results / protocol.name / f"place_{place}"
-        if not (record / TRIALS).exists():
-            raise InputError(f"{record / TRIALS}: no such file; first run benchmarks/forecast at place {place}")
+        if read_place(record, place, protocol) is None:  # a draw from a part of the trials would be another one
+            raise InputError(f"{record} is not complete; first run benchmarks/forecast at place {place} to its end")
         scene = given.work / protocol.name / f"place_{place}"
         freeze(record, {setup: scene / "runs" / setup for setup in protocol.setups})  # the policies that were recorded
         chosen = drawn(read_trials(record / TRIALS), given.share, place)
