@@ -1,13 +1,12 @@
 """Camera positions on sampled places: films each place, builds to the stage `cameras`, and compares with the truth.
 
-    python benchmarks/cameras.py WORK --places 60 61 62
+    python benchmarks/cameras.py WORK --places 60 61 62 [--json FILE]
 
 WORK gets a scene per place, filmed in the first of its lightings; an existing film is used again. Errors are distances
 of camera centers from the true ones after the similarity that fits best. A frame of a film that was left out counts as
-missing. With --json FILE, the table is written to a file, too.
+missing.
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -18,6 +17,8 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from record import record_parser, save, write_so_far
 
 from twin.geometry.cameras import Cameras
 from twin.geometry.poses import umeyama
@@ -58,11 +59,10 @@ def measure(folder: Path) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("work", type=Path, help="folder for the scenes")
     parser.add_argument("--places", type=int, nargs="+", required=True, metavar="NUMBER")
     parser.add_argument("--mapper", default="auto", help="cameras.mapper of the builds (default: auto)")
-    parser.add_argument("--json", type=Path, help="write the table to this file")
     given = parser.parse_args()
     rows: list[dict[str, Any]] = []
     failed = False
@@ -86,13 +86,13 @@ def main() -> int:
             return 1
         start = time.monotonic()
         error = _run("twin.build", folder, "--until", "cameras", "--set", f"cameras.mapper={given.mapper}")
-        row = {"place": place, "seconds": round(time.monotonic() - start)}
+        row = {"name": folder.name, "seconds": round(time.monotonic() - start)}
         rows.append(row | ({"error": error} if error else measure(folder)))
         print(json.dumps(rows[-1]), flush=True)
         failed = failed or bool(error)
-        if given.json:
-            given.json.write_text(json.dumps(rows, indent=1) + "\n")
-    return int(failed)
+        if given.json:  # after every place, so that an interrupted run keeps its figures
+            write_so_far(given.json, {"places": rows})
+    return save(given.json, {"places": rows}, given.replace_record) or int(failed)
 
 
 if __name__ == "__main__":

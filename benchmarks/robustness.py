@@ -8,7 +8,6 @@ Each test prints a table and, with --json FILE, writes it. The exit status is 1 
 generated scenes in a temporary folder.
 """
 
-import argparse
 import contextlib
 import gc
 import json
@@ -28,6 +27,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from record import record_parser, save
 from sameness import QUICK
 
 from twin.files import digest_file
@@ -417,12 +417,11 @@ def _verb(root: Path, name: str, *arguments: str) -> list[str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record_parser(__doc__)
     parser.add_argument("test", choices=("endurance", "kills", "disk"))
     parser.add_argument("--steps", type=int, default=1_000_000, help="control steps of endurance (default %(default)s)")
     parser.add_argument("--times", type=int, default=50, help="kills of each command (default %(default)s)")
     parser.add_argument("--only", choices=("build", "train", "validate"), help="kill only this command")
-    parser.add_argument("--json", type=Path, help="write the results here")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -434,9 +433,7 @@ def main() -> int:
         out = tests[options.test]()
     for key, value in out.items():
         print(f"{key:40} {value}")
-    if options.json:
-        options.json.write_text(json.dumps(out, indent=1) + "\n")
-    return 0 if out["ok"] else 1
+    return save(options.json, out, options.replace_record) or int(not out["ok"])
 
 
 if __name__ == "__main__":

@@ -113,6 +113,25 @@ def test_a_partial_run_does_not_overwrite_a_record(tmp_path):
     assert done.returncode == 2 and "rows[B5" in done.stderr and file.read_bytes() == kept
 
 
+def test_places_and_checks_that_ran_before_stay_in_their_records(scripts, tmp_path, monkeypatch, capsys):
+    import cameras
+    import robustness
+
+    monkeypatch.setattr(cameras, "_run", lambda *_: "")
+    monkeypatch.setattr(cameras, "measure", lambda folder: {"rms_m": 0.01})
+    file = tmp_path / "cameras.json"
+    for places, status in ((("7", "8"), 0), (("7",), 2)):
+        monkeypatch.setattr(sys, "argv", ["cameras", str(tmp_path), "--places", *places, "--json", str(file)])
+        assert cameras.main() == status
+        assert [row["name"] for row in json.loads(file.read_text())["places"]] == ["place_7", "place_8"]
+    assert "has entries that the new record lacks (places[place_8])" in capsys.readouterr().err
+    file = tmp_path / "robustness.json"
+    for name, status in (("endurance", 0), ("disk", 2)):
+        monkeypatch.setattr(robustness, name, lambda *_, name=name: {name: 1, "ok": True})
+        monkeypatch.setattr(sys, "argv", ["robustness", name, "--json", str(file)])
+        assert robustness.main() == status and "endurance" in json.loads(file.read_text())
+
+
 # ---- Table 1's scores
 
 
