@@ -71,7 +71,8 @@ def places_of_tasks(scene: Path) -> Iterator[tuple[str, float]]:
     truth = Truth.load(twin.scene.truth)
     cameras = Cameras.load(twin.scene.stage("metric"))
     to_truth = align_poses(cameras.camera_to_world, matched_poses(truth, cameras))
-    station, lateral = nearest_on_route(true_route(), to_truth.points(twin.world().route)[:, :2])
+    plan = filming.FilmingPlan.of(sample_place(truth.number, truth.road_length)) if truth.number else None
+    station, lateral = nearest_on_route(true_route(plan, truth.route), to_truth.points(twin.world().route)[:, :2])
     yield "reality.route_off_max_m", float(np.abs(lateral).max())
     yield "reality.route_off_mean_m", float(np.abs(lateral).mean())
     yield "reality.route_begins_later_m", float(station[0])

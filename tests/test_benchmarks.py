@@ -10,8 +10,13 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from twin.reality.filming import FilmingPlan
+from twin.reality.place_sampling import sample_place
+from twin.reality.road_task import true_route
+from twin.reality.sampled_road import SampledRoad
 from twin.robot import HuskyParams
 from twin.scene import SceneDir
 
@@ -78,6 +83,31 @@ def test_visual_vs_collision_drives_the_robot_of_the_scene(scripts, monkeypatch,
     with pytest.raises(Called) as called:
         overlay.visual_vs_collision(tmp_path)
     assert called.value.args == (world.robot,)
+
+
+def test_a_route_is_compared_with_that_of_its_own_place(scripts, monkeypatch, tmp_path):
+    import reality
+
+    route = SampledRoad(sample_place(7))
+    there = true_route(FilmingPlan.of(sample_place(7)), route)
+    truth = SimpleNamespace(number=7, road_length=0.0, route=route)
+    cameras = SimpleNamespace(camera_to_world=route_poses(there))
+    monkeypatch.setattr(reality.Truth, "load", lambda _: truth)
+    monkeypatch.setattr(reality.Cameras, "load", lambda _: cameras)
+    monkeypatch.setattr(reality, "matched_poses", lambda *_: cameras.camera_to_world)
+    opened = SimpleNamespace(scene=SceneDir(tmp_path), world=lambda: SimpleNamespace(route=there[20:]))
+    monkeypatch.setattr(reality, "load_scene", lambda _: opened)
+    found = dict(reality.places_of_tasks(tmp_path))
+    assert found["reality.route_off_max_m"] < 1e-6
+    along = np.linalg.norm(np.diff(there[:21, :2], axis=0), axis=1).sum()
+    assert found["reality.route_begins_later_m"] == pytest.approx(along, abs=1e-6)
+
+
+def route_poses(route):
+    """Level poses (n, 4, 4) at the points of a route."""
+    poses = np.tile(np.eye(4), (len(route), 1, 1))
+    poses[:, :3, 3] = route
+    return poses
 
 
 def test_peak_memory_is_that_of_this_process(scripts):
