@@ -2,7 +2,7 @@
 
     python benchmarks/day.py SCENE [--days NAME ...] [--policies RUN ...] [--json FILE] [--pictures FOLDER]
 
-The scene was built from films of the generated place (`twin reality`) and has a lighting fitted to one photo of each
+The scene was built from films of place 0 (`twin reality`) and has a lighting fitted to one photo of each
 day (`benchmarks/table1`, step `photos`). From eight other stations of the road, images of every day are compared with
 renderings from the same poses under the photo's appearance and fog. The figures are PSNR, and for steering a ratio: the
 policies' change of steering from rendering to image, divided by the change that randomized sun and shadows cause.
@@ -95,13 +95,16 @@ def main() -> int:
     )
     given = parser.parse_args()
     twin = load_scene(given.scene)
+    filmed_place = Truth.load(twin.scene.truth)
+    if filmed_place.number:
+        parser.error(f"{given.scene} is a film of place {filmed_place.number}; expected one of place 0, as scenes/demo")
     field, cameras = twin.field(), Cameras.load(twin.scene.stage("metric"))
     model = twin.world().model()
     intrinsics = camera_intrinsics(model, model.camera("front").id, SIZE)
     rays = unproject(pixel_grid(*SIZE), intrinsics)
     lengths = np.linalg.norm(rays, axis=-1).astype(np.float32)
     truth, true_poses = true_images(given.days)
-    to_truth = align_poses(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras))
+    to_truth = align_poses(cameras.camera_to_world, matched_poses(filmed_place, cameras))
     poses = to_truth.inverse().poses(true_poses)
     views = Viewpoints.of(poses, intrinsics, SIZE)
     clear = [field.render(views, name) for name in given.days]

@@ -1,6 +1,6 @@
 """Benchmark of suns fitted to photos: one photo per day, compared with pictures of the day from there and elsewhere.
 
-    python benchmarks/sun.py SCENE [--place N] [--camera N] [--days N ...] [--json FILE] [--pictures FOLDER]
+    python benchmarks/sun.py SCENE [--camera N] [--days N ...] [--json FILE] [--pictures FOLDER]
 
 The scene was built from films of a generated place (`twin reality film`). For each day, by number, a lighting is
 fitted to a photo from the start of the road as `twin relight` does, but at the true pose of the photo: without a sun
@@ -39,7 +39,7 @@ VARIANTS = ("embedding", "searched", "true")
 
 def day_pictures(setup: Setup, light: Lighting) -> tuple[NDArray[np.float32], NDArray]:
     """Pictures at all stations (stations, h, w, 3), the first of which is the photo, and true camera_to_world poses."""
-    line = place_on_test_day(setup.place).route
+    line = place_on_test_day(setup.place, setup.length).route
     robot, camera = recordings.robot_and_camera(setup, light)
     rows, poses = [], []
     for station in np.linspace(FIRST, line.length - MARGIN, STATIONS):
@@ -106,25 +106,25 @@ def day_row(
 def main() -> int:
     parser = record_parser(__doc__)
     parser.add_argument("scene", type=Path)
-    parser.add_argument("--place", type=int, default=0, help="number of the generated place")
     parser.add_argument("--camera", type=int, default=0, help="number of the robot's camera")
     parser.add_argument("--days", type=int, nargs="+", default=list(range(20, 30)), metavar="N")
     parser.add_argument("--pictures", type=Path, help="folder for images: the day, and the twin in each variant")
     given = parser.parse_args()
-    twin, setup = load_scene(given.scene), Setup(given.place, 0, given.camera)
-    cameras = Cameras.load(twin.scene.stage("metric"))
-    from_truth = align_poses(cameras.camera_to_world, matched_poses(Truth.load(twin.scene.truth), cameras)).inverse()
+    twin = load_scene(given.scene)
+    truth, cameras = Truth.load(twin.scene.truth), Cameras.load(twin.scene.stage("metric"))
+    setup = Setup(truth.number, 0, given.camera, truth.road_length)
+    from_truth = align_poses(cameras.camera_to_world, matched_poses(truth, cameras)).inverse()
     field, baked, days = twin.radiance_field("cpu"), twin.field(), {}
     intrinsics, casters = intrinsics_of(draw_camera(setup.camera), SIZE), shadow_casters(twin.scene, baked)
     assert casters is not None
     for number in given.days:
         light = weather(f"day_{number}")
-        truth, poses = day_pictures(setup, light)
+        real, poses = day_pictures(setup, light)
         poses = from_truth.poses(poses)
         ray, _, is_sunny = light.suns[0]
         toward = -from_truth.rotation @ np.array(ray) / np.linalg.norm(ray)
         views = Views(baked, poses, intrinsics)
-        row, pictures = day_row(truth, toward if is_sunny else None, field, views, poses[0], casters, intrinsics)
+        row, pictures = day_row(real, toward if is_sunny else None, field, views, poses[0], casters, intrinsics)
         azimuth, elevation = angles(toward)
         days[f"day_{number}"] = row | {"sunny": is_sunny, "azimuth_deg": azimuth, "elevation_deg": elevation}
         text = " ".join(
@@ -135,7 +135,7 @@ def main() -> int:
             given.pictures.mkdir(parents=True, exist_ok=True)
             image = np.hstack([np.vstack(one) for one in pictures])
             write_image(given.pictures / f"day_{number}.png", (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
-    figures: dict[str, object] = {"place": given.place, "days": days}
+    figures: dict[str, object] = {"place": setup.place, "days": days}
     for label, is_sunny in (("sunny", True), ("overcast", False)):
         rows = [row for row in days.values() if row["sunny"] == is_sunny]
         if rows:

@@ -15,6 +15,7 @@ import pytest
 
 from twin.reality.filming import FilmingPlan
 from twin.reality.place_sampling import sample_place
+from twin.reality.real_test import Setup
 from twin.reality.road_task import true_route
 from twin.reality.sampled_road import SampledRoad
 from twin.robot import HuskyParams
@@ -108,6 +109,35 @@ def route_poses(route):
     poses = np.tile(np.eye(4), (len(route), 1, 1))
     poses[:, :3, 3] = route
     return poses
+
+
+def test_pictures_of_days_are_of_the_place_of_the_scene(scripts, monkeypatch, tmp_path, capsys):
+    import day
+    import sun
+
+    class Taken(Exception):
+        pass
+
+    def pictures(setup, light):
+        raise Taken(setup, light.name)
+
+    poses = route_poses(np.array([[0.0, 0.0, 1.0], [5.0, 0.0, 1.0], [5.0, 2.0, 1.0]]))
+    opened = SimpleNamespace(scene=SceneDir(tmp_path), radiance_field=lambda _: None, field=lambda: None)
+    for script in (sun, day):
+        monkeypatch.setattr(script, "load_scene", lambda _: opened)
+        monkeypatch.setattr(script, "matched_poses", lambda *_: poses)
+    monkeypatch.setattr(sun.Truth, "load", lambda _: SimpleNamespace(number=7, road_length=120.0))
+    monkeypatch.setattr(sun.Cameras, "load", lambda _: SimpleNamespace(camera_to_world=poses))
+    monkeypatch.setattr(sun, "shadow_casters", lambda *_: ())
+    monkeypatch.setattr(sun, "day_pictures", pictures)
+    monkeypatch.setattr(sys, "argv", ["sun", str(tmp_path), "--camera", "2", "--days", "21"])
+    with pytest.raises(Taken) as taken:
+        sun.main()
+    assert taken.value.args == (Setup(7, 0, 2, 120.0), "day_21")
+    monkeypatch.setattr(sys, "argv", ["day", str(tmp_path)])
+    with pytest.raises(SystemExit) as stop:
+        day.main()
+    assert stop.value.code == 2 and "is a film of place 7; expected one of place 0" in capsys.readouterr().err
 
 
 def test_peak_memory_is_that_of_this_process(scripts):
