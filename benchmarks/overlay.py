@@ -25,13 +25,13 @@ from twin.config import ObstacleConfig
 from twin.env.compositor import Compositor
 from twin.env.obstacles import ObstacleModel, add_obstacle_geoms, add_obstacles, place
 from twin.env.physics import camera_pose
-from twin.geometry.cameras import Cameras, opencv_to_mujoco
+from twin.geometry.cameras import Cameras, opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.poses import Similarity
 from twin.loading import load_scene
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.reality import true_world as reality
 from twin.reality.filming import sensor_image
-from twin.reality.lighting import LIGHTINGS
+from twin.reality.sky import apply_haze
 from twin.reality.truth import Truth, align_poses, matched_poses
 
 SIZE = (160, 90)
@@ -68,7 +68,8 @@ class TrueWorld:
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self.data)
-        self.light = replace(LIGHTINGS[lighting], noise=0.0)
+        self.light = replace(truth.place.lightings[lighting], noise=0.0)
+        self._ground, self._rays = truth.ground_height, unproject(pixel_grid(*SIZE), intrinsics)
         shadows = any(shadow for _, _, shadow in self.light.suns)
         with wp.ScopedDevice("cpu"):
             self.device_model = mujoco_warp.put_model(self.model)
@@ -110,6 +111,8 @@ class TrueWorld:
             packed = self.contexts[0].rgb_data.numpy()[0].reshape(SIZE[::-1])
             depth = self.contexts[1].depth_data.numpy()[0].reshape(SIZE[::-1]).copy()
         light = np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], -1).astype(np.float32) / 255.0
+        ground = float(self._ground(camera_to_world[:2, 3]))
+        light = apply_haze(light, depth, self._rays, camera_to_world, self.light, ground)
         return sensor_image(np.random.default_rng(0), light, self.light, 1.0) / 255.0, np.where(depth > 0.0, depth, 1e4)
 
 
@@ -151,7 +154,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
     errors: dict[str, list[np.ndarray]] = defaultdict(list)
     ious: dict[str, list[tuple[int, int]]] = defaultdict(list)
     length = float(arc_lengths(world.route)[-1])
-    for lighting in (name for name in field.lightings if name in LIGHTINGS):
+    for lighting in (name for name in field.lightings if name in truth.place.lightings):
         true_world = TrueWorld(truth, lighting, world.intrinsics)
         rows = []
         for kind in kinds:
@@ -215,7 +218,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
         intersection, union = np.sum(ious[lighting], 0)
         figures[f"overlay.mask_iou.{lighting}"] = float(intersection / union)
         # The true world's sky is ambient light without occlusion: only its sun casts shadows.
-        casts = any(shadow for _, _, shadow in LIGHTINGS[lighting].suns)
+        casts = any(shadow for _, _, shadow in truth.place.lightings[lighting].suns)
         for name in ("shadow", "no_shadow") if casts else ():
             off = np.concatenate(errors[f"{name}.{lighting}"])
             figures[f"overlay.{name}_rms.{lighting}"] = float(np.sqrt((off**2).mean()))

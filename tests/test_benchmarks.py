@@ -7,13 +7,18 @@ import importlib
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 
+from twin.geometry.poses import look_at
+from twin.reality import lighting as lighting_module
 from twin.reality.filming import FilmingPlan
+from twin.reality.lighting import LIGHTINGS
 from twin.reality.place_sampling import sample_place
 from twin.reality.real_test import Setup
 from twin.reality.road_task import true_route
@@ -138,6 +143,34 @@ def test_pictures_of_days_are_of_the_place_of_the_scene(scripts, monkeypatch, tm
     with pytest.raises(SystemExit) as stop:
         day.main()
     assert stop.value.code == 2 and "is a film of place 7; expected one of place 0" in capsys.readouterr().err
+
+
+def test_the_true_world_of_obstacles_has_the_light_and_the_haze_of_its_place(scripts, monkeypatch):
+    """A white wall 20 m ahead, in the place's own `sun`: exposure 0.5 and haze of the horizon's color."""
+    import overlay
+
+    def world(lighting, place):
+        spec = mujoco.MjSpec()
+        spec.worldbody.add_camera(name="film")
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[50, 1, 50], pos=[0, 21, 0], rgba=[1, 1, 1, 1])
+        lighting_module.add_lights(spec, place.lightings[lighting], np.zeros((0, 3)))
+        return spec
+
+    monkeypatch.setattr(overlay.reality, "world_spec", world)
+    monkeypatch.setattr(overlay, "KINDS", ())
+    pose = look_at(np.array([0.0, 0.0, 1.0]), np.array([0.0, 5.0, 1.0]))
+    light = replace(LIGHTINGS["sun"], horizon=(0.0, 0.0, 1.0), exposure=0.5, suns=(((0, 1, 0), (0, 0, 0), False),))
+    seen = {}
+    for visibility in (float("inf"), 5.0):
+        place = SimpleNamespace(lightings={"sun": replace(light, visibility=visibility)})
+        truth = SimpleNamespace(place=place, ground_height=lambda xy: 0.0)
+        rgb, depth = overlay.TrueWorld(truth, "sun", np.array([80.0, 80.0, 80.0, 45.0])).render(pose, None, np.eye(4))
+        assert depth[45, 80] == pytest.approx(20.0, abs=0.01)
+        seen[visibility] = rgb[45, 80]
+    np.testing.assert_allclose(seen[float("inf")], 0.5 * np.array(light.ambient), atol=0.01)
+    through = np.exp(-20.0 / 5.0)
+    np.testing.assert_allclose(seen[5.0][:2], through * seen[float("inf")][:2], atol=0.01)
+    assert seen[5.0][2] > 0.45
 
 
 def test_peak_memory_is_that_of_this_process(scripts):
