@@ -126,7 +126,7 @@ def test_acceleration_ramps_continue_from_window_to_window():
     """Wheels lag behind a ramp, so only the commands of earlier windows determine the controller's state at a window's
     start.
     """
-    drive = drivetrain.Drivetrain(1.0, 1.0, 9.0, 9.0, 0.2, 1.0, 9.0, 0.3)
+    drive = drivetrain.Drivetrain(1.0, 1.0, np.inf, 9.0, 9.0, 0.2, 1.0, 9.0, 0.3)
     time = np.arange(3 * logs.SAMPLES) * logs.PERIOD
     ramp = np.maximum(0.0, time - drive.latency)
     lagged = drive.mean_acceleration * (ramp - drive.lag * (1 - np.exp(-ramp / drive.lag)))
@@ -138,6 +138,37 @@ def test_acceleration_ramps_continue_from_window_to_window():
     assert targets[1:, :25] == pytest.approx(targets[:-1, 200:])
     assert targets[:, 100, 0] == pytest.approx(drive.mean_acceleration * (2.0 * np.arange(3) + 0.8), abs=1.01 * step)
     assert drivetrain.at_samples(turned) == pytest.approx(wheels, abs=step)
+
+
+def limited_windows(seed: int, truth: HuskyParams, most: tuple[float, float]) -> logs.Windows:
+    """Wheel speeds of the drivetrain model, with noise, under random commands of up to `most` [m/s], [rad/s]."""
+    rng = np.random.default_rng(seed)
+    requests = np.repeat(rng.uniform(-1, 1, (40, 2, 2)) * most, logs.SAMPLES // 2, 1)
+    windows = windows_of(np.zeros((40, logs.SAMPLES, 2)), commands=requests, twist=True)
+    windows = replace(windows, groups=np.arange(40) // 2, follows=np.arange(40) > 0)
+    _, turned = drivetrain.simulate_drivetrain(drivetrain.Drivetrain.from_robot(truth, True), windows)
+    return replace(windows, wheels=drivetrain.at_samples(turned) + rng.normal(0, 0.02, windows.wheels.shape))
+
+
+def test_a_speed_limit_below_the_commands_is_found():
+    truth = replace(SOFT, max_speed=0.5)
+    windows = limited_windows(0, truth, (0.9, 1.8))
+    fitted, fit = drivetrain.fit_drivetrain(windows, HuskyParams())
+    found = fitted.robot_fields(HuskyParams(), True)
+    for name in ("max_speed", "max_acceleration", "max_yaw_acceleration", "command_latency", "servo_lag"):
+        assert found[name] == pytest.approx(getattr(truth, name), rel=0.03), name
+    assert {"mean_limit", "mean_acceleration"} <= fit.errors.keys()
+
+
+def test_the_largest_command_is_no_limit():
+    """The robot is faster than the published one, and reaches none of its limits."""
+    truth = replace(SOFT, max_speed=3.0, max_wheel_speed=3.0, max_yaw_rate=2.0)
+    windows = limited_windows(1, truth, (1.3, 0.9))
+    fitted, fit = drivetrain.fit_drivetrain(windows, HuskyParams())
+    assert fit.refused.keys() == {"mean_limit", "half_limit", "wheel_limit"}
+    assert "raise max_wheel_speed in [robot]" in fit.refused["wheel_limit"]
+    assert "raise" not in fit.refused["half_limit"]
+    assert fitted.half_gain == pytest.approx(truth.separation_multiplier, abs=4 * fit.errors["half_gain"])
 
 
 @pytest.mark.parametrize("late", [0.4, 0.2, 0.07, 0.0, -0.15])

@@ -24,6 +24,13 @@ EXTRA_SAMPLES = 5  # samples after a window's end, for poses measured after it
 _HISTORY = 20  # samples of the previous window from which delayed commands are taken
 _CHAIN = 3  # number of previous windows over which a ramp is simulated: six seconds
 _PER_SAMPLE = round(PERIOD / CONTROL_STEP)
+_LIMITS = {
+    "mean_limit": "max_speed",
+    "half_limit": "max_yaw_rate",
+    "wheel_limit": "max_wheel_speed",
+}  # and their fields
+_LIMIT_NATS = 3.0  # [nat] least loss of a log's likelihood without a limit from which the limit counts as reached
+_EXCEEDED = 1.05  # a speed / the robot's limit above which the log contradicts the limit
 _SIDES: Kinds = (0, 0)  # residuals of the left and the right wheels [rad/s]
 
 
@@ -33,6 +40,8 @@ class Drivetrain:
 
     mean_gain: float
     half_gain: float
+    mean_limit: float
+    """Infinite if commands are wheel speeds, which bypass this limit."""
     half_limit: float
     wheel_limit: float
     latency: float
@@ -47,6 +56,7 @@ class Drivetrain:
         return Drivetrain(
             1.0,
             params.separation_multiplier if twist else 1.0,
+            params.max_speed / WHEEL_RADIUS if twist else np.inf,
             params.max_yaw_rate * half,
             params.max_wheel_speed / WHEEL_RADIUS,
             params.command_latency,
@@ -58,12 +68,13 @@ class Drivetrain:
     def robot_fields(self, params: HuskyParams, twist: bool) -> dict[str, float]:
         """Converts the drivetrain to fields of `HuskyParams`.
 
-        If commands are wheel speeds (not `twist`), the separation multiplier is copied from `params`.
+        If commands are wheel speeds (not `twist`), separation multiplier and top speed are copied from `params`.
         """
         multiplier = self.half_gain if twist else params.separation_multiplier
         half = multiplier * TRACK / 2 / WHEEL_RADIUS
         return {
             "separation_multiplier": multiplier,
+            "max_speed": self.mean_limit * WHEEL_RADIUS if twist else params.max_speed,
             "max_yaw_rate": self.half_limit / half,
             "max_wheel_speed": self.wheel_limit * WHEEL_RADIUS,
             "command_latency": self.latency,
@@ -85,8 +96,8 @@ def simulate_drivetrain(drivetrain: Drivetrain, windows: Windows) -> tuple[Array
         `CONTROL_STEP` [s] apart.
     """
     gains = np.array([drivetrain.mean_gain, drivetrain.half_gain])
-    commanded = windows.commanded_speeds * gains
-    commanded[..., 1] = np.clip(commanded[..., 1], -drivetrain.half_limit, drivetrain.half_limit)
+    limits = np.array([drivetrain.mean_limit, drivetrain.half_limit])
+    commanded = np.clip(windows.commanded_speeds * gains, -limits, limits)
     speed = windows.wheels[:, 0]
     start = np.stack([speed.mean(1), (speed[:, 1] - speed[:, 0]) / 2], -1)
     before = np.repeat(start[:, None], _HISTORY, 1)
@@ -143,16 +154,21 @@ def at_samples(fine: Array) -> Array:
 
 
 def fit_drivetrain(windows: Windows, params: HuskyParams) -> tuple[Drivetrain, Fit]:
-    """Fits the drivetrain to a log's wheel speeds; parameters that are not identified keep the values of `params`."""
+    """Fits the drivetrain to a log's wheel speeds; parameters that are not identified keep the values of `params`.
+
+    A limit is identified only if the log contradicts a drivetrain without it (`_LIMIT_NATS`). Otherwise the fit would
+    take the largest command for a limit. A limit that the log exceeds is raised for the fit of the others.
+    """
     default = Drivetrain.from_robot(params, windows.twist)
     fitting = windows.fitting
     measured = windows.wheels[fitting]
     commanded = np.abs(windows.commanded_speeds[fitting, -1])
-    half = np.abs(measured[..., 1] - measured[..., 0]) / 2
+    mean, half = np.abs(measured.mean(2)), np.abs(measured[..., 1] - measured[..., 0]) / 2
     # Initial gains come from the windows' final wheel speeds, initial limits from the highest speeds.
     start = {
         "mean_gain": 1.0 if windows.twist else _gain(commanded[:, 0], np.abs(measured[:, -1].mean(1))),
         "half_gain": _gain(commanded[:, 1], half[:, -1]),
+        "mean_limit": float(np.quantile(mean, 0.98)),
         "half_limit": float(np.quantile(half, 0.95)),
         "wheel_limit": float(np.quantile(np.abs(measured), 0.98)),
         "latency": 0.1,
@@ -160,20 +176,31 @@ def fit_drivetrain(windows: Windows, params: HuskyParams) -> tuple[Drivetrain, F
         "half_acceleration": 4.0,
         "lag": 0.1,
     }
+    highest = dict(zip(_LIMITS, (float(x.max()) for x in (mean, half, np.abs(measured))), strict=True))
+    exceeded = {
+        name: f"; the log exceeds the robot's limit of {getattr(default, name):.3g}, so raise {field} in [robot]"
+        for name, field in _LIMITS.items()
+        if highest[name] > _EXCEEDED * getattr(default, name)
+    }
+    default = replace(default, **{name: highest[name] for name in exceeded})
 
     def residuals(values: dict[str, float]) -> Array:
         lagged = simulate_drivetrain(replace(default, **values), windows)[1]
         return (at_samples(lagged) - windows.wheels)[fitting]
 
+    def cost(values: dict[str, float]) -> float:
+        return negative_log_likelihood(residuals(values), _SIDES)
+
     # At a wrong latency, accelerations hardly change the residuals. So the search starts at the best of several pairs
     # of latency and acceleration.
     tries = [start | {"latency": t, "half_acceleration": a} for t in (0.05, 0.15, 0.25, 0.4) for a in (3.0, 8.0, 30.0)]
-    start = min(tries, key=lambda values: negative_log_likelihood(residuals(values), _SIDES))
+    start = min(tries, key=cost)
     table = [
-        Parameter(name, None, std, low, high, getattr(default, name), unit, cure)
+        Parameter(name, None, std, low, high, getattr(default, name), unit, cure + exceeded.get(name, ""))
         for name, std, low, high, unit, cure in (
             ("mean_gain", 0.05 * start["mean_gain"], 0.05, 20.0, "", "driving straight at several speeds"),
             ("half_gain", 0.1 * start["half_gain"], 0.02, 20.0, "", "turns of several strengths"),
+            ("mean_limit", 0.3, 0.2, 30.0, "rad/s", "commands beyond the top speed"),
             ("half_limit", 0.3, 0.2, 40.0, "rad/s", "turns on the spot at full command"),
             ("wheel_limit", 0.3, 0.5, 30.0, "rad/s", "full speed and a turn at once"),
             ("latency", 0.05, 0.0, 0.9, "s", "sudden changes of command"),
@@ -181,10 +208,21 @@ def fit_drivetrain(windows: Windows, params: HuskyParams) -> tuple[Drivetrain, F
             ("half_acceleration", 3.0, 0.5, 200.0, "rad/s²", "sudden turns at full command"),
             ("lag", 0.05, 0.0, 1.0, "s", "sudden changes of command"),
         )
-        if not (windows.twist and name == "mean_gain")
+        if name != ("mean_gain" if windows.twist else "mean_limit")
     ]
-    found = fit_parameters(table, residuals, _SIDES, windows.groups[fitting], start)
-    return replace(default, **found.values), found
+    refused: dict[str, str] = {}
+    while True:  # each round has fewer parameters
+        found = fit_parameters(table, residuals, _SIDES, windows.groups[fitting], start)
+        least = cost(found.values) + _LIMIT_NATS / len(measured)
+        idle = [
+            p for p in table if p.name in {*_LIMITS} & {*found.errors} and cost(found.values | {p.name: np.inf}) < least
+        ]
+        if not idle:
+            return replace(default, **found.values), replace(found, refused=refused | found.refused)
+        for p in idle:
+            table.remove(p)
+            refused[p.name] = f"{p.name} = {p.default:.4g} {p.unit}: the log does not reach this limit; needs {p.cure}"
+        start = found.values
 
 
 def _gain(x: Array, y: Array) -> float:

@@ -25,6 +25,7 @@ from twin.types import Array
 
 _DRIVE_FIELDS = {  # field of HuskyParams → parameter of the drivetrain, to which it is proportional
     "separation_multiplier": "half_gain",
+    "max_speed": "mean_limit",
     "max_yaw_rate": "half_limit",
     "max_wheel_speed": "wheel_limit",
     "command_latency": "latency",
