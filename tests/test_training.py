@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -252,6 +253,9 @@ def test_tests_break_off_no_episode_of_the_training(scene, tmp_path):
         train_policy(twin.load_scene(scene), folder, SHORT, processes=1, referee=referee)
         driven[tested] = [{**row, "wall_s": ""} for row in rows(folder / "episodes.csv")]
     assert driven[True] == driven[False]
+    log = [{name: float(value) for name, value in row.items()} for row in rows(tmp_path / "True" / "log.csv")]
+    for before, row in pairwise(log):  # speeds are those of a segment, here 40 steps, without its test
+        assert row["steps_per_s"] * (row["wall_s"] - before["wall_s"] + 0.1) >= 40
     assert any(int(row["step"]) // 40 > (int(row["step"]) - 4 * int(row["steps"])) // 40 for row in driven[True])
 
 

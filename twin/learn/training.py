@@ -344,7 +344,7 @@ class _RunRecorder(BaseCallback):
         # Written only now: the environments have started, so the configuration is valid.
         write_json(self._folder / "config.json", self._settings)
         self._saved = self._first = self.model.num_timesteps
-        self._first_updates = self.model._n_updates
+        self._first_updates, self._first_time = self.model._n_updates, time.monotonic()
         kept = _keep_rows(self._folder / "episodes.csv", TRAINING_EPISODE_COLUMNS, self._saved)
         self._recent: list[bool] = kept[-RECENT_EPISODES:]
         _keep_rows(self._folder / "log.csv", LOG_COLUMNS, self._saved)
@@ -380,7 +380,7 @@ class _RunRecorder(BaseCallback):
         """Saves the policy, the state and a row of the log, unless no step was done since the last save."""
         if self.model.num_timesteps == self._saved:
             return
-        model, elapsed = self.model, max(time.monotonic() - self._started, 1e-9)
+        model, elapsed = self.model, max(time.monotonic() - self._first_time, 1e-9)
         logged = model.logger.name_to_value
         row = (
             *(model.num_timesteps, f"{self.wall:.1f}", model._n_updates),
