@@ -84,6 +84,7 @@ def test_a_bag_of_an_episode_is_judged_as_the_episode_was(place, tmp_path, name,
     assert trial.main([str(scene), str(bag), *given]) == 0
     printed = capsys.readouterr().out
     assert f"{name}, ahead, day: {cause} after {progress:.1f} m and {steps * 0.1:.1f} s" in printed
+    assert f"counted in {out}\n" in printed
     (row,) = read_trials(tmp_path / "real_trials.csv")
     assert (row.cause, row.steps, row.policy) == (cause, steps, name)
     assert row.progress == pytest.approx(progress, abs=1e-3)

@@ -45,6 +45,8 @@ from twin.sysid.trial_recording import FrameFit, PosesFrame, TrialRecording, rea
 from twin.types import Array, Image
 from twin_policy import Limits, Pilot, Rectifier
 
+REAL_CSV = "real.csv"
+"""Name of the results table in the scene's folder."""
 _ANSWER = 300_000_000  # [ns] longest time from a picture to the command that follows from it
 _SAME = 1e-3  # [m/s], [rad/s]; commands that differ by less count as equal
 _OWN = 0.5  # if the policy repeats a smaller share of the commands, another one or a person may have driven
@@ -84,7 +86,7 @@ def evaluate_trial(
     """
     scene = load_writable(root)
     policy = load_policy(find_policy(root, policy_name))
-    out = out or root / "real.csv"
+    out = out or root / REAL_CSV
     with exclusive_lock(out.with_name(f".{out.stem}.lock"), f"{out} is being written"):
         recording = read_trial(bag, topics)
         table = out.with_name(f"{out.stem}_trials.csv")
@@ -327,6 +329,7 @@ def command(options: argparse.Namespace) -> None:
     )
     if not options.quiet:
         print(summary(row, figures))
+        print(f"counted in {options.out or options.scene / REAL_CSV}")
         print(f"look at {folder / 'trial.mp4'}")
 
 
