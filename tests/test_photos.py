@@ -74,6 +74,16 @@ def test_photos_of_two_shapes_are_refused(tmp_path: Path) -> None:
     refused(tmp_path, SourceConfig(path="photos"), "source of their own")
 
 
+def test_a_small_first_photo_does_not_shrink_the_others_silently(tmp_path: Path, capsys) -> None:
+    for i, frame in enumerate(views([0, 9, 18])):
+        write_image(tmp_path / f"photos/{i}.png", frame if i else np.ascontiguousarray(frame[::2, ::2]))
+    captured(tmp_path, [SourceConfig(path="photos")])
+    said = f"photos of up to {WIDTH}x{HEIGHT} are scaled to {WIDTH // 2}x{HEIGHT // 2}"
+    assert said in capsys.readouterr().err
+    captured(tmp_path, [SourceConfig(path="photos")], max_size=WIDTH // 2)  # nothing is lost
+    assert said not in capsys.readouterr().err
+
+
 def _posed(tmp_path: Path, per_frame: list[dict[str, Any]], **top: Any) -> None:
     frames = []
     for i, extra in enumerate(per_frame):

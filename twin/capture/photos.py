@@ -175,7 +175,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
     posed_lenses: list[Lens] = []
     seen: set[bytes] = set()
     duplicates = blank = unmasked = 0
-    native = size = (0, 0)
+    native = size = largest = (0, 0)
     stream = _load_ahead(task.writer.pool, images.paths, lenses, chosen)
     for i, (image, exif) in runtime.track(stream, f"reading {task.name}", len(chosen), "image"):
         path, shape = images.paths[i], (image.shape[1], image.shape[0])
@@ -186,6 +186,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
                 f"{path}: {shape[0]}x{shape[1]}, but the images before it are {native[0]}x{native[1]}; "
                 "put images of another aspect ratio into a source of their own"
             )
+        largest = max(largest, shape)
         if shape != size:
             image = resize(image, *size)
         digest = hashlib.sha256(image.tobytes()).digest()
@@ -213,6 +214,11 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
         focals += [exif.focal] if exif.focal else []
     if not index:
         raise InputError(f"{task.path}: all {len(chosen)} images are blank (one color); give photos of the place")
+    if fitted_size(*largest, task.config.max_size) > size:
+        runtime.log_line(
+            f"  {task.name}: photos of up to {largest[0]}x{largest[1]} are scaled to {size[0]}x{size[1]}, the size of "
+            "the first one; give photos of another size a source of their own"
+        )
     task.check_masked(unmasked, len(index))
     intrinsics = [lens.intrinsics for lens in posed_lenses]
     if posed_lenses:
