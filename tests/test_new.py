@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 from pathlib import Path
 
@@ -34,6 +35,13 @@ def test_new_writes_a_scene_that_loads_and_never_overwrites(tmp_path: Path, caps
     assert new_main([str(root), str(day)]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and "already" in error and (root / "scene.toml").read_text() == before
+
+
+def test_the_next_command_can_be_pasted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    day = film(tmp_path / "day.mp4", views([5 * i for i in range(4)]))
+    assert new_main([str(tmp_path / "my road"), str(day)]) == 0
+    words = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("next: "))
+    assert words == ["twin", "build", str(tmp_path / "my road")]
 
 
 def _uncommented(text: str, line: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -65,7 +66,7 @@ class Twin:
     def report(self) -> dict[str, Any]:
         """`report.json` of the last build."""
         if not self.scene.report_json.exists():
-            raise InputError(f"{self.scene.report_json} is missing; run twin build {self.scene.root}")
+            raise InputError(f"{self.scene.report_json} is missing; run twin build {shlex.quote(str(self.scene.root))}")
         return read_json(self.scene.report_json)
 
 
@@ -84,5 +85,6 @@ def load_writable(path: Path) -> Twin:
     """Opens a scene folder to which results will be added. Raises InputError as `load_scene` does, or for a pack."""
     twin = load_scene(path)
     if twin.scene.root != path:
-        raise InputError(f"{path} is a pack; unpack it to a folder, which can take results: twin unpack {path} FOLDER")
+        command = f"twin unpack {shlex.quote(str(path))} FOLDER"
+        raise InputError(f"{path} is a pack; unpack it to a folder, which can take results: {command}")
     return twin

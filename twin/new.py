@@ -15,6 +15,7 @@ import argparse
 import contextlib
 import itertools
 import os
+import shlex
 import shutil
 import sys
 from functools import partial
@@ -436,7 +437,7 @@ def command(options: argparse.Namespace) -> None:
         print(f"metric scale: {join_names(sources)}")
     else:
         print("fill in [metric] there: the build needs a metric scale")
-    print(f"next: twin build {options.scene}")
+    print(f"next: twin build {shlex.quote(str(options.scene))}")
 
 
 main = partial(commands.main, "new")

@@ -17,6 +17,7 @@ import argparse
 import csv
 import io
 import re
+import shlex
 import sys
 import zipfile
 from collections.abc import Sequence
@@ -296,7 +297,7 @@ def command(given: argparse.Namespace) -> None:
     if not given.quiet:
         total = sum(one["bytes"] for one in manifest["files"].values())
         size = f"{out.stat().st_size / 1e6:.1f} MB, {total / 1e6:.1f} MB unpacked"
-        print(f"{out}: {size}; drive in it: twin drive {out}")
+        print(f"{out}: {size}; drive in it: twin drive {shlex.quote(str(out))}")
 
 
 main = partial(commands.main, "pack")

@@ -18,6 +18,7 @@ its stamp has the current key and its files match the stamp. Package versions ar
 
 import os
 import re
+import shlex
 import shutil
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
@@ -264,7 +265,7 @@ def _verified_stamp(scene: SceneDir, stage: str) -> Stamp:
     if not path.exists() and (scene.root / PACK_JSON).exists():
         raise InputError(f"{scene.root} comes from a pack, which has neither {name} nor films; ask its sender for them")
     if not path.exists():
-        raise InputError(f"{scene.root} has no {name} yet; run twin build {scene.root}")
+        raise InputError(f"{scene.root} has no {name} yet; run twin build {shlex.quote(str(scene.root))}")
     facts = regular_file(path).stat()
     return _verified_once(folder, (facts.st_mtime_ns, facts.st_size))
 

@@ -20,6 +20,7 @@ import math
 import os
 import re
 import secrets
+import shlex
 import shutil
 import stat
 import struct
@@ -428,7 +429,7 @@ def command(given: argparse.Namespace) -> None:
     manifest = unpack(find_pack(given.pack) or given.pack, given.folder, given.trust)
     if not given.quiet:
         policies = f", with the policies {', '.join(manifest['policies'])}" if manifest["policies"] else ""
-        print(f"{given.folder}: {manifest['name']}{policies}; drive in it: twin drive {given.folder}")
+        print(f"{given.folder}: {manifest['name']}{policies}; drive in it: twin drive {shlex.quote(str(given.folder))}")
 
 
 main = partial(commands.main, "unpack")

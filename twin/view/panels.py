@@ -6,6 +6,7 @@ and renders it to a film.
 """
 
 import itertools
+import shlex
 import sys
 import tempfile
 import threading
@@ -354,7 +355,8 @@ class PathPanel:
         path, file = self._path(), self._file()
         file.parent.mkdir(exist_ok=True)
         path.save(file)
-        text = f"{file}; to film it: twin view {self._viewer.twin.scene.root} --path {file} --out film.mp4"
+        words = ["twin", "view", str(self._viewer.twin.scene.root), "--path", str(file)]
+        text = f"{file}; to film it: {shlex.join(words)} --out film.mp4"
         self._viewer.notify("Path saved", text, "green")
 
     def _load(self) -> None:
