@@ -28,7 +28,7 @@ from twin.assets.views import Views, render_views
 from twin.errors import InputError
 from twin.files import load_arrays
 from twin.geometry.cameras import Cameras, RenderableField, pixel_grid, unproject
-from twin.geometry.images import psnr, resize, write_image
+from twin.geometry.images import psnr, resize, to_uint8, write_image
 from twin.geometry.mesh_rays import ShadowCasters, angles, direction
 from twin.nerf.lightings import AddedLighting, Fog, check_name
 from twin.nerf.sun import Sun, heading_from_gps, parse_time, sun_direction
@@ -272,7 +272,7 @@ def comparison(name: str, relit: PhotoFit) -> NDArray[np.uint8]:
     gap = np.ones((height, _GAP, 3), np.float32)
     photo, fitted, nearest = relit.images
     row = np.hstack([photo, gap, fitted, gap, nearest])
-    out = (np.clip(row, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    out = to_uint8(row)
     labels = (
         "photo",
         f"fitted{' with sun' if relit.sun else ''}: {name}, {relit.psnr_fitted:.1f} dB",

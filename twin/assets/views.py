@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from twin import runtime
 from twin.geometry.cameras import Cameras, RenderableField, pixel_grid, scaled_intrinsics, unproject
+from twin.geometry.images import to_uint8
 from twin.types import Array
 
 _BATCH = 8
@@ -86,7 +87,7 @@ def render_views(
         for start in range(0, len(chosen), _BATCH):
             part = slice(start, start + _BATCH)
             image = field.render(chosen.select(np.arange(len(chosen))[part]), lighting or field.lightings[0], size)
-            rgb.append((np.clip(image.rgb, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
+            rgb.append(to_uint8(image.rgb))
             depth.append(reliable_depth(np.asarray(image.depth), np.asarray(image.opacity), far))
             bar.update(len(image.depth))
     all_depth = np.concatenate(depth)

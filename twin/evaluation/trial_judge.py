@@ -14,7 +14,7 @@ from twin.env.env_factory import EnvFactory
 from twin.env.task import Motion, RewardAndTermination
 from twin.errors import InputError
 from twin.geometry.cameras import Rendering, Viewpoints, evenly_spaced
-from twin.geometry.images import psnr
+from twin.geometry.images import psnr, to_uint8
 from twin.geometry.poses import wrap_angle
 from twin.mjcf.world import heading_at
 from twin.robot import PixelCamera
@@ -161,7 +161,7 @@ def view(
     twin = [np.clip(one.rgb[0], 0.0, 1.0) for one in renderings]
     return TrialViews(
         lighting,
-        [(one * 255.0 + 0.5).astype(np.uint8) for one in twin],
+        [to_uint8(one) for one in twin],
         np.array([psnr(a, b) for a, b in zip(twin, real, strict=True)]),
         np.array([psnr(_matched(a, b), b) for a, b in zip(twin, real, strict=True)]),
         np.array([trust.of(pose[None], one)[0] for pose, one in zip(seen, renderings, strict=True)]),

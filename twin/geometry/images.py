@@ -126,7 +126,7 @@ def _too_large(path: Path, size: str) -> InputError:
 def write_image(path: Path, image: NDArray) -> None:
     """Writes RGB or gray (uint8, or float in [0, 1]) as PNG or JPEG, chosen by the suffix."""
     if image.dtype != np.uint8:
-        image = (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+        image = to_uint8(image)
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     path.parent.mkdir(parents=True, exist_ok=True)

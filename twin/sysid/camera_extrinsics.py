@@ -29,7 +29,7 @@ from twin.capture.video import FilmStatistics, read_film, video_film
 from twin.config import CaptureConfig
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, opencv_to_mujoco
-from twin.geometry.images import psnr, write_image
+from twin.geometry.images import psnr, to_uint8, write_image
 from twin.geometry.passes import path_length
 from twin.loading import load_scene
 from twin.mjcf.scene_xml import rest_pose
@@ -317,7 +317,7 @@ def write_camera_comparison(
         filmed = cv2.resize(frames[found.frames[k]], size, interpolation=cv2.INTER_AREA)
         rendered = [field.render(here, lighting).rgb[0] for lighting in field.lightings]
         best = max(rendered, key=lambda rgb: psnr(rgb, filmed / np.float32(255.0)))
-        rows.append(np.hstack([filmed, (np.clip(best, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)]))
+        rows.append(np.hstack([filmed, to_uint8(best)]))
     write_image(folder / "camera.png", np.vstack(rows))
 
 
