@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from twin.env.domain_randomization import RandomizationSample
 from twin.geometry.poses import inverse_pose
 from twin.nerf.lightings import FOG_REACH, Fog
+from twin.nerf.sun import surface_normals
 from twin.types import Array, Array32
 
 # ---- fog
@@ -94,22 +95,13 @@ class DirectionalRelighting:
         """
         low, high = _HEIGHT_RAMP
         weight = np.clip((points[..., 2] - low) / (high - low), 0.0, 1.0)
-        facing = weight * (_normals(points) @ self._sun - self._sun[2])
+        facing = weight * (surface_normals(points, _SMOOTHING) @ self._sun - self._sun[2])
         log_gain = facing[..., None] * self._gain
         far = depth > _NEAR
         share = np.minimum((depth[far] - _NEAR) / (RELIGHT_REACH - _NEAR), 1.0)[:, None]
         ahead = points[far] @ self._sun / np.sqrt(np.einsum("...i,...i", points[far], points[far]))
         log_gain[far] += share * (self._sky_gain + ahead[:, None] * (0.5 * self._gain) - log_gain[far])
         return rgb * np.exp(log_gain)
-
-
-def _normals(points: Array32) -> Array32:
-    """Unit normals, towards the camera, of the surface through points relative to it, shape (height, width, 3)."""
-    smooth = cv2.blur(points, (_SMOOTHING, _SMOOTHING), borderType=cv2.BORDER_REPLICATE)
-    down, across = np.gradient(smooth, axis=(0, 1))
-    normal = np.cross(down, across)
-    squares, towards = (np.einsum("...i,...i", normal, other) for other in (normal, smooth))
-    return normal * (-np.sign(towards) / np.sqrt(np.maximum(squares, 1e-18)))[..., None]
 
 
 # ---- cast shadows

@@ -180,17 +180,24 @@ def _levelness(normals: NDArray) -> NDArray:
     return np.clip((normals[:, 2] - low) / (high - low), 0.0, 1.0)
 
 
-def _normals(points: Array32) -> Array32:
-    """Unit normals of the surface through points relative to the camera (height, width, 3), towards the camera.
+def surface_normals(points: Array32, window: int) -> Array32:
+    """Unit normals, towards the camera, of the surface through points relative to it, shape (height, width, 3).
 
-    Level surfaces get a vertical normal, since the ground in a radiance field is rough.
+    The points are averaged over `window`² pixels.
     """
-    window = max(3, 2 * round(_SMOOTHING * points.shape[1] / 2) + 1)
     smooth = cv2.blur(points, (window, window), borderType=cv2.BORDER_REPLICATE)
     down, across = np.gradient(smooth, axis=(0, 1))
     normal = np.cross(down, across)
     squares, towards = (np.einsum("...i,...i", normal, other) for other in (normal, smooth))
-    normal *= (-np.sign(towards) / np.sqrt(np.maximum(squares, 1e-18)))[..., None]
+    return normal * (-np.sign(towards) / np.sqrt(np.maximum(squares, 1e-18)))[..., None]
+
+
+def _normals(points: Array32) -> Array32:
+    """The `surface_normals` for relighting, shape (height, width, 3).
+
+    Level surfaces get a vertical normal, since the ground in a radiance field is rough.
+    """
+    normal = surface_normals(points, max(3, 2 * round(_SMOOTHING * points.shape[1] / 2) + 1))
     low, high = _LEVEL
     level = np.clip((normal[..., 2:] - low) / (high - low), 0.0, 1.0)
     normal += level * (np.array([0.0, 0.0, 1.0], np.float32) - normal)
