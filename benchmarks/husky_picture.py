@@ -11,7 +11,7 @@ from twin.env.mujoco_renderer import RayCaster, mujoco_rays
 from twin.geometry.cameras import opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.images import write_image
 from twin.geometry.poses import look_at
-from twin.mjcf.husky import SCENE_XML
+from twin.mjcf.husky import HUSKY_SCENE_XML
 
 _SIZE, _SUPERSAMPLED = (640, 360), 2
 _FOCAL = 700.0  # [px]
@@ -19,7 +19,7 @@ _EYE, _TARGET = (1.5, -1.25, 0.95), (0.0, 0.02, 0.2)  # [m]
 
 
 def main() -> None:
-    model = mujoco.MjModel.from_xml_path(str(SCENE_XML))
+    model = mujoco.MjModel.from_xml_path(str(HUSKY_SCENE_XML))
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 500)
     width, height = (_SUPERSAMPLED * side for side in _SIZE)
@@ -34,7 +34,7 @@ def main() -> None:
     intrinsics = np.array([focal, focal, width / 2, height / 2])
     caster.set_rays(mujoco_rays(unproject(pixel_grid(width, height), intrinsics)))
     rgb = cv2.resize(caster.cast()[0].reshape(height, width, 3), _SIZE, interpolation=cv2.INTER_AREA)
-    write_image(SCENE_XML.with_name("husky.png"), np.rint(rgb).astype(np.uint8))
+    write_image(HUSKY_SCENE_XML.with_name("husky.png"), np.rint(rgb).astype(np.uint8))
 
 
 if __name__ == "__main__":

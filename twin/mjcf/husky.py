@@ -40,7 +40,7 @@ from twin.types import Array
 TIMESTEP = 0.002  # [s]
 HUSKY_XML = Path(__file__).parents[1] / "assets" / "husky" / "husky.xml"
 """The published robot alone, without a floor."""
-SCENE_XML = HUSKY_XML.with_name("scene.xml")
+HUSKY_SCENE_XML = HUSKY_XML.with_name("scene.xml")
 """The published robot on a plane, to be opened in a viewer."""
 
 _CHASSIS_INERTIA = (0.6022, 1.7386, 2.0296, -0.02364, -0.1197, -0.001544)  # ixx iyy izz ixy ixz iyz [kg m²]
@@ -445,5 +445,5 @@ SCENE = """<!-- The Husky on a plane, made by python -m twin.mjcf.husky; do not 
 
 if __name__ == "__main__":
     HUSKY_XML.write_text(standalone_xml(), encoding="utf-8")
-    SCENE_XML.write_text(SCENE, encoding="utf-8")
-    print(f"wrote {HUSKY_XML} and {SCENE_XML}")
+    HUSKY_SCENE_XML.write_text(SCENE, encoding="utf-8")
+    print(f"wrote {HUSKY_XML} and {HUSKY_SCENE_XML}")
