@@ -17,7 +17,7 @@ from twin.geometry.images import psnr, read_image, write_image
 from twin.nerf.appearance import initial_appearance
 from twin.nerf.buffers import Layout
 from twin.nerf.field import RadianceField, untrained_field
-from twin.nerf.lightings import AddedLighting, Fog, Lightings, added_lightings, check_name, mixed_fog
+from twin.nerf.lightings import AddedLighting, Fog, Lightings, added_lightings, check_new_name, mixed_fog
 from twin.relight import PhotoFit, comparison, fit_photo, main, summary
 from twin.report import video_layout
 from twin.report.video_layout import draw_label
@@ -290,4 +290,4 @@ def test_share_of_a_mixture_is_from_0_to_1(share):
 @pytest.mark.parametrize("name", RESERVED_LIGHTINGS)
 def test_reserved_names_are_refused(name):
     with pytest.raises(InputError, match=rf"--name '{name}': reserved"):
-        check_name(name, ("day",))
+        check_new_name(name, ("day",))

@@ -30,7 +30,7 @@ from twin.files import load_arrays
 from twin.geometry.cameras import Cameras, RenderableField, pixel_grid, unproject
 from twin.geometry.images import psnr, resize, to_uint8, write_image
 from twin.geometry.mesh_rays import ShadowCasters, angles, direction
-from twin.nerf.lightings import AddedLighting, Fog, check_name
+from twin.nerf.lightings import AddedLighting, Fog, check_new_name
 from twin.nerf.sun import Sun, heading_from_gps, parse_time, sun_direction
 from twin.scene import SceneDir, require_stage, stage_result
 from twin.types import Array
@@ -323,7 +323,7 @@ def relight(
     for stage in ("capture", "cameras", "metric"):
         require_stage(scene, stage)
     field = RadianceField.load(scene.stage("field"))
-    check_name(name, field.lightings)
+    check_new_name(name, field.lightings)
     source = find_sun(scene, sun, time, location, heading)
     casters = None
     if source:

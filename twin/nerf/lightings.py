@@ -24,8 +24,7 @@ from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
 from twin.files import read_json, wrap_read_errors, write_json
 from twin.nerf.sun import Sun, Sunlight, mixed_sunlight
-from twin.scene import SceneDir, stage_result
-from twin.scene import check_name as check_scene_name
+from twin.scene import SceneDir, check_name, stage_result
 from twin.types import Array32
 
 # ---- fog
@@ -345,9 +344,9 @@ class AddedLighting:
         write_json(scene.lightings / f"{self.name}.json", head)
 
 
-def check_name(name: str, filmed: tuple[str, ...]) -> None:
+def check_new_name(name: str, filmed: tuple[str, ...]) -> None:
     """Raises InputError for a name that is reserved, filmed, or unfit for a file name or a part of a mixture."""
-    check_scene_name(name, "--name")
+    check_name(name, "--name")
     if name in RESERVED_LIGHTINGS:
         raise InputError(f"--name {name!r}: reserved for random lightings; choose another, such as afternoon")
     if name in filmed:
