@@ -23,6 +23,7 @@ from twin.nerf.kernels import hashgrid, space, volume
 from twin.runtime import available_cores
 from twin.warp_runtime import wp
 
+Item = TypeVar("Item")
 T = TypeVar("T")
 
 _pool: ThreadPoolExecutor | None = None
@@ -47,7 +48,7 @@ def shard_count(device: str) -> int:
     return 4 if device == "cpu" else 1
 
 
-def parallel(work: Callable[[int], T], items: Iterable[int], device: str) -> list[T]:
+def parallel(work: Callable[[Item], T], items: Iterable[Item], device: str) -> list[T]:
     """Maps `work` over items, in parallel on a CPU and serially on CUDA; results in order.
 
     Each worker uses one torch thread: parallel shards use the cores better than parallel operations within a shard.
