@@ -108,7 +108,7 @@ def log_line(line: str) -> None:
 # ---- signals
 
 _AGAIN = 0.05  # [s] if the exception of a signal was dropped, the signal is sent again after this time
-_STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Stopped(KeyboardInterrupt):
@@ -260,8 +260,7 @@ def die_with_parent(parent: int | None = None) -> None:
 def ignore_terminal_signals() -> None:
     """Makes a child ignore the terminal's signals, which its parent handles; SIGTERM still ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if hasattr(signal, "SIGHUP"):
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
 
