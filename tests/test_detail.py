@@ -187,6 +187,27 @@ def _level_of(detail: Detail, hits: np.ndarray, level: int) -> np.ndarray:
     return out
 
 
+def test_a_ray_shows_detail_by_its_opacity():
+    """The features of a ray are those of its surface times its opacity, so the detail must be, too."""
+    one, pixels = np.ones(CHANNELS, np.float32), WIDTH * HEIGHT
+    detail = replace(sloping_ground(), cell=10.0, vertices=np.full((8, CHANNELS), 138, np.uint8), vertex_step=one)
+    stored, image = kernels.DetailBytes(), kernels.ImageBuffers()
+    stored.texels = wp.zeros(0, dtype=kernels.Bytes, device="cpu")
+    stored.vertices = wp.array(detail.vertices, dtype=kernels.Bytes, device="cpu")
+    stored.vertex_step = Channels(*one.tolist())
+    pose = look_at(np.array([0.0, 0.0, 5.0]), np.array([1.0, 0.0, 5.0])).astype(np.float32)
+    image.rotation = wp.array(pose[None, :3, :3], dtype=wp.mat33f, device="cpu")
+    image.position = wp.array(pose[None, :3, 3], dtype=wp.vec3f, device="cpu")
+    image.intrinsics = wp.array(K[None].astype(np.float32), dtype=wp.vec4f, device="cpu")
+    image.width, image.height = WIDTH, HEIGHT
+    opacity = np.linspace(0.5, 1.0, pixels, dtype=np.float32)
+    features = wp.array(np.stack([opacity, *[np.zeros_like(opacity)] * 15])[None], dtype=wp.float32, device="cpu")
+    depth = wp.full((1, pixels), 2.0, dtype=wp.float32, device="cpu")
+    inputs = [detail_grid(detail, "cpu"), stored, image, 0, pixels, pixels, depth]
+    wp.launch(kernels.add_detail, (1, 1), inputs, [features], device="cpu")
+    assert np.allclose(features.numpy()[0, 1:], 10.0 * opacity, atol=1e-4)
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path, device):
     cameras = make_cameras(tmp_path)

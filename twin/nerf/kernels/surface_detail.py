@@ -440,7 +440,7 @@ def add_detail(
     depth: wp.array2d(dtype=wp.float32),
     features: wp.array3d(dtype=wp.float32),
 ):
-    """Adds detail to the features of runs of pixels, from `first` up to `last`, of every camera."""
+    """Adds detail times opacity to the features of runs of pixels, from `first` up to `last`, of every camera."""
     camera, run = wp.tid()
     k = image.intrinsics[camera]
     rotation = image.rotation[camera]
@@ -468,4 +468,6 @@ def add_detail(
                     found = 1
                     value = wp.cw_mul(vertex_bytes(grid, detail.vertices, hit), detail.vertex_step)
                 if found == 1:
-                    add_channels(features, camera * CHANNELS * pixels + pixel, pixels, value)
+                    add_channels(
+                        features, camera * CHANNELS * pixels + pixel, pixels, value * features[camera, 0, pixel]
+                    )
