@@ -95,6 +95,19 @@ def test_held_out_frames_are_not_among_the_training_pixels(cameras):
     assert len(pixels.colors) == (~cameras.held_out).sum() * WIDTH * HEIGHT
 
 
+def test_masked_parts_of_held_out_frames_are_not_scored(cameras, tmp_path):
+    first, second = np.flatnonzero(cameras.held_out)
+    lower = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    lower[HEIGHT // 2 :] = 0
+    for i, mask in ((first, np.zeros_like(lower)), (second, lower)):
+        write_image(tmp_path / "masks" / f"{cameras.names[i]}.png", mask)
+    field = train_field(cameras, SparsePoints.empty(), CONFIG)[0]
+    baked = bake(field, TrainingPixels(cameras, SparsePoints.empty(), WIDTH), steps=1, max_bricks=200)[0]
+    scores = evaluate(field, replace(cameras, masks=tmp_path / "masks"), WIDTH, baked=baked)
+    assert scores["n"] == {"day": 0, "night": 1}
+    assert not scores["ssim_small_lower"] and not scores["psnr_small_lower"]
+
+
 def test_no_training_frame_is_an_input_error(cameras):
     with pytest.raises(InputError, match="held out"):
         TrainingPixels(replace(cameras, held_out=np.ones(len(cameras), bool)), SparsePoints.empty(), WIDTH)

@@ -117,6 +117,17 @@ def test_cameras_survive_saving_and_renaming(tmp_path):
     assert picked.names == ("a/000001", "b/000000") and picked.held_out.tolist() == [True, False]
 
 
+def test_masked_pixels_do_not_raise_ssim():
+    rng = np.random.default_rng(5)
+    reference = rng.random((40, 60, 3))
+    image, mask = np.clip(reference + rng.normal(0.0, 0.3, reference.shape), 0.0, 1.0), np.ones((40, 60), bool)
+    assert ssim(image, reference, mask) == ssim(image, reference)
+    mask[:, :30] = False
+    image[~mask] = reference[~mask]
+    assert ssim(image, reference, mask) == pytest.approx(ssim(image[:, 30:], reference[:, 30:]), abs=0.05)
+    assert np.isnan(ssim(image, reference, np.zeros_like(mask)))
+
+
 def test_images_round_trip_and_scores(tmp_path):
     rng = np.random.default_rng(5)
     image = rng.integers(0, 256, (20, 30, 3), dtype=np.uint8)

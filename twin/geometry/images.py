@@ -143,6 +143,10 @@ def resize(image: NDArray, width: int, height: int) -> NDArray:
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
 
 
+SSIM_WINDOW = 11
+"""Side of the windows of `ssim` [px], and least side of its images."""
+
+
 def psnr(image: NDArray, reference: NDArray, mask: NDArray | None = None) -> float:
     """Peak signal-to-noise ratio [dB] of float images in [0, 1] over the pixels where `mask` is true."""
     error = (image.astype(np.float64) - reference) ** 2
@@ -150,9 +154,17 @@ def psnr(image: NDArray, reference: NDArray, mask: NDArray | None = None) -> flo
     return float("inf") if mse == 0.0 else -10.0 * np.log10(mse)
 
 
-def ssim(image: NDArray, reference: NDArray) -> float:
-    """Structural similarity (Wang et al. 2004, Gaussian window σ = 1.5) of float RGB images in [0, 1]."""
+def ssim(image: NDArray, reference: NDArray, mask: NDArray | None = None) -> float:
+    """Structural similarity (Wang et al. 2004, Gaussian window σ = 1.5) of float RGB images in [0, 1].
+
+    With a mask, it is the mean over the windows whose middle is in it, NaN if there is none.
+    """
     from skimage.metrics import structural_similarity  # slow to import
 
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    return float(structural_similarity(image, reference, channel_axis=-1, data_range=1.0, **window))
+    mean, values = structural_similarity(image, reference, channel_axis=-1, data_range=1.0, full=True, **window)
+    if mask is None or mask.all():
+        return float(mean)
+    inside = slice(SSIM_WINDOW // 2, -(SSIM_WINDOW // 2))
+    kept = values[inside, inside][mask[inside, inside]]
+    return float(kept.mean()) if len(kept) else float("nan")

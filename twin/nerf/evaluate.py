@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from twin.geometry.cameras import Cameras, RenderableField, evenly_spaced, nearest_frame, pixel_grid, unproject
-from twin.geometry.images import psnr, resize, ssim
+from twin.geometry.images import SSIM_WINDOW, psnr, resize, ssim
 from twin.nerf import network
 from twin.nerf.appearance import fit_appearance
 from twin.nerf.baked import BakedField
@@ -28,19 +28,21 @@ from twin.types import Array
 _FIT_RAYS = 4000  # rays of half an image that a fit uses, evenly spaced
 _MAX_FRAMES = 6  # held-out frames scored per lighting, evenly spaced
 _SMALL_WIDTH = 160  # [px] width of the images that policies see
-_SSIM_WINDOW = 11  # [px]
 _ROW_STEP = 8  # step between the image rows on which the trained and the baked field are compared
 
 
 def score_frame(
     field: RadianceField, cameras: Cameras, i: int, max_width: int, baked: BakedField | None = None
 ) -> dict[str, float]:
-    """Scores one held-out frame: `psnr`, `unfitted`, `wrong` (nan with one lighting) [dB] and `ssim`.
+    """Scores one held-out frame: `psnr`, `unfitted`, `wrong` (nan with one lighting) [dB] and `ssim`; empty if all of
+    it is masked.
 
     With a baked field also `baking_gain` (its unfitted PSNR minus that of the trained field, on every eighth row),
     `psnr_small`, `ssim_small`, and for the lower half of the image `psnr_small_lower` and `ssim_small_lower`.
     """
     bytes_, mask, intrinsics = load_frame(cameras, i, max_width)
+    if not mask.any():
+        return {}
     image = bytes_.astype(np.float32) / 255.0
     height, width = mask.shape
     camera = cameras.select(np.array([i]))
@@ -79,18 +81,18 @@ def score_frame(
         fitted.append(fit_appearance(field.parameters, features[some], harmonics[some], colors[some], start)[0])
         shown = picture(fitted[-1])
         psnrs.append(psnr(shown, image, score_on))
-        # SSIM takes no mask. Copying masked pixels from the frame limits their effect to windows that contain them.
+        # Copying masked pixels from the frame limits their effect on the windows of SSIM that contain them.
         shown[~mask] = image[~mask]
         side = slice(width // 2, None) if half is left else slice(None, width // 2)
-        if min(height, width // 2) >= _SSIM_WINDOW:
-            ssims.append(ssim(shown[:, side], image[:, side]))
+        if min(height, width // 2) >= SSIM_WINDOW:
+            ssims.append(ssim(shown[:, side], image[:, side], mask[:, side]))
     if baked is not None and len(fitted) == 2:
         out |= _small_scores(baked, camera, image, mask, fitted)
     others = [name for name in field.lightings if name != cameras.lightings[i]]
     wrong = [psnr(picture(field.embedding(name)), image, mask) for name in others]
     return out | {
         "psnr": float(np.mean(psnrs)) if psnrs else float("nan"),
-        "ssim": float(np.mean(ssims)) if ssims else float("nan"),
+        "ssim": float(np.nanmean(ssims)) if np.isfinite(ssims).any() else float("nan"),
         "unfitted": psnr(picture(start), image, mask),
         "wrong": float(np.mean(wrong)) if wrong else float("nan"),
     }
@@ -108,9 +110,11 @@ def _small_scores(
     shown[~usable] = wanted[~usable]
     out = {}
     for name, rows in (("small", slice(0, None)), ("small_lower", slice(size[1] // 2, None))):
+        if not usable[rows].any():
+            continue
         out[f"psnr_{name}"] = psnr(shown[rows], wanted[rows], usable[rows])
-        if min(shown[rows].shape[:2]) >= _SSIM_WINDOW:
-            out[f"ssim_{name}"] = ssim(shown[rows], wanted[rows])
+        if min(shown[rows].shape[:2]) >= SSIM_WINDOW:
+            out[f"ssim_{name}"] = ssim(shown[rows], wanted[rows], usable[rows])
     return out
 
 
@@ -125,8 +129,8 @@ def evaluate(
 
     The scores are `psnr` [dB], `ssim`, `psnr_unfitted` and `psnr_wrong_lighting` (None without another lighting); with
     a baked field also `baking_gain` [dB] (see `score_frame`), and `psnr_small`, `psnr_small_lower`, `ssim_small` and
-    `ssim_small_lower` of images at most 160 px wide. `n` is the number of frames; lightings without held-out frames
-    have n = 0 and no other entry.
+    `ssim_small_lower` of images at most 160 px wide. `n` is the number of frames that are not masked as a whole;
+    lightings without any have n = 0 and no other entry.
     """
     columns = {"psnr": "psnr", "ssim": "ssim", "psnr_unfitted": "unfitted"}
     if baked is not None:
@@ -140,7 +144,8 @@ def evaluate(
     scores: dict[str, list[dict[str, float]]] = {name: [] for name in field.lightings}
     with single_threaded_torch():
         for name, i in track(frames, "held-out frames", unit="frame"):
-            scores[name].append(score_frame(field, cameras, i, max_width, baked))
+            if row := score_frame(field, cameras, i, max_width, baked):
+                scores[name].append(row)
     for name, rows in scores.items():
         result["n"][name] = len(rows)
         for key, column in columns.items():
