@@ -129,6 +129,11 @@ def test_names_from_files_are_text() -> None:
     assert "<b>&$x_1$" in parsed(svg).text
 
 
+@pytest.mark.filterwarnings("error")
+def test_letters_that_matplotlib_lacks_are_left_to_the_browser() -> None:
+    assert "夜" in parsed(figures.svg(figures.bar_chart({"夜": 20.0}, {}, "dB", "PSNR"))).text
+
+
 def test_the_histogram_shows_the_median() -> None:
     svg = figures.svg(figures.histogram(np.array([1.0, 2.0, 2.5, 9.0, 100.0]), "px", "points", 4.0))
     assert "median 2.5 (n = 5)" in parsed(svg).text

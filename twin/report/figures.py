@@ -8,6 +8,7 @@ many rows and columns.
 import hashlib
 import io
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -79,9 +80,11 @@ def svg(figure: Figure) -> str:
     buffer = io.BytesIO()
     FigureCanvasSVG(figure)
     no_metadata = {"Date": None, "Creator": None}
-    figure.savefig(
-        buffer, format="svg", dpi=_RASTER_DPI, metadata=no_metadata, bbox_inches="tight", pad_inches=0.04
-    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # the page has the browser's fonts, matplotlib's lacks some letters
+        figure.savefig(
+            buffer, format="svg", dpi=_RASTER_DPI, metadata=no_metadata, bbox_inches="tight", pad_inches=0.04
+        )  # fmt: skip
     text = buffer.getvalue().decode()
     text = text[text.index("<svg") :]
     # The style element would apply to the whole page, which has the same rule already.
