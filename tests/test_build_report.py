@@ -221,6 +221,12 @@ def test_a_page_without_a_video_has_no_player(scene: SceneDir) -> None:
     assert "video" not in read(page(scene, REPORT)).tags
 
 
+def test_a_print_splits_no_figure(scene: SceneDir) -> None:
+    """A rule for whole sections has no effect on those longer than a sheet, whose figures it would split."""
+    printed = page(scene, {}).partition("@media print")[2]
+    assert ".charts > div, figure, dl div, .caution, tr { break-inside:avoid }" in printed
+
+
 @pytest.mark.parametrize(
     ("follower", "sentence", "mood"),
     [
