@@ -116,19 +116,24 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def _git(*arguments: str) -> bytes:
+    return subprocess.run(["git", *arguments], cwd=_ROOT, check=True, stdout=subprocess.PIPE).stdout
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("commit", help="commit to compare with")
-    parser.add_argument("--work", type=Path, help="working folder, kept (default: a temporary one)")
+    parser.add_argument("--work", type=Path, help="folder that keeps each commit's tree and scene (default: none)")
     options = parser.parse_args()
+    commit = _git("rev-parse", "--verify", f"{options.commit}^{{commit}}").decode().strip()
     with tempfile.TemporaryDirectory() as temporary:
-        work = (options.work or Path(temporary)).resolve()
+        work = (options.work or Path(temporary)).resolve() / commit
         old, scene = work / "before", work / "scene"
         if not old.exists():
             work.mkdir(parents=True, exist_ok=True)
-            archive = subprocess.run(["git", "archive", options.commit], cwd=_ROOT, check=True, stdout=subprocess.PIPE)
+            archive = _git("archive", commit)
             old.mkdir()
-            subprocess.run(["tar", "x", "-C", str(old)], input=archive.stdout, check=True)
+            subprocess.run(["tar", "x", "-C", str(old)], input=archive, check=True)
         before, after = Tree(old), Tree(_ROOT)
         if not (scene / "build").exists():
             before.python("-m", "twin.reality", "film", "--tiny", "--out", scene)

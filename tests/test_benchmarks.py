@@ -173,6 +173,37 @@ def test_the_true_world_of_obstacles_has_the_light_and_the_haze_of_its_place(scr
     assert seen[5.0][2] > 0.45
 
 
+def test_a_kept_folder_is_compared_with_the_commit_asked_for(scripts, monkeypatch, tmp_path, capsys):
+    import sameness
+
+    class Tree(sameness.Tree):
+        def python(self, *arguments):
+            (Path(arguments[-1]) / "truth").mkdir(parents=True)
+
+        def build(self, scene):
+            (scene / "build").mkdir()
+
+        def digests(self, scene, lightings, work):
+            return {"text": (self.root / "text").read_text()}
+
+    def git(*arguments):
+        subprocess.run(["git", "-C", str(root), "-c", "user.name=a", "-c", "user.email=a@a", *arguments], check=True)
+
+    root = tmp_path / "root"
+    root.mkdir()
+    git("init", "-q")
+    for text in ("old", "new"):
+        (root / "text").write_text(text)
+        git("add", "text")
+        git("commit", "-q", "-m", text)
+    monkeypatch.setattr(sameness, "Tree", Tree)
+    monkeypatch.setattr(sameness, "_ROOT", root)
+    for commit, status in (("HEAD", 0), ("HEAD~1", 1), ("HEAD", 0)):
+        monkeypatch.setattr(sys, "argv", ["sameness", commit, "--work", str(tmp_path / "work")])
+        assert sameness.main() == status
+    assert "0 of 1 results equal those of HEAD~1" in capsys.readouterr().out
+
+
 def test_peak_memory_is_that_of_this_process(scripts):
     from fuzzing.cases import peak_memory
 
