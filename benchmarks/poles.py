@@ -161,6 +161,8 @@ def main() -> int:
     parser = record_parser(__doc__)
     parser.add_argument("scenes", type=Path, nargs="+")
     options = parser.parse_args()
+    if len({root.name for root in options.scenes}) < len(options.scenes):
+        parser.error("two scenes have the same folder name, under which figures are kept; give each another name")
     about = {"scenes": [str(one) for one in options.scenes], "versions": versions("twin", "numpy")}
     targets = {f"{root.name}.{name}": wanted for root in options.scenes for name, wanted in TARGETS.items()}
     measures = [partial(measure, root) for root in options.scenes]

@@ -204,6 +204,15 @@ def test_a_kept_folder_is_compared_with_the_commit_asked_for(scripts, monkeypatc
     assert "0 of 1 results equal those of HEAD~1" in capsys.readouterr().out
 
 
+def test_scenes_of_one_name_do_not_share_a_record(scripts, monkeypatch, capsys):
+    import poles
+
+    monkeypatch.setattr(sys, "argv", ["poles", "old/place_7", "new/place_7"])
+    with pytest.raises(SystemExit) as stop:
+        poles.main()
+    assert stop.value.code == 2 and "two scenes have the same folder name" in capsys.readouterr().err
+
+
 def test_peak_memory_is_that_of_this_process(scripts):
     from fuzzing.cases import peak_memory
 
