@@ -180,7 +180,7 @@ def test_resumptions_have_episodes_of_their_own(scene, tmp_path, monkeypatch):
 
 
 _WRONG: list[tuple[str, object]] = [
-    *[("seed", -1), ("seed", 2**64), ("steps", 0), ("steps", 10**30), ("worlds", 0), ("worlds", 99_999_999)],
+    *[("seed", -1), ("seed", 2**32), ("steps", 0), ("steps", 10**30), ("worlds", 0), ("worlds", 99_999_999)],
     *[("updates", 0.0), ("updates", float("nan")), ("entropy", float("inf")), ("steering", float("nan"))],
     *[("colours", -1.0), ("colours", float("nan")), ("batch", 0), ("buffer", 10**12), ("hidden", (10**9,))],
     *[("convolutions", ((0, 5, 3),)), ("worlds", True), ("gamma", "high"), ("observe", "eyes"), ("device", "tpu")],
@@ -229,6 +229,12 @@ def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     assert seen[0] == 124 and seen[-1] == SHORT.steps
     checkpoints = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert checkpoints == ["000000080", "000000160", "000000240"]
+
+
+def test_fractions_of_updates_add_up(scene, tmp_path):
+    few = replace(SHORT, steps=80, starts=0, updates=0.1)
+    train_policy(twin.load_scene(scene), tmp_path, few, processes=1)
+    assert json.loads((tmp_path / "state" / "state.json").read_text())["updates"] == 8
 
 
 def test_the_goal_is_worth_surviving_for_ever():

@@ -43,7 +43,7 @@ class TrainConfig:
     """`nerf`: pictures of the radiance field; `simulator`: MuJoCo's pictures of the extracted mesh."""
     lighting: str = TRAINING
     """See `env/episode_lighting.py`; by default, a lighting is sampled for every episode."""
-    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
+    seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     success: Annotated[float, Range(0, 1)] = 0.95
     """Success rate at which the training ends (`selection.py`)."""
     steps: Annotated[int, Range(1, 10**10)] = 24_000

@@ -166,10 +166,11 @@ def train(
         resumed = before["resumed"] + 1
         seeds = np.random.SeedSequence([config.seed, resumed, _TRAINING_STREAM])
         envs.seed(int(seeds.generate_state(1, np.uint64)[0]))
-        updates = max(1, round(config.updates * config.worlds))
 
         def learn() -> None:
-            if model.num_timesteps > config.starts:
+            done = model.num_timesteps
+            updates = int(config.updates * (done + config.worlds) + 1e-9) - int(config.updates * done + 1e-9)
+            if done > config.starts and updates:
                 model.train(updates, config.batch)
 
         envs.meanwhile = learn
