@@ -12,6 +12,7 @@ from filmed_wall import HEIGHT, WIDTH, film, views
 
 from twin.build import build
 from twin.config_file import load_config
+from twin.errors import InputError
 from twin.geometry.images import write_image
 from twin.new import main as new_main
 from twin.new import new_scene
@@ -35,6 +36,21 @@ def test_new_writes_a_scene_that_loads_and_never_overwrites(tmp_path: Path, caps
     assert new_main([str(root), str(day)]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and "already" in error and (root / "scene.toml").read_text() == before
+
+
+def test_two_at_once_do_not_mix_their_films(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second would write to the unfinished copies of the first, and replace its `scene.toml`."""
+    day = film(tmp_path / "day.mp4", views([5 * i for i in range(4)]))
+    copy, refused = shutil.copyfile, []
+
+    def copy_slowly(source: Path, target: Path) -> None:
+        with pytest.raises(InputError, match="is being written by process"):
+            new_scene(tmp_path / "road", [day])
+        refused.append(copy(source, target))
+
+    monkeypatch.setattr("twin.new.shutil.copyfile", copy_slowly)
+    new_scene(tmp_path / "road", [day])
+    assert len(refused) == 1 and sorted(p.name for p in (tmp_path / "road").iterdir()) == ["input", "scene.toml"]
 
 
 def test_the_next_command_can_be_pasted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

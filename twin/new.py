@@ -130,8 +130,19 @@ def new_scene(root: Path, films: list[Path], camera_height: float | None = None,
                 load_photo(posed.paths[0], posed.lenses[0])  # raises an error if the camera does not fit the images
     if topic and not bags:
         raise InputError(f"--topic {topic}: none of the films is a bag; leave it out")
+    with runtime.exclusive_lock(root / ".new.lock", f"{root} is being written"):
+        return _write_scene(scene, films, bags, camera_height)
+
+
+def _write_scene(
+    scene: SceneDir, films: list[Path], bags: dict[Path, BagContents], camera_height: float | None
+) -> Path:
+    """Copies checked films and writes `scene.toml`, see `new_scene`."""
+    root = scene.root
+    if scene.config_file.exists():
+        raise InputError(f"{scene.config_file}: another process has just written it; edit it")
     inputs = root / "input"
-    inputs.mkdir(parents=True, exist_ok=True)
+    inputs.mkdir(exist_ok=True)
     text = _HEAD.format(name=toml_string(root.resolve().name))
     notes: list[str] = []
     lightings: list[str] = []
