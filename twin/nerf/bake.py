@@ -22,6 +22,7 @@ from twin.nerf.buffers import (
     Workspace,
     in_batches,
     parallel,
+    part_count,
     shard_count,
     single_threaded_torch,
     warp_view,
@@ -226,7 +227,7 @@ class _FineTuner:
         self.gradient, self.second = torch.zeros_like(values), torch.zeros(*values.shape[:2], 2, device=device)
         self.w_values, self.w_gradient = warp_view(values, volume.Channels), warp_view(self.gradient, volume.Channels)
         self.w_second = warp_view(self.second, wp.vec2f)
-        self.shards = shard_count(device)
+        self.shards, self.parts = shard_count(device), part_count(device)
         self.rays = -(-_RAYS // self.shards) * self.shards
         self.ws = Workspace(section.layout, self.rays, _SAMPLES, device, training=True)
         self.cameras = CameraArrays(pixels.cameras.camera_to_world, pixels.intrinsics, device)
@@ -247,7 +248,7 @@ class _FineTuner:
                 backward = partial(self._backward, color=color, step=step)
                 squared = parallel(backward, range(self.shards), self.field.device)
                 errors.append(torch.stack(squared))
-                parallel(partial(self._update, rate=decay, step=step), range(self.shards), self.field.device)
+                parallel(partial(self._update, rate=decay, step=step), range(self.parts), self.field.device)
                 progress.update()
         last = torch.stack(errors[-max(1, self.steps // 10) :]).tolist()
         return float(-10 * np.log10(np.mean([sum(shards) / self.shards for shards in last])))
@@ -281,7 +282,7 @@ class _FineTuner:
         return (error.detach() ** 2).mean()
 
     def _update(self, part: int, rate: float, step: int) -> None:
-        gradients = [self.ws.w_positions, self.index, self.ws.w_outputs_grad, part, self.shards]
+        gradients = [self.ws.w_positions, self.index, self.ws.w_outputs_grad, part, self.parts]
         wp.launch(
             kernels.interpolate_backward,
             self.rays * _SAMPLES,

@@ -48,6 +48,11 @@ def shard_count(device: str) -> int:
     return 4 if device == "cpu" else 1
 
 
+def part_count(device: str) -> int:
+    """Number of parts of an update whose result does not depend on it; every part reads the whole batch."""
+    return min(shard_count(device), available_cores())
+
+
 def parallel(work: Callable[[Item], T], items: Iterable[Item], device: str) -> list[T]:
     """Maps `work` over items, in parallel on a CPU and serially on CUDA; results in order.
 

@@ -19,7 +19,7 @@ from twin.nerf import network
 from twin.nerf.appearance import Appearance
 from twin.nerf.baked import BakedField
 from twin.nerf.baked_arrays import Detail, detail_grid
-from twin.nerf.buffers import parallel, shard_count, single_threaded_torch, warp_view
+from twin.nerf.buffers import parallel, part_count, shard_count, single_threaded_torch, warp_view
 from twin.nerf.dataset import TrainingPixels
 from twin.nerf.kernels import surface_detail as kernels
 from twin.nerf.kernels import volume
@@ -223,7 +223,7 @@ class _DetailFitter:
 
     def __init__(self, baked: BakedField, appearance: Appearance, detail: Detail, pixels: SurfacePixels):
         self.detail, self.pixels, self.device = detail, pixels, baked.device
-        self.shards = shard_count(self.device)
+        self.shards, self.parts = shard_count(self.device), part_count(self.device)
         self.parameters = {name: torch.from_numpy(value).to(self.device) for name, value in baked.network.items()}
         with torch.no_grad():
             self.embeddings = appearance.of_frames(torch.arange(len(appearance.frames), device=self.device))
@@ -255,7 +255,7 @@ class _DetailFitter:
                 self.hits[:count] = torch.from_numpy(self.pixels.hits[rows])
                 rate = _RATE * _FINAL_RATE ** (step / steps)
                 squared = parallel(partial(self._backward, rows=rows), range(self.shards), self.device)
-                parallel(partial(self._update, count=count, rate=rate, step=step), range(self.shards), self.device)
+                parallel(partial(self._update, count=count, rate=rate, step=step), range(self.parts), self.device)
                 errors.append(torch.stack(squared))
                 progress.update()
         some, means = max(1, steps // 10), [sum(shards) / count / 3 for shards in torch.stack(errors).tolist()]
@@ -290,13 +290,13 @@ class _DetailFitter:
         wp.launch(
             kernels.interpolate_detail_backward,
             count,
-            [self.w_hits, self.grid, self.w_added_grad, part, self.shards],
+            [self.w_hits, self.grid, self.w_added_grad, part, self.parts],
             [self.texels[1], self.vertices[1]],
             device=self.device,
         )
         rates = [rate, 1.0 / (1.0 - 0.99 ** (step + 1))]
         if self.device == "cpu":
-            hits = [self.w_hits, self.grid, part, self.shards]
+            hits = [self.w_hits, self.grid, part, self.parts]
             wp.launch(kernels.adam_step_detail, count, [*hits, *rates, *self.texels, *self.vertices], device="cpu")
         else:
             for table in (self.texels, self.vertices):
