@@ -370,6 +370,8 @@ def test_a_copy_goes_on_like_its_original(tmp_path, make):
 def test_unknown_tasks_and_options_are_refused(scene):
     with pytest.raises(InputError, match=r"'straight': the route .* no such segment of 30 m; .* there are .*bend \(10"):
         twin.load(scene, "straight")
+    with pytest.raises(InputError, match="seed = -1; expected None, or a whole number of 0 or more"):
+        twin.load(scene, "bend", seed=-1, pixels=False)
     with pytest.raises(InputError, match="did you mean 'lighting'"):
         twin.load(scene, "bend", lightning="day")
     with pytest.raises(InputError, match="unknown; the field has day, night"):

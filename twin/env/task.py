@@ -29,7 +29,7 @@ from twin.env.obstacles import EpisodeObstacles, ObstacleMotion
 from twin.env.options import STATE_SIZES, Options, check_actions
 from twin.env.physics import EpisodeState, HuskyPhysics
 from twin.env.route_segments import RouteSegment
-from twin.errors import InputError
+from twin.errors import InputError, short_repr
 from twin.files import write_json
 from twin.geometry.poses import wrap_angle
 from twin.mjcf.world import World, heading_at, nearest_on_route, point_at
@@ -305,8 +305,11 @@ class DriveTask(control.Task):
         self._start_station = segment.start
 
     def seed(self, seed: int | None) -> None:
-        """Starts a new sequence of episodes."""
-        self._rng = np.random.default_rng(seed)
+        """Starts a new sequence of episodes. Raises InputError: the seed is negative, or not a whole number."""
+        try:
+            self._rng = np.random.default_rng(seed)
+        except (TypeError, ValueError):
+            raise InputError(f"seed = {short_repr(seed)}; expected None, or a whole number of 0 or more") from None
 
     def rng(self, stream: int) -> np.random.Generator:
         """Returns a new generator of one stream of the current episode."""
