@@ -27,6 +27,7 @@ from twin.evaluation.trials import csv_text
 from twin.files import write_json
 from twin.learn import selection
 from twin.learn.policy import load_policy
+from twin.learn.sac import PixelSAC
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.train_config import TrainConfig
 from twin.learn.training import TRAINING_EPISODE_COLUMNS, Segment, _keep_rows, check_same, checkpoint_folder
@@ -229,6 +230,15 @@ def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     assert seen[0] == 124 and seen[-1] == SHORT.steps
     checkpoints = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert checkpoints == ["000000080", "000000160", "000000240"]
+
+
+def test_a_save_at_the_end_of_an_episode_logs_the_critics_values(scene, tmp_path, monkeypatch):
+    """stable-baselines3 clears what it logged every `log_interval` episodes."""
+    learn = PixelSAC.learn
+    monkeypatch.setattr(PixelSAC, "learn", lambda *given, **rest: learn(*given, **(rest | {"log_interval": 1})))
+    train_policy(twin.load_scene(scene), tmp_path, replace(SHORT, steps=120, save_every=4, starts=0), processes=1)
+    assert all(float(row["value"]) > -10 for row in rows(tmp_path / "log.csv")[1:])  # not NaN
+    assert rows(tmp_path / "episodes.csv")
 
 
 def test_fractions_of_updates_add_up(scene, tmp_path):

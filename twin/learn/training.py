@@ -359,6 +359,8 @@ class _RunRecorder(BaseCallback):
         self._checkpoint()
 
     def _on_step(self) -> bool:
+        logged = self.model.logger.name_to_value  # copied, since stable-baselines3 clears it after some episodes
+        self._logged = [logged.get(f"train/{name}", float("nan")) for name in ("ent_coef", "value")]
         rows = []
         for info in (one for one in self.locals["infos"] if "episode" in one):
             if not info["start"]:
@@ -382,13 +384,12 @@ class _RunRecorder(BaseCallback):
         if self.model.num_timesteps == self._saved:
             return
         model, elapsed = self.model, max(time.monotonic() - self._first_time, 1e-9)
-        logged = model.logger.name_to_value
         row = (
             *(model.num_timesteps, f"{self.wall:.1f}", model._n_updates),
             f"{(model.num_timesteps - self._first) / elapsed:.2f}",
             f"{(model._n_updates - self._first_updates) / elapsed:.2f}",
             round(runtime.resident_memory() / 2**20),
-            *(f"{logged.get(f'train/{name}', float('nan')):.4g}" for name in ("ent_coef", "value")),
+            *(f"{value:.4g}" for value in self._logged),
         )
         self._append("log", LOG_COLUMNS, [row])
         self._save_policy(self._folder)
