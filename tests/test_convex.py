@@ -1,5 +1,7 @@
 """Convex decomposition of closed meshes, and clearing the corridor of its parts."""
 
+import threading
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ from analytic import right_turn
 from twin.assets.convex import (
     ConvexPart,
     SolidPiece,
+    _run_child,
     decompose,
     half_spaces,
     inside_hull,
@@ -20,6 +23,7 @@ from twin.assets.convex import (
 from twin.assets.ground import Ground
 from twin.assets.solids import HEADROOM, Corridor, clear_corridor, clip_part
 from twin.geometry.route import distance_to_route
+from twin.runtime import bar
 
 BOUND = 0.2  # [m]
 
@@ -130,6 +134,16 @@ def test_decomposition_covers_its_pieces_within_the_bound_and_is_cached(tmp_path
     again = decompose(pieces, BOUND, tmp_path, seed=0)
     assert again.cached == 1
     assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(made.parts, again.parts, strict=True))
+
+
+def test_a_crash_costs_one_piece_only(tmp_path: Path):
+    vertices, faces = _ell()
+    np.savez(tmp_path / "ell.npz", vertices=vertices, faces=faces, bound=BOUND, seed=0)
+    jobs = [(tmp_path / f"{source}.npz", tmp_path / f"{source}_parts.npz") for source in ("missing", "ell")]
+    with bar("pieces", len(jobs), "piece") as progress:
+        _run_child(deque(jobs), progress, threading.Event())
+        assert progress.n == 2
+    assert [target.exists() for _, target in jobs] == [False, True]  # the child ended at the missing file
 
 
 def test_clipping_keeps_exactly_one_side():

@@ -9,12 +9,15 @@ seed, so it uses one thread, and its results are cached by a hash of the input. 
 block doorways, so parts that protrude too far are split.
 """
 
+import contextlib
 import hashlib
+import json
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import metadata
@@ -34,6 +37,7 @@ _MAX_COACD_FACES = 400  # larger meshes are decimated for CoACD, which is slow w
 # Results are checked, so a coarser search than CoACD's defaults suffices.
 _SEARCH = {"resolution": 100, "mcts_nodes": 5, "mcts_iterations": 10, "mcts_max_depth": 2}
 _TIME_LIMIT = 120.0  # [s] per piece; far more than a piece needs, so that a slow machine does not change the result
+_POLL = 0.02  # [s] between checks for a result
 _MAX_PROCESSES = 16  # each takes 150 MB
 _MAX_HULL_VERTICES = 32
 _SAMPLE_SPACING = 0.06  # [m] between test points on surfaces
@@ -248,13 +252,12 @@ def _run_coacd(
     pending = [job for job in jobs if not job[1].exists()]
     for source, _, piece in pending:
         np.savez(source, vertices=piece.vertices, faces=piece.faces, bound=bound, seed=seed)
+    waiting = deque((source, target) for source, target, _ in sorted(pending, key=lambda job: -len(job[2].samples)))
     count = max(1, min(runtime.available_cores(), _MAX_PROCESSES, len(pending)))
     with runtime.bar("convex parts", len(pending), "piece") as bar, ThreadPoolExecutor(count) as pool:
-        # Interleaved, so that every child gets large and small pieces.
-        queues = [[job[:2] for job in pending[k::count]] for k in range(count)]
         stopped = threading.Event()
         try:
-            list(pool.map(lambda queue: _run_children(queue, bar, stopped), queues))
+            list(pool.map(lambda _: _run_child(waiting, bar, stopped), range(count)))
         finally:
             stopped.set()
     results: list[list[ConvexPart] | None] = []
@@ -264,34 +267,45 @@ def _run_coacd(
     return results, len(jobs) - len(pending)
 
 
-def _run_children(jobs: list[tuple[Path, Path]], bar: runtime.tqdm, stopped: threading.Event) -> None:
-    """Runs child processes one after another, until every job has a result or has failed, or `stopped` is set."""
-    pending = list(jobs)
-    while pending:
-        command = [sys.executable, "-m", "twin.assets.convex", *(str(path) for job in pending for path in job)]
-        child = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            process_group=0,  # terminal signals go to the parent only
-            env=child_environment(OMP_NUM_THREADS="1"),
-        )
-        done, since = 0, time.monotonic()
-        while child.poll() is None and time.monotonic() - since < _TIME_LIMIT and not stopped.is_set():
-            if pending[done:] and pending[done][1].exists():
-                done, since = done + 1, time.monotonic()
-                bar.update()
-            else:
-                time.sleep(0.05)
-        child.kill()
-        child.wait()
-        if stopped.is_set():
-            return
-        finished = sum(target.exists() for _, target in pending)
-        bar.update(finished - done)
-        # Jobs run in order, so the first job without a result has crashed or timed out.
-        pending = [job for job in pending if not job[1].exists()][1:]
+def _run_child(waiting: deque[tuple[Path, Path]], bar: runtime.tqdm, stopped: threading.Event) -> None:
+    """Gives waiting jobs to a child process, until none is left, or `stopped` is set.
+
+    A job whose child crashes or exceeds the time limit gets no result; the next job gets a new child.
+    """
+    child: subprocess.Popen[bytes] | None = None
+    try:
+        while not stopped.is_set():
+            try:
+                source, target = waiting.popleft()
+            except IndexError:
+                return
+            child = child or subprocess.Popen(
+                [sys.executable, "-m", "twin.assets.convex"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                process_group=0,  # terminal signals go to the parent only
+                env=child_environment(OMP_NUM_THREADS="1"),
+            )
+            assert child.stdin
+            with contextlib.suppress(BrokenPipeError):  # the child has crashed
+                child.stdin.write(json.dumps([str(source), str(target)]).encode() + b"\n")
+                child.stdin.flush()
+            end = time.monotonic() + _TIME_LIMIT
+            while not (target.exists() or child.poll() is not None or time.monotonic() > end or stopped.is_set()):
+                time.sleep(_POLL)
+            if not target.exists():
+                _end(child)
+                child = None
+            bar.update()
+    finally:
+        if child:
+            _end(child)
+
+
+def _end(child: "subprocess.Popen[bytes]") -> None:
+    child.kill()
+    child.communicate()  # closes the pipe, too
 
 
 def _read_parts(path: Path) -> list[ConvexPart] | None:
@@ -301,13 +315,13 @@ def _read_parts(path: Path) -> list[ConvexPart] | None:
     return parts or None
 
 
-def _decompose_files(paths: list[Path]) -> None:
-    """Runs CoACD in the child process. Each input path in `paths` is followed by the path of its result."""
+def _decompose_files(jobs: Iterable[bytes]) -> None:
+    """Runs CoACD in the child process. A job is a line of JSON: the path of the input and that of its result."""
     import coacd
 
     coacd.set_log_level("off")
-    for source, target in zip(paths[::2], paths[1::2], strict=True):
-        data = load_arrays(source)
+    for source, target in map(json.loads, jobs):
+        data = load_arrays(Path(source))
         vertices, faces = data["vertices"], data["faces"]
         if len(faces) > _MAX_COACD_FACES:
             vertices, faces = fast_simplification.simplify(
@@ -324,9 +338,9 @@ def _decompose_files(paths: list[Path]) -> None:
             seed=int(data["seed"]),
         )
         points = [np.asarray(v) for v, _ in result]
-        save_arrays(target, {"points": np.concatenate(points), "counts": np.array([len(p) for p in points])})
+        save_arrays(Path(target), {"points": np.concatenate(points), "counts": np.array([len(p) for p in points])})
 
 
 if __name__ == "__main__":
     die_with_parent()
-    _decompose_files([Path(argument) for argument in sys.argv[1:]])
+    _decompose_files(sys.stdin.buffer)
