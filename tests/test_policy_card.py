@@ -57,7 +57,7 @@ def test_a_card_after_training_has_no_success_in_the_twin(scene):
 
 
 def test_a_validated_and_driven_policy_has_its_rates(scene):
-    validate(scene, {"held-out": "g" * 9 + "x", "night": "gggx"})
+    validate(scene, {"held-out": "g" * 9 + "x", "night": "gggx", "rain|wet": "gg"})
     cells = tally(read_trials(scene.episodes_csv))
     real = [Cell("first", "straight", day, 5, won, "held-out") for day, won in (("monday", 4), ("tuesday", 5))]
     make_forecast("demo", cells, real, 0, {("first", "straight"): Estimate(0.8, 0.6, 0.9, 20)}).save(scene.forecast)
@@ -65,6 +65,7 @@ def test_a_validated_and_driven_policy_has_its_rates(scene):
     text = path.read_text()
     assert "| straight | held-out | 9 of 10 | 0.90 (0.65 to 0.98) |" in text
     assert "| straight | night | 3 of 4 | 0.75" in text
+    assert r"| straight | rain\|wet | 2 of 2 |" in text
     (row,) = [line for line in text.splitlines() if line.startswith("| straight | 10 |")]
     assert "0.90" in row
     front = text.split("---")[1]

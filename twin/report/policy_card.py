@@ -64,7 +64,7 @@ def card(policy: Policy, folder: Path, cells: Sequence[Cell], known: Sequence[Ca
         "environment steps": f"{trained['step']:,}" if "step" in trained else None,
         "seed": trained.get("seed"),
     }
-    rows = [f"| {name} | {value} |" for name, value in facts.items() if value is not None]
+    rows = [_row(name, value) for name, value in facts.items() if value is not None]
     action = "yaw rate at a constant speed" if control.actions == 1 else "speed and yaw rate"
     sees = f"the last {policy.stack} pictures of {width} × {height} px, {1 / control.control_timestep:g} a second"
     return "\n".join(
@@ -143,9 +143,8 @@ def _twin_table(cells: Sequence[Cell]) -> list[str]:
     for cell in cells:
         of = rate_summary(cell.successes, cell.trials)
         interval = _interval(of["low"], of["high"])
-        out.append(
-            f"| {cell.task} | {cell.lighting} | {cell.successes} of {cell.trials} | {of['rate']:.2f} ({interval}) |"
-        )
+        count, rate = f"{cell.successes} of {cell.trials}", f"{of['rate']:.2f} ({interval})"
+        out.append(_row(cell.task, cell.lighting, count, rate))
     return [*out, "", f"Intervals contain the rate of further episodes with {CONFIDENCE:.0%} confidence."]
 
 
@@ -157,8 +156,13 @@ def _road_table(known: Sequence[Candidate]) -> list[str]:
         ]
         told = ["", "Predicted from other policies that were driven there:", "", *predicted] if predicted else []
         return ["Not driven on the real road.", *told]
-    rows = [f"| {c.task} | {c.real.n} | {format_estimate(c.real)} | {format_estimate(c.twin)} |" for c in driven]
+    rows = [_row(c.task, c.real.n, format_estimate(c.real), format_estimate(c.twin)) for c in driven]
     return ["| task | trials | rate on the road | rate in the twin |", "|---|---|---|---|", *rows]
+
+
+def _row(*columns: object) -> str:
+    """A row of a Markdown table; in a name, `|` would begin another column."""
+    return f"| {' | '.join(str(column).replace('|', chr(92) + '|') for column in columns)} |"
 
 
 def _interval(low: float, high: float) -> str:
