@@ -166,9 +166,17 @@ def test_the_largest_command_is_no_limit():
     windows = limited_windows(1, truth, (1.3, 0.9))
     fitted, fit = drivetrain.fit_drivetrain(windows, HuskyParams())
     assert fit.refused.keys() == {"mean_limit", "half_limit", "wheel_limit"}
-    assert "raise max_wheel_speed in [robot]" in fit.refused["wheel_limit"]
+    assert "max_wheel_speed = 1 is kept, which the log exceeds, so raise it in [robot]" in fit.refused["wheel_limit"]
     assert "raise" not in fit.refused["half_limit"]
     assert fitted.half_gain == pytest.approx(truth.separation_multiplier, abs=4 * fit.errors["half_gain"])
+
+
+def test_a_wrong_sample_of_an_encoder_exceeds_no_limit():
+    windows = limited_windows(1, SOFT, (0.5, 0.6))
+    windows.wheels[4, 7, 0] = 300.0
+    fitted, fit = drivetrain.fit_drivetrain(windows, HuskyParams())
+    assert "raise" not in "".join(fit.refused.values())
+    assert fitted.wheel_limit == drivetrain.Drivetrain.from_robot(HuskyParams(), True).wheel_limit
 
 
 @pytest.mark.parametrize("late", [0.4, 0.2, 0.07, 0.0, -0.15])

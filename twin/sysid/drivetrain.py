@@ -30,6 +30,7 @@ _LIMITS = {
     "wheel_limit": "max_wheel_speed",
 }  # and their fields
 _LIMIT_NATS = 3.0  # [nat] least loss of a log's likelihood without a limit from which the limit counts as reached
+_HELD = 0.9  # quantile of a window's speeds: the highest speed that the robot held for 0.2 s
 _EXCEEDED = 1.05  # a speed / the robot's limit above which the log contradicts the limit
 _SIDES: Kinds = (0, 0)  # residuals of the left and the right wheels [rad/s]
 
@@ -176,9 +177,11 @@ def fit_drivetrain(windows: Windows, params: HuskyParams) -> tuple[Drivetrain, F
         "half_acceleration": 4.0,
         "lag": 0.1,
     }
-    highest = dict(zip(_LIMITS, (float(x.max()) for x in (mean, half, np.abs(measured))), strict=True))
+    # Speeds held for a while: a wrong sample of an encoder exceeds no limit.
+    held = (np.quantile(x, _HELD, 1).max() for x in (mean, half, np.abs(measured).max(2)))
+    highest = dict(zip(_LIMITS, map(float, held), strict=True))
     exceeded = {
-        name: f"; the log exceeds the robot's limit of {getattr(default, name):.3g}, so raise {field} in [robot]"
+        name: f"; {field} = {getattr(params, field):g} is kept, which the log exceeds, so raise it in [robot]"
         for name, field in _LIMITS.items()
         if highest[name] > _EXCEEDED * getattr(default, name)
     }
