@@ -341,6 +341,15 @@ def test_trials_of_another_task_of_the_same_name_are_refused(gray, tmp_path):
     real_test.run([left], "straight", ["rain"], 2, out)
 
 
+def test_a_task_whose_run_was_stopped_before_its_first_trial_may_change(gray, tmp_path, monkeypatch):
+    left, out, task = written(tmp_path / "left", 0.9), tmp_path / "results.csv", task_of_place(0, "straight")
+    with monkeypatch.context() as patched:
+        patched.setattr(RealTest, "run_trial", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            real_test.run([left], task, ["rain"], 1, out)
+    assert len(real_test.run([left], replace(task, half_width=0.4), ["rain"], 1, out)) == 1
+
+
 def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):
     """Place, day, robot and camera, and their values outside training's ranges, which are printed as well."""
     left, out = written(tmp_path / "left", 0.9), tmp_path / "results.csv"

@@ -243,7 +243,7 @@ def run(
         known = {(one.policy, one.task, one.lighting, one.seed) for one in done}
         for policy in {one.name: one for one in loaded}.values():
             test = RealTest(task_for(policy, task, setup.place, setup.length), setup, policy.size)
-            _check_task(task, table, out.with_name(f"{out.stem}_tasks.json"))
+            _check_task(task, done, table, out.with_name(f"{out.stem}_tasks.json"))
             for lighting in dict.fromkeys(lightings):
                 # Each weather has its own seeds: with shared ones, the starts in all weathers would be the same.
                 first = _FIRST_SEED + _SEEDS_PER_LIGHTING * weather_index(lighting)
@@ -277,11 +277,13 @@ def _check_setup(setup: Setup, table: Path, record: Path) -> None:
     write_json(record, {**given, "outside_training": setup.outside, "robot_values": robot, "camera_values": camera})
 
 
-def _check_task(task: str | RoadTask, table: Path, record: Path) -> None:
-    """Records a task's numbers; none for a task of the place. Raises InputError: the name has other numbers there."""
+def _check_task(task: str | RoadTask, done: list[Trial], table: Path, record: Path) -> None:
+    """Records a task's numbers; none for a task of the place. Raises InputError: trials of this name had others."""
     name, numbers = (task, []) if isinstance(task, str) else (task.name, task.numbers)
     with wrap_read_errors(record, "give another --out"):
         tasks = dict(read_json(record)) if record.exists() else {}
+        if name not in {one.task for one in done}:  # a run was stopped before its first trial
+            tasks.pop(name, None)
         known = tasks.setdefault(name, numbers)
         if len(known) != len(numbers) or not np.allclose(known, numbers, atol=1e-6):
             raise InputError(f"{table} has trials of another task {name!r}; give another --out, or rename the task")
