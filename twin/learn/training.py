@@ -335,6 +335,7 @@ class _RunRecorder(BaseCallback):
         self._folder, self._config, self._settings, self._origin = folder, config, settings, origin
         self._wall, self._resumed, self._started = wall, resumed, time.monotonic()
         self._watch, self._stop, self._writers = watch, stop, writers
+        self._logged = dict.fromkeys(("ent_coef", "value"), float("nan"))
 
     @property
     def wall(self) -> float:
@@ -360,7 +361,7 @@ class _RunRecorder(BaseCallback):
 
     def _on_step(self) -> bool:
         logged = self.model.logger.name_to_value  # copied, since stable-baselines3 clears it after some episodes
-        self._logged = [logged.get(f"train/{name}", float("nan")) for name in ("ent_coef", "value")]
+        self._logged = {name: logged.get(f"train/{name}", last) for name, last in self._logged.items()}
         rows = []
         for info in (one for one in self.locals["infos"] if "episode" in one):
             if not info["start"]:
@@ -389,7 +390,7 @@ class _RunRecorder(BaseCallback):
             f"{(model.num_timesteps - self._first) / elapsed:.2f}",
             f"{(model._n_updates - self._first_updates) / elapsed:.2f}",
             round(runtime.resident_memory() / 2**20),
-            *(f"{value:.4g}" for value in self._logged),
+            *(f"{value:.4g}" for value in self._logged.values()),
         )
         self._append("log", LOG_COLUMNS, [row])
         self._save_policy(self._folder)
