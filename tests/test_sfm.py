@@ -17,6 +17,7 @@ import psutil
 import pycolmap
 import pytest
 
+from twin import runtime
 from twin.capture import mapping, sfm, worker
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.capture.matching import Matcher, open_database
@@ -143,6 +144,22 @@ def _run(street: Street, out: Path, **changes: object) -> dict:
 
 
 # --- the whole stage --------------------------------------------------------------------------------------------------
+
+
+def test_there_are_no_more_threads_than_cores(street: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A container may allow few of a machine's cores, and each process for relative poses takes memory."""
+    jobs = []
+
+    def stop(_: object, job: dict, __: Path) -> None:
+        jobs.append(job)
+        raise InterruptedError
+
+    monkeypatch.setattr(sfm, "run_worker", stop)
+    monkeypatch.setattr(runtime, "available_cores", lambda: 1)
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    with pytest.raises(InterruptedError):
+        _run(street, tmp_path / "out")
+    assert jobs[0]["threads"] == 1
 
 
 def test_street_is_solved(street: Street, tmp_path: Path) -> None:

@@ -319,7 +319,8 @@ class Matcher:
 def open_database(capture: Capture, stage: Path, work: Path, free_focal: bool, threads: int, seed: int) -> Matcher:
     """Creates a database in `work` with the frames and cameras of a capture, whose stage folder is `stage`.
 
-    `free_focal` ignores all calibrations and focal length priors; `threads` and `seed` are for COLMAP.
+    `free_focal` ignores all calibrations and focal length priors; `threads` and `seed` are for COLMAP and relative
+    poses.
     """
     path, images = work / "database.db", stage / "images"
     path.unlink(missing_ok=True)

@@ -6,7 +6,6 @@ reconstructs. Films without a common view, such as those that go down the road i
 separately, and joined by the ground if that is possible.
 """
 
-import os
 import shutil
 from dataclasses import asdict
 from pathlib import Path
@@ -77,7 +76,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     capture = Capture.load(stage)
     work = out / "work"
     work.mkdir()
-    threads = min(os.cpu_count() or 1, _MAX_THREADS)
+    threads = min(runtime.available_cores(), _MAX_THREADS)
     job = asdict(settings) | {"capture": str(stage), "seed": config.seed, "threads": threads}
     run_worker(solve_mapping, job, work)
     summary = read_json(work / "result.json")
