@@ -84,6 +84,13 @@ def test_a_small_first_photo_does_not_shrink_the_others_silently(tmp_path: Path,
     assert said not in capsys.readouterr().err
 
 
+def test_a_photo_that_was_cut_by_a_row_does_not_count_as_small(tmp_path: Path, capsys) -> None:
+    for i, frame in enumerate(views([0, 9, 18])):
+        write_image(tmp_path / f"photos/{i}.png", frame if i else frame[:-1])
+    captured(tmp_path, [SourceConfig(path="photos")])
+    assert "are scaled to" not in capsys.readouterr().err
+
+
 def _posed(tmp_path: Path, per_frame: list[dict[str, Any]], **top: Any) -> None:
     frames = []
     for i, extra in enumerate(per_frame):

@@ -214,7 +214,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
         focals += [exif.focal] if exif.focal else []
     if not index:
         raise InputError(f"{task.path}: all {len(chosen)} images are blank (one color); give photos of the place")
-    if fitted_size(*largest, task.config.max_size) > size:
+    if max(fitted_size(*largest, task.config.max_size)) > max(size):
         runtime.log_line(
             f"  {task.name}: photos of up to {largest[0]}x{largest[1]} are scaled to {size[0]}x{size[1]}, the size of "
             "the first one; give photos of another size a source of their own"
