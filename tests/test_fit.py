@@ -210,6 +210,14 @@ def trained(cameras: Cameras, config: NerfConfig) -> RadianceField:
     return trainer.finish()
 
 
+def test_rays_are_drawn_in_the_memory_of_the_host(cameras):
+    """They are drawn while a GPU trains; a copy to its memory would wait for it."""
+    trainer = Trainer(cameras, floor_points(cameras), CONFIG, 0, "cpu", camera_height=1.5)
+    trainer.device = "meta"
+    _, free = trainer._draw(0)
+    assert free is not None and free.device.type == "cpu"
+
+
 def test_training_is_bit_equal_on_any_number_of_cores(cameras, monkeypatch):
     first = trained(cameras, CONFIG)
     monkeypatch.setattr(buffers, "available_cores", lambda: 1)

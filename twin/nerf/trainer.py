@@ -394,7 +394,7 @@ class Trainer:
             return None
         points = random_free_points(self.rng, free, n, self.config.near_plane)
         near_box = self.field.sections[section].layout.near_box
-        return torch.as_tensor(near_box.grid_positions(points), device=self.device)
+        return torch.from_numpy(near_box.grid_positions(points))
 
     def finish(self) -> RadianceField:
         """The trained field, detached from autograd."""
