@@ -186,6 +186,22 @@ def test_an_object_that_left_is_excluded_before_training_begins(tmp_path, monkey
     assert trainer.pixels.unmasked[shows].mean() < 0.03 and trainer.pixels.unmasked.mean() > 0.6
 
 
+def test_rays_that_are_drawn_ahead_avoid_the_movers(tmp_path, monkeypatch):
+    """Each step draws the rays of the next one, except of that which finds the movers."""
+    cameras, _ = film(tmp_path, "day", PLACE, n=3)
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[:, :40] = True
+    monkeypatch.setattr(training, "mover_masks", lambda pixels, _: [mask] * len(pixels.cameras))
+    config = NerfConfig(steps=4, rays=256, samples=8, levels=3, log2_table=10, max_width=WIDTH, stereo=False)
+    trainer = Trainer(cameras, SparsePoints.empty(), config, 0, "cpu")
+    assert trainer.movers_step == 1
+    masked = []
+    while not trainer.done:
+        trainer.step()
+        masked.append(bool((trainer.ws.pixel[:, 0] < 40).any()))
+    assert masked == [True, False, False, False]
+
+
 def test_baking_uses_the_pixels_that_training_used(tmp_path, monkeypatch):
     scene, out = SceneDir(tmp_path / "scene"), tmp_path / "out"
     cameras, _ = film(tmp_path, "day", PLACE)
