@@ -92,7 +92,7 @@ def test_few_groups_lose_one_degree_of_freedom():
 def test_standard_errors_with_large_residuals_at_high_leverage():
     """A fifth of the windows is stuck, with five times the leverage."""
     found, errors = [], []
-    for seed in range(60):
+    for seed in range(200):
         rng = np.random.default_rng(seed)
         stuck = np.arange(300) % 5 == 0
         x = np.where(stuck, 5.0, 1.0) * rng.normal(size=300)
@@ -100,6 +100,19 @@ def test_standard_errors_with_large_residuals_at_high_leverage():
         found.append(one.values["slope"] - 2.0)
         errors.append(one.errors["slope"])
     assert 0.75 < np.sqrt(np.square(found).mean() / np.square(errors).mean()) < 1.25
+
+
+def test_windows_that_disagree_determine_their_mean():
+    """Half of the windows prefer −1 and half +1. In between, a pair of windows has the loss log(1 + t⁴ / 4), flat at 0
+    but steep beyond. The error is the shift t at which its gradient is the standard error √n / 2 of the score.
+    """
+    off = np.tile([-1.0, 1.0], 50)[:, None, None] * np.ones(3)
+    table = [Parameter("t", None, 1.4, -10, 10, 5.0, "")]
+    found = fit_parameters(table, lambda v: v["t"] - off, (0, 0, 0), np.arange(100), {"t": 0.0})
+    assert not found.refused
+    assert found.values["t"] == pytest.approx(0.0, abs=0.01)
+    t = found.errors["t"]
+    assert 100 / 4 * t**3 / (1 + t**4 / 4) == pytest.approx(np.sqrt(100) / 2, rel=0.03)
 
 
 def test_outliers_do_not_decide_a_distant_start():

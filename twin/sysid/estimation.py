@@ -118,6 +118,7 @@ def _per_window(factor: Array, like: Array) -> Array:
 
 _MAX_ERROR_SHARE = 0.5  # largest standard error of an identified parameter, in prior standard deviations
 _MIN_CURVATURE = 0.1  # smallest curvature / that of the least-squares step, see `_inverse_curvature`
+_CURVATURE_STEPS = 20  # iterations that find the curvature over a standard error
 _STEP = 0.05  # step of finite differences, in prior standard deviations
 _NATS = 0.02  # [nat] a search ends when a step gains less; it is the loss at 0.2 standard errors from the maximum
 _EVALUATIONS = 50  # limit of evaluations per round of the search, not counting those for Jacobians
@@ -312,23 +313,39 @@ def _standard_errors(jacobian: Array, scaled: Array, groups: NDArray[np.int64], 
     # A tiny prior gives a direction without information a huge error instead of a division by zero.
     tiny = 1e-9 * max(1.0, float(np.trace(information)) / len(information))
     prior = np.diag(np.where(weights > 0, weights, tiny))
-    inverse = _inverse_curvature(information + prior, score)
     prior_meat = prior * np.where(weights > 0, weights, 1.0)
-    robust = np.diag(inverse @ (meat * count / max(1, count - 1) + prior_meat) @ inverse)
     window_meat = score.T @ score * len(score) / max(1, len(score) - len(information))
-    independent = np.diag(inverse @ (window_meat + prior_meat) @ inverse)
-    variance = np.maximum(robust, independent)
+    meats = np.stack([meat * count / max(1, count - 1), window_meat]) + prior_meat
+    inverses = [_inverse_curvature(information + prior, root, score, m) for m in meats]
+    variance = np.max([np.diag(v @ m @ v) for v, m in zip(inverses, meats, strict=True)], 0)
     flat = np.diag(information) < 1e-6 * max(1.0, float(np.diag(information).max()))
     return np.where(flat, np.inf, np.sqrt(np.maximum(variance, 0.0))) * stds
 
 
-def _inverse_curvature(information: Array, score: Array) -> Array:
-    """Inverse of the curvature of the objective, shape (p, p).
+def _inverse_curvature(information: Array, root: Array, score: Array, meat: Array) -> Array:
+    """Inverse of the curvature of the objective between plus and minus one standard error, shape (p, p).
 
-    The curvature of log(1 + s) is the curvature of the squares that replace it in a least-squares step, minus twice the
-    squared score of a window. Where noise makes the difference too small, `_MIN_CURVATURE` times the former is used.
+    The curvature of log(1 + s) is smaller than that of the squares that replace it in a least-squares step. At the
+    optimum it can be nearly zero although the optimum is sharp: if half of the windows prefer one latency and half
+    another, the objective is flat between the two but steep beyond. So the curvature along each principal axis is the
+    mean over the interval of a standard error, which in turn depends on the curvature. It is at least `_MIN_CURVATURE`
+    times that of the least-squares step, since its estimate is noisy.
+
+    Args:
+        information: Curvature of the least-squares step, with the prior, shape (p, p).
+        root: Weighted Jacobian, shape (n, residuals of a window, p).
+        score: Score of each window, shape (n, p).
+        meat: Covariance of the sum of the scores, shape (p, p).
     """
-    root = np.linalg.inv(np.linalg.cholesky(information))
-    less, axes = np.linalg.eigh(2 * root @ score.T @ score @ root.T)
-    half = axes.T @ root
-    return half.T @ (half / np.maximum(1 - less, _MIN_CURVATURE)[:, None])
+    whiten = np.linalg.inv(np.linalg.cholesky(information))
+    axes = np.linalg.eigh(whiten @ score.T @ score @ whiten.T)[1].T @ whiten
+    # A shift t along an axis multiplies 1 + s of a window by 1 + 2 t · first + t² · second.
+    first, second = score @ axes.T, ((root @ axes.T) ** 2).sum(1)
+    spread = np.diag(axes @ meat @ axes.T)
+    curvature = np.ones(len(axes))  # relative to the least-squares step, since the axes are whitened
+    for _ in range(_CURVATURE_STEPS):
+        t2 = spread / curvature**2
+        both = 1 + t2 * second
+        loss = second - (second * both - 2 * first**2) / (both**2 - 4 * t2 * first**2)
+        curvature = np.sqrt(curvature * np.clip(1 - loss.sum(0), _MIN_CURVATURE, 1))
+    return axes.T @ (axes / curvature[:, None])
