@@ -245,7 +245,7 @@ def test_a_known_robot_is_recovered(drive, tmp_path):
     result = identify(windows, HuskyParams())
     found = result.identified
     for name, tolerance in {
-        "command_latency": 0.05,
+        "command_latency": 0.06,  # the controller reads commands of the log up to one of its periods late
         "servo_lag": 0.04,
         "max_acceleration": 0.2,
         "max_yaw_acceleration": 0.3,
