@@ -130,6 +130,7 @@ def pair_geometries(
             error = (errors[first][matches[:, 0]] + errors[second][matches[:, 1]]) / 2
             matches, error = matches[np.isfinite(error)], error[np.isfinite(error)]  # some lenses cannot be inverted
             if len(matches) < _MIN_MATCHES:
+                send_message(step=1)
                 continue
             two = cameras[camera_of[first]], cameras[camera_of[second]]
             a, b = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
