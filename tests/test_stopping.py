@@ -150,7 +150,7 @@ from twin.assets import convex
 ball = trimesh.creation.icosphere(4)
 def piece(k):
     bumps = 1.0 + 0.3 * np.sin(9.0 * ball.vertices + k).prod(1)
-    return convex.SolidPiece.from_mesh(ball.vertices * bumps[:, None], ball.faces)
+    return convex.SolidPiece.from_mesh(ball.vertices * bumps[:, None], ball.faces, lambda points: points[:, 0] > -9.0)
 convex._run_coacd([piece(k) for k in range(40)], 0.01, Path({str(tmp_path)!r}), 0)
 """
     process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)

@@ -85,17 +85,11 @@ class SolidPiece:
     """Maps points (k, 3) to a mask (k,) of those inside the mesh."""
 
     @staticmethod
-    def from_mesh(
-        vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]] | None = None
-    ) -> "SolidPiece":
-        """Samples the surface of a mesh. `inside` replaces the default test by winding numbers, which is slow."""
+    def from_mesh(vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]]) -> "SolidPiece":
+        """Samples the surface of a mesh; for `inside` see the attribute."""
         vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
         samples = surface_samples(vertices, faces, _SAMPLE_SPACING)
-
-        def by_winding(points: Array) -> NDArray[np.bool_]:
-            return winding_number(points, vertices, faces) > 0.5
-
-        return SolidPiece(vertices, faces, samples, cKDTree(samples), inside or by_winding)
+        return SolidPiece(vertices, faces, samples, cKDTree(samples), inside)
 
     def protrusion(self, part: ConvexPart) -> float:
         """Protrusion of a part [m]; 0 below the sample spacing. It may be too large by up to half that spacing."""
@@ -170,14 +164,11 @@ def split_to_bound(
     inside = piece.samples[inside_hull(part, piece.samples, 1e-3 + _SAMPLE_SPACING)]
     if len(inside) < 8:
         return []
-    axis = int(np.argmax(np.ptp(inside, axis=0)))
-    middle = float(inside[:, axis].min() + inside[:, axis].max()) / 2
+    along = inside[:, np.argmax(np.ptp(inside, axis=0))]
+    middle = float(along.min() + along.max()) / 2
     halves = []
-    for half in (
-        inside[inside[:, axis] <= middle + _SAMPLE_SPACING],
-        inside[inside[:, axis] >= middle - _SAMPLE_SPACING],
-    ):
-        hull = ConvexPart.hull(half)
+    for half in (along <= middle + _SAMPLE_SPACING, along >= middle - _SAMPLE_SPACING):
+        hull = ConvexPart.hull(inside[half])
         if hull is not None:
             halves += split_to_bound(hull, piece, bound, max_splits - 1)
     return halves
@@ -185,18 +176,12 @@ def split_to_bound(
 
 def inside_hull(part: ConvexPart, points: Array, slack: float = 0.0) -> NDArray[np.bool_]:
     """Mask of the points (k, 3) inside the part or within about `slack` [m] of it."""
-    normal, offset = half_spaces(part)
-    return np.all(points @ normal.T <= offset + slack, axis=1)
-
-
-def half_spaces(part: ConvexPart) -> tuple[Array, Array]:
-    """Outward normals (f, 3) and offsets (f,) of the faces; points x inside have normal · x ≤ offset."""
     a, b, c = (part.vertices[part.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
     solid = length > 1e-12
     normal = normal[solid] / length[solid, None]
-    return normal, (normal * a[solid]).sum(1)
+    return np.all(points @ normal.T <= (normal * a[solid]).sum(1) + slack, axis=1)
 
 
 def uncovered_fraction(piece: SolidPiece, parts: list[ConvexPart], bound: float) -> float:
@@ -219,23 +204,6 @@ def surface_samples(vertices: Array, faces: NDArray, spacing: float) -> Array:
         weights = np.stack([n - i[keep] - j[keep], i[keep], j[keep]], 1) / n
         points.append(np.einsum("kc,fcd->fkd", weights, corners[level == n]).reshape(-1, 3))
     return np.concatenate(points)
-
-
-def winding_number(points: Array, vertices: Array, faces: NDArray) -> Array:
-    """Winding numbers (k,) of a closed mesh around points (k, 3): 1 inside, 0 outside.
-
-    Each is the sum of the faces' signed solid angles, divided by 4π (van Oosterom & Strackee 1983, eq. 8).
-    """
-    out = np.zeros(len(points))
-    corners = vertices[faces]
-    chunk = max(1, 400_000 // max(len(faces), 1))
-    for start in range(0, len(points), chunk):
-        a, b, c = (corners[None, :, k] - points[start : start + chunk, None] for k in range(3))
-        la, lb, lc = (np.linalg.norm(x, axis=-1) for x in (a, b, c))
-        volume = np.einsum("pfk,pfk->pf", a, np.cross(b, c))
-        ab, bc, ca = ((x * y).sum(-1) for x, y in ((a, b), (b, c), (c, a)))
-        out[start : start + chunk] = np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum(1) / (2 * np.pi)
-    return out
 
 
 def _run_coacd(
