@@ -78,15 +78,9 @@ class Ground:
         with wrap_read_errors(path, "build the scene again"):
             data = load_arrays(path)
             ground = Ground(data["height"], data["origin"], float(data["cell"]), data["measured"], data["rgb"])
-            rows, columns = ground.height.shape
-            check_shapes(
-                {
-                    "height": (ground.height, (rows, columns), "f"),
-                    "origin": (ground.origin, (2,), "f"),
-                    "measured": (ground.measured, (rows, columns), "b"),
-                    "rgb": (ground.rgb, (rows, columns, 3), "u"),
-                }
-            )
+            rows, columns = size = ground.height.shape
+            shapes = {"height": (size, "f"), "origin": ((2,), "f"), "measured": (size, "b"), "rgb": ((*size, 3), "u")}
+            check_shapes({name: (getattr(ground, name), *shape) for name, shape in shapes.items()})
             if not (0.0 < ground.cell < np.inf and np.isfinite(ground.height).all() and rows * columns):
                 raise ValueError(f"cell = {ground.cell} m; expected > 0, and one or more heights, all finite")
         return ground
@@ -200,12 +194,8 @@ def _path_data(
             slow = 1.4826 * float(np.median(np.abs(drift - np.median(drift))))
         # The other kinds of data vary by about 3 cm; any further slow variation is attributed to the camera.
         sigma = float(np.sqrt(_SIGMA_PATH**2 + rapid**2 + max(0.0, slow**2 - 0.03**2)))
-        metrics[cameras.sources[index[0]]] = {
-            "camera_height_m": height,
-            "rapid_m": rapid,
-            "slow_m": slow,
-            "sigma_m": sigma,
-        }
+        own = {"camera_height_m": height, "rapid_m": rapid, "slow_m": slow, "sigma_m": sigma}
+        metrics[cameras.sources[index[0]]] = own
         if len(index) >= 2:
             parts.append(_path_strip(np.column_stack([position[:, :2], z]), sigma))
     return (HeightData.join(parts) if parts else HeightData.empty()), metrics

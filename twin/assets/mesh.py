@@ -225,8 +225,7 @@ def _visual_mesh(
         colors[~seen] = colors[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
     ground_vertices, ground_faces = ground.triangles(_VISUAL_GROUND_CELL, max_faces // 3)
     column, row = np.rint((ground_vertices[:, :2] - ground.origin) / ground.cell).astype(int).T
-    rows, columns = ground.height.shape
-    ground_colors = ground.rgb[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
+    ground_colors = ground.rgb[row, column]
     visual: dict[str, NDArray] = {
         "vertices": np.concatenate([vertices, ground_vertices]).astype(np.float32),
         "faces": np.concatenate([faces, ground_faces + len(vertices)]).astype(np.int32),
@@ -351,9 +350,9 @@ def ground_picture(field: RenderableField, cameras: Cameras, ground: Ground, lig
             bar.update()
             pose = trained.camera_to_world[i]
             column, row = np.floor((pose[:2, 3] - ground.origin) / step).astype(int)
-            low = max(0, row - reach), max(0, column - reach)
+            low = np.maximum([row - reach, column - reach], 0)
             window = slice(low[0], max(0, row + reach)), slice(low[1], max(0, column + reach))
-            v, u = np.indices(best[window].shape) + np.array(low)[:, None, None]
+            v, u = np.indices(best[window].shape) + low[:, None, None]
             xy = ground.origin + (np.stack([u, v], -1) + 0.5) * step
             distance = np.linalg.norm(xy - pose[:2, 3], axis=-1)
             ahead = ((xy - pose[:2, 3]) @ pose[:2, 2]) > 0.5 * distance
@@ -362,10 +361,9 @@ def ground_picture(field: RenderableField, cameras: Cameras, ground: Ground, lig
             if not len(at):
                 continue
             points = np.concatenate([xy.reshape(-1, 2)[at], ground.at(xy.reshape(-1, 2)[at])[:, None]], 1)
-            native = int(trained.sizes[i, 0]), int(trained.sizes[i, 1])
-            size = _WIDTH, max(2, round(_WIDTH * native[1] / native[0]))
-            intrinsics = scaled_intrinsics(trained.intrinsics[i], native, size)
-            pixel, depth = project(points, pose, intrinsics)
+            width, height = trained.sizes[i].tolist()
+            size = _WIDTH, max(2, round(_WIDTH * height / width))
+            pixel, depth = project(points, pose, scaled_intrinsics(trained.intrinsics[i], (width, height), size))
             inside = (pixel > 0.5).all(1) & (pixel < np.array(size) - 0.5).all(1) & (depth > 0.1)
             if not inside.any():
                 continue

@@ -97,10 +97,9 @@ def solid_voxels(
 ) -> SolidVoxels:
     """The solid within `config.margin` of a path (m, 2) [m], cleared of the corridor, in one section of the place."""
     voxel, section = volume.voxel, volume.section
-    nothing = SolidVoxels.join([])
     distance = _distance_to_path(volume, path, config.margin)
     if distance is None or not (volume.distance < 0).any():
-        return nothing
+        return SolidVoxels.join([])
     columns = volume.distance.shape[:2]
     xy = volume.origin[:2] + voxel * np.stack(np.meshgrid(*map(np.arange, columns), indexing="ij"), -1)
     z = volume.origin[2] + voxel * np.arange(volume.distance.shape[2])

@@ -166,7 +166,7 @@ def fuse(points: Array, views: Views, band: float, far: float) -> tuple[NDArray,
         for index, chosen in _groups(points, views, reach):
             found = wp.full(len(index), float("nan"), dtype=wp.float32)
             votes = [wp.zeros(len(index), dtype=wp.float32) for _ in range(2)]
-            inputs = [_vectors(points[index]), *cameras, _indices(chosen), slant, *constants]
+            inputs = [_vectors(points[index]), *cameras, wp.array(chosen, dtype=wp.int32), slant, *constants]
             wp.launch(_fuse_kernel, len(index), inputs, [found, *votes])
             distance[index], near[index], free[index] = (values.numpy() for values in (found, *votes))
     return distance, near, free
@@ -189,7 +189,7 @@ def color_points(
         for index, chosen in _groups(points, views, reach):
             mean, found = wp.zeros(len(index), dtype=wp.vec3), wp.zeros(len(index), dtype=wp.float32)
             where = _vectors(points[index]), _vectors(normals[index])
-            inputs = [*where, centers, *cameras, _indices(chosen), rgb, tolerance]
+            inputs = [*where, centers, *cameras, wp.array(chosen, dtype=wp.int32), rgb, tolerance]
             wp.launch(_color_kernel, len(index), inputs, [mean, found])
             colors[index], seen[index] = mean.numpy(), found.numpy() > 0
     return (colors + 0.5).astype(np.uint8), seen
@@ -205,10 +205,6 @@ def _camera_arrays(views: Views) -> list[wp.array]:
 
 def _vectors(points: Array) -> wp.array:
     return wp.array(np.asarray(points, np.float32), dtype=wp.vec3)
-
-
-def _indices(chosen: NDArray[np.int64]) -> wp.array:
-    return wp.array(chosen, dtype=wp.int32)
 
 
 # ---- views of a group of points

@@ -27,9 +27,7 @@ class ColorField(RenderableField, Protocol):
     """A renderable field with a near box, such as `RadianceField`."""
 
     @property
-    def bounds(self) -> Array:
-        """Low and high corner of the near box [m], shape (2, 3)."""
-        ...
+    def bounds(self) -> Array: ...  # low and high corner of the near box [m], shape (2, 3)
 
 
 @dataclass(frozen=True)
@@ -80,8 +78,7 @@ def render_views(
     """
     chosen = cameras.select(select_spread_frames(cameras, count))
     size = (width, max(2, round(width * float(cameras.sizes[0, 1] / cameras.sizes[0, 0]))))
-    native = [(int(w), int(h)) for w, h in chosen.sizes]
-    intrinsics = np.stack([scaled_intrinsics(k, s, size) for k, s in zip(chosen.intrinsics, native, strict=True)])
+    intrinsics = scaled_intrinsics(chosen.intrinsics, chosen.sizes, size)
     rgb, depth = [], []
     with runtime.bar(what, len(chosen), "view") as bar:
         for start in range(0, len(chosen), _BATCH):
@@ -132,10 +129,9 @@ def surface_slant(depth: NDArray, intrinsics: Array, camera_to_world: Array) -> 
 
     A plane n · x = c seen along r = (x, y, 1) has inverse depth q = (n · r) / c, hence n ∝ (∂ₓ, ∂ᵧ, q − x ∂ₓ − y ∂ᵧ).
     """
-    n, height, width = depth.shape
-    slant = np.ones(depth.shape, np.float32)
-    upward = np.zeros(depth.shape, np.float32)
-    for i in range(n):
+    height, width = depth.shape[1:]
+    slant, upward = np.empty((2, *depth.shape), np.float32)
+    for i in range(len(depth)):
         inverse = 1.0 / np.where(depth[i] > 0, depth[i], np.nan)
         rays = unproject(pixel_grid(width, height), intrinsics[i])
         dv, du = np.gradient(inverse)
