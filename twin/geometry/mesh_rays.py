@@ -80,8 +80,9 @@ class Surface:
         return out.numpy().astype(np.float64)
 
 
-def _vectors(points: Array) -> wp.array:
-    return wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu")
+def _vectors(points: NDArray) -> wp.array:
+    # Single precision suffices, as scenes are some hundred meters wide.
+    return wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device="cpu")
 
 
 # ---- shadow map
@@ -175,15 +176,11 @@ class OrthographicShadowMap:
 
         If the unit normals (n, 3) of the surfaces at the points are given, slopes do not shadow themselves.
         """
-        right, upward = plane_axes(self.toward)
-        # Single precision suffices, as scenes are some hundred meters wide.
-        if normals is None:
-            normals = np.zeros(points.shape)
-        at: Any = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device="cpu")
-        facing: Any = wp.array(np.ascontiguousarray(normals, np.float32), dtype=wp.vec3, device="cpu")
+        facing = np.zeros(points.shape) if normals is None else normals
+        axes = (wp.vec3(*axis.tolist()) for axis in (*plane_axes(self.toward), self.toward))
+        where = [_vectors(points), _vectors(facing), *axes, wp.vec2(*self.origin.tolist())]
+        inputs = [self._height, *where, self.texel, BIAS, _RAMP]
         out = wp.empty(len(points), dtype=float, device="cpu")
-        axes = (wp.vec3(*axis.tolist()) for axis in (right, upward, self.toward))
-        inputs = [self._height, at, facing, *axes, wp.vec2(*self.origin.tolist()), self.texel, BIAS, _RAMP]
         wp.launch(_look_up, len(points), inputs=inputs, outputs=[out], device="cpu")
         return out.numpy()
 

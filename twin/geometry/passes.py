@@ -77,10 +77,8 @@ def find_passes(cameras: Cameras) -> list[FilmedPass]:
                 first = int(frames[0])
                 if _looks_back(cameras.camera_to_world[frames], path):
                     path = path[::-1]
-                source = cameras.sources[first]
-                found.append(
-                    FilmedPass(f"{source}:{number}", source, cameras.lightings[first], frames, path, ends_with)
-                )
+                source, lighting = cameras.sources[first], cameras.lightings[first]
+                found.append(FilmedPass(f"{source}:{number}", source, lighting, frames, path, ends_with))
     return found
 
 
@@ -140,13 +138,12 @@ def _between_retraces(
     # Frames are assigned to passes by their arc length along the path; frames of a turn belong to no pass.
     station = _frame_stations(positions[frames, :2], path)
     spacing = path_length(path) / (len(path) - 1)
-    starts = [0, *(start for _, start, _ in cuts)]
-    ends = [*(end for end, _, _ in cuts), len(path) - 1]
-    out = []
-    for start, end, kind in zip(starts, ends, [*(kind for *_, kind in cuts), ending], strict=True):
+    out, start = [], 0
+    for end, following, kind in [*cuts, (len(path) - 1, 0, ending)]:
         mine = frames[(station >= (start - 0.5) * spacing) & (station <= (end + 0.5) * spacing)]
         if end > start and len(mine):
             out.append((mine, path[start : end + 1], kind))
+        start = following
     return out
 
 

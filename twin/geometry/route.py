@@ -80,13 +80,11 @@ def filmed_route(cameras: Cameras, config: RouteConfig | None = None, table: str
 
 def route_metrics(route: Route) -> dict[str, object]:
     """All passes and the names of the chosen ones, as JSON."""
-    return {
-        "chosen": list(route.chosen),
-        "passes": [
-            {"name": one.name, "length_m": one.length, "frames": len(one.frames), "ends_with": one.ends_with}
-            for one in route.passes
-        ],
-    }
+    passes = [
+        {"name": one.name, "length_m": one.length, "frames": len(one.frames), "ends_with": one.ends_with}
+        for one in route.passes
+    ]
+    return {"chosen": list(route.chosen), "passes": passes}
 
 
 def _named(name: str, passes: list[FilmedPass], table: str) -> FilmedPass:
@@ -171,9 +169,7 @@ def _blended(line: Array, rest: Array) -> Array:
 
 def _through_points(points: tuple[tuple[float, ...], ...], passes: list[FilmedPass], table: str) -> Array:
     line = smooth_line(np.array(points, float))
-    off = (
-        np.min([distance_to_route(one.path, line) for one in passes], axis=0) if passes else np.full(len(line), np.inf)
-    )
+    off = np.min([np.full(len(line), np.inf), *(distance_to_route(one.path, line) for one in passes)], axis=0)
     worst = int(np.argmax(off))
     if off[worst] > _OFF_FILM:
         x, y = line[worst]
