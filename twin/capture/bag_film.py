@@ -133,14 +133,6 @@ class BagContents:
         return Film(self.path, FilmTiming(times, 0.0, self.recorded), partial(_decode, self))
 
 
-class _Rows:
-    """The numbers in a topic's messages, in compact arrays because there may be many messages."""
-
-    def __init__(self) -> None:
-        self.times = array("q")  # header and recording time [ns] of each message
-        self.values = array("d")
-
-
 def read_contents(path: Path, topic: str = "") -> BagContents:
     """Reads calibration, positions, extrinsics and stamps of the pictures in a bag; decodes only one picture.
 
@@ -156,7 +148,8 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
         where = f"{path}: {topics['pictures']}"
         picture: Any = None  # the first one that is not damaged
         problem: InputError | None = None
-        rows = {kind: _Rows() for kind in topics if kind in ("pictures", "fixes", "odometry")}
+        # Header and recording times [ns], and numbers; in compact arrays because there may be many messages.
+        rows = {kind: (array("q"), array("d")) for kind in ("pictures", "fixes", "odometry")}
         first: dict[str, Any] = {}
         transforms: dict[str, tuple[str, Array]] = {}
         kinds = {name: kind for kind, name in topics.items()}
@@ -172,26 +165,22 @@ def read_contents(path: Path, topic: str = "") -> BagContents:
                 except InputError as error:
                     problem = problem or error
             if kind in rows:
-                rows[kind].times.extend((header_time(message), recorded))
-                rows[kind].values.extend(_values(kind, message))
+                rows[kind][0].extend((header_time(message), recorded))
+                rows[kind][1].extend(_values(kind, message))
         recorded = messages_by_topic(bag.connections, (RAW, COMPRESSED))[topics["pictures"]]
         log_note = _log_note(bag.connections)
         others = tuple(name for name in picture_topics(bag.connections) if name != topics["pictures"])
-    if not rows["pictures"].times:
+    if not rows["pictures"][0]:
         raise InputError(f"{path}: no message on {topics['pictures']}; record it")
     if problem is not None and picture is None:
         raise problem
-    times = {
-        kind: message_times(np.array(one.times, np.int64).reshape(-1, 2), topics[kind], path)
-        for kind, one in rows.items()
-        if one.times
-    }
+    times = {kind: message_times(np.array(at, np.int64), topics.get(kind, ""), path) for kind, (at, _) in rows.items()}
     position, stamps = _ordered(times["pictures"], where)
     frame = str(first["pictures"].header.frame_id)
     lens, note = _lens(first.get("camera"), topics, frame, (width, height), path)
     camera_to_base = _pose_in_base(transforms, frame)
-    fix_times, fixes = _table(rows.get("fixes"), times.get("fixes"), 3)
-    pose_times, poses = _table(rows.get("odometry"), times.get("odometry"), 7)
+    fix_times, fixes = _table(times["fixes"], rows["fixes"][1], 3)
+    pose_times, poses = _table(times["odometry"], rows["odometry"][1], 7)
     arm = np.zeros(3) if camera_to_base is None else camera_to_base[:3, 3]
     encoding = getattr(picture, "encoding", None) or str(getattr(first["pictures"], "format", "")) or "compressed"
     return BagContents(
@@ -259,12 +248,10 @@ def _ordered(times: NDArray[np.int64], where: str) -> tuple[NDArray[np.int64], N
     return position, times[position]
 
 
-def _table(rows: _Rows | None, times: NDArray[np.int64] | None, width: int) -> tuple[NDArray[np.int64], Array]:
-    """Increasing times (n,) and values (n, width) of a topic's messages; n is 0 without a topic."""
-    if rows is None or times is None:
-        return np.zeros(0, np.int64), np.zeros((0, width))
+def _table(times: NDArray[np.int64], values: array, width: int) -> tuple[NDArray[np.int64], Array]:
+    """Increasing times (n,) and values (n, width) of a topic's messages."""
     times, index = np.unique(times, return_index=True)
-    return times, np.array(rows.values, np.float64).reshape(-1, width)[index]
+    return times, np.array(values, np.float64).reshape(-1, width)[index]
 
 
 def _interpolated(times: Array, first: int, knots: NDArray[np.int64], values: Array, max_gap: float) -> Array:
@@ -410,7 +397,7 @@ def _pose_in_base(transforms: dict[str, tuple[str, Array]], frame: str) -> Array
         if name not in transforms or name in seen:
             return None
         seen.add(name)
-        name, step = transforms[name][0], transforms[name][1]
+        name, step = transforms[name]
         pose = step @ pose
     if abs(pose[2, 2]) > abs(pose[2, 1]):  # z is vertical: x is forward and y left, unlike in optical frames
         pose[:3, :3] = pose[:3, :3] @ CAMERA_AHEAD
@@ -420,8 +407,7 @@ def _pose_in_base(transforms: dict[str, tuple[str, Array]], frame: str) -> Array
 def _seat(camera_to_base: Array | None, transforms: dict[str, tuple[str, Array]]) -> CameraSeat | None:
     if camera_to_base is None:
         return None
-    base_height = BASE_HEIGHT
-    known = False
+    base_height, known = BASE_HEIGHT, False
     for child, (parent, pose) in transforms.items():
         if _is_named(child, _GROUND) and _is_named(parent, _BASE):
             base_height, known = -float(pose[2, 3]), True

@@ -159,10 +159,6 @@ class SourceTask:
         """The segments of the source that are used, each [from, to] [s]; empty for the whole source."""
         return self.source.keep or self.config.keep
 
-    def given_lens(self, native: tuple[int, int]) -> Lens | None:
-        """The calibration in `scene.toml`, see `given_lens`."""
-        return given_lens(self.path, self.source, native)
-
     def info(self, size: tuple[int, int], lens: Lens | None, calibrated: bool) -> SourceInfo:
         """The `SourceInfo` for a frame size [px]; an unknown lens gets SIMPLE_RADIAL, which fits most cameras."""
         model, params = (lens.model, lens.params) if lens else ("SIMPLE_RADIAL", ())

@@ -37,8 +37,9 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     Raises InputError: an unreadable or impossible input, or fewer than two usable frames in all.
     """
     names = source_names([source.path for source in config.source])
-    lightings = [_lighting_name(source) for source in config.source]
-    for source in config.source:
+    lightings = [source.lighting or _source_name(source.path)[:MAX_NAME] for source in config.source]
+    for source, lighting in zip(config.source, lightings, strict=True):
+        check_lighting(lighting, f"{source.path}: lighting")
         _check_calibration(scene.root / source.path, source)
     kept = []
     for name, lighting, source in zip(names, lightings, config.source, strict=True):
@@ -135,12 +136,6 @@ def held_out_frames(count: int, every: int, source: int) -> NDArray[np.bool_]:
     return held_out
 
 
-def _lighting_name(source: SourceConfig) -> str:
-    lighting = source.lighting or _source_name(source.path)[:MAX_NAME]
-    check_lighting(lighting, f"{source.path}: lighting")
-    return lighting
-
-
 def _check_calibration(path: Path, source: SourceConfig) -> None:
     """Raises InputError if a calibration in `scene.toml` does not fit its film or folder of photos.
 
@@ -182,7 +177,7 @@ def _read_video(task: SourceTask, bag: BagContents | None) -> KeptFrames:
     """Reads a video file, or the film in a bag with its calibration and positions."""
     film = video_film(task.path) if bag is None else bag.film()
     if bag is not None:
-        task.given_lens(bag.size)
+        given_lens(task.path, task.source, bag.size)
     index: list[int] = []
     times: list[float] = []
     count, unmasked, size = FilmStatistics(), 0, (0, 0)
@@ -202,7 +197,7 @@ def _read_video(task: SourceTask, bag: BagContents | None) -> KeptFrames:
     for note in filter(None, (damage_note(task.path, count), format_note(task.path, count))):
         runtime.log_line(f"  {note}")
     task.check_masked(unmasked, len(index))
-    lens = task.given_lens(count.size)
+    lens = given_lens(task.path, task.source, count.size)
     if lens is None and bag is not None and bag.lens is not None:
         lens = bag.lens.scaled(*count.size)
     info = task.info(size, lens.scaled(*size) if lens else None, lens is not None)

@@ -153,27 +153,17 @@ def _ground_picture(part: Part, poses: Array, lighting: str, read_frame: FrameRe
     for k in chosen:
         center, forward = poses[k, :3, 3], poses[k, :2, 2]
         ahead = forward / max(float(np.linalg.norm(forward)), 1e-9)
-        corners = center[:2] + np.array(
-            [
-                [x * ahead[0] - y * ahead[1], x * ahead[1] + y * ahead[0]]
-                for x in (_NEAR, _FAR)
-                for y in (-_ASIDE, _ASIDE)
-            ]
-        )
+        left = np.array([-ahead[1], ahead[0]])
+        corners = center[:2] + np.array([x * ahead + y * left for x in (_NEAR, _FAR) for y in (-_ASIDE, _ASIDE)])
         c0, r0 = np.floor((corners.min(0) - low) / pixel).astype(int)
         c1, r1 = np.ceil((corners.max(0) - low) / pixel).astype(int)
         x, y = np.meshgrid(low[0] + (np.arange(c0, c1) + 0.5) * pixel, low[1] + (np.arange(r0, r1) + 0.5) * pixel)
         offset = np.stack([x - center[0], y - center[1]], -1)
-        along, aside = offset @ ahead, offset @ np.array([-ahead[1], ahead[0]])
+        along, aside = offset @ ahead, offset @ left
         window = slice(r0, r1), slice(c0, c1)
         rise = slopes[k] * along
-        take = (
-            (np.abs(rise) < _STEEPEST)
-            & (along > _NEAR)
-            & (along < _FAR)
-            & (np.abs(aside) < _ASIDE)
-            & (along < nearest[window])
-        )
+        take = (np.abs(rise) < _STEEPEST) & (np.abs(aside) < _ASIDE)
+        take &= (along > _NEAR) & (along < _FAR) & (along < nearest[window])
         ground = np.stack([x, y, center[2] - 1.0 + rise], -1)
         camera = part.cameras[k]
         pixels = np.full((*x.shape, 2), -1.0)
@@ -219,11 +209,8 @@ def _matches(a: _GroundPicture, b: _GroundPicture) -> tuple[Array, Array]:
     if descriptors_a is None or descriptors_b is None or min(len(xy_a), len(xy_b)) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    forth = {
-        m.queryIdx: m.trainIdx
-        for m, n in matcher.knnMatch(descriptors_a, descriptors_b, k=2)
-        if m.distance < _RATIO * n.distance
-    }
+    two = matcher.knnMatch(descriptors_a, descriptors_b, k=2)
+    forth = {best.queryIdx: best.trainIdx for best, second in two if best.distance < _RATIO * second.distance}
     back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(descriptors_b, descriptors_a, k=1)}
     mutual = np.array([(i, j) for i, j in forth.items() if back[j] == i], np.int64).reshape(-1, 2)
     return xy_a[mutual[:, 0]], xy_b[mutual[:, 1]]

@@ -202,12 +202,16 @@ class Mapper:
         return best
 
     def _attempts(self) -> Iterator[tuple[str, Callable[[], pycolmap.Reconstruction | None]]]:
+        matcher = self._matcher
         if self._kind in ("auto", "averaging"):
             yield "averaging", self._averaging
         if self._kind in ("auto", "global"):
-            yield "global", lambda: self._global(self._matcher.database)
+            yield "global", lambda: self._global(matcher.database)
             if far := self._loops():
-                yield "global, without loops", lambda: self._global(self._without(far))
+                yield (
+                    "global, without loops",
+                    lambda: self._global(matcher.copied_without(far, fresh_folder(self._work, "fewer_pairs"))),
+                )
         if self._kind in ("auto", "incremental"):
             yield "incremental", self._incremental
 
@@ -216,9 +220,6 @@ class Mapper:
         source = self._matcher.capture.source_index
         pairs = self._matcher.verified()
         return [(i, j) for i, j in pairs if source[i] == source[j] and abs(i - j) > SEQUENCE_STEPS[-1]]
-
-    def _without(self, pairs: list[Pair]) -> Path:
-        return self._matcher.copied_without(pairs, fresh_folder(self._work, "fewer_pairs"))
 
     def _averaging(self) -> pycolmap.Reconstruction | None:
         matcher = self._matcher

@@ -22,7 +22,7 @@ from PIL import ExifTags
 
 from twin import runtime
 from twin.capture.camera_models import Lens, same_aspect, undistorted
-from twin.capture.capture_data import QUEUE_SIZE, KeptFrames, SourceTask, read_mask
+from twin.capture.capture_data import NO_GPS, QUEUE_SIZE, KeptFrames, SourceTask, given_lens, read_mask
 from twin.capture.formats import ImageSet
 from twin.capture.video import BLANK_STD, fitted_size, in_segments
 from twin.errors import InputError
@@ -51,7 +51,7 @@ class PhotoExif:
 
 def read_exif(path: Path) -> PhotoExif:
     """Reads a photo's header; absent or malformed values count as unknown and raise no error."""
-    nothing = PhotoExif(None, (math.nan, math.nan, math.nan), None, 1)
+    nothing = PhotoExif(None, NO_GPS, None, 1)
     try:
         found = open_header(path)
         if found is None:
@@ -108,7 +108,7 @@ def _gps(gps: Any) -> tuple[float, float, float]:
     longitude = _degrees(gps.get(tag.GPSLongitude), gps.get(tag.GPSLongitudeRef), "W")
     # Cameras without a fix write zeros.
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0) or latitude == longitude == 0.0:
-        return math.nan, math.nan, math.nan
+        return NO_GPS
     altitude = _finite(gps.get(tag.GPSAltitude), math.nan)
     below = gps.get(tag.GPSAltitudeRef) in (1, b"\x01")
     return latitude, longitude, -altitude if below else altitude
@@ -159,7 +159,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
             f"  {task.path.name}: {images.missing_masks} masks are listed but do not exist; these images are used whole"
         )
     lenses = images.lenses
-    if lenses and (given := task.given_lens((lenses[0].width, lenses[0].height))):
+    if lenses and (given := given_lens(task.path, task.source, (lenses[0].width, lenses[0].height))):
         lenses = (given,) * len(lenses)
     # A source has one camera model, so images with different distortions are undistorted here.
     several = lenses is not None and len({(lens.model, lens.distortion) for lens in lenses}) > 1
@@ -223,7 +223,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
     intrinsics = [lens.intrinsics for lens in posed_lenses]
     if posed_lenses:
         info = task.info(size, posed_lenses[0].with_intrinsics(np.median(intrinsics, axis=0)), True)
-    elif known := task.given_lens(native):
+    elif known := given_lens(task.path, task.source, native):
         info = task.info(size, known.scaled(*size), True)
     else:
         info = task.info(size, _focal_prior(focals, size, task.name), False)

@@ -205,9 +205,8 @@ def solve_mapping(job: dict[str, Any], work: Path) -> None:
     pycolmap.set_random_seed(job["seed"])
     matcher = open_database(capture, stage, work, job["free_focal"], job["threads"], job["seed"])
     matcher.extract(job["features"], job["max_feature_size"])
-    summary = _new_summary()
+    summary = _new_summary() | {"stabilized": [], "checked_steps": 0, "contradicted_steps": []}
     shutters: dict[str, RollingShutter] = {}
-    summary["stabilized"], summary["checked_steps"], summary["contradicted_steps"] = [], 0, []
     if capture.camera_to_world is not None:
         summary["mapper"] = "given poses"
         solved = [(matcher, _triangulate(matcher, capture.camera_to_world, work))]
@@ -219,14 +218,14 @@ def solve_mapping(job: dict[str, Any], work: Path) -> None:
         found = check_poses(pairs, its_matcher.frame_of(), capture.source_index, frames, poses)
         summary["checked_steps"] += found.steps
         summary["contradicted_steps"] += [[capture.names[i], capture.names[j]] for i, j in found.contradicted]
-    if capture.camera_to_world is None:
-        for its_matcher, model in solved:
+        if capture.camera_to_world is None:
             corrected, stabilized = correct_model(model, its_matcher, Mapper(its_matcher, job, work).refine)
             shutters |= corrected
             summary["stabilized"] += stabilized
     results = [_arrays(model, its_matcher) for its_matcher, model in solved]
     order = np.argsort(np.concatenate([one["frames"] for one in results]))
-    lenses = [lens for its_matcher, model in solved for lens in _lenses(model, its_matcher)]
+    cameras = [camera for its_matcher, model in solved for camera in _cameras(model, its_matcher)]
+    lenses = [Lens(one.model.name, tuple(map(float, one.params)), one.width, one.height) for one in cameras]
     # The points of each model follow those of the models before it.
     first = np.cumsum([0, *(len(one["xyz"]) for one in results)])
     for one, offset in zip(results, first[:-1], strict=True):
@@ -266,11 +265,6 @@ def _cameras(model: pycolmap.Reconstruction, matcher: Matcher) -> list[pycolmap.
     """The camera of each registered frame."""
     ids = [model.images[int(matcher.image_ids[i])].camera_id for i in registered_poses(model, matcher)[0]]
     return [model.cameras[one] for one in ids]
-
-
-def _lenses(model: pycolmap.Reconstruction, matcher: Matcher) -> list[Lens]:
-    cameras = _cameras(model, matcher)
-    return [Lens(one.model.name, tuple(float(p) for p in one.params), one.width, one.height) for one in cameras]
 
 
 def _triangulate(matcher: Matcher, given: Array, work: Path) -> pycolmap.Reconstruction:
