@@ -49,10 +49,8 @@ _MAX_SPLITS = 5
 class ConvexPart:
     """A closed convex hull."""
 
-    vertices: Array
-    """Shape (v, 3) [m]."""
-    faces: NDArray[np.int64]
-    """Shape (f, 3), outward."""
+    vertices: Array  # shape (v, 3) [m]
+    faces: NDArray[np.int64]  # shape (f, 3), outward
 
     @staticmethod
     def hull(points: Array) -> "ConvexPart | None":
@@ -78,11 +76,9 @@ class SolidPiece:
 
     vertices: Array
     faces: NDArray[np.int64]
-    samples: Array
-    """Shape (s, 3)."""
+    samples: Array  # shape (s, 3)
     tree: cKDTree
-    inside: Callable[[Array], NDArray[np.bool_]]
-    """Maps points (k, 3) to a mask (k,) of those inside the mesh."""
+    inside: Callable[[Array], NDArray[np.bool_]]  # maps points (k, 3) to a mask (k,) of those inside the mesh
 
     @staticmethod
     def from_mesh(vertices: Array, faces: NDArray, inside: Callable[[Array], NDArray[np.bool_]]) -> "SolidPiece":
@@ -104,16 +100,11 @@ class Decomposition:
     """Convex parts of all pieces, and statistics."""
 
     parts: list[ConvexPart]
-    protrusion: Array
-    """Protrusion of each part [m], shape (n,)."""
-    uncovered: float
-    """Uncovered fraction of the surfaces of all pieces."""
-    failed: int
-    """Pieces on which CoACD crashed, timed out or left too much uncovered."""
-    split: int
-    """Parts that were split because they protruded too far."""
-    cached: int
-    """Pieces whose result was in the cache."""
+    protrusion: Array  # protrusion of each part [m], shape (n,)
+    uncovered: float  # uncovered fraction of the surfaces of all pieces
+    failed: int  # pieces on which CoACD crashed, timed out or left too much uncovered
+    split: int  # parts that were split because they protruded too far
+    cached: int  # pieces whose result was in the cache
 
 
 def decompose(pieces: list[SolidPiece], bound: float, cache: Path, seed: int) -> Decomposition:

@@ -23,8 +23,7 @@ from twin.files import atomic_path, read_bytes
 from twin.geometry.cameras import Cameras
 from twin.types import Array
 
-VIEWS, WIDTH = 60, 320
-"""Number of rendered views, and their width [px]."""
+VIEWS, WIDTH = 60, 320  # number of rendered views, and their width [px]
 FAR = 100.0  # [m] geometry at a larger depth becomes background
 _BACKGROUND = 150.0  # [m] distance of the background's splats
 _MIN_SKY, _MAX_SKY = 500, 50_000  # least and about the largest number of pixels in the fit of the sky's color
@@ -43,16 +42,11 @@ SH_CONSTANT = 0.28209479177387814  # spherical harmonic of degree 0, 1 / (2 âˆšÏ
 class Gaussians:
     """k disks, each with a normal along its z axis."""
 
-    positions: NDArray[np.float32]
-    """Centers [m], shape (k, 3)."""
-    rotations: NDArray[np.float32]
-    """Quaternions w, x, y, z, shape (k, 4)."""
-    scales: NDArray[np.float32]
-    """Standard deviations along the axes [m], shape (k, 3)."""
-    rgb: NDArray[np.float32]
-    """In [0, 1], shape (k, 3)."""
-    opacity: NDArray[np.float32]
-    """In (0, 1), shape (k,)."""
+    positions: NDArray[np.float32]  # centers [m], shape (k, 3)
+    rotations: NDArray[np.float32]  # quaternions w, x, y, z, shape (k, 4)
+    scales: NDArray[np.float32]  # standard deviations along the axes [m], shape (k, 3)
+    rgb: NDArray[np.float32]  # in [0, 1], shape (k, 3)
+    opacity: NDArray[np.float32]  # in (0, 1), shape (k,)
 
     def render_settings(self) -> dict[str, NDArray[np.float32]]:
         """Arguments for `mujoco_warp.create_render_context`, which then draws these splats."""

@@ -27,16 +27,11 @@ from twin.types import Array
 class Ground:
     """Heights z [m] on a regular grid; node (row, column) is at `origin + cell · (column, row)`."""
 
-    height: NDArray[np.float64]
-    """Shape (rows along y, columns along x) [m], without holes."""
-    origin: NDArray[np.float64]
-    """x, y of node (0, 0) [m], shape (2,)."""
-    cell: float
-    """Grid spacing [m]."""
-    measured: NDArray[np.bool_]
-    """False where the height is extrapolated, shape as `height`."""
-    rgb: NDArray[np.uint8]
-    """Mean color of the ground around each node, shape (rows, columns, 3)."""
+    height: NDArray[np.float64]  # shape (rows along y, columns along x) [m], without holes
+    origin: NDArray[np.float64]  # x, y of node (0, 0) [m], shape (2,)
+    cell: float  # grid spacing [m]
+    measured: NDArray[np.bool_]  # false where the height is extrapolated, shape as `height`
+    rgb: NDArray[np.uint8]  # mean color of the ground around each node, shape (rows, columns, 3)
 
     def at(self, xy: NDArray) -> NDArray[np.float64]:
         """Bilinear height [m] at points (..., 2), clamped to the edge."""
@@ -119,12 +114,9 @@ _MAX_DEPTH = 18.0  # [m] deeper pixels are not used: the ground there fills only
 class HeightData:
     """k height data."""
 
-    xyz: Array
-    """Shape (k, 3) [m]."""
-    sigma: Array
-    """Shape (k,) [m]."""
-    kind: NDArray[np.int8]
-    """Index into `DATA_KINDS`, shape (k,)."""
+    xyz: Array  # shape (k, 3) [m]
+    sigma: Array  # shape (k,) [m]
+    kind: NDArray[np.int8]  # index into `DATA_KINDS`, shape (k,)
 
     @staticmethod
     def empty() -> "HeightData":

@@ -153,11 +153,9 @@ def _surface_points(views: Views, ground: Ground, box: Array, far: float) -> Arr
 class _Fused:
     """Results of the fusion of all sections of a place."""
 
-    surface: tuple[Array, NDArray[np.int64]]
-    """Vertices (v, 3) [m] and faces (f, 3) of the zero level above the ground."""
+    surface: tuple[Array, NDArray[np.int64]]  # vertices (v, 3) [m] and faces (f, 3) of the zero level above the ground
     solid: solids.SolidVoxels
-    outvoted: int
-    """Number of voxels at which free votes removed a surface."""
+    outvoted: int  # number of voxels at which free votes removed a surface
 
 
 def _fuse_sections(

@@ -45,10 +45,8 @@ _CORRIDOR_SLACK = 0.02  # [m] added to the corridor's half width, against roundi
 class Corridor:
     """Free space along the route and its branches."""
 
-    lines: tuple[Array, ...]
-    """Polylines [m], each of shape (m, 2)."""
-    reach: float
-    """Half width of the corridor plus its margin [m]."""
+    lines: tuple[Array, ...]  # polylines [m], each of shape (m, 2)
+    reach: float  # half width of the corridor plus its margin [m]
 
     @property
     def points(self) -> Array:
@@ -64,12 +62,9 @@ class Corridor:
 class SolidVoxels:
     """Voxels of the solid and their neighbors. Voxel (i, j, k) is at corner + voxel · (i, j, k)."""
 
-    index: NDArray[np.int64]
-    """i, j, k in the lattice of the place, shape (n, 3)."""
-    field: NDArray[np.float32]
-    """Distance from the solid's surface [m], negative in it, shape (n,)."""
-    above: NDArray[np.float32]
-    """Height above the ground [m], shape (n,)."""
+    index: NDArray[np.int64]  # i, j, k in the lattice of the place, shape (n, 3)
+    field: NDArray[np.float32]  # distance from the solid's surface [m], negative in it, shape (n,)
+    above: NDArray[np.float32]  # height above the ground [m], shape (n,)
 
     @cached_property
     def key(self) -> NDArray[np.int64]:

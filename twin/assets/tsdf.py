@@ -246,10 +246,8 @@ def views_of_box(views: Views, low: Array, high: Array, reach: float) -> NDArray
 
 # ---- volumes
 
-BLOCK = 4
-"""[voxels] Side of the blocks that are fused or left out as a whole."""
-BAND_VOXELS = 2.0
-"""[voxels] Half width of the band around a surface."""
+BLOCK = 4  # [voxels] side of the blocks that are fused or left out as a whole
+BAND_VOXELS = 2.0  # [voxels] half width of the band around a surface
 _MAX_VOXELS = 40_000_000  # a place with more voxels is divided into sections
 _SECTION_SIDE = 256  # [voxels] side of a section, a multiple of `BLOCK`
 _FREE_MAJORITY = 0.75  # a surface is removed if a larger fraction of votes is `free`
@@ -263,16 +261,11 @@ class VolumeSection:
     the sections beside it.
     """
 
-    start: NDArray[np.int64]
-    """First voxel with frame, shape (3,)."""
-    shape: NDArray[np.int64]
-    """Number of voxels with frame, shape (3,)."""
-    low: NDArray[np.int64]
-    """First voxel without frame, shape (3,)."""
-    high: NDArray[np.int64]
-    """First voxel after the section without frame, shape (3,)."""
-    place: NDArray[np.int64]
-    """Number of voxels of the lattice, shape (3,)."""
+    start: NDArray[np.int64]  # first voxel with frame, shape (3,)
+    shape: NDArray[np.int64]  # number of voxels with frame, shape (3,)
+    low: NDArray[np.int64]  # first voxel without frame, shape (3,)
+    high: NDArray[np.int64]  # first voxel after the section without frame, shape (3,)
+    place: NDArray[np.int64]  # number of voxels of the lattice, shape (3,)
 
     @property
     def inner(self) -> tuple[slice, slice, slice]:
@@ -316,15 +309,11 @@ class Volume:
 
     distance: NDArray[np.float32]
     """Signed distances [m], shape (x, y, z); NaN where no surface is near or no view votes."""
-    hidden: NDArray[np.bool_]
-    """Mask of the voxels near a surface that got no votes; they may be solid."""
-    origin: Array
-    """Position of voxel (0, 0, 0) [m], shape (3,)."""
-    voxel: float
-    """Grid spacing [m]."""
+    hidden: NDArray[np.bool_]  # mask of the voxels near a surface that got no votes; they may be solid
+    origin: Array  # position of voxel (0, 0, 0) [m], shape (3,)
+    voxel: float  # grid spacing [m]
     section: VolumeSection
-    outvoted: int
-    """Number of voxels of the section without frame at which free votes removed a surface."""
+    outvoted: int  # number of voxels of the section without frame at which free votes removed a surface
 
 
 def fuse_volume(hits: Array, views: Views, corner: Array, voxel: float, section: VolumeSection, far: float) -> Volume:

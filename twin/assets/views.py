@@ -34,18 +34,13 @@ class ColorField(RenderableField, Protocol):
 class Views:
     """n rendered views of one size."""
 
-    camera_to_world: Array
-    """Shape (n, 4, 4)."""
-    intrinsics: Array
-    """fx, fy, cx, cy [px] at the rendered size, shape (n, 4)."""
-    rgb: NDArray[np.uint8]
-    """Shape (n, h, w, 3)."""
+    camera_to_world: Array  # shape (n, 4, 4)
+    intrinsics: Array  # fx, fy, cx, cy [px] at the rendered size, shape (n, 4)
+    rgb: NDArray[np.uint8]  # shape (n, h, w, 3)
     depth: NDArray[np.float32]
     """z-depth [m], shape (n, h, w); 0 where unreliable. The background has a larger depth than any surface."""
-    slant: NDArray[np.float32]
-    """Slant of each pixel, shape (n, h, w), at least `_MIN_SLANT`."""
-    upward: NDArray[np.float32]
-    """z components (n, h, w) of the unit surface normals that point toward the lens."""
+    slant: NDArray[np.float32]  # slant of each pixel, shape (n, h, w), at least `_MIN_SLANT`
+    upward: NDArray[np.float32]  # z components (n, h, w) of the unit surface normals that point toward the lens
 
     def __len__(self) -> int:
         return len(self.depth)

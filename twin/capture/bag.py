@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from twin_policy import CompressedPicture, RawPicture
 
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
-METADATA = "metadata.yaml"
-"""The file by which a folder is recognized as a ROS 2 bag."""
+METADATA = "metadata.yaml"  # the file by which a folder is recognized as a ROS 2 bag
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, FIX = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/NavSatFix"
 ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
@@ -49,8 +48,7 @@ TYPES = {
     "wheels": ("sensor_msgs/msg/JointState",),
     "poses": (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"),
     "imu": ("sensor_msgs/msg/Imu",),
-}
-"""Message types of each kind of topic."""
+}  # message types of each kind of topic
 FROM_WHEELS = ("platform", "wheel", "velocity_controller")
 """A topic with one of these words in its name is taken for odometry computed from the wheels."""
 MIN_POSES = 10

@@ -61,18 +61,13 @@ _MAX_PIXELS = 1 << 28  # [px] largest accepted size of a compressed picture
 class CameraSeat:
     """A camera's extrinsics: its pose on the robot."""
 
-    height: float
-    """Height of the lens above flat ground [m]."""
+    height: float  # height of the lens above flat ground [m]
     ground_known: bool
     """False if the bag has no `base_footprint`; `base_link` is then assumed to be as high as on a Husky."""
-    offset: tuple[float, float]
-    """Distance of the lens forward and to the left of `base_link` [m]."""
-    yaw: float
-    """Angle of the viewing direction to the left of straight ahead [°]."""
-    pitch: float
-    """Angle of the viewing direction below the horizontal [°]."""
-    roll: float
-    """Angle by which the camera leans to its right [°]."""
+    offset: tuple[float, float]  # distance of the lens forward and to the left of `base_link` [m]
+    yaw: float  # angle of the viewing direction to the left of straight ahead [°]
+    pitch: float  # angle of the viewing direction below the horizontal [°]
+    roll: float  # angle by which the camera leans to its right [°]
 
 
 @dataclass(frozen=True)
@@ -82,32 +77,20 @@ class BagContents:
     path: Path
     topics: dict[str, str]
     """Content → topic. The contents are pictures and, if the bag has them, camera, fixes, odometry and transforms."""
-    other_pictures: tuple[str, ...]
-    """Other topics with pictures, which are not used."""
+    other_pictures: tuple[str, ...]  # other topics with pictures, which are not used
     encoding: str
-    size: tuple[int, int]
-    """Width, height of the first undamaged picture [px]."""
-    recorded: int
-    """Number of pictures according to the bag's index."""
-    stamps: NDArray[np.int64]
-    """Stamps of the pictures that are used, increasing [ns], shape (n,)."""
-    position: NDArray[np.int64]
-    """Positions of these pictures among the topic's messages, shape (n,)."""
-    lens: Lens | None
-    """The calibrated lens; None without a usable calibration."""
-    lens_note: str
-    """Source of the calibration, or the reason why it is missing."""
-    fix_times: NDArray[np.int64]
-    """Times of the fixes [ns], increasing, shape (f,)."""
-    fixes: Array
-    """Latitude [°], longitude [°], altitude [m], shape (f, 3); NaN without a fix."""
-    odometry_times: NDArray[np.int64]
-    """Times of the odometry [ns], increasing, shape (p,)."""
-    odometry: Array
-    """Positions of the lens [m], shape (p, 3)."""
+    size: tuple[int, int]  # width, height of the first undamaged picture [px]
+    recorded: int  # number of pictures according to the bag's index
+    stamps: NDArray[np.int64]  # stamps of the pictures that are used, increasing [ns], shape (n,)
+    position: NDArray[np.int64]  # positions of these pictures among the topic's messages, shape (n,)
+    lens: Lens | None  # the calibrated lens; None without a usable calibration
+    lens_note: str  # source of the calibration, or the reason why it is missing
+    fix_times: NDArray[np.int64]  # times of the fixes [ns], increasing, shape (f,)
+    fixes: Array  # latitude [°], longitude [°], altitude [m], shape (f, 3); NaN without a fix
+    odometry_times: NDArray[np.int64]  # times of the odometry [ns], increasing, shape (p,)
+    odometry: Array  # positions of the lens [m], shape (p, 3)
     seat: CameraSeat | None
-    log_note: str
-    """Topics by which the bag is a log for `twin align`, or those that it lacks."""
+    log_note: str  # topics by which the bag is a log for `twin align`, or those that it lacks
 
     @property
     def duration(self) -> float:

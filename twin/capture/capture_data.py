@@ -33,8 +33,7 @@ _ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "camera_to_world": ((4, 4), "f"),
     "intrinsics": ((4,), "f"),
     "odometry": ((3,), "f"),
-}
-"""Arrays of `Capture` that are stored: name → (shape per frame, `dtype.kind`)."""
+}  # arrays of `Capture` that are stored: name → (shape per frame, `dtype.kind`)
 
 
 def nearest_longitudes(longitude: Array, to: float = 0.0) -> Array:

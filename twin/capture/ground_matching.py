@@ -48,30 +48,21 @@ FrameReader = Callable[[int], tuple[NDArray[np.uint8], NDArray[np.uint8] | None]
 class Part:
     """A reconstruction of n frames."""
 
-    frames: NDArray[np.int64]
-    """Indices of the frames in the capture, shape (n,)."""
-    camera_to_world: Array
-    """Poses in the reconstruction's frame and unit, shape (n, 4, 4)."""
-    points: Array
-    """Sparse points, shape (m, 3)."""
-    cameras: list[pycolmap.Camera]
-    """Camera of each frame, with distortion."""
-    lightings: list[str]
-    """Lighting of each frame."""
+    frames: NDArray[np.int64]  # indices of the frames in the capture, shape (n,)
+    camera_to_world: Array  # poses in the reconstruction's frame and unit, shape (n, 4, 4)
+    points: Array  # sparse points, shape (m, 3)
+    cameras: list[pycolmap.Camera]  # camera of each frame, with distortion
+    lightings: list[str]  # lighting of each frame
 
 
 @dataclass(frozen=True)
 class _GroundPicture:
     """Map of the ground of the frames of one lighting."""
 
-    gray: NDArray[np.uint8]
-    """Shape (rows, columns); x grows with the column and y with the row."""
-    owner: NDArray[np.int32]
-    """Frame of each pixel, as an index into the part's frames; −1: not seen."""
-    origin: Array
-    """x, y of the corner of the first pixel, shape (2,)."""
-    pixel: float
-    """Side of a pixel."""
+    gray: NDArray[np.uint8]  # shape (rows, columns); x grows with the column and y with the row
+    owner: NDArray[np.int32]  # frame of each pixel, as an index into the part's frames; −1: not seen
+    origin: Array  # x, y of the corner of the first pixel, shape (2,)
+    pixel: float  # side of a pixel
 
 
 def join(a: Part, b: Part, read_frame: FrameReader) -> Similarity | None:

@@ -23,8 +23,7 @@ import numpy as np
 
 from twin.types import Array32, Image
 
-HLG, PQ = 18, 16
-"""Transfer characteristics of HDR films (ITU-T H.273)."""
+HLG, PQ = 18, 16  # transfer characteristics of HDR films (ITU-T H.273)
 HDR_NAMES = {HLG: "HLG", PQ: "PQ"}
 
 _WHITE = 203.0  # [cd/m²] diffuse white

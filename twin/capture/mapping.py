@@ -30,8 +30,7 @@ from twin.geometry.passes import path_outliers
 from twin.geometry.poses import inverse_pose, umeyama
 from twin.types import Array
 
-MIN_FRAMES = 3
-"""Least number of frames of a reconstruction."""
+MIN_FRAMES = 3  # least number of frames of a reconstruction
 _NEAR_STEPS = 3.0  # [median steps between frames] largest distance between the two cameras of a near pair
 _NEAR_PAIRS = 4  # largest number of near pairs per frame
 # The reconstruction is repeated if more near pairs are verified than this fraction of the pairs verified before.

@@ -84,8 +84,7 @@ class PairGeometry:
     agreeing: float  # fraction of all matches that agree with the pose
 
 
-_Job = tuple[PairMatches, Array | None, int]
-"""Matches of a pair, COLMAP's rotation if it found one, and a seed."""
+_Job = tuple[PairMatches, Array | None, int]  # matches of a pair, COLMAP's rotation if it found one, and a seed
 
 
 def pair_geometries(

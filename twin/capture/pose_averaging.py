@@ -315,10 +315,8 @@ _MAX_DEPTH = 30.0
 class PoseCheck:
     """Steps of films that pairs of frames support or contradict."""
 
-    steps: int
-    """Number of steps that were checked."""
-    contradicted: list[tuple[int, int]]
-    """Both frames of each step that most pairs contradict."""
+    steps: int  # number of steps that were checked
+    contradicted: list[tuple[int, int]]  # both frames of each step that most pairs contradict
 
 
 def near_in_film(film: NDArray[np.int64], frames: NDArray[np.int64]) -> set[Pair]:

@@ -57,8 +57,7 @@ Effect = Literal["zoom", "rows", "columns", "shift"]
 class RollingShutter:
     """The rolling shutter of one film."""
 
-    axis: int
-    """Pixel coordinate across the lines: 1 if lines are rows, 0 if they are columns."""
+    axis: int  # pixel coordinate across the lines: 1 if lines are rows, 0 if they are columns
     skews: dict[int, Array]
     """Skew of each frame [rad], shape (3,), by the frame's index in the capture; none if it has too few points."""
 

@@ -25,8 +25,7 @@ _CAMERA_ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "sizes": ((2,), "i"),
     "times": ((), "f"),
     "held_out": ((), "b"),
-}
-"""Arrays of `Cameras` that are stored: name → (shape per frame, `dtype.kind`)."""
+}  # arrays of `Cameras` that are stored: name → (shape per frame, `dtype.kind`)
 
 
 def opencv_to_mujoco(camera_to_world: Array) -> Array:
@@ -246,20 +245,17 @@ class SparsePoints:
 
 # ---- renderings
 
-FAR = 1.0e4
-"""z-depth of the background [m]."""
+FAR = 1.0e4  # z-depth of the background [m]
 
 
 @dataclass(frozen=True)
 class Rendering:
     """n rendered views of one size."""
 
-    rgb: NDArray[np.float32]
-    """Color in [0, 1], shape (n, height, width, 3)."""
+    rgb: NDArray[np.float32]  # color in [0, 1], shape (n, height, width, 3)
     depth: NDArray[np.float32]
     """z-depth [m] at which half the light is blocked, `FAR` where less is blocked; shape (n, height, width)."""
-    opacity: NDArray[np.float32]
-    """Share of the light that is blocked, in [0, 1], shape (n, height, width)."""
+    opacity: NDArray[np.float32]  # share of the light that is blocked, in [0, 1], shape (n, height, width)
 
 
 class RenderableField(Protocol):

@@ -21,11 +21,9 @@ MAX_PIXELS = 2 * 89_478_485  # largest number of pixels accepted; Pillow rejects
 DECODE_ERRORS = (
     *(ArithmeticError, AttributeError, EOFError, LookupError, OSError, SyntaxError, TypeError, ValueError),
     *(AssertionError, MemoryError, NotImplementedError, RuntimeError, struct.error, zlib.error, cv2.error),
-)
-"""Exceptions that Pillow and OpenCV raise for damaged files."""
+)  # exceptions that Pillow and OpenCV raise for damaged files
 _MAX_BYTES = 2 << 30  # largest image file [bytes]
-HEIF_SUFFIXES = (".heic", ".heif")
-"""Suffixes of photos from phones; reading them needs the extra `heif`."""
+HEIF_SUFFIXES = (".heic", ".heif")  # suffixes of photos from phones; reading them needs the extra `heif`
 _HEIF = "HEIF"  # Pillow's name of HEIF and HEIC
 _CURE = "replace or remove it"
 warnings.filterwarnings("ignore", category=PillowImage.DecompressionBombWarning)  # Pillow warns from MAX_PIXELS / 2 on
@@ -143,8 +141,7 @@ def resize(image: NDArray, width: int, height: int) -> NDArray:
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
 
 
-SSIM_WINDOW = 11
-"""Side of the windows of `ssim` [px], and least side of its images."""
+SSIM_WINDOW = 11  # side of the windows of `ssim` [px], and least side of its images
 
 
 def psnr(image: NDArray, reference: NDArray, mask: NDArray | None = None) -> float:

@@ -87,12 +87,9 @@ def _vectors(points: NDArray) -> wp.array:
 
 # ---- shadow map
 
-TEXEL = 0.15
-"""[m] side of a texel."""
-BIAS = 0.3
-"""[m] height by which the map must exceed a point for a shadow: the error of a radiance field's surfaces."""
-ROUGH_BIAS = 0.5
-"""[m] additional bias of rough surfaces, see `ShadowCasters`."""
+TEXEL = 0.15  # [m] side of a texel
+BIAS = 0.3  # [m] height by which the map must exceed a point for a shadow: the error of a radiance field's surfaces
+ROUGH_BIAS = 0.5  # [m] additional bias of rough surfaces, see `ShadowCasters`
 _RAMP = 0.2  # [m] height above the bias over which the shadow becomes full
 _LEAST_COSINE = wp.constant(0.1)  # lower bound of the cosine of incidence when a slope is computed
 _MAX_SIDE = 4096  # [texels] longest side of a map; larger places get larger texels
@@ -157,14 +154,10 @@ def _look_up(
 class OrthographicShadowMap:
     """Height map of a place seen from the sun."""
 
-    toward: Array
-    """Unit vector towards the sun, shape (3,)."""
-    origin: Array
-    """Coordinates of the center of the first texel along `right` and `upward` [m], shape (2,)."""
-    texel: float
-    """Side of a texel [m]."""
-    height: Array32
-    """Largest coordinate along `toward` in each texel [m], −inf where nothing is; shape (rows, columns)."""
+    toward: Array  # unit vector towards the sun, shape (3,)
+    origin: Array  # coordinates of the center of the first texel along `right` and `upward` [m], shape (2,)
+    texel: float  # side of a texel [m]
+    height: Array32  # largest coordinate along `toward` in each texel [m], −inf where nothing is; shape (rows, columns)
 
     @cached_property
     def _height(self) -> Any:

@@ -48,16 +48,12 @@ _MAX_TURN = np.radians(5.0)  # [rad] smaller deviations from the predicted direc
 class FilmedPass:
     """One pass of one source."""
 
-    name: str
-    """`<source>:<number>`, numbered from 1 in order of time."""
+    name: str  # `<source>:<number>`, numbered from 1 in order of time
     source: str
     lighting: str
-    frames: NDArray[np.int64]
-    """Indices into the cameras, in order of time."""
-    path: Array
-    """Points `SPACING` apart, shape (m, 2) [m]; reversed in time if the camera looked backward."""
-    ends_with: str
-    """Reason why the pass ends: `end` (of the film), `jump`, `turn` or `lap`."""
+    frames: NDArray[np.int64]  # indices into the cameras, in order of time
+    path: Array  # points `SPACING` apart, shape (m, 2) [m]; reversed in time if the camera looked backward
+    ends_with: str  # reason why the pass ends: `end` (of the film), `jump`, `turn` or `lap`
 
     @property
     def length(self) -> float:

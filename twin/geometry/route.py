@@ -18,8 +18,7 @@ from twin.geometry.cameras import Cameras
 from twin.geometry.passes import SPACING, FilmedPass, find_passes, path_directions, path_length, resample, smooth_line
 from twin.types import Array
 
-BRANCH = "branch."
-"""Prefix of the branches' names in `route.npz`, the file of the route."""
+BRANCH = "branch."  # prefix of the branches' names in `route.npz`, the file of the route
 _MIN_LENGTH = 2.0  # [m] least length of a route
 _AS_LONG = 0.98  # lines longer than this fraction of the longest count as equally long, so that noise does not decide
 _ASIDE = 0.6  # [m] largest lateral offset between a pass and its continuation; the joined line runs midway
@@ -36,12 +35,9 @@ _OFF_FILM = 1.0  # [m] largest distance of a line through way points from the fi
 class Route:
     """A drivable line and the passes that it was chosen from."""
 
-    line: Array
-    """Points about 0.25 m apart in driving order, shape (m, 2) [m]."""
-    chosen: tuple[str, ...]
-    """Names of these passes in driving order; empty if way points were given."""
-    passes: tuple[FilmedPass, ...]
-    """All filmed passes, chosen or not."""
+    line: Array  # points about 0.25 m apart in driving order, shape (m, 2) [m]
+    chosen: tuple[str, ...]  # names of these passes in driving order; empty if way points were given
+    passes: tuple[FilmedPass, ...]  # all filmed passes, chosen or not
 
 
 def filmed_branches(cameras: Cameras, branches: tuple[BranchConfig, ...]) -> dict[str, Array]:
