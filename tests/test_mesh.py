@@ -101,17 +101,16 @@ def test_poles_are_parts_and_visible_but_never_in_the_corridor(made, tmp_path):
 
 
 def test_sections_give_the_surface_and_the_solid_of_one(stood, monkeypatch):
-    one = mesh._fuse_sections(*stood, SETTINGS)
+    (whole_vertices, whole_faces), whole, outvoted = mesh._fuse_sections(*stood, SETTINGS)
     monkeypatch.setattr(tsdf, "_MAX_VOXELS", 1000)
     monkeypatch.setattr(tsdf, "_SECTION_SIDE", 32)
     fuse, fused = tsdf.fuse_volume, []
     monkeypatch.setattr(tsdf, "fuse_volume", lambda *given: fused.append(fuse(*given)) or fused[-1])
-    many = mesh._fuse_sections(*stood, SETTINGS)
+    (vertices, faces), joined, outvoted_in_sections = mesh._fuse_sections(*stood, SETTINGS)
     assert len(fused) > 4 and max(volume.distance.size for volume in fused) < 600_000
     for name in ("index", "field", "above"):
-        np.testing.assert_array_equal(getattr(many.solid, name), getattr(one.solid, name))
-    assert many.outvoted == one.outvoted
-    (vertices, faces), (whole_vertices, whole_faces) = many.surface, one.surface
+        np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name))
+    assert outvoted_in_sections == outvoted
     assert len(vertices) == len(whole_vertices) and len(faces) == len(whole_faces)
     assert cKDTree(vertices).query(whole_vertices)[0].max() < 1e-5
     np.testing.assert_array_equal(np.bincount(_edges(faces)), np.bincount(_edges(whole_faces)))  # no cracks
@@ -123,7 +122,7 @@ def test_pieces_do_not_end_at_borders_of_sections(stood, monkeypatch):
     for most in (tsdf._MAX_VOXELS, 1000):
         monkeypatch.setattr(tsdf, "_MAX_VOXELS", most)
         monkeypatch.setattr(tsdf, "_SECTION_SIDE", 32)
-        solid = mesh._fuse_sections(views, ground, corridor, path, box, SETTINGS).solid
+        solid = mesh._fuse_sections(views, ground, corridor, path, box, SETTINGS)[1]
         found.append(solid_pieces(solid, box[0], SETTINGS.voxel, path, SETTINGS))
     assert found[0][1] == found[1][1] and len(found[0][0]) == len(found[1][0]) > 2
     for a, b in zip(found[0][0], found[1][0], strict=True):

@@ -119,6 +119,7 @@ def require_spz() -> Any:
 
 _TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1"}
 _TYPES |= {"int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "short": "<i2", "ushort": "<u2", "char": "i1"}
+_COLUMNS = ("x y z", "opacity", "f_dc_0 f_dc_1 f_dc_2", "scale_0 scale_1 scale_2", "rot_0 rot_1 rot_2 rot_3")
 _MAX_HEAD = 1 << 16  # [bytes]
 _MAX_PLY = 4 << 30  # [bytes]
 _MAX_COORDINATE = 1e6  # [m]
@@ -151,8 +152,7 @@ def read_ply(path: Path) -> Gaussians:
             if len(line) != 3 or line[1] not in _TYPES:
                 raise InputError(f"{path}: property {' '.join(line[1:])!r} is unknown; {cure}")
             names.append((line[2], _TYPES[line[1]]))
-    wanted = ["x", "y", "z", "opacity", *(f"{kind}_{c}" for kind, n in _COLUMNS.items() for c in range(n))]
-    missing = [name for name in wanted if name not in dict(names)]
+    missing = [name for name in " ".join(_COLUMNS).split() if name not in dict(names)]
     if missing or len(dict(names)) < len(names):
         what = f"lacks {missing}" if missing else "has two properties of the same name"
         raise InputError(f"{path} {what}; {cure}")
@@ -161,24 +161,19 @@ def read_ply(path: Path) -> Gaussians:
     if len(content) - start < count * row.itemsize:
         raise InputError(f"{path} is cut off: its head announces {count} splats of {row.itemsize} bytes; copy it again")
     rows = np.frombuffer(content, row, count, start)
-
-    def columns(*of: str) -> NDArray[np.float32]:
-        return np.stack([rows[name] for name in of], -1).astype(np.float32)
-
     with np.errstate(over="ignore", invalid="ignore"):
-        position, rotation = columns("x", "y", "z"), columns(*(f"rot_{c}" for c in range(4)))
+        position, logit_opacity, harmonic, log_scale, rotation = (
+            np.stack([rows[name] for name in column.split()], -1).astype(np.float32) for column in _COLUMNS
+        )
         length = np.linalg.norm(rotation, axis=1, keepdims=True)
-        scale = np.exp(columns(*(f"scale_{c}" for c in range(3))))
-        rgb = np.clip(columns(*(f"f_dc_{c}" for c in range(3))) * np.float32(SH_CONSTANT) + np.float32(0.5), 0.0, 1.0)
-        opacity = 1.0 / (1.0 + np.exp(-columns("opacity")[:, 0]))
+        scale = np.exp(log_scale)
+        rgb = np.clip(harmonic * np.float32(SH_CONSTANT) + np.float32(0.5), 0.0, 1.0)
+        opacity = 1.0 / (1.0 + np.exp(-logit_opacity[:, 0]))
     sound = (np.abs(position) < _MAX_COORDINATE).all(1) & (scale < _MAX_COORDINATE).all(1) & (length[:, 0] > 1e-6)
     sound &= np.isfinite(rgb).all(1) & np.isfinite(opacity) & np.isfinite(rotation).all(1)
     if not sound.any():
         raise InputError(f"{path} has no splat whose numbers are finite; {cure}")
     return Gaussians(*(a[sound] for a in (position, rotation / np.maximum(length, 1e-6), scale, rgb, opacity)))
-
-
-_COLUMNS = {"f_dc": 3, "scale": 3, "rot": 4}
 
 
 def views_by_lighting(field: ColorField, cameras: Cameras, lightings: Sequence[str]) -> dict[str, Views]:

@@ -4,6 +4,7 @@ A height datum is a height z ± σ measured at (x, y). There are three kinds: `f
 surfaces), `points` (from structure from motion) and `path` (camera centers lowered by the camera height).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -119,12 +120,9 @@ class HeightData:
     kind: NDArray[np.int8]  # index into `DATA_KINDS`, shape (k,)
 
     @staticmethod
-    def empty() -> "HeightData":
-        return HeightData(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int8))
-
-    @staticmethod
-    def join(parts: list["HeightData"]) -> "HeightData":
-        return HeightData(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("xyz", "sigma", "kind")))
+    def join(parts: Sequence["HeightData"]) -> "HeightData":
+        every = (HeightData(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int8)), *parts)
+        return HeightData(*(np.concatenate([getattr(p, name) for p in every]) for name in ("xyz", "sigma", "kind")))
 
 
 def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData:
@@ -133,7 +131,7 @@ def cell_medians(xyz: Array, sigma: Array, cell: float, kind: int) -> HeightData
     Its σ is (1 + 1/n) times the smallest σ of the points: it is never smaller, since errors of neighbors correlate.
     """
     if len(xyz) == 0:
-        return HeightData.empty()
+        return HeightData.join([])
     key = np.floor(xyz[:, :2] / cell).astype(np.int64)
     key -= key.min(0)
     flat = key[:, 0] * (key[:, 1].max() + 1) + key[:, 1]
@@ -190,7 +188,7 @@ def _path_data(
         metrics[cameras.sources[index[0]]] = own
         if len(index) >= 2:
             parts.append(_path_strip(np.column_stack([position[:, :2], z]), sigma))
-    return (HeightData.join(parts) if parts else HeightData.empty()), metrics
+    return HeightData.join(parts), metrics
 
 
 def _path_strip(xyz: Array, sigma: float) -> HeightData:
@@ -391,7 +389,7 @@ def build_ground(
     """
     low, high = box
     coarse = HeightGrid.covering(low, high, _COARSE_CELL, _COARSE_NODES, line, config.margin + _BESIDE_LINE)
-    path, path_metrics = _path_data(cameras, None, height) if height is not None else (HeightData.empty(), {})
+    path, path_metrics = _path_data(cameras, None, height) if height is not None else (HeightData.join([]), {})
     level = fit_height(path, coarse, iterations=1)[0] if len(path.xyz) else np.zeros((coarse.rows, coarse.columns))
     tree = cKDTree(path.xyz[:, :2]) if len(path.xyz) else None
     field, pixels, colors = _field_data(views)

@@ -10,7 +10,7 @@ the solids, decomposes the solids into convex parts, and clears the corridor (`s
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -101,14 +101,14 @@ def build_assets(
     poles = replace(poles, height=np.minimum(poles.height, _MAX_POLE))
     inside = (poles.foot[:, :2] > box[0, :2]) & (poles.foot[:, :2] < box[1, :2])
     posts = solids.pole_parts(poles.select(np.flatnonzero(inside.all(1))), corridor, ground)
-    fused = _fuse_sections(views, ground, corridor, path, box, settings)
+    surface, solid, outvoted = _fuse_sections(views, ground, corridor, path, box, settings)
     clock.append(("fuse", time.perf_counter()))
     visual, visual_metrics = _visual_mesh(
-        fused, posts, views, ground, settings.voxel, FREE_SPACE_REACH * far, round(share * _VISUAL_FACES)
+        *surface, posts, views, ground, settings.voxel, FREE_SPACE_REACH * far, round(share * _VISUAL_FACES)
     )
     np.savez(out / "visual.npz", **visual)  # type: ignore[arg-type]
     clock.append(("surface", time.perf_counter()))
-    pieces, left_out = solids.solid_pieces(fused.solid, box[0], settings.voxel, path, settings)
+    pieces, left_out = solids.solid_pieces(solid, box[0], settings.voxel, path, settings)
     clock.append(("solids", time.perf_counter()))
     part_metrics = _save_parts(pieces, posts, corridor, ground, config, round(share * settings.max_parts), out, cache)
     clock.append(("convex", time.perf_counter()))
@@ -120,7 +120,7 @@ def build_assets(
         "views": len(views),
         "voxel_m": settings.voxel,
         "floaters": {
-            "voxels_seen_through": fused.outvoted,
+            "voxels_seen_through": outvoted,
             "surface_pieces": visual_metrics["floaters_removed"],
             "solid_specks": left_out["specks"],
         },
@@ -149,19 +149,14 @@ def _surface_points(views: Views, ground: Ground, box: Array, far: float) -> Arr
     return np.concatenate(hits)
 
 
-@dataclass(frozen=True)
-class _Fused:
-    """Results of the fusion of all sections of a place."""
-
-    surface: tuple[Array, NDArray[np.int64]]  # vertices (v, 3) [m] and faces (f, 3) of the zero level above the ground
-    solid: solids.SolidVoxels
-    outvoted: int  # number of voxels at which free votes removed a surface
-
-
 def _fuse_sections(
     views: Views, ground: Ground, corridor: solids.Corridor | None, path: Array, box: Array, settings: MeshConfig
-) -> _Fused:
-    """Fuses the views in one section of the place after the other, since a long road would not fit into memory."""
+) -> tuple[tuple[Array, NDArray[np.int64]], solids.SolidVoxels, int]:
+    """Fuses the views in one section of the place after the other, since a long road would not fit into memory.
+
+    Returns vertices (v, 3) [m] and faces (f, 3) of the zero level above the ground; the solid; and the number of voxels
+    at which free votes removed a surface.
+    """
     voxel, far = settings.voxel, _far(settings)
 
     def heights(low: Array, high: Array) -> tuple[float, float]:
@@ -183,7 +178,7 @@ def _fuse_sections(
         surfaces.append(tsdf.compact(vertices, faces[above[faces].any(1)]))
         solid.append(solids.solid_voxels(volume, ground, corridor, path, settings))
         outvoted += volume.outvoted
-    return _Fused(tsdf.join_surfaces(surfaces, box[0], voxel), solids.SolidVoxels.join(solid), outvoted)
+    return tsdf.join_surfaces(surfaces, box[0], voxel), solids.SolidVoxels.join(solid), outvoted
 
 
 def _far(settings: MeshConfig) -> float:
@@ -192,7 +187,8 @@ def _far(settings: MeshConfig) -> float:
 
 
 def _visual_mesh(
-    fused: _Fused,
+    vertices: Array,
+    faces: NDArray[np.int64],
     posts: list[convex.ConvexPart],
     views: Views,
     ground: Ground,
@@ -202,11 +198,11 @@ def _visual_mesh(
 ) -> tuple[dict[str, NDArray], dict[str, Any]]:
     """Returns about `max_faces` colored triangles, two thirds of them above the ground, and metrics.
 
-    Pixels of views that are deeper than `far` [m] are background.
+    `vertices` (v, 3) [m] and `faces` (f, 3) are the zero level above the ground, `posts` the parts of poles. Pixels of
+    views that are deeper than `far` [m] are background.
     """
     band = tsdf.BAND_VOXELS * voxel
     reach = 1.1 * far + 4 * band  # surfaces beyond it differ by more than the tolerance from all depths
-    vertices, faces = fused.surface
     colors, seen = color_points(vertices, tsdf.vertex_normals(vertices, faces), views, band, reach)
     # Valid distances form a band around each surface. The rear boundary of that band also yields triangles. They are no
     # surface, and no view sees them, so they are removed.
@@ -224,17 +220,14 @@ def _visual_mesh(
     ground_vertices, ground_faces = ground.triangles(_VISUAL_GROUND_CELL, max_faces // 3)
     column, row = np.rint((ground_vertices[:, :2] - ground.origin) / ground.cell).astype(int).T
     ground_colors = ground.rgb[row, column]
-    visual: dict[str, NDArray] = {
-        "vertices": np.concatenate([vertices, ground_vertices]).astype(np.float32),
-        "faces": np.concatenate([faces, ground_faces + len(vertices)]).astype(np.int32),
-        "colors": np.concatenate([colors, ground_colors]).astype(np.uint8),
-    }
-    return visual, {
-        "faces": len(visual["faces"]),
-        "vertices": len(visual["vertices"]),
-        "standing_faces": len(faces),
-        "floaters_removed": floaters,
-    }
+    standing = len(faces)
+    faces = np.concatenate([faces, ground_faces + len(vertices)])
+    vertices = np.concatenate([vertices, ground_vertices])
+    colors = np.concatenate([colors, ground_colors])
+    visual: dict[str, NDArray] = {"vertices": vertices.astype(np.float32), "faces": faces.astype(np.int32)}
+    visual["colors"] = colors
+    counts = {"faces": len(faces), "vertices": len(vertices), "standing_faces": standing, "floaters_removed": floaters}
+    return visual, counts
 
 
 def _outward(part: convex.ConvexPart) -> Array:

@@ -53,12 +53,9 @@ def combine_scales(scales: dict[str, Scale]) -> Scale:
     scales are merged. Several scales add two entries: `scales` holds each scale divided by the result, and its
     uncertainty; `scale_disagreement` is the largest difference between two scales in standard deviations.
     """
-    names = list(scales)
-    notes: dict[str, Any] = {}
-    for one in scales.values():
-        notes |= one.notes
-    if len(names) == 1:
-        return Scale(scales[names[0]].value, scales[names[0]].uncertainty, notes)
+    if len(scales) == 1:
+        return next(iter(scales.values()))
+    notes = {name: note for one in scales.values() for name, note in one.notes.items()}
     logs = np.log([one.value for one in scales.values()])
     sigmas = np.array([one.uncertainty for one in scales.values()])
     exact = np.flatnonzero(sigmas == 0.0)
@@ -72,7 +69,7 @@ def combine_scales(scales: dict[str, Scale]) -> Scale:
     apart = np.abs(logs[:, None] - logs) / np.maximum(np.hypot(sigmas[:, None], sigmas), 1e-9)
     notes["scales"] = {
         name: {"relative": float(np.exp(log - mean)), "uncertainty": float(one)}
-        for name, log, one in zip(names, logs, sigmas, strict=True)
+        for name, log, one in zip(scales, logs, sigmas, strict=True)
     }
     notes["scale_disagreement"] = float(apart.max())
     return Scale(float(np.exp(mean)), sigma, notes)
