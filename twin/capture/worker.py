@@ -34,16 +34,6 @@ _CURES = {
     "SIGTERM": "stopped from outside: build again",
 }
 _DISK_FULL = ("no space left on device", "disk is full", "sqlite_full")
-_MAPPING_LOG_STEPS = (  # parts of COLMAP's log lines that advance the mapping bar
-    "Rotation averaging done",
-    "Track establishment done",
-    "Global positioning done",
-    "iteration 1 / ",
-    "iteration 2 / ",
-    "iteration 3 / ",
-    "Iterative bundle adjustment done",
-    "refinement done",
-)
 
 
 # ---- in the parent
@@ -67,21 +57,30 @@ def run_worker(solve: Callable[[dict[str, Any], Path], None], job: dict[str, Any
         env=child_environment(),
     )
     assert process.stdout and process.stderr
-    bars = _ProgressBars()
     recent: deque[str] = deque(maxlen=30)
-    reader = threading.Thread(target=_keep_log, args=(process.stderr, folder / "colmap.log", bars, recent), daemon=True)
+    reader = threading.Thread(target=_keep_log, args=(process.stderr, folder / "colmap.log", recent), daemon=True)
     reader.start()
+    bar: runtime.tqdm | None = None
     error: str | None = None
     try:
-        for line in process.stdout:
-            error = bars.show(line).get("error", error)
+        for message in filter(None, map(_parsed, process.stdout)):
+            if "bar" in message:
+                if bar is not None:
+                    bar.close()
+                bar = runtime.bar(message["bar"], message["total"])
+            if "step" in message and bar is not None:
+                bar.update(message["step"])
+            if "say" in message:
+                runtime.log_line(message["say"])
+            error = message.get("error", error)
         code = process.wait()
     finally:
         if process.poll() is None:
             process.kill()
             process.wait()
         reader.join(timeout=5.0)
-        bars.close()
+        if bar is not None:
+            bar.close()
     if code == 0:
         return
     tail = " | ".join(recent)[-1500:]
@@ -97,53 +96,19 @@ def run_worker(solve: Callable[[dict[str, Any], Path], None], job: dict[str, Any
     raise RuntimeError(f"COLMAP's worker failed with exit status {code}: {tail}")
 
 
-class _ProgressBars:
-    """The current progress bar, advanced by the worker's messages and by COLMAP's log; thread-safe."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._bar: Any = None
-        self._mapping = False
-
-    def show(self, line: str) -> dict[str, Any]:
-        """Parses and shows a message of the worker; returns {} for a line that is not a message."""
-        try:
-            message = json.loads(line)
-        except json.JSONDecodeError:
-            return {}
-        if not isinstance(message, dict):
-            return {}
-        if "bar" in message:
-            self.close()
-        with self._lock:
-            if "bar" in message:
-                self._mapping = message["bar"] == "mapping"
-                self._bar = runtime.bar(message["bar"], message["total"] or len(_MAPPING_LOG_STEPS))
-            if "step" in message and self._bar is not None:
-                self._bar.update(message["step"])
-            if "say" in message:
-                runtime.log_line(message["say"])
-        return message
-
-    def log(self, line: str) -> None:
-        """Advances the mapping bar if a line of COLMAP's log reports the end of a step."""
-        finished = "fixed-rotation" not in line and any(part in line for part in _MAPPING_LOG_STEPS)
-        with self._lock:
-            if finished and self._mapping and self._bar is not None and self._bar.n < self._bar.total:
-                self._bar.update(1)
-
-    def close(self) -> None:
-        with self._lock:
-            if self._bar is not None:
-                self._bar.close()
-                self._bar = None
+def _parsed(line: str) -> dict[str, Any]:
+    """A message of the worker; {} for a line that is not a message."""
+    try:
+        message = json.loads(line)
+    except json.JSONDecodeError:
+        return {}
+    return message if isinstance(message, dict) else {}
 
 
-def _keep_log(stream: IO[str], path: Path, bars: _ProgressBars, recent: deque[str]) -> None:
+def _keep_log(stream: IO[str], path: Path, recent: deque[str]) -> None:
     with path.open("wb", buffering=0) as log:
         for line in stream:
             recent.append(line.rstrip("\n"))
-            bars.log(line)
             with contextlib.suppress(OSError):  # on a full disk the worker itself fails
                 log.write(line.encode())
 
