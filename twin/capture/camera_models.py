@@ -70,9 +70,7 @@ class Lens:
 
     @property
     def is_distorted(self) -> bool:
-        return self.model not in ("SIMPLE_PINHOLE", "PINHOLE") and (
-            "FISHEYE" in self.model or any(value != 0.0 for value in self.distortion)
-        )
+        return "FISHEYE" in self.model or any(value != 0.0 for value in self.distortion)
 
     def with_intrinsics(self, intrinsics: Array) -> "Lens":
         """The lens with other fx, fy, cx, cy [px]; a model with one focal length gets the mean of fx and fy."""
@@ -153,9 +151,8 @@ def undistortion(lens: Lens) -> tuple[Lens, PixelMap | None]:
     if lens.camera.is_undistorted() or _max_displacement(lens, pinhole) < _NEGLIGIBLE_DISTORTION:
         return pinhole, None
     grid = pixel_grid(lens.width, lens.height)
-    return pinhole, (raw_pixels(lens, unproject(grid.reshape(-1, 2), pinhole.intrinsics)) - 0.5).reshape(
-        grid.shape
-    ).astype(np.float32)
+    raw = raw_pixels(lens, unproject(grid.reshape(-1, 2), pinhole.intrinsics))
+    return pinhole, (raw - 0.5).reshape(grid.shape).astype(np.float32)
 
 
 def undistorted(image: Image, lens: Lens, nearest: bool = False) -> tuple[Image, Lens]:

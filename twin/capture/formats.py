@@ -216,12 +216,8 @@ def read_colmap(folder: Path, images: Path | None = None) -> ImageSet:
             "set `images` in scene.toml to their folder"
         )
     found = [(root / name, lens, pose) for name, lens, pose in posed if is_file(root / name)]
-    return ImageSet(
-        tuple(path for path, _, _ in found),
-        tuple(lens for _, lens, _ in found),
-        np.stack([pose for _, _, pose in found]),
-        missing=len(posed) - len(found),
-    )
+    paths, lenses, poses = zip(*found, strict=True)
+    return ImageSet(paths, lenses, np.stack(poses), missing=len(posed) - len(found))
 
 
 def read_transforms(path: Path, images: Path | None = None) -> ImageSet:
@@ -269,15 +265,8 @@ def _image_set(path: Path, table: dict[str, Any], images: Path | None) -> ImageS
             "set `images` in scene.toml to their folder"
         )
     files = sorted(entries, key=lambda file: natural_key(str(file)))
-    masks = tuple(entries[file][2] for file in files)
-    return ImageSet(
-        tuple(files),
-        tuple(entries[file][0] for file in files),
-        np.stack([entries[file][1] for file in files]),
-        masks if any(masks) else None,
-        missing,
-        missing_masks,
-    )
+    lenses, poses, masks = zip(*(entries[file] for file in files), strict=True)
+    return ImageSet(tuple(files), lenses, np.stack(poses), masks if any(masks) else None, missing, missing_masks)
 
 
 def listed_files(path: Path, images: Path | None = None) -> list[Path]:
@@ -337,7 +326,6 @@ def lens_from_transforms(table: dict[str, Any], file: Path, where: str) -> Lens:
 
 
 def is_image(path: Path) -> bool:
-    """True if the file exists and its name has an image suffix."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and is_file(path)
 
 

@@ -78,14 +78,10 @@ def register_photo(photo: Image, exif: PhotoExif, scene: SceneDir) -> Registrati
         lenses = [(vars(lens), held, origin) for lens, held, origin in candidate_lenses(size, exif, scene)]
         run_worker(solve_photo, {"metric": str(scene.stage("metric")), "lenses": lenses}, work)
         result = read_json(work / "result.json")
-    return Registration(
-        np.array(result["camera_to_world"]),
-        lens_from_json(result["lens"]).scaled(*full),
-        result["lens_from"],
-        result["matches"],
-        result["inliers"],
-        result["error"] * full[0] / size[0],
-    )
+    result["camera_to_world"] = np.array(result["camera_to_world"])
+    result["lens"] = lens_from_json(result["lens"]).scaled(*full)
+    result["error"] = result["error"] * full[0] / size[0]
+    return Registration(**result)
 
 
 def candidate_lenses(size: tuple[int, int], exif: PhotoExif, scene: SceneDir) -> list[tuple[Lens, bool, str]]:

@@ -73,11 +73,8 @@ def averaged_poses(
     rotations, residual = _average_rotations(pairs, first, second, cost, len(film))
     directions = np.stack([-rotations[j].T @ pair.translation for j, pair in zip(second, pairs, strict=True)])
     along = _goes_along(first, second, directions, film)
-    usable = [
-        k
-        for k, pair in enumerate(pairs)
-        if along[k] and _is_consistent(pair, residual[k]) and len(pair.features) >= _MIN_NEAR
-    ]
+    consistent = [k for k, pair in enumerate(pairs) if along[k] and _is_consistent(pair, residual[k])]
+    usable = [k for k in consistent if len(pairs[k].features) >= _MIN_NEAR]
     scaled, units = _units([pairs[k] for k in usable], cost[usable])
     kept = np.array(usable, np.int64)[scaled]
     if not len(kept):
@@ -137,11 +134,8 @@ def _ends(
     first = np.array([row_of[pair.matches.first] for pair in pairs], np.int64)
     second = np.array([row_of[pair.matches.second] for pair in pairs], np.int64)
     steps = np.where(film[first] == film[second], np.abs(first - second), _OTHER_FILM_STEPS)
-    return (
-        first,
-        second,
-        steps / np.array([max(len(pair.features), 1) * max(pair.agreeing, 0.1) ** 4 for pair in pairs]),
-    )
+    support = np.array([max(len(pair.features), 1) * max(pair.agreeing, 0.1) ** 4 for pair in pairs])
+    return first, second, steps / support
 
 
 def _is_consistent(pair: PairGeometry, residual: float) -> bool:
@@ -189,9 +183,8 @@ def _units(pairs: list[PairGeometry], cost: Array) -> tuple[NDArray[np.int64], A
     wrong = (residual > _WRONG * error).astype(np.float64)
     used = np.isfinite(residual)
     ends = np.concatenate([first[used], second[used]])
-    bad = np.bincount(ends, np.tile(wrong[used], 2), minlength=count) / np.maximum(
-        np.bincount(ends, minlength=count), 1
-    )
+    total = np.maximum(np.bincount(ends, minlength=count), 1)
+    bad = np.bincount(ends, np.tile(wrong[used], 2), minlength=count) / total
     good = solved[bad[solved] < _WRONG_FRACTION]
     return good, np.exp(logarithms[good, 0])
 
@@ -206,8 +199,7 @@ def unit_equations(pairs: list[PairGeometry]) -> list[tuple[int, int, float, flo
     equations: list[tuple[int, int, float, float, int]] = []
     for views in at.values():
         count = 1 + max(int(pairs[k].features[:, side].max()) for k, side in views)
-        depth = np.full((len(views), count), np.nan)
-        variance = np.full((len(views), count), np.nan)
+        depth, variance = np.full((2, len(views), count), np.nan)
         for row, (k, side) in enumerate(views):
             feature = pairs[k].features[:, side]
             depth[row, feature] = np.log(pairs[k].depths[:, side])
@@ -236,8 +228,7 @@ def _weighted_median(values: Array, weights: Array) -> float:
 def solve_differences(equations: Differences, count: int) -> tuple[NDArray[np.int64], Array, Array]:
     """Solves for the unknowns that are connected by equations, if there are several parts for those of the largest.
 
-    Returns the solved unknowns' numbers (k,), all unknowns (count, ...), and the residuals (m,),
-    NaN if not used.
+    Returns the solved unknowns' numbers (k,), all unknowns (count, ...), and the residuals (m,), NaN if not used.
     """
     first, second = equations.first, equations.second
     solution = np.zeros((count, equations.value.shape[1]))
@@ -381,9 +372,8 @@ def check_poses(
     checked = votes[:2].sum((0, 2)) > 0
     torn, misplaced = (votes[:2, :, 1] > votes[:2, :, 0]).any(0), votes[2, :, 1] > votes[2, :, 0]
     torn |= checked & (misplaced | np.roll(misplaced, -1))  # the steps to and from a misplaced frame
-    return PoseCheck(
-        int(np.count_nonzero(checked)), [(int(frames[k]), int(frames[k + 1])) for k in np.flatnonzero(torn)]
-    )
+    contradicted = [(int(frames[k]), int(frames[k + 1])) for k in np.flatnonzero(torn)]
+    return PoseCheck(int(np.count_nonzero(checked)), contradicted)
 
 
 def _agree_with_chains(pairs: list[PairGeometry], ends: list[tuple[int, int]]) -> list[int]:

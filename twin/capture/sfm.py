@@ -60,6 +60,7 @@ _MAX_POINT_ERROR = 20.0
 # number of connections between the groups.
 _TOGETHER_FRACTION, _TOGETHER_PAIRS = 0.8, 20
 _POSED_PAIRS = 10  # largest number of pairs per frame if poses are given
+_Solved = tuple[Matcher, pycolmap.Reconstruction]  # a model with the matcher of its frames
 
 
 # ---- the stage
@@ -274,9 +275,7 @@ def _triangulate(matcher: Matcher, given: Array, work: Path) -> pycolmap.Reconst
     return triangulated(matcher, posed_model(matcher, np.arange(len(given)), given), work)
 
 
-def _reconstruct(
-    matcher: Matcher, job: dict[str, Any], work: Path, summary: dict[str, Any]
-) -> list[tuple[Matcher, pycolmap.Reconstruction]]:
+def _reconstruct(matcher: Matcher, job: dict[str, Any], work: Path, summary: dict[str, Any]) -> list[_Solved]:
     """Models of all groups of linked films, in the frame of the first one; `matcher` has only features."""
     capture = matcher.capture
     if len(capture.names) < MIN_FRAMES:
@@ -293,7 +292,7 @@ def _reconstruct(
     groups = matcher.linked_groups()
     if len(groups) == 1:
         return [(matcher, reconstruct(matcher, job, work, summary))]
-    solved: list[tuple[Matcher, pycolmap.Reconstruction]] = []
+    solved: list[_Solved] = []
     found: list[dict[str, Any]] = []  # summaries of the models in `solved`
     first: InputError | None = None
     for k, frames in enumerate(groups):
@@ -322,7 +321,7 @@ def _reconstruct(
 
 def _reconstructed(
     matcher: Matcher, frames: NDArray[np.int64], job: dict[str, Any], work: Path
-) -> tuple[tuple[Matcher, pycolmap.Reconstruction], dict[str, Any]]:
+) -> tuple[_Solved, dict[str, Any]]:
     """The model of some frames with its own matcher, and its summary. Raises InputError: too few frames or pairs."""
     own = matcher.restricted(frames, work)
     if len(frames) < MIN_FRAMES or len(own.verified()) < 2:
@@ -335,7 +334,7 @@ def _new_summary() -> dict[str, Any]:
     return {"near_pairs": 0, "outliers": [], "registered_anew": [], "joined": [], "may_drift": []}
 
 
-def _is_one(solved: tuple[Matcher, pycolmap.Reconstruction], a: NDArray[np.int64], b: NDArray[np.int64]) -> bool:
+def _is_one(solved: _Solved, a: NDArray[np.int64], b: NDArray[np.int64]) -> bool:
     """True if a model has most frames of two groups in its coherent part, and enough connections between the groups."""
     matcher, model = solved
     coherent = np.array(sorted(coherent_frames(model, matcher)))
@@ -350,7 +349,7 @@ def _source_names(capture: Capture, frames: NDArray[np.int64]) -> list[str]:
     return [capture.sources[s].name for s in np.unique(capture.source_index[frames]).tolist()]
 
 
-def _join(first: tuple[Matcher, pycolmap.Reconstruction], other: tuple[Matcher, pycolmap.Reconstruction]) -> bool:
+def _join(first: _Solved, other: _Solved) -> bool:
     """Transforms the other model to the frame of the first; returns False if their grounds do not match."""
     matcher = first[0]
 

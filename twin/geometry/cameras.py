@@ -118,17 +118,6 @@ def nearest_frame(cameras: Cameras, i: int, lighting: str) -> int | None:
     return min(candidates, key=lambda k: float(cost[k])) if candidates else None
 
 
-class PosedCameras(Protocol):
-    """The attributes that a renderer reads; `Cameras` and `Viewpoints` have them."""
-
-    @property
-    def camera_to_world(self) -> Array: ...
-    @property
-    def intrinsics(self) -> Array: ...
-    @property
-    def sizes(self) -> NDArray[np.int64]: ...
-
-
 @dataclass(frozen=True)
 class Viewpoints:
     """n virtual pinhole views."""
@@ -143,6 +132,9 @@ class Viewpoints:
         pose = np.asarray(camera_to_world, np.float64).reshape(-1, 4, 4)
         k = np.broadcast_to(np.asarray(intrinsics, np.float64), (len(pose), 4))
         return Viewpoints(pose, k, np.broadcast_to(np.array(size, np.int64), (len(pose), 2)))
+
+
+PosedCameras = Cameras | Viewpoints  # what renderers take
 
 
 def intrinsics_for_size(cameras: PosedCameras, size: tuple[int, int] | None) -> tuple[Array, tuple[int, int]]:
