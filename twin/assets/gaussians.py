@@ -130,8 +130,7 @@ def read_ply(path: Path) -> Gaussians:
 
     Only the constant color is kept; higher spherical harmonics are ignored. Gaussians that are not finite are left out.
 
-    Raises:
-        InputError: The file does not exist, has another format, or is cut off.
+    Raises InputError: the file does not exist, has another format, or is cut off.
     """
     content = read_bytes(path, _MAX_PLY)
     cure = "expected a 3D Gaussian splat .ply (binary, little endian), as 3DGS trainers write"
@@ -177,12 +176,9 @@ def read_ply(path: Path) -> Gaussians:
 
 
 def views_by_lighting(field: ColorField, cameras: Cameras, lightings: Sequence[str]) -> dict[str, Views]:
-    """Renders the views for Gaussians under each lighting, without fog.
+    """Renders the views for Gaussians under each lighting, without fog; all have the same depth images.
 
-    The depth images are the same under every lighting.
-
-    Raises:
-        InputError: unknown lighting.
+    Raises InputError: unknown lighting.
     """
     filmed = [name for name in field.lightings if name in cameras.lightings]
     names = dict.fromkeys([*lightings, *filmed])
@@ -201,14 +197,11 @@ def gaussians_by_lighting(views: Mapping[str, Views]) -> dict[str, Gaussians]:
 def sky_on_surfaces(views: Sequence[Views]) -> NDArray[np.bool_]:
     """Mask (n, h, w) of pixels with the color of the sky but the depth of a surface, such as gaps in a tree's crown.
 
-    From other viewpoints, Gaussians of such pixels would look like blue clumps, so `views_by_lighting` moves these
-    pixels to the background. The sky's color under each lighting is a quadratic function of the direction, fitted to
-    the pixels of the background. A pixel above the horizon is in the mask if it differs little from that color (mean
-    square over lightings and channels). Up to `_BLEND_REACH` pixels from such a pixel the limit is larger, since pixels
-    there blend the sky's color with that of leaves.
-
-    Args:
-        views: The same views under each filmed lighting.
+    `views` are the same views under each filmed lighting. From other viewpoints, Gaussians of such pixels would look
+    like blue clumps, so `views_by_lighting` moves these pixels to the background. The sky's color under each lighting
+    is a quadratic function of the direction, fitted to the pixels of the background. A pixel above the horizon is in
+    the mask if it differs little from that color (mean square over lightings and channels). Up to `_BLEND_REACH` pixels
+    from such a pixel the limit is larger, since pixels there blend the sky's color with that of leaves.
     """
     sky = views[0].depth > FAR
     if np.count_nonzero(sky) < _MIN_SKY:
@@ -234,10 +227,8 @@ def sky_on_surfaces(views: Sequence[Views]) -> NDArray[np.bool_]:
 def gaussians_of_views(views: Views, background: float) -> tuple[Gaussians, NDArray[np.int64]]:
     """One Gaussian per pixel, thinned to one per cell; the cells are about as large as the Gaussians.
 
-    Pixels of depth 0 are skipped; depths are limited to `background` [m].
-
-    Returns:
-        k Gaussians, and for each the index (k,) of its pixel among the n · h · w pixels of the views.
+    Pixels of depth 0 are skipped; depths are limited to `background` [m]. Also returns for each Gaussian the index (k,)
+    of its pixel among the n · h · w pixels of the views.
 
     Raises InputError: no pixel has a depth.
     """

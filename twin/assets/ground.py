@@ -164,10 +164,8 @@ def _path_data(
 ) -> tuple[HeightData, dict[str, dict]]:
     """Data from the camera path, lowered by the camera height. Their σ includes the up-and-down motion of the camera.
 
-    Args:
-        cameras: n cameras, in meters.
-        ground_height: Ground height below each camera, from the other kinds of data [m], shape (n,); None = unknown.
-        camera_height: The given height of the camera [m]; 0 = each source's median height above `ground_height`.
+    `ground_height` (n,) [m] is that below each camera, from the other kinds of data, None if unknown; `camera_height`
+    [m] is the given one, 0 for each source's median height above `ground_height`.
     """
     parts, metrics = [], {}
     for index in source_frames(cameras):

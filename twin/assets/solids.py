@@ -139,16 +139,11 @@ def solid_pieces(
 ) -> tuple[list[SolidPiece], dict[str, int]]:
     """Closed meshes of the solid's components that reach `obstacle_height` above the ground, cut into tiles.
 
-    Args:
-        voxels: The solid of the whole place.
-        corner: Position of the lattice's voxel (0, 0, 0) [m], shape (3,).
-        voxel: Spacing of the lattice [m].
-        path: Route or positions of the cameras, shape (m, 2) [m].
-        config: Settings of the mesh.
+    The lattice has its voxel (0, 0, 0) at `corner` (3,) [m] and the spacing `voxel` [m]. `path` (m, 2) [m] is the route
+    or the positions of the cameras.
 
-    Returns:
-        The pieces, nearest to the path first; and the numbers of components by kind: `standing` ones, of which the
-        pieces are made, and `specks` and `low` ones, which are left out.
+    Returns the pieces, nearest to the path first; and the numbers of components by kind: `standing` ones, of which the
+    pieces are made, and `specks` and `low` ones, which are left out.
     """
     solid = np.flatnonzero(voxels.field < 0)
     component = _components(voxels.key[solid])
@@ -293,8 +288,7 @@ def clear_corridor(
 ) -> tuple[list[tuple[int, ConvexPart]], int]:
     """Clears the corridor: cuts convex parts at the headroom, and below it along tangents of the corridor.
 
-    Returns:
-        The remaining parts, each with the index of its original; and the number of parts that were cut or dropped.
+    Returns the remaining parts, each with the index of its original, and the number of parts that were cut or dropped.
     """
     out: list[tuple[int, ConvexPart]] = []
     clipped = 0

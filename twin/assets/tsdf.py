@@ -279,11 +279,8 @@ def divide(
 ) -> list[VolumeSection]:
     """Sections of a place: one if it has at most 40 million voxels, otherwise square columns of 256 voxels' side.
 
-    Args:
-        box: Low and high corner of the place, shape (2, 3) [m].
-        voxel: Spacing of the lattice [m], whose voxel (0, 0, 0) is at the low corner.
-        frame: Least width of the frame [voxels].
-        heights: Returns the lowest and highest z [m] of interest between two corners (x, y), each of shape (2,) [m].
+    The lattice has its voxel (0, 0, 0) at the low corner of `box` (2, 3) [m] and the spacing `voxel` [m]; frames have
+    at least `frame` voxels. `heights` returns the lowest and highest z [m] of interest between two corners (x, y) [m].
     """
     blocks = np.ceil((box[1] - box[0]) / (voxel * BLOCK)).astype(np.int64) + 1
     whole = blocks * BLOCK

@@ -119,12 +119,10 @@ class BagContents:
 def read_contents(path: Path, topic: str = "") -> BagContents:
     """Reads calibration, positions, extrinsics and stamps of the pictures in a bag; decodes only one picture.
 
-    Args:
-        topic: Topic of the pictures; empty for the topic with the most pictures.
+    `topic` is that of the pictures; empty for the topic with the most pictures.
 
-    Raises:
-        InputError: the path is not a bag; or the bag is damaged, or has no pictures, an unknown encoding, an
-            unsupported camera model, or stamps out of order.
+    Raises InputError: the path is not a bag; or the bag is damaged, or has no pictures, an unknown encoding, an
+    unsupported camera model, or stamps out of order.
     """
     with open_bag(path) as bag:
         topics = _topics(bag.connections, path, topic)
@@ -311,12 +309,9 @@ def _decode(contents: BagContents, count: FilmStatistics) -> Iterator[tuple[floa
 
 
 def lens_of(info: Any, rectified: bool, where: str) -> Lens:
-    """The lens of a CameraInfo. Raises InputError for an unknown camera model or implausible values.
+    """The lens of a sensor_msgs/CameraInfo of ROS 1 or 2; for rectified pictures, the matrix P gives the intrinsics.
 
-    Args:
-        info: sensor_msgs/CameraInfo of ROS 1 or 2.
-        rectified: True if the pictures are rectified; the matrix P then gives the intrinsics.
-        where: Beginning of the error messages.
+    Raises InputError: an unknown camera model or implausible values; `where` begins the message.
     """
     from twin_policy import Camera, PictureError
 

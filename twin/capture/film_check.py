@@ -60,12 +60,9 @@ class StaticParts:
 
 
 def static_parts(frames: list[Image]) -> StaticParts:
-    """Finds the parts that are fixed to the camera in frames that spread over a film.
+    """Finds the parts that are fixed to the camera in frames that spread over a film, RGB (h, w, 3), about 320 px wide.
 
     Nothing is found in fewer than 12 frames, in frames of several sizes, or if the camera hardly moves.
-
-    Args:
-        frames: RGB, shape (h, w, 3), about 320 px wide; the result is in pixels of these frames.
     """
     if len(frames) < MIN_FRAMES or len({frame.shape for frame in frames}) > 1:
         return StaticParts()

@@ -55,17 +55,13 @@ _REFINEMENTS = 30  # largest number of iterations of the last bundle adjustment
 
 
 def reconstruct(matcher: Matcher, job: dict[str, Any], work: Path, summary: dict[str, Any]) -> pycolmap.Reconstruction:
-    """Reconstructs the frames of a matcher, of which at least two pairs are verified.
+    """Reconstructs the frames of a matcher, of which at least two pairs are verified; matches near pairs, too.
 
-    Args:
-        matcher: Its matches are complete but for near pairs, which are added.
-        job: Settings of the stage, see `sfm.solve_mapping`.
-        work: Folder for COLMAP's files.
-        summary: Receives the mapper's name, the number of near pairs, the frames left out, and the films whose scale
-            may drift, because all models of global mapping were torn.
+    `job` holds the settings of the stage, see `sfm.solve_mapping`; COLMAP's files are written to `work`. `summary`
+    receives the mapper's name, the number of near pairs, the frames left out, and the films whose scale may drift,
+    because all models of global mapping were torn.
 
-    Raises:
-        InputError: no frame could be registered.
+    Raises InputError: no frame could be registered.
     """
     mapper = Mapper(matcher, job, work)
     model = mapper.best(summary)
@@ -163,10 +159,7 @@ class Mapper:
     def best(self, summary: dict[str, Any]) -> pycolmap.Reconstruction:
         """The largest coherent model of a few attempts; the other frames are deregistered.
 
-        A larger model replaces the one from averaged poses only if the two agree.
-
-        Raises:
-            InputError: no attempt gave a model.
+        A larger model replaces the one from averaged poses only if the two agree. Raises InputError: no model.
         """
         matcher, needed = self._matcher, self._min_registered * len(self._matcher.frames)
         best: pycolmap.Reconstruction | None = None

@@ -238,12 +238,8 @@ def relative_pose(
     """Pose of the second camera relative to the first: rotation (3, 3) and direction of the translation (3,), up to its
     sign; and its cost.
 
-    Args:
-        a: Unit rays (n, 3) of the matches in the first camera.
-        b: Those in the second camera.
-        rotations: Starts (3, 3).
-        error: [rad] Standard deviations (n,) of the epipolar errors of correct matches.
-        rng: Random generator for the choice of matches.
+    `a` and `b` (n, 3) are the unit rays of the matches in the two cameras, `rotations` (3, 3) the starts, `error` (n,)
+    [rad] the standard deviations of the epipolar errors of correct matches.
     """
     wide: list[tuple[Array, Array, float]] = []
     for start in rotations:

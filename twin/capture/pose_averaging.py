@@ -55,11 +55,8 @@ def averaged_poses(
 ) -> tuple[NDArray[np.int64], Array]:
     """Frames (k,) whose poses are determined together, and their camera_to_world (k, 4, 4) in any unit of length.
 
-    Args:
-        pairs: Pairs with geometry.
-        row_of: Frame of each of COLMAP's images.
-        film: Film of each frame (n,), whose frames are in the order of time.
-        seed: Chooses random matches.
+    `row_of` maps COLMAP's images to frames; `film` (n,) is the film of each frame, whose frames are in the order of
+    time; `seed` chooses random matches.
     """
     if not pairs:
         return np.zeros(0, np.int64), np.zeros((0, 4, 4))
@@ -323,14 +320,9 @@ def check_poses(
     frames: NDArray[np.int64],
     camera_to_world: Array,
 ) -> PoseCheck:
-    """Compares poses with the geometry of pairs.
+    """Compares the poses (k, 4, 4), in any unit of length, of sorted frames (k,) with the geometry of pairs.
 
-    Args:
-        pairs: Pairs with geometry.
-        row_of: Frame of each of COLMAP's images.
-        film: Film of each frame (n,), whose frames are in the order of time.
-        frames: Frames with a pose (k,), sorted.
-        camera_to_world: Their poses (k, 4, 4), in any unit of length.
+    For `row_of` and `film` see `averaged_poses`.
     """
     near = near_in_film(film, frames)
     place = {int(frame): k for k, frame in enumerate(frames)}

@@ -152,13 +152,8 @@ def correct_model(
 ) -> tuple[dict[str, RollingShutter], list[str]]:
     """Finds the films with a rolling shutter; corrects the keypoints of the model for it, and refines the model.
 
-    Args:
-        model: A complete reconstruction. It is changed only if a rolling shutter is found.
-        matcher: The matcher of the model.
-        refine: Runs bundle adjustment.
-
-    Returns:
-        The rolling shutters by the name of the source, and the names of the stabilized sources.
+    The model, a complete reconstruction, is changed only if a rolling shutter is found. `refine` runs bundle
+    adjustment. Returns the rolling shutters by the name of the source, and the names of the stabilized sources.
     """
     capture = matcher.capture
     films: dict[str, tuple[Effect, dict[int, _Frame]]] = {}

@@ -48,9 +48,8 @@ def filmed_branches(cameras: Cameras, branches: tuple[BranchConfig, ...]) -> dic
 def filmed_route(cameras: Cameras, config: RouteConfig | None = None, table: str = "route") -> Route:
     """Chooses the route among the filmed passes; error messages name `table` of scene.toml.
 
-    Raises:
-        InputError: the route is shorter than 2 m or folds back on itself, passes that are to be joined lie apart, a
-            pass has an unknown name, or way points leave what was filmed.
+    Raises InputError: the route is shorter than 2 m or folds back on itself, passes that are to be joined lie apart, a
+    pass has an unknown name, or way points leave what was filmed.
     """
     config = config or RouteConfig()
     passes = find_passes(cameras)
