@@ -14,7 +14,6 @@ from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.geometry.images import psnr, read_image, write_image
-from twin.nerf.appearance import initial_appearance
 from twin.nerf.buffers import Layout
 from twin.nerf.field import RadianceField, untrained_field
 from twin.nerf.lightings import AddedLighting, Fog, Lightings, added_lightings, check_new_name, mixed_fog
@@ -27,9 +26,8 @@ from twin.scene import SceneDir, stage_result, write_stamp
 def small_field(seed: int = 0) -> RadianceField:
     """An untrained field: its background varies with direction and embedding, which is all that a fit needs."""
     frames = tuple(f"day/{i:06d}" for i in range(4))
-    appearance = initial_appearance(("day", "night"), frames, np.zeros(4, np.int64), 8, seed)
     layout = Layout((0.0, 0.0, 0.0), (8.0, 8.0, 4.0), 0.1, 4, 2.0, 10, 32, 8)
-    return untrained_field([layout], appearance, seed, "cpu")
+    return untrained_field([layout], ("day", "night"), frames, np.zeros(4, np.int64), seed, "cpu")
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,6 @@ from tiny_twin import tiny_twin
 from twin import command_line, runtime
 from twin.errors import InputError, print_error, shortened
 from twin.geometry.images import write_image
-from twin.nerf.appearance import initial_appearance
 from twin.nerf.buffers import Layout
 from twin.nerf.field import untrained_field
 from twin.scene import write_stamp
@@ -48,11 +47,11 @@ def _corridor(root: Path) -> Path:
     """A place in which a photo can be registered, with a field of two lightings."""
     scene = filmed_corridor(root)
     frames = tuple(f"day/{i:06d}" for i in range(4))
-    appearance = initial_appearance(("day", "night"), frames, np.zeros(4, np.int64), 8, 0)
     layout = Layout((0.0, 0.0, 0.0), (8.0, 8.0, 4.0), 0.1, 4, 2.0, 10, 32, 8)
     for stage in ("field", "mesh"):
         scene.stage(stage).mkdir()
-    untrained_field([layout], appearance, 0, "cpu").save(scene.stage("field"))
+    field = untrained_field([layout], ("day", "night"), frames, np.zeros(4, np.int64), 0, "cpu")
+    field.save(scene.stage("field"))
     for stage in ("capture", "cameras", "metric", "field", "mesh"):
         write_stamp(scene.stage(stage), stage)
     return root

@@ -59,15 +59,6 @@ class Appearance:
         )
 
 
-def initial_appearance(
-    lightings: tuple[str, ...], frames: tuple[str, ...], frame_lighting: NDArray[np.int64], dim: int, seed: int
-) -> Appearance:
-    """Random lighting vectors and zero residuals."""
-    rng = np.random.default_rng([seed, 1])
-    vectors = torch.as_tensor(rng.normal(0.0, 0.3, (len(lightings), dim)).astype(np.float32))
-    return Appearance(lightings, frames, frame_lighting, vectors, torch.zeros(len(frames), dim))
-
-
 # ---- fit to a photo
 
 _STEPS = 40

@@ -77,7 +77,7 @@ def bake(
         f"network.{k}": v.detach().cpu().numpy() for k, v in field.parameters.items() if not k.startswith("trunk")
     }
     networks |= _probes(field, pixels, seed)
-    baked = BakedField(sections, field.appearance.named(), networks, field.device, field.about, field.road)
+    baked = BakedField(sections, field.appearance.named(), networks, field.device, field.road)
     return baked, {
         "bricks_near": sum(one["bricks_near"] for one in facts),
         "bricks_far": sum(one["bricks_far"] for one in facts),

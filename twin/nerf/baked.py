@@ -197,7 +197,6 @@ class BakedField:
         lightings: Lightings,
         networks: dict[str, NDArray],
         device: str = "cpu",
-        about: dict[str, Any] | None = None,
         road: RoadSections | None = None,
     ):
         """
@@ -206,12 +205,10 @@ class BakedField:
             lightings: Appearance embeddings by name.
             networks: `network.*`, and for random lightings `probes.*` (see `lightings.Probes`).
             device: `cpu` or `cuda`.
-            about: JSON-able metadata stored with the field.
             road: Determines the sections that render a camera; None: a road of one section.
         """
         self.sections, self.road = tuple(sections), road or undivided_road()
-        self.lightings_by_name, self.about, self.device = lightings, about or {}, device
-        self.networks = networks
+        self.lightings_by_name, self.networks, self.device = lightings, networks, device
         if "probes.features" in networks:
             probes = Probes(networks["probes.features"], networks["probes.harmonics"], self.network)
             self.lightings_by_name = replace(lightings, probes=probes)
@@ -350,7 +347,7 @@ class BakedField:
 
     def alone(self, section: int) -> "BakedField":
         """A field of one section, for all cameras."""
-        return BakedField([self.sections[section]], self.lightings_by_name, self.networks, self.device, self.about)
+        return BakedField([self.sections[section]], self.lightings_by_name, self.networks, self.device)
 
     def single_threaded(self) -> "BakedField":
         """A field on the same arrays with its own render targets and lock. It renders on the calling thread.
@@ -465,8 +462,8 @@ class BakedField:
 
     # ---- files
 
-    def save(self, folder: Path) -> None:
-        """Writes `baked.json`, a file per section (`section_file`), and with several sections the road."""
+    def save(self, folder: Path, about: dict[str, Any] | None = None) -> None:
+        """Writes `baked.json` with the metadata `about`, a file per section, and with several sections the road."""
         names = self.lightings_by_name
         shared = {**self.networks, "lightings.vectors": names.vectors, "lightings.frames": names.frame_vectors}
         for k, section in enumerate(self.sections):
@@ -483,7 +480,7 @@ class BakedField:
                 **({"more_layouts": layouts[1:]} if layouts[1:] else {}),
                 "lightings": names.names,
                 "frames": names.frames,
-                "about": self.about,
+                "about": about or {},
             },
         )
 
@@ -504,7 +501,6 @@ class BakedField:
                 )
             layouts = stored_layouts(head)
             names, frames = tuple(map(require_text, head["lightings"])), tuple(map(require_text, head["frames"]))
-            about = dict(head["about"])
         arrays = load_tensors(folder / section_file(0))
         with wrap_read_errors(folder / section_file(0), "build the scene again"):
             vectors, frame_vectors = arrays.pop("lightings.vectors"), arrays.pop("lightings.frames")
@@ -520,4 +516,4 @@ class BakedField:
             ]
             road = RoadSections.load(folder, len(layouts))
             lightings = Lightings(names, vectors, frames, frame_vectors)
-            return BakedField(sections, lightings, networks, device, about, road)
+            return BakedField(sections, lightings, networks, device, road)

@@ -116,80 +116,6 @@ _MIN_NEAR_PLANE = 1e-3  # [m] losses divide by distances along rays, so no sampl
 
 
 @dataclass(frozen=True)
-class NearBox:
-    """The near box [m], by its center and half sides."""
-
-    center: tuple[float, float, float]
-    half: tuple[float, float, float]
-
-    @property
-    def bounds(self) -> NDArray[np.float64]:
-        """Lowest and highest corner [m], shape (2, 3)."""
-        center, half = np.array(self.center), np.array(self.half)
-        return np.stack([center - half, center + half])
-
-    @property
-    def scale(self) -> float:
-        """The longest half side [m]."""
-        return max(self.half)
-
-    def grid_positions(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Points (n, 3) [m] → grid positions in [0, 1), shape (n, 3); see `kernels/space.py`."""
-        u = (points - np.array(self.center)) / np.array(self.half)
-        m = np.maximum(np.abs(u).max(1, keepdims=True), 1.0)
-        u *= (2.0 - 1.0 / m) / m
-        return (u * 0.25 + 0.5).clip(0.0, 1.0 - 1e-6).astype(np.float32)
-
-
-def near_box_of_cameras(camera_to_world: NDArray[np.float64], near_half_extent: float = 0.0) -> NearBox:
-    """The near box of cameras (n, 4, 4), z up: contains them and the points half the path's extent ahead of each.
-
-    The box has a margin, which is smaller vertically, as most of what is filmed from a road lies beside the road. A
-    nonzero `near_half_extent` [m] instead gives a cube with that half side around the cameras.
-    """
-    positions, ahead = camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
-    low, high = positions.min(0), positions.max(0)
-    if near_half_extent > 0.0:
-        center, half = (low + high) / 2, np.full(3, near_half_extent)
-    else:
-        longest = max(float((high - low).max()), 1e-3)
-        seen = np.concatenate([positions, positions + 0.5 * longest * ahead])
-        low, high = seen.min(0), seen.max(0)
-        center = (low + high) / 2
-        half = (high - low) / 2 + longest * np.array([0.15, 0.15, 0.1])
-    return NearBox(tuple(map(float, center)), tuple(map(float, half)))  # type: ignore[arg-type]
-
-
-def opacity_grid_sizes(near_box: NearBox) -> list[tuple[tuple[int, ...], float]]:
-    """Cells per axis, and side of a cell [contracted m], of the near and the far opacity grid.
-
-    The near grid covers the near box, the far grid the contracted cube, which is twice as wide.
-    """
-    out = []
-    for sides, cells in ((2.0 * np.array(near_box.half), _NEAR_CELLS), (4.0 * np.array(near_box.half), _FAR_CELLS)):
-        cell = float((sides.prod() / cells) ** (1 / 3))
-        out.append((tuple(int(n) for n in np.maximum(np.ceil(sides / cell), 4)), cell))
-    return out
-
-
-def level_cells(near_box: NearBox, levels: int, growth: float) -> NDArray[np.float32]:
-    """Cells per axis of every hash level, shape (levels, 3); each level has `growth` times as many as the one before.
-
-    Inside the near box, cells are cubes.
-    """
-    sides = 4.0 * np.array(near_box.half)
-    per_meter = _COARSEST_CELLS * growth ** np.arange(levels) / sides.max()
-    return np.maximum(per_meter[:, None] * sides, 1.0).astype(np.float32)
-
-
-def level_shapes(cells: NDArray[np.float32], log2_table: int) -> NDArray[np.int32]:
-    """Vertices per axis, and 1 if the level is stored densely, shape (levels, 4)."""
-    vertices = np.floor(cells).astype(np.int64) + 2
-    dense = vertices.prod(1) <= 2**log2_table
-    return np.concatenate([vertices, dense[:, None]], 1).astype(np.int32)
-
-
-@dataclass(frozen=True)
 class Layout:
     """Sizes and bounds of a field. `field.json` stores these names as keys."""
 
@@ -201,23 +127,83 @@ class Layout:
     """Distance at which rays start [m]."""
     levels: int
     growth: float
+    """Ratio of the cells per axis of consecutive hash levels."""
     log2_table: int
     hidden: int
     appearance_dim: int
 
     @property
-    def near_box(self) -> NearBox:
-        return NearBox(self.centre, self.half)
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of the near box [m], shape (2, 3)."""
+        center, half = np.array(self.centre), np.array(self.half)
+        return np.stack([center - half, center + half])
+
+    @property
+    def scale(self) -> float:
+        """The longest half side of the near box [m]."""
+        return max(self.half)
 
     @property
     def density_unit(self) -> float:
         """Density at raw output 0 [1/contracted m]."""
-        return _INITIAL_OPTICAL_DEPTH / self.near_box.scale
+        return _INITIAL_OPTICAL_DEPTH / self.scale
+
+    def grid_positions(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Points (n, 3) [m] → grid positions in [0, 1), shape (n, 3); see `kernels/space.py`."""
+        u = (points - np.array(self.centre)) / np.array(self.half)
+        m = np.maximum(np.abs(u).max(1, keepdims=True), 1.0)
+        u *= (2.0 - 1.0 / m) / m
+        return (u * 0.25 + 0.5).clip(0.0, 1.0 - 1e-6).astype(np.float32)
+
+    def opacity_grids(self) -> list[tuple[tuple[int, ...], float]]:
+        """Cells per axis, and side of a cell [contracted m], of the near and the far opacity grid.
+
+        The near grid covers the near box, the far grid the contracted cube, which is twice as wide.
+        """
+        out = []
+        for sides, cells in ((2.0 * np.array(self.half), _NEAR_CELLS), (4.0 * np.array(self.half), _FAR_CELLS)):
+            cell = float((sides.prod() / cells) ** (1 / 3))
+            out.append((tuple(int(n) for n in np.maximum(np.ceil(sides / cell), 4)), cell))
+        return out
+
+    def level_cells(self) -> NDArray[np.float32]:
+        """Cells per axis of every hash level, shape (levels, 3). Inside the near box, cells are cubes."""
+        sides = 4.0 * np.array(self.half)
+        per_meter = _COARSEST_CELLS * self.growth ** np.arange(self.levels) / sides.max()
+        return np.maximum(per_meter[:, None] * sides, 1.0).astype(np.float32)
+
+    def level_shapes(self) -> NDArray[np.int32]:
+        """Vertices per axis, and 1 if the level is stored densely, shape (levels, 4)."""
+        vertices = np.floor(self.level_cells()).astype(np.int64) + 2
+        dense = vertices.prod(1) <= 2**self.log2_table
+        return np.concatenate([vertices, dense[:, None]], 1).astype(np.int32)
 
 
-def near_distance(near_box: NearBox, known: NDArray) -> float:
-    """Distance of near surfaces from the cameras [m]: a low quantile of the known distances (k,), if there are any."""
-    return float(np.quantile(known, 0.05)) if len(known) else 0.25 * near_box.scale
+def near_box(
+    camera_to_world: NDArray[np.float64], near_half_extent: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Center and half sides [m] of the near box of cameras (n, 4, 4), z up.
+
+    It contains the cameras and the points half the path's extent ahead of each, with a margin, which is smaller
+    vertically, as most of what is filmed from a road lies beside the road. A nonzero `near_half_extent` [m] instead
+    gives a cube with that half side around the cameras.
+    """
+    positions, ahead = camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
+    low, high = positions.min(0), positions.max(0)
+    if near_half_extent > 0.0:
+        return (low + high) / 2, np.full(3, near_half_extent)
+    longest = max(float((high - low).max()), 1e-3)
+    seen = np.concatenate([positions, positions + 0.5 * longest * ahead])
+    low, high = seen.min(0), seen.max(0)
+    return (low + high) / 2, (high - low) / 2 + longest * np.array([0.15, 0.15, 0.1])
+
+
+def near_distance(scale: float, known: NDArray) -> float:
+    """Distance of near surfaces from the cameras [m]: a low quantile of the known distances (k,).
+
+    Without a known one, it is a quarter of `scale`, the longest half side of the near box [m].
+    """
+    return float(np.quantile(known, 0.05)) if len(known) else 0.25 * scale
 
 
 def section_layout(camera_to_world: NDArray[np.float64], config: NerfConfig, known: NDArray, focal: float) -> Layout:
@@ -226,12 +212,12 @@ def section_layout(camera_to_world: NDArray[np.float64], config: NerfConfig, kno
     The finest hash cell is `_CELL_PIXELS` wide at the distance of near surfaces, for a focal length [px of a training
     frame].
     """
-    near_box = near_box_of_cameras(camera_to_world, config.near_half_extent)
-    cell = _CELL_PIXELS * near_distance(near_box, known) / focal
-    ratio = 4.0 * near_box.scale / cell / _COARSEST_CELLS
+    center, half = (tuple(values.tolist()) for values in near_box(camera_to_world, config.near_half_extent))
+    cell = _CELL_PIXELS * near_distance(max(half), known) / focal
+    ratio = 4.0 * max(half) / cell / _COARSEST_CELLS
     return Layout(
-        near_box.center,
-        near_box.half,
+        center,
+        half,
         near_plane=max(config.near_plane, _MIN_NEAR_PLANE),
         levels=config.levels,
         growth=float(np.clip(ratio ** (1.0 / max(1, config.levels - 1)), *_GROWTH_RANGE)),

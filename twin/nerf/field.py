@@ -29,10 +29,7 @@ from twin.nerf.buffers import (
     Layout,
     Workspace,
     in_batches,
-    level_cells,
-    level_shapes,
     load_training_kernels,
-    opacity_grid_sizes,
     resolve_device,
     warp_view,
 )
@@ -80,15 +77,14 @@ class FieldSection:
         self.device = "cpu" if table.device.type == "cpu" else "cuda"
         load_training_kernels(self.device)
         self.w_table = warp_view(table, hashgrid.Feature)
-        cells = level_cells(layout.near_box, layout.levels, layout.growth)
         self.w_levels: Any = hashgrid.Levels()
-        self.w_levels.cells = wp.array(cells, dtype=wp.vec3f, device=self.device)
-        self.w_levels.shapes = wp.array(level_shapes(cells, layout.log2_table), dtype=wp.vec4i, device=self.device)
+        self.w_levels.cells = wp.array(layout.level_cells(), dtype=wp.vec3f, device=self.device)
+        self.w_levels.shapes = wp.array(layout.level_shapes(), dtype=wp.vec4i, device=self.device)
         self.w_levels.mask = wp.uint32(2**layout.log2_table - 1)
         self.w_grids: Any = volume.OpacityGrids()
         self.w_grids.near, self.w_grids.far = (warp_view(grid, wp.float32) for grid in grids)
-        cells_of_grids: Any = opacity_grid_sizes(layout.near_box)
-        (_, self.w_grids.near_cell), (_, self.w_grids.far_cell) = cells_of_grids
+        sizes: Any = layout.opacity_grids()
+        (_, self.w_grids.near_cell), (_, self.w_grids.far_cell) = sizes
         self.contraction: Any = space.Contraction()
         self.contraction.center = wp.vec3f(*layout.centre)
         self.contraction.inverse_half = wp.vec3f(*(1.0 / np.array(layout.half)))
@@ -171,33 +167,6 @@ class FieldSection:
             device=self.device,
         )
 
-    # ---- queries
-
-    def density(self, points: NDArray) -> NDArray[np.float32]:
-        """Density [1/m] at points [m], shape (k, 3) → (k,)."""
-        points = np.ascontiguousarray(points, np.float32)
-        result = np.empty(len(points), np.float32)
-
-        def query(rows: slice) -> None:
-            n = rows.stop - rows.start
-            meters = torch.as_tensor(points[rows], device=self.device)
-            with self.workspace(0, 1, QUERY_POINTS) as ws:
-                wp.launch(
-                    space.contract_points,
-                    n,
-                    [warp_view(meters, wp.vec3f), self.contraction],
-                    [ws.w_positions],
-                    device=self.device,
-                )
-                self.query(ws, 0, n)
-                raw = ws.outputs[:n, 0].clamp(max=volume.RAW_LIMIT)
-                result[rows] = (torch.exp(raw) * self.layout.density_unit).cpu().numpy()
-            u = np.abs((points[rows] - self.layout.centre) / self.layout.half).max(1)
-            result[rows] /= np.maximum(u, 1.0) ** 2
-
-        in_batches(query, len(points), QUERY_POINTS, self.device)
-        return result
-
     def trace(
         self, cameras: CameraArrays, camera: NDArray, pixel: NDArray, rays: NDArray[np.int64], out: Traced
     ) -> None:
@@ -251,7 +220,6 @@ class RadianceField:
         road: RoadSections,
         appearance: Appearance,
         parameters: dict[str, torch.Tensor],
-        about: dict[str, Any] | None = None,
     ):
         """
         Args:
@@ -259,10 +227,9 @@ class RadianceField:
             road: Determines the section that renders a camera.
             appearance: Embeddings, on the device of the tensors.
             parameters: Weights of the networks, see `network.initial_parameters`.
-            about: JSON-able metadata stored with the field.
         """
         self.sections, self.road = tuple(sections), road
-        self.appearance, self.parameters, self.about = appearance, parameters, about or {}
+        self.appearance, self.parameters = appearance, parameters
         self.device = self.sections[0].device
         for section in self.sections[1:]:  # spare workspaces fit all sections
             section.spare = self.sections[0].spare
@@ -274,7 +241,7 @@ class RadianceField:
     @property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner of the near boxes [m], shape (2, 3)."""
-        low, high = np.stack([section.layout.near_box.bounds for section in self.sections], 1)
+        low, high = np.stack([section.layout.bounds for section in self.sections], 1)
         return np.stack([low.min(0), high.max(0)])
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
@@ -332,8 +299,8 @@ class RadianceField:
 
     # ---- files
 
-    def save(self, folder: Path) -> None:
-        """Writes `field.safetensors` and `field.json`."""
+    def save(self, folder: Path, about: dict[str, Any] | None = None) -> None:
+        """Writes `field.json` with the metadata `about`, `field.safetensors`, and with several sections the road."""
         tensors: dict[str, torch.Tensor] = {}
         for k, section in enumerate(self.sections):
             tensors |= {f"{_prefix(k)}{name}": tensor for name, tensor in section.tensors().items()}
@@ -351,7 +318,7 @@ class RadianceField:
                 "lightings": self.appearance.lightings,
                 "frames": self.appearance.frames,
                 "frame_lighting": self.appearance.frame_lighting.tolist(),
-                "about": self.about,
+                "about": about or {},
             },
         )
 
@@ -376,7 +343,7 @@ class RadianceField:
                 for one in (head["layout"], *head.get("more_layouts", ()))
             ]
             names, frames = tuple(map(require_text, head["lightings"])), tuple(map(require_text, head["frames"]))
-            frame_lighting, about = np.array(head["frame_lighting"], np.int64), dict(head["about"])
+            frame_lighting = np.array(head["frame_lighting"], np.int64)
         path = regular_file(folder / "field.safetensors")
         with wrap_read_errors(path, "build the scene again"):
             tensors = load_file(str(path), device=device)
@@ -394,7 +361,7 @@ class RadianceField:
                 )
                 for k, layout in enumerate(layouts)
             ]
-        return RadianceField(sections, RoadSections.load(folder, len(sections)), appearance, parameters, about)
+        return RadianceField(sections, RoadSections.load(folder, len(sections)), appearance, parameters)
 
 
 def _check_tensors(
@@ -413,7 +380,7 @@ def _check_tensors(
     }
     for k, layout in enumerate(layouts):
         shapes[f"{_prefix(k)}table"] = (first.levels, 2**layout.log2_table, hashgrid.FEATURES)
-        for name, (shape, _) in zip(("near", "far"), opacity_grid_sizes(layout.near_box), strict=True):
+        for name, (shape, _) in zip(("near", "far"), layout.opacity_grids(), strict=True):
             shapes[f"{_prefix(k)}grid.{name}"] = shape
     check_shapes({name: (arrays[name], shape, "f") for name, shape in shapes.items()})
     if frame_lighting.shape != (frames,) or not np.isin(frame_lighting, np.arange(lightings)).all():
@@ -421,11 +388,18 @@ def _check_tensors(
 
 
 def untrained_field(
-    layouts: Sequence[Layout], appearance: Appearance, seed: int, device: str, road: RoadSections | None = None
+    layouts: Sequence[Layout],
+    lightings: tuple[str, ...],
+    frames: tuple[str, ...],
+    frame_lighting: NDArray[np.int64],
+    seed: int,
+    device: str,
+    road: RoadSections | None = None,
 ) -> RadianceField:
     """The field before its first training step; its density is low and almost uniform.
 
-    `layouts` has one layout per section of `road`; None is a road of one section.
+    `layouts` has one layout per section of `road`; None is a road of one section. For the lightings and frames see
+    `Appearance`.
     """
     generator = torch.Generator().manual_seed(seed)
     first = layouts[0]
@@ -436,14 +410,12 @@ def untrained_field(
         table = (torch.rand(layout.levels, 2**layout.log2_table, hashgrid.FEATURES, generator=generator) - 0.5) * 2e-2
         near, far = (
             torch.full(shape, -math.expm1(-layout.density_unit * cell), device=device)
-            for shape, cell in opacity_grid_sizes(layout.near_box)
+            for shape, cell in layout.opacity_grids()
         )
         sections.append(FieldSection(layout, table.to(device), (near, far), parameters))
-    moved = Appearance(
-        appearance.lightings,
-        appearance.frames,
-        appearance.frame_lighting,
-        appearance.vectors.to(device),
-        appearance.residuals.to(device),
+    vectors = np.random.default_rng([seed, 1]).normal(0.0, 0.3, (len(lightings), first.appearance_dim))
+    residuals = torch.zeros(len(frames), first.appearance_dim, device=device)
+    appearance = Appearance(
+        lightings, frames, frame_lighting, torch.as_tensor(vectors.astype(np.float32), device=device), residuals
     )
-    return RadianceField(sections, road or undivided_road(), moved, parameters)
+    return RadianceField(sections, road or undivided_road(), appearance, parameters)

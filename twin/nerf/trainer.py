@@ -23,7 +23,6 @@ from twin.files import read_json
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.images import write_image
 from twin.nerf import network
-from twin.nerf.appearance import initial_appearance
 from twin.nerf.bake import bake
 from twin.nerf.buffers import (
     CameraArrays,
@@ -142,8 +141,7 @@ class Trainer:
         self.pixels.points = join_depths([self.pixels.points, pole_depths(self.pixels, self.poles)])
         self.parts = [self.pixels.of_frames(frames) for frames in self.frames]
         """Pixels of each section."""
-        appearance = initial_appearance(lightings, train.names, frame_lighting, config.appearance_dim, seed)
-        self.field = untrained_field(layouts, appearance, seed, device, self.road)
+        self.field = untrained_field(layouts, lightings, train.names, frame_lighting, seed, device, self.road)
         self.rng = np.random.default_rng([seed, 2])
         self.shards = shard_count(device)
         self.free_points = _FREE_POINTS // self.shards
@@ -160,7 +158,7 @@ class Trainer:
         self.refinement: PoseRefinement | None = None
         """Camera corrections; None without `nerf.refine_cameras`."""
         if config.refine_cameras:
-            near = near_distance(layouts[0].near_box, known)
+            near = near_distance(layouts[0].scale, known)
             self.refinement = PoseRefinement(train.camera_to_world, self.pixels.intrinsics, near, self.ws)
             self.arrays = self.refinement.arrays
         else:
@@ -269,7 +267,7 @@ class Trainer:
                 ws.inverse_grad[rays] = gradients[1] / ws.cosines[rays]
             s.composite_backward(
                 *(ws, start, count, _DISTORTION / self.rays, _DEPTH / self.rays, _DEPTH_REACH),
-                _LOG_OFFSET * s.layout.near_box.scale,
+                _LOG_OFFSET * s.layout.scale,
             )
             first, second = self._trunk_backward(samples)
             if self._refines:
@@ -318,7 +316,7 @@ class Trainer:
         section.query(ws, start, self.free_points)
         rows = slice(start, start + self.free_points)
         density = torch.exp(ws.outputs[rows, 0].clamp(max=volume.RAW_LIMIT)) * layout.density_unit
-        depth = density * layout.near_box.scale
+        depth = density * layout.scale
         ws.outputs_grad[rows, 0] = _FREE / _FREE_POINTS * depth / (1.0 + depth)
         return self._trunk_backward(rows)
 
@@ -393,8 +391,7 @@ class Trainer:
         if not len(free):
             return None
         points = random_free_points(self.rng, free, n, self.config.near_plane)
-        near_box = self.field.sections[section].layout.near_box
-        return torch.from_numpy(near_box.grid_positions(points))
+        return torch.from_numpy(self.field.sections[section].layout.grid_positions(points))
 
     def finish(self) -> RadianceField:
         """The trained field, detached from autograd."""
@@ -505,15 +502,14 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
         metrics["detail"] = fit_detail(baked, field.appearance, pixels, config.seed, config.nerf.detail_passes)
     metrics |= evaluate(field, cameras, config.nerf.max_width, baked=baked)
     metrics["cross_lighting"] = cross_lighting(baked, cameras)
-    field.about = {
+    about = {
         "scene": config.name,
         "seed": config.seed,
         "nerf": asdict(config.nerf),
         "versions": {name: metadata.version(name) for name in ("twin", "torch", "warp-lang", "numpy")},
         "metrics": without_timings(metrics),
     }
-    field.save(out)
+    field.save(out, about)
     poles.save(out)
-    baked.about = field.about
-    baked.save(out)
+    baked.save(out, about)
     return metrics

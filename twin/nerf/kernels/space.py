@@ -87,13 +87,6 @@ def grid_position_backward(u: wp.vec3f, g: wp.vec3f) -> wp.vec3f:
 
 
 @wp.kernel(enable_backward=False)
-def contract_points(points: wp.array(dtype=wp.vec3f), box: Contraction, positions: wp.array(dtype=wp.vec3f)):
-    """Grid positions of points [m]."""
-    i = wp.tid()
-    positions[i] = grid_position(unit_position(box, points[i]))
-
-
-@wp.kernel(enable_backward=False)
 def pixel_rays(
     camera: wp.array(dtype=wp.int32),
     pixel: wp.array(dtype=wp.vec2f),
