@@ -32,6 +32,12 @@ def loud() -> None:
     runtime.set_quiet(False)
 
 
+@pytest.fixture
+def quiet(loud: None) -> None:
+    """Quiet mode, for files whose tests show progress."""
+    runtime.set_quiet(True)
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """Folder of the real captures; tests that ask for it skip where it is absent."""

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from devices import DEVICES
 
-from twin import runtime
 from twin.errors import InputError
 from twin.geometry.cameras import FAR, Viewpoints, intrinsics_for_size, pixel_grid, unproject
 from twin.geometry.poses import look_at
@@ -22,9 +21,7 @@ LAYOUT = BrickLayout((0.0, 0.0, 0.0), (4.0, 4.0, 2.0), 0.05, 0.5, (10, 10, 5), (
 LOW, STEP = -6.0, 18.0 / 255.0
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    runtime.set_quiet(True)
+pytestmark = pytest.mark.usefixtures("quiet")
 
 
 def places(layout: BrickLayout, near: np.ndarray, far: np.ndarray) -> np.ndarray:

@@ -8,14 +8,8 @@ from test_review import CheckeredField, make_cameras
 
 from twin.geometry.cameras import PosedCameras, Rendering
 from twin.nerf.evaluate import cross_lighting, mean_color
-from twin.runtime import set_quiet
 
-
-@pytest.fixture(autouse=True)
-def quiet():
-    set_quiet(True)
-    yield
-    set_quiet(False)
+pytestmark = pytest.mark.usefixtures("quiet")
 
 
 class Stubborn(CheckeredField):

@@ -18,18 +18,13 @@ from twin.nerf.detail import fit_detail
 from twin.nerf.kernels import surface_detail as kernels
 from twin.nerf.kernels.volume import CHANNELS, Channels
 from twin.nerf.trainer import train_field
-from twin.runtime import set_quiet
 from twin.warp_runtime import wp
 
 ORIGIN = np.array([-3.0, -2.0])
 CELL = 0.25
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    set_quiet(True)
-    yield
-    set_quiet(False)
+pytestmark = pytest.mark.usefixtures("quiet")
 
 
 def slope(x, y):

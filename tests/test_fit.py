@@ -24,7 +24,6 @@ from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
 from twin.nerf.poles import Poles
 from twin.nerf.trainer import Trainer, plane_loss, run, train_field
-from twin.runtime import set_quiet
 from twin.scene import SceneDir
 
 WIDTH, HEIGHT = 32, 24
@@ -32,11 +31,7 @@ K = np.array([24.0, 24.0, 16.0, 12.0])
 CONFIG = NerfConfig(steps=6, rays=128, samples=8, levels=3, log2_table=10, max_width=WIDTH)
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    set_quiet(True)
-    yield
-    set_quiet(False)
+pytestmark = pytest.mark.usefixtures("quiet")
 
 
 def ground_image(pose: np.ndarray, brightness: float) -> np.ndarray:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from analytic import AnalyticField, Box, Post, waves
 
-from twin import runtime
 from twin.assets.solids import Corridor, pole_parts
 from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, project, unproject
 from twin.geometry.images import read_image, write_image
@@ -23,9 +22,7 @@ POST, BOLLARD, COLUMN = (8.0, 2.6, 0.05, 2.2), (6.0, -2.2, 0.07, 0.9), (9.0, -3.
 """x, y, radius and height [m]."""
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    runtime.set_quiet(True)
+pytestmark = pytest.mark.usefixtures("quiet")
 
 
 def pattern(points: np.ndarray) -> np.ndarray:

@@ -12,7 +12,6 @@ from test_baked import LAYOUT, SIZE, K, baked, wall
 from test_fit import CONFIG, HEIGHT, WIDTH, floor_points, make_cameras
 from test_fit import K as FIT_K
 
-from twin import runtime
 from twin.errors import InputError
 from twin.geometry.cameras import SparsePoints, Viewpoints
 from twin.geometry.poses import look_at
@@ -28,12 +27,7 @@ from twin.nerf.field import RadianceField
 from twin.nerf.road import OVERLAP, RoadSections, divide_road, undivided_road
 from twin.nerf.trainer import Trainer, train_field
 
-
-@pytest.fixture(autouse=True)
-def quiet():
-    runtime.set_quiet(True)
-    yield
-    runtime.set_quiet(False)
+pytestmark = pytest.mark.usefixtures("quiet")
 
 
 def line(length: float, step: float = 0.7) -> np.ndarray:

@@ -8,7 +8,6 @@ import pytest
 from analytic import AnalyticField, Box
 from test_stereo import HEIGHT, PLACE, WIDTH, K, pattern, points_of, poses
 
-from twin import runtime
 from twin.config import NerfConfig, SceneConfig, SourceConfig
 from twin.files import write_json
 from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, unproject
@@ -23,9 +22,7 @@ CAR = Box(7.0, -2.0, 3.6, 1.7, 1.4)
 MOVING = slice(30, 66)  # rows of a mover
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    runtime.set_quiet(True)
+pytestmark = pytest.mark.usefixtures("quiet")
 
 
 def columns(i: int) -> slice:
