@@ -23,6 +23,7 @@ _MAX_POINT_ERROR = 2.0  # [px] greatest reprojection error of a used point
 _MIN_TRACK_LENGTH = 3  # least number of frames in which a used point was matched
 _PATH_REACH = 12.0  # [camera heights] the path is used up to this distance ahead
 _PATH_OFFSETS = (-0.5, 0.0, 0.5)  # [camera heights] lateral offsets at which the ground is assumed level with the path
+_SUPERVISION = ("points", "path", "stereo")  # attributes of `TrainingPixels` with the kinds of depth supervision
 _TRIPLE_SPACING = 0.02  # greatest spacing of a triple's pixels (see `batch`) [share of the image width]
 
 
@@ -55,16 +56,18 @@ class DepthSupervision:
         """The rows of frame i."""
         return slice(*np.searchsorted(self.frame, np.array([i, i + 1], self.frame.dtype)))
 
+    def select(self, rows: NDArray) -> "DepthSupervision":
+        """The rows with these indices or where this mask is true."""
+        return DepthSupervision(self.frame[rows], self.pixel[rows], self.distance[rows])
+
 
 def join_depths(parts: list[DepthSupervision]) -> DepthSupervision:
     """Joins depth supervision, in the order of the frames."""
-    frame = np.concatenate([np.zeros(0, np.int32), *(p.frame for p in parts)])
-    order = np.argsort(frame, kind="stable")
-    return DepthSupervision(
-        frame[order],
-        np.concatenate([np.zeros((0, 2)), *(p.pixel for p in parts)])[order],
-        np.concatenate([np.zeros(0, np.float32), *(p.distance for p in parts)])[order],
+    parts = [DepthSupervision(np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0, np.float32)), *parts]
+    joined = DepthSupervision(
+        *(np.concatenate(columns) for columns in zip(*(vars(p).values() for p in parts), strict=True))
     )
+    return joined.select(np.argsort(joined.frame, kind="stable"))
 
 
 class TrainingPixels:
@@ -112,7 +115,9 @@ class TrainingPixels:
         kept = [part & ~mark.ravel() for part, mark in zip(parts, marked, strict=True)]
         self.unmasked = np.concatenate([new if new.any() else old for old, new in zip(parts, kept, strict=True)])
         vars(self).pop("_index", None)
-        self.points, self.path, self.stereo = map(self._on_unmasked, (self.points, self.path, self.stereo))
+        for name in _SUPERVISION:
+            pool = getattr(self, name)
+            setattr(self, name, pool.select(self.is_unmasked(pool.frame, pool.pixel)))
 
     def of_frames(self, frames: NDArray[np.int64]) -> "TrainingPixels":
         """The same pixels and frame indices, but `batch` samples from the given frames only.
@@ -124,10 +129,9 @@ class TrainingPixels:
         out = copy.copy(self)
         out.frames = frames
         vars(out).pop("_index", None)
-        for name in ("points", "path", "stereo"):
+        for name in _SUPERVISION:
             pool = getattr(self, name)
-            keep = np.isin(pool.frame, frames)
-            setattr(out, name, DepthSupervision(pool.frame[keep], pool.pixel[keep], pool.distance[keep]))
+            setattr(out, name, pool.select(np.isin(pool.frame, frames)))
         if not any(self.unmasked[self.start[i] : self.start[i + 1]].any() for i in frames):
             raise InputError(
                 f"a section of the road has no pixel to train on: its {len(frames)} frames are held out or masked; "
@@ -139,10 +143,6 @@ class TrainingPixels:
         """Mask (k,) of the pixels (k, 2) that are used, in one frame or in frames (k,)."""
         u, v = pixel.astype(int).T
         return self.unmasked[self.start[frame] + v * self.width[frame] + u]
-
-    def _on_unmasked(self, depths: DepthSupervision) -> DepthSupervision:
-        keep = self.is_unmasked(depths.frame, depths.pixel)
-        return DepthSupervision(depths.frame[keep], depths.pixel[keep], depths.distance[keep])
 
     def depths_in_frame(self, i: int, xyz: NDArray) -> DepthSupervision:
         """Depth supervision of frame i from points (k, 3) [m]; drops points outside the frame or on masked pixels."""
@@ -190,7 +190,7 @@ class TrainingPixels:
         Each shard holds, in this order: `triples` × 3 rays (a triple goes through three equally spaced pixels in a
         line), `singles` rays through random pixels, and `supervised` rays with depth, equally many of each kind.
         """
-        kinds = [pool for pool in (self.points, self.path, self.stereo) if len(pool.frame)]
+        kinds = [pool for name in _SUPERVISION if len((pool := getattr(self, name)).frame)]
         if not kinds:
             singles, supervised = singles + supervised, 0
         parts = [self._triples(rng, shards * triples), self._pixels(self._random(rng, shards * singles))]
