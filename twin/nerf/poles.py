@@ -137,52 +137,57 @@ class _Bars:
     square: Array
 
 
-_Read = tuple[Array, list[wp.array]]
+@dataclass(frozen=True)
+class _LevelPicture:
+    """A picture as a level camera would have taken it."""
+
+    turn: Array
+    """Axes of the camera, see `_level`."""
+    intrinsics: Array
+    """fx, fy, cx, cy [px]"""
+    tables: list[wp.array]
+    """Summed-area tables of the colors, and of the pixels that are masked or outside."""
 
 
 class _LevelPictures:
-    """Pictures of some frames as level cameras would have taken them, as summed-area tables."""
+    """Level pictures of some frames, used up to a depth."""
 
-    def __init__(
-        self,
-        pixels: TrainingPixels,
-        frames: NDArray[np.int64],
-        known: dict[int, _Read] | None = None,
-        far: float = _DEPTHS[1],
-    ) -> None:
-        """The pictures of the frames in `known` have been read before. They are used up to the depth `far` [m]."""
-        self.frames, self._far = frames, far
-        self.films = np.array(pixels.cameras.sources)[frames]
-        self.lightings = np.array(pixels.cameras.lightings)[frames]
-        self.positions = pixels.cameras.positions[frames]
-        self._turns = [_level(pixels.cameras.camera_to_world[i]) for i in frames]
-        known, numbers = known or {}, frames.tolist()
-        new = [k for k, i in enumerate(numbers) if i not in known]
-        fresh = parallel(lambda k: self._read_frame(pixels, numbers[k], self._turns[k]), new, "cpu")
-        known = known | {numbers[k]: one for k, one in zip(new, fresh, strict=True)}
-        self.read = {i: known[i] for i in numbers}
-        self._intrinsics, self._tables = zip(*self.read.values(), strict=True)
+    def __init__(self, pixels: TrainingPixels, far: float = _DEPTHS[1]) -> None:
+        """Begins without pictures, see `read`; `far` is the greatest depth at which they are used [m]."""
+        self._pixels, self._far = pixels, far
+        self.frames: list[int] = []
+        self.pictures: list[_LevelPicture] = []
 
-    @staticmethod
-    def _read_frame(pixels: TrainingPixels, i: int, turn: Array) -> _Read:
-        """Intrinsics fx, fy, cx, cy [px], and tables of the colors and of the pixels that are masked or outside."""
-        shape = int(pixels.height[i]), int(pixels.width[i])
+    def read(self, frames: NDArray[np.int64]) -> None:
+        """Changes the frames; those that are kept are not read again, and the others leave memory first."""
+        known = {i: one for i, one in zip(self.frames, self.pictures, strict=True) if i in frames}
+        self.frames, self.pictures = frames.tolist(), []
+        new = [i for i in self.frames if i not in known]
+        known |= zip(new, parallel(self._read_frame, new, "cpu"), strict=True)
+        self.pictures = [known[i] for i in self.frames]
+        cameras = self._pixels.cameras
+        self.films, self.lightings = np.array(cameras.sources)[frames], np.array(cameras.lightings)[frames]
+        self.positions = cameras.positions[frames]
+
+    def _read_frame(self, i: int) -> _LevelPicture:
+        pixels = self._pixels
+        shape, pose = (int(pixels.height[i]), int(pixels.width[i])), pixels.cameras.camera_to_world[i]
         picture, intrinsics = load_picture(pixels.cameras, i, _width(pixels, i))
         height, width = picture.shape[:2]
         masked = ~pixels.unmasked[pixels.start[i] : pixels.start[i + 1]].reshape(shape)
         mask = cv2.resize(masked.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
         fx, fy, cx, cy = intrinsics
-        matrix = np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
-        rotation = turn.T @ pixels.cameras.camera_to_world[i, :3, :3]
-        homography = matrix @ rotation @ np.linalg.inv(matrix)
+        matrix, turn = np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]]), _level(pose)
+        homography = matrix @ (turn.T @ pose[:3, :3]) @ np.linalg.inv(matrix)
         level = cv2.warpPerspective(picture, homography, (width, height))
         hidden = cv2.warpPerspective(mask, homography, (width, height), flags=cv2.INTER_NEAREST, borderValue=1)
-        return intrinsics, [wp.array(cv2.integral(one), dtype=wp.int32, device="cpu") for one in (level, hidden)]
+        tables: list[wp.array] = [wp.array(cv2.integral(one), dtype=wp.int32, device="cpu") for one in (level, hidden)]
+        return _LevelPicture(turn, intrinsics, tables)
 
     def seen(self, k: int, feet: Array) -> tuple[NDArray[np.int64], Array]:
         """Indices of the spots (n, 3) before picture k, and their positions in its camera: right, up and ahead [m]."""
-        local = (feet - self.positions[k]) @ self._turns[k] * (1.0, -1.0, 1.0)
-        fx, _, cx, _ = self._intrinsics[k]
+        local = (feet - self.positions[k]) @ self.pictures[k].turn * (1.0, -1.0, 1.0)
+        fx, _, cx, _ = self.pictures[k].intrinsics
         ahead = (local[:, 2] > _DEPTHS[0]) & (local[:, 2] < self._far) & (np.abs(local[:, 0]) * fx < local[:, 2] * cx)
         index = np.flatnonzero(ahead)
         return index, local[index]
@@ -228,8 +233,8 @@ class _LevelPictures:
                         continue
                     spots: wp.array = wp.array(local.astype(np.float32), dtype=wp.vec3, device="cpu")
                     rows: wp.array = wp.array(halves[half][index].astype(np.int32), dtype=wp.int32, device="cpu")
-                    lens = wp.vec4(*map(float, self._intrinsics[k]))
-                    inputs = [*self._tables[k], lens, spots, rows, *given]
+                    lens = wp.vec4(*map(float, self.pictures[k].intrinsics))
+                    inputs = [*self.pictures[k].tables, lens, spots, rows, *given]
                     wp.launch(kernels.add_bars, len(index), inputs, sums, device="cpu")
 
             parallel(add, range(2), "cpu")
@@ -243,11 +248,12 @@ class _LevelPictures:
         offset [m], and the contrast [gray levels]; shape (n, 4).
         """
         out = []
-        for k, (sums, hidden) in enumerate(self._tables):
+        for k, picture in enumerate(self.pictures):
+            sums, hidden = picture.tables
             index, local = self.seen(k, foot[None])
             if not len(index) or (len(found) and self._covered(k, local, radius, found)[0]):
                 continue
-            (x, y, z), table, (fx, fy, cx, cy) = local[0], sums.numpy(), self._intrinsics[k]
+            (x, y, z), table, (fx, fy, cx, cy) = local[0], sums.numpy(), picture.intrinsics
             half = radius * fx / z
             middle, side = fx * x / z + cx, max(1.0, 0.5 * half)
             most = int(np.clip(0.6 * half, *_OFFSET_WINDOW) / _OFFSET_STEP)
@@ -271,7 +277,7 @@ class _LevelPictures:
             )
             contrast = np.minimum(*(np.abs(inside - beside).max(-1) for beside in (left, right))).mean(0)
             best = int(contrast.argmax())
-            out.append((*self._turns[k][:2, 0], steps[best] * z / fx, contrast[best]))
+            out.append((*picture.turn[:2, 0], steps[best] * z / fx, contrast[best]))
         return np.array(out).reshape(-1, 4)
 
     def _covered(self, k: int, local: Array, radius: float, found: "Poles") -> NDArray[np.bool_]:
@@ -293,33 +299,29 @@ def find_poles(pixels: TrainingPixels, camera_height: float) -> Poles:
     path = cKDTree(positions[:, :2])
     steps = np.array(list(product((-1.0, 0.0, 1.0), repeat=2))) * _BESIDE[1]
     tiles = np.unique(np.floor((positions[:, None, :2] + steps).reshape(-1, 2) / _TILE).astype(int), axis=0)
-    poles, evidence, read = Poles.none(), np.zeros(0), dict[int, _Read]()
+    poles, evidence, pictures = Poles.none(), np.zeros(0), _LevelPictures(pixels)
     for corner in track(tiles * _TILE, "poles", unit="square"):
         spots = _spots(corner, path, positions[:, 2] - camera_height)
         beyond = np.maximum(np.abs(positions[kept, :2] - corner - 0.5 * _TILE) - 0.5 * _TILE, 0.0)
         frames = _at_most(kept, np.linalg.norm(beyond, axis=1) < _DEPTHS[1], pixels)
         if len(spots) and len(frames) >= _MIN_ALL:
-            read = {i: read[i] for i in frames.tolist() if i in read}  # a square's pictures also show the next one
-            pictures = _LevelPictures(pixels, frames, read)
-            read = pictures.read
+            pictures.read(frames)
             more, sums = _search(pictures, spots, poles)
-            del pictures
             poles, evidence = Poles.join([poles, more]), np.append(evidence, sums)
-    read.clear()
+    del pictures  # those of `_extended` take their memory
     return _extended(pixels, kept, poles.select(_peaks(poles.foot[:, :2], evidence, 0.0, _APART)))
 
 
 def _extended(pixels: TrainingPixels, kept: NDArray[np.int64], poles: Poles) -> Poles:
     """Poles that reach the highest band by which they were found, continued upward as far as pictures show them."""
-    tall, height, read = poles.height > _BANDS[_JUDGED - 1][0], poles.height.copy(), dict[int, _Read]()
+    tall, height = poles.height > _BANDS[_JUDGED - 1][0], poles.height.copy()
+    pictures = _LevelPictures(pixels, _HIGH_DEPTHS[1])
     for i in np.flatnonzero(tall):
         away = np.linalg.norm(pixels.cameras.positions[kept, :2] - poles.foot[i, :2], axis=1)
         frames = _at_most(kept, (away > _HIGH_DEPTHS[0]) & (away < _HIGH_DEPTHS[1]), pixels)
         if len(frames) < _MIN_ALL:
             continue
-        read = {k: read[k] for k in frames.tolist() if k in read}
-        pictures = _LevelPictures(pixels, frames, read, _HIGH_DEPTHS[1])
-        read = pictures.read
+        pictures.read(frames)
         others = poles.select(np.flatnonzero(tall & (np.arange(len(poles)) != i)))  # lower ones hide nothing there
         thin = int(np.abs(np.array(_RADII) - poles.radius[i]).argmin())
         bars = pictures.bars(poles.foot[i : i + 1], (_RADII[thin], _RADII[thin + _TWICE]), _BANDS[_JUDGED:], others)
@@ -329,7 +331,6 @@ def _extended(pixels: TrainingPixels, kept: NDArray[np.int64], poles: Poles) -> 
         good = sums[top] / (top + 1) + _CHANCE >= _MIN_QUALITY and thicker[top] <= _MAX_RATIO * sums[top]
         if good and sums[top] > 0.0:
             height[i] = _BANDS[_JUDGED + top][1]
-        del pictures
     return Poles(poles.foot, poles.radius, height)
 
 
@@ -337,11 +338,12 @@ def pole_depths(pixels: TrainingPixels, poles: Poles) -> DepthSupervision:
     """Depth supervision on the fronts of poles in the pictures that show their bars in the usual color."""
     tops = [round((height - _BANDS[0][0]) / _BAND) for height in poles.height]
     views: list[list[_View]] = [[] for _ in tops]
+    pictures = _LevelPictures(pixels, _HIGH_DEPTHS[1])
     for i, position in enumerate(pixels.cameras.positions):
         away = np.linalg.norm(poles.foot[:, :2] - position[:2], axis=1)
         near = np.flatnonzero(away < np.where(np.array(tops) > _JUDGED, _HIGH_DEPTHS[1], _DEPTHS[1]))
         if len(near):
-            pictures = _LevelPictures(pixels, np.array([i]), far=_HIGH_DEPTHS[1])
+            pictures.read(np.array([i]))
             (bars,) = pictures.bars(poles.foot[near], tuple(map(float, poles.radius[near])), _BANDS)
             rows = np.arange(len(near))
             count, contrast, color = (one[rows, rows] for one in (bars.count, bars.contrast, bars.color))
