@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from analytic import AnalyticField, Box, waves
 
-from twin import runtime
 from twin.geometry.cameras import Cameras, SparsePoints, Viewpoints, pixel_grid, project, unproject
 from twin.geometry.images import write_image
 from twin.geometry.poses import look_at
@@ -19,9 +18,7 @@ K = np.array([110.0, 110.0, 80.0, 45.0])
 PLACE = AnalyticField(boxes=(Box(9.0, 3.0, 2.0, 2.0, 2.5), Box(14.0, -2.5, 1.0, 3.0, 4.0)), amplitude=0.0)
 
 
-@pytest.fixture(autouse=True)
-def quiet():
-    runtime.set_quiet(True)
+pytestmark = pytest.mark.usefixtures("quiet")
 
 
 def pattern(points: np.ndarray) -> np.ndarray:
@@ -145,16 +142,18 @@ def test_sources_are_of_the_same_film_and_degrees_apart(tmp_path):
 
 def test_homography_agrees_with_projection(tmp_path):
     """A pixel's image under the homography is the projection of its point."""
-    from twin.nerf.stereo import _geometry
+    from twin.nerf.stereo import _mappings
 
     cameras = film(tmp_path, 4)
     pixels = TrainingPixels(cameras, points_of(cameras), WIDTH)
-    geometry = _geometry(pixels, 0, np.array([1, 3], np.int32))
+    there, back = _mappings(pixels, 0, np.array([1, 3], np.int32))
     pixel, depth = np.array([[30.5, 70.5], [120.5, 60.5]]), np.array([3.0, 5.0])
     place = unproject(pixel, K) * depth[:, None] @ cameras.camera_to_world[0, :3, :3].T + cameras.positions[0]
     homogeneous = np.column_stack([pixel, np.ones(2)])
     for k, j in enumerate((1, 3)):
-        h = homogeneous @ geometry.homography[k].T + geometry.epipole[k] / depth[:, None]
+        h = homogeneous @ there[k, :, :3].T + there[k, :, 3] / depth[:, None]
         expected, z = project(place, cameras.camera_to_world[j], K)
         assert np.allclose(h[:, :2] / h[:, 2:], expected)
         assert np.allclose(h[:, 2] * depth, z)
+        h = np.column_stack([expected, np.ones(2)]) @ back[k, :, :3].T + back[k, :, 3] / z[:, None]
+        assert np.allclose(h[:, :2] / h[:, 2:], pixel)

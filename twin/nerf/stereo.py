@@ -6,7 +6,7 @@ al. 2015) fits a plane to every cell, such that the sources, warped by the plane
 enough sources find the same point. Surfaces without texture get no depth.
 """
 
-from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -33,18 +33,6 @@ _MIN_VOTES = 2  # sources that must agree; 1 suffices if a frame has only one so
 _MIN_POINTS = 20  # least number of sparse points from which a frame's depth range is estimated
 
 
-@dataclass(frozen=True)
-class StereoGeometry:
-    """Mapping of a frame's pixels into its s sources, homography · (u, v, 1) + epipole / depth, and back."""
-
-    homography: Array
-    """K_source · R · K⁻¹, shape (s, 3, 3)."""
-    epipole: Array
-    """K_source · t, shape (s, 3)."""
-    back_homography: Array
-    back_epipole: Array
-
-
 def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[DepthSupervision, dict[str, Any]]:
     """Depth supervision for every frame that has sources, and a summary; the same seed gives the same depths.
 
@@ -69,12 +57,20 @@ def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[Depth
     planes: wp.array = wp.zeros((n, rows, columns), dtype=wp.vec3, device=device)
     costs: wp.array = wp.full((n, rows, columns), 2.0, dtype=wp.float32, device=device)
     cells: wp.array = wp.array(shapes, dtype=wp.vec2i, device=device)
-    geometry = [_geometry(pixels, i, sources[i]) for i in range(n)]
+
+    def mapping(matrices: Array) -> list[wp.array]:
+        """Homographies and epipoles, see `_mappings`, on the device."""
+        homography, epipole = matrices[..., :3].astype(np.float32), matrices[..., 3].astype(np.float32)
+        return [
+            wp.array(homography, dtype=wp.mat33, device=device),
+            wp.array(epipole, dtype=wp.vec3, device=device),
+        ]
+
+    mappings = [_mappings(pixels, i, sources[i]) for i in range(n)]
     views = [kernels.SourceViews() for _ in range(n)]
-    for view, source, g in zip(views, sources, geometry, strict=True):
+    for view, source, (there, _) in zip(views, sources, mappings, strict=True):
         view.source = wp.array(source, dtype=wp.int32, device=device)
-        view.homography = wp.array(g.homography.astype(np.float32), dtype=wp.mat33, device=device)
-        view.epipole = wp.array(g.epipole.astype(np.float32), dtype=wp.vec3, device=device)
+        view.homography, view.epipole = mapping(there)
     wp.load_module("twin.nerf.kernels.patch_match", device=device)
 
     with bar("stereo", n, "frame") as progress:
@@ -89,18 +85,10 @@ def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[Depth
                     for guess in (_planes_at_points(pixels, i, step, shape), _ground_planes(pixels, i, step, shape))
                 ]
                 own_planes, own_costs = _frame_part(planes, i, shape), _frame_part(costs, i, shape)
-                for number in range(_ROUNDS + 1):
-                    for parity in (0, 1):
-                        wp.launch(
-                            kernels.sweep,
-                            (shape[0], (shape[1] + 1) // 2),
-                            [
-                                *(frames, views[i], i, step, spacing, low, high, number, parity),
-                                *(seed * 100_003 + i, *guesses),
-                            ],
-                            [own_planes, own_costs],
-                            device=device,
-                        )
+                for number, parity in product(range(_ROUNDS + 1), (0, 1)):
+                    inputs = [frames, views[i], i, step, spacing, low, high, number, parity, seed * 100_003 + i]
+                    dim = shape[0], (shape[1] + 1) // 2
+                    wp.launch(kernels.sweep, dim, [*inputs, *guesses], [own_planes, own_costs], device=device)
             progress.update()
 
         parallel(find, range(n), device)
@@ -110,19 +98,8 @@ def stereo_depths(pixels: TrainingPixels, seed: int, device: str) -> tuple[Depth
         if not len(sources[i]):
             return none, 0
         votes: wp.array = wp.zeros(shape, dtype=wp.int32, device=device)
-        back: list[wp.array] = [
-            wp.array(geometry[i].back_homography.astype(np.float32), dtype=wp.mat33, device=device),
-            wp.array(geometry[i].back_epipole.astype(np.float32), dtype=wp.vec3, device=device),
-        ]
-        wp.launch(
-            kernels.count_votes,
-            shape,
-            [
-                *(views[i], *back, planes, cells, _frame_part(costs, i, shape), i, step),
-                *(_MAX_COST, _TOLERANCE, _MIN_PARALLAX, votes),
-            ],
-            device=device,
-        )
+        inputs = [views[i], *mapping(mappings[i][1]), planes, cells, _frame_part(costs, i, shape), i, step]
+        wp.launch(kernels.count_votes, shape, [*inputs, _MAX_COST, _TOLERANCE, _MIN_PARALLAX, votes], device=device)
         q = _frame_part(planes, i, shape).numpy()[..., 0]
         row, column = np.nonzero(votes.numpy() >= min(_MIN_VOTES, len(sources[i])))
         pixel = np.stack([column, row], 1) * step + step // 2 + 0.5
@@ -178,28 +155,29 @@ def _depth_quantiles(pixels: TrainingPixels, i: int) -> Array:
     own = points.frame == i
     if own.sum() < _MIN_POINTS:
         own = np.ones(len(points.frame), bool)
-    rays = np.stack([np.ones(int(own.sum())), *_ray_slopes(pixels, points.frame[own], points.pixel[own])], 1)
-    depth = points.distance[own] / np.linalg.norm(rays, axis=1)
+    x, y, _ = unproject(points.pixel[own], pixels.intrinsics[points.frame[own]]).T
+    depth = points.distance[own] / np.sqrt(1.0 + x**2 + y**2)
     return np.quantile(depth, [0.01, 0.25, 0.5, 0.75, 0.99])
 
 
-def _ray_slopes(pixels: TrainingPixels, frame: NDArray, pixel: Array) -> tuple[Array, Array]:
-    fx, fy, cx, cy = pixels.intrinsics[frame].T
-    return (pixel[:, 0] - cx) / fx, (pixel[:, 1] - cy) / fy
+def _mappings(pixels: TrainingPixels, i: int, sources: NDArray[np.int32]) -> Array:
+    """Mappings of frame i's pixels into its s sources, and back, shape (2, s, 3, 4).
 
+    Pixel (u, v) of a point at a z-depth is mapped to `M[:, :3] @ (u, v, 1) + M[:, 3] / depth`: a homography
+    K_to · R · K_from⁻¹ and an epipole K_to · t.
+    """
 
-def _geometry(pixels: TrainingPixels, i: int, sources: NDArray[np.int32]) -> StereoGeometry:
     def matrix(k: Array) -> Array:
         return np.array([[k[0], 0.0, k[2]], [0.0, k[1], k[3]], [0.0, 0.0, 1.0]])
 
-    own, out = matrix(pixels.intrinsics[i]), np.zeros((len(sources), 2, 3, 4))
+    own, out = matrix(pixels.intrinsics[i]), np.zeros((2, len(sources), 3, 4))
     for k, j in enumerate(sources):
         other = matrix(pixels.intrinsics[j])
         there = inverse_pose(pixels.cameras.camera_to_world[j]) @ pixels.cameras.camera_to_world[i]
         here = inverse_pose(there)
         for way, a, b, pose in ((0, other, own, there), (1, own, other, here)):
-            out[k, way, :, :3], out[k, way, :, 3] = a @ pose[:3, :3] @ np.linalg.inv(b), a @ pose[:3, 3]
-    return StereoGeometry(out[:, 0, :, :3], out[:, 0, :, 3], out[:, 1, :, :3], out[:, 1, :, 3])
+            out[way, k, :, :3], out[way, k, :, 3] = a @ pose[:3, :3] @ np.linalg.inv(b), a @ pose[:3, 3]
+    return out
 
 
 def _frame_part(array: wp.array, i: int, shape: tuple[int, ...]) -> wp.array:
@@ -220,7 +198,7 @@ def _planes_at_points(pixels: TrainingPixels, i: int, step: int, shape: tuple[in
     out = np.zeros((*shape, 3))
     if own.any():
         pixel = pixels.points.pixel[own]
-        x, y = _ray_slopes(pixels, pixels.points.frame[own], pixel)
+        x, y, _ = unproject(pixel, pixels.intrinsics[i]).T
         q = np.sqrt(1.0 + x**2 + y**2) / pixels.points.distance[own]
         out[..., 0] = q[cKDTree(pixel).query(_cell_pixels(step, shape).reshape(-1, 2))[1]].reshape(shape)
     return out
