@@ -175,9 +175,9 @@ def lit_cosine(shadows: OrthographicShadowMap, points: NDArray, normals: NDArray
 
 
 def _levelness(normals: NDArray) -> NDArray:
-    """1 for level surfaces, 0 for steep ones; normals (n, 3) → (n,)."""
+    """1 for level surfaces, 0 for steep ones; normals (..., 3) → (...)."""
     low, high = _LEVEL
-    return np.clip((normals[:, 2] - low) / (high - low), 0.0, 1.0)
+    return np.clip((normals[..., 2] - low) / (high - low), 0.0, 1.0)
 
 
 def surface_normals(points: Array32, window: int) -> Array32:
@@ -198,9 +198,7 @@ def _normals(points: Array32) -> Array32:
     Level surfaces get a vertical normal, since the ground in a radiance field is rough.
     """
     normal = surface_normals(points, max(3, 2 * round(_SMOOTHING * points.shape[1] / 2) + 1))
-    low, high = _LEVEL
-    level = np.clip((normal[..., 2:] - low) / (high - low), 0.0, 1.0)
-    normal += level * (np.array([0.0, 0.0, 1.0], np.float32) - normal)
+    normal += _levelness(normal)[..., None] * (np.array([0.0, 0.0, 1.0], np.float32) - normal)
     return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)).astype(np.float32)
 
 

@@ -9,6 +9,7 @@ embedding and fog.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,16 +58,11 @@ class SunProblem:
     bases: Array32
     """Colors of the field under each base, shape (bases, n, 3)."""
 
-    def subset(self, rows: NDArray) -> "SunProblem":
-        """The problem of some pixels."""
-        return SunProblem(self.colors[rows], self.seen.subset(rows), self.distances[rows], self.bases[:, rows])
-
 
 @dataclass(frozen=True)
 class LinearFit:
     """A sun fitted to a photo by least squares, with one base."""
 
-    base: int
     toward: Array
     """Unit vector towards the sun, shape (3,)."""
     coefficients: Array32
@@ -86,22 +82,19 @@ def search_directions(problem: SunProblem, casters: ShadowCasters, fog: Fog) -> 
         return known[key]
 
     grid = [fits(a, e) for e in _ELEVATIONS for a in np.arange(0.0, 360.0, _AZIMUTH_STEP)]
-    best = [min((one[k] for one in grid), key=_error) for k in range(len(problem.bases))]
+    error = attrgetter("error")
+    best = [min((one[k] for one in grid), key=error) for k in range(len(problem.bases))]
     promising = set(np.argsort([one.error for one in best])[:_BASES].tolist()) | {len(best) - 1}
     for k in promising:
-        starts = sorted((one[k] for one in grid), key=_error)[:_STARTS]
+        starts = sorted((one[k] for one in grid), key=error)[:_STARTS]
         for found in starts:
             for step in _REFINEMENTS:
                 azimuth, elevation = angles(found.toward)
                 wide = step / math.cos(math.radians(elevation))
                 around = ((wide, 0.0), (-wide, 0.0), (0.0, step), (0.0, -step))
-                found = min([found, *(fits(azimuth + a, elevation + e)[k] for a, e in around)], key=_error)
-            best[k] = min(best[k], found, key=_error)
+                found = min([found, *(fits(azimuth + a, elevation + e)[k] for a, e in around)], key=error)
+            best[k] = min(best[k], found, key=error)
     return best
-
-
-def _error(fit: LinearFit) -> float:
-    return fit.error
 
 
 def fit_direction(problem: SunProblem, shadows: OrthographicShadowMap, fog: Fog) -> list[LinearFit]:
@@ -110,14 +103,14 @@ def fit_direction(problem: SunProblem, shadows: OrthographicShadowMap, fog: Fog)
     kept = _kept(fog, problem.distances)[:, None]
     target = problem.colors - (1.0 - kept) * np.asarray(fog.airlight)
     out = []
-    for number, base in enumerate(problem.bases):
+    for base in problem.bases:
         coefficients = np.empty((len(TERMS), 3))
         for c in range(3):
             coefficients[:, c] = _solve(kept * base[:, c : c + 1] * terms, target[:, c])
         gain = np.clip(terms @ coefficients, MIN_GAIN, MAX_GAIN)
         shown = np.clip(kept * base * gain + (1.0 - kept) * np.asarray(fog.airlight), 0.0, 1.0)
         error = float(((shown - problem.colors) ** 2).mean())
-        out.append(LinearFit(number, shadows.toward, coefficients.astype(np.float32), error))
+        out.append(LinearFit(shadows.toward, coefficients.astype(np.float32), error))
     return out
 
 
