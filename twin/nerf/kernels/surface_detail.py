@@ -124,9 +124,9 @@ def surface_hit(grid: DetailGrid, o: wp.vec3f, ray: wp.vec3f, depth: wp.float32,
 
 
 @wp.func
-def level_weight(footprint: wp.float32, texel: wp.float32) -> wp.float32:
-    """1 if texels of side `texel` [m] are coarse enough not to alias at a footprint [m], else 0."""
-    return wp.where(footprint < MAX_FOOTPRINT * texel, 1.0, 0.0)
+def is_shown(footprint: wp.float32, texel: wp.float32) -> wp.bool:
+    """True if texels of side `texel` [m] are coarse enough not to alias at a footprint [m]."""
+    return footprint < MAX_FOOTPRINT * texel
 
 
 @wp.func
@@ -151,17 +151,29 @@ def vertex_row(grid: DetailGrid, x: wp.int32, y: wp.int32, z: wp.int32) -> wp.in
 
 
 @wp.func
-def weight_elsewhere(grid: DetailGrid, hit: Hit) -> wp.float32:
-    """Weight of the hash grid at a hit that is not on the ground."""
-    return level_weight(-hit[3], grid.cell)
+def texel_corner(grid: DetailGrid, level: wp.int32, x: wp.float32, y: wp.float32, n: wp.int32):
+    """Row (see `texel_row`) and weight of corner n = x + 2·y of a level's cell at (x, y) [m] from the grid's corner."""
+    side = grid.texel * float(1 << level)
+    px = x / side
+    py = y / side
+    ix = int(px)
+    iy = int(py)
+    ax = px - float(ix)
+    ay = py - float(iy)
+    share = wp.where((n & 1) > 0, ax, 1.0 - ax) * wp.where((n >> 1) > 0, ay, 1.0 - ay)
+    return texel_row(grid, level, ix + (n & 1), iy + (n >> 1)), share
 
 
 @wp.func
-def corner_share(b: wp.vec3f, n: wp.int32) -> wp.float32:
-    """Weight of a cell's corner n = x + 2·y + 4·z at the position b in the cell."""
+def vertex_corner(grid: DetailGrid, hit: Hit, n: wp.int32):
+    """Row and weight of corner n = x + 2·y + 4·z of the hash grid's cell at a hit."""
+    p = wp.vec3f(hit[0], hit[1], hit[2]) / grid.cell
+    low = wp.vec3f(wp.floor(p[0]), wp.floor(p[1]), wp.floor(p[2]))
+    b = p - low
     x = wp.where((n & 1) > 0, b[0], 1.0 - b[0])
     y = wp.where((n & 2) > 0, b[1], 1.0 - b[1])
-    return x * y * wp.where((n & 4) > 0, b[2], 1.0 - b[2])
+    share = x * y * wp.where((n & 4) > 0, b[2], 1.0 - b[2])
+    return vertex_row(grid, int(low[0]) + (n & 1), int(low[1]) + ((n >> 1) & 1), int(low[2]) + (n >> 2)), share
 
 
 # ---- training
@@ -192,18 +204,10 @@ def interpolated(
     grid: DetailGrid, values: wp.array(dtype=Channels), level: wp.int32, x: wp.float32, y: wp.float32
 ) -> Channels:
     """Interpolated texels of a level at (x, y) [m] from the grid's corner."""
-    side = grid.texel * float(1 << level)
-    px = x / side
-    py = y / side
-    ix = int(px)
-    iy = int(py)
-    ax = px - float(ix)
-    ay = py - float(iy)
     total = Channels()
     for n in range(4):
-        row = texel_row(grid, level, ix + (n & 1), iy + (n >> 1))
+        row, share = texel_corner(grid, level, x, y, n)
         if row >= 0:
-            share = wp.where((n & 1) > 0, ax, 1.0 - ax) * wp.where((n >> 1) > 0, ay, 1.0 - ay)
             total += values[row] * share
     return total
 
@@ -223,17 +227,12 @@ def interpolate_detail(
     total = Channels()
     if hit[3] > 0.0:
         for level in range(LEVELS):
-            weight = level_weight(hit[3], grid.texel * float(1 << level))
-            if weight > 0.0:
-                total += interpolated(grid, texels, level, hit[0], hit[1]) * weight
-    else:
-        weight = weight_elsewhere(grid, hit)
-        p = wp.vec3f(hit[0], hit[1], hit[2]) / grid.cell
-        low = wp.vec3f(wp.floor(p[0]), wp.floor(p[1]), wp.floor(p[2]))
-        b = p - low
+            if is_shown(hit[3], grid.texel * float(1 << level)):
+                total += interpolated(grid, texels, level, hit[0], hit[1])
+    elif is_shown(-hit[3], grid.cell):
         for n in range(8):
-            row = vertex_row(grid, int(low[0]) + (n & 1), int(low[1]) + ((n >> 1) & 1), int(low[2]) + (n >> 2))
-            total += vertices[row] * (weight * corner_share(b, n))
+            row, share = vertex_corner(grid, hit, n)
+            total += vertices[row] * share
     outputs[i] = total
 
 
@@ -255,29 +254,16 @@ def interpolate_detail_backward(
     hit = hits[i]
     if hit[3] > 0.0:
         for level in range(LEVELS):
-            side = grid.texel * float(1 << level)
-            weight = level_weight(hit[3], side)
-            if weight > 0.0:
-                px = hit[0] / side
-                py = hit[1] / side
-                ix = int(px)
-                iy = int(py)
-                ax = px - float(ix)
-                ay = py - float(iy)
+            if is_shown(hit[3], grid.texel * float(1 << level)):
                 for n in range(4):
-                    row = texel_row(grid, level, ix + (n & 1), iy + (n >> 1))
+                    row, share = texel_corner(grid, level, hit[0], hit[1], n)
                     if row >= 0 and (row // TEXELS) % parts == part:
-                        share = weight * wp.where((n & 1) > 0, ax, 1.0 - ax) * wp.where((n >> 1) > 0, ay, 1.0 - ay)
                         wp.atomic_add(texels_grad, row, g * share)
-    else:
-        weight = weight_elsewhere(grid, hit)
-        p = wp.vec3f(hit[0], hit[1], hit[2]) / grid.cell
-        low = wp.vec3f(wp.floor(p[0]), wp.floor(p[1]), wp.floor(p[2]))
-        b = p - low
+    elif is_shown(-hit[3], grid.cell):
         for n in range(8):
-            row = vertex_row(grid, int(low[0]) + (n & 1), int(low[1]) + ((n >> 1) & 1), int(low[2]) + (n >> 2))
+            row, share = vertex_corner(grid, hit, n)
             if (row // 8) % parts == part:
-                wp.atomic_add(vertices_grad, row, g * (weight * corner_share(b, n)))
+                wp.atomic_add(vertices_grad, row, g * share)
 
 
 @wp.func
@@ -323,21 +309,14 @@ def adam_step_detail(
     hit = hits[i]
     if hit[3] > 0.0:
         for level in range(LEVELS):
-            side = grid.texel * float(1 << level)
-            if level_weight(hit[3], side) > 0.0:
-                ix = int(hit[0] / side)
-                iy = int(hit[1] / side)
+            if is_shown(hit[3], grid.texel * float(1 << level)):
                 for n in range(4):
-                    row = texel_row(grid, level, ix + (n & 1), iy + (n >> 1))
+                    row, _ = texel_corner(grid, level, hit[0], hit[1], n)
                     if row >= 0 and (row // TEXELS) % parts == part:
                         adam_row(row, rate, second_correction, texels, texels_grad, texels_second)
     else:
-        p = wp.vec3f(hit[0], hit[1], hit[2]) / grid.cell
-        x = int(wp.floor(p[0]))
-        y = int(wp.floor(p[1]))
-        z = int(wp.floor(p[2]))
         for n in range(8):
-            row = vertex_row(grid, x + (n & 1), y + ((n >> 1) & 1), z + (n >> 2))
+            row, _ = vertex_corner(grid, hit, n)
             if (row // 8) % parts == part:
                 adam_row(row, rate, second_correction, vertices, vertices_grad, vertices_second)
 
@@ -396,18 +375,11 @@ class DetailBytes:
 
 @wp.func
 def texture_bytes(grid: DetailGrid, texels: wp.array(dtype=Bytes), level: wp.int32, x: wp.float32, y: wp.float32):
-    side = grid.texel * float(1 << level)
-    px = x / side
-    py = y / side
-    ix = int(px)
-    iy = int(py)
-    ax = px - float(ix)
-    ay = py - float(iy)
+    """Interpolated texels of a level at (x, y) [m] from the grid's corner, as bytes around 0."""
     total = Channels()
     for n in range(4):
-        row = texel_row(grid, level, ix + (n & 1), iy + (n >> 1))
+        row, share = texel_corner(grid, level, x, y, n)
         if row >= 0:
-            share = wp.where((n & 1) > 0, ax, 1.0 - ax) * wp.where((n >> 1) > 0, ay, 1.0 - ay)
             total += (as_floats(sample_of(texels, row)) - Channels(_ZERO)) * share
     return total
 
@@ -415,13 +387,10 @@ def texture_bytes(grid: DetailGrid, texels: wp.array(dtype=Bytes), level: wp.int
 @wp.func
 def vertex_bytes(grid: DetailGrid, vertices: wp.array(dtype=Bytes), hit: Hit) -> Channels:
     """Interpolated vertices of the hash grid at a hit, as bytes around 0."""
-    p = wp.vec3f(hit[0], hit[1], hit[2]) / grid.cell
-    low = wp.vec3f(wp.floor(p[0]), wp.floor(p[1]), wp.floor(p[2]))
-    b = p - low
     total = Channels()
     for n in range(8):
-        row = vertex_row(grid, int(low[0]) + (n & 1), int(low[1]) + ((n >> 1) & 1), int(low[2]) + (n >> 2))
-        total += as_floats(sample_of(vertices, row)) * corner_share(b, n)
+        row, share = vertex_corner(grid, hit, n)
+        total += as_floats(sample_of(vertices, row)) * share
     return total - Channels(_ZERO)
 
 
@@ -459,12 +428,12 @@ def add_detail(
                 found = int(0)
                 if hit[3] > 0.0:
                     level = int(0)
-                    while level < LEVELS and level_weight(hit[3], grid.texel * float(1 << level)) <= 0.0:
+                    while level < LEVELS and not is_shown(hit[3], grid.texel * float(1 << level)):
                         level += 1
                     if level < LEVELS:
                         found = 1
                         value = wp.cw_mul(texture_bytes(grid, detail.texels, level, hit[0], hit[1]), detail.texel_step)
-                elif weight_elsewhere(grid, hit) > 0.0:
+                elif is_shown(-hit[3], grid.cell):
                     found = 1
                     value = wp.cw_mul(vertex_bytes(grid, detail.vertices, hit), detail.vertex_step)
                 if found == 1:
