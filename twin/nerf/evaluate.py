@@ -34,12 +34,7 @@ _ROW_STEP = 8  # step between the image rows on which the trained and the baked 
 def score_frame(
     field: RadianceField, cameras: Cameras, i: int, max_width: int, baked: BakedField | None = None
 ) -> dict[str, float]:
-    """Scores one held-out frame: `psnr`, `unfitted`, `wrong` (nan with one lighting) [dB] and `ssim`; empty if all of
-    it is masked.
-
-    With a baked field also `baking_gain` (its unfitted PSNR minus that of the trained field, on every eighth row),
-    `psnr_small`, `ssim_small`, and for the lower half of the image `psnr_small_lower` and `ssim_small_lower`.
-    """
+    """Scores of one held-out frame, see `evaluate`; nan or missing where unknown, empty if all of it is masked."""
     bytes_, mask, intrinsics = load_frame(cameras, i, max_width)
     if not mask.any():
         return {}
@@ -93,8 +88,8 @@ def score_frame(
     return out | {
         "psnr": float(np.mean(psnrs)) if psnrs else float("nan"),
         "ssim": float(np.nanmean(ssims)) if np.isfinite(ssims).any() else float("nan"),
-        "unfitted": psnr(picture(start), image, mask),
-        "wrong": float(np.mean(wrong)) if wrong else float("nan"),
+        "psnr_unfitted": psnr(picture(start), image, mask),
+        "psnr_wrong_lighting": float(np.mean(wrong)) if wrong else float("nan"),
     }
 
 
@@ -128,15 +123,16 @@ def evaluate(
     """Mean held-out scores by lighting, as a dictionary of dictionaries: score → lighting → mean.
 
     The scores are `psnr` [dB], `ssim`, `psnr_unfitted` and `psnr_wrong_lighting` (None without another lighting); with
-    a baked field also `baking_gain` [dB] (see `score_frame`), and `psnr_small`, `psnr_small_lower`, `ssim_small` and
-    `ssim_small_lower` of images at most 160 px wide. `n` is the number of frames that are not masked as a whole;
-    lightings without any have n = 0 and no other entry.
+    a baked field also `baking_gain` [dB], its unfitted PSNR minus that of the trained field on every eighth row, and
+    `psnr_small` and `ssim_small` of images at most 160 px wide, and `psnr_small_lower` and `ssim_small_lower` of their
+    lower halves. `n` is the number of frames that are not masked as a whole; lightings without any have n = 0 and no
+    other entry.
     """
-    columns = {"psnr": "psnr", "ssim": "ssim", "psnr_unfitted": "unfitted"}
+    keys = ["psnr", "ssim", "psnr_unfitted"]
     if baked is not None:
-        small = ("psnr_small", "psnr_small_lower", "ssim_small", "ssim_small_lower")
-        columns |= {name: name for name in ("baking_gain", *small)}
-    result: dict[str, Any] = {key: {} for key in (*columns, "n", "psnr_wrong_lighting")}
+        keys += ["baking_gain", "psnr_small", "psnr_small_lower", "ssim_small", "ssim_small_lower"]
+    keys += ["n", "psnr_wrong_lighting"]
+    result: dict[str, Any] = {key: {} for key in keys}
     frames = []
     for name in field.lightings:
         mine = [i for i in np.flatnonzero(cameras.held_out) if cameras.lightings[i] == name]
@@ -147,14 +143,13 @@ def evaluate(
             if row := score_frame(field, cameras, i, max_width, baked):
                 scores[name].append(row)
     for name, rows in scores.items():
-        result["n"][name] = len(rows)
-        for key, column in columns.items():
-            values = [row[column] for row in rows if np.isfinite(row.get(column, np.nan))]
+        if rows:
+            result["psnr_wrong_lighting"][name] = None
+        for key in keys:
+            values = [row[key] for row in rows if np.isfinite(row.get(key, np.nan))]
             if values:
                 result[key][name] = round(float(np.mean(values)), 4)
-        wrong = [row["wrong"] for row in rows if np.isfinite(row["wrong"])]
-        if rows:
-            result["psnr_wrong_lighting"][name] = round(float(np.mean(wrong)), 4) if wrong else None
+        result["n"][name] = len(rows)
     return result
 
 
