@@ -37,9 +37,9 @@ from twin.errors import InputError, short_repr
 from twin.files import atomic_path, digest_json, json_bytes, load_tensors, read_bytes, read_json, read_toml, toml_value
 from twin.learn.policy import JSON, ONNX, WEIGHTS, find_policy, load_policy
 from twin.loading import Twin, load_scene
-from twin.nerf.baked_arrays import BrickLayout, samples_read, section_file, stored_layouts
+from twin.nerf.baked_arrays import BAKED_FORMATS, BAKED_HEAD, BrickLayout, samples_read, section_file
 from twin.nerf.lightings import lighting_files
-from twin.nerf.road import ROAD_FILE
+from twin.nerf.road import ROAD_FILE, read_head
 from twin.scene import STAGE_FOLDERS, SceneDir, Stamp, package_versions, require_stage, stage_result
 
 LEVELS = 256
@@ -48,7 +48,7 @@ _ZERO = 128  # byte that encodes 0 in the detail; bytes are rounded to this plus
 _FINER = 4  # step of features / step of density; density is rounded less because it determines surfaces
 _VERTEX_STEP = 2  # step of the hash grid's vertices / step of features
 _CHUNK = 1 << 20  # [bytes] written between two updates of the progress bar
-_PACKED = {"metric": ("cameras.json", "cameras.npz"), "field": ("baked.json", "baked.safetensors")}
+_PACKED = {"metric": ("cameras.json", "cameras.npz"), "field": (BAKED_HEAD, "baked.safetensors")}
 _IS_BAKED = re.compile(r"/baked(_\d+)?\.safetensors$")
 _MESH = ("ground.npz", "parts.npz", "visual.npz")
 _TEXT = """\
@@ -190,7 +190,7 @@ def _add_stages(files: dict[str, bytes], scene: SceneDir, levels: int) -> str:
         kept = {name: read_bytes(folder / name) for name in names if (folder / name).is_file()}
         results[stage] = stamp.result
         if stage == "field":
-            for k, layout in enumerate(stored_layouts(read_json(folder / "baked.json"))):
+            for k, layout in enumerate(read_head(folder / BAKED_HEAD, BAKED_FORMATS, BrickLayout)[0]):
                 name = section_file(k)
                 kept[name] = to_bytes(packed_field(layout, load_tensors(folder / name), levels))
             if (folder / ROAD_FILE).exists():

@@ -26,17 +26,15 @@ class Appearance:
         frame_lighting: NDArray[np.int64],
         vectors: torch.Tensor,
         residuals: torch.Tensor,
-        stale: tuple[str, ...] = (),
     ):
         """
         Args:
             lightings: Names of the lightings, whose embeddings are `vectors` (lightings, dim).
             frames: Names of the training frames, whose residuals are `residuals` (n, dim).
             frame_lighting: Index of each frame's lighting, shape (n,).
-            stale: See `Lightings.stale`.
         """
         self.lightings, self.frames, self.frame_lighting = lightings, frames, frame_lighting
-        self.vectors, self.residuals, self.stale = vectors, residuals, stale
+        self.vectors, self.residuals = vectors, residuals
         self.lighting_of_frame = torch.as_tensor(frame_lighting, device=vectors.device)
 
     def of_frames(self, frame: torch.Tensor) -> torch.Tensor:
@@ -48,15 +46,7 @@ class Appearance:
         every = torch.arange(len(self.frames), device=self.vectors.device)
         with torch.no_grad():
             vectors, frame_vectors = self.vectors.detach().cpu().numpy(), self.of_frames(every).cpu().numpy()
-        return Lightings(self.lightings, vectors, self.frames, frame_vectors, stale=self.stale)
-
-    def added(self, more: dict[str, Array32], stale: tuple[str, ...] = ()) -> "Appearance":
-        """See `Lightings.added`."""
-        new = [torch.as_tensor(vector, device=self.vectors.device)[None] for vector in more.values()]
-        return Appearance(
-            *((*self.lightings, *more), self.frames, self.frame_lighting, torch.cat([self.vectors, *new])),
-            *(self.residuals, (*self.stale, *stale)),
-        )
+        return Lightings(self.lightings, vectors, self.frames, frame_vectors)
 
 
 # ---- fit to a photo

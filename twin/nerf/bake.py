@@ -257,16 +257,11 @@ class _FineTuner:
         f, s, ws = self.field, self.section, self.ws
         count = self.rays // self.shards
         start = shard * count
-        rays, samples = slice(start, start + count), slice(start * _SAMPLES, (start + count) * _SAMPLES)
+        rays = slice(start, start + count)
         s.cast(ws, self.cameras, start, count)
         s.sample(ws, start, count, 0.02, seed=self.seed * 1_000_003 + step)
-        wp.launch(
-            kernels.interpolate,
-            count * _SAMPLES,
-            [ws.w_positions, self.index, self.w_values, _EMPTY_RAW_DENSITY, samples.start],
-            [ws.w_outputs],
-            device=f.device,
-        )
+        inputs = [ws.w_positions, self.index, self.w_values, _EMPTY_RAW_DENSITY, start * _SAMPLES]
+        wp.launch(kernels.interpolate, count * _SAMPLES, inputs, [ws.w_outputs], device=f.device)
         s.composite(ws, start, count)
         composited = ws.composited[rays].detach().requires_grad_(True)
         harmonics = network.spherical_harmonics(ws.directions[rays])
@@ -282,19 +277,15 @@ class _FineTuner:
         return (error.detach() ** 2).mean()
 
     def _update(self, part: int, rate: float, step: int) -> None:
+        n, device = self.rays * _SAMPLES, self.field.device
         gradients = [self.ws.w_positions, self.index, self.ws.w_outputs_grad, part, self.parts]
-        wp.launch(
-            kernels.interpolate_backward,
-            self.rays * _SAMPLES,
-            [*gradients, self.w_gradient],
-            device=self.field.device,
-        )
+        wp.launch(kernels.interpolate_backward, n, [*gradients, self.w_gradient], device=device)
         rates = volume.Channels(_RATES[0] * rate, *[_RATES[1] * rate] * (volume.CHANNELS - 1))
         adam = [rates, 1.0 / (1.0 - 0.99 ** (step + 1)), self.w_values, self.w_gradient, self.w_second]
-        if self.field.device == "cpu":
-            wp.launch(kernels.adam_step, self.rays * _SAMPLES, [*gradients, *adam], device="cpu")
+        if device == "cpu":
+            wp.launch(kernels.adam_step, n, [*gradients, *adam], device=device)
         else:
-            wp.launch(kernels.adam_step_everywhere, self.w_values.shape, adam, device=self.field.device)
+            wp.launch(kernels.adam_step_everywhere, self.w_values.shape, adam, device=device)
 
 
 def _probes(field: RadianceField, pixels: TrainingPixels, seed: int) -> dict[str, NDArray]:

@@ -12,7 +12,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,19 +21,21 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save as to_bytes
 
-from twin.errors import InputError, short_repr
-from twin.files import check_shapes, load_tensors, read_json, require_text, wrap_read_errors, write_json
+from twin.errors import InputError
+from twin.files import check_shapes, load_tensors, wrap_read_errors
 from twin.geometry.cameras import PosedCameras, Rendering, intrinsics_for_size
 from twin.nerf.baked_arrays import (
+    BAKED_FORMATS,
+    BAKED_HEAD,
     BLOCK_DIM,
     BakedSection,
+    BrickLayout,
     Detail,
     RenderKernels,
     SectionOnDevice,
     check_arrays,
     check_networks,
     section_file,
-    stored_layouts,
 )
 from twin.nerf.kernels import march as kernels
 from twin.nerf.kernels import surface_detail as detail_kernels
@@ -41,13 +43,12 @@ from twin.nerf.kernels.color_head import LANES as HEAD_LANES
 from twin.nerf.kernels.color_head import Vec8
 from twin.nerf.kernels.volume import CHANNELS
 from twin.nerf.lightings import Fog, Lightings, Probes
-from twin.nerf.road import RoadSections, undivided_road
+from twin.nerf.road import RoadSections, read_head, undivided_road, write_head
 from twin.nerf.sun import Sun, Sunlight
 from twin.runtime import available_cores
 from twin.types import Array32
 from twin.warp_runtime import wp
 
-_FORMAT, _FORMAT_OF_SECTIONS = 2, 3  # format with one section, and with several
 # Largest number of render targets that are kept per section, one per number of cameras and image size; the least
 # recently used one is dropped. A vector env renders either all its envs or those that reset, whose number varies.
 _MAX_TARGETS = 4
@@ -77,15 +78,6 @@ class CameraBatch:
         """Some of the cameras."""
         stop = None if self.stop is None else self.stop[rows]
         return CameraBatch(self.pose[rows], self.intrinsics[rows], self.size, self.bias[rows], stop)
-
-
-@dataclass(frozen=True)
-class RenderedImages:
-    """Images of n cameras, with or without features."""
-
-    rendering: Rendering
-    features: Array32 | None
-    """Opacity (channel 0) and composited features, shape (n, CHANNELS, height, width)."""
 
 
 class RenderTarget:
@@ -161,8 +153,8 @@ class RenderTarget:
         for launch in self.launches[band]:
             launch.launch()
 
-    def images(self, features: bool, pool: ThreadPoolExecutor | None) -> RenderedImages:
-        """Copies of the images, as the buffers are reused; with or without features. The threads of `pool` copy."""
+    def images(self, features: bool, pool: ThreadPoolExecutor | None) -> tuple[Rendering, Array32 | None]:
+        """Copies of the images, as the buffers are reused, and of the `features`. The threads of `pool` copy."""
         arrays = [self.rgb, self.depth, self.opacity, *([self.features] if features else [])]
         shapes = [(*self.shape, 3), self.shape, self.shape, (self.shape[0], CHANNELS, *self.shape[1:])]
         sources = [array.numpy() for array in (self._staged(arrays) if self.rgb.device.is_cuda else arrays)]
@@ -173,7 +165,7 @@ class RenderTarget:
         parts = [(to[some], source[some]) for to, source in pairs for some in slices]
         copying = pool.map if pool and len(slices) > 1 else map
         list(copying(np.copyto, *zip(*parts, strict=True)))
-        return RenderedImages(Rendering(*out[:3]), out[3] if features else None)
+        return Rendering(*out[:3]), out[3] if features else None
 
     def _staged(self, arrays: list[Any]) -> list[Any]:
         """Copies on the host of arrays on a GPU, in page-locked memory, where transfers are faster."""
@@ -294,7 +286,7 @@ class BakedField:
         """
         with self._lock:  # all callers share the render targets
             views = self._views(cameras, lighting, size, stop)
-            return self._rendered(views, self._shares(views)).rendering
+            return self._rendered(views, self._shares(views))[0]
 
     def render_on_device(
         self,
@@ -315,7 +307,7 @@ class BakedField:
             if len(needed) == 1:
                 target = self._render(int(needed[0]), views)
                 return consume(target.rgb, target.opacity)
-            out = self._rendered(views, shares).rendering
+            out = self._rendered(views, shares)[0]
             n = len(out.rgb)
             consume(
                 wp.array(out.rgb.reshape(n, -1, 3), dtype=wp.vec3f, device=self.device),
@@ -332,9 +324,9 @@ class BakedField:
         """
         with self._lock:
             views = self._views(cameras, lighting, size)
-            out = self._rendered(views, self._shares(views, blended=False), features=True)
-            assert out.features is not None
-            return out.rendering, out.features
+            rendering, channels = self._rendered(views, self._shares(views, blended=False), features=True)
+            assert channels is not None
+            return rendering, channels
 
     def set_detail(self, section: int, detail: Detail) -> None:
         """Replaces the detail of a section."""
@@ -376,7 +368,9 @@ class BakedField:
         positions = views.pose[:, :3, 3]
         return self.road.shares(positions) if blended else np.eye(len(self.sections))[self.road.nearest(positions)]
 
-    def _rendered(self, views: CameraBatch, shares: NDArray[np.float64], features: bool = False) -> RenderedImages:
+    def _rendered(
+        self, views: CameraBatch, shares: NDArray[np.float64], features: bool = False
+    ) -> tuple[Rendering, Array32 | None]:
         """Renders views by the sections that have a share in them; `features` needs shares that are 0 or 1."""
         needed = np.flatnonzero(shares.any(0)).tolist()
         if len(needed) == 1:
@@ -392,25 +386,22 @@ class BakedField:
             padded = np.append(rows, np.repeat(rows[-1:], count - len(rows)))
             parts[k] = rows, self._render(k, views.subset(padded), len(needed)).images(features, self._pool)
         n, (width, height) = len(shares), views.size
-        out = RenderedImages(
-            Rendering(*(np.zeros((n, height, width, *channels), np.float32) for channels in ((3,), (), ()))),
-            np.zeros((n, CHANNELS, height, width), np.float32) if features else None,
-        )
-        total = out.rendering
+        total = Rendering(*(np.zeros((n, height, width, *channels), np.float32) for channels in ((3,), (), ())))
+        all_channels = np.zeros((n, CHANNELS, height, width), np.float32) if features else None
         for k in needed:
-            rows, one = parts[k]
+            rows, (one, channels) = parts[k]
             m, share = len(rows), shares[rows, k].astype(np.float32)[:, None, None]
-            opacity = share * one.rendering.opacity[:m]
+            opacity = share * one.opacity[:m]
             # Colors of rays that stop are those of the field in front alone, so they count by its opacity.
-            total.rgb[rows] += (share if views.stop is None else opacity)[..., None] * one.rendering.rgb[:m]
+            total.rgb[rows] += (share if views.stop is None else opacity)[..., None] * one.rgb[:m]
             total.opacity[rows] += opacity
             nearest = shares[rows].argmax(1) == k
-            total.depth[rows[nearest]] = one.rendering.depth[:m][nearest]
-            if out.features is not None and one.features is not None:
-                out.features[rows] = one.features[:m]
+            total.depth[rows[nearest]] = one.depth[:m][nearest]
+            if all_channels is not None and channels is not None:
+                all_channels[rows] = channels[:m]
         if views.stop is not None:
             total.rgb[...] /= np.maximum(total.opacity, 1e-6)[..., None]
-        return out
+        return total, all_channels
 
     def _section(self, k: int, count: int) -> tuple[SectionOnDevice, OrderedDict[tuple, RenderTarget]]:
         """Section k on the device, and this object's render targets of it.
@@ -471,18 +462,8 @@ class BakedField:
             contiguous = {name: np.ascontiguousarray(array) for name, array in stored.items()}
             (folder / section_file(k)).write_bytes(to_bytes(contiguous))
         self.road.save(folder)
-        layouts = [asdict(section.layout) for section in self.sections]
-        write_json(
-            folder / "baked.json",
-            {
-                "format": _FORMAT_OF_SECTIONS if layouts[1:] else _FORMAT,
-                "layout": layouts[0],
-                **({"more_layouts": layouts[1:]} if layouts[1:] else {}),
-                "lightings": names.names,
-                "frames": names.frames,
-                "about": about or {},
-            },
-        )
+        layouts = [section.layout for section in self.sections]
+        write_head(folder / BAKED_HEAD, BAKED_FORMATS, layouts, names.names, names.frames, {"about": about or {}})
 
     @staticmethod
     def load(folder: Path, device: str = "cpu") -> "BakedField":
@@ -490,17 +471,7 @@ class BakedField:
 
         Sections from the second on are read, and found damaged, only when a camera needs them.
         """
-        path = folder / "baked.json"
-        if not path.exists():
-            raise InputError(f"{folder}: contains no baked.json; build the scene (again)")
-        head = read_json(path)
-        with wrap_read_errors(path, "build the scene again"):
-            if (found := head.get("format")) not in (formats := (_FORMAT, _FORMAT_OF_SECTIONS)):
-                raise InputError(
-                    f"{path}: format {short_repr(found)}, expected one of {formats}; build the scene again"
-                )
-            layouts = stored_layouts(head)
-            names, frames = tuple(map(require_text, head["lightings"])), tuple(map(require_text, head["frames"]))
+        layouts, names, frames, _ = read_head(folder / BAKED_HEAD, BAKED_FORMATS, BrickLayout)
         arrays = load_tensors(folder / section_file(0))
         with wrap_read_errors(folder / section_file(0), "build the scene again"):
             vectors, frame_vectors = arrays.pop("lightings.vectors"), arrays.pop("lightings.frames")

@@ -278,6 +278,9 @@ def detail_grid(detail: Detail, device: str) -> Any:
 
 # ---- a section in files
 
+BAKED_HEAD = "baked.json"
+BAKED_FORMATS = 2, 3  # format with one section, and with several
+
 
 class BakedSection:
     """Bricks and detail of one section of the road, in memory or in a file that is read on demand."""
@@ -308,15 +311,6 @@ class BakedSection:
 def section_file(k: int) -> str:
     """Name of the file with the arrays of section k; that of section 0 also has those that all sections share."""
     return f"baked_{k}.safetensors" if k else "baked.safetensors"
-
-
-def stored_layouts(head: dict[str, Any]) -> list[BrickLayout]:
-    """Layouts of the sections in `baked.json`."""
-    layouts = []
-    for one in (head["layout"], *head.get("more_layouts", ())):
-        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in one.items()}
-        layouts.append(BrickLayout(**fields))
-    return layouts
 
 
 # ---- on a device

@@ -173,13 +173,8 @@ def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, s
             )
             depth: wp.array = wp.array(shown.depth.ravel(), dtype=wp.float32, device=baked.device)
             hits = wp.empty(len(depth), dtype=kernels.Hit, device=baked.device)
-            wp.launch(
-                kernels.find_surface,
-                len(depth),
-                [grid, wp.mat33f(*pose[:3, :3].ravel()), wp.vec3f(*pose[:3, 3]), wp.vec4f(*k), width, depth],
-                [hits],
-                device=baked.device,
-            )
+            camera = [wp.mat33f(*pose[:3, :3].ravel()), wp.vec3f(*pose[:3, 3]), wp.vec4f(*k)]
+            wp.launch(kernels.find_surface, len(depth), [grid, *camera, width, depth], [hits], device=baked.device)
             hit = hits.numpy()
             rows = slice(pixels.start[i], pixels.start[i + 1])
             coarsest = np.where(hit[:, 3] > 0.0, _TEXEL * 2 ** (kernels.LEVELS - 1), _CELL)
@@ -270,13 +265,8 @@ class _DetailFitter:
         def batch(array: NDArray) -> torch.Tensor:
             return torch.from_numpy(array[mine]).to(self.device)
 
-        wp.launch(
-            kernels.interpolate_detail,
-            high - low,
-            [self.w_hits, self.grid, self.texels[0], self.vertices[0], low],
-            [self.w_added],
-            device=self.device,
-        )
+        inputs = [self.w_hits, self.grid, self.texels[0], self.vertices[0], low]
+        wp.launch(kernels.interpolate_detail, high - low, inputs, [self.w_added], device=self.device)
         added = self.added[low:high, 1:].detach().requires_grad_(True)
         harmonics = network.spherical_harmonics(batch(self.pixels.directions).float())
         embedding = self.embeddings[batch(self.pixels.frame).long()]
@@ -287,13 +277,9 @@ class _DetailFitter:
         return (error.detach() ** 2).sum()
 
     def _update(self, part: int, count: int, rate: float, step: int) -> None:
-        wp.launch(
-            kernels.interpolate_detail_backward,
-            count,
-            [self.w_hits, self.grid, self.w_added_grad, part, self.parts],
-            [self.texels[1], self.vertices[1]],
-            device=self.device,
-        )
+        inputs = [self.w_hits, self.grid, self.w_added_grad, part, self.parts]
+        outputs = [self.texels[1], self.vertices[1]]
+        wp.launch(kernels.interpolate_detail_backward, count, inputs, outputs, device=self.device)
         rates = [rate, 1.0 / (1.0 - 0.99 ** (step + 1))]
         if self.device == "cpu":
             hits = [self.w_hits, self.grid, part, self.parts]
@@ -305,13 +291,8 @@ class _DetailFitter:
     def quantized(self) -> Detail:
         """The detail as the renderer reads it: bytes, with the coarser levels added to every texel."""
         total = wp.zeros(self.texels[0].shape, dtype=volume.Channels, device=self.device)
-        wp.launch(
-            kernels.sum_levels,
-            total.shape[0],
-            [wp.array(self.detail.tiles, dtype=wp.vec2i, device=self.device), self.grid, self.texels[0]],
-            [total],
-            device=self.device,
-        )
+        tiles: wp.array = wp.array(self.detail.tiles, dtype=wp.vec2i, device=self.device)
+        wp.launch(kernels.sum_levels, total.shape[0], [tiles, self.grid, self.texels[0]], [total], device=self.device)
         texels, texel_step = _as_bytes(total.numpy())
         vertices, vertex_step = _as_bytes(self.vertices[0].numpy())
         return replace(self.detail, texels=texels, texel_step=texel_step, vertices=vertices, vertex_step=vertex_step)

@@ -8,7 +8,6 @@ cameras; `kernels/space.py` defines the other terms.
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,7 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file
 from safetensors.torch import save as to_bytes
 
-from twin.errors import InputError, short_repr
-from twin.files import check_shapes, read_json, regular_file, require_text, wrap_read_errors, write_json
+from twin.files import check_shapes, regular_file, wrap_read_errors
 from twin.geometry.cameras import FAR, PosedCameras, Rendering, intrinsics_for_size, pixel_grid
 from twin.nerf import network
 from twin.nerf.appearance import Appearance
@@ -35,10 +33,11 @@ from twin.nerf.buffers import (
 )
 from twin.nerf.kernels import hashgrid, space, volume
 from twin.nerf.kernels.color_head import HARMONICS
-from twin.nerf.road import RoadSections, undivided_road
+from twin.nerf.road import RoadSections, read_head, undivided_road, write_head
 from twin.warp_runtime import wp
 
-_FORMAT, _FORMAT_OF_SECTIONS = 1, 2  # format of a field with one section, and of one with several
+_HEAD = "field.json"
+_FORMATS = 1, 2  # format of a field with one section, and of one with several
 QUERY_POINTS = 65536
 """Points per batch of `FieldSection.query`."""
 _RENDER_RAYS = 4096  # rays per batch when rendering
@@ -94,51 +93,30 @@ class FieldSection:
 
     def cast(self, ws: Workspace, cameras: CameraArrays, start: int, count: int) -> None:
         """Pixels → rays."""
-        wp.launch(
-            space.pixel_rays,
-            count,
-            [ws.w_camera, ws.w_pixel, cameras.rotation, cameras.position, cameras.intrinsics, start],
-            [ws.w_rays],
-            device=self.device,
-        )
+        inputs = [ws.w_camera, ws.w_pixel, cameras.rotation, cameras.position, cameras.intrinsics, start]
+        wp.launch(space.pixel_rays, count, inputs, [ws.w_rays], device=self.device)
 
     def sample(
         self, ws: Workspace, start: int, count: int, floor: float, target_mass: float = 0.0, seed: int | None = None
     ) -> None:
         """Rays → samples, see `volume.sample_rays`: jittered, or at the middles of the strata if `seed` is None."""
         jitter = -1 if seed is None else seed & _MAX_SEED
-        wp.launch(
-            volume.sample_rays,
-            count,
-            [
-                *(ws.w_rays, ws.w_targets, self.contraction, self.w_grids),
-                *(self.layout.near_plane, floor, target_mass, jitter, start),
-            ],
-            [ws.w_strata, ws.w_ray_positions],
-            device=self.device,
-        )
+        inputs = [ws.w_rays, ws.w_targets, self.contraction, self.w_grids]
+        inputs += [self.layout.near_plane, floor, target_mass, jitter, start]
+        wp.launch(volume.sample_rays, count, inputs, [ws.w_strata, ws.w_ray_positions], device=self.device)
 
     def query(self, ws: Workspace, start: int, count: int) -> None:
         """Grid positions → network outputs, for rows (samples, not rays) [start, start + count)."""
-        wp.launch(
-            hashgrid.encode,
-            count,
-            [ws.w_positions, self.w_table, self.w_levels, start],
-            [ws.w_features],
-            device=self.device,
-        )
+        inputs = [ws.w_positions, self.w_table, self.w_levels, start]
+        wp.launch(hashgrid.encode, count, inputs, [ws.w_features], device=self.device)
         rows = slice(start, start + count)
         network.trunk(self.parameters, ws.features[rows], ws.hidden[rows], ws.outputs[rows])
 
     def composite(self, ws: Workspace, start: int, count: int) -> None:
         """Network outputs → opacity and features per ray."""
-        wp.launch(
-            volume.composite,
-            count,
-            [ws.w_ray_outputs, ws.w_strata, self.layout.density_unit, start],
-            [ws.w_weights, ws.w_composited, ws.w_inverse, ws.w_median],
-            device=self.device,
-        )
+        inputs = [ws.w_ray_outputs, ws.w_strata, self.layout.density_unit, start]
+        outputs = [ws.w_weights, ws.w_composited, ws.w_inverse, ws.w_median]
+        wp.launch(volume.composite, count, inputs, outputs, device=self.device)
 
     def composite_backward(
         self,
@@ -155,17 +133,9 @@ class FieldSection:
         The samples of a ray have weights wᵢ and distances tᵢ [m]. The last four arguments are weights and scales of two
         regularizers, see `volume.composite_backward`.
         """
-        wp.launch(
-            volume.composite_backward,
-            count,
-            [
-                *(ws.w_ray_outputs, ws.w_strata, ws.w_weights, ws.w_targets),
-                *(ws.w_composited_grad, ws.w_inverse_grad, self.layout.density_unit),
-                *(distortion, depth, depth_reach, log_offset, start),
-            ],
-            [ws.w_ray_outputs_grad],
-            device=self.device,
-        )
+        inputs = [ws.w_ray_outputs, ws.w_strata, ws.w_weights, ws.w_targets, ws.w_composited_grad, ws.w_inverse_grad]
+        inputs += [self.layout.density_unit, distortion, depth, depth_reach, log_offset, start]
+        wp.launch(volume.composite_backward, count, inputs, [ws.w_ray_outputs_grad], device=self.device)
 
     def trace(
         self, cameras: CameraArrays, camera: NDArray, pixel: NDArray, rays: NDArray[np.int64], out: Traced
@@ -230,13 +200,15 @@ class RadianceField:
         """
         self.sections, self.road = tuple(sections), road
         self.appearance, self.parameters = appearance, parameters
+        self._added: tuple[dict[str, NDArray[np.float32]], tuple[str, ...]] = {}, ()
         self.device = self.sections[0].device
         for section in self.sections[1:]:  # spare workspaces fit all sections
             section.spare = self.sections[0].spare
 
     @property
     def lightings(self) -> tuple[str, ...]:
-        return self.appearance.lightings
+        """Names of the filmed lightings, then of the added ones."""
+        return *self.appearance.lightings, *self._added[0]
 
     @property
     def bounds(self) -> NDArray[np.float64]:
@@ -246,11 +218,11 @@ class RadianceField:
 
     def embedding(self, lighting: str) -> NDArray[np.float32]:
         """See `Lightings.embedding`."""
-        return self.appearance.named().embedding(lighting)
+        return self.appearance.named().added(*self._added).embedding(lighting)
 
     def add_lightings(self, more: dict[str, NDArray[np.float32]], stale: tuple[str, ...] = ()) -> None:
         """See `Lightings.added`."""
-        self.appearance = self.appearance.added(more, stale)
+        self._added = self._added[0] | more, (*self._added[1], *stale)
 
     def trace(self, cameras: CameraArrays, camera: NDArray, pixel: NDArray) -> Traced:
         """Traces n rays, given by camera index (n,) and pixel (n, 2) [px]; the result does not depend on the lighting.
@@ -309,18 +281,9 @@ class RadianceField:
         stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
         (folder / "field.safetensors").write_bytes(to_bytes(stored))
         self.road.save(folder)
-        write_json(
-            folder / "field.json",
-            {
-                "format": _FORMAT_OF_SECTIONS if self.sections[1:] else _FORMAT,
-                "layout": asdict(self.sections[0].layout),
-                **({"more_layouts": [asdict(one.layout) for one in self.sections[1:]]} if self.sections[1:] else {}),
-                "lightings": self.appearance.lightings,
-                "frames": self.appearance.frames,
-                "frame_lighting": self.appearance.frame_lighting.tolist(),
-                "about": about or {},
-            },
-        )
+        layouts, a = [section.layout for section in self.sections], self.appearance
+        more = {"frame_lighting": a.frame_lighting.tolist(), "about": about or {}}
+        write_head(folder / _HEAD, _FORMATS, layouts, a.lightings, a.frames, more)
 
     @staticmethod
     def load(folder: Path, device: str | None = None) -> "RadianceField":
@@ -329,20 +292,8 @@ class RadianceField:
         Raises InputError if the folder has no field, or its files are damaged or of another format.
         """
         device = resolve_device(device)
-        path = folder / "field.json"
-        if not path.exists():
-            raise InputError(f"{folder}: contains no field.json; build the scene's field first")
-        head = read_json(path)
-        with wrap_read_errors(path, "build the scene again"):
-            if (found := head.get("format")) not in (formats := (_FORMAT, _FORMAT_OF_SECTIONS)):
-                raise InputError(
-                    f"{path}: format {short_repr(found)}, expected one of {formats}; build the scene again"
-                )
-            layouts = [
-                Layout(**(one | {key: tuple(one[key]) for key in ("centre", "half")}))
-                for one in (head["layout"], *head.get("more_layouts", ()))
-            ]
-            names, frames = tuple(map(require_text, head["lightings"])), tuple(map(require_text, head["frames"]))
+        layouts, names, frames, head = read_head(folder / _HEAD, _FORMATS, Layout)
+        with wrap_read_errors(folder / _HEAD, "build the scene again"):
             frame_lighting = np.array(head["frame_lighting"], np.int64)
         path = regular_file(folder / "field.safetensors")
         with wrap_read_errors(path, "build the scene again"):

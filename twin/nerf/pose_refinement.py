@@ -54,26 +54,11 @@ class PoseRefinement:
     def backward(self, section: FieldSection, start: int, count: int) -> None:
         """Computes gradients of the rays [start, start + count) from the gradients of their samples' features."""
         ws = self._ws
-        wp.launch(
-            hashgrid.encode_positions_backward,
-            count * ws.samples,
-            [
-                *(ws.w_positions, section.w_table, section.w_levels, start * ws.samples),
-                ws.w_features_grad,
-            ],
-            [self._w_positions_grad],
-            device=section.device,
-        )
-        wp.launch(
-            space.rays_backward,
-            count,
-            [
-                *(ws.w_rays, ws.w_strata.distances, section.contraction, start),
-                self._w_ray_positions_grad,
-            ],
-            self._w_ray_grad,
-            device=section.device,
-        )
+        samples = [ws.w_positions, section.w_table, section.w_levels, start * ws.samples, ws.w_features_grad]
+        outputs = [self._w_positions_grad]
+        wp.launch(hashgrid.encode_positions_backward, count * ws.samples, samples, outputs, device=section.device)
+        rays = [ws.w_rays, ws.w_strata.distances, section.contraction, start, self._w_ray_positions_grad]
+        wp.launch(space.rays_backward, count, rays, self._w_ray_grad, device=section.device)
 
     def step(self, rate: float) -> None:
         """Takes an optimizer step; `rate` scales the learning rates."""

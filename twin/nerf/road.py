@@ -5,17 +5,21 @@ rendered by the section that has the nearest filmed position. Close to a border 
 there, and the pictures are blended, so that there is no visible seam when a robot drives across.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save as to_bytes
 
-from twin.files import check_shapes, load_tensors, wrap_read_errors
+from twin.errors import InputError, short_repr
+from twin.files import check_shapes, load_tensors, read_json, require_text, wrap_read_errors, write_json
 from twin.types import Array
+
+T = TypeVar("T")
 
 ROAD_FILE = "road.safetensors"
 """File of a road of several sections."""
@@ -103,6 +107,48 @@ class RoadSections:
 def undivided_road() -> RoadSections:
     """A road of one section."""
     return RoadSections(np.zeros((1, 3)), np.zeros(1, np.int64))
+
+
+# ---- heads of fields: the layouts of their sections, and the names of lightings and frames
+
+
+def write_head(
+    path: Path,
+    formats: tuple[int, int],
+    layouts: Sequence[Any],
+    lightings: tuple[str, ...],
+    frames: tuple[str, ...],
+    more: dict[str, Any],
+) -> None:
+    """Writes the JSON file of a field, with `more` entries. `formats`: that of one section, and that of several."""
+    first, *others = map(asdict, layouts)
+    head: dict[str, Any] = {"format": formats[bool(others)], "layout": first}
+    head |= {"more_layouts": others} if others else {}
+    write_json(path, head | {"lightings": lightings, "frames": frames} | more)
+
+
+def read_head(
+    path: Path, formats: tuple[int, int], layout: Callable[..., T]
+) -> tuple[list[T], tuple[str, ...], tuple[str, ...], dict[str, Any]]:
+    """Reads a file of `write_head`: layouts (of a dataclass), names of the lightings and of the frames, all entries.
+
+    Raises InputError if it is missing, damaged or of another format.
+    """
+    if not path.exists():
+        raise InputError(f"{path.parent}: contains no {path.name}; build the scene (again)")
+    head = read_json(path)
+    with wrap_read_errors(path, "build the scene again"):
+        if (found := head.get("format")) not in formats:
+            raise InputError(f"{path}: format {short_repr(found)}, expected one of {formats}; build the scene again")
+        layouts = [
+            layout(**{key: tuple(value) if isinstance(value, list) else value for key, value in one.items()})
+            for one in (head["layout"], *head.get("more_layouts", ()))
+        ]
+        lightings, frames = (tuple(map(require_text, head[key])) for key in ("lightings", "frames"))
+        return layouts, lightings, frames, head
+
+
+# ---- division
 
 
 def divide_road(positions: Array, length: float) -> RoadSections:

@@ -241,7 +241,7 @@ class Trainer:
 
         s.cast(ws, self.arrays, start, count)
         s.sample(ws, start, count, 0.1 + explore, target_mass=0.3, seed=self.seed * 1_000_003 + self.steps_done)
-        s.query(ws, samples.start, samples.stop - samples.start)
+        s.query(ws, samples.start, count * ws.samples)
         s.composite(ws, start, count)
 
         composited = ws.composited[rays].detach().requires_grad_(True)
@@ -275,13 +275,8 @@ class Trainer:
             if free:
                 more = self._free_backward(s, first_free)
                 first, second = first + more[0], second + more[1]
-            wp.launch(
-                volume.sample_densities,
-                samples.stop - samples.start,
-                [ws.w_outputs, s.layout.density_unit, samples.start],
-                [ws.w_densities],
-                device=self.device,
-            )
+            inputs = [ws.w_outputs, s.layout.density_unit, samples.start]
+            wp.launch(volume.sample_densities, count * ws.samples, inputs, [ws.w_densities], device=self.device)
             return (error.detach() ** 2).mean(), [first, second, *gradients[2:]]
 
     def _exclude(self, masks: list[NDArray[np.bool_]]) -> None:
@@ -327,15 +322,10 @@ class Trainer:
         one task each, those that take longest first.
         """
         rate, levels = self.rate(), self.config.levels
+        each, parts = (1, 2) if self.device == "cpu" else (levels, 1)
         tasks: list[Callable[[], None]] = [self._draw_next]
-        if self.device == "cpu":
-            tasks += [partial(self._update_levels, section, level, 1, rate) for level in reversed(range(levels))]
-            tasks += [partial(self._update_grids, section, part, 2) for part in range(2)]
-        else:
-            tasks += [
-                partial(self._update_levels, section, 0, levels, rate),
-                partial(self._update_grids, section, 0, 1),
-            ]
+        tasks += [partial(self._update_levels, section, k, each, rate) for k in reversed(range(0, levels, each))]
+        tasks += [partial(self._update_grids, section, part, parts) for part in range(parts)]
         tasks.append(partial(self._update_networks, gradients, rate))
         parallel(lambda task: task(), tasks, self.device)
 
@@ -359,31 +349,17 @@ class Trainer:
         """Accumulates the gradients of `count` hash levels from `first` on, and takes an Adam step on them."""
         s, ws, moments = self.field.sections[section], self.ws, self.moments[section]
         t = self.steps_done // self.road.count + 1
-        wp.launch(
-            hashgrid.encode_backward,
-            (count, ws.features.shape[0]),
-            [ws.w_positions, s.w_levels, first, ws.w_features_grad, moments[0]],
-            device=self.device,
-        )
-        wp.launch(
-            hashgrid.adam_step,
-            (count, s.table.shape[1]),
-            [
-                *(first, self.config.learning_rate * rate / (1.0 - 0.9**t), 1.0 / (1.0 - 0.99**t)),
-                *(s.w_table, *moments),
-            ],
-            device=self.device,
-        )
+        gradients = [ws.w_positions, s.w_levels, first, ws.w_features_grad, moments[0]]
+        wp.launch(hashgrid.encode_backward, (count, ws.features.shape[0]), gradients, device=self.device)
+        rates = [self.config.learning_rate * rate / (1.0 - 0.9**t), 1.0 / (1.0 - 0.99**t)]
+        tables = [s.w_table, *moments]
+        wp.launch(hashgrid.adam_step, (count, s.table.shape[1]), [first, *rates, *tables], device=self.device)
 
     def _update_grids(self, section: int, part: int, parts: int) -> None:
         """Updates one of `parts` parts of the cells of a section's opacity grids."""
         s, ws = self.field.sections[section], self.ws
-        wp.launch(
-            volume.update_grids,
-            self.rays * ws.samples,
-            [ws.w_positions, ws.w_densities, _RISE, _FALL, part, parts, s.w_grids],
-            device=self.device,
-        )
+        inputs = [ws.w_positions, ws.w_densities, _RISE, _FALL, part, parts, s.w_grids]
+        wp.launch(volume.update_grids, self.rays * ws.samples, inputs, device=self.device)
 
     def _free_points(self, section: int, n: int) -> torch.Tensor | None:
         """Grid positions of random free points of a section, shape (n, 3); None without free segments."""
