@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from twin.command_line import HelpFormatter, Parser, run
-from twin.config import HELD_OUT, QUALITIES, Condition
+from twin.config import CAUSES, HELD_OUT, QUALITIES, Condition
 from twin.scene import STAGE_FOLDERS
+
+_Add = Callable[..., Any]
 
 
 @dataclass(frozen=True)
@@ -21,10 +23,12 @@ class Verb:
     """A subcommand of `twin`."""
 
     summary: str
-    define: Callable[[argparse.ArgumentParser], None]
-    """Adds the description and options to a parser."""
+    define: Callable[[argparse.ArgumentParser, _Add], None]
+    """Adds the description and options to a parser; its second argument is the parser's `add_argument`."""
     module: str
     """Module whose function `command` runs with the parsed options."""
+    quiet: str = "no progress, no summary"
+    """Help of the option --quiet; without any, there is no such option."""
 
 
 def main(verb: str, arguments: list[str] | None = None) -> int:
@@ -42,7 +46,9 @@ def main(verb: str, arguments: list[str] | None = None) -> int:
 def parser_of(verb: str) -> argparse.ArgumentParser:
     """The argument parser of a verb, a key of `VERBS`."""
     parser = Parser(prog=f"twin {verb}", formatter_class=HelpFormatter)
-    VERBS[verb].define(parser)
+    VERBS[verb].define(parser, parser.add_argument)
+    if VERBS[verb].quiet:
+        parser.add_argument("--quiet", action="store_true", help=VERBS[verb].quiet)
     return parser
 
 
@@ -55,8 +61,7 @@ _OTHERS_POLICIES = (
 )
 
 
-def _new(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _new(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = (
         "Start a scene folder from films or robots' bags (ROS 2, or .bag of ROS 1; pip install 'twin[ros]'). A bag "
         "also brings the camera's calibration, GPS and odometry for the scale, and the camera's pose on the robot."
@@ -67,8 +72,7 @@ def _new(parser: argparse.ArgumentParser) -> None:
     add("--topic", help="topic of a bag's pictures; default: that with the most pictures")
 
 
-def _build(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _build(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = "Turn a filmed place into a drivable MuJoCo twin."
     parser.set_defaults(resumes=True)
     parser.epilog = """\
@@ -96,11 +100,9 @@ twin new SCENE VIDEO... writes such a folder.
     add("--quality", choices=tuple(QUALITIES), help="sharpness of the field; default: as in scene.toml, or standard")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="override scene.toml, as in nerf.steps=4000")
     add("--device", choices=("cpu", "cuda"), help="default: cuda where it is usable, else cpu")
-    add("--quiet", action="store_true", help="no progress, no summary")
 
 
-def _relight(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _relight(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = (
         "Add a lighting to a built scene from one photo: the photo is located, then an appearance embedding of the "
         "radiance field, fog and, on demand, a sun are fitted to it. Then the twin can be rendered in that lighting."
@@ -120,11 +122,9 @@ def _relight(parser: argparse.ArgumentParser) -> None:
     add("--time", help="when the photo was taken, such as 2026-06-01T17:30+02:00; gives the sun")
     add("--location", metavar="LAT,LON", help="where it was taken [°]; default: by the frames' GPS")
     add("--heading", type=float, metavar="DEG", help="compass angle of the scene's x axis [°]; default: by GPS")
-    add("--quiet", action="store_true", help="no progress, no summary")
 
 
-def _align(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _align(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = (
         "Fit the Husky's parameters to the log of a real Husky's drive, and score them on parts of the log that were "
         "held out; or fit the pose of its camera to a film by that camera."
@@ -143,19 +143,14 @@ def _align(parser: argparse.ArgumentParser) -> None:
     add("--topic", help="topic of the bag's poses; with --camera, of its pictures")
     add("--out", type=Path, help="folder for robot.toml and alignment/; default: that of the scene")
     add("--level", action="store_true", help="assume level ground and ignore the log's IMU")
-    add("--quiet", action="store_true", help="no progress, no summary")
 
 
-def _film(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _film(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = "Film a drive in a built scene: robot view, chase view, map, speed and reward."
     parser.epilog = _OTHERS_POLICIES
     add("scene", type=Path, help="folder of a built scene, or a pack")
     add("--task", default="right_turn", help="straight, right_turn, route, or one of scene.toml")
-    add(
-        "--policy",
-        help="a run, a checkpoint, an ONNX file, module:function or a zip; default: a scripted route follower",
-    )
+    add("--policy", help="a run, a checkpoint, an ONNX file, module:function or a zip; default: a scripted driver")
     add("--trust", action="store_true", help="load a policy file that may run code")
     add(
         "--lighting",
@@ -179,17 +174,10 @@ def _film(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="record drives as a LeRobot dataset instead of a film (pip install 'twin[lerobot]')",
     )
-    add(
-        "--episodes",
-        type=int,
-        default=1,
-        help="drives in the dataset, with seeds from --seed on (default: %(default)s)",
-    )
-    add("--quiet", action="store_true", help="no progress, no summary")
+    add("--episodes", type=int, default=1, help="drives in the dataset, with seeds from --seed on")
 
 
-def _drive(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _drive(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = (
         "Show the Husky driving, in a film or on the page of twin view. By default, the policy of a pack or of a "
         "scene's only run drives the task of its training; without such a policy, the scripted driver drives."
@@ -203,11 +191,9 @@ def _drive(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, default=0, help="seed of the episode")
     add("--port", type=int, default=8080, help="port of the page; if taken, the next free one; 0: any")
     add("--out", type=Path, help="the mp4; default: in SCENE/films; for a pack, in this folder")
-    add("--quiet", action="store_true", help="no progress, no summary")
 
 
-def _pack(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _pack(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = "Pack a built scene into one file with what driving in it needs, for another machine."
     add("scene", type=Path, help="folder of a built scene")
     add("-o", "--out", type=Path, metavar="FILE", help="the pack; default: NAME.twin in this folder")
@@ -222,11 +208,9 @@ def _pack(parser: argparse.ArgumentParser) -> None:
         "and change the field; 256 keeps every bit",
     )
     add("--trust", action="store_true", help="include policies that may run code when they are loaded")
-    add("--quiet", action="store_true", help="no progress, no summary")
 
 
-def _unpack(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _unpack(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = (
         "Unpack a pack into a scene folder, in which all commands work that need no films. Its paths, sizes and "
         "digests are checked, and nothing in it runs."
@@ -234,11 +218,9 @@ def _unpack(parser: argparse.ArgumentParser) -> None:
     add("pack", type=Path, help="the file")
     add("folder", type=Path, help="folder to make")
     add("--trust", action="store_true", help="unpack policies that may run code when loaded, too")
-    add("--quiet", action="store_true", help="no summary")
 
 
-def _view(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _view(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = (
         "Show a built scene in the browser: look around under any lighting, drive the Husky by keys or a policy, put "
         "obstacles in its way, compare film and twin, place camera paths. Or render such a path to a film."
@@ -262,11 +244,9 @@ def _view(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, help="the mp4 of --path")
     add("--size", default="1280x720", help="size of the film [px]")
     add("--fps", type=int, default=30, help="frames per second of the film")
-    add("--quiet", action="store_true", help="no progress, no address, no summary")
 
 
-def _export(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _export(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = (
         "Write a built place for other programs: all of it as USD, its mesh as glTF, its radiance field as Gaussian "
         "splats, its frames and cameras for other trainers, a task's rules for evaluation elsewhere."
@@ -291,11 +271,9 @@ def _export(parser: argparse.ArgumentParser) -> None:
         help="lighting of --glb, --ply and --spz, and the first one in --usd: a name, or a mixture sun:night:0.5; "
         "default: first filmed one",
     )
-    add("--quiet", action="store_true", help="no progress, no summary")
 
 
-def _train(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _train(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = "Train a policy by SAC from pixels."
     parser.set_defaults(resumes=True)
     add("scene", type=Path, help="folder of a built scene")
@@ -306,11 +284,7 @@ def _train(parser: argparse.ArgumentParser) -> None:
     add("--preset", choices=("cpu", "gpu"), default="cpu", help="sizes of network, batch and run")
     add("--action", choices=("steering", "twist"), help="default: steering, at fixed speed")
     add("--success", type=float, help="success rate in tests at which the training ends (default: 0.95)")
-    add(
-        "--steps",
-        type=int,
-        help="largest number of control steps, all environments together (default: 24000; gpu: 60000)",
-    )
+    add("--steps", type=int, help="largest number of control steps of all environments (default: 24000; gpu: 60000)")
     add("--worlds", type=int, help="number of parallel environments (default: 8; gpu: 32)")
     add("--processes", type=int, help="processes that step the environments (default: one per core, at most 16)")
     add("--device", choices=("cpu", "cuda"), help="where the networks are trained (default: cpu; preset gpu: cuda)")
@@ -337,11 +311,9 @@ def _train(parser: argparse.ArgumentParser) -> None:
         help="project of Weights & Biases, or ENTITY/PROJECT, to which numbers are logged and at the end a film of the "
         "kept policy (pip install 'twin[wandb]')",
     )
-    add("--quiet", action="store_true", help="no progress, no summary")
 
 
-def _validate(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _validate(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = "Measure how often policies succeed, lighting by lighting."
     parser.set_defaults(resumes=True)
     parser.epilog = _OTHERS_POLICIES
@@ -360,11 +332,9 @@ def _validate(parser: argparse.ArgumentParser) -> None:
     add("--trust", action="store_true", help="load policy files that may run code")
     add("--processes", type=int, default=1, help="processes on this machine; each uses two cores")
     add("--ray", metavar="ADDRESS", help="use a Ray cluster; auto: the one on this machine")
-    add("--quiet", action="store_true", help="no progress, no table")
 
 
-def _trial(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _trial(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = (
         "Evaluate a trial on the road, from the robot's ROS bag, by the twin's rules. The results are a row of "
         "real.csv, a film of robot and twin side by side, and their differences in path and pictures."
@@ -379,14 +349,8 @@ def _trial(parser: argparse.ArgumentParser) -> None:
     add("--policy", help="the policy that drove: a run, a checkpoint or an ONNX file")
     add("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")
     add("--lighting", metavar="NAME", help="name of the day or lighting in real.csv")
-    add(
-        "--twin-lighting", metavar="NAME", help="the twin's lighting to compare with; default: as before, or --lighting"
-    )
-    add(
-        "--cause",
-        choices=("collision", "out_of_bounds", "timeout", "rollover", "stuck"),
-        help="what ended the trial, if the poses do not show it",
-    )
+    add("--twin-lighting", metavar="NAME", help="the twin's lighting to compare with; default: as before or --lighting")
+    add("--cause", choices=CAUSES[1:], help="what ended the trial, if the poses do not show it")
     add("--out", type=Path, metavar="CSV", help="default: SCENE/real.csv; a list of trials is beside it")
     add(
         "--frame",
@@ -400,18 +364,13 @@ def _trial(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="write the bags, of a policy or a human, as a LeRobot dataset instead (pip install 'twin[lerobot]')",
     )
-    for name, what in (
-        ("image", "pictures"),
-        ("camera-info", "calibration"),
-        ("poses", "poses"),
-        ("commands", "commands"),
-    ):
-        add(f"--{name}", metavar="TOPIC", help=f"topic of the {what}")
-    add("--quiet", action="store_true", help="no progress, no summary")
+    add("--image", metavar="TOPIC", help="topic of the pictures")
+    add("--camera-info", metavar="TOPIC", help="topic of the calibration")
+    add("--poses", metavar="TOPIC", help="topic of the poses")
+    add("--commands", metavar="TOPIC", help="topic of the commands")
 
 
-def _forecast(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _forecast(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = "Predict success on the road from success in the twin."
     parser.epilog = """\
 real.csv, one line per policy and lighting:
@@ -425,66 +384,45 @@ If the twin has no lighting of a name, a column twin_lighting names the lighting
 held-out+randomised.
 """
     add("scene", type=Path, help="folder of a scene with validated policies")
-    add(
-        "--real",
-        type=Path,
-        nargs="+",
-        default=[],
-        metavar="CSV",
-        help="trials on the road, in one table or several; see below",
-    )
+    add("--real", type=Path, nargs="+", default=[], metavar="CSV", help="tables of trials on the road; see below")
     add("--seed", type=int, default=0, help="seed of the sampling from posteriors")
-    add("--quiet", action="store_true", help="no summary")
 
 
-def _reality(parser: argparse.ArgumentParser) -> None:
+def _reality(parser: argparse.ArgumentParser, add: _Add) -> None:
     parser.description = (
         "A generated place whose truth is known: film it, drive policies in it, compare a build with it."
     )
     commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
 
-    def command(name: str, text: str) -> tuple[argparse.ArgumentParser, Callable[..., Any]]:
+    def command(name: str, text: str) -> tuple[argparse.ArgumentParser, _Add]:
         """A command's parser, and the function that adds an option to it."""
         parser = commands.add_parser(name, help=text, description=text, formatter_class=HelpFormatter)
         return parser, parser.add_argument
 
-    def place(one: argparse.ArgumentParser) -> None:
-        one.add_argument(
-            "--place",
-            type=int,
-            default=0,
-            metavar="NUMBER",
-            help="0: the demo's street; from 1: sampled places (1 to 49 are for development)",
-        )
-        one.add_argument(
-            "--length",
-            type=float,
-            default=0.0,
-            metavar="METERS",
-            help="lengthen a sampled place's road to this, 20 to 2000; 0: as sampled",
-        )
+    def place(add: _Add) -> None:
+        what = "0: the demo's street; from 1: sampled places (1 to 49 are for development)"
+        add("--place", type=int, default=0, metavar="NUMBER", help=what)
+        what = "lengthen a sampled place's road to this, 20 to 2000; 0: as sampled"
+        add("--length", type=float, default=0.0, metavar="METERS", help=what)
 
-    def robot(one: argparse.ArgumentParser, camera: bool = True) -> None:
-        place(one)
-        one.add_argument("--robot", type=int, default=0, metavar="NUMBER", help="number of the simulated robot")
+    def robot(add: _Add, camera: bool = True) -> None:
+        place(add)
+        add("--robot", type=int, default=0, metavar="NUMBER", help="number of the simulated robot")
         if camera:
-            one.add_argument("--camera", type=int, default=0, metavar="NUMBER", help="number of that robot's camera")
+            add("--camera", type=int, default=0, metavar="NUMBER", help="number of that robot's camera")
 
     def one_weather(one: argparse.ArgumentParser) -> None:
         either = one.add_mutually_exclusive_group(required=True)
         either.add_argument("--lighting", metavar="NAME", help="a designed weather")
         either.add_argument("--day", type=int, nargs=1, metavar="NUMBER", help="number of a random day, from 1")
 
-    one, add = command("film", "film the place into a scene folder")
+    _, add = command("film", "film the place into a scene folder")
     add("--out", type=Path, required=True, help="scene folder to write")
-    place(one)
+    place(add)
     add("--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; for a sampled place, its own")
     add("--tiny", action="store_true", help="only 12 m in 320x180 px under two lightings, for tests")
-    add(
-        "--traffic",
-        action="store_true",
-        help="walkers and cars move through the films, and parked cars have left in the last lighting",
-    )
+    traffic = "walkers and cars move through the films, and parked cars have left in the last lighting"
+    add("--traffic", action="store_true", help=traffic)
     add("--side-roads", action="store_true", help="film the side roads of a sampled place, too: films of their own")
     add("--readout", type=float, default=0.0, metavar="SECONDS", help="rolling shutter; 0: none")
     add("--shake", type=float, metavar="FACTOR", help="shake of the camera; 1: as on a cart")
@@ -493,59 +431,63 @@ def _reality(parser: argparse.ArgumentParser) -> None:
     one, add = command("drive", "the real test: drive policy files in weather that was not filmed")
     one.set_defaults(resumes=True)
     add("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
-    add(
-        "--task",
-        required=True,
-        help="{straight,right_turn}; a sampled place names its own; or a .json of twin export --task-file",
-    )
+    task = "{straight,right_turn}; a sampled place names its own; or a .json of twin export --task-file"
+    add("--task", required=True, help=task)
     add("--scene", type=Path, help="the built scene from which the .json was exported")
-    robot(one)
+    robot(add)
     add("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
     add("--lightings", nargs="+", metavar="NAME", help="designed weathers (default: all)")
     add("--day", type=int, nargs="+", metavar="NUMBER", help="numbers of random days, from 1")
-    add(
-        "--out",
-        type=Path,
-        required=True,
-        help="real.csv, with a table of trials beside it; only one command at a time may write it",
-    )
+    out = "real.csv, with a table of trials beside it; only one command at a time may write it"
+    add("--out", type=Path, required=True, help=out)
     add("--twin-lighting", default=str(Condition(HELD_OUT, True)), help="the twin's lighting to compare with")
     add("--films", type=Path, help="folder for a film of every trial driven now, as the robot saw it")
-    one, add = command("log", "a drive log of the place's Husky, for twin align")
+    _, add = command("log", "a drive log of the place's Husky, for twin align")
     add("--out", type=Path, required=True, help="drive.csv")
     add("--duration", type=float, default=300.0, help="length of the drive [s]")
-    robot(one, camera=False)
-    one, add = command("onboard", "a film by the place's Husky, for twin align")
+    robot(add, camera=False)
+    _, add = command("onboard", "a film by the place's Husky, for twin align")
     add("--out", type=Path, required=True, help="robot.mp4")
-    robot(one)
+    robot(add)
     one, add = command("bag", "a ROS 2 bag of one trial of the place's Husky, for twin trial")
     add("--out", type=Path, required=True, help="folder of the bag")
     add("--policy", type=Path, help="policy folder; default: the robot follows the route")
     add("--task", default="straight", help="{straight,right_turn}; a sampled place names its own")
     one_weather(one)
     add("--seed", type=int, default=0, help="seed of start, camera and noise")
-    robot(one)
+    robot(add)
     one, add = command("photo", "a photo by the Husky's camera in the weather of a trial, for twin relight")
     one_weather(one)
     add("--out", type=Path, required=True, help="photo.png")
-    robot(one)
+    robot(add)
 
 
 VERBS = {
-    "new": Verb("start a scene folder from films, photos or bags", _new, "twin.new"),
+    "new": Verb("start a scene folder from films, photos or bags", _new, "twin.new", quiet=""),
     "build": Verb("turn a scene folder into a drivable twin, with a report and a review video", _build, "twin.build"),
     "relight": Verb("add a lighting to a built scene, from one photo", _relight, "twin.relight"),
     "align": Verb("fit the robot to a log of a real one, or its camera to a film", _align, "twin.align"),
     "drive": Verb("show the Husky driving in a scene or a pack", _drive, "twin.drive"),
-    "view": Verb("look at a built scene and drive in it, in the browser", _view, "twin.view.__main__"),
+    "view": Verb(
+        "look at a built scene and drive in it, in the browser",
+        _view,
+        "twin.view.__main__",
+        "no progress, no address, no summary",
+    ),
     "film": Verb("film a drive in a built scene", _film, "twin.film"),
     "export": Verb("write the place for other programs: USD, glTF, splats, cameras", _export, "twin.export.__main__"),
     "pack": Verb("pack a built scene into one file, with policies, for another machine", _pack, "twin.pack"),
-    "unpack": Verb("unpack such a file into a scene folder", _unpack, "twin.unpack"),
+    "unpack": Verb("unpack such a file into a scene folder", _unpack, "twin.unpack", "no summary"),
     "train": Verb("train a policy on a task of a built scene", _train, "twin.train"),
-    "validate": Verb("measure how often policies succeed, lighting by lighting", _validate, "twin.validate"),
+    "validate": Verb(
+        "measure how often policies succeed, lighting by lighting", _validate, "twin.validate", "no progress, no table"
+    ),
     "trial": Verb("evaluate a trial on the road from the robot's recording", _trial, "twin.trial"),
-    "forecast": Verb("predict success on the real road from success in the twin", _forecast, "twin.forecast"),
-    "reality": Verb("a generated place whose truth is known: film it, drive in it", _reality, "twin.reality.__main__"),
+    "forecast": Verb(
+        "predict success on the real road from success in the twin", _forecast, "twin.forecast", "no summary"
+    ),
+    "reality": Verb(
+        "a generated place whose truth is known: film it, drive in it", _reality, "twin.reality.__main__", ""
+    ),
 }
 """The verbs, in the order in which a user needs them."""

@@ -18,7 +18,7 @@ from typing import Any
 from zlib import crc32
 
 from twin import commands, runtime
-from twin.config import HELD_OUT, Condition
+from twin.config import Condition
 from twin.config_file import load_config
 from twin.env.domain_randomization import condition_options, measured_parameters
 from twin.env.env_factory import fingerprint
@@ -44,9 +44,6 @@ from twin.report.policy_card import write_policy_cards
 from twin.report.validation_report import failure_map, summary_lines, write_validation_page
 from twin.runtime import exclusive_lock
 from twin.scene import SceneDir
-
-DEFAULT_LIGHTINGS = (HELD_OUT, str(Condition(HELD_OUT, True)))
-"""Held-out lightings, first without and then with domain randomization, which is closer to a real road."""
 
 _FIRST_SEED, _PER_LIGHTING, _BLOCKS = 1_000_000_000, 1_000, 900_000  # see `lighting_seeds`
 _SEARCH_SEED, _FINAL_SEED = 2_000_000, 3_000_000  # first seeds of the search for the worst lighting, and of its test
@@ -115,9 +112,9 @@ class Campaign:
 def validate(
     root: Path,
     sources: Sequence[str],
-    task: str = "straight",
-    lightings: Sequence[str] = DEFAULT_LIGHTINGS,
-    episodes: int = 100,
+    task: str,
+    lightings: Sequence[str],
+    episodes: int,
     worst: bool = False,
     trust: bool = False,
     processes: int = 1,
