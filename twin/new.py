@@ -13,6 +13,7 @@ folder that contains all of its files; they are copied with their paths relative
 
 import argparse
 import contextlib
+import filecmp
 import itertools
 import os
 import shlex
@@ -35,7 +36,7 @@ from twin.capture.video import open_film, probe
 from twin.config import MAX_CAMERA_HEIGHT, RANDOMIZED, RESERVED_LIGHTINGS
 from twin.config_file import ROBOT_TOML, parse_table
 from twin.errors import InputError, join_names
-from twin.files import atomic_path, digest_file, exists, is_file, new_folder, read_toml, toml_string, write_text
+from twin.files import atomic_path, exists, is_file, new_folder, read_toml, toml_string, write_text
 from twin.geometry.images import write_image
 from twin.geometry.passes import path_length
 from twin.robot import BASE_HEIGHT, HuskyParams
@@ -313,76 +314,42 @@ def _taken(bag: BagContents) -> str:
 
 
 def _import_film(film: Path, inputs: Path) -> Path:
-    """Copies a film, folder or posed image set to `input/`, unless it is there already; returns its path relative to
-    `input/`."""
+    """Copies a film, folder or posed image set to `input/`, unless it or an equal copy is there already; returns its
+    path relative to `input/`."""
     film, inputs = (Path(os.path.normpath(path.absolute())) for path in (film, inputs))
     if film.is_relative_to(inputs):
         return film.relative_to(inputs)
-    return _copy_image_set(film, inputs) if detect_kind(film) in _POSED else _copy_film(film, inputs)
-
-
-def _copy_film(film: Path, inputs: Path) -> Path:
-    """Copies a film or folder to `input/`, or reuses an identical copy; returns its relative path."""
-    copy, number = inputs / film.name, 2
-    while copy.exists() and not _is_same(film, copy):
-        name = f"{film.name}_{number}" if film.is_dir() else f"{film.stem}_{number}{film.suffix}"
-        copy, number = inputs / name, number + 1
-    if not copy.exists():
-        # Under another name until it is complete, so that an interrupted copy does not count as a film.
-        if film.is_dir():
-            with new_folder(copy) as aside:
-                shutil.copytree(film, aside, ignore=_not_copied, dirs_exist_ok=True)
-        else:
-            with atomic_path(copy) as aside:
-                shutil.copyfile(film, aside)
-    return copy.relative_to(inputs)
-
-
-def _not_copied(folder: str, names: list[str]) -> list[str]:
-    """Entries of a folder that are not copied: pipes, devices, dangling links, and links to folders."""
-    paths = [Path(folder) / name for name in names]
-    return [path.name for path in paths if not is_file(path) and (path.is_symlink() or not path.is_dir())]
-
-
-def _is_same(film: Path, copy: Path) -> bool:
-    """True for files of equal content, and for folders whose files have equal names and contents."""
-    if film.is_dir() and copy.is_dir():
-        return _same_files(_files_within(film), film, copy)
-    both_files = film.is_file() and copy.is_file() and film.stat().st_size == copy.stat().st_size
-    return both_files and digest_file(film) == digest_file(copy)
-
-
-def _same_files(files: list[Path], root: Path, copy: Path) -> bool:
-    """True if the folder `copy` has just the given files below `root`, with equal contents."""
+    is_posed = detect_kind(film) in _POSED
+    root, files = _posed_files(film) if is_posed else (film, _files_within(film))
     names = {file.relative_to(root) for file in files}
-    return names == {file.relative_to(copy) for file in _files_within(copy)} and all(
-        _is_same(root / name, copy / name) for name in names
-    )
-
-
-def _files_within(folder: Path) -> list[Path]:
-    """The files that are copied with a folder, see `_not_copied`."""
-    return [Path(at, name) for at, _, names in os.walk(folder) for name in names if is_file(Path(at, name))]
-
-
-def _copy_image_set(film: Path, inputs: Path) -> Path:
-    """Copies a posed image set from its root to `input/`, or reuses an identical copy; returns its relative path."""
-    root, files = _posed_files(film)
-    copy, number = inputs / root.name, 2
     within = film.relative_to(root)
+    copy, number = inputs / root.name, 2
     while copy.exists():
-        if _same_files(files, root, copy):
-            return Path(copy.name) / within
-        copy, number = inputs / f"{root.name}_{number}", number + 1
-    with new_folder(copy) as aside:
+        if names == {file.relative_to(copy) for file in _files_within(copy)} and all(
+            filecmp.cmp(root / name, copy / name, shallow=False) for name in names
+        ):
+            return (copy / within).relative_to(inputs)
+        name = f"{root.name}_{number}" if root.is_dir() else f"{root.stem}_{number}{root.suffix}"
+        copy, number = inputs / name, number + 1
+    # Under another name until it is complete, so that an interrupted copy does not count as a film.
+    with new_folder(copy) if root.is_dir() else atomic_path(copy) as aside:
         for file in files:
             target = aside / file.relative_to(root)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, target)
-        outside = [path for path in _image_set(aside / within).paths if not path.is_relative_to(aside)]
+        outside = (
+            [path for path in _image_set(aside / within).paths if not path.is_relative_to(aside)] if is_posed else []
+        )
         if outside:
             raise InputError(f"{film}: names images by absolute paths, such as {outside[0]}; make them relative")
-    return Path(copy.name) / within
+    return (copy / within).relative_to(inputs)
+
+
+def _files_within(path: Path) -> list[Path]:
+    """The file itself, or the files below a folder, without pipes, devices, dangling links, and links to folders."""
+    if path.is_file():
+        return [path]
+    return [Path(at, name) for at, _, names in os.walk(path) for name in names if is_file(Path(at, name))]
 
 
 def _image_set(film: Path) -> ImageSet:
