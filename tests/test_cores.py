@@ -10,7 +10,7 @@ from twin import runtime
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
     monkeypatch.setattr(runtime, "_core_limit", None)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda who: set(range(8)), raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda who: set(range(8)))
     runtime._quota.cache_clear()
     yield
     runtime._quota.cache_clear()

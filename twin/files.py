@@ -302,11 +302,7 @@ def allocate(path: Path, size: int) -> None:
     existed = path.exists()
     file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(file, 0, size)
-        else:  # macOS
-            for start in range(os.fstat(file).st_size, size, 1 << 20):
-                os.pwrite(file, bytes(min(1 << 20, size - start)), start)
+        os.posix_fallocate(file, 0, size)
     except OSError as error:
         if not existed:
             path.unlink(missing_ok=True)

@@ -228,7 +228,6 @@ def signals_held() -> Iterator[None]:
 
 _PARENT = "TWIN_PARENT"  # environment variable with the process number of the parent
 _PR_SET_PDEATHSIG = 1
-_PARENT_POLL = 0.5  # [s] between checks whether the parent is alive
 
 
 def child_environment(**more: str) -> dict[str, str]:
@@ -243,18 +242,9 @@ def die_with_parent(parent: int | None = None) -> None:
     `parent` is a process number, by default that from `child_environment`, or else that of the present parent.
     """
     parent = parent or int(os.environ.get(_PARENT, os.getppid()))
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-
-    def exit_when_orphaned() -> None:
-        while os.getppid() == parent:
-            time.sleep(_PARENT_POLL)
-        os._exit(1)
-
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # the parent ended before the call
         os._exit(1)
-    # For systems without prctl.
-    threading.Thread(target=exit_when_orphaned, daemon=True).start()
 
 
 def ignore_terminal_signals() -> None:
@@ -290,7 +280,7 @@ def return_memory() -> None:
 
 def available_cores() -> int:
     """Number of CPU cores that this process may use, by its affinity, the container's quota and `limit_cores`."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = len(os.sched_getaffinity(0))
     return min(count, _core_limit or count, _quota() or count)
 
 
