@@ -222,23 +222,16 @@ def command(options: argparse.Namespace) -> None:
 # ---- figures
 
 _MEASURED, _MODEL, _OTHER = "#444444", "#d1495b", "#3d7ea6"
+_DPI = 110
 _SHOWN = 3  # largest number of windows in the plot of wheel speeds
 
 
-def write_plots(folder: Path, windows: Windows, fitted: Prediction, baseline: Prediction) -> list[Path]:
-    """Writes four PNGs and returns their paths.
-
-    They show the held-out windows; the plot of track ratios shows all windows of steady speed.
-    """
-    figures = {
-        folder / "ends.png": _plot_ends(windows, fitted, baseline),
-        folder / "turning.png": _plot_turning(windows, fitted),
-        folder / "wheels.png": _plot_wheels(windows, fitted),
-        folder / "errors.png": _plot_errors(windows, fitted, baseline),
-    }
-    for path, figure in figures.items():
-        figure.savefig(path, dpi=110)
-    return list(figures)
+def write_plots(folder: Path, windows: Windows, fitted: Prediction, baseline: Prediction) -> None:
+    """Writes four PNGs. They show the held-out windows, but `turning.png` shows all windows of steady speed."""
+    _plot_ends(windows, fitted, baseline).savefig(folder / "ends.png", dpi=_DPI)
+    _plot_turning(windows, fitted).savefig(folder / "turning.png", dpi=_DPI)
+    _plot_wheels(windows, fitted).savefig(folder / "wheels.png", dpi=_DPI)
+    _plot_errors(windows, fitted, baseline).savefig(folder / "errors.png", dpi=_DPI)
 
 
 def _plot_ends(windows: Windows, fitted: Prediction, baseline: Prediction) -> Figure:

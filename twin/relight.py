@@ -225,7 +225,6 @@ def find_sun(
         raise InputError(f"--heading {heading}: expected the compass angle of the scene's x axis in degrees")
     from twin.capture.capture_data import Capture, nearest_longitudes
     from twin.capture.scale import local_east_north_up
-    from twin.geometry.cameras import Cameras
 
     capture = Capture.load(require_stage(scene, "capture"))
     known = np.isfinite(capture.gps[:, :2]).all(1)
@@ -316,7 +315,6 @@ def relight(
     from twin.capture.camera_models import undistorted
     from twin.capture.localize import register_photo
     from twin.capture.photos import load_photo
-    from twin.geometry.cameras import Cameras
     from twin.nerf.baked import BakedField
     from twin.nerf.field import RadianceField
 
@@ -325,10 +323,8 @@ def relight(
     field = RadianceField.load(scene.stage("field"))
     check_new_name(name, field.lightings)
     source = find_sun(scene, sun, time, location, heading)
-    casters = None
     if source:
-        require_stage(scene, "mesh")  # checked first, since reading the baked field takes time
-        casters = shadow_casters(scene, BakedField.load(scene.stage("field")))
+        require_stage(scene, "mesh")  # before the photo is fitted
     image, facts = load_photo(photo, None)
     try:
         found = register_photo(image, facts, scene)
@@ -340,7 +336,8 @@ def relight(
     lens = lens.scaled(round(lens.width * scale), round(lens.height * scale))
     small = np.asarray(resize(flat, lens.width, lens.height), np.float32) / 255.0
     relit = fit_photo(field, small, found.camera_to_world, lens.intrinsics)
-    if source and casters:
+    if source:
+        casters = shadow_casters(scene, BakedField.load(scene.stage("field")))
         relit = with_sun(field, relit, casters, source)
     away = float(np.linalg.norm(Cameras.load(scene.stage("metric")).positions - position, axis=1).min())
     figures = {

@@ -44,11 +44,8 @@ from twin.runtime import exclusive_lock
 from twin.scene import MAX_HASHED, PACK_JSON, STAGE_FOLDERS, SceneDir
 
 SUFFIX = ".twin"
-_SEARCHED = (
-    Path(),
-    Path("scenes"),
-    Path(__file__).resolve().parents[1] / "scenes",
-)  # folders in which a pack given by its name is searched
+# Folders in which a pack given by its name is searched.
+_SEARCHED = (Path(), Path("scenes"), Path(__file__).resolve().parents[1] / "scenes")
 FORMAT, VERSION = "twin pack", 1
 MANIFEST, README = "manifest.json", "README.txt"
 PLAIN, DIFFERENCES = "plain", "differences"

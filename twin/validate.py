@@ -295,7 +295,7 @@ def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], p
             )
         recorded["roads"][road] = digest
     for name, source in policies.items():
-        digest = _digest(Path(source), source)
+        digest = _digest(source)
         if name in driven and recorded["policies"].get(name) != digest:
             raise InputError(
                 f"policy {name!r}: {source} is not the file that was validated under this name; move {folder} away, or "
@@ -311,8 +311,9 @@ def _road(task: str, lighting: str) -> str:
     return f"{task}, {'drawn' if lighting.startswith('drawn_') else lighting}"
 
 
-def _digest(path: Path, source: str) -> str:
+def _digest(source: str) -> str:
     """Digest of a policy's files. For a function, whose code is unknown, the digest of its name."""
+    path = Path(source)
     if path.is_dir():
         return digest_file(path / JSON)  # it contains the digest of the weights
     return digest_file(path) if path.is_file() else digest_json(source)

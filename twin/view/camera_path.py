@@ -18,7 +18,7 @@ import numpy as np
 
 from twin.env.episode_lighting import EpisodeLighting
 from twin.errors import short_repr
-from twin.files import json_bytes, read_json, wrap_read_errors, write_bytes
+from twin.files import read_json, wrap_read_errors, write_json
 from twin.geometry.images import to_uint8
 from twin.nerf.baked import BakedField
 from twin.nerf.lightings import mixed_fog
@@ -97,10 +97,7 @@ class CameraPath:
         ]
 
     def save(self, path: Path) -> None:
-        write_bytes(path, self.to_json())
-
-    def to_json(self) -> bytes:
-        return json_bytes({"format": _FORMAT, "views": [_view_row(view) for view in self.views]})
+        write_json(path, {"format": _FORMAT, "views": [_view_row(view) for view in self.views]})
 
     @staticmethod
     def load(path: Path, field: BakedField, lighting: str | None = None) -> "CameraPath":

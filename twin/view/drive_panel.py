@@ -35,7 +35,7 @@ class DrivePanel:
         gui = viewer.server.gui
         folders = [gui.add_folder(name, visible=False) for name in ("Husky", "Obstacles")]
         with folders[0]:
-            self._driver = gui.add_dropdown("driver", driving.drivers)
+            self._driver = gui.add_dropdown("driver", tuple(driving.drivers))
             viewer.on_update(self._driver, self._choose_driver)
             self._run_button = gui.add_button("Start driving")
             viewer.on_click(self._run_button, lambda event: self._toggle_drive())

@@ -225,14 +225,15 @@ class Driving:
         loose = EnvFactory.open(shared, segment.route or "route", {**common, **free})
         bound = EnvFactory.open(shared, task, {**common, **(policy.options() if policy else {})})
         by_keys, by_others = ("keys", loose, FreeDrive), ("task", bound, DriveTask)
-        self._drivers: dict[str, tuple[Driver, tuple[str, EnvFactory, type[DriveTask]]]] = {
+        self.drivers: dict[str, tuple[Driver, tuple[str, EnvFactory, type[DriveTask]]]] = {
             KEYS_DRIVER: (KeyDriver(held), by_keys),
             SCRIPTED_DRIVER: (RouteDriver(), by_others),
         }
         if policy:
-            self._drivers[f"policy {policy.name}"] = PolicyDriver(policy), by_others
+            self.drivers[f"policy {policy.name}"] = PolicyDriver(policy), by_others
         self._environments: dict[str, DriveEnvironment] = {}
-        self._name = KEYS_DRIVER
+        self.driver = KEYS_DRIVER
+        """Name of the present driver, a key of `drivers`."""
         self._lock = threading.RLock()
         self._running, self._closed = threading.Event(), threading.Event()
         self._rate = 1.0
@@ -241,22 +242,6 @@ class Driving:
         self._thread = threading.Thread(target=self._run, daemon=True, name="driving")
         self._thread.start()
 
-    def _environment(self, factory: EnvFactory, kind: type[DriveTask]) -> DriveEnvironment:
-        factory = replace(factory, obstacles=self.obstacles)
-        physics = DrivePhysics.of(copy.copy(factory.model), factory.world.robot)
-        task = kind(factory.world, factory.segment, factory.options, self.obstacles, factory.model, self._seed)
-        pixels = factory.make_observer([(physics, task)])
-        assert pixels is not None
-        return DriveEnvironment(physics, task, pixels)
-
-    @property
-    def drivers(self) -> tuple[str, ...]:
-        return tuple(self._drivers)
-
-    @property
-    def driver(self) -> str:
-        return self._name
-
     @property
     def running(self) -> bool:
         return self._running.is_set()
@@ -264,17 +249,22 @@ class Driving:
     @property
     def environment(self) -> DriveEnvironment:
         """The environment of the present driver, created when it is first needed."""
-        name, factory, kind = self._drivers[self._name][1]
+        name, factory, kind = self.drivers[self.driver][1]
         if name not in self._environments:
-            self._environments[name] = self._environment(factory, kind)
+            factory = replace(factory, obstacles=self.obstacles)
+            physics = DrivePhysics.of(copy.copy(factory.model), factory.world.robot)
+            task = kind(factory.world, factory.segment, factory.options, self.obstacles, factory.model, self._seed)
+            pixels = factory.make_observer([(physics, task)])
+            assert pixels is not None
+            self._environments[name] = DriveEnvironment(physics, task, pixels)
         return self._environments[name]
 
     def choose(self, driver: str) -> None:
         """Switches to a driver, which begins at the start of its task."""
         with self._lock:
             self.pause()
-            if driver != self._name:
-                self._name = driver
+            if driver != self.driver:
+                self.driver = driver
                 self.reset()
 
     def start(self) -> None:
@@ -349,7 +339,7 @@ class Driving:
             self._rate += 0.2 * (period / max(time.monotonic() - began, 1e-3) - self._rate)
 
     def _advance(self) -> None:
-        driver, environment = self._drivers[self._name][0], self.environment
+        driver, environment = self.drivers[self.driver][0], self.environment
         assert self._step is not None
         action = np.asarray(driver(environment, self._step), float)
         try:

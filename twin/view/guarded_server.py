@@ -105,18 +105,18 @@ class Gate:
         """A refusal, or the redirect that stores the token as a cookie; None if the request is allowed."""
         host, origin = _header(request, "Host"), _header(request, "Origin")
         if self._token is None and (host is None or not _is_loopback(_hostname(host))):
-            return _plain(http.HTTPStatus.FORBIDDEN, "this page is for this machine only; see twin view --host\n")
+            return _answer(http.HTTPStatus.FORBIDDEN, "this page is for this machine only; see twin view --host\n")
         if _is_handshake(request) and origin is not None and (host is None or urlsplit(origin).netloc != host):
-            return _plain(http.HTTPStatus.FORBIDDEN, "another site's page may not connect\n")
+            return _answer(http.HTTPStatus.FORBIDDEN, "another site's page may not connect\n")
         if self._token is None or self._equal(self._cookie_value(request)):
             return None
         given = parse_qs(urlsplit(request.path).query).get("token", [])
         if len(given) == 1 and self._equal(given[0]) and not _is_handshake(request):
-            answer = _plain(http.HTTPStatus.SEE_OTHER, "")
-            answer.headers["Location"] = "/"
-            answer.headers["Set-Cookie"] = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Lax"
-            return answer
-        return _plain(http.HTTPStatus.UNAUTHORIZED, "open the address that twin view printed, with its token\n")
+            redirect = _answer(http.HTTPStatus.SEE_OTHER, "")
+            redirect.headers["Location"] = "/"
+            redirect.headers["Set-Cookie"] = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Lax"
+            return redirect
+        return _answer(http.HTTPStatus.UNAUTHORIZED, "open the address that twin view printed, with its token\n")
 
     def _equal(self, given: str | None) -> bool:
         assert self._token is not None
@@ -194,7 +194,9 @@ def open_server(host: str, port: int, label: str) -> GuardedServer:
             if refusal := gate.refusal(request):
                 return refusal
             if not _is_handshake(request) and urlsplit(request.path).path == "/":
-                return index(request)
+                page = _answer(http.HTTPStatus.OK, index, "text/html")
+                page.headers["Referrer-Policy"] = "no-referrer"
+                return page
             return check(connection, request)
 
         async def guarded_handler(connection: ServerConnection) -> None:
@@ -276,20 +278,12 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def _index_page() -> Callable[[Request], Response]:
-    """Answers requests with viser's page, in which `page.js` is embedded."""
+def _index_page() -> str:
+    """viser's page, in which `page.js` is embedded."""
     page = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text(encoding="utf-8")
     script = resources.files("twin.view").joinpath("page.js").read_text(encoding="utf-8")
     head = page.index("</head>")
-    content = (page[:head] + f"<script>{script}</script>" + page[head:]).encode()
-
-    def answer(request: Request) -> Response:
-        headers = Headers({"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(content))})
-        headers["Cache-Control"] = "no-store"
-        headers["Referrer-Policy"] = "no-referrer"
-        return Response(http.HTTPStatus.OK, "OK", headers, content)
-
-    return answer
+    return f"{page[:head]}<script>{script}</script>{page[head:]}"
 
 
 def _header(request: Request, name: str) -> str | None:
@@ -309,8 +303,8 @@ def _hostname(host: str) -> str:
     return name[1 : name.index("]")] if name.startswith("[") and "]" in name else name.partition(":")[0]
 
 
-def _plain(status: http.HTTPStatus, text: str) -> Response:
+def _answer(status: http.HTTPStatus, text: str, kind: str = "text/plain") -> Response:
     body = text.encode()
-    headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
+    headers = Headers({"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))})
     headers["Cache-Control"] = "no-store"
     return Response(status, status.phrase, headers, body)

@@ -30,11 +30,6 @@ _ROUTE_COLOR, _CORRIDOR_COLOR, _GROUND_COLOR = (255, 214, 0), (0, 200, 255), (12
 _PART_COLOR, _EDGE_COLOR = (255, 87, 51), (200, 60, 40)
 
 
-def wxyz_of(rotation: Array) -> Array:
-    """Quaternion w, x, y, z of a rotation matrix (3, 3)."""
-    return viser.transforms.SO3.from_matrix(rotation).wxyz.astype(np.float64)
-
-
 @dataclass
 class Layer:
     """One layer; its nodes are below `/layers/<name>`."""

@@ -29,7 +29,7 @@ from twin.scene import check_name
 from twin.types import Array
 from twin.unpack import is_cached
 from twin.view.camera_path import CameraPath, KeyView, named_lighting, path_frames, spaced_times, write_path_film
-from twin.view.layers import clicked_frame, wxyz_of
+from twin.view.layers import clicked_frame
 from twin.view.picture_loop import FilmedFrame
 from twin.view.viewer import FOV, MOVED, Viewer, camera_pose_of
 
@@ -336,7 +336,7 @@ class PathPanel:
                     aspect=_FILM_SIZE[0] / _FILM_SIZE[1],
                     scale=0.2,
                     color=_COLOR,
-                    wxyz=wxyz_of(pose[:3, :3]),
+                    wxyz=viser.transforms.SO3.from_matrix(pose[:3, :3]).wxyz,
                     position=pose[:3, 3],
                 )
             )

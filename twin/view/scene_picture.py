@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from twin.env.compositor import Compositor
 
 _CAMERA = "view"  # name of the free camera in the model
-_MAX_COMPOSITORS = (
-    8  # cached compositors: one for coarse and one for fine pictures of four pages; creating one takes seconds
-)
+# Number of cached compositors: for coarse and fine pictures of four pages. Creating one takes seconds.
+_MAX_COMPOSITORS = 8
 
 
 @dataclass(frozen=True)
