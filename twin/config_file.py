@@ -171,29 +171,18 @@ def _check(config: SceneConfig, folder: str) -> None:
     printable = config.name.isprintable() or config.name == folder
     _require(printable, f"name = {config.name!r}; expected a text without control characters")
     _check_tasks(config.task)
+    _check_ranges(config)
     for section in _SECTIONS:
-        settings = getattr(config, section)
-        kind: type = type(settings)
-        for key, bounds in setting_ranges(kind).items():
-            _check_range(getattr(settings, key), bounds, f"{section}.{key}")
-    _check_range(config.seed, setting_ranges(SceneConfig)["seed"], "seed")
-    for source in config.source:
-        what = f"of [[source]] {source.path!r}"
-        bounds = setting_ranges(SourceConfig)["camera_height"]
-        _check_range(source.camera_height, bounds, f"camera_height {what}")
-        _check_segments(source.keep, f"keep {what}")
+        _check_ranges(getattr(config, section), f"{section}.")
     _check_segments(config.capture.keep, "capture.keep")
     _check_route(config.route, "route")
     _check_branches(config)
     check_obstacles(config.obstacle)
-    _check_metric(config.metric)
     metric = config.metric
-    scales = (
-        *(metric.camera_height > 0.0, metric.distance, metric.gps, metric.odometry, metric.marker),
-        metric.poses_are_metric,
-    )
+    _check_metric(metric)
+    heights = [metric.camera_height, *(source.camera_height for source in config.source)]
     _require(
-        any(scales) or any(source.camera_height > 0.0 for source in config.source),
+        any((*heights, metric.distance, metric.gps, metric.odometry, metric.marker, metric.poses_are_metric)),
         "[metric] gives no scale; give one or more of "
         "camera_height = 1.2 (lens above ground [m]), distance = {metres, frame_a, a, b} (two marked points), "
         "gps = true (EXIF or NavSatFix of a bag), odometry = true (of a bag), "
@@ -204,6 +193,13 @@ def _check(config: SceneConfig, folder: str) -> None:
 def _require(condition: object, message: str) -> None:
     if not condition:
         raise InputError(message)
+
+
+def _check_ranges(settings: Any, prefix: str = "", suffix: str = "") -> None:
+    """Checks the fields of a dataclass that have a range; prefix and suffix of their names are for the messages."""
+    kind: type = type(settings)
+    for key, bounds in setting_ranges(kind).items():
+        _check_range(getattr(settings, key), bounds, f"{prefix}{key}{suffix}")
 
 
 def _check_range(value: float, bounds: Range, what: str) -> None:
@@ -219,6 +215,8 @@ def _check_source(source: SourceConfig) -> None:
         _require("\0" not in value, f"{key} = {value!r}; expected a path without NUL characters")
     what = f"of [[source]] {source.path!r}"
     _check_choice(source.kind, KINDS, "kind")
+    _check_ranges(source, suffix=f" {what}")
+    _check_segments(source.keep, f"keep {what}")
     if source.lighting:
         check_lighting(source.lighting, f"lighting {what}")
     if source.camera is not None:
@@ -265,7 +263,7 @@ def _check_branches(config: SceneConfig) -> None:
         _check_name(branch.name, "[[branch]] name")
         what = f"[[branch]] {branch.name!r}"
         _require(branch.passes or branch.points, f"{what} has neither passes nor points; give one of them")
-        _check_range(branch.max_gap, setting_ranges(RouteConfig)["max_gap"], f"{what} max_gap")
+        _check_ranges(branch, f"{what} ")
         _check_route(branch, what)
     names = [branch.name for branch in config.branch]
     _check_unique(["route", *names], "routes")
