@@ -1,22 +1,17 @@
 """`twin align`: fits the Husky's parameters to a drive log, or its front camera to a film by that camera.
 
     twin align scenes/demo drive.csv
-    twin align scenes/demo robot.mp4
     twin align scenes/my_road drive.mcap [--camera]
     twin align husky drive.npz --out aligned
 
 System identification fits the controller's limits and latency, the servo's lag, tires, ground, center of mass and
 effective wheel radii to half of the log. The other half is held out to score this fit, and a kinematic model
-that is fitted to the same data. Each value has a standard error; parameters that the log does not determine keep their
-values and are listed. Results are `robot.toml`, which the scene's next build uses, and `alignment/` with `align.json`
-and four figures.
-
-A ROS bag serves as a log; with --camera, its pictures serve as a film. If the bag's only poses are wheel odometry, but
-the scene was built from the bag's pictures, the log's poses are computed from the reconstructed cameras.
+that is fitted to the same data. Results are `robot.toml`, which the scene's next build uses, and `alignment/` with
+`align.json` and four figures. Parameters that the log does not determine keep their values.
 
 A film by the robot's front camera in the built place determines the camera's extrinsics (height, yaw, pitch, roll) and,
-unless `[robot] camera_intrinsics` is given, its focal length. The values are written to the same `robot.toml`;
-`alignment/camera.png` shows the film beside the twin's images.
+unless `[robot] camera_intrinsics` is given, its focal length. `alignment/camera.png` shows the film beside the twin's
+images. A ROS bag serves as a log or, with --camera, as a film.
 """
 
 import argparse

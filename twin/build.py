@@ -1,10 +1,7 @@
 """`twin build`: builds a drivable twin of a filmed place, stage by stage; stages that are up to date are skipped.
 
-    twin build SCENE [--until STAGE] [--force STAGE] [--set nerf.steps=4000] [--device cpu|cuda] [--quiet]
-
-`PIPELINE` defines the stages. Each is announced as "stage n of 7". It writes `build/<folder>.partial`, which is renamed
-at the end. After a killed build, the next one removes partial folders, skips the finished stages, and continues.
-`twin.scene` defines when a stage is up to date.
+`PIPELINE` defines the stages. Each writes `build/<folder>.partial`, which is renamed at the end. After a killed build,
+the next one removes partial folders and continues. `twin.scene` defines when a stage is up to date.
 """
 
 import argparse

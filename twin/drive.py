@@ -1,8 +1,5 @@
 """`twin drive`: shows the Husky driving in a scene or a pack, as a film or in the browser.
 
-    twin drive demo
-    twin drive scenes/demo --policy first --lighting night --view
-
 By default, the first policy in a pack, or the policy of a scene's only run, drives the task of its training; without
 such a policy, the scripted driver drives. `twin.film` has more options.
 """

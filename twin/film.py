@@ -1,14 +1,11 @@
 """`twin film`: films a drive in a built scene, for visual review.
 
-    twin film scenes/demo --task right_turn --lighting night --obstacles 4
     twin film scenes/demo --policy first --task straight --lighting held-out --seed 7 --out drive.mp4
-    twin film scenes/demo --policy first --task straight --rerun drive.rrd
     twin film scenes/demo --lerobot drives --episodes 20
 
-The film shows the robot's camera image, the robot from behind, its position, speed and reward. The driver is a scripted
-route follower, or a policy that `twin.validate` accepts; a policy also gives the environment's options. Task, lighting
-and seed determine the episode, so any row of `validation/episodes.csv` can be filmed. `--rerun` also writes the drive
-as a recording for Rerun. With `--lerobot`, drives are recorded as a dataset for learning instead of a film.
+The driver is a scripted route follower, or a policy that `twin.validate` accepts; a policy also gives the environment's
+options. Task, lighting and seed determine the episode, so any row of `validation/episodes.csv` can be filmed. With
+`--lerobot`, drives are recorded as a dataset for learning instead of a film.
 """
 
 import argparse

@@ -1,7 +1,5 @@
 """`twin forecast`: forecasts success on the real road from success in the twin.
 
-    twin forecast SCENE [--real results.csv ...]
-
 This reads `validation/episodes.csv`, which `twin.validate` writes, and the user's tables of real trials. It writes
 `forecast.json`, `forecast.csv` and `forecast.html` to `<SCENE>/forecast`. Without real trials, it only ranks the
 policies in the twin.

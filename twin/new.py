@@ -2,10 +2,9 @@
 
     twin new scenes/my_road day.mp4 dusk.mp4 --camera-height 1.2
 
-This writes `scenes/my_road/scene.toml` with the common settings and copies the films into `input/`;
-`twin build scenes/my_road` then builds the scene. A bag (`twin.capture.bag_film`) provides pictures and their
-calibration. Its GPS and odometry become sources of scale. Its `/tf_static` gives the camera's extrinsics (height,
-position and angles on the robot), which are written to `robot.toml`.
+This writes `scenes/my_road/scene.toml` with the common settings and copies the films into `input/`. The GPS and
+odometry of a bag (`twin.capture.bag_film`) become sources of scale. Its `/tf_static` gives the camera's extrinsics
+(height, position and angles on the robot), which are written to `robot.toml`.
 
 A *posed image set* is a `transforms.json` or a COLMAP model, which refers to image files. Its *root* is the deepest
 folder that contains all of its files; they are copied with their paths relative to the root.

@@ -1,7 +1,6 @@
 """`twin pack`: packs a built scene, with chosen policies, into one file for another machine.
 
     twin pack scenes/demo --policy first -o demo.twin
-    twin pack scenes/demo --policy first --levels 8 -o scenes/demo.twin
 
 A pack contains what driving needs: the baked radiance field, the MJCF scene with its assets, ground, collision parts
 and cameras, tasks, robot, and lightings fitted to photos. It contains no films, frames, reports, or torch model.

@@ -4,11 +4,8 @@
     twin relight scenes/demo photo.jpg --name afternoon --time 2026-06-01T17:30+02:00 --location 48.14,11.58
 
 This localizes the photo, then fits an appearance embedding and fog so that renderings of the frozen radiance field
-match the photo. The lighting is saved as `<scene>/lightings/afternoon.json`, with an image beside it that shows the
-photo, the field under the fitted lighting, and the field under the most similar filmed lighting. A lighting may have a
-sun. Its direction is given, computed from time and place, or, on demand, searched in the photo (`nerf/sun_fit.py`).
-Afterwards, `twin.load_scene(scene).field()` has the lighting as `lighting="afternoon"` or in mixtures such as
-`"sun:afternoon:0.5"`; environments apply its sun and fog to their images.
+match the photo. The lighting is saved as `<scene>/lightings/afternoon.json`, with an image beside it (`comparison`). It
+may have a sun, whose direction is given, computed from time and place, or searched in the photo (`nerf/sun_fit.py`).
 """
 
 import argparse

@@ -1,8 +1,6 @@
 """`twin train`: trains a policy from pixels on a task of a built scene.
 
     twin train scenes/demo --task straight --run first
-    twin train scenes/demo --task straight --run plain --observe simulator
-    twin train scenes/demo --task straight --run day --lighting sun
 
 A training ends when the success rate in tests without exploration reaches `--success`, when tests no longer improve, or
 at `--steps`. If a run was stopped or killed, the same command continues it. The policy is saved in `runs/<name>` of the

@@ -2,17 +2,11 @@
 
     twin trial scenes/my_road monday_1.mcap --policy first --task straight --lighting monday
 
-The bag has the front camera's pictures and camera_info, commands, and poses (RTK, LiDAR or filtered odometry). Pictures
-are localized in the scene, and the poses are fitted to their positions. Then the twin's rules of success and failure
-are applied to the trial. Poses do not show collisions; `--cause collision` states that the recording ends with a
-collision.
-
-Two files are written to `<scene>/trials/<bag>/`. `trial.mp4` shows the robot's pictures beside the twin's. `trial.json`
-has the outcome; the distance between the final positions of the real robot and of the twin's robot under the same
-commands; the similarity of the pictures; and the fraction of recorded commands that the policy repeats when it receives
-the recorded pictures. The trial is counted in `real.csv`, and listed with its cause in `real_trials.csv` beside it.
-
-    twin trial scenes/my_road monday_1.mcap monday_2.mcap --task straight --lerobot drives
+Pictures of the bag are localized in the scene, and its poses are fitted to their positions. Then the twin's rules of
+success and failure are applied. Poses do not show collisions; `--cause collision` states that the recording ends with
+one. `<scene>/trials/<bag>/` has a film (`trial.mp4`) and the figures (`trial.json`): the outcome, a replay of the
+commands in the twin, the similarity of the pictures, and the commands that the policy gives for the recorded pictures.
+The trial is counted in `real.csv`, and listed with its cause in `real_trials.csv` beside it.
 
 With `--lerobot`, recordings are written as a dataset for learning instead; see `twin/report/drive_dataset.py`.
 """

@@ -1,11 +1,9 @@
 """`twin validate`: measures the success rates of policies in a built scene, per lighting.
 
-    twin validate scenes/demo --task straight --policy scenes/demo/runs/first --episodes 100
     twin validate scenes/demo --policy first plain my_module:act --lightings held-out night --worst --films
 
-A policy is a run (name or folder), a checkpoint of a run, an ONNX file or `module:function`. All policies drive the
-same episodes. Episodes that are in `validation/episodes.csv` are not driven again, so the same command continues a
-stopped validation. `validation/validation.html` shows the results.
+All policies drive the same episodes. Episodes that are in `validation/episodes.csv` are not driven again, so the same
+command continues a stopped validation. `validation/validation.html` shows the results.
 """
 
 import argparse

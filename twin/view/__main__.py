@@ -1,10 +1,9 @@
 """`twin view`: shows a built scene in the browser, and drives the Husky in it; or renders a camera path to a film.
 
-    twin view scenes/demo
     twin view scenes/demo --policy first --task straight
     twin view scenes/demo --path scenes/demo/paths/path.json --out film.mp4
 
-No GPU and no network are required. The page is served to this machine alone unless `--host` names another address; the
+The page is served to this machine alone unless `--host` names another address; the
 printed address then has a token that the browser needs.
 """
 
