@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from drive_logs import SOFT, columns, windows_of
 
-from twin.align import main, summary
+from twin import commands
+from twin.align import summary
 from twin.config_file import parse_table, read_robot
 from twin.env.controller import Controller, limit_command, wheel_speeds
 from twin.robot import TRACK, WHEEL_RADIUS, HuskyParams
@@ -333,9 +334,9 @@ def test_fields_of_the_scene_that_override_fitted_ones_are_named(tmp_path, monke
     )
     np.savez(log, **columns(HuskyParams(), 4.0, seed=0))
     for target in (scene, scene / "scene.toml", scene / "robot.toml"):  # the last one written by the first
-        assert main([str(target), str(log)]) == 0
+        assert commands.main("align", [str(target), str(log)]) == 0
         assert "overrides fitted values: friction;" in capsys.readouterr().out, target
-    assert main([str(scene), str(log), "--out", str(tmp_path / "out")]) == 0
+    assert commands.main("align", [str(scene), str(log), "--out", str(tmp_path / "out")]) == 0
     assert "overrides fitted values" not in capsys.readouterr().out  # that folder is not the scene's
 
 
@@ -349,7 +350,7 @@ def test_an_unwritable_folder_is_refused_before_the_fit(out, drive, tmp_path, mo
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "alignment").write_text("")
     np.savez(tmp_path / "log.npz", **drive)
-    assert main(["husky", str(tmp_path / "log.npz"), "--out", str(tmp_path / out), "--quiet"]) == 2
+    assert commands.main("align", ["husky", str(tmp_path / "log.npz"), "--out", str(tmp_path / out), "--quiet"]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and str(tmp_path / out) in said and "--out" in said
 
@@ -364,7 +365,7 @@ def test_an_unwritable_folder_is_refused_before_the_fit(out, drive, tmp_path, mo
 )
 def test_bad_arguments_exit_with_status_2(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
+    assert commands.main("align", arguments) == 2
     assert message in capsys.readouterr().err
 
 

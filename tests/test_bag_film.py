@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 from test_metric import _path, _points, _similarity, _world
 from test_pictures import _mosaic  # a mosaic of `SMOOTH`
 
+from twin import commands
 from twin.capture.bag_film import lens_of, read_contents
 from twin.capture.camera_models import Lens, checked_lens
 from twin.capture.capture_data import Capture
@@ -39,7 +40,6 @@ from twin.errors import InputError
 from twin.files import remove
 from twin.geometry.cameras import Cameras
 from twin.geometry.images import read_image
-from twin.new import main as new_main
 
 SHIFTS = [6 * i for i in range(30)]
 TIMES = np.arange(30) / 10.0
@@ -257,7 +257,7 @@ def test_new_takes_what_the_bag_has_and_says_so(tmp_path: Path, capsys: pytest.C
     rear = [replace(one, topic="/rear/image") for one in pictures(views(SHIFTS), TIMES) if one.stamp < START + 10**9]
     bag = write(tmp_path / "drive", [*whole(), *rear])
     root = tmp_path / "scene"
-    assert new_main([str(root), str(bag)]) == 0
+    assert commands.main("new", [str(root), str(bag)]) == 0
     said = capsys.readouterr()
     text = said.out + said.err
     for words in (
@@ -277,7 +277,7 @@ def test_new_takes_what_the_bag_has_and_says_so(tmp_path: Path, capsys: pytest.C
     robot = read_robot(root / "robot.toml")
     assert robot["camera_height"] == pytest.approx(0.7) and robot["camera_offset"] == pytest.approx([0.3, 0.0])
     assert robot["camera_pitch"] == pytest.approx(np.degrees(0.1), abs=1e-3)
-    assert new_main([str(tmp_path / "other"), str(bag), "--topic", "/rear/image"]) == 0
+    assert commands.main("new", [str(tmp_path / "other"), str(bag), "--topic", "/rear/image"]) == 0
     assert load_config(tmp_path / "other/scene.toml").source[0].topic == "/rear/image"
 
 
@@ -290,13 +290,13 @@ def test_new_says_whether_the_bag_is_also_a_log(tmp_path: Path, capsys: pytest.C
         ("d", [*moved, *odometry_on("/platform/odom")], "commands /cmd_vel, wheels /platform/odom, poses /odom"),
     ):
         bag = write(tmp_path / f"drive_{name}", [*whole(), *more])
-        assert new_main([str(tmp_path / f"scene_{name}"), str(bag)]) == 0
+        assert commands.main("new", [str(tmp_path / f"scene_{name}"), str(bag)]) == 0
         assert words in capsys.readouterr().err
 
 
 def test_new_says_when_odometry_is_too_short_for_the_scale(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     bag = write(tmp_path / "short", [one for one in whole() if one.topic != "/odom" or one.stamp < START + 10**9])
-    assert new_main([str(tmp_path / "scene"), str(bag)]) == 0
+    assert commands.main("new", [str(tmp_path / "scene"), str(bag)]) == 0
     said = capsys.readouterr()
     assert "(less than 15 m, so not used for the scale)" in said.err
     assert "metric scale: camera_height and gps\n" in said.out
@@ -318,7 +318,7 @@ def test_new_names_a_set_clock_and_the_other_files_of_a_bag(tmp_path: Path, caps
     (file,) = bag.glob("*.mcap")
     file.rename(bag / "drive_0.mcap")
     (bag / "drive_1.mcap").write_bytes(b"")
-    assert new_main([str(tmp_path / "scene"), str(bag / "drive_0.mcap")]) == 0
+    assert commands.main("new", [str(tmp_path / "scene"), str(bag / "drive_0.mcap")]) == 0
     said = capsys.readouterr().err
     assert "drive_0.mcap: no picture for 100000000.1 s from 1.9 s on" in said
     assert "only this one of the bag's 2 files is used; for all, give its folder" in said
@@ -328,10 +328,10 @@ def test_new_names_a_set_clock_and_the_other_files_of_a_bag(tmp_path: Path, caps
 def test_a_compressed_file_of_a_bag_is_read_in_its_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     for mode in (CompressionMode.FILE, CompressionMode.MESSAGE):
         bag = write(tmp_path / mode.name, whole(), compression=mode)
-        assert new_main([str(tmp_path / f"{mode.name} scene"), str(bag)]) == 0
+        assert commands.main("new", [str(tmp_path / f"{mode.name} scene"), str(bag)]) == 0
         (file,) = (one for one in bag.iterdir() if one.suffix != ".yaml")
         capsys.readouterr()
-        assert new_main([str(tmp_path / "other"), str(file)]) == 2
+        assert commands.main("new", [str(tmp_path / "other"), str(file)]) == 2
         assert "give the bag's folder" in capsys.readouterr().err
 
 
@@ -437,7 +437,7 @@ def test_damaged_files_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
     ):
         file.write_bytes(data)
         refused(tmp_path, SourceConfig(path=file.name), words)
-        assert new_main([str(tmp_path / "scene"), str(file)]) == 2
+        assert commands.main("new", [str(tmp_path / "scene"), str(file)]) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
     refused(tmp_path, SourceConfig(path=bag.name, topic="/none"), "topic /none; expected one of .*/camera/image")
     (tmp_path / "bare").mkdir()

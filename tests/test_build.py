@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from twin import build as verb
+from twin import commands
 from twin.config import CaptureConfig, MjcfConfig, NerfConfig, SceneConfig, SourceConfig
 from twin.files import digest_json
 from twin.scene import SceneDir, Stamp, replace_file
@@ -202,7 +203,7 @@ def test_a_full_or_read_only_disk_is_one_line_and_loses_nothing(pipeline, capsys
 
     sys.modules["fake_field"].run = refuse
     capsys.readouterr()
-    assert verb.main([str(pipeline.root), "--set", "nerf.steps=9", "--quiet"]) == 2
+    assert commands.main("build", [str(pipeline.root), "--set", "nerf.steps=9", "--quiet"]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "half.txt" in error and ("again" in error or "writable" in error)
     assert (pipeline.scene.stage("field") / "result.txt").read_text() == before
@@ -210,11 +211,11 @@ def test_a_full_or_read_only_disk_is_one_line_and_loses_nothing(pipeline, capsys
 
 
 def test_bad_input_exits_2_and_a_bug_keeps_its_traceback(pipeline, capsys):
-    assert verb.main([str(pipeline.root), "--set", "nerf.stepz=9"]) == 2
+    assert commands.main("build", [str(pipeline.root), "--set", "nerf.stepz=9"]) == 2
     assert "did you mean 'steps'" in capsys.readouterr().err
-    assert verb.main([str(pipeline.root / "nowhere")]) == 2
+    assert commands.main("build", [str(pipeline.root / "nowhere")]) == 2
     (pipeline.root / "input/a.txt").unlink()
-    assert verb.main([str(pipeline.root)]) == 2
+    assert commands.main("build", [str(pipeline.root)]) == 2
     assert "input/a.txt" in capsys.readouterr().err
     (pipeline.root / "input/a.txt").write_text("film")
 
@@ -223,7 +224,7 @@ def test_bad_input_exits_2_and_a_bug_keeps_its_traceback(pipeline, capsys):
 
     sys.modules["fake_capture"].run = bug
     with pytest.raises(KeyError):
-        verb.main([str(pipeline.root), "--quiet"])
+        commands.main("build", [str(pipeline.root), "--quiet"])
 
 
 def test_a_killed_build_resumes_and_a_second_one_refuses(pipeline, tmp_path):

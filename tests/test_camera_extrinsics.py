@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from textured import K, filmed_corridor, picture
 from tiny_world import tiny_world
 
-from twin import runtime
-from twin.align import main
+from twin import commands, runtime
 from twin.assets.ground import Ground
 from twin.capture.camera_models import Lens
 from twin.capture.localize import _LocalizedFrame, _shared_focal, register_film
@@ -288,7 +287,7 @@ def test_the_verb_keeps_other_fields_and_prints_the_fit(place, film, found_once,
     robot = place.root / "robot.toml"
     robot.write_text("friction = 0.6\ncamera_intrinsics = [400.0, 400.0, 160.0, 120.0]\ncamera_size = [320, 240]\n")
     by_hand(place, "camera_offset = [0.3, 0.05]\nmax_speed = 0.8\n")
-    assert main([str(place.config_file), str(film)]) == 0
+    assert commands.main("align", [str(place.config_file), str(film)]) == 0
     assert "camera_yaw = " in capsys.readouterr().out
     table = read_robot(robot)
     assert table["friction"] == 0.6 and "max_speed" not in table
@@ -308,14 +307,14 @@ def test_given_intrinsics_are_used(place, film, found_once, capsys):
     robot = place.root / "robot.toml"
     robot.write_text("camera_intrinsics = [400.0, 400.0, 320.0, 240.0]\ncamera_size = [640, 480]\n")
     by_hand(place, "camera_pitch = 5.0\ncamera_intrinsics = [520.0, 520.0, 320.0, 240.0]\ncamera_size = [640, 480]\n")
-    assert main([str(place.root), str(film)]) == 0
+    assert commands.main("align", [str(place.root), str(film)]) == 0
     assert "overrides fitted values: camera_pitch;" in capsys.readouterr().out
     assert not {"camera_intrinsics", "camera_size"} & set(read_robot(robot))
 
 
 def test_unusable_films_are_refused_in_one_line(place, film, registered, tmp_path, capsys, monkeypatch):
     def refused(*arguments: str) -> str:
-        assert main(list(arguments)) == 2
+        assert commands.main("align", list(arguments)) == 2
         return capsys.readouterr().err
 
     root = str(place.root)

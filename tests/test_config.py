@@ -3,7 +3,7 @@ import math
 
 import pytest
 
-from twin import build
+from twin import commands
 from twin.config import CAMERA_MODELS, MARKER_FAMILIES, SceneConfig
 from twin.config_file import _SECTIONS, load_config
 from twin.errors import InputError
@@ -174,18 +174,18 @@ def test_a_file_given_for_a_scene_is_one_line(tmp_path, capsys, monkeypatch):
     path = _write(tmp_path, _MINIMAL)
     (tmp_path / "README.md").write_text("no scene")
     for given, cure in ((path, f"give the folder of the scene, {tmp_path}"), (tmp_path / "README.md", "scenes/demo")):
-        assert build.main([str(given)]) == 2
+        assert commands.main("build", [str(given)]) == 2
         error = capsys.readouterr().err
         assert error.startswith(f"error: {given} is a file; ") and cure in error and error.count("\n") == 1
     (tmp_path / "other/scene.toml").mkdir(parents=True)
-    assert build.main([str(tmp_path / "other")]) == 2
+    assert commands.main("build", [str(tmp_path / "other")]) == 2
     assert "is a folder; expected a file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("setting", ["nerf.bake_steps=0", "nerf.sightings=1.0", "nerf.levels=0", "mesh.views=0"])
 def test_a_number_out_of_range_is_refused_before_the_build(tmp_path, capsys, setting):
     _write(tmp_path, _MINIMAL)
-    assert build.main([str(tmp_path), "--set", setting]) == 2
+    assert commands.main("build", [str(tmp_path), "--set", setting]) == 2
     error = capsys.readouterr().err
     assert setting.split("=")[0] in error and "expected" in error and error.count("\n") == 1
     assert not (tmp_path / "build").exists()

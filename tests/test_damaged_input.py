@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from twin import build as verb
+from twin import commands
 from twin.capture.capture_data import read_mask
 from twin.capture.formats import read_colmap, read_transforms
 from twin.capture.photos import load_photo
@@ -52,7 +53,7 @@ def _film(path, frames):
 
 def _fails(capsys, root, *words, until="metric"):
     capsys.readouterr()
-    assert verb.main([str(root), "--until", until, "--quiet"]) == 2
+    assert commands.main("build", [str(root), "--until", until, "--quiet"]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert lines[-1].startswith("error: ") and all(word in lines[-1] for word in words), lines
     assert "Traceback" not in "".join(lines)
@@ -69,7 +70,7 @@ def test_one_photo_and_an_empty_one(tmp_path, capsys):
 
 def test_unknown_key_and_no_scale(tmp_path, capsys):
     root = _scene(tmp_path, _source("a.mp4") + "[metric]\ncamera_hight = 1.2\n")
-    assert verb.main([str(root)]) == 2
+    assert commands.main("build", [str(root)]) == 2
     assert "did you mean 'camera_height'" in capsys.readouterr().err
     _film(root / "input/a.mp4", [_noise(i) for i in range(4)])
     _scene(tmp_path, _source("a.mp4"))
@@ -80,7 +81,7 @@ def test_unknown_key_and_no_scale(tmp_path, capsys):
 def test_a_failure_keeps_what_was_built(tmp_path, capsys, keep):
     root = _scene(tmp_path, _source("a.mp4") + _METRIC)
     _film(root / "input/a.mp4", [_noise(i) for i in range(20)])
-    assert verb.main([str(root), "--until", keep, "--quiet"]) == 0
+    assert commands.main("build", [str(root), "--until", keep, "--quiet"]) == 0
     before = (root / "build/1_capture/stamp.json").read_text()
     (root / "input/a.mp4").write_bytes(b"gone")
     _fails(capsys, root, "a.mp4", until=keep)

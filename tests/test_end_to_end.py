@@ -14,8 +14,8 @@ import warp as wp
 
 import twin
 from twin import build as verb
+from twin import commands
 from twin.reality.__main__ import TINY, film
-from twin.reality.__main__ import main as reality
 from twin.scene import STAGE_FOLDERS
 
 QUICK = (
@@ -46,7 +46,7 @@ def built(tmp_path_factory):
     film(replace(TINY, samples=1, fps=2), root)  # as many frames as a build keeps
     done = subprocess.run(_command(root), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert reality(["compare", str(root)]) == 0
+    assert commands.main("reality", ["compare", str(root)]) == 0
     return root, done.stdout
 
 

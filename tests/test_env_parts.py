@@ -12,7 +12,7 @@ from tiny_twin import tiny_field, tiny_twin
 from tiny_world import tiny_world
 
 import twin
-from twin import runtime
+from twin import commands, runtime
 from twin.config import HELD_OUT, TRAINING, TaskConfig
 from twin.env.domain_randomization import EVALUATION_RANGES, NominalModel, RandomizationSample, Ranges
 from twin.env.drivers import PolicyDriver, RouteDriver, find_callable
@@ -25,7 +25,6 @@ from twin.env.route_segments import find_task, scene_tasks
 from twin.env.trust import Trust
 from twin.env.vector_env import make_vector_env
 from twin.errors import InputError
-from twin.film import main
 from twin.geometry.cameras import Rendering, Viewpoints
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
@@ -364,11 +363,11 @@ def test_the_film_shows_the_drive_to_its_end(scene, tmp_path, capsys):
     """This test is slow, because the chase camera's kernels compile on first use."""
     out = tmp_path / "drive.mp4"
     arguments = [str(scene.scene.root), "--task", "ahead", "--lighting", "night", "--out", str(out)]
-    assert main(arguments) == 0
+    assert commands.main("film", arguments) == 0
     assert "goal after 3." in capsys.readouterr().out
     told = video_info(out)
     assert told["codec"] == "h264" and 20 < told["frames"] < 60
-    assert main([str(scene.scene.root), "--task", "moon", "--quiet"]) == 2
+    assert commands.main("film", [str(scene.scene.root), "--task", "moon", "--quiet"]) == 2
     assert "task 'moon': unknown; there are route" in capsys.readouterr().err
 
 
@@ -376,7 +375,7 @@ def test_a_dataset_has_the_drives_that_are_filmed(scene, tmp_path, capsys):
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
     out = tmp_path / "drives"
     arguments = [str(scene.scene.root), "--task", "ahead"]
-    assert main([*arguments, "--lerobot", str(out), "--episodes", "2", "--seed", "4"]) == 0
+    assert commands.main("film", [*arguments, "--lerobot", str(out), "--episodes", "2", "--seed", "4"]) == 0
     assert capsys.readouterr().out.startswith("2 drives, ")
     rows = parquet.read_table(out / "data/chunk-000/file-000.parquet").to_pydict()
     numbers, actions = np.array(rows["episode_index"]), np.float32(rows["action"])
@@ -390,7 +389,7 @@ def test_a_dataset_has_the_drives_that_are_filmed(scene, tmp_path, capsys):
         pixels = np.array([one["pixels"][-1] for one in seen[:-1]])
         luma = [0.299, 0.587, 0.114]  # the codec halves the size of the colors' differences, not of this
         assert np.abs(film @ luma - pixels @ luma).mean() < 3.5  # 5 to 7 where it is a picture late
-    assert main([*arguments, "--lerobot", str(out), "--quiet"]) == 2
+    assert commands.main("film", [*arguments, "--lerobot", str(out), "--quiet"]) == 2
     assert "is there already" in capsys.readouterr().err
 
 
@@ -408,7 +407,7 @@ def test_a_dataset_has_the_drives_that_are_filmed(scene, tmp_path, capsys):
     ],
 )
 def test_impossible_films_are_refused_in_one_line(scene, capsys, option, words):
-    assert main([str(scene.scene.root), "--task", "ahead", "--quiet", *option]) == 2
+    assert commands.main("film", [str(scene.scene.root), "--task", "ahead", "--quiet", *option]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and words in error and error.count("\n") == 1
 

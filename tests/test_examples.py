@@ -11,9 +11,8 @@ from tiny_runs import SMALL
 from tiny_twin import tiny_twin
 
 import twin
-from twin import runtime
+from twin import commands, runtime
 from twin.errors import InputError
-from twin.film import main as film
 from twin.learn.policy import Control, save_policy
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -50,7 +49,7 @@ def test_sac_learns(scene, tmp_path, capsys):
 def test_imitation_drives_as_it_was_shown(scene, tmp_path, monkeypatch, capsys):
     pytest.importorskip("pyarrow", reason="needs pyarrow")
     root, drives = str(scene), tmp_path / "drives"
-    assert film([root, "--task", "ahead", "--lerobot", str(drives), "--episodes", "2", "--quiet"]) == 0
+    assert commands.main("film", [root, "--task", "ahead", "--lerobot", str(drives), "--episodes", "2", "--quiet"]) == 0
     module = example("imitation")
     monkeypatch.setattr(module, "WEIGHTS", tmp_path / "imitation.safetensors")
     module.train(drives, steps=60)

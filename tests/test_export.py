@@ -13,11 +13,11 @@ import trimesh
 from test_gaussians import floor_views
 from tiny_twin import filmed_tiny_twin
 
-from twin import runtime
+from twin import commands, runtime
 from twin.assets.gaussians import read_ply
 from twin.capture.formats import read_model, read_transforms
 from twin.export import gltf
-from twin.export.__main__ import export, main
+from twin.export.__main__ import export
 from twin.geometry.cameras import Cameras, SparsePoints, project
 from twin.geometry.images import read_image
 from twin.loading import load_scene
@@ -41,7 +41,7 @@ def out(scene, tmp_path_factory) -> Path:
         "task-file": "t.json",
     }
     given = [text for name, value in options.items() for text in (f"--{name}", str(out / value))]
-    assert main([str(scene), *given, "--task", "ahead", "--lighting", "night", "--quiet"]) == 0
+    assert commands.main("export", [str(scene), *given, "--task", "ahead", "--lighting", "night", "--quiet"]) == 0
     assert sorted(path.name for path in out.iterdir()) == sorted(options.values())
     return out
 
@@ -213,19 +213,19 @@ def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, wor
     for name in ("folder", "folder.usd"):
         (tmp_path / name).mkdir()
     (tmp_path / "file").write_text("")
-    assert main(["nowhere", *arguments]) == 2
+    assert commands.main("export", ["nowhere", *arguments]) == 2
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder", "folder.usd"]
 
 
 def test_an_unknown_lighting_is_refused(scene, tmp_path, capsys) -> None:
-    assert main([str(scene), "--ply", str(tmp_path / "a.ply"), "--lighting", "noon"]) == 2
+    assert commands.main("export", [str(scene), "--ply", str(tmp_path / "a.ply"), "--lighting", "noon"]) == 2
     assert "noon" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("package", "option", "name"), [("pxr", "usd", "a.usdz"), ("gsply", "spz", "a.spz")])
 def test_a_missing_package_is_named(scene, tmp_path, monkeypatch, capsys, package, option, name) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    assert main([str(scene), f"--{option}", str(tmp_path / name)]) == 2
+    assert commands.main("export", [str(scene), f"--{option}", str(tmp_path / name)]) == 2
     assert f"pip install 'twin[{option}]'" in capsys.readouterr().err and not list(tmp_path.iterdir())

@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 from scipy.special import expit
 
+from twin import commands
 from twin.config import CAUSES
 from twin.errors import InputError
 from twin.evaluation.agreement import OTHERS, SHUFFLED, TWIN, Estimate
@@ -27,7 +28,7 @@ from twin.evaluation.statistics import (
     spearman,
 )
 from twin.evaluation.trials import EPISODE_COLUMNS, Cell, Trial, csv_text
-from twin.forecast import forecast, main
+from twin.forecast import forecast
 from twin.report import forecast_report
 from twin.report.figures import lighting_labels
 from twin.report.forecast_report import forecast_page
@@ -454,7 +455,7 @@ def test_the_same_seed_gives_the_same_forecast() -> None:
 def test_the_verb_writes_all_files_and_prints_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     twin, real = cells(n=8)
     root = scene(tmp_path / "road", twin)
-    assert main([str(root), "--real", str(results(tmp_path / "results.csv", real))]) == 0
+    assert commands.main("forecast", [str(root), "--real", str(results(tmp_path / "results.csv", real))]) == 0
     printed = capsys.readouterr().out
     assert "Spearman" in printed and "not driven" in printed and "forecast.html" in printed
     assert sorted(path.name for path in (root / "forecast").iterdir()) == [
@@ -488,7 +489,7 @@ def test_bad_input_is_one_line_and_status_2(
     monkeypatch.chdir(tmp_path)
     scene(tmp_path / "road", cells()[0])
     (tmp_path / "empty").mkdir()
-    assert main(arguments) == 2
+    assert commands.main("forecast", arguments) == 2
     said = capsys.readouterr().err
     assert told in said and said.startswith("error: ") and said.count("\n") == 1
     assert not (tmp_path / "road" / "forecast").exists()

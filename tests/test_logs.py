@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from drive_logs import columns, write_csv
 
-from twin.align import main
+from twin import commands
 from twin.errors import InputError
 from twin.robot import WHEEL_RADIUS, HuskyParams
 from twin.sysid import kinematics, log_files, logs
@@ -92,7 +92,7 @@ def test_bad_logs_are_refused_in_one_line(kind, drive, tmp_path, capsys):
     change, message = BAD[kind]
     path = tmp_path / "log.npz"
     np.savez(path, **change(drive))
-    assert main(["husky", str(path), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert commands.main("align", ["husky", str(path), "--out", str(tmp_path / "out"), "--quiet"]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert re.search(message, said), said

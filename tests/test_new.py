@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from filmed_wall import HEIGHT, WIDTH, film, views
 
+from twin import commands
 from twin.build import build
 from twin.config_file import load_config
 from twin.errors import InputError
 from twin.geometry.images import write_image
-from twin.new import main as new_main
 from twin.new import new_scene
 
 
@@ -22,7 +22,7 @@ def test_new_writes_a_scene_that_loads_and_never_overwrites(tmp_path: Path, caps
     day = film(tmp_path / "day.mp4", views([5 * i for i in range(4)]))
     dusk = film(tmp_path / 'other/du"sk.mp4', views([5 * i for i in range(4)]))
     root = tmp_path / "scenes" / "road"
-    assert new_main([str(root), str(day), str(dusk), "--camera-height", "1.2"]) == 0
+    assert commands.main("new", [str(root), str(day), str(dusk), "--camera-height", "1.2"]) == 0
     config = load_config(root / "scene.toml")
     assert config.name == "road" and config.metric.camera_height == 1.2
     assert [(s.path, s.lighting) for s in config.source] == [("input/day.mp4", "day"), ('input/du"sk.mp4', 'du"sk')]
@@ -33,7 +33,7 @@ def test_new_writes_a_scene_that_loads_and_never_overwrites(tmp_path: Path, caps
             (tmp_path / "one.toml").write_text(_uncommented(before, line))
             load_config(tmp_path / "one.toml")
     capsys.readouterr()
-    assert new_main([str(root), str(day)]) == 2
+    assert commands.main("new", [str(root), str(day)]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and "already" in error and (root / "scene.toml").read_text() == before
 
@@ -55,7 +55,7 @@ def test_two_at_once_do_not_mix_their_films(tmp_path: Path, monkeypatch: pytest.
 
 def test_the_next_command_can_be_pasted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     day = film(tmp_path / "day.mp4", views([5 * i for i in range(4)]))
-    assert new_main([str(tmp_path / "my road"), str(day)]) == 0
+    assert commands.main("new", [str(tmp_path / "my road"), str(day)]) == 0
     words = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("next: "))
     assert words == ["twin", "build", str(tmp_path / "my road")]
 
@@ -76,7 +76,7 @@ def test_new_refuses_unusable_films(
     monkeypatch.chdir(tmp_path)
     film(tmp_path / "day.mp4", views([0, 5, 10]))
     (tmp_path / "text.mp4").write_text("no film")
-    assert new_main(["scene", *arguments]) == 2
+    assert commands.main("new", ["scene", *arguments]) == 2
     assert capsys.readouterr().err.startswith("error: ") and not (tmp_path / "scene/scene.toml").exists()
 
 
@@ -116,7 +116,7 @@ def test_a_posed_image_set_is_copied_with_its_images_and_can_be_built(tmp_path: 
         table = _transforms(data)
         given_path, path = (table, "input/fox/transforms.json") if given == "transforms.json" else (data, "input/fox")
     root = tmp_path / "scene"
-    assert new_main([str(root), str(given_path), "--camera-height", "1.2"]) == 0
+    assert commands.main("new", [str(root), str(given_path), "--camera-height", "1.2"]) == 0
     (source,) = load_config(root / "scene.toml").source
     assert (source.path, source.lighting) == (path, "fox")
     shutil.rmtree(tmp_path / "data")  # the scene stands alone
@@ -132,11 +132,11 @@ def test_the_inner_folder_of_a_posed_image_set_is_told(
     data = tmp_path / "fox"
     _transforms(data) if kind == "transforms" else _colmap(data)
     photos = next(data.rglob("*.png")).parent
-    assert new_main([str(tmp_path / "scene"), str(photos)]) == 0
+    assert commands.main("new", [str(tmp_path / "scene"), str(photos)]) == 0
     said = capsys.readouterr().err
     assert f"{data} has camera poses of these photos, which are not used; to use them, delete" in said
     alone = shutil.copytree(photos, tmp_path / "alone/images")
-    assert new_main([str(tmp_path / "other"), str(alone)]) == 0
+    assert commands.main("new", [str(tmp_path / "other"), str(alone)]) == 0
     assert "camera poses" not in capsys.readouterr().err
 
 
@@ -146,13 +146,13 @@ def test_a_camera_that_does_not_fit_its_images_is_refused(tmp_path: Path, capsys
         whole = json.loads(table.read_text()) | {"w": size[0], "h": size[1], "fl_x": 10.0 * size[0]}
         whole["fl_x"] = 10.0 * WIDTH if name == "far" else 1500.0
         table.write_text(json.dumps(whole))
-        assert new_main([str(tmp_path / name), str(tmp_path / "fox")]) == 2
+        assert commands.main("new", [str(tmp_path / name), str(tmp_path / "fox")]) == 2
         assert words in capsys.readouterr().err
 
 
 def test_a_posed_image_set_in_the_scene_stays_where_it_is(tmp_path: Path) -> None:
     table = _transforms(tmp_path / "scene/input/fox")
-    assert new_main([str(tmp_path / "scene"), str(table), "--camera-height", "1.2"]) == 0
+    assert commands.main("new", [str(tmp_path / "scene"), str(table), "--camera-height", "1.2"]) == 0
     (source,) = load_config(tmp_path / "scene/scene.toml").source
     assert (source.path, source.lighting) == ("input/fox/transforms.json", "fox")
     assert [path.name for path in (tmp_path / "scene/input").iterdir()] == ["fox"]
@@ -168,7 +168,7 @@ def test_a_posed_image_set_without_its_images_is_refused(tmp_path: Path, capsys:
         (model, "none of its 3 images"),
         (absolute, "absolute paths"),
     ):
-        assert new_main([str(tmp_path / "scene"), str(given)]) == 2
+        assert commands.main("new", [str(tmp_path / "scene"), str(given)]) == 2
         error = capsys.readouterr().err
         assert error.startswith("error: ") and words in error and error.count("\n") == 1
         assert not (tmp_path / "scene/scene.toml").exists() and not list((tmp_path / "scene").glob("input/*"))
@@ -177,7 +177,7 @@ def test_a_posed_image_set_without_its_images_is_refused(tmp_path: Path, capsys:
 @pytest.mark.parametrize("name", ["training", "any", "day+randomised"])
 def test_a_reserved_name_is_changed(tmp_path: Path, name: str) -> None:
     day = film(tmp_path / f"{name}.mp4", views([5 * i for i in range(4)]))
-    assert new_main([str(tmp_path / "scene"), str(day), "--camera-height", "1.2"]) == 0
+    assert commands.main("new", [str(tmp_path / "scene"), str(day), "--camera-height", "1.2"]) == 0
     assert build(tmp_path / "scene", until="capture")["capture"]["frames"] >= 2
 
 
@@ -207,7 +207,7 @@ def test_what_is_no_film_is_refused(tmp_path, capsys, name, words):
     film(tmp_path / "one.mp4", views([0]))
     film(tmp_path / "part.ts", views([5 * i for i in range(20)]))
     (tmp_path / "list.m3u8").write_text("#EXTM3U\n#EXT-X-TARGETDURATION:2\n#EXTINF:2,\npart.ts\n#EXT-X-ENDLIST\n")
-    assert new_main([str(tmp_path / "scene"), str(tmp_path / name)]) == 2
+    assert commands.main("new", [str(tmp_path / "scene"), str(tmp_path / name)]) == 2
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1 and not (tmp_path / "scene").exists()
 
@@ -215,7 +215,7 @@ def test_what_is_no_film_is_refused(tmp_path, capsys, name, words):
 def test_a_scene_inside_the_photo_folder_is_refused(tmp_path, capsys):
     write_image(tmp_path / "photos/a.png", np.zeros((8, 8, 3), np.uint8))
     for scene in ("photos", "photos/deep/scene"):
-        assert new_main([str(tmp_path / scene), str(tmp_path / "photos")]) == 2
+        assert commands.main("new", [str(tmp_path / scene), str(tmp_path / "photos")]) == 2
         error = capsys.readouterr().err
         assert "inside the folder" in error and "choose another folder" in error and error.count("\n") == 1
     assert [path.name for path in (tmp_path / "photos").iterdir()] == ["a.png"]
@@ -265,5 +265,5 @@ def test_films_of_one_name_become_two_lightings(tmp_path, capsys):
 def test_an_option_whose_value_is_two_dashes_is_refused(tmp_path, capsys):
     """argparse alone would return an empty list."""
     with pytest.raises(SystemExit) as end:
-        new_main([str(tmp_path / "scene"), "film.mp4", "--camera-height=--"])
+        commands.main("new", [str(tmp_path / "scene"), "film.mp4", "--camera-height=--"])
     assert end.value.code == 2 and "--camera-height: expected one argument" in capsys.readouterr().err

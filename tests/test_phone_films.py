@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from films import HLG, PQ, street, write_film, write_hdr_film
 
+from twin import commands
 from twin.capture.film_check import check_film
 from twin.capture.formats import image_files
 from twin.capture.photos import load_photo
@@ -18,7 +19,6 @@ from twin.capture.video import FilmStatistics, damage_note, decode, format_note,
 from twin.config import CaptureConfig
 from twin.errors import InputError
 from twin.geometry.images import read_image
-from twin.new import main
 
 
 def read(path: Path) -> tuple[list[np.ndarray], FilmStatistics, list[float]]:
@@ -213,6 +213,6 @@ def test_what_is_wrong_with_a_film_is_named_with_a_cure(tmp_path):
 
 def test_new_says_it_and_makes_the_scene_all_the_same(tmp_path, capsys):
     write_film(tmp_path / "night.mp4", [one // 8 for one in street(20, (640, 384))], g="1")
-    assert main([str(tmp_path / "road"), str(tmp_path / "night.mp4"), "--camera-height", "1.2"]) == 0
+    assert commands.main("new", [str(tmp_path / "road"), str(tmp_path / "night.mp4"), "--camera-height", "1.2"]) == 0
     out, error = capsys.readouterr()
     assert "night.mp4: dark: " in out + error and (tmp_path / "road" / "scene.toml").exists()

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from twin import commands
 from twin.config import MjcfConfig
 from twin.env.options import parse_options
 from twin.env.route_segments import find_task
@@ -26,7 +27,6 @@ from twin.learn.policy import Control, Policy, load_policy, save_policy
 from twin.learn.policy_network import Architecture
 from twin.mjcf.world import World, arc_lengths, point_at
 from twin.reality import campus_road, real_test, recordings, true_world
-from twin.reality.__main__ import main
 from twin.reality.campus_road import RoadLine
 from twin.reality.lighting import LIGHTINGS, WEATHER, weather, weather_index
 from twin.reality.real_camera import native_size
@@ -355,7 +355,7 @@ def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):
     left, out = written(tmp_path / "left", 0.9), tmp_path / "results.csv"
     given = ["drive", "--policy", str(left), "--task", "whole", "--trials", "1", "--out", str(out)]
     numbers = ["--place", "3", "--robot", "2", "--camera", "5", "--day", "21", "--lightings", "rain"]
-    assert main([*given, *numbers]) == 0
+    assert commands.main("reality", [*given, *numbers]) == 0
     said = capsys.readouterr().out
     assert "place 3, robot 2, camera 5; outside training's ranges: payload 23.97 (0 to 20), wheel_radius 0.9741" in said
     with out.open(newline="") as file:
@@ -372,7 +372,7 @@ def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):
     assert (record["place"], record["robot"], record["camera"]) == (3, 2, 5) and record["version"] == 2
     assert record["robot_values"]["payload"] == pytest.approx(23.97, abs=0.01)
     assert read_results([out], [Cell("left", "whole", "held-out+randomised", 10, 5)])
-    assert main([*given, "--place", "3", "--robot", "-1"]) == 2
+    assert commands.main("reality", [*given, "--place", "3", "--robot", "-1"]) == 2
     assert "robot -1: expected 0 or more" in capsys.readouterr().err
 
 
@@ -397,7 +397,7 @@ def test_only_a_policy_file_drives(what, tmp_path, capsys):
     if what == "folder":
         Path(given).mkdir()
     arguments = ["drive", "--policy", given, "--task", "straight", "--trials", "1", "--out", str(tmp_path / "r.csv")]
-    assert main(arguments) == 2
+    assert commands.main("reality", arguments) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: ") and said.count("\n") == 1 and what in said
     assert not (tmp_path / "r.csv").exists()
@@ -425,7 +425,7 @@ def test_the_robots_film_goes_down_the_road(tmp_path, monkeypatch):
     monkeypatch.setattr(true_world, "world_spec", lambda light, place: mujoco.MjSpec())
     monkeypatch.setattr(recordings, "_FPS", 1)
     path = tmp_path / "robot.mp4"
-    assert main(["onboard", "--out", str(path)]) == 0
+    assert commands.main("reality", ["onboard", "--out", str(path)]) == 0
     positions = np.array(Recorder.last.poses)[:, :3, 3]
     station, lateral = RoadLine().project(positions[:, :2])
     assert station[0] < 5.0 and 26.0 < station[-1] < 32.0 and np.all(np.diff(station)[5:] > 0.05)
@@ -440,12 +440,12 @@ def test_a_photo_is_of_the_weather_asked_for(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(true_world, "Rasterizer", Recorder)
     monkeypatch.setattr(true_world, "world_spec", lambda light, place: lights.append(light) or mujoco.MjSpec())
     path = tmp_path / "photos" / "haze.png"
-    assert main(["photo", "--lighting", "haze", "--out", str(path)]) == 0
+    assert commands.main("reality", ["photo", "--lighting", "haze", "--out", str(path)]) == 0
     assert lights == [WEATHER["haze"]] and read_image(path).shape == (*native_size()[::-1], 3)
     capsys.readouterr()
-    assert main(["photo", "--lighting", "haze", "--out", str(tmp_path / "haze.txt")]) == 2
+    assert commands.main("reality", ["photo", "--lighting", "haze", "--out", str(tmp_path / "haze.txt")]) == 2
     assert "expected a .png or .jpg file" in capsys.readouterr().err
-    assert main(["onboard", "--out", str(tmp_path)]) == 2
+    assert commands.main("reality", ["onboard", "--out", str(tmp_path)]) == 2
     assert "expected a .mp4 file" in capsys.readouterr().err
 
 
@@ -465,7 +465,7 @@ def test_the_log_is_what_alignment_reads(tmp_path, monkeypatch, capsys):
     assert np.array_equal(first, again) and not np.array_equal(first, other)
     monkeypatch.setattr(RealRobot, "step", lambda *given: pytest.fail("the robot drives before --out is checked"))
     for name in ("", "drive.txt", "drive"):
-        assert main(["log", "--out", str(tmp_path / name)]) == 2
+        assert commands.main("reality", ["log", "--out", str(tmp_path / name)]) == 2
         assert "expected a .csv file" in capsys.readouterr().err
     for duration in (3.0, np.inf):
         with pytest.raises(InputError, match=f"duration = {duration:g} s; expected 10 to 36000"):

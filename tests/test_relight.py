@@ -9,7 +9,7 @@ import torch
 from textured import SIZE, K, filmed_corridor, picture, pose_at
 
 import twin
-from twin import runtime
+from twin import commands, runtime
 from twin.config import RESERVED_LIGHTINGS
 from twin.errors import InputError
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
@@ -17,7 +17,7 @@ from twin.geometry.images import psnr, read_image, write_image
 from twin.nerf.buffers import Layout
 from twin.nerf.field import RadianceField, untrained_field
 from twin.nerf.lightings import AddedLighting, Fog, Lightings, added_lightings, check_new_name, mixed_fog
-from twin.relight import PhotoFit, comparison, fit_photo, main, summary
+from twin.relight import PhotoFit, comparison, fit_photo, summary
 from twin.report import video_layout
 from twin.report.video_layout import draw_label
 from twin.scene import SceneDir, stage_result, write_stamp
@@ -117,7 +117,7 @@ def _filmed(field, pose, size):
 
 
 def test_relight_adds_a_lighting_to_the_scene(scene, capsys):
-    assert main([str(scene.root), str(scene.root / "photo.png"), "--name", "dusk"]) == 0
+    assert commands.main("relight", [str(scene.root), str(scene.root / "photo.png"), "--name", "dusk"]) == 0
     said = capsys.readouterr().out
     assert "inliers of" in said and "dB fitted" in said
     field = twin.load_scene(scene.root).radiance_field()
@@ -197,7 +197,7 @@ def test_unusable_input_ends_with_one_line_and_status_2(scene, tmp_path, capsys)
         ([str(scene.root), photo, "--name", "x", "--time", "noon"], "--time 'noon': expected date, time and offset"),
         ([str(scene.root), photo, "--name", "x", "--sun", "120,35"], "has no 4_mesh yet; run twin build"),
     ):
-        assert main([*arguments, "--quiet"]) == 2
+        assert commands.main("relight", [*arguments, "--quiet"]) == 2
         error = capsys.readouterr().err.strip()
         assert error.startswith("error: ") and words in error and "\n" not in error
     assert not (scene.lightings / "x.json").exists()
@@ -253,7 +253,7 @@ def test_fog_of_a_hazy_photo_is_stored_and_printed(scene, monkeypatch, capsys):
     air, image = Fog(0.03, (0.9, 0.8, 0.7)), np.zeros((*SIZE[::-1], 3), np.float32)
     relit = PhotoFit("day", np.zeros(8, np.float32), air, (image, image, image), 16.3, 25.3, 24.0, 12.34)
     monkeypatch.setattr("twin.relight.fit_photo", lambda *_: relit)
-    assert main([str(scene.root), str(scene.root / "photo.png"), "--name", "hazy"]) == 0
+    assert commands.main("relight", [str(scene.root), str(scene.root / "photo.png"), "--name", "hazy"]) == 0
     assert "visibility 100 m; 12.3 dB on the other half without fog" in capsys.readouterr().out
     assert added_lightings(scene, 8)[2]["hazy"] == air
 

@@ -8,9 +8,9 @@ import pytest
 from tiny_twin import tiny_twin
 
 import twin
+from twin import commands
 from twin.env.drivers import RouteDriver
 from twin.env.episode import record_episode
-from twin.film import main
 
 TIMED = {
     *("/world/robot", "/world/driven", "/world/robot/camera", "/speed/wanted", "/speed/driven", "/yaw_rate/wanted"),
@@ -43,7 +43,9 @@ def test_a_recording_holds_the_drive(scene, tmp_path, capsys):
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     path = tmp_path / "drive.rrd"
     options = ["--task", "ahead", "--lighting", "night", "--seed", "3"]
-    assert main([str(scene), *options, "--rerun", str(path), "--out", str(tmp_path / "drive.mp4")]) == 0
+    assert (
+        commands.main("film", [str(scene), *options, "--rerun", str(path), "--out", str(tmp_path / "drive.mp4")]) == 0
+    )
     assert f"look at it: rerun {path}" in capsys.readouterr().out
     seen = []
     environment = twin.load(scene, "ahead", 3, lighting="night")
@@ -83,13 +85,15 @@ def test_a_recording_holds_the_drive(scene, tmp_path, capsys):
 )
 def test_impossible_recordings_are_refused_in_one_line(scene, capsys, options, words):
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    assert main([str(scene), "--task", "ahead", "--quiet", *options]) == 2
+    assert commands.main("film", [str(scene), "--task", "ahead", "--quiet", *options]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and words in error and error.count("\n") == 1
 
 
 def test_without_the_package_one_line_says_what_to_install(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    assert main([str(scene), "--task", "ahead", "--quiet", "--rerun", str(tmp_path / "drive.rrd")]) == 2
+    assert (
+        commands.main("film", [str(scene), "--task", "ahead", "--quiet", "--rerun", str(tmp_path / "drive.rrd")]) == 2
+    )
     error = "error: a Rerun recording needs the missing package rerun-sdk: pip install 'twin[rerun]'\n"
     assert capsys.readouterr().err == error

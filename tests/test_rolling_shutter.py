@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from twin import commands
 from twin.build import build
 from twin.capture import rolling_shutter
 from twin.capture.camera_models import Lens, raw_pixels, undistortion
@@ -16,7 +17,6 @@ from twin.capture.rolling_shutter import RollingShutter, correct_model, correcte
 from twin.files import read_json
 from twin.geometry.cameras import Cameras
 from twin.reality.__main__ import film as film_place
-from twin.reality.__main__ import main as reality
 from twin.reality.filming import FilmingPlan
 from twin.reality.place_sampling import sample_place
 from twin.reality.truth import align_poses, matched_poses
@@ -201,7 +201,7 @@ def test_a_rolling_shutter_survives_json() -> None:
 
 @pytest.mark.parametrize(("option", "value"), [("--readout", "-0.1"), ("--readout", "1"), ("--shake", "-1")])
 def test_impossible_films_are_refused(option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    assert reality(["film", "--tiny", "--out", str(tmp_path / "x"), option, value]) == 2
+    assert commands.main("reality", ["film", "--tiny", "--out", str(tmp_path / "x"), option, value]) == 2
     assert f"{option} {value}" in capsys.readouterr().err and not (tmp_path / "x").exists()
 
 

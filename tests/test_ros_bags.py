@@ -11,7 +11,7 @@ from ros_bag import write_bag
 from test_bag_film import PINHOLE, SHIFTS, TIMES
 from tiny_world import tiny_scene
 
-from twin.align import main as align_main
+from twin import commands
 from twin.assets.ground import Ground
 from twin.config import SceneConfig, SourceConfig
 from twin.errors import InputError
@@ -49,7 +49,7 @@ def test_poses_of_the_wheels_are_refused_and_those_of_pictures_used(table, tmp_p
     bag = write_bag(tmp_path / "bag", table, without=("poses",))
     with pytest.raises(InputError, match=r"no topic with poses .* other than wheel odometry among .*/platform/odom"):
         read_bag(bag)
-    assert align_main(["husky", str(bag), "--out", str(tmp_path)]) == 2
+    assert commands.main("align", ["husky", str(bag), "--out", str(tmp_path)]) == 2
     assert capsys.readouterr().err.count("error: ") == 1
     begin = 1_700_000_000 * 10**9 + round(table["time"][0] * 1e9)
     times = begin + (np.arange(0, 10, 0.5) * 1e9).astype(np.int64)

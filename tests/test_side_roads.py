@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from test_end_to_end import QUICK
 
+from twin import commands
 from twin.config_file import load_config
 from twin.geometry.mesh_rays import Surface
 from twin.mjcf.world import World
@@ -219,7 +220,7 @@ def test_the_true_corridor_covers_all_lines(filmed):
     ],
 )
 def test_what_cannot_be_filmed_is_refused(given, said, tmp_path, capsys):
-    assert verb.main(["film", "--side-roads", "--out", str(tmp_path / "x"), *given]) == 2
+    assert commands.main("reality", ["film", "--side-roads", "--out", str(tmp_path / "x"), *given]) == 2
     error = capsys.readouterr().err
     assert said in error and len(error.strip().splitlines()) == 1 and not (tmp_path / "x").exists()
 
@@ -241,11 +242,11 @@ def test_a_task_of_such_a_scene_is_refused_by_the_real_test(filmed):
 def test_films_of_a_crossing_become_one_place_with_two_routes(tmp_path):
     root = tmp_path / "scene"
     options = ["--place", str(PLACE), "--side-roads", "--tiny", "--lightings", "sun"]
-    assert verb.main(["film", *options, "--out", str(root)]) == 0
+    assert commands.main("reality", ["film", *options, "--out", str(root)]) == 0
     settings = [word for setting in QUICK for word in ("--set", setting)]
     done = subprocess.run([sys.executable, "-m", "twin.build", str(root), *settings], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert verb.main(["compare", str(root)]) == 0
+    assert commands.main("reality", ["compare", str(root)]) == 0
     report = json.loads((root / "build/report.json").read_text())
     assert report["cameras"]["registered"] >= 0.9 * report["cameras"]["total"]
     assert report["truth"]["ate_m"] < 0.1 and report["truth"]["route_median_m_side_1"] < 0.3

@@ -6,11 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from twin import commands
 from twin.errors import InputError
 from twin.files import read_json
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.reality import filming
-from twin.reality.__main__ import main, scene_task, scene_toml
+from twin.reality.__main__ import scene_task, scene_toml
 from twin.reality.place_sampling import MAX_FRAMES, sample_place
 from twin.reality.place_spec import GRADE_STEP, LONGEST_DRAWN, RUN_IN, RUN_OUT
 from twin.reality.sampled_place import build
@@ -154,5 +155,7 @@ def test_the_truth_of_a_long_place_has_its_length(place, tmp_path):
 
 @pytest.mark.parametrize(("given", "said"), [(("12", "10"), "expected 20 to 2000"), (("0", "100"), "demo's road")])
 def test_a_length_that_cannot_be_is_refused(given, said, tmp_path, capsys):
-    assert main(["film", "--place", given[0], "--length", given[1], "--out", str(tmp_path / "x")]) != 0
+    assert (
+        commands.main("reality", ["film", "--place", given[0], "--length", given[1], "--out", str(tmp_path / "x")]) != 0
+    )
     assert said in capsys.readouterr().err and not (tmp_path / "x").exists()

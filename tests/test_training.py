@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from tiny_twin import tiny_twin
 
 import twin
-from twin import runtime, train
+from twin import commands, runtime
 from twin.env.domain_randomization import Ranges
 from twin.errors import InputError
 from twin.evaluation.training_curves import read_episodes
@@ -132,25 +132,27 @@ def test_the_verb_trains_and_refuses_what_it_cannot_begin_or_resume(scene, capsy
     for name, value in (("_BATCHES", (2,)), ("_TEST_EPISODES", 2), ("_FINALISTS", 1), ("FRESH_EPISODES", 3)):
         monkeypatch.setattr(selection, name, value)
     common = [str(scene), "--run", "one", "--quiet", "--worlds", "2", "--processes", "1", "--steps", "4"]
-    assert train.main([*common, "--task", "strait"]) == 2
-    assert train.main([*common, "--task", "ahead", "--lighting", "dusk"]) == 2
+    assert commands.main("train", [*common, "--task", "strait"]) == 2
+    assert commands.main("train", [*common, "--task", "ahead", "--lighting", "dusk"]) == 2
     told = capsys.readouterr().err
     assert told.count("error: ") == 2 and "dusk" in told
     assert not (scene / "runs/one/config.json").exists()
-    assert train.main([*common, "--task", "ahead", "--observe", "simulator"]) == 0
+    assert commands.main("train", [*common, "--task", "ahead", "--observe", "simulator"]) == 0
     assert (scene / "runs/one/success.png").exists()
     trained = load_policy(scene / "runs/one").trained
     assert trained["observe"] == "simulator"
     assert trained["camera"] == list(twin.load_scene(scene).world().intrinsics)
     choice = json.loads((scene / "runs/one/choice.json").read_text())
     assert choice["steps"] == 4 and choice["chosen"]["trials"] == 3
-    assert train.main([*common, "--task", "ahead", "--lighting", "day"]) == 2
+    assert commands.main("train", [*common, "--task", "ahead", "--lighting", "day"]) == 2
     assert "error: " in capsys.readouterr().err
 
 
 def test_two_trainings_of_one_run_do_not_mix(scene, capsys):
     with exclusive_lock(scene / "runs/.locked.lock", "x"):
-        assert train.main([str(scene), "--task", "ahead", "--run", "locked", "--quiet", "--steps", "4"]) == 2
+        assert (
+            commands.main("train", [str(scene), "--task", "ahead", "--run", "locked", "--quiet", "--steps", "4"]) == 2
+        )
     assert "locked is being trained by process" in capsys.readouterr().err
     assert not (scene / "runs/locked").exists()
 

@@ -15,7 +15,7 @@ from test_policy import some_weights
 from tiny_twin import tiny_twin
 
 import twin
-from twin import trial
+from twin import commands, trial
 from twin.capture.bag_film import read_contents
 from twin.commands import parser_of
 from twin.config import CAUSES
@@ -81,7 +81,7 @@ def test_a_bag_of_an_episode_is_judged_as_the_episode_was(place, tmp_path, name,
     assert cause == {"ahead": "goal", "left": "out_of_bounds"}[name]
     out, bag = tmp_path / "real.csv", bag_of(drives[name], tmp_path / "monday")
     given = ["--policy", name, "--task", "ahead", "--lighting", "day", "--frame", "scene", "--out", str(out)]
-    assert trial.main([str(scene), str(bag), *given]) == 0
+    assert commands.main("trial", [str(scene), str(bag), *given]) == 0
     printed = capsys.readouterr().out
     assert f"{name}, ahead, day: {cause} after {progress:.1f} m and {steps * 0.1:.1f} s" in printed
     assert f"counted in {out}\n" in printed
@@ -120,7 +120,7 @@ def test_bags_become_a_dataset_with_what_the_robot_saw_and_was_told(place, tmp_p
     scene, drives = place
     bags, out = [str(bag_of(drives[name], tmp_path / name)) for name in ("ahead", "left")], tmp_path / "drives"
     given = ["--policy", "ahead", "--task", "ahead", "--lighting", "monday", "--frame", "scene", "--lerobot", str(out)]
-    assert trial.main([str(scene), *bags, *given]) == 0
+    assert commands.main("trial", [str(scene), *bags, *given]) == 0
     counts = [drives[name][-1].message[2] for name in ("ahead", "left")]
     assert f"2 drives, 1 to the goal, {sum(counts)} frames: {out}" in capsys.readouterr().out
     rows = parquet.read_table(out / "data/chunk-000/file-000.parquet").to_pydict()
@@ -191,7 +191,7 @@ def test_a_drive_by_hand_needs_no_policy_and_no_outcome(place, tmp_path):
     ],
 )
 def test_options_that_contradict_each_other_are_refused_in_one_line(place, options, words, capsys):
-    assert trial.main([str(place[0]), *options, "--task", "ahead", "--quiet"]) == 2
+    assert commands.main("trial", [str(place[0]), *options, "--task", "ahead", "--quiet"]) == 2
     said = capsys.readouterr().err
     assert words in said and said.count("\n") == 1
 
@@ -328,7 +328,7 @@ def test_bad_bags_are_refused_in_one_line(place, tmp_path, kind, capsys):
     change, message = BAD[kind]
     bag = write(tmp_path / "bag", change([one for one in drives["ahead"] if one.topic]))
     given = ["--policy", "ahead", "--task", "ahead", "--lighting", "day", "--frame", "scene", "--quiet"]
-    assert trial.main([str(scene), str(bag), *given, "--out", str(tmp_path / "real.csv")]) == 2
+    assert commands.main("trial", [str(scene), str(bag), *given, "--out", str(tmp_path / "real.csv")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert re.search(message, said), said

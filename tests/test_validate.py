@@ -12,7 +12,7 @@ from test_policy import some_weights
 from tiny_runs import SMALL, tiny_runs
 from tiny_twin import tiny_twin
 
-from twin import load_scene, runtime, validate
+from twin import commands, load_scene, runtime, validate
 from twin.config import Condition
 from twin.env import episode_lighting
 from twin.env.domain_randomization import EVALUATION_RANGES, condition_options
@@ -267,8 +267,8 @@ def test_the_worst_lighting_is_evaluated_on_fresh_episodes(fresh, monkeypatch):
 
 def test_the_verb_validates_and_refuses_bad_arguments(fresh, capsys):
     common = [str(fresh), "--task", "ahead", "--lightings", "day", "--episodes", "2"]
-    assert validate.main([*common, "--policy", "ahead", "left", "--quiet"]) == 0
-    assert validate.main([*common, "--policy", "ahead", "left"]) == 0
+    assert commands.main("validate", [*common, "--policy", "ahead", "left", "--quiet"]) == 0
+    assert commands.main("validate", [*common, "--policy", "ahead", "left"]) == 0
     said = capsys.readouterr().out
     assert "only the first succeeded" in said and "/2 " in said
     for wrong in (
@@ -276,7 +276,7 @@ def test_the_verb_validates_and_refuses_bad_arguments(fresh, capsys):
         ["--policy", "ahead", "--lightings", "dusk"],
         ["--policy", "ahead", "--episodes", "0"],
     ):
-        assert validate.main([*common, *wrong, "--quiet"]) == 2
+        assert commands.main("validate", [*common, *wrong, "--quiet"]) == 2
         assert capsys.readouterr().err.count("\n") == 1
 
 
@@ -346,7 +346,7 @@ def test_two_nodes_of_ray_give_the_table_of_one_process(fresh):
 def test_no_cluster_is_one_line(fresh, capsys):
     pytest.importorskip("ray", reason="ray is not installed")
     given = [str(fresh), "--policy", "ahead", "--task", "ahead", "--lightings", "day", "--episodes", "1", "--quiet"]
-    assert validate.main([*given, "--ray", "127.0.0.1:1"]) == 2
+    assert commands.main("validate", [*given, "--ray", "127.0.0.1:1"]) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: --ray 127.0.0.1:1: no cluster there")
     assert said.count("\n") == 1

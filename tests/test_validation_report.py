@@ -17,7 +17,7 @@ from test_forecast import Text
 from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
 
-from twin import film, runtime, validate
+from twin import commands, film, runtime, validate
 from twin.errors import InputError
 from twin.evaluation.statistics import rate_summary
 from twin.evaluation.training_curves import binned_rates, plot_success_curve, training_summaries
@@ -331,7 +331,7 @@ def test_any_policy_can_be_filmed_in_the_environment_it_asks_for(fresh, episodes
     shutil.copytree(run, run / "checkpoints" / "000000100", ignore=lambda *_: ["checkpoints"])
     common = [str(fresh), "--task", "ahead", "--lighting", "day", "--seed", "5", "--out", str(tmp_path / "a.mp4")]
     for source in ("ahead", str(run), str(run / "policy.onnx"), "ahead/000000100", "my_film_policy:act"):
-        assert film.main([*common, "--policy", source, "--quiet"]) == 0
+        assert commands.main("film", [*common, "--policy", source, "--quiet"]) == 0
     one, *others, callable_ = episodes
     assert one.actions.shape[1] == 1  # it steers, which is not the environment's default
     for other in others:
@@ -346,7 +346,7 @@ def test_any_policy_can_be_filmed_in_the_environment_it_asks_for(fresh, episodes
         ("/no/such/folder", "expected a run's folder, an .onnx file or module:function"),
         ("nobody.onnx", "expected a run's folder, an .onnx file or module:function"),
     ):
-        assert film.main([*common, "--policy", wrong, "--quiet"]) == 2
+        assert commands.main("film", [*common, "--policy", wrong, "--quiet"]) == 2
         said = capsys.readouterr().err
         assert said.startswith(f"error: no policy {wrong}") and hint in said
 

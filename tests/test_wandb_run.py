@@ -19,7 +19,7 @@ from test_training import SHORT
 from tiny_twin import tiny_twin
 
 import twin
-from twin import runtime, train
+from twin import commands, runtime
 from twin.files import read_json
 from twin.learn import selection
 from twin.learn.training import prepare_folder
@@ -90,7 +90,7 @@ def stand_in(tmp_path, monkeypatch):
 
 def trained(scene: Path, name: str, steps: int, *options: str) -> int:
     common = ["--task", "ahead", "--lighting", "day", "--worlds", "2", "--processes", "1", "--quiet"]
-    return train.main([str(scene), *common, "--run", name, "--steps", str(steps), *options])
+    return commands.main("train", [str(scene), *common, "--run", name, "--steps", str(steps), *options])
 
 
 def test_a_run_gets_the_tests_and_a_film_and_continues(scene, stand_in):

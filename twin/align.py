@@ -19,7 +19,6 @@ import sys
 import tempfile
 import tomllib
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -310,7 +309,5 @@ def _plot_distribution(axis: Axes, values: Array, color: str, name: str) -> None
     axis.set_ylim(0, 1)
 
 
-main = partial(commands.main, "align")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("align"))

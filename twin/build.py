@@ -12,7 +12,6 @@ import os
 import sys
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -345,7 +344,5 @@ def command(options: argparse.Namespace) -> None:
             print(f"look at {SceneDir(options.scene).report_html} and {SceneDir(options.scene).review_mp4}")
 
 
-main = partial(commands.main, "build")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("build"))

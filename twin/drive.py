@@ -6,7 +6,6 @@ such a policy, the scripted driver drives. `twin.film` has more options.
 
 import argparse
 import sys
-from functools import partial
 
 from twin import commands
 from twin.config_file import load_config
@@ -59,7 +58,5 @@ def command(given: argparse.Namespace) -> None:
         print(summary(path, episode))
 
 
-main = partial(commands.main, "drive")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("drive"))

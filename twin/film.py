@@ -11,7 +11,6 @@ options. Task, lighting and seed determine the episode, so any row of `validatio
 import argparse
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -223,7 +222,5 @@ def summary(path: Path, episode: Episode) -> str:
     return f"{episode.cause or 'cut off'} after {episode.progress[-1]:.1f} m and {episode.times[-1]:.1f} s: {path}"
 
 
-main = partial(commands.main, "film")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("film"))

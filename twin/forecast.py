@@ -8,7 +8,6 @@ policies in the twin.
 import argparse
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from twin import commands
@@ -63,7 +62,5 @@ def command(options: argparse.Namespace) -> None:
         print(f"look at {SceneDir(options.scene).forecast / 'forecast.html'}")
 
 
-main = partial(commands.main, "forecast")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("forecast"))

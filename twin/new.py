@@ -18,7 +18,6 @@ import os
 import shlex
 import shutil
 import sys
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -417,7 +416,5 @@ def command(options: argparse.Namespace) -> None:
     print(f"next: twin build {shlex.quote(str(options.scene))}")
 
 
-main = partial(commands.main, "new")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("new"))

@@ -21,7 +21,6 @@ import sys
 import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -299,7 +298,5 @@ def command(given: argparse.Namespace) -> None:
         print(f"{out}: {size}; drive in it: twin drive {shlex.quote(str(out))}")
 
 
-main = partial(commands.main, "pack")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("pack"))

@@ -11,7 +11,6 @@ may have a sun, whose direction is given, computed from time and place, or searc
 import argparse
 import sys
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -450,7 +449,5 @@ def rough_triangles(views: Views, ground: Ground, mesh_vertices: Array) -> tuple
     return np.concatenate(all_vertices), np.concatenate(all_faces)
 
 
-main = partial(commands.main, "relight")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("relight"))

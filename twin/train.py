@@ -12,7 +12,6 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -107,7 +106,5 @@ def _train(
         return choice
 
 
-main = partial(commands.main, "train")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("train"))

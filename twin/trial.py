@@ -13,7 +13,6 @@ With `--lerobot`, recordings are written as a dataset for learning instead; see 
 
 import argparse
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -327,7 +326,5 @@ def command(options: argparse.Namespace) -> None:
         print(f"look at {folder / 'trial.mp4'}")
 
 
-main = partial(commands.main, "trial")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("trial"))

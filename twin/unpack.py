@@ -27,7 +27,6 @@ import struct
 import sys
 import zipfile
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -429,7 +428,5 @@ def command(given: argparse.Namespace) -> None:
         print(f"{given.folder}: {manifest['name']}{policies}; drive in it: twin drive {shlex.quote(str(given.folder))}")
 
 
-main = partial(commands.main, "unpack")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("unpack"))

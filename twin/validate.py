@@ -10,7 +10,6 @@ import argparse
 import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -351,7 +350,5 @@ def command(given: argparse.Namespace) -> None:
         print(f"look at {SceneDir(given.scene).validation / 'validation.html'}")
 
 
-main = partial(commands.main, "validate")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("validate"))

@@ -11,7 +11,6 @@ the splats, and `twin.env.task` the task files.
 
 import argparse
 import sys
-from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -157,7 +156,5 @@ def _field_files(
     return lines
 
 
-main = partial(commands.main, "export")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("export"))

@@ -19,7 +19,6 @@ import argparse
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from twin import commands
@@ -302,7 +301,5 @@ def scene_task(given: str, scene: Path | None, place: int, length: float = 0.0) 
     return read_task(Path(given), align_poses(cameras.camera_to_world, matched_poses(truth, cameras)))
 
 
-main = partial(commands.main, "reality")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("reality"))

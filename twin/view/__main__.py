@@ -13,7 +13,6 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -191,7 +190,5 @@ def load_driving(page: "Page", task: str | None = None, policy: "Policy | None" 
     page.add_driving(driving)
 
 
-main = partial(commands.main, "view")
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(commands.main("view"))
