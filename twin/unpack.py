@@ -268,6 +268,11 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
             f"{path}: version {short_repr(head.get('version'))}, expected {VERSION}: it was written by another version "
             "of twin; use that version, or pack the scene again with this one"
         )
+    if missing := {*head["files"], README, MANIFEST} ^ set(by_name):
+        name = short_repr(min(missing))
+        raise InputError(
+            f"{path}: {name} is listed in {MANIFEST} but not in the pack, or in the pack but not listed; {_CURE}"
+        )
     total = 0
     for name, facts in head["files"].items():
         if not PLACES.fullmatch(name):
@@ -279,20 +284,14 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
             coding = short_repr(facts["coding"])
             raise InputError(f"{path}: {name} has coding {coding}; expected {PLAIN} or {DIFFERENCES}; {_CURE}")
         require_text(facts["sha256"])
+        if by_name[name].file_size != size:
+            raise InputError(
+                f"{path}: {name} has {by_name[name].file_size:,} bytes; {MANIFEST} says otherwise; {_CURE}"
+            )
         total += size
     bound = min(MAX_TOTAL, max(_FREE, _MAX_RATIO * path.stat().st_size))
     if total > bound:
         raise InputError(f"{path} unpacks to {total:,} bytes; expected at most {bound:,} for a file of its size")
-    if missing := {*head["files"], README, MANIFEST} ^ set(by_name):
-        name = short_repr(min(missing))
-        raise InputError(
-            f"{path}: {name} is listed in {MANIFEST} but not in the pack, or in the pack but not listed; {_CURE}"
-        )
-    for name, facts in head["files"].items():
-        if by_name[name].file_size != facts["bytes"]:
-            raise InputError(
-                f"{path}: {name} has {by_name[name].file_size:,} bytes; {MANIFEST} says otherwise; {_CURE}"
-            )
     head["name"] = require_text(head["name"])
     head["policies"] = list(map(require_text, head["policies"]))
     return head

@@ -54,16 +54,8 @@ class Campaign:
     def __init__(
         self, twin: Twin, task: str, path: Path, sources: dict[str, str], trust: bool, processes: int, ray: str | None
     ) -> None:
-        """
-        Args:
-            twin: A built scene.
-            task: See `twin.load`.
-            path: The table.
-            sources: Sources of the policies by name.
-            trust: Allows policy files to run code.
-            processes: Number of local worker processes.
-            ray: Address of a Ray cluster; None: worker processes are used.
-        """
+        """`path` is the table, `sources` are the policies' sources by name, and `ray` is the address of a Ray cluster;
+        without it, this machine's worker processes are used."""
         self._scene, self.task, self.path = str(twin.scene.root.resolve()), task, path
         self._sources, self._trust, self._processes, self._ray = sources, trust, processes, ray
         self._done = {t.key: t for t in _read_table(path)}
