@@ -8,6 +8,7 @@ brightness of the pictures and overshoots. *White balance*: drifts over seconds.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -23,7 +24,7 @@ from twin.reality.lighting import Lighting
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_robot import RealRobot
 from twin.reality.sky import apply_haze
-from twin.types import Array, Array32, Image
+from twin.types import Array, Array32, Image, Range, setting_ranges
 
 # ---- one camera's numbers
 
@@ -38,91 +39,65 @@ class HiddenCamera:
     number: int
 
     # Extrinsics and intrinsics.
-    shift_forward: float
+    shift_forward: Annotated[float, Range(-0.028, 0.028)]
     """Forward offset of the lens from its nominal position [m]."""
-    shift_left: float
+    shift_left: Annotated[float, Range(-0.028, 0.028)]
     """Offset to the left [m]."""
-    shift_up: float
+    shift_up: Annotated[float, Range(-0.028, 0.028)]
     """Upward offset [m]."""
-    turn_right: float
+    turn_right: Annotated[float, Range(-1.4, 1.4)]
     """Rotation about the camera's rightward axis, in addition to the nominal pitch [°]."""
-    turn_up: float
+    turn_up: Annotated[float, Range(-1.4, 1.4)]
     """Rotation about the camera's upward axis [°]."""
-    turn_back: float
+    turn_back: Annotated[float, Range(-1.4, 1.4)]
     """Rotation about the camera's backward axis [°]."""
-    zoom: float
+    zoom: Annotated[float, Range(0.98, 1.02)]
     """Focal length relative to the nominal one."""
-    center_x: float
+    center_x: Annotated[float, Range(-0.008, 0.008)]
     """Offset of the principal point to the right, as a fraction of the width."""
-    center_y: float
+    center_y: Annotated[float, Range(-0.008, 0.008)]
     """Offset of the principal point downwards, also as a fraction of the width."""
 
     # Time.
-    latency: float
+    latency: Annotated[float, Range(0.03, 0.10)]
     """Time from the middle of the readout until the policy receives the picture [s]."""
-    readout: float
+    readout: Annotated[float, Range(0.010, 0.033)]
     """Time from the readout of the first row to that of the last one [s]."""
-    shutter: float
+    shutter: Annotated[float, Range(0.002, 0.016)]
     """Time for which a row is exposed by day [s]."""
 
     # Exposure and color.
-    exposure_target: float
+    exposure_target: Annotated[float, Range(0.36, 0.48)]
     """Mean brightness at which automatic exposure aims, as a fraction of the sensor's range."""
-    exposure_range: float
+    exposure_range: Annotated[float, Range(0.25, 0.5)]
     """Largest deviation of the logarithm of the exposure from that of `Lighting.exposure`."""
-    exposure_rate: float
+    exposure_rate: Annotated[float, Range(2.0, 5.0)]
     """Natural frequency of automatic exposure [rad/s]."""
-    exposure_damping: float
+    exposure_damping: Annotated[float, Range(0.35, 0.8)]
     """Damping ratio of automatic exposure; below 1 the exposure overshoots."""
-    white_drift: float
+    white_drift: Annotated[float, Range(0.015, 0.05)]
     """Standard deviation of the logarithms of the gains of red and blue."""
-    gamma: float
+    gamma: Annotated[float, Range(0.85, 1.18)]
     """Exponent of the response curve."""
-    contrast: float
+    contrast: Annotated[float, Range(-0.1, 0.35)]
     """Strength of the S shape of the response curve around middle gray."""
 
     # Lens and sensor.
-    vignetting: float
+    vignetting: Annotated[float, Range(0.08, 0.3)]
     """Fraction of light lost at half a width from the center."""
-    bloom: float
+    bloom: Annotated[float, Range(0.1, 0.4)]
     """Factor on the light beyond the sensor's range, which spreads around bright spots."""
-    dirt: float
+    dirt: Annotated[float, Range(0.1, 0.45)]
     """Largest opacity of the spots on the lens."""
-    spots: float
+    spots: Annotated[float, Range(0.0, 7.0)]
     """Number of spots, rounded down."""
-    noise: float
+    noise: Annotated[float, Range(0.4, 1.2)]
     """Noise relative to `Lighting.noise`."""
-    quality: float
+    quality: Annotated[float, Range(45.0, 90.0)]
     """JPEG quality, rounded down."""
 
 
-RANGES: dict[str, tuple[float, float]] = {
-    "shift_forward": (-0.028, 0.028),
-    "shift_left": (-0.028, 0.028),
-    "shift_up": (-0.028, 0.028),
-    "turn_right": (-1.4, 1.4),
-    "turn_up": (-1.4, 1.4),
-    "turn_back": (-1.4, 1.4),
-    "zoom": (0.98, 1.02),
-    "center_x": (-0.008, 0.008),
-    "center_y": (-0.008, 0.008),
-    "latency": (0.03, 0.10),
-    "readout": (0.010, 0.033),
-    "shutter": (0.002, 0.016),
-    "exposure_target": (0.36, 0.48),
-    "exposure_range": (0.25, 0.5),
-    "exposure_rate": (2.0, 5.0),
-    "exposure_damping": (0.35, 0.8),
-    "white_drift": (0.015, 0.05),
-    "gamma": (0.85, 1.18),
-    "contrast": (-0.1, 0.35),
-    "vignetting": (0.08, 0.3),
-    "bloom": (0.1, 0.4),
-    "dirt": (0.1, 0.45),
-    "spots": (0.0, 7.0),
-    "noise": (0.4, 1.2),
-    "quality": (45.0, 90.0),
-}
+RANGES = {name: (one.low, one.high) for name, one in setting_ranges(HiddenCamera).items()}
 """Ranges from which `draw_camera` samples uniformly."""
 
 TRAINED: dict[str, tuple[float, float]] = {

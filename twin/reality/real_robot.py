@@ -27,15 +27,16 @@ clocks, whose periods jitter.
 """
 
 from collections import deque
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import atan2, copysign, cos, exp, hypot, pi, sin, sqrt
+from typing import Annotated
 
 import numpy as np
 
 from twin.errors import InputError
 from twin.reality import SEED
 from twin.reality.place_objects import KnownPlace, Solids
-from twin.types import Array
+from twin.types import Array, Range, setting_ranges
 
 # ---- facts (Clearpath's description of the Husky A200)
 
@@ -68,117 +69,86 @@ class HiddenRobot:
     number: int = 0
 
     # Body.
-    payload: float = 10.0
+    payload: Annotated[float, Range(0.0, 26.0)] = 10.0
     """Mass on the top plate [kg]."""
-    payload_height: float = 0.45
+    payload_height: Annotated[float, Range(0.38, 0.55)] = 0.45
     """Height of the payload's center above the ground [m]."""
-    center_forward: float = -0.02
+    center_forward: Annotated[float, Range(-0.05, 0.02)] = -0.02
     """Distance of the center of mass ahead of the middle of the four wheels [m]."""
-    center_left: float = 0.0
+    center_left: Annotated[float, Range(-0.012, 0.012)] = 0.0
     """Distance of the center of mass to the left of this point [m]."""
 
     # Tires.
-    friction: float = 0.7
+    friction: Annotated[float, Range(0.42, 0.98)] = 0.7
     """Sliding friction coefficient along the tire."""
-    lateral_grip: float = 1.1
+    lateral_grip: Annotated[float, Range(1.0, 1.35)] = 1.1
     """Friction coefficient across the tire, relative to the one along it."""
-    static_excess: float = 1.05
+    static_excess: Annotated[float, Range(1.0, 1.12)] = 1.05
     """Static friction relative to sliding friction."""
-    bristle_stiffness: float = 200.0
+    bristle_stiffness: Annotated[float, Range(140.0, 320.0)] = 200.0
     """σ₀ [1/m]."""
-    bristle_damping: float = 1.5
+    bristle_damping: Annotated[float, Range(1.0, 2.0)] = 1.5
     """σ₁ [s/m]."""
-    patch_length: float = 0.09
+    patch_length: Annotated[float, Range(0.07, 0.11)] = 0.09
     """L [m]."""
-    rolling_resistance: float = 0.02
+    rolling_resistance: Annotated[float, Range(0.012, 0.04)] = 0.02
     """Ratio of the resisting force to the load."""
-    wheel_radius: float = 1.0
+    wheel_radius: Annotated[float, Range(0.97, 1.02)] = 1.0
     """Mean radius, relative to the nominal radius that the controller uses."""
-    wheel_difference: float = 0.0
+    wheel_difference: Annotated[float, Range(-0.009, 0.009)] = 0.0
     """Relative excess of the right tires' radius over the left ones'."""
-    tire_stiffness: float = 50_000.0
+    tire_stiffness: Annotated[float, Range(35_000.0, 70_000.0)] = 50_000.0
     """Vertical stiffness of a tire [N/m]."""
 
     # Bounce on the tires.
-    bounce_frequency: float = 9.0
+    bounce_frequency: Annotated[float, Range(6.5, 11.0)] = 9.0
     """Natural frequency of height, pitch and roll [Hz]."""
-    bounce_damping: float = 0.15
+    bounce_damping: Annotated[float, Range(0.08, 0.25)] = 0.15
     """Damping ratio."""
-    shake: float = 0.2
+    shake: Annotated[float, Range(0.08, 0.35)] = 0.2
     """Standard deviation of the pitch and roll that the road's texture causes at 1 m/s [°]."""
 
     # Drivetrain.
-    torque_constant: float = 0.035
+    torque_constant: Annotated[float, Range(0.031, 0.038)] = 0.035
     """Torque constant of a motor, net of the gear's losses [N m/A]; also the back-EMF constant [V s/rad]."""
-    resistance: float = 0.35
+    resistance: Annotated[float, Range(0.28, 0.45)] = 0.35
     """Resistance of a motor with its leads [Ω]."""
-    current_limit: float = 24.0
+    current_limit: Annotated[float, Range(18.0, 28.0)] = 24.0
     """Greatest current of a motor [A]."""
-    gear_friction: float = 1.5
+    gear_friction: Annotated[float, Range(0.8, 2.5)] = 1.5
     """Coulomb friction of motor and gear, at the wheels of a side [N m]."""
-    rotor_inertia: float = 0.3
+    rotor_inertia: Annotated[float, Range(0.2, 0.4)] = 0.3
     """Inertia of motor and gear, at the wheels of a side [kg m²]."""
-    battery_voltage: float = 25.0
+    battery_voltage: Annotated[float, Range(23.5, 27.0)] = 25.0
     """Voltage without load [V]."""
-    battery_resistance: float = 0.08
+    battery_resistance: Annotated[float, Range(0.04, 0.14)] = 0.08
     """[Ω]"""
 
     # Control.
-    loop_gain: float = 2.2
+    loop_gain: Annotated[float, Range(1.4, 2.8)] = 2.2
     """Proportional gain of the velocity loop [V s/rad]."""
-    loop_integral: float = 25.0
+    loop_integral: Annotated[float, Range(14.0, 35.0)] = 25.0
     """Integral gain of the velocity loop [V/rad]."""
-    loop_period: float = 0.01
+    loop_period: Annotated[float, Range(0.008, 0.02)] = 0.01
     """[s]"""
     controller_period: float = 0.1
     """Period of the controller that takes commands [s]."""
     timeout: float = 0.25
     """Time without a command after which the controller stops [s]."""
-    jitter: float = 0.1
+    jitter: Annotated[float, Range(0.0, 0.25)] = 0.1
     """Largest relative deviation of a period of the controller or of a loop."""
-    deadband: float = 0.01
+    deadband: Annotated[float, Range(0.0, 0.03)] = 0.01
     """Speed of a side below which the controller commands standstill [m/s]."""
-    command_latency: float = 0.05
+    command_latency: Annotated[float, Range(0.02, 0.15)] = 0.05
     """Time from sending a command to its arrival at the controller [s]."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if not np.isfinite(getattr(self, field.name)):
-                raise InputError(f"robot: {field.name} = {getattr(self, field.name)}; expected a finite number")
+        for name, value in vars(self).items():
+            if not np.isfinite(value):
+                raise InputError(f"robot: {name} = {value}; expected a finite number")
 
 
-RANGES: dict[str, tuple[float, float]] = {
-    "payload": (0.0, 26.0),
-    "payload_height": (0.38, 0.55),
-    "center_forward": (-0.05, 0.02),
-    "center_left": (-0.012, 0.012),
-    "friction": (0.42, 0.98),
-    "lateral_grip": (1.0, 1.35),
-    "static_excess": (1.0, 1.12),
-    "bristle_stiffness": (140.0, 320.0),
-    "bristle_damping": (1.0, 2.0),
-    "patch_length": (0.07, 0.11),
-    "rolling_resistance": (0.012, 0.04),
-    "wheel_radius": (0.97, 1.02),
-    "wheel_difference": (-0.009, 0.009),
-    "tire_stiffness": (35_000.0, 70_000.0),
-    "bounce_frequency": (6.5, 11.0),
-    "bounce_damping": (0.08, 0.25),
-    "shake": (0.08, 0.35),
-    "torque_constant": (0.031, 0.038),
-    "resistance": (0.28, 0.45),
-    "current_limit": (18.0, 28.0),
-    "gear_friction": (0.8, 2.5),
-    "rotor_inertia": (0.2, 0.4),
-    "battery_voltage": (23.5, 27.0),
-    "battery_resistance": (0.04, 0.14),
-    "loop_gain": (1.4, 2.8),
-    "loop_integral": (14.0, 35.0),
-    "loop_period": (0.008, 0.02),
-    "jitter": (0.0, 0.25),
-    "deadband": (0.0, 0.03),
-    "command_latency": (0.02, 0.15),
-}
+RANGES = {name: (one.low, one.high) for name, one in setting_ranges(HiddenRobot).items()}
 """Ranges from which `draw_robot` samples uniformly."""
 
 TRAINED: dict[str, tuple[float, float]] = {
@@ -238,13 +208,16 @@ class RealRobot:
         self._wheel = [0.0, 0.0]  # [rad/s] per side
         self._z = [[0.0, 0.0] for _ in _TIRES]
         self._force = [0.0, 0.0]  # lagged sum of the tires' forces
-        self._acceleration = (0.0, 0.0)
+        self.acceleration = (0.0, 0.0)
+        """The IMU's proper acceleration, forward and left [m/s²]."""
         self._voltage, self._integral, self._target = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
         self._current = [0.0, 0.0]
         self._limited = (0.0, 0.0)
         self._arrivals: deque[tuple[float, float, float]] = deque()
         self._newest = (-np.inf, 0.0, 0.0)
-        self._time, self._steps = 0.0, 0
+        self._steps = 0
+        self.time = 0.0
+        """Time since `set_pose` [s]."""
         self._next_control = float(rng.uniform(0.0, r.controller_period))
         self._next_loop = float(rng.uniform(0.0, r.loop_period))
         self._last_control, self._last_loop = 0.0, 0.0
@@ -258,7 +231,7 @@ class RealRobot:
 
     def command(self, v: float, yaw_rate: float) -> None:
         """Sends a command: speed [m/s] and yaw rate [rad/s]. It arrives after the command latency."""
-        self._arrivals.append((self._time + self.robot.command_latency, v, yaw_rate))
+        self._arrivals.append((self.time + self.robot.command_latency, v, yaw_rate))
 
     def step(self, period: float) -> None:
         """Advances by `period` [s]."""
@@ -270,9 +243,9 @@ class RealRobot:
         push = spread * sqrt(4.0 * r.bounce_damping * omega**3 / _STEP)
         noise = (self._rng.standard_normal((steps, 3)) * np.array([0.1 * push, push, push])).tolist()
         for k in range(steps):
-            if self._time >= self._next_control - 1e-9:
+            if self.time >= self._next_control - 1e-9:
                 self._control()
-            if self._time >= self._next_loop - 1e-9:
+            if self.time >= self._next_loop - 1e-9:
                 self._velocity_loop()
             self._advance()
             if self._steps % _GROUND_STEPS == 0:
@@ -289,9 +262,9 @@ class RealRobot:
                 self._attitude_rate[i] = rate
                 self._attitude[i] += _STEP * rate
             self._steps += 1
-            self._time = self._steps * _STEP
-            self._poses.append((self._time, self._x, self._y, self._yaw, *self._attitude))
-        while self._poses[0][0] < self._time - _HISTORY:
+            self.time = self._steps * _STEP
+            self._poses.append((self.time, self._x, self._y, self._yaw, *self._attitude))
+        while self._poses[0][0] < self.time - _HISTORY:
             self._poses.popleft()
 
     # ---- control
@@ -299,12 +272,12 @@ class RealRobot:
     def _control(self) -> None:
         """Runs the controller: timeout, limits of speed and acceleration, speeds of both sides, deadband."""
         r = self.robot
-        elapsed = self._time - self._last_control
-        self._last_control = self._time
-        self._next_control = self._time + r.controller_period * (1.0 + r.jitter * float(self._rng.uniform(-1.0, 1.0)))
-        while self._arrivals and self._arrivals[0][0] <= self._time + 1e-9:
+        elapsed = self.time - self._last_control
+        self._last_control = self.time
+        self._next_control = self.time + r.controller_period * (1.0 + r.jitter * float(self._rng.uniform(-1.0, 1.0)))
+        while self._arrivals and self._arrivals[0][0] <= self.time + 1e-9:
             self._newest = self._arrivals.popleft()
-        stale = self._time - self._newest[0] > r.timeout
+        stale = self.time - self._newest[0] > r.timeout
         wanted = (0.0, 0.0) if stale else self._newest[1:]
         out = []
         for value, before, most, change in zip(
@@ -323,9 +296,9 @@ class RealRobot:
     def _velocity_loop(self) -> None:
         """Runs the PI loops of both sides; a loop's integral stays constant while the battery limits the voltage."""
         r = self.robot
-        elapsed = self._time - self._last_loop
-        self._last_loop = self._time
-        self._next_loop = self._time + r.loop_period * (1.0 + r.jitter * float(self._rng.uniform(-1.0, 1.0)))
+        elapsed = self.time - self._last_loop
+        self._last_loop = self.time
+        self._next_loop = self.time + r.loop_period * (1.0 + r.jitter * float(self._rng.uniform(-1.0, 1.0)))
         drawn = sum(abs(self._current[i] * self._voltage[i]) for i in (0, 1)) / r.battery_voltage
         most = r.battery_voltage - r.battery_resistance * drawn
         for i in (0, 1):
@@ -387,7 +360,7 @@ class RealRobot:
         keep = _STEP / _LOAD_LAG
         self._force[0] += keep * (along - self._force[0])
         self._force[1] += keep * (across - self._force[1])
-        self._acceleration = (along / mass, across / mass)
+        self.acceleration = (along / mass, across / mass)
         ax = along / mass - _GRAVITY * sin(pitch)
         ay = across / mass - _GRAVITY * sin(roll) * cos(pitch)
         self._vx = vx + _STEP * (ax + rate * vy)
@@ -423,11 +396,6 @@ class RealRobot:
     # ---- observations
 
     @property
-    def time(self) -> float:
-        """Time since `set_pose` [s]."""
-        return self._time
-
-    @property
     def pose(self) -> tuple[float, float, float]:
         """x, y [m] and yaw [rad] of the base."""
         return self._x, self._y, self._yaw
@@ -449,35 +417,22 @@ class RealRobot:
         return self._vx + self._rate * r.center_left, self._vy - self._rate * r.center_forward, self._rate
 
     @property
-    def acceleration(self) -> tuple[float, float]:
-        """The IMU's proper acceleration, forward and left [m/s²]."""
-        return self._acceleration
-
-    @property
     def currents(self) -> tuple[float, float]:
         """Currents of the two motors [A]."""
         return self._current[0], self._current[1]
 
     def base_to_world(self, at: float) -> Array:
         """Pose of the base (4, 4), axes forward, left, up, at a time [s] in the last 2 s."""
-        return pose_matrix(self._pose_at(at))
-
-    def _pose_at(self, at: float) -> tuple[float, ...]:
         first = self._poses[0][0]
         k = min(max((at - first) / _STEP, 0.0), len(self._poses) - 1.0)
         before = int(k)
         share = k - before
         a, b = self._poses[before], self._poses[min(before + 1, len(self._poses) - 1)]
-        return tuple(p + share * (q - p) for p, q in zip(a[1:], b[1:], strict=True))
-
-
-def pose_matrix(pose: tuple[float, ...]) -> Array:
-    """x, y [m], yaw [rad], z [m], pitch up, roll to the right [rad] as a matrix (4, 4) of axes forward, left, up."""
-    x, y, yaw, z, pitch, roll = pose
-    cy, sy, cp, sp, cr, sr = cos(yaw), sin(yaw), cos(pitch), sin(pitch), cos(roll), sin(roll)
-    turn = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    nose = np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]])
-    lean = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = turn @ nose @ lean, (x, y, z)
-    return out
+        x, y, yaw, z, pitch, roll = (p + share * (q - p) for p, q in zip(a[1:], b[1:], strict=True))
+        cy, sy, cp, sp, cr, sr = cos(yaw), sin(yaw), cos(pitch), sin(pitch), cos(roll), sin(roll)
+        turn = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+        nose = np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]])
+        lean = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+        out = np.eye(4)
+        out[:3, :3], out[:3, 3] = turn @ nose @ lean, (x, y, z)
+        return out
