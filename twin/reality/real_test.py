@@ -9,9 +9,9 @@ outside the ranges of training (`outside_training`).
 The k-th trial in a weather has the same seed for every policy, hence the same start, shake and noise, so that policies
 can be compared in pairs.
 
-In version 1 the robot, its controller, the camera's effects, the haze and the rules were the twin's own. Tables of that
-version can be read and reported on, but not continued. Two constants of the twin were measured on images of this world
-(`twin.env.domain_randomization.KNOWN_WEATHER_FRACTION`, `twin.env.irradiance.GROUND_ALBEDO`).
+Tables of version 1 can be read and reported on, but not continued (`REALITY_VERSION`). Two constants of the twin were
+measured on images of this world (`twin.env.domain_randomization.KNOWN_WEATHER_FRACTION`,
+`twin.env.irradiance.GROUND_ALBEDO`).
 """
 
 from collections.abc import Callable, Sequence
@@ -35,14 +35,10 @@ from twin.reality.real_camera import TRAINED as camera_ranges
 from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of
 from twin.reality.real_robot import TRAINED as robot_ranges
 from twin.reality.real_robot import RealRobot, draw_robot
-from twin.reality.road_task import CAMPUS_TASKS, RealJudge, RoadTask, place_on_test_day, task_of_place
+from twin.reality.road_task import RealJudge, RoadTask, place_on_test_day, task_of_place
 from twin.reality.true_world import rasterizer_of
 from twin.runtime import bar, exclusive_lock
 from twin.types import Image
-
-TASKS = ("straight", "right_turn")
-"""Tasks of place 0 on which the demo's figures are measured."""
-assert set(TASKS) <= set(CAMPUS_TASKS)
 
 _FIRST_SEED = 7_000_000  # seed of the first trial
 _SEEDS_PER_LIGHTING = 10_000  # upper bound of trials per policy and lighting
@@ -291,20 +287,16 @@ def _check_task(task: str | RoadTask, done: list[Trial], table: Path, record: Pa
 
 
 def _run_trial(test: RealTest, policy: Policy, lighting: str, seed: int, films: Path | None) -> Trial:
-    """Drives one trial and films it if `films` is given."""
+    """Drives one trial and writes a film of its enlarged pictures, at 10 Hz, if the folder `films` is given."""
     frames: list[Image] = []
     trial = test.run_trial(policy, lighting, seed, frames.append if films else None)
     if films:
-        _write_film(frames, films / f"{trial.policy.replace('/', '_')}_{trial.task}_{lighting}_{seed}.mp4")
+        films.mkdir(parents=True, exist_ok=True)
+        path = films / f"{trial.policy.replace('/', '_')}_{trial.task}_{lighting}_{seed}.mp4"
+        width, height = (_FILM_SCALE * side for side in test.size)
+        plan = FilmingPlan(width=width, height=height, fps=10, crf=23)
+        write_video((one.repeat(_FILM_SCALE, 0).repeat(_FILM_SCALE, 1) for one in frames), plan, path)
     return trial
-
-
-def _write_film(frames: Sequence[Image], path: Path) -> None:
-    """Writes a film of the enlarged images at 10 Hz."""
-    height, width = (_FILM_SCALE * side for side in frames[0].shape[:2])
-    plan = FilmingPlan(width=width, height=height, fps=10, crf=23)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_video((one.repeat(_FILM_SCALE, 0).repeat(_FILM_SCALE, 1) for one in frames), plan, path)
 
 
 def _check_policy_digests(policies: Sequence[Policy], paths: Sequence[Path], record: Path) -> None:

@@ -29,7 +29,7 @@ from twin.reality.place_objects import DrivenLine
 from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of, native_size
 from twin.reality.real_robot import RealRobot, draw_robot
 from twin.reality.real_test import RealTest, Setup
-from twin.reality.road_task import place_on_test_day, task_of_place
+from twin.reality.road_task import place_on_test_day, stations_of, task_of_place
 from twin.reality.sampled_road import SampledRoad
 from twin.reality.true_world import rasterizer_of
 from twin.runtime import bar, track
@@ -393,8 +393,7 @@ def follow(line: Array, pose: tuple[float, float, float], station: float, speed:
         most: Bound of the yaw rate [rad/s].
     """
     ahead = 0.6 + 0.6 * speed
-    knots = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
-    x, y = (float(np.interp(station + ahead, knots, line[:, k])) for k in (0, 1))
+    x, y = (float(np.interp(station + ahead, stations_of(line), line[:, k])) for k in (0, 1))
     bearing = atan2(y - pose[1], x - pose[0]) - pose[2]
     rate = 2.0 * speed * sin(bearing) / max(hypot(x - pose[0], y - pose[1]), 0.2)
     return copysign(min(abs(rate), most), rate)

@@ -76,12 +76,11 @@ class RoadTask:
 
     def __post_init__(self) -> None:
         line = self.line
-        knots = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T))) if line.ndim == 2 else np.zeros(1)
         wrong = (
             f"line of shape {line.shape}; expected (m, 2), m ≥ 2"
             if line.ndim != 2 or line.shape[1] != 2 or len(line) < 2
-            else f"start {self.start:g} m and goal {self.goal:g} m on a line of {knots[-1]:.2f} m"
-            if not -1e-6 <= self.start < self.goal <= knots[-1] + 1e-6
+            else f"start {self.start:g} m and goal {self.goal:g} m on a line of {self.knots[-1]:.2f} m"
+            if not -1e-6 <= self.start < self.goal <= self.knots[-1] + 1e-6
             else "half width, time limit, speed, yaw rate and control step; expected all above 0"
             if not min(self.half_width, self.time_limit, self.speed, self.yaw_rate, self.control_timestep) > 0.0
             else ""
@@ -97,7 +96,7 @@ class RoadTask:
     @property
     def knots(self) -> Array:
         """Station of each point of the line [m], shape (m,)."""
-        return np.append(0.0, np.cumsum(np.hypot(*np.diff(self.line, axis=0).T)))
+        return stations_of(self.line)
 
     def at(self, station: float) -> tuple[float, float, float]:
         """x, y [m] of the line at a station, and the line's heading [rad] over 1 m around the station."""
@@ -118,6 +117,11 @@ class RoadTask:
         off = float(rng.uniform(-self.start_offset, self.start_offset))
         turn = float(rng.uniform(-self.start_heading, self.start_heading))
         return x - off * sin(heading), y + off * cos(heading), heading + turn
+
+
+def stations_of(line: Array) -> Array:
+    """Station of each point (m, 2) of a line [m], shape (m,)."""
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
 
 
 def read_task(path: Path, to_truth: Similarity | None = None) -> RoadTask:
