@@ -258,11 +258,6 @@ _INDEX_BITS = 23
 _MAX_TAPS = 6  # largest number of texture lookups along a footprint's longer axis
 
 
-@wp.kernel
-def _reset(nearest_keys: wp.array[wp.int64]):
-    nearest_keys[wp.tid()] = wp.int64(_NO_TRIANGLE)
-
-
 @wp.func
 def _extend_box_by_edge(box: wp.vec4, a: wp.vec3, b: wp.vec3, intrinsics: wp.vec4):
     """Extends a box (x0, y0, x1, y1) [samples] to contain a, and the intersection of edge a–b with the near plane."""
@@ -531,7 +526,7 @@ class Rasterizer:
         eye = wp.vec3(*camera_to_world[:3, 3].tolist())
         width, height = self._size
         with wp.ScopedDevice("cpu"):
-            wp.launch(_reset, width * height, [self._nearest])
+            self._nearest.fill_(_NO_TRIANGLE)
             view = [to_camera, eye, self._intrinsics, width]
             wp.launch(_rasterize, len(self._corners), [self._corners, *view, height, self._nearest])
             wp.launch(_shade, self._rgb.shape, [*self._inputs, self._nearest, *view, self._rgb, self._depth])
