@@ -40,7 +40,7 @@ def test_descriptions_are_within_their_ranges():
             reach = edge + section.kerb_width + section.sides[side].width
             assert reach * abs(piece.curvature) < 1.0 and section.sides[side].width > 1.0, number
         assert sum(piece.length for piece in spec.line.pieces) > spec.line.length
-        assert 0.29 <= film.spacing <= 2.01 and 0.4 <= film.camera_height <= 1.7, number
+        assert 0.29 <= film.speed / film.fps <= 2.01 and 0.4 <= film.camera_height <= 1.7, number
         assert 55.0 <= np.rad2deg(film.fov) <= 95.0 and 1 <= len(spec.lights) <= 3
         assert abs(film.stated_height - film.camera_height) <= 2.0 * film.height_tolerance + 0.006
         assert not (film.carrier == "phone" and film.calibrated)

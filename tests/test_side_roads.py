@@ -19,7 +19,7 @@ from twin.reality.place_sampling import sample_place
 from twin.reality.place_spec import FREE_HALF_WIDTH, MOUTH_REACH
 from twin.reality.sampled_place import build
 from twin.reality.sampled_road import SampledRoad
-from twin.reality.side_roads import LEAD, SIDE_VERGE, SideAxis, SideLine, occupied, turn_end
+from twin.reality.side_roads import LEAD, SIDE_VERGE, SideLine
 from twin.reality.true_world import near_stretch
 from twin.reality.truth import HALF_WIDTH, Truth, corridor
 from twin.scene import SceneDir
@@ -41,7 +41,7 @@ def place(spec):
 def _lines(number):
     spec = sample_place(number, side_roads=True)
     road = SampledRoad(spec)
-    return road, [(one, SideLine(road, one)) for one in spec.line.side_roads]
+    return road, [(axis, SideLine(road, axis)) for axis in road.side_axes]
 
 
 def test_all_but_the_line_is_that_of_the_place():
@@ -68,9 +68,8 @@ def test_no_other_side_road_crosses_one(numbers, length):
             edge = (spec.section.left if mouth.side > 0 else spec.section.right) + spec.section.kerb_width
             across = mouth.station + 0.5 * mouth.width * np.linspace(-1.0, 1.0, 9)
             xy = road.at(across[:, None], mouth.side * (edge + np.arange(0.0, MOUTH_REACH, 0.25)))
-            for one in spec.line.side_roads:
-                at = SideAxis(road, one).project(xy)
-                assert not occupied(spec.section, one, *at, 0.0).any(), (number, one.name)
+            for axis in road.side_axes:
+                assert not axis.occupied(xy, 0.0).any(), (number, axis.one.name)
 
 
 def test_a_side_line_is_smooth_and_projects_back():
@@ -78,7 +77,8 @@ def test_a_side_line_is_smooth_and_projects_back():
     rng = np.random.default_rng(0)
     for number in NUMBERS:
         road, lines = _lines(number)
-        for one, line in lines:
+        for axis, line in lines:
+            one = axis.one
             stations = np.arange(0.0, line.length, 0.05)
             xy = line.at(stations)
             steps = np.diff(xy, axis=0)
@@ -88,7 +88,7 @@ def test_a_side_line_is_smooth_and_projects_back():
             assert np.allclose(np.unwrap(line.heading(stations[:-1])), np.unwrap(np.arctan2(*steps.T[::-1])), atol=0.02)
             on_road, off_road = road.project(xy[stations < LEAD])
             assert np.abs(off_road).max() < 1e-6 and np.ptp(on_road) == pytest.approx(LEAD, abs=0.06)
-            out, across = SideAxis(road, one).project(xy[stations > turn_end(one)])
+            out, across = axis.project(xy[stations > line.turn_end])
             assert np.abs(across).max() < 1e-6 and out[-1] == pytest.approx(one.driven, abs=0.06)
             lateral = rng.uniform(-1.5, 1.5, len(stations))
             back = line.project(line.at(stations, lateral))
@@ -115,13 +115,13 @@ def test_nothing_stands_on_side_roads_and_things_stand_beside_them(place, spec):
         grid = np.stack(np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 9)]), -1).reshape(-1, 2) * half
         c, s = np.cos(solid.yaw), np.sin(solid.yaw)
         xy = grid @ np.array([[c, s], [-s, c]]) + solid.center[:2]
-        for one in spec.line.side_roads:
-            at = SideAxis(road, one).project(xy)
-            assert not occupied(spec.section, one, *at, 0.0).any(), name
-            station, lateral = SideLine(road, one).project(xy)
-            inside = (station > 0.0) & (station < SideLine(road, one).length)
+        for axis in road.side_axes:
+            at, line = axis.project(xy), SideLine(road, axis)
+            assert not axis.occupied(xy, 0.0).any(), name
+            station, lateral = line.project(xy)
+            inside = (station > 0.0) & (station < line.length)
             assert (np.abs(lateral)[inside] > FREE_HALF_WIDTH).all(), name
-            beside[one.name] += bool((np.abs(at[1]) < 12.0).any() and (at[0] > 14.0).any())
+            beside[axis.one.name] += bool((np.abs(at[1]) < 12.0).any() and (at[0] > 14.0).any())
     assert min(beside.values()) >= 5, beside
     assert len({obj.name for obj in place.objects}) == len(place.objects)
 
@@ -134,8 +134,7 @@ def test_what_stood_beside_the_driven_line_stands_there_still(place, spec):
 
     plain, now = centers(build(sample_place(PLACE))), centers(place)
     kept = np.linalg.norm(plain[:, None] - now, axis=-1).min(1) < 1e-6
-    axes = [SideAxis(place.route, one) for one in spec.line.side_roads]
-    away = np.min([np.abs(axis.project(plain)[1]) for axis in axes], axis=0)
+    away = np.min([np.abs(axis.project(plain)[1]) for axis in place.route.side_axes], axis=0)
     assert kept.mean() > 0.9 and kept[away > 12.0].mean() > 0.98 and len(now) > len(plain)
 
 
@@ -146,8 +145,8 @@ def test_the_ground_mesh_is_the_true_ground(place, spec):
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
     surface = Surface(np.concatenate([part.vertices for part in parts]), faces)
     rng = np.random.default_rng(0)
-    for one in spec.line.side_roads:
-        axis, line = SideAxis(place.route, one), SideLine(place.route, one)
+    for axis in place.route.side_axes:
+        one, line = axis.one, SideLine(place.route, axis)
         lateral = rng.uniform(-FREE_HALF_WIDTH, FREE_HALF_WIDTH, 1500)
         driven = line.at(rng.uniform(0.0, line.length, 1500), lateral)
         edge = 0.5 * one.mouth.width + spec.section.kerb_width

@@ -17,7 +17,7 @@ film by the robot's camera, also for `twin.align`. `bag` writes a robot's record
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,7 +40,7 @@ from twin.reality.real_test import Setup
 from twin.reality.road_task import RoadTask, read_task
 from twin.reality.sampled_place import build_number
 from twin.reality.sampled_road import SampledRoad
-from twin.reality.side_roads import SideLine, turn_end
+from twin.reality.side_roads import SideLine
 from twin.reality.truth import HALF_WIDTH, TrueFilm, Truth, align_poses, compare, matched_poses
 from twin.scene import SceneDir, require_stage
 
@@ -53,11 +53,6 @@ TINY = FilmingPlan(
 _LENGTHS = (20.0, 2000.0)  # [m] range of `--length`
 _MAX_READOUT = 0.1  # [s]
 _MAX_SHAKE = 10.0
-
-
-def _tiny(plan: FilmingPlan) -> FilmingPlan:
-    """The first 12 m of a plan in 320 × 180 px, under at most two lightings."""
-    return replace(plan, lightings=plan.lightings[:2], length=12.0, width=320, height=180)
 
 
 def film(
@@ -99,7 +94,7 @@ def film(
     place = build_number(number, length=length, side_roads=side_roads) if number else campus_road.build()
     assert isinstance(place.route, RoadLine | SampledRoad)
     lines: list[tuple[FilmingPlan, DrivenLine]] = [(plan, place.route)]
-    lines += [(one_plan, SideLine(place.route, one)) for one, one_plan in sides]
+    lines += [(side_plan, line) for line, side_plan in sides]
     parked = parked_cars(place, plan.start, plan.length) if traffic else []
     films, lightings = {}, {}
     for lighting in plan.lightings:
@@ -124,15 +119,15 @@ def film(
         number,
         lightings,
         plan.camera_height,
-        {one.name: one_plan.length for one, one_plan in sides},
+        {line.one.name: side_plan.length for line, side_plan in sides},
     )
     truth.save(out / "truth")
     write_text(out / "scene.toml", scene_toml(plan, out.resolve().name, spec, truth.road_length, sides))
     return truth
 
 
-_Sides = Sequence[tuple[SideRoad, FilmingPlan]]
-"""Filmed side roads and the plans of their films."""
+_Sides = Sequence[tuple[SideLine, FilmingPlan]]
+"""Lines into the filmed side roads, and the plans of their films."""
 _AFTER_TURN = 4.0  # [m] from the end of the turn to that of the task `into_<side road>`
 _DEVELOPMENT = 49  # places up to this number are for development
 _TINY_SIDE = 20.0  # [m] of a side road's line that `--tiny` films
@@ -142,9 +137,11 @@ def _filmed_sides(spec: PlaceSpec, plan: FilmingPlan) -> _Sides:
     """The side roads whose turn begins within the filmed length. Raises InputError if there are none."""
     tiny = plan.length < spec.line.length
     road, out = SampledRoad(spec), []
-    for one in _within(spec, plan.length):
-        length = SideLine(road, one).length
-        out.append((one, plan.side(one.name, min(length, _TINY_SIDE) if tiny else length)))
+    for axis in road.side_axes:
+        if axis.one in _within(spec, plan.length):
+            line = SideLine(road, axis)
+            length = min(line.length, _TINY_SIDE) if tiny else line.length
+            out.append((line, plan.side(axis.one.name, length)))
     if not out:
         reach = plan.length if tiny else float("inf")
         known = [str(n) for n in range(1, _DEVELOPMENT + 1) if _within(sample_place(n, side_roads=True), reach)]
@@ -166,7 +163,7 @@ def scene_toml(
 ) -> str:
     """The contents of `scene.toml`, as a user would write them; `spec` is None for the campus road.
 
-    `road_length` is `Truth.road_length` [m]; `sides` are the filmed side roads and the plans of their films.
+    `road_length` is `Truth.road_length` [m].
     """
     fx, fy, cx, cy = (round(float(v), 4) for v in plan.intrinsics)
     place = f" --place {spec.number}" if spec else ""
@@ -191,19 +188,14 @@ def scene_toml(
     for task, (start, length) in (tasks(spec.line) if spec else {}).items():
         if start + length <= plan.length:
             lines += ["[[task]]", f'name = "{task}"', f"start = {start}", f"length = {length}", ""]
-    for side, there in sides:
-        lines += ["[[branch]]", f'name = "{side.name}"  # also a task: the whole branch']
+    for line, there in sides:
+        side = line.one.name
+        lines += ["[[branch]]", f'name = "{side}"  # also a task: the whole branch']
         lines += [f'passes = ["{film_name(plan.lightings[0], there.passes[0])}"]', ""]
-        end = min(turn_end(side) + _AFTER_TURN, 0.9 * there.length)
-        lines += ["[[task]]", f'name = "into_{side.name}"', f'route = "{side.name}"']
+        end = min(line.turn_end + _AFTER_TURN, 0.9 * there.length)
+        lines += ["[[task]]", f'name = "into_{side}"', f'route = "{side}"']
         lines += ["start = 0.5", f"length = {end - 0.5:.2f}", ""]
     return "\n".join(lines)
-
-
-def _check_lightings(names: list[str], among: Iterable[str]) -> None:
-    for name in names:
-        if name not in among:
-            raise InputError(f"no lighting {short_repr(name)} in this place; expected one of {', '.join(among)}")
 
 
 def command(options: argparse.Namespace) -> None:
@@ -218,15 +210,19 @@ def command(options: argparse.Namespace) -> None:
         plan = TINY if options.tiny else FilmingPlan()
         if options.place:
             plan = FilmingPlan.of(sample_place(options.place, options.length))
-            plan = _tiny(plan) if options.tiny else plan
-        _check_lightings(options.lightings or [], plan.lightings if options.place else LIGHTINGS)
-        plan = replace(plan, lightings=tuple(dict.fromkeys(options.lightings))) if options.lightings else plan
+            if options.tiny:
+                plan = replace(plan, lightings=plan.lightings[:2], length=12.0, width=320, height=180)
+        known = plan.lightings if options.place else tuple(LIGHTINGS)
+        for name in options.lightings or []:
+            if name not in known:
+                raise InputError(f"no lighting {short_repr(name)} in this place; expected one of {', '.join(known)}")
+        plan = replace(plan, lightings=tuple(dict.fromkeys(options.lightings or plan.lightings)))
         if not 0.0 <= options.readout <= _MAX_READOUT:
             raise InputError(f"--readout {options.readout:g}: expected 0 to {_MAX_READOUT:g} s")
         if options.shake is not None and not 0.0 <= options.shake <= _MAX_SHAKE:
             raise InputError(f"--shake {options.shake:g}: expected 0 to {_MAX_SHAKE:g}")
-        plan = replace(plan, readout=options.readout)
-        plan = plan if options.shake is None else replace(plan, shake=options.shake)
+        shake = plan.shake if options.shake is None else options.shake
+        plan = replace(plan, readout=options.readout, shake=shake)
         film(plan, options.out, options.place, options.traffic, None, options.length, options.side_roads)
     elif options.command == "compare":
         scene = SceneDir(options.scene)
@@ -247,10 +243,8 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
     elif options.command == "onboard":
         recordings.write_film(options.out, setup)
     elif options.command == "bag":
-        from twin.reality.recordings import write_robot_bag
-
         (lighting,) = days or [options.lighting]
-        trial = write_robot_bag(options.out, options.policy, options.task, lighting, options.seed, setup)
+        trial = recordings.write_robot_bag(options.out, options.policy, options.task, lighting, options.seed, setup)
         print(f"{options.out}: {trial.cause} after {trial.progress:.1f} m")
     elif options.command == "photo":
         (lighting,) = days or [options.lighting]

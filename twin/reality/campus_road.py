@@ -55,7 +55,7 @@ _WAVES = (
 
 @dataclass(frozen=True)
 class RoadLine:
-    """The center line of the road: a straight, a right-hand arc and a straight."""
+    """The center line of the road, as a `DrivenLine`: a straight, a right-hand arc and a straight."""
 
     straight: float = 30.0
     """Length before the turn [m]."""
@@ -72,7 +72,6 @@ class RoadLine:
         return self.radius * self.turn
 
     def heading(self, station: ArrayLike) -> Array:
-        """Direction of travel, counterclockwise from +x [rad]; shape as `station`."""
         return -np.clip((np.asarray(station) - self.straight) / self.radius, 0.0, self.turn)
 
     def at(self, station: ArrayLike, lateral: ArrayLike = 0.0) -> Array:
@@ -101,7 +100,6 @@ class RoadLine:
         return np.take_along_axis(stations, best, 0)[0], np.take_along_axis(laterals, best, 0)[0]
 
     def ground_height(self, xy: ArrayLike) -> Array:
-        """True height of the ground [m], shape (..., 2) → (...)."""
         return undulation(xy) + cross_profile(self.project(xy)[1])
 
 
@@ -172,7 +170,7 @@ def campus_textures() -> dict[str, NDArray[np.uint8]]:
     paved = round(PAVEMENT_WIDTH / _VERGE_PIXEL)
     left[-paved:] = textures.slabs(rng(3), (paved, shape[1]), _VERGE_PIXEL, (0.57, 0.75))
     out["verge_left"] = to_uint8(left)
-    out["kerb"] = to_uint8(textures.kerb(rng(4), (16, round(length / 0.02)), 0.02))
+    out["kerb"] = to_uint8(textures.slabs(rng(4), (16, round(length / 0.02)), 0.02, (10.0, 0.9)) * np.float32(0.95))
     out["land"] = to_uint8(textures.grass(rng(5), (2292, 2172), 1 / 12))
     for k, (name, (kind, color)) in enumerate(WALLS.items()):
         (_, size, _) = BUILDINGS[name]
@@ -338,9 +336,7 @@ def _road_strip(route: DrivenLine, laterals: list[float], heights: list[float] |
     span = np.cumsum(np.hypot(np.diff(across), np.diff((z - undulation(xy))[:, 0])))
     v = np.concatenate([[0.0], span / span[-1]])
     u = (stations - START) / (END - START)
-    return primitives.grid(
-        np.concatenate([xy, z[..., None]], -1), np.stack(np.broadcast_arrays(u[None], v[:, None]), -1)
-    )
+    return primitives.grid(xy, z, u[None], v[:, None])
 
 
 def _add_ground(place: KnownPlace) -> None:
@@ -364,6 +360,5 @@ def _add_ground(place: KnownPlace) -> None:
     xy = np.stack([x, y], -1)
     _, lateral = route.project(xy)
     sunk = np.where(np.abs(lateral) < edge + 1.5, 0.45, np.where(np.abs(lateral) < outer + VERGE_WIDTH, 0.10, 0.03))
-    points = np.concatenate([xy, (route.ground_height(xy) - sunk)[..., None]], -1)
-    uv = np.stack([(x - x0) / (x1 - x0), (y1 - y) / (y1 - y0)], -1)
-    place.objects.append(PlaceObject("land", "ground", primitives.grid(points, uv), "land"))
+    part = primitives.grid(xy, route.ground_height(xy) - sunk, (x - x0) / (x1 - x0), (y1 - y) / (y1 - y0))
+    place.objects.append(PlaceObject("land", "ground", part, "land"))

@@ -67,10 +67,9 @@ def add_block(
                 sill = primitives.box((wide + 0.2, 0.14, 0.07), z0 - 0.09)
                 at = np.append(middle + 0.07 * out, 0.0)
                 trim.append(place.cell("white", sill.moved(at, float(np.arctan2(across[1], across[0])))))
+    glass = [place.cell(f"window{k}", pane) for k, pane in panes]
     place.objects.append(PlaceObject(f"{name}_trim", "obstacle", primitives.join(trim)))
-    place.objects.append(
-        PlaceObject(f"{name}_glass", "obstacle", primitives.join([place.cell(f"window{k}", p) for k, p in panes]))
-    )
+    place.objects.append(PlaceObject(f"{name}_glass", "obstacle", primitives.join(glass)))
     # A window that is lit after dark has a mesh for day and one for dark; `true_world.world_spec` selects one.
     day = primitives.join([place.cell(f"window{k}", p) for k, p in lit])
     dark = primitives.join([place.cell(f"lit{k % 8}", p) for k, p in lit])
@@ -172,57 +171,34 @@ def _roof(house: House, top: float) -> tuple[list[MeshPart], float, list[MeshPar
     if house.roof == "flat":
         z = top + 0.32
         corners = [[-w / 2, d / 2, z], [-w / 2, -d / 2, z], [w / 2, -d / 2, z], [w / 2, d / 2, z]]
-        quad = primitives.quad(np.array(corners))
-        return [quad], top, []
+        return [primitives.quad(corners)], top, []
     low = top - o * slope + 0.06
     if house.roof == "shed":
         high = top + d * slope
         y0, y1, z1 = -d / 2 - o, d / 2 + o, high + o * slope + 0.06
-        quad = primitives.quad(
-            np.array([[-w / 2 - o, y1, z1], [-w / 2 - o, y0, low], [w / 2 + o, y0, low], [w / 2 + o, y1, z1]])
-        )
-        back = primitives.quad(
-            np.array([[w / 2, d / 2, high], [w / 2, d / 2, top], [-w / 2, d / 2, top], [-w / 2, d / 2, high]])
-        )
-        ends = [
-            MeshPart(
-                np.array([[x, -d / 2, top], [x, d / 2, top], [x, d / 2, high]]),
-                np.array([[0, 1, 2]], np.int32),
-                np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0]]),
-            )
-            for x in (-w / 2, w / 2)
-        ]
-        return [quad], high, [back, *ends]
+        x, y = w / 2, d / 2
+        side = primitives.quad([[-x - o, y1, z1], [-x - o, y0, low], [x + o, y0, low], [x + o, y1, z1]])
+        back = primitives.quad([[x, y, high], [x, y, top], [-x, y, top], [-x, y, high]])
+        uv = [[0.0, 1.0], [1.0, 1.0], [1.0, 0.0]]
+        ends = [primitives.triangle([[end, -y, top], [end, y, top], [end, y, high]], uv) for end in (-x, x)]
+        return [side], high, [back, *ends]
     ridge = top + 0.5 * d * slope
     inset = min(0.5 * d, 0.45 * w) if house.roof == "hip" else -o
-    x, y, z = w / 2 + o, d / 2 + o, ridge + 0.06
-    slopes = []
+    x, y, z, tip = w / 2 + o, d / 2 + o, ridge + 0.06, w / 2 - inset
+    slopes, gables = [], []
     for sign in (1.0, -1.0):
-        slopes.append(
-            primitives.quad(
-                np.array(
-                    [
-                        [-sign * (w / 2 - inset), 0, z],
-                        [-sign * x, -sign * y, low],
-                        [sign * x, -sign * y, low],
-                        [sign * (w / 2 - inset), 0, z],
-                    ]
-                )
-            )
-        )
-    gables = []
+        right, front = sign * x, -sign * y
+        corners = [[-sign * tip, 0, z], [-right, front, low], [right, front, low], [sign * tip, 0, z]]
+        slopes.append(primitives.quad(corners))
+    uv = [[0.5, 0.0], [0.0, 1.0], [1.0, 1.0]]
     for sign in (1.0, -1.0):
-        uv = np.array([[0.5, 0.0], [0.0, 1.0], [1.0, 1.0]])
+        right, end = sign * x, sign * w / 2
         if house.roof == "hip":
-            points = np.array([[sign * (w / 2 - inset), 0, z], [sign * x, -y, low], [sign * x, y, low]])
-            slopes.append(MeshPart(points, np.array([[0, 1, 2]], np.int32), uv))
+            slopes.append(primitives.triangle([[sign * tip, 0, z], [right, -y, low], [right, y, low]], uv))
         else:
-            points = np.array([[sign * w / 2, 0, ridge], [sign * w / 2, -d / 2, top], [sign * w / 2, d / 2, top]])
-            gables.append(MeshPart(points, np.array([[0, 1, 2]], np.int32), uv))
+            gables.append(primitives.triangle([[end, 0, ridge], [end, -d / 2, top], [end, d / 2, top]], uv))
     if turned:
-        quarter = np.pi / 2
-        slopes = [part.moved(np.zeros(3), quarter) for part in slopes]
-        gables = [part.moved(np.zeros(3), quarter) for part in gables]
+        slopes, gables = ([part.moved(np.zeros(3), np.pi / 2) for part in parts] for parts in (slopes, gables))
     return slopes, ridge, gables
 
 

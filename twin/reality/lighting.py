@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 
 from twin.errors import InputError, short_repr
 from twin.reality import SEED
-from twin.reality.place_spec import LightSpec, PlaceSpec, Rgb
-
-Color = tuple[float, float, float]
+from twin.reality.place_spec import LightSpec, PlaceSpec, Rgb, rgb
 
 
 @dataclass(frozen=True)
@@ -23,20 +21,20 @@ class Lighting:
     """One lighting, and the camera settings of films under it. Colors are RGB."""
 
     name: str
-    ambient: Color
+    ambient: Rgb
     """Ambient light."""
-    suns: tuple[tuple[Color, Color, bool], ...]
+    suns: tuple[tuple[Rgb, Rgb, bool], ...]
     """Directional lights: direction of the rays, color, and a flag for cast shadows."""
-    zenith: Color
-    horizon: Color
+    zenith: Rgb
+    horizon: Rgb
     clouds: float
     """Cloud cover, 0 to 1."""
-    cloud: Color
-    skyline: Color
+    cloud: Rgb
+    skyline: Rgb
     """Color of the distant trees and roofs along the horizon."""
     occlusion: float
     """Strength of the baked ambient occlusion, 0 to 1."""
-    lamps: Color = (0.0, 0.0, 0.0)
+    lamps: Rgb = (0.0, 0.0, 0.0)
     """Light of the street lamps."""
     glow: float = 0.0
     """Emission of lamp heads and lit windows."""
@@ -45,9 +43,9 @@ class Lighting:
     """Standard deviation of the log exposure within a film."""
     noise: float = 0.004
     """Sensor noise at mid gray [fraction of full scale]."""
-    gain: Color = (1.0, 1.0, 1.0)
+    gain: Rgb = (1.0, 1.0, 1.0)
     """White balance: factors on RGB."""
-    glow_sun: Color = (0.0, 0.0, 0.0)
+    glow_sun: Rgb = (0.0, 0.0, 0.0)
     """Brightening of the sky around the first sun."""
     wet: float = 0.0
     """Fraction by which wet ground is darker, 0 to 1."""
@@ -160,10 +158,8 @@ def add_lights(spec: mujoco.MjSpec, lighting: Lighting, lamp_heads: NDArray[np.f
 
 
 _DAYS = 15
-_HIGH_SUN, _LOW_SUN = (
-    np.array([1.0, 0.94, 0.83]),
-    np.array([1.0, 0.60, 0.34]),
-)  # colors of a high sun and of a sun at the horizon
+_HIGH_SUN = np.array([1.0, 0.94, 0.83])
+_LOW_SUN = np.array([1.0, 0.60, 0.34])  # color of a sun at the horizon
 _REDDENING_ANGLE = 14.0  # [°] difference of elevation over which the redness of a low sun falls to 1/e
 _MEAN_BRIGHTNESS = 0.3  # mean image value for which a day's exposure is chosen
 
@@ -177,17 +173,8 @@ def _day(number: int) -> Lighting:
     visibility, wetness = float(np.exp(rng.uniform(np.log(60.0), np.log(400.0)))), float(rng.uniform(0.15, 0.4))
     tint, brightness = rng.uniform(-0.03, 0.03), float(np.exp(rng.uniform(-0.15, 0.15)))
 
-    return daylight(
-        f"day_{number}",
-        elevation,
-        azimuth,
-        clouds,
-        veil,
-        visibility if hazy else float("inf"),
-        wetness if wet else 0.0,
-        tint,
-        brightness,
-    )
+    haze, water = visibility if hazy else float("inf"), wetness if wet else 0.0
+    return daylight(f"day_{number}", elevation, azimuth, clouds, veil, haze, water, tint, brightness)
 
 
 def daylight(
@@ -250,9 +237,8 @@ def daylight(
     )
 
 
-def _color(rgb: np.ndarray) -> Color:
-    red, green, blue = np.clip(rgb, 0.0, 1.05).tolist()
-    return red, green, blue
+def _color(values: np.ndarray) -> Rgb:
+    return rgb(np.clip(values, 0.0, 1.05))
 
 
 WEATHER: dict[str, Lighting] = {
@@ -402,17 +388,8 @@ def _lighting(light: LightSpec, spec: PlaceSpec) -> Lighting:
             exposure=1.8 if lit else 2.1,
             gain=gain,
         )
-    day = daylight(
-        light.name,
-        light.elevation,
-        np.deg2rad(light.azimuth),
-        light.clouds,
-        0.2,
-        light.haze,
-        0.0,
-        light.warmth,
-        1.0,
-    )
+    azimuth = np.deg2rad(light.azimuth)
+    day = daylight(light.name, light.elevation, azimuth, light.clouds, 0.2, light.haze, 0.0, light.warmth, 1.0)
     if light.name == "dusk":
         day = replace(
             day,
@@ -435,4 +412,4 @@ def _ray(light: LightSpec) -> Rgb:
 
 
 def _scaled(color: Rgb, factor: float) -> Rgb:
-    return factor * color[0], factor * color[1], factor * color[2]
+    return rgb(factor * np.array(color))

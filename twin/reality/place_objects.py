@@ -5,7 +5,7 @@ and wires, which comparisons with the truth ignore). Stations and laterals are d
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import cos, hypot, sin
 from typing import Any, Protocol
 
@@ -48,25 +48,9 @@ class DrivenLine(Protocol):
         """True height of the ground [m], shape (..., 2) → (...)."""
 
 
-@dataclass(frozen=True)
-class Atlas:
-    """A texture of square cells with names, in 8 columns and at least as many rows."""
-
-    names: tuple[str, ...] = CELLS
-    """Names of the cells, row by row."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of cells."""
-        return max(8, -(-len(self.names) // 8)), 8
-
-    def cell(self, name: str, part: MeshPart) -> MeshPart:
-        """Maps the texture coordinates of a part into a cell."""
-        rows, columns = self.shape
-        row, column = divmod(self.names.index(name), columns)
-        count = np.array([columns, rows])
-        low, inset = np.array([column, row]) / count, 1.5 / (count * ATLAS_CELL)
-        return part.in_window(low + inset, low + 1.0 / count - inset)
+def atlas_shape(cells: tuple[str, ...]) -> tuple[int, int]:
+    """Rows and columns of cells in an atlas with these cells."""
+    return max(8, -(-len(cells) // 8)), 8
 
 
 @dataclass(frozen=True)
@@ -123,7 +107,8 @@ class KnownPlace:
     number: int = 0
     seed: tuple[int, ...] = (SEED,)
     """Seed of the objects' details."""
-    atlas: Atlas = field(default_factory=Atlas)
+    cells: tuple[str, ...] = CELLS
+    """Names of the atlas's cells, row by row."""
     objects: list[PlaceObject] = field(default_factory=list)
     lamp_heads: list[Array] = field(default_factory=list)
     """Positions of the shining lamps [m], each of shape (3,)."""
@@ -138,8 +123,13 @@ class KnownPlace:
         return float(self.route.heading(station))
 
     def cell(self, name: str, part: MeshPart) -> MeshPart:
-        """Maps the texture coordinates of a part into a cell of the atlas."""
-        return self.atlas.cell(name, part)
+        """Maps the texture coordinates of a part from [0, 1]² into a cell of the atlas."""
+        rows, columns = atlas_shape(self.cells)
+        row, column = divmod(self.cells.index(name), columns)
+        count = np.array([columns, rows])
+        low, inset = np.array([column, row]) / count, 1.5 / (count * ATLAS_CELL)
+        low, high = low + inset, low + 1.0 / count - inset
+        return replace(part, uv=low + np.clip(part.uv, 0.0, 1.0) * (high - low))
 
     def rng(self, *key: int) -> np.random.Generator:
         """The random generator for a key, such as the kind and number of an object."""
@@ -153,7 +143,7 @@ def up(height: float) -> Array:
 
 def vertical_quad(left: Array, right: Array, low: float, high: float) -> MeshPart:
     """A vertical rectangle between two points (x, y) [m] and two heights [m]."""
-    return primitives.quad(np.array([[*left, high], [*left, low], [*right, low], [*right, high]]))
+    return primitives.quad([[*left, high], [*left, low], [*right, low], [*right, high]])
 
 
 class Solids:

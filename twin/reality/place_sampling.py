@@ -30,6 +30,7 @@ from twin.reality.place_spec import (
     Side,
     SurfaceSpec,
     TreesSpec,
+    rgb,
     stream,
 )
 from twin.reality.sampled_road import SampledRoad, lengthen, sample_line
@@ -107,14 +108,13 @@ def _subset(rng: np.random.Generator, items: tuple[T, ...], least: int, most: in
 
 def _shade(rng: np.random.Generator, base: Rgb, spread: float) -> Rgb:
     """Samples a color near `base`: the brightness varies by up to `spread`, the channels with σ = 0.2 `spread`."""
-    red, green, blue = np.clip(
-        np.array(base) * rng.uniform(1.0 - spread, 1.0 + spread) + rng.normal(0.0, 0.2 * spread, 3), 0.03, 0.93
-    ).tolist()
-    return red, green, blue
+    color = np.array(base) * rng.uniform(1.0 - spread, 1.0 + spread) + rng.normal(0.0, 0.2 * spread, 3)
+    return rgb(np.clip(color, 0.03, 0.93))
 
 
-def _hsv(hue: float, saturation: float, value: float) -> Rgb:
-    """RGB of a hue in turns, saturation and value in [0, 1]."""
+def _hsv(rng: np.random.Generator, *ranges: tuple[float, float]) -> Rgb:
+    """Samples a color, from ranges of its hue in turns, its saturation and its value in [0, 1]."""
+    hue, saturation, value = (float(rng.uniform(*one)) for one in ranges)
     return colorsys.hsv_to_rgb(hue, saturation, value)
 
 
@@ -156,16 +156,8 @@ def _fitted(section: SectionSpec, line: LineSpec) -> SectionSpec:
     for side, edge, sign in zip(section.sides, (section.left, section.right), (1.0, -1.0), strict=True):
         tight = [1.0 / abs(piece.curvature) for piece in line.pieces if sign * piece.curvature > 0.0]
         width = min(side.width, min(tight, default=np.inf) - edge - section.kerb_width - 0.35)
-        sides.append(Side(min(side.pavement, 0.75 * width), side.paving, side.verge, width, side.slope))
-    return SectionSpec(
-        section.left,
-        section.right,
-        section.shape,
-        section.crossfall,
-        section.kerb_height,
-        section.kerb_width,
-        (sides[0], sides[1]),
-    )
+        sides.append(replace(side, pavement=min(side.pavement, 0.75 * width), width=width))
+    return replace(section, sides=(sides[0], sides[1]))
 
 
 def _surface(rng: np.random.Generator, paint: np.random.Generator, setting: str, section: SectionSpec) -> SurfaceSpec:
@@ -180,21 +172,18 @@ def _surface(rng: np.random.Generator, paint: np.random.Generator, setting: str,
     }[setting]
     kind = _pick(rng, kinds)
     level = float(rng.uniform(*{"asphalt": (0.20, 0.46), "concrete": (0.46, 0.66)}.get(kind, (0.34, 0.6))))
-    hue = {"asphalt": (1.0, 1.0, 1.02), "concrete": (1.02, 1.0, 0.94)}.get(kind)
-    if hue is None:
-        hue = _pick(
-            rng,
-            {(1.0, 0.99, 0.97): 2.0, (1.14, 0.97, 0.78): 1.5, (1.28, 0.88, 0.72): 1.0, (1.07, 1.02, 0.88): 1.5},
-        )
-    tone = _shade(rng, (level * hue[0], level * hue[1], level * hue[2]), 0.05)
+    hue = {"asphalt": (1.0, 1.0, 1.02), "concrete": (1.02, 1.0, 0.94)}.get(kind) or _pick(
+        rng, {(1.0, 0.99, 0.97): 2.0, (1.14, 0.97, 0.78): 1.5, (1.28, 0.88, 0.72): 1.0, (1.07, 1.02, 0.88): 1.5}
+    )
+    tone = _shade(rng, rgb(level * np.array(hue)), 0.05)
     unit = (float(rng.uniform(0.10, 0.24)), float(rng.uniform(0.10, 0.30)))
     if kind == "concrete":
         unit = (section.width / int(rng.integers(1, 3)), float(rng.uniform(2.5, 6.0)))
     age = float(rng.uniform(0.0, 1.0))
     narrow = kind in ("gravel", "concrete") and section.width < 4.2 and section.left == section.right
     patched = {"asphalt": 0.7, "concrete": 0.15, "pavers": 0.1}.get(kind, 0.0)
-    green = _hsv(float(rng.uniform(0.13, 0.27)), float(rng.uniform(0.25, 0.60)), float(rng.uniform(0.28, 0.54)))
-    earth = _hsv(float(rng.uniform(0.06, 0.12)), float(rng.uniform(0.2, 0.5)), float(rng.uniform(0.30, 0.54)))
+    green = _hsv(rng, (0.13, 0.27), (0.25, 0.60), (0.28, 0.54))
+    earth = _hsv(rng, (0.06, 0.12), (0.2, 0.5), (0.30, 0.54))
     bare = float(rng.uniform(0.0, 0.5)) ** 1.5
     coarse, cracks = float(rng.uniform(0.5, 1.3)), 1.6 * age * float(rng.uniform(0.2, 1.0))
     covers = float(rng.uniform(9.0, 30.0)) * (rng.random() < 0.8)
@@ -302,9 +291,9 @@ def _boundaries(rng: np.random.Generator, setting: str, section: SectionSpec) ->
         height = float(rng.uniform(0.6, 1.9))
         if kind in ("picket", "bollards", "rails"):
             height = min(height, 1.25)
-        wood = _hsv(float(rng.uniform(0.04, 0.12)), float(rng.uniform(0.1, 0.6)), float(rng.uniform(0.25, 0.85)))
-        stone = _hsv(float(rng.uniform(0.03, 0.14)), float(rng.uniform(0.05, 0.45)), float(rng.uniform(0.35, 0.8)))
-        zinc = _hsv(float(rng.uniform(0.25, 0.6)), float(rng.uniform(0.0, 0.35)), float(rng.uniform(0.25, 0.6)))
+        wood = _hsv(rng, (0.04, 0.12), (0.1, 0.6), (0.25, 0.85))
+        stone = _hsv(rng, (0.03, 0.14), (0.05, 0.45), (0.35, 0.8))
+        zinc = _hsv(rng, (0.25, 0.6), (0.0, 0.35), (0.25, 0.6))
         color = {"wall": stone, "mesh": zinc, "bollards": zinc}.get(kind, wood)
         beyond = float(rng.uniform(0.1, 1.6))
         distance = section.kerb_width + side.pavement + beyond
@@ -333,7 +322,7 @@ def _trees(rng: np.random.Generator, setting: str, grass: Rgb) -> TreesSpec:
     if rng.random() < 0.18:  # autumn
         hue = float(rng.uniform(0.06, 0.13))
     greens = tuple(
-        _hsv(
+        colorsys.hsv_to_rgb(
             float(np.clip(hue + rng.normal(0.0, 0.025), 0.03, 0.40)),
             float(rng.uniform(0.3, 0.65)),
             float(np.clip(value + rng.normal(0.0, 0.05), 0.16, 0.6)),
@@ -341,7 +330,7 @@ def _trees(rng: np.random.Generator, setting: str, grass: Rgb) -> TreesSpec:
         for _ in range(4)
     )
     low = float(rng.uniform(3.0, 6.5))
-    bark = _hsv(float(rng.uniform(0.04, 0.1)), float(rng.uniform(0.1, 0.5)), float(rng.uniform(0.18, 0.5)))
+    bark = _hsv(rng, (0.04, 0.1), (0.1, 0.5), (0.18, 0.5))
     tufts = {"town": (0.0, 20.0), "works": (0.0, 30.0), "field": (40.0, 120.0), "forest": (30.0, 90.0)}
     return TreesSpec(
         float(rng.uniform(*density)),
@@ -422,9 +411,9 @@ def _horizon(rng: np.random.Generator, setting: str) -> HorizonSpec:
     far = float(rng.uniform(0.0, 1.0))  # 1 is the farthest; a farther horizon is paler and bluer
     pale = {"trees": 0.3, "flat": 0.6}.get(kind, 0.95) * far
     base = np.array([0.95, 0.95, 0.85]) * rng.uniform(0.75, 1.15, 3)
-    red, green, blue = ((1.0 - pale) * base + pale * np.array([1.75, 1.72, 1.95])).tolist()
+    tint = rgb((1.0 - pale) * base + pale * np.array([1.75, 1.72, 1.95]))
     elevation, deviation, widest = (float(rng.uniform(*span)) for span in (height, roughness, period))
-    return HorizonSpec(kind, elevation, deviation, widest, (red, green, blue))
+    return HorizonSpec(kind, elevation, deviation, widest, tint)
 
 
 def _lights(rng: np.random.Generator, lamps: LampsSpec) -> tuple[LightSpec, ...]:
@@ -477,17 +466,5 @@ def _film(rng: np.random.Generator, line: LineSpec, section: SectionSpec, lighti
     shake = float(rng.uniform(*{"phone": (1.8, 3.2), "cart": (0.7, 1.3)}.get(carrier, (0.4, 1.6))))
     calibrated = carrier != "phone" and rng.random() < 0.75
     return FilmSpec(
-        carrier,
-        tuple(passes),
-        speed,
-        fps,
-        speed / fps,
-        height,
-        stated,
-        tolerance,
-        pitch,
-        fov,
-        size,
-        shake,
-        bool(calibrated),
+        carrier, tuple(passes), speed, fps, height, stated, tolerance, pitch, fov, size, shake, bool(calibrated)
     )

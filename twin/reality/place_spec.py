@@ -8,10 +8,18 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from twin.reality import SEED
 
 Rgb = tuple[float, float, float]
+
+
+def rgb(values: ArrayLike) -> Rgb:
+    """A color from an array of shape (3,)."""
+    red, green, blue = np.asarray(values, float).tolist()
+    return red, green, blue
+
 
 SETTINGS = ("town", "suburb", "village", "works", "park", "forest", "field")
 MOUTH_REACH = 26.0  # [m] from the road's edge to the end of a side road that is not filmed
@@ -119,6 +127,22 @@ class SectionSpec:
     def width(self) -> float:
         """Width of the road [m]."""
         return self.left + self.right
+
+    def edge(self, side: int) -> float:
+        """Distance of the road's edge from the driven line on a side (1 = left, −1 = right) [m]."""
+        return self.left if side > 0 else self.right
+
+    def kerb_edge(self, side: int) -> float:
+        """Distance of the curb's outer edge from the driven line on a side [m]."""
+        return self.edge(side) + self.kerb_width
+
+    def beside(self, side: int) -> Side:
+        """The ground on a side."""
+        return self.sides[0 if side > 0 else 1]
+
+    def verge_edge(self, side: int) -> float:
+        """Distance of the verge's outer edge from the driven line on a side [m]."""
+        return self.kerb_edge(side) + self.beside(side).width
 
 
 @dataclass(frozen=True)
@@ -309,8 +333,6 @@ class FilmSpec:
     speed: float
     """[m/s]"""
     fps: int
-    spacing: float
-    """Distance between frames [m]; equals speed / fps."""
     camera_height: float
     """True height of the camera above the ground [m]."""
     stated_height: float

@@ -178,7 +178,7 @@ def _grow(
     """Adds a plant's wood, with the trunk's collision shape (height `stem`, `radius` [m]), and the plant's leaves."""
     centers = centers[centers[:, 2] > foot[2] + 0.1]
     trunk = Solid("cylinder", foot + up(0.5 * stem), (radius * 1.1, 0.5 * stem + 0.1, 0.0))
-    bark = "birch" if skin == "leaf3" and place.atlas.names[-1] == "birch" else f"bark{k % 3}"
+    bark = "birch" if skin == "leaf3" and "birch" in place.cells else f"bark{k % 3}"
     part = place.cell(bark, primitives.join(wood))
     place.objects.append(PlaceObject(f"tree_{k}", "obstacle", part, "atlas", (trunk,)))
     middle = centers.mean(0)

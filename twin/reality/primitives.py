@@ -6,7 +6,7 @@ A *part* is a surface with one texture; `uv` is (column, row) in [0, 1] of that 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from twin.types import Array
 
@@ -23,10 +23,6 @@ class MeshPart:
     """Shape (m, 3)."""
     uv: Array
     """Shape (n, 2)."""
-
-    def in_window(self, low: Array, high: Array) -> "MeshPart":
-        """The same surface, with texture coordinates mapped from [0, 1]² into a window of an atlas."""
-        return replace(self, uv=low + np.clip(self.uv, 0.0, 1.0) * (np.asarray(high) - low))
 
     def moved(self, origin: Array, yaw: float = 0.0) -> "MeshPart":
         """The mesh rotated about z by `yaw` [rad], then translated by `origin` [m]."""
@@ -45,19 +41,32 @@ def join(parts: list[MeshPart]) -> MeshPart:
     )
 
 
-def grid(points: Array, uv: Array) -> MeshPart:
-    """A surface through a lattice of points, shapes (rows, columns, 3) and (rows, columns, 2).
+def share(values: Array) -> Array:
+    """Distances of rising or falling values from the first, as fractions of that of the last; shape (n,)."""
+    return np.abs(values - values[0]) / np.ptp(values)
 
-    It faces up if the row index increases from a road's left to its right, and the column index along the road.
+
+def grid(xy: Array, z: Array, u: Array, v: Array) -> MeshPart:
+    """A surface through a lattice of points: xy (rows, columns, 2) and z (rows, columns) [m].
+
+    Its texture coordinates are u and v, which broadcast to (rows, columns). It faces up if the row index increases from
+    a road's left to its right, and the column index along the road.
     """
-    rows, columns = points.shape[:2]
+    rows, columns = z.shape
+    points = np.concatenate([xy, z[..., None]], -1)
+    uv = np.stack(np.broadcast_arrays(u, v), -1)
     i = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     return MeshPart(points.reshape(-1, 3), faces.astype(np.int32), uv.reshape(-1, 2))
 
 
-def quad(corners: Array) -> MeshPart:
+def triangle(corners: ArrayLike, uv: ArrayLike) -> MeshPart:
+    """A triangle from its corners (3, 3) and their texture coordinates (3, 2)."""
+    return MeshPart(np.asarray(corners, float), np.array([[0, 1, 2]], np.int32), np.asarray(uv, float))
+
+
+def quad(corners: ArrayLike) -> MeshPart:
     """A rectangle from its corners top left, bottom left, bottom right, top right; shape (4, 3)."""
     uv = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]])
     return MeshPart(np.asarray(corners, float), np.array([[0, 1, 2], [0, 2, 3]], np.int32), uv)
@@ -69,9 +78,9 @@ def box(size: tuple[float, float, float], base: float = 0.0) -> MeshPart:
     ring = [(-x, -y), (x, -y), (x, y), (-x, y)]
     sides = []
     for (ax, ay), (bx, by) in zip(ring, ring[1:] + ring[:1], strict=True):
-        sides.append(quad(np.array([[ax, ay, z1], [ax, ay, z0], [bx, by, z0], [bx, by, z1]])))
-    top = quad(np.array([[-x, y, z1], [-x, -y, z1], [x, -y, z1], [x, y, z1]]))
-    bottom = quad(np.array([[-x, -y, z0], [-x, y, z0], [x, y, z0], [x, -y, z0]]))
+        sides.append(quad([[ax, ay, z1], [ax, ay, z0], [bx, by, z0], [bx, by, z1]]))
+    top = quad([[-x, y, z1], [-x, -y, z1], [x, -y, z1], [x, y, z1]])
+    bottom = quad([[-x, -y, z0], [-x, y, z0], [x, y, z0], [x, -y, z0]])
     return join([*sides, top, bottom])
 
 
@@ -83,10 +92,9 @@ def walls(width: float, depth: float, low: float, high: float) -> MeshPart:
     parts = []
     for k in range(4):
         (ax, ay), (bx, by) = ring[k], ring[k + 1]
-        part = quad(np.array([[ax, ay, high], [ax, ay, low], [bx, by, low], [bx, by, high]]))
-        parts.append(
-            replace(part, uv=np.stack([np.where(part.uv[:, 0] > 0, along[k + 1], along[k]), part.uv[:, 1]], 1))
-        )
+        part = quad([[ax, ay, high], [ax, ay, low], [bx, by, low], [bx, by, high]])
+        u = np.where(part.uv[:, 0] > 0, along[k + 1], along[k])
+        parts.append(replace(part, uv=np.stack([u, part.uv[:, 1]], 1)))
     return join(parts)
 
 
@@ -105,7 +113,7 @@ def prism(outline: Array, width: float) -> MeshPart:
         parts.append(MeshPart(cap, fan, np.stack([uv[:, 0], 1.0 - uv[:, 1]], 1)))
     for (ax, az), (bx, bz) in zip(outline, np.roll(outline, -1, 0), strict=True):
         y = width / 2
-        parts.append(quad(np.array([[ax, y, az], [ax, -y, az], [bx, -y, bz], [bx, y, bz]])))
+        parts.append(quad([[ax, y, az], [ax, -y, az], [bx, -y, bz], [bx, y, bz]]))
     return join(parts)
 
 
@@ -123,8 +131,7 @@ def tube(
     angle = np.linspace(0.0, 2 * np.pi, sides + 1)
     ring = np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2
     points = np.stack([top + radius_top * ring, bottom + radius_bottom * ring])
-    u, v = np.meshgrid(np.linspace(0, 1, sides + 1), [0.0, 1.0])
-    side = grid(points, np.stack([u, v], -1))
+    side = grid(points[..., :2], points[..., 2], np.linspace(0, 1, sides + 1)[None], np.array([[0.0], [1.0]]))
     if not capped:
         return side
     lids = []

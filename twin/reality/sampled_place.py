@@ -16,15 +16,15 @@ from twin.reality import SEED
 from twin.reality import street_furniture as furniture
 from twin.reality.houses import House, add_house
 from twin.reality.lighting import place_lightings
-from twin.reality.place_objects import Atlas, GroundLayout, KnownPlace
+from twin.reality.place_objects import GroundLayout, KnownPlace
 from twin.reality.place_sampling import sample_place
 from twin.reality.place_spec import CLEARANCE, FREE_HALF_WIDTH, PlaceSpec, Rgb, stream
 from twin.reality.plants import add_bare_tree, add_conifer, add_crowned_tree, add_shrub, add_tufts
 from twin.reality.sampled_road import STEP, SampledRoad, add_land, add_road, add_side_roads, land_boxes
 from twin.reality.sampled_textures import SAMPLED_CELLS, sampled_textures
-from twin.reality.side_roads import SIDE_VERGE, SideLine, add_side_road, begin_of_verges, occupied
+from twin.reality.side_roads import SIDE_VERGE, SideAxis, SideLine, add_side_road
 from twin.reality.sky import place_sky
-from twin.reality.street_furniture import BAY, add_boundary, thickness
+from twin.reality.street_furniture import BAY, THICKNESS, add_boundary
 from twin.types import Array
 
 _FIELD_MARGIN = 14.0  # [m] from the driven line to the edges of `GroundLayout.field`
@@ -48,11 +48,10 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
     driven = np.concatenate([road.at(np.linspace(0.0, spec.line.length, 200)), *beside])
     corners = ((driven.min(0) - _FIELD_MARGIN).tolist(), (driven.max(0) + _FIELD_MARGIN).tolist())
     section = spec.section
-    left, right = section.left + section.kerb_width, -section.right - section.kerb_width
     across = {
         "road": (section.left, -section.right),
-        "verge_left": (left + section.sides[0].width, left),
-        "verge_right": (right, right - section.sides[1].width),
+        "verge_left": (section.verge_edge(1), section.kerb_edge(1)),
+        "verge_right": (-section.kerb_edge(-1), -section.verge_edge(-1)),
     }
     names_of_parts = [f"_{k}" if k else "" for k in range(parts)]
     lands = land_boxes(np.concatenate([road.at(stations), *beside]), tiled=parts > 1)
@@ -80,20 +79,20 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
         partial(place_sky, spec),
         number=spec.number,
         seed=(SEED, 100, spec.number, 1000),
-        atlas=Atlas(SAMPLED_CELLS),
+        cells=SAMPLED_CELLS,
     )
     for part, first, last in zip(names_of_parts, ends, ends[1:], strict=False):
         add_road(place, road, stations[first : last + 1], part)
     add_side_roads(place, road, stations)
-    for axis, one in zip(road.side_axes, spec.line.side_roads, strict=True):
-        add_side_road(place, section, axis, one)
+    for axis in road.side_axes:
+        add_side_road(place, axis)
     for name, box in lands.items():
         add_land(place, road, name, box)
     site = Site(road)
     names.update(_furnish(place, _of_driven_line(spec), site, displaced))
     for k, axis in enumerate(road.side_axes):
         there = replace(place, route=axis, seed=(*place.seed, 30 + k))  # shares the lists of objects and lamps
-        names.update(_furnish(there, _of_side_road(spec, k), site, displaced))
+        names.update(_furnish(there, _of_side_road(spec, axis, k), site, displaced))
     return place
 
 
@@ -114,7 +113,7 @@ class Site:
 
     def __init__(self, road: SampledRoad) -> None:
         self._road = road
-        self._side_lines = [SideLine(road, one) for one in road.line.side_roads]
+        self._side_lines = [SideLine(road, axis) for axis in road.side_axes]
         self._taken: list[tuple[float, float, float, Array]] = []  # x, y, radius, corners
 
     def take(
@@ -150,8 +149,8 @@ class Site:
         free = (road.edges(lateral) > section.kerb_width + clear) & (np.abs(lateral) > FREE_HALF_WIDTH + CLEARANCE)
         for mouth in road.line.mouths:
             free &= (np.abs(station - mouth.station) > mouth.width / 2 + 0.4) | (lateral * mouth.side < 0.0)
-        for line, axis, one in zip(self._side_lines, road.side_axes, road.line.side_roads, strict=True):
-            free &= ~occupied(section, one, *axis.project(xy), clear)
+        for line, axis in zip(self._side_lines, road.side_axes, strict=True):
+            free &= ~axis.occupied(xy, clear)
             along, off = line.project(xy)
             free &= (np.abs(off) > FREE_HALF_WIDTH + CLEARANCE) | (along < 0.0) | (along > line.length)
         return bool(free.all())
@@ -222,17 +221,16 @@ def _of_driven_line(spec: PlaceSpec) -> _Roadside:
     return _Roadside(
         spec,
         *(-6.0, length + 22.0, (-7.0, length + 20.0)),
-        (section.left + section.kerb_width, section.right + section.kerb_width),
+        (section.kerb_edge(1), section.kerb_edge(-1)),
         (section.sides[0].width, section.sides[1].width),
         (section.sides[0].pavement, section.sides[1].pavement),
     )
 
 
-def _of_side_road(spec: PlaceSpec, k: int) -> _Roadside:
-    one, section = spec.line.side_roads[k], spec.section
-    edge, begin = 0.5 * one.mouth.width + section.kerb_width, begin_of_verges(section, one)
-    last = one.length - 1.0
-    return _Roadside(spec, begin, last, (begin, last), (edge, edge), (SIDE_VERGE, SIDE_VERGE), (0.0, 0.0), (k,))
+def _of_side_road(spec: PlaceSpec, axis: SideAxis, k: int) -> _Roadside:
+    begin, last = axis.verge_start, axis.length - 1.0
+    edges, verges = (axis.edge, axis.edge), (SIDE_VERGE, SIDE_VERGE)
+    return _Roadside(spec, begin, last, (begin, last), edges, verges, (0.0, 0.0), (k,))
 
 
 # ---- objects
@@ -258,13 +256,12 @@ def _add_houses(place: KnownPlace, along: _Roadside, site: Site) -> dict[str, tu
     rng, spec = along.stream("houses", 1), along.spec
     houses = spec.houses
     out: dict[str, tuple[House, str, Rgb, Rgb]] = {}
-    first, last = along.first, along.last
     if houses.density <= 0.05:
         return out
-    most = max(16, int(0.14 * (last - first)))
+    most = max(16, int(0.14 * (along.last - along.first)))
     for side in (1, -1):
-        station = first + float(rng.uniform(0.0, 12.0))
-        while station < last + 10.0:
+        station = along.first + float(rng.uniform(0.0, 12.0))
+        while station < along.last + 10.0:
             width, depth = float(rng.uniform(*houses.front)), float(rng.uniform(6.0, 11.0))
             storeys = int(rng.integers(houses.storeys[0], houses.storeys[1] + 1))
             setback = float(rng.uniform(*houses.setback))
@@ -289,8 +286,7 @@ def _add_lamps(place: KnownPlace, along: _Roadside, site: Site) -> None:
     rng, lamps = along.stream("lamps", 1), along.spec.lamps
     if lamps.kind == "none":
         return
-    first, last = along.first, along.last
-    for k, station in enumerate(np.arange(first + rng.uniform(0.0, lamps.spacing), last, lamps.spacing)):
+    for k, station in enumerate(np.arange(along.first + rng.uniform(0.0, lamps.spacing), along.last, lamps.spacing)):
         side = lamps.side or (1 if k % 2 else -1)
         shines = bool(rng.random() >= lamps.broken)
         away = max(along.edge(side) + 0.45, FREE_HALF_WIDTH + 0.35)
@@ -310,21 +306,18 @@ def _add_lamps(place: KnownPlace, along: _Roadside, site: Site) -> None:
 
 def _add_boundaries(place: KnownPlace, along: _Roadside, site: Site) -> None:
     rng, spec = along.stream("boundaries", 1), along.spec
-    first, last = along.first, along.last
     for side, name, boundary in ((1, "left", spec.boundaries[0]), (-1, "right", spec.boundaries[1])):
         if boundary.kind == "none":
             continue
-        away = along.edge(side) + max(boundary.distance, 0.3)
-        if away < FREE_HALF_WIDTH + 0.6:
-            away = FREE_HALF_WIDTH + 0.6
-        lateral, thick = side * away, thickness(boundary.kind)
+        away = max(along.edge(side) + max(boundary.distance, 0.3), FREE_HALF_WIDTH + 0.6)
+        lateral, thick = side * away, THICKNESS[boundary.kind]
         pieces = spec.line.pieces if not along.key else ()  # side roads are straight
         tight = min((1 / abs(p.curvature) for p in pieces if side * p.curvature > 0.0), default=np.inf)
         if away > tight - 0.8:
             continue
         runs: list[list[float]] = [[]]
         wanted = rng.random(1000) < boundary.covered
-        for k, station in enumerate(np.arange(first, last, BAY).tolist()):
+        for k, station in enumerate(np.arange(along.first, along.last, BAY).tolist()):
             at, half = station + BAY / 2, (BAY / 2, thick / 2)
             if boundary.kind == "bollards":
                 at, half = station, (0.12, 0.12)
@@ -344,9 +337,8 @@ def _add_poles(place: KnownPlace, along: _Roadside, site: Site) -> None:
     rng = along.stream("furniture", 1)
     side, height = int(rng.choice([-1, 1])), float(rng.uniform(6.5, 8.5))
     away = along.edge(side) + min(1.2, 0.5 * along.verge(side)) + float(rng.uniform(0.4, 1.6))
-    first, last = along.first, along.last
     feet = []
-    for k, station in enumerate(np.arange(first + rng.uniform(0, 10), last, rng.uniform(20.0, 30.0))):
+    for k, station in enumerate(np.arange(along.first + rng.uniform(0, 10), along.last, rng.uniform(20.0, 30.0))):
         at = float(station), side * away
         if site.take(place.route.at(*at), (0.16, 0.16), 0.0):
             furniture.add_post(place, f"pole_{along.numbered(k)}", *at, height, 0.13, "pole")
@@ -359,11 +351,10 @@ def _scatter(
     rng: np.random.Generator, along: _Roadside, amount: float, near: float, far: float
 ) -> list[tuple[float, float]]:
     """Random stations and laterals [m]: `amount` per 100 m of road, at `near` to `far` from the curb."""
-    first, last = along.first, along.last
     out = []
-    for _ in range(int(rng.poisson(amount * (last - first) / 100.0))):
-        side = int(rng.choice([-1, 1]))
-        out.append((float(rng.uniform(first, last)), side * (along.edge(side) + float(rng.uniform(near, far)))))
+    for _ in range(int(rng.poisson(amount * (along.last - along.first) / 100.0))):
+        side, station = int(rng.choice([-1, 1])), float(rng.uniform(along.first, along.last))
+        out.append((station, side * (along.edge(side) + float(rng.uniform(near, far)))))
     return out
 
 
@@ -432,6 +423,9 @@ def _add_furniture(place: KnownPlace, along: _Roadside, site: Site, other_day: n
         size = float(rng.uniform(0.5, 1.1)), float(rng.uniform(0.3, 0.5)), float(rng.uniform(0.8, 1.4))
         furniture.add_cabinet(place, k, *at, size)
 
+    def stone(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+        furniture.add_stone(place, k, *at, float(rng.uniform(0.25, 0.65)))
+
     def bollard(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
         furniture.add_post(place, f"bollard_{k}", *at, float(rng.uniform(0.7, 1.1)), 0.07, "dark")
 
@@ -442,14 +436,7 @@ def _add_furniture(place: KnownPlace, along: _Roadside, site: Site, other_day: n
     each(4, f.cones, 0.3, 1.2, 0.3, small("cone"))
     each(5, f.crates, 1.0, 4.0, 0.75, small("crate"))
     each(6, f.cabinets, 0.6, 3.0, 0.6, cabinet)
-    each(
-        7,
-        f.stones,
-        0.5,
-        6.0,
-        0.6,
-        lambda k, at, rng: furniture.add_stone(place, k, *at, float(rng.uniform(0.25, 0.65))),
-    )
+    each(7, f.stones, 0.5, 6.0, 0.6, stone)
 
 
 def _add_trees(place: KnownPlace, along: _Roadside, site: Site) -> None:

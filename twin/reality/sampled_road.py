@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from twin.reality import primitives
 from twin.reality.place_objects import KnownPlace, PlaceObject
@@ -27,7 +27,7 @@ from twin.reality.place_spec import (
     SectionSpec,
     stream,
 )
-from twin.reality.side_roads import SideAxis, depth_below, verge_lift
+from twin.reality.side_roads import SideAxis, smooth
 from twin.types import Array
 
 _CROWN_ROUNDING = 0.3  # [m] half width of the rounding of a crown
@@ -62,22 +62,24 @@ class SampledRoad:
         self._headings = np.array(headings)
         self._points = np.array(points)
         self._curvatures = np.array([*(piece.curvature for piece in spec.line.pieces), 0.0])
-        self.side_axes = [SideAxis(self, one) for one in spec.line.side_roads]
+        self.side_axes = [SideAxis(self, self.section, one) for one in spec.line.side_roads]
 
     # ---- plan
 
     def heading(self, station: ArrayLike) -> Array:
-        """Direction of travel, counterclockwise from +x [rad]; shape as `station`."""
         s = np.asarray(station, float)
-        k = np.clip(np.searchsorted(self._starts, s, side="right") - 1, 0, None)
-        curvature = np.where(s < 0.0, 0.0, self._curvatures[k])
+        k, curvature = self._piece(s)
         return self._headings[k] + curvature * (s - self._starts[k])
+
+    def _piece(self, station: Array) -> tuple[NDArray[np.int64], Array]:
+        """Index of the piece at a station [m], and the line's curvature there [1/m]."""
+        k = np.clip(np.searchsorted(self._starts, station, side="right") - 1, 0, None)
+        return k, np.where(station < 0.0, 0.0, self._curvatures[k])
 
     def at(self, station: ArrayLike, lateral: ArrayLike = 0.0) -> Array:
         """Points (x, y) [m], shape (..., 2). The line continues straight before station 0 and beyond its end."""
         s, lateral = np.broadcast_arrays(np.asarray(station, float), np.asarray(lateral, float))
-        k = np.clip(np.searchsorted(self._starts, s, side="right") - 1, 0, None)
-        curvature = np.where(s < 0.0, 0.0, self._curvatures[k])
+        k, curvature = self._piece(s)
         along = s - self._starts[k]
         heading = self._headings[k] + curvature * along
         # The chord of an arc of angle a is the arc's length times sinc(a / 2), in the direction of the mean heading.
@@ -125,10 +127,9 @@ class SampledRoad:
         """1 at side roads on a side (1 = left, −1 = right), falling to 0 within `_DROP_LENGTH` beside them."""
         station = np.asarray(station, float)
         out = np.zeros(station.shape)
-        for mouth in self.line.mouths:
-            if mouth.side == side:
-                beside = np.abs(station - mouth.station) - 0.5 * mouth.width
-                out = np.maximum(out, 1.0 - np.clip(beside / _DROP_LENGTH, 0.0, 1.0))
+        for mouth in self.mouths(side):
+            beside = np.abs(station - mouth.station) - 0.5 * mouth.width
+            out = np.maximum(out, 1.0 - np.clip(beside / _DROP_LENGTH, 0.0, 1.0))
         return out
 
     def mouths(self, side: int) -> list[Mouth]:
@@ -151,8 +152,8 @@ class SampledRoad:
         station, lateral = np.broadcast_arrays(np.asarray(station, float), np.asarray(lateral, float))
         section = self.section
         out = self._surface(np.clip(lateral, -section.right, section.left))
-        for sign, side, edge in ((1, section.sides[0], section.left), (-1, section.sides[1], section.right)):
-            away = sign * lateral - edge
+        for sign in (1, -1):
+            away, side = sign * lateral - section.edge(sign), section.beside(sign)
             kerb = section.kerb_height * (1.0 - self.mouth_weight(station, sign))
             out = out + np.where(away > 0.0, kerb + side.slope * np.clip(away, 0.0, side.width), 0.0)
         return out
@@ -192,7 +193,6 @@ class SampledRoad:
         return out
 
     def ground_height(self, xy: ArrayLike) -> Array:
-        """True height of the ground [m], shape (..., 2) → (...)."""
         xy = np.asarray(xy, float)
         station, lateral = self.project(xy)
         section = self.section
@@ -202,13 +202,13 @@ class SampledRoad:
         # Distance past the road's ends [m], minus 5 m.
         beyond = np.maximum(self.start - 5.0 - station, station - self.end - 5.0)
         share = np.maximum(share, np.clip(beyond / 5.0, 0.0, 1.0))
-        share = share * share * (3.0 - 2.0 * share)
+        share = smooth(share)
         off = share > 0.0
         if off.any():
             z = np.array(z)
             z[off] = (1.0 - share[off]) * z[off] + share[off] * self._land(xy[off])
-        for axis, one in zip(self.side_axes, self.line.side_roads, strict=True):
-            z = z + verge_lift(section, one, *axis.project(xy))
+        for axis in self.side_axes:
+            z = z + axis.verge_lift(xy)
         return z
 
 
@@ -255,38 +255,27 @@ def add_road(place: KnownPlace, road: SampledRoad, stations: Array, suffix: str)
         z = road.ground_height(xy)
         if lifts is not None:
             z = road.profile(stations)[None] + lifts
-        v = (laterals[0] - laterals) / (laterals[0] - laterals[-1]) if np.ptp(laterals) > 0 else np.zeros(len(laterals))
-        u = (stations - stations[0]) / (stations[-1] - stations[0])
-        uv = np.stack(np.broadcast_arrays(u[None], v[:, None]), -1)
-        part = primitives.grid(np.concatenate([xy, z[..., None]], -1), uv)
+        part = primitives.grid(xy, z, primitives.share(stations)[None], primitives.share(laterals)[:, None])
         if gaps:
             middle = stations[(part.faces % len(stations))].mean(1)
             keep = np.ones(len(part.faces), bool)
             for mouth in road.mouths(gaps):
                 keep &= np.abs(middle - mouth.station) > 0.5 * mouth.width
-            part = primitives.MeshPart(part.vertices, part.faces[keep], part.uv)
+            part = replace(part, faces=part.faces[keep])
         place.objects.append(PlaceObject(f"{name}{suffix}", "ground", part, f"{texture}{suffix}"))
 
     inner = 1e-6  # keeps the vertices at the road's edges on the road
     strip("road", "road", np.linspace(section.left - inner, -section.right + inner, 15))
-    for sign, name, edge, side in (
-        (1, "left", section.left, section.sides[0]),
-        (-1, "right", section.right, section.sides[1]),
-    ):
-        outer = edge + section.kerb_width
+    for sign, name in ((1, "left"), (-1, "right")):
+        edge, outer = section.edge(sign), section.kerb_edge(sign)
         if section.kerb_height > 0.0:
             low = road.cross_profile(stations, sign * edge)
             high = road.cross_profile(stations, sign * (edge + 0.03))
-            profile = [
-                (edge, low - 0.02),
-                (edge + 0.015, high - 0.15 * (high - low)),
-                (edge + 0.03, high),
-                (outer, road.cross_profile(stations, sign * (outer + inner))),
-            ]
-            profile = profile[::-1] if sign > 0 else profile
-            laterals, lifts = np.array([sign * p[0] for p in profile]), np.stack([p[1] for p in profile])
-            strip(f"kerb_{name}", "kerb", laterals, lifts)
-        across = sign * np.linspace(outer + inner, outer + side.width, 9)
+            profile = np.array([edge, edge + 0.015, edge + 0.03, outer])
+            back = road.cross_profile(stations, sign * (outer + inner))
+            lifts = np.stack([low - 0.02, high - 0.15 * (high - low), high, back])
+            strip(f"kerb_{name}", "kerb", sign * profile[::-sign], lifts[::-sign])
+        across = sign * np.linspace(outer + inner, outer + section.beside(sign).width, 9)
         strip(f"verge_{name}", f"verge_{name}", np.sort(across)[::-1], gaps=sign)
 
 
@@ -297,18 +286,14 @@ def add_side_roads(place: KnownPlace, road: SampledRoad, stations: Array) -> Non
     for k, mouth in enumerate(road.line.mouths):
         if mouth in filmed:
             continue
-        edge = section.left if mouth.side > 0 else section.right
-        reach = edge + section.kerb_width + np.arange(0.0, MOUTH_REACH, 0.5)
+        reach = section.kerb_edge(mouth.side) + np.arange(0.0, MOUTH_REACH, 0.5)
         first = stations[np.argmax(stations + STEP / 2 > mouth.station - mouth.width / 2)]
         inside = stations[(stations >= first - STEP) & (stations <= mouth.station + mouth.width / 2 + STEP)]
         xy = road.at(inside[None], mouth.side * reach[:, None])
         z = road.ground_height(xy) + 0.01
-        u = (reach - reach[0]) / np.ptp(reach)
-        v = (inside - inside[0]) / np.ptp(inside)
-        uv = np.stack(np.broadcast_arrays(0.03 + 0.3 * (k % 3) + 0.25 * u[:, None], v[None]), -1)
-        order = slice(None, None, -1) if mouth.side > 0 else slice(None)
-        points = np.concatenate([xy, z[..., None]], -1)[order]
-        part = primitives.grid(points, uv[order])
+        u = 0.03 + 0.3 * (k % 3) + 0.25 * primitives.share(reach)
+        order = -mouth.side
+        part = primitives.grid(xy[::order], z[::order], u[::order, None], primitives.share(inside)[None])
         place.objects.append(PlaceObject(f"side_road_{k}", "ground", part, "side_road"))
 
 
@@ -326,11 +311,11 @@ def add_land(place: KnownPlace, road: SampledRoad, name: str, box: tuple[float, 
     for mouth in road.line.mouths:
         near = (np.abs(station - mouth.station) < mouth.width / 2 + 1.6) & (lateral * mouth.side > 0.0)
         sunk = np.where(near & (away < MOUTH_REACH), 0.3, sunk)
-    for axis, one in zip(road.side_axes, road.line.side_roads, strict=True):
-        sunk = np.maximum(sunk, depth_below(section, one, *axis.project(xy), _LAND_STEP + 0.1))
-    points = np.concatenate([xy, (road.ground_height(xy) - sunk)[..., None]], -1)
-    uv = np.clip(np.stack([(x - x0) / (x1 - x0), (y1 - y) / (y1 - y0)], -1), 0.0, 1.0)
-    place.objects.append(PlaceObject(name, "ground", primitives.grid(points, uv), name))
+    for axis in road.side_axes:
+        sunk = np.maximum(sunk, axis.depth_below(xy, _LAND_STEP + 0.1))
+    u, v = np.clip((x - x0) / (x1 - x0), 0.0, 1.0), np.clip((y1 - y) / (y1 - y0), 0.0, 1.0)
+    part = primitives.grid(xy, road.ground_height(xy) - sunk, u, v)
+    place.objects.append(PlaceObject(name, "ground", part, name))
 
 
 # ---- samples of the line
@@ -341,9 +326,7 @@ _LONG_SEPARATION = 30.0  # [m] the same between a point of the lengthening and a
 # apart in plan, so `_LONG_SEPARATION` can be kept.
 _HEADING_BOUND = float(np.deg2rad(58.0))  # [rad]
 _BEND_ROOM = 2.0  # [m] least distance from a verge's outer edge to the center of a bend of the lengthening
-_MOUTH_ROOM = (
-    30.0  # [m] a further side road must be far from the rest of the road at this distance from the road's edge
-)
+_MOUTH_ROOM = 30.0  # [m] from the road's edge; a further side road must be far from the rest of the road there
 
 
 def sample_line(rng: np.random.Generator, setting: str, section: SectionSpec) -> LineSpec:
@@ -362,13 +345,21 @@ def sample_line(rng: np.random.Generator, setting: str, section: SectionSpec) ->
     mouths: list[Mouth] = []
     stations = np.cumsum([0.0, *(piece.length for piece in pieces)])
     for piece, start in zip(pieces, stations, strict=False):
-        width, side = float(rng.uniform(2.8, 6.0)), int(rng.choice([-1, 1]))
-        offset, wanted = float(rng.uniform(0.0, 1.0)), rng.random() < (0.25 if setting in ("forest", "field") else 0.5)
-        room = min(piece.length, length - float(start)) - width - 4.0
-        if piece.curvature == 0.0 and wanted and room > 0.0 and len(mouths) < 2:
-            mouths.append(Mouth(round(float(start) + 2.0 + width / 2 + offset * room, 2), side, width))
+        mouth = _mouth(rng, setting, piece, float(start), length)
+        if mouth and len(mouths) < 2:
+            mouths.append(mouth)
     relief = float(rng.uniform(0.0, 0.35 if setting in ("town", "works") else 1.4))
     return LineSpec(pieces, round(length, 2), tuple(grades.tolist()), bumps, tuple(mouths), relief)
+
+
+def _mouth(rng: np.random.Generator, setting: str, piece: Piece, start: float, length: float) -> Mouth | None:
+    """Samples a side road on a piece of a line of `length` [m] that begins at station `start`, or none."""
+    width, side = float(rng.uniform(2.8, 6.0)), int(rng.choice([-1, 1]))
+    offset, wanted = float(rng.uniform(0.0, 1.0)), rng.random() < (0.25 if setting in ("forest", "field") else 0.5)
+    room = min(piece.length, length - start) - width - 4.0
+    if piece.curvature != 0.0 or not wanted or room <= 0.0:
+        return None
+    return Mouth(round(start + 2.0 + width / 2 + offset * room, 2), side, width)
 
 
 def _pieces(rng: np.random.Generator, setting: str, section: SectionSpec, length: float) -> tuple[Piece, ...]:
@@ -382,7 +373,7 @@ def _pieces(rng: np.random.Generator, setting: str, section: SectionSpec, length
         if straight:
             piece = Piece(float(rng.uniform(6.0, 34.0)), 0.0)
         else:
-            least = max(6.0, (section.left if left else section.right) + section.kerb_width + 2.2)
+            least = max(6.0, section.kerb_edge(1 if left else -1) + 2.2)
             radius = float(np.exp(rng.uniform(np.log(least), np.log(40.0))))
             angle = np.deg2rad(rng.uniform(20.0, 100.0)) * bendy
             piece = Piece(min(radius * float(angle), 45.0), (1.0 if left else -1.0) / radius)
@@ -412,16 +403,14 @@ def lengthen(rng: np.random.Generator, line: LineSpec, setting: str, section: Se
     starts = np.cumsum([0.0, *(piece.length for piece in pieces)]).tolist()
     begins = np.cumsum([0, *(_point_count(piece) for piece in pieces)]).tolist()
     for n in range(len(line.pieces), len(pieces)):
-        piece, start = pieces[n], starts[n]
-        width, side = float(rng.uniform(2.8, 6.0)), int(rng.choice([-1, 1]))
-        offset, wanted = float(rng.uniform(0.0, 1.0)), rng.random() < (0.25 if setting in ("forest", "field") else 0.5)
-        room = min(piece.length, length - start) - width - 4.0
-        if piece.curvature != 0.0 or not wanted or room <= 0.0:
+        start = starts[n]
+        mouth = _mouth(rng, setting, pieces[n], start, length)
+        if not mouth:
             continue
-        mouth = Mouth(round(start + 2.0 + width / 2 + offset * room, 2), side, width)
+        side = mouth.side
         begin = xy[begins[n] - 1]
         ahead = (xy[begins[n]] - begin) / np.linalg.norm(xy[begins[n]] - begin)
-        reach = (section.left if side > 0 else section.right) + _MOUTH_ROOM
+        reach = section.edge(side) + _MOUTH_ROOM
         end = begin + (mouth.station - start) * ahead + side * reach * np.array([-ahead[1], ahead[0]])
         if np.linalg.norm(xy - end, axis=1).min() > 0.5 * reach:
             mouths.append(mouth)
@@ -454,9 +443,8 @@ def _further(
             if abs(off + (angle if left else -angle)) > _HEADING_BOUND:
                 left = off < 0.0
                 angle = min(angle, _HEADING_BOUND + abs(off))
-            k = 0 if left else 1
-            edge = (section.left, section.right)[k] + section.kerb_width
-            least = max(6.0, edge + 2.2, edge + section.sides[k].width + _BEND_ROOM)
+            side = 1 if left else -1
+            least = max(6.0, section.kerb_edge(side) + 2.2, section.verge_edge(side) + _BEND_ROOM)
             radius = float(np.exp(rng.uniform(np.log(least), np.log(40.0))))
             angle = min(angle, 45.0 / radius)
             out.append(Piece(radius * angle, (1.0 if left else -1.0) / radius))

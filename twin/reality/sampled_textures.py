@@ -5,7 +5,7 @@ from functools import cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from twin.geometry.images import to_uint8
 from twin.reality import textures
@@ -13,21 +13,24 @@ from twin.reality.houses import House
 from twin.reality.place_objects import CELLS, GroundLayout
 from twin.reality.place_spec import (
     MOUTH_REACH,
-    BoundarySpec,
     HousesSpec,
     PlaceSpec,
     Rgb,
     SectionSpec,
     SideRoad,
     SurfaceSpec,
+    rgb,
     stream,
 )
-from twin.reality.side_roads import SIDE_VERGE, texture_sizes
+from twin.reality.side_roads import SIDE_VERGE
 from twin.reality.textures import (
+    ARROW,
     CHIPS,
     AtlasColors,
+    add_blades,
     add_cracks,
     add_patch,
+    add_stain,
     blend,
     fbm,
     grains,
@@ -97,25 +100,12 @@ def _asphalt(
     columns = image.shape[1]
     grains(rng, image, 0.16 * surface.coarseness, CHIPS)
     speckle(rng, image, int(length * 40 * surface.coarseness), (0.5, 1.6), CHIPS)
-    dark = tuple(0.75 * c for c in surface.tone)
+    dark = 0.75 * np.array(surface.tone)
     for track in (-0.75, 0.75):  # polished by wheels
         wander = track + 0.10 * fbm(rng, (1, columns), 8.0 / pixel, 200.0)
-        blend(image, (dark[0], dark[1], dark[2]), 0.3 * np.exp(-0.5 * ((lateral - wander) / 0.22) ** 2))
-    stains = int(length * rng.uniform(0.05, 0.6))
-    for _ in range(stains):
-        _stain(image, (rng.uniform(0, columns), rng.uniform(0, image.shape[0])), rng.uniform(3, 26))
-
-
-def _stain(image: Array32, center: tuple[float, float], radius: float) -> None:
-    """Darkens a round spot; center (column, row) and radius [px]."""
-    rows, columns = image.shape[:2]
-    r0, r1 = max(0, int(center[1] - radius)), min(rows, int(center[1] + radius) + 1)
-    c0, c1 = max(0, int(center[0] - radius)), min(columns, int(center[0] + radius) + 1)
-    if r1 <= r0 or c1 <= c0:
-        return
-    rr, cc = np.mgrid[r0:r1, c0:c1]
-    blob = np.clip(1.6 - np.hypot(rr - center[1], cc - center[0]) / (0.6 * radius), 0, 1)
-    blend(image[r0:r1, c0:c1], (0.12, 0.12, 0.13), 0.6 * blob)
+        blend(image, dark, 0.3 * np.exp(-0.5 * ((lateral - wander) / 0.22) ** 2))
+    for _ in range(int(length * rng.uniform(0.05, 0.6))):
+        add_stain(image, (rng.uniform(0, columns), rng.uniform(0, image.shape[0])), rng.uniform(3, 26))
 
 
 def _slab_field(
@@ -124,7 +114,7 @@ def _slab_field(
     unit: tuple[float, float],
     pixel: float,
     spread: float,
-    joint: Rgb,
+    joint: ArrayLike,
     gap: float,
     bond: int = 0,
 ) -> None:
@@ -166,7 +156,7 @@ def _gravel(
     wander = 0.12 * fbm(rng, (1, shape[1]), 9.0 / pixel, 200.0)
     for track in (-0.72, 0.72):
         weight = np.exp(-0.5 * ((lateral - track - wander) / 0.26) ** 2)
-        blend(image, (float(lighter[0]), float(lighter[1]), float(lighter[2])), 0.45 * weight)
+        blend(image, lighter, 0.45 * weight)
     ragged = 0.16 * fbm(rng, shape, 0.8 / pixel, 3.0)
     edge = np.minimum(section.left - lateral, section.right + lateral)
     green = edge + ragged < 0.22
@@ -188,8 +178,7 @@ def _repair(rng: np.random.Generator, image: Array32, surface: SurfaceSpec, leng
         r0 = max(0, r0)
         if c1 - c0 < 8 or r1 - r0 < 8:
             continue
-        tone = np.array(surface.tone) * rng.uniform(0.6, 1.25)
-        add_patch(rng, image[r0:r1, c0:c1], (float(tone[0]), float(tone[1]), float(tone[2])))
+        add_patch(rng, image[r0:r1, c0:c1], np.array(surface.tone) * rng.uniform(0.6, 1.25))
     add_cracks(rng, image, int(length * surface.cracks), (0.8, 2.2), (0.10, 0.10, 0.10), 0.7)
 
 
@@ -222,11 +211,10 @@ def _mark(
         stripes = (np.abs(along - station) < 1.6) & (((middle + 0.25) % 1.0) < 0.5)
         blend(image, (0.82, 0.81, 0.78), worn * stripes)
     if "arrows" in surface.markings:
-        shaft = [(-1.6, -0.08), (0.4, -0.08), (0.4, -0.3), (1.3, 0.0), (0.4, 0.3), (0.4, 0.08), (-1.6, 0.08)]
         for station in np.arange(rng.uniform(6.0, 20.0), columns * pixel - 4.0, rng.uniform(16.0, 30.0)):
             mask = np.zeros((rows, columns), np.float32)
             at = (section.left + 0.25 * section.width * (section.left == section.right)) / pixel
-            cv2.fillPoly(mask, [np.array([[(station + a) / pixel, at + b / pixel] for a, b in shaft], np.int32)], 1.0)
+            cv2.fillPoly(mask, [np.array([[(station + a) / pixel, at + b / pixel] for a, b in ARROW], np.int32)], 1.0)
             blend(image, surface.paint, worn * mask)
 
 
@@ -235,10 +223,10 @@ def _mark(
 
 def turf(rng: np.random.Generator, surface: SurfaceSpec, shape: tuple[int, int], pixel: float, kind: str) -> Array32:
     """Ground beside the road from above: `grass`, `meadow` (tall, with straw and flowers), `earth`, `gravel`."""
-    green, earth = np.array(surface.grass), np.array(surface.earth)
-    base = {"earth": earth, "gravel": 0.5 * earth + 0.25}.get(kind, green)
+    earth = np.array(surface.earth)
+    base = {"earth": earth, "gravel": 0.5 * earth + 0.25}.get(kind, np.array(surface.grass))
     patches, fine = fbm(rng, shape, 4.0 / pixel, 10), fbm(rng, shape, 2.5 / pixel, 1.5, 0.8)
-    image = tinted((float(base[0]), float(base[1]), float(base[2])), fine, 0.17, patches)
+    image = tinted(base, fine, 0.17, patches)
     if kind in ("earth", "gravel"):
         blend(image, surface.grass, np.clip(fbm(rng, shape, 1.6 / pixel, 3.0) - 0.9, 0, 0.8))
         tones = np.stack([base * k for k in (0.6, 0.8, 1.2, 1.4)]).clip(0.04, 0.9).astype(np.float32)
@@ -246,15 +234,7 @@ def turf(rng: np.random.Generator, surface: SurfaceSpec, shape: tuple[int, int],
         speckle(rng, image, int(shape[0] * shape[1] * (0.004 if kind == "gravel" else 0.0012)), (0.8, 3.0), tones)
         return np.clip(image, 0.02, 1.0)
     blend(image, surface.earth, np.clip(fbm(rng, shape, 1.8 / pixel, 3.0) - 1.4 + 3.0 * surface.bare, 0, 0.8))
-    count = int(shape[0] * shape[1] * 0.02)
-    starts = np.stack([rng.uniform(0, shape[1], count), rng.uniform(0, shape[0], count)], -1)
-    ends = starts + rng.normal(0, 4.0, (count, 2))
-    brightness = rng.uniform(0.55, 1.65, count)
-    straw = np.array([0.62, 0.55, 0.30])
-    dry = rng.random(count) < (0.3 if kind == "meadow" else 0.04)
-    colors = np.where(dry[:, None], straw, green) * brightness[:, None]
-    for a, b, color in zip(starts.astype(int).tolist(), ends.astype(int).tolist(), colors.tolist(), strict=True):
-        cv2.line(image, a, b, color, 1)
+    add_blades(rng, image, surface.grass, dry=0.3 if kind == "meadow" else 0.04)
     spots = np.array([[0.6, 0.45, 0.18], [0.45, 0.27, 0.1], [0.5, 0.5, 0.47], [0.72, 0.66, 0.2]], np.float32)
     if kind == "meadow":
         flower = rng.choice(np.array([[0.85, 0.8, 0.2], [0.9, 0.9, 0.88], [0.7, 0.2, 0.3], [0.5, 0.4, 0.75]]), 2)
@@ -320,7 +300,7 @@ def wall(rng: np.random.Generator, kind: str, color: Rgb, shape: tuple[int, int]
         image = textures.plaster(rng, shape, pixel, color)
     else:
         image = tinted(color, fbm(rng, shape, 2.0 / pixel, 2.0), 0.07, 0.4 * fbm(rng, shape, 2.0 / pixel, 8))
-        dark = (0.4 * color[0], 0.4 * color[1], 0.4 * color[2])
+        dark = 0.4 * np.array(color)
         if kind == "boards":
             unit = (0.18, 40.0) if rng.random() < 0.6 else (40.0, 0.16)  # horizontal or vertical boards
             _slab_field(rng, image, unit, pixel, 0.09, dark, 0.03)
@@ -342,12 +322,11 @@ def wall(rng: np.random.Generator, kind: str, color: Rgb, shape: tuple[int, int]
 def roof(rng: np.random.Generator, houses: HousesSpec, color: Rgb, shape: tuple[int, int], pixel: float) -> Array32:
     """A roof: rows from ridge to eaves."""
     image = tinted(color, fbm(rng, shape, 3.0 / pixel, 2.0), 0.10, 0.6 * fbm(rng, shape, 2.0 / pixel, 8))
-    dark = (0.45 * color[0], 0.45 * color[1], 0.45 * color[2])
     if "sheet" in houses.walls:
         ribs = np.arange(shape[1]) * pixel % 0.5 < 0.06
         image *= np.where(ribs, 0.7, 1.0)[None, :, None].astype(np.float32)
     else:
-        _slab_field(rng, image, (0.33, 0.24), pixel, 0.10, dark, 0.05, 2)
+        _slab_field(rng, image, (0.33, 0.24), pixel, 0.10, 0.45 * np.array(color), 0.05, 2)
     blend(image, (0.28, 0.30, 0.18), np.clip(fbm(rng, shape, 40, 3.0) - 1.2, 0, 0.7))
     return np.clip(image, 0.02, 1.0)
 
@@ -373,41 +352,31 @@ def _atlas_image(spec: PlaceSpec) -> NDArray[np.uint8]:
     rng = stream(spec.number, "furniture", 3)
 
     def near(color: Rgb, spread: float = 0.25) -> Rgb:
-        red, green, blue = np.clip(np.array(color) * rng.uniform(1 - spread, 1 + spread, 3), 0.03, 0.9).tolist()
-        return red, green, blue
+        return rgb(np.clip(np.array(color) * rng.uniform(1 - spread, 1 + spread, 3), 0.03, 0.9))
 
-    defaults = AtlasColors()
-    metals = {name: near(color) for name, color in defaults.metals.items()}
+    metals = {name: near(color) for name, color in AtlasColors().metals.items()}
     metals |= {f"paint{k}": c for k, c in enumerate((spec.furniture.car_colors * 6)[:6])}
-    left, right = spec.boundaries
     metals |= {"cabinet": near((0.5, 0.53, 0.5), 0.3), "stone": near((0.45, 0.44, 0.42), 0.2)}
     woods = {"planks": near((0.50, 0.37, 0.24)), "crate": near((0.52, 0.40, 0.27)), "pole": near((0.33, 0.26, 0.2))}
     woods["shutter"] = near((0.3, 0.34, 0.3), 0.8)
-
     masonry = {"chimney": near((0.45, 0.3, 0.25), 0.3)}
-
-    def surface(boundary: BoundarySpec, name: str) -> None:
+    for side, boundary in zip(("left", "right"), spec.boundaries, strict=True):
         material = {"wall": masonry, "mesh": metals, "bollards": metals}.get(boundary.kind, woods)
-        material[name] = boundary.color
-
-    surface(left, "boundary_left")
-    surface(right, "boundary_right")
+        material[f"boundary_{side}"] = boundary.color
     plates = [((0.93, 0.92, 0.88), f"{chr(65 + int(rng.integers(26)))}X {int(rng.integers(100, 999))}") for _ in "12"]
     signs = [
         (_SIGN_GROUNDS[int(rng.integers(len(_SIGN_GROUNDS)))], _WORDS[int(rng.integers(len(_WORDS)))]) for _ in range(6)
     ]
-    color = spec.lamps.color
     trees = spec.trees
-    dark = trees.greens[0]
     colors = AtlasColors(
         metals=metals,
         woods=woods,
         masonry=masonry,
         doors=(near((0.6, 0.42, 0.3), 0.5), near((0.4, 0.5, 0.5), 0.6)),
         greens=trees.greens,
-        hedge=(0.45 * dark[0], 0.45 * dark[1], 0.45 * dark[2]),
+        hedge=rgb(0.45 * np.array(trees.greens[0])),
         barks=(trees.bark, near(trees.bark), near(trees.bark)),
-        lamp=(0.4 + 0.6 * color[0], 0.4 + 0.6 * color[1], 0.4 + 0.6 * color[2]),
+        lamp=rgb(0.4 + 0.6 * np.array(spec.lamps.color)),
         signs=(*signs, *plates),
         window=spec.houses.window,
         frames=np.array([spec.houses.trim]),
@@ -437,7 +406,8 @@ def _paint_side_road(spec: PlaceSpec, k: int, one: SideRoad) -> dict[str, NDArra
     def rng(key: int) -> np.random.Generator:
         return stream(spec.number, "side_roads", k, 10, key)
 
-    half, (before, length) = 0.5 * one.mouth.width, texture_sizes(section, one)
+    begin = section.verge_edge(one.mouth.side)
+    half, before, length = 0.5 * one.mouth.width, begin - section.kerb_edge(one.mouth.side), one.length - begin
     across = replace(section, left=half, right=half)
     out = {
         one.name: road(rng(0), surface, across, length, _ROAD_PIXEL),

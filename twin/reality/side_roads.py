@@ -31,43 +31,78 @@ _STEP = 0.5  # [m] spacing of the vertices along a side road
 _LIFT = 0.01  # [m] height of the surface above the ground
 
 
-class SideAxis:
-    """The axis of a side road."""
+def smooth(share: Array) -> Array:
+    """A smooth step: 0 up to a share of 0, 1 from a share of 1 on."""
+    share = np.clip(share, 0.0, 1.0)
+    return share * share * (3.0 - 2.0 * share)
 
-    def __init__(self, road: DrivenLine, one: SideRoad) -> None:
-        self._road = road
+
+class SideAxis:
+    """The axis of a side road, and the ground that the side road takes up."""
+
+    def __init__(self, road: DrivenLine, section: SectionSpec, one: SideRoad) -> None:
+        """`section` is that of the driven road."""
+        self._road, self.section, self.one = road, section, one
         self.length = one.length
+        self.edge = 0.5 * one.mouth.width + section.kerb_width
+        """Distance of the curbs' outer edges from the axis [m]."""
+        self.surface_start = section.kerb_edge(one.mouth.side)
+        """Station where the surface begins [m]: at the curb of the driven road."""
+        self.verge_start = section.verge_edge(one.mouth.side)
+        """Station where the verge of the driven road ends [m]; there, the side road's verges begin."""
         self._origin = road.at(one.mouth.station)
         self._yaw = float(road.heading(one.mouth.station)) + one.mouth.side * 0.5 * np.pi
         ahead = np.array([np.cos(self._yaw), np.sin(self._yaw)])
         self._axes = np.stack([ahead, [-ahead[1], ahead[0]]])
 
     def heading(self, station: ArrayLike) -> Array:
-        """See `DrivenLine`."""
         return np.full(np.shape(station), self._yaw)
 
     def at(self, station: ArrayLike, lateral: ArrayLike = 0.0) -> Array:
-        """See `DrivenLine`."""
         return self._origin + np.stack(np.broadcast_arrays(station, lateral), -1) @ self._axes
 
     def project(self, xy: ArrayLike) -> tuple[Array, Array]:
-        """See `DrivenLine`."""
         off = (np.asarray(xy, float) - self._origin) @ self._axes.T
         return off[..., 0], off[..., 1]
 
     def ground_height(self, xy: ArrayLike) -> Array:
-        """See `DrivenLine`."""
         return self._road.ground_height(xy)
+
+    def verge_lift(self, xy: Array) -> Array:
+        """Height of the verges above the land [m] at points (..., 2), shape (...); 0 on the side road's surface."""
+        station, lateral = self.project(xy)
+        away = np.abs(lateral)
+        along = smooth((station - self.verge_start) / _RISE) * (1.0 - smooth((station - self.length) / _RISE))
+        across = (away > 0.5 * self.one.mouth.width) * (1.0 - smooth((away - (self.edge + SIDE_VERGE)) / _RISE))
+        return self.section.kerb_height * along * across
+
+    def occupied(self, xy: Array, margin: float) -> NDArray[np.bool_]:
+        """True at points (..., 2) on the side road, its curbs, or up to a margin [m] beside them."""
+        station, lateral = self.project(xy)
+        return np.asarray((np.abs(lateral) < self.edge + margin) & (station > 0.0) & (station < self.length))
+
+    def depth_below(self, xy: Array, margin: float) -> Array:
+        """Depth of the land's mesh below the side road and its verges [m] at points (..., 2), shape (...).
+
+        `margin` [m] is about the distance between the land's vertices.
+        """
+        station, lateral = self.project(xy)
+        away = np.abs(lateral) - (self.edge + SIDE_VERGE)
+        along = (station > self.verge_start - margin) & (station < self.length)
+        return np.where(along & (away < -margin), 0.5, np.where(along & (away < margin), 0.12, 0.0))
 
 
 class SideLine:
     """The line that the film of a side road follows."""
 
-    def __init__(self, road: DrivenLine, one: SideRoad) -> None:
-        self._road, self._axis = road, SideAxis(road, one)
+    def __init__(self, road: DrivenLine, axis: SideAxis) -> None:
+        self.one = one = axis.one
+        self._road, self._axis = road, axis
         self._side, self._radius = float(one.mouth.side), one.radius
         self._turn = one.mouth.station - one.radius  # station of the driven line where the turn begins
         self._bend = 0.5 * np.pi * one.radius
+        self.turn_end = LEAD + self._bend
+        """Station where the turn ends [m]."""
         self.length = LEAD + self._bend + one.driven - one.radius
         self._yaw = float(road.heading(one.mouth.station))
         self._ahead = np.array([np.cos(self._yaw), np.sin(self._yaw)])
@@ -75,13 +110,11 @@ class SideLine:
         self._center = road.at(one.mouth.station) + one.radius * (self._side * self._left - self._ahead)
 
     def heading(self, station: ArrayLike) -> Array:
-        """See `DrivenLine`."""
         s = np.asarray(station, float) - LEAD
         turned = self._yaw + self._side * np.clip(s, 0.0, self._bend) / self._radius
         return np.where(s < 0.0, self._road.heading(self._turn + np.minimum(s, 0.0)), turned)
 
     def at(self, station: ArrayLike, lateral: ArrayLike = 0.0) -> Array:
-        """See `DrivenLine`."""
         s, lateral = np.broadcast_arrays(np.asarray(station, float) - LEAD, np.asarray(lateral, float))
         angle = np.clip(s, 0.0, self._bend) / self._radius
         radius = (self._radius - self._side * lateral)[..., None]
@@ -92,7 +125,6 @@ class SideLine:
         return np.where((s > self._bend)[..., None], self._axis.at(s - self._bend + self._radius, lateral), out)
 
     def project(self, xy: ArrayLike) -> tuple[Array, Array]:
-        """See `DrivenLine`."""
         xy = np.asarray(xy, float)
         along, off = self._road.project(xy)
         from_turn = np.minimum(along - self._turn, 0.0)
@@ -110,13 +142,7 @@ class SideLine:
         return station + LEAD, np.where(bent, aside, lateral)
 
     def ground_height(self, xy: ArrayLike) -> Array:
-        """See `DrivenLine`."""
         return self._road.ground_height(xy)
-
-
-def turn_end(one: SideRoad) -> float:
-    """Station of a side line where the turn ends [m]."""
-    return LEAD + 0.5 * np.pi * one.radius
 
 
 # ---- which mouths have one
@@ -129,19 +155,21 @@ def with_side_roads(line: LineSpec, section: SectionSpec, road: DrivenLine, star
     road, which extends from station `start` to `end` [m], and from other side roads, filmed or not.
     """
     others = road.at(np.arange(start, end, 1.0))
-    short = {mouth: _short_axis(road, section, mouth) for mouth in line.mouths}
+    short = {}  # points (n, 2) [m] on the side roads that are not filmed
+    for mouth in line.mouths:
+        reach = section.kerb_edge(mouth.side) + np.arange(0.0, MOUTH_REACH, 0.5)
+        short[mouth] = road.at(np.full_like(reach, mouth.station), mouth.side * reach)
     found: list[tuple[Mouth, SideRoad]] = []
     taken: list[Array] = []
     for mouth in sorted(line.mouths, key=lambda one: one.station):
         wide = replace(mouth, width=max(mouth.width, _MIN_WIDTH))
-        edge = section.left if mouth.side > 0 else section.right
-        radius = min(0.5 * wide.width, edge) + _SWING
+        radius = min(0.5 * wide.width, section.edge(mouth.side)) + _SWING
         if mouth.station - radius - LEAD < 0.0:
             continue
-        kerb = edge + section.kerb_width
+        kerb = section.kerb_edge(mouth.side)
         whole = SideRoad(f"side_{len(found) + 1}", wide, radius, 0.0, kerb + _DRIVEN + _BEYOND)
         out = np.arange(kerb, whole.length + 0.1, 0.5)
-        axis = SideAxis(road, whole).at(out)
+        axis = SideAxis(road, section, whole).at(out)
         free = np.linalg.norm(axis[:, None] - others, axis=-1).min(1) > np.minimum(_NEAR_MOUTH * out, _ROOM)
         half = 0.5 * wide.width + section.kerb_width + SIDE_VERGE
         for other, points in short.items():
@@ -162,79 +190,26 @@ def with_side_roads(line: LineSpec, section: SectionSpec, road: DrivenLine, star
     )
 
 
-def _short_axis(road: DrivenLine, section: SectionSpec, mouth: Mouth) -> Array:
-    """Points (n, 2) [m] of a side road that is not filmed."""
-    out = surface_start(section, mouth) + np.arange(0.0, MOUTH_REACH, 0.5)
-    return road.at(np.full_like(out, mouth.station), mouth.side * out)
+# ---- meshes
 
 
-# ---- ground
-
-
-def _smooth(share: Array) -> Array:
-    share = np.clip(share, 0.0, 1.0)
-    return share * share * (3.0 - 2.0 * share)
-
-
-def begin_of_verges(section: SectionSpec, one: SideRoad) -> float:
-    """Station of the axis where the verge of the driven road ends [m]; there, the side road's verges begin."""
-    return surface_start(section, one.mouth) + section.sides[0 if one.mouth.side > 0 else 1].width
-
-
-def _outer(section: SectionSpec, one: SideRoad) -> float:
-    """Distance of the verges' outer edges from the axis [m]."""
-    return 0.5 * one.mouth.width + section.kerb_width + SIDE_VERGE
-
-
-def verge_lift(section: SectionSpec, one: SideRoad, station: Array, lateral: Array) -> Array:
-    """Height of a side road's verges above the land [m], for stations and laterals of its axis; 0 on its surface."""
-    away = np.abs(lateral)
-    along = _smooth((station - begin_of_verges(section, one)) / _RISE) * (1.0 - _smooth((station - one.length) / _RISE))
-    across = (away > 0.5 * one.mouth.width) * (1.0 - _smooth((away - _outer(section, one)) / _RISE))
-    return section.kerb_height * along * across
-
-
-def occupied(section: SectionSpec, one: SideRoad, station: Array, lateral: Array, margin: float) -> NDArray[np.bool_]:
-    """True where a side road is, with its curbs and a margin [m]; arguments as for `verge_lift`."""
-    wide = 0.5 * one.mouth.width + section.kerb_width + margin
-    return np.asarray((np.abs(lateral) < wide) & (station > 0.0) & (station < one.length))
-
-
-def depth_below(section: SectionSpec, one: SideRoad, station: Array, lateral: Array, margin: float) -> Array:
-    """Depth of the land's mesh below a side road and its verges [m], as for `verge_lift`.
-
-    `margin` [m] is about the distance between the land's vertices.
-    """
-    away = np.abs(lateral) - _outer(section, one)
-    along = (station > begin_of_verges(section, one) - margin) & (station < one.length)
-    return np.where(along & (away < -margin), 0.5, np.where(along & (away < margin), 0.12, 0.0))
-
-
-def surface_start(section: SectionSpec, mouth: Mouth) -> float:
-    """Station of the axis where a side road's surface begins [m]: at the curb of the driven road."""
-    return (section.left if mouth.side > 0 else section.right) + section.kerb_width
-
-
-def add_side_road(place: KnownPlace, section: SectionSpec, axis: SideAxis, one: SideRoad) -> None:
+def add_side_road(place: KnownPlace, axis: SideAxis) -> None:
     """Adds surface, curbs and verges of a side road; their textures are `<name>`, `<name>_kerb`, `<name>_verge`."""
+    one, section = axis.one, axis.section
     half, kerb = 0.5 * one.mouth.width, section.kerb_width
 
     def strip(name: str, texture: str, first: float, laterals: Array, last: float, lift: float = 0.0) -> None:
         """Adds a strip of the ground between two stations, with vertices at `laterals` [m], left first."""
         stations = np.linspace(first, last, max(2, round((last - first) / _STEP) + 1))
         xy = axis.at(stations[None], laterals[:, None])
-        points = np.concatenate([xy, axis.ground_height(xy)[..., None] + lift], -1)
-        place.objects.append(PlaceObject(name, "ground", primitives.grid(points, uv(stations, laterals)), texture))
+        part = primitives.grid(
+            xy, axis.ground_height(xy) + lift, primitives.share(stations)[None], primitives.share(laterals)[:, None]
+        )
+        place.objects.append(PlaceObject(name, "ground", part, texture))
 
-    def uv(stations: Array, laterals: Array) -> Array:
-        u = (stations - stations[0]) / (stations[-1] - stations[0])
-        v = (laterals[0] - laterals) / (laterals[0] - laterals[-1])
-        return np.stack(np.broadcast_arrays(u[None], v[:, None]), -1)
-
-    begin, inner = begin_of_verges(section, one), 1e-6
+    begin, inner = axis.verge_start, 1e-6
     # Between the verges of the driven road, the surface is wider, as the verges' gap ends at a vertex.
-    first = surface_start(section, one.mouth)
-    strip(f"{one.name}_mouth", f"{one.name}_mouth", first, _across(half + _STEP), begin, _LIFT)
+    strip(f"{one.name}_mouth", f"{one.name}_mouth", axis.surface_start, _across(half + _STEP), begin, _LIFT)
     strip(one.name, one.name, begin, _across(half - inner), one.length, _LIFT)
     for sign, side in ((1, "left"), (-1, "right")):
         outer = sign * np.linspace(half + kerb + inner, half + kerb + SIDE_VERGE, 5)
@@ -247,17 +222,11 @@ def add_side_road(place: KnownPlace, section: SectionSpec, axis: SideAxis, one: 
         z = axis.ground_height(xy)
         z[1] = z[2] - 0.15 * (z[2] - z[0])
         z[0] -= 0.02
-        order = slice(None, None, -1) if sign > 0 else slice(None)
-        points = np.concatenate([xy, z[..., None]], -1)[order]
-        part = primitives.grid(points, uv(stations, profile)[order])
+        part = primitives.grid(
+            xy[::-sign], z[::-sign], primitives.share(stations)[None], primitives.share(profile)[::-sign, None]
+        )
         place.objects.append(PlaceObject(f"{one.name}_kerb_{side}", "ground", part, f"{one.name}_kerb"))
 
 
 def _across(half: float) -> Array:
     return np.linspace(half, -half, 9)
-
-
-def texture_sizes(section: SectionSpec, one: SideRoad) -> tuple[float, float]:
-    """Length of a side road between the verges of the driven road, and beyond them [m]."""
-    begin = begin_of_verges(section, one)
-    return begin - surface_start(section, one.mouth), one.length - begin

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from twin.reality import SEED
 from twin.reality.lighting import Lighting
-from twin.reality.place_spec import HorizonSpec, PlaceSpec, stream
+from twin.reality.place_spec import HorizonSpec, PlaceSpec, rgb, stream
 from twin.reality.textures import fbm
 from twin.types import Array
 
@@ -67,8 +67,7 @@ def sky_cube_map(
 
 def place_sky(spec: PlaceSpec, lighting: Lighting) -> NDArray[np.uint8]:
     """The cube map of the sky of a place under a lighting."""
-    red, green, blue = (a * b for a, b in zip(lighting.skyline, spec.horizon.tint, strict=True))
-    tinted = replace(lighting, skyline=(red, green, blue))
+    tinted = replace(lighting, skyline=rgb(np.multiply(lighting.skyline, spec.horizon.tint)))
     seed = SEED + 1000 * spec.number
     return sky_cube_map(tinted, seed, skyline=skyline(spec.horizon, stream(spec.number, "horizon", 1)))
 

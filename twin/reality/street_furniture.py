@@ -297,8 +297,8 @@ def add_stone(place: KnownPlace, k: int, station: float, lateral: float, radius:
     swell[0] = swell[0, 0]
     points = np.stack([np.cos(rise) * np.cos(angle), np.cos(rise) * np.sin(angle), 0.75 * np.sin(rise)], -1)
     points = foot + radius * swell[..., None] * points
-    uv = np.stack([angle / (2 * np.pi), 0.5 - rise / np.pi], -1)
-    part = place.cell("stone", primitives.grid(points, uv))
+    mesh = primitives.grid(points[..., :2], points[..., 2], angle / (2 * np.pi), 0.5 - rise / np.pi)
+    part = place.cell("stone", mesh)
     solid = Solid("cylinder", foot + up(0.3 * radius), (0.85 * radius, 0.35 * radius, 0.0))
     place.objects.append(PlaceObject(f"stone_{k}", "obstacle", part, "atlas", (solid,)))
 
@@ -306,12 +306,8 @@ def add_stone(place: KnownPlace, k: int, station: float, lateral: float, radius:
 # ---- boundaries
 
 BAY = 2.0  # [m] length of a piece
-_THICK = {"wall": 0.26, "hedge": 0.7, "picket": 0.06, "boards": 0.06, "rails": 0.09, "mesh": 0.06, "bollards": 0.2}
-
-
-def thickness(kind: str) -> float:
-    """Thickness of a boundary [m]."""
-    return _THICK[kind]
+THICKNESS = {"wall": 0.26, "hedge": 0.7, "picket": 0.06, "boards": 0.06, "rails": 0.09, "mesh": 0.06, "bollards": 0.2}
+"""Thickness of a boundary by its kind [m]."""
 
 
 def add_boundary(place: KnownPlace, name: str, spec: BoundarySpec, skin: str, stations: Array, lateral: float) -> None:
@@ -340,7 +336,7 @@ def add_boundary(place: KnownPlace, name: str, spec: BoundarySpec, skin: str, st
         bay.vertices[:, 2] += (bay.vertices[:, 0] / length + 0.5) * off[2]
         middle = 0.5 * (ends[0] + ends[1])
         parts.append(bay.moved(np.append(middle[:2], ends[0][2]), yaw))
-        half = (length / 2, thickness(spec.kind) / 2, spec.height / 2 + 0.1)
+        half = (length / 2, THICKNESS[spec.kind] / 2, spec.height / 2 + 0.1)
         solids.append(Solid("box", middle + up(spec.height / 2), half, yaw))
     place.objects.append(PlaceObject(name, "obstacle", primitives.join(parts), "atlas", tuple(solids)))
 

@@ -10,11 +10,14 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from twin.reality.place_objects import ATLAS_CELL
+from twin.reality.place_objects import ATLAS_CELL, atlas_shape
+from twin.reality.place_spec import Rgb
 from twin.types import Array32
 
+ARROW = ((-1.6, -0.08), (0.4, -0.08), (0.4, -0.3), (1.3, 0.0), (0.4, 0.3), (0.4, 0.08), (-1.6, 0.08))
+"""Outline of an arrow on the road: along and across it [m]."""
 CHIPS = np.array([[0.55, 0.54, 0.52], [0.22, 0.22, 0.22], [0.47, 0.43, 0.39], [0.17, 0.17, 0.18]], np.float32)
 """Colors of the stones in asphalt and concrete."""
 
@@ -33,13 +36,13 @@ def fbm(rng: np.random.Generator, shape: tuple[int, int], coarsest: float, fines
     return (out - out.mean()) / out.std()
 
 
-def blend(image: NDArray, color: tuple[float, float, float], weight: NDArray) -> None:
+def blend(image: NDArray, color: ArrayLike, weight: NDArray) -> None:
     """Blends a color into an image, in place; `weight` in [0, 1], shape (rows, columns)."""
     w = weight[..., None].astype(np.float32)
     image += w * (np.asarray(color, np.float32) - image)
 
 
-def tinted(base: tuple[float, float, float], noise: NDArray, contrast: float, tint: NDArray | None = None) -> Array32:
+def tinted(base: ArrayLike, noise: NDArray, contrast: float, tint: NDArray | None = None) -> Array32:
     """A color modulated by noise with zero mean; positive values of `tint` shift it to warm, negative ones to cold."""
     image = np.asarray(base, np.float32) * (1.0 + contrast * noise[..., None].astype(np.float32))
     if tint is not None:
@@ -97,7 +100,7 @@ def add_cracks(
     image: NDArray,
     count: int,
     widths: tuple[float, float],
-    color: tuple[float, float, float],
+    color: Rgb,
     weight: float,
 ) -> None:
     """Draws cracks along and across a road into its image, in place; `widths` is their range [px]."""
@@ -110,7 +113,7 @@ def add_cracks(
     blend(image, color, weight * cv2.GaussianBlur(mask, (3, 3), 0.6))
 
 
-def add_patch(rng: np.random.Generator, part: NDArray, tone: tuple[float, float, float]) -> None:
+def add_patch(rng: np.random.Generator, part: NDArray, tone: ArrayLike) -> None:
     """Turns a part of a road's image into a repaired patch of another tone with a tarred seam, in place."""
     rows, columns = part.shape[:2]
     fresh = tinted(tone, fbm(rng, (rows, columns), 30, 2.0), 0.14)
@@ -120,6 +123,16 @@ def add_patch(rng: np.random.Generator, part: NDArray, tone: tuple[float, float,
     cv2.rectangle(seam, (1, 1), (columns - 2, rows - 2), 1.0, int(rng.integers(2, 4)))
     worn = np.clip(0.6 + 0.4 * fbm(rng, seam.shape, 40, 3.0), 0.0, 0.9)
     blend(part, (0.12, 0.12, 0.125), seam * worn)
+
+
+def add_stain(image: Array32, center: tuple[float, float], radius: float) -> None:
+    """Darkens a round spot, in place; center (column, row) and radius [px]."""
+    rows, columns = image.shape[:2]
+    r0, r1 = max(0, int(center[1] - radius)), min(rows, int(center[1] + radius) + 1)
+    c0, c1 = max(0, int(center[0] - radius)), min(columns, int(center[0] + radius) + 1)
+    rr, cc = np.mgrid[r0:r1, c0:c1]
+    blob = np.clip(1.6 - np.hypot(rr - center[1], cc - center[0]) / (0.6 * radius), 0, 1)
+    blend(image[r0:r1, c0:c1], (0.12, 0.12, 0.13), 0.6 * blob)
 
 
 def road(rng: np.random.Generator, length: float, half_width: float, pixel: float) -> Array32:
@@ -151,15 +164,7 @@ def road(rng: np.random.Generator, length: float, half_width: float, pixel: floa
         add_patch(rng, image[r0:r1, c0:c1], (level, level, level * 1.02))
     add_cracks(rng, image, int(length * 1.1), (1.0, 3.0), (0.08, 0.08, 0.085), 0.85)
     for _ in range(int(length / 1.8)):  # drips of oil, spilt water, chewing gum
-        center = [int(rng.uniform(0, columns)), int(rng.uniform(0, rows))]
-        size = int(rng.uniform(3, 26))
-        r = slice(max(0, center[1] - size), center[1] + size)
-        c = slice(max(0, center[0] - size), center[0] + size)
-        rr, cc = np.mgrid[r.start : min(rows, r.stop), c.start : min(columns, c.stop)]
-        if rr.size == 0:
-            continue
-        blob = np.clip(1.6 - np.hypot(rr - center[1], cc - center[0]) / (0.6 * size), 0, 1)
-        blend(image[rr[0, 0] : rr[-1, 0] + 1, cc[0, 0] : cc[0, -1] + 1], (0.12, 0.12, 0.13), 0.6 * blob)
+        add_stain(image, (int(rng.uniform(0, columns)), int(rng.uniform(0, rows))), int(rng.uniform(3, 26)))
     _markings(rng, image, lateral, pixel)
     for station in np.arange(4.0, length, 11.0):  # manholes and storm drains
         station += rng.uniform(-3, 3)
@@ -181,8 +186,7 @@ def _markings(rng: np.random.Generator, image: Array32, lateral: NDArray, pixel:
         c = station / pixel
         middle = (3.0 - (1.4 if left else -1.4)) / pixel
         sign = -1.0 if left else 1.0
-        shaft = [(-1.6, -0.08), (0.4, -0.08), (0.4, -0.3), (1.3, 0.0), (0.4, 0.3), (0.4, 0.08), (-1.6, 0.08)]
-        outline = np.array([[c + sign * a / pixel, middle + b / pixel] for a, b in shaft], np.int32)
+        outline = np.array([[c + sign * a / pixel, middle + b / pixel] for a, b in ARROW], np.int32)
         mask = np.zeros((rows, columns), np.float32)
         cv2.fillPoly(mask, [outline], 1.0)
         blend(image, (0.80, 0.80, 0.76), worn * mask)
@@ -208,16 +212,27 @@ def gully(image: Array32, column: int, left: bool, pixel: float) -> None:
         image[r0 + 3 : r0 + across - 3, column + k : column + k + 4] = (0.05, 0.05, 0.05)
 
 
+def add_blades(rng: np.random.Generator, image: Array32, green: Rgb, dry: float = 0.0) -> None:
+    """Draws blades of grass into an image, in place; a fraction `dry` of them is straw."""
+    rows, columns = image.shape[:2]
+    count = int(rows * columns * 0.02)
+    starts = np.stack([rng.uniform(0, columns, count), rng.uniform(0, rows, count)], -1)
+    ends = starts + rng.normal(0, 4.0, (count, 2))
+    brightness = rng.uniform(0.55, 1.65, (count, 1))
+    colors = np.tile(green, (count, 1))
+    if dry:
+        colors[rng.random(count) < dry] = (0.62, 0.55, 0.30)
+    for a, b, color in zip(
+        starts.astype(int).tolist(), ends.astype(int).tolist(), (colors * brightness).tolist(), strict=True
+    ):
+        cv2.line(image, a, b, color, 1)
+
+
 def grass(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Array32:
     """Turf from above: patches, bare earth, blades, stones, fallen leaves; `pixel` [m]."""
     image = tinted((0.29, 0.38, 0.15), fbm(rng, shape, 2.5 / pixel, 1.5, 0.8), 0.17, fbm(rng, shape, 4.0 / pixel, 10))
     blend(image, (0.44, 0.36, 0.22), np.clip(fbm(rng, shape, 1.8 / pixel, 3.0) - 1.1, 0, 0.8))
-    count = int(shape[0] * shape[1] * 0.02)
-    starts = np.stack([rng.uniform(0, shape[1], count), rng.uniform(0, shape[0], count)], -1)
-    ends = starts + rng.normal(0, 4.0, (count, 2))
-    tones = rng.uniform(0.55, 1.65, count)
-    for a, b, tone in zip(starts.astype(int).tolist(), ends.astype(int).tolist(), tones, strict=True):
-        cv2.line(image, a, b, (0.29 * tone, 0.37 * tone, 0.14 * tone), 1)
+    add_blades(rng, image, (0.29, 0.37, 0.14))
     colors = np.array([[0.6, 0.45, 0.18], [0.45, 0.27, 0.1], [0.8, 0.8, 0.7], [0.5, 0.5, 0.47], [0.72, 0.66, 0.2]])
     speckle(rng, image, int(shape[0] * shape[1] * 0.0015), (1.0, 3.2), colors.astype(np.float32))
     return np.clip(image, 0.02, 1.0)
@@ -238,12 +253,7 @@ def slabs(rng: np.random.Generator, shape: tuple[int, int], pixel: float, slab: 
     return np.clip(image, 0.02, 1.0).astype(np.float32)
 
 
-def kerb(rng: np.random.Generator, shape: tuple[int, int], pixel: float) -> Array32:
-    """Curb stones 0.9 m long, with rows across the profile of the curb and columns along the curb."""
-    return slabs(rng, shape, pixel, (10.0, 0.9)) * np.float32(0.95)
-
-
-def bricks(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: tuple[float, float, float]) -> Array32:
+def bricks(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: Rgb) -> Array32:
     """Brickwork with bricks of random tones and stains from top to bottom."""
     image = slabs(rng, shape, pixel, (0.12, 0.36))
     gray = image.mean(-1, keepdims=True) / 0.5
@@ -253,9 +263,7 @@ def bricks(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base:
     return np.clip(tint * (1.0 + 0.10 * stains[..., None] - 0.06 * streaks[..., None]), 0.02, 1.0).astype(np.float32)
 
 
-def plaster(
-    rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: tuple[float, float, float]
-) -> Array32:
+def plaster(rng: np.random.Generator, shape: tuple[int, int], pixel: float, base: Rgb) -> Array32:
     """Plastered wall: blotches, drip streaks, cracks, a darker plinth."""
     image = tinted(base, fbm(rng, shape, 3.0 / pixel, 1.5), 0.06, 0.5 * fbm(rng, shape, 2.0 / pixel, 8))
     streaks = np.clip(fbm(rng, (1, shape[1]), 24, 2.0), 0, 3) * np.linspace(1.0, 0.1, shape[0])[:, None]
@@ -285,10 +293,9 @@ WINDOW_BARS: dict[str, tuple[tuple[slice, ...], ...]] = {
     "shutters": (np.s_[:, 34:38], np.s_[30:33, :], np.s_[62:65, :]),
 }
 """Glazing bars by style of window, within 96 rows and 72 columns."""
-_FRAMES = np.array([[0.86, 0.86, 0.84], [0.32, 0.22, 0.15], [0.25, 0.3, 0.27]])
 
 
-def window(rng: np.random.Generator, lit: bool, style: str = "cross", frames: NDArray[np.float64] = _FRAMES) -> Array32:
+def window(rng: np.random.Generator, lit: bool, style: str, frames: NDArray[np.float64]) -> Array32:
     """A window of 96 × 72 px: frame, glazing bars, and sky, curtains or a lit room behind the glass.
 
     `frames` are the colors of frames to choose from, shape (n, 3).
@@ -320,9 +327,7 @@ def window(rng: np.random.Generator, lit: bool, style: str = "cross", frames: ND
     return np.clip(image, 0.02, 1.0)
 
 
-def bark(
-    rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float] = (0.34, 0.27, 0.20)
-) -> Array32:
+def bark(rng: np.random.Generator, shape: tuple[int, int], base: Rgb) -> Array32:
     """Bark: long vertical furrows, lichen."""
     grain = fbm(rng, (shape[0] // 4, shape[1]), 24, 1.0, 0.85)
     grain = cv2.resize(grain, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
@@ -331,16 +336,14 @@ def bark(
     return np.clip(image, 0.03, 1.0)
 
 
-def leaf(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Array32:
+def leaf(rng: np.random.Generator, shape: tuple[int, int], base: Rgb) -> Array32:
     """Leaf tones from dark (left) to light (right); `primitives.leaves` assigns each leaf a window of this texture."""
     image = tinted(base, fbm(rng, shape, 60, 1.0, 0.85), 0.20, 0.8 * fbm(rng, shape, 30, 6))
     image *= np.linspace(0.35, 1.35, shape[1], dtype=np.float32)[None, :, None]
     return np.clip(image, 0.03, 1.0)
 
 
-def wood(
-    rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float] = (0.50, 0.37, 0.24)
-) -> Array32:
+def wood(rng: np.random.Generator, shape: tuple[int, int], base: Rgb) -> Array32:
     """Weathered planks with the grain along the columns."""
     grain = cv2.resize(fbm(rng, (shape[0], shape[1] // 8), 12, 1.0), shape[::-1], interpolation=cv2.INTER_LINEAR)
     image = tinted(base, grain, 0.17)
@@ -349,7 +352,7 @@ def wood(
     return np.clip(image, 0.03, 1.0)
 
 
-def metal(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, float, float]) -> Array32:
+def metal(rng: np.random.Generator, shape: tuple[int, int], base: Rgb) -> Array32:
     """Painted or galvanized metal: scratches, rust, stickers."""
     image = tinted(base, fbm(rng, shape, 40, 1.5), 0.11)
     blend(image, (0.36, 0.2, 0.1), np.clip(fbm(rng, shape, 30, 1.5) - 1.5, 0, 0.8))
@@ -363,7 +366,7 @@ def metal(rng: np.random.Generator, shape: tuple[int, int], base: tuple[float, f
     return np.clip(image, 0.03, 1.0)
 
 
-def notice(rng: np.random.Generator, shape: tuple[int, int], ground: tuple[float, float, float], word: str) -> Array32:
+def notice(rng: np.random.Generator, shape: tuple[int, int], ground: Rgb, word: str) -> Array32:
     """A sign or poster: border, a word, lines of small print, dots."""
     rows, columns = shape
     image = np.empty((rows, columns, 3), np.uint8)
@@ -393,22 +396,14 @@ def stripes(
     return np.clip(image * (1.0 + 0.12 * fbm(rng, shape, 40, 1.5)[..., None]), 0.03, 1.0)
 
 
-def resized(image: Array32, shape: tuple[int, int], smooth: bool = True) -> Array32:
-    """The image scaled to (rows, columns), with cubic (`smooth`) or linear interpolation."""
-    how = cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR
-    return cv2.resize(image, shape[::-1], interpolation=how).astype(np.float32)
-
-
 # ---- atlas
-
-_Rgb = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class AtlasColors:
     """Colors and styles that differ between the atlases of places; the defaults are those of the campus road."""
 
-    metals: Mapping[str, _Rgb] = field(
+    metals: Mapping[str, Rgb] = field(
         default_factory=lambda: {
             "zinc": (0.55, 0.57, 0.58),
             "dark": (0.16, 0.17, 0.18),
@@ -421,16 +416,16 @@ class AtlasColors:
             "glass": (0.16, 0.2, 0.24),
         }
     )
-    woods: Mapping[str, _Rgb] = field(
+    woods: Mapping[str, Rgb] = field(
         default_factory=lambda: {"planks": (0.50, 0.37, 0.24), "crate": (0.50, 0.37, 0.24)}
     )
-    masonry: Mapping[str, _Rgb] = field(default_factory=dict)
-    doors: tuple[_Rgb, _Rgb] = ((0.50, 0.37, 0.24), (0.50, 0.37, 0.24))
-    greens: tuple[_Rgb, ...] = ((0.26, 0.37, 0.12), (0.33, 0.42, 0.13), (0.40, 0.40, 0.14), (0.22, 0.33, 0.14))
-    hedge: _Rgb = (0.10, 0.16, 0.06)
-    barks: tuple[_Rgb, ...] = ((0.34, 0.27, 0.20),) * 3
-    lamp: _Rgb = (1.0, 0.93, 0.76)
-    signs: tuple[tuple[_Rgb, str], ...] = (
+    masonry: Mapping[str, Rgb] = field(default_factory=dict)
+    doors: tuple[Rgb, Rgb] = ((0.50, 0.37, 0.24), (0.50, 0.37, 0.24))
+    greens: tuple[Rgb, ...] = ((0.26, 0.37, 0.12), (0.33, 0.42, 0.13), (0.40, 0.40, 0.14), (0.22, 0.33, 0.14))
+    hedge: Rgb = (0.10, 0.16, 0.06)
+    barks: tuple[Rgb, ...] = ((0.34, 0.27, 0.20),) * 3
+    lamp: Rgb = (1.0, 0.93, 0.76)
+    signs: tuple[tuple[Rgb, str], ...] = (
         *(((0.10, 0.22, 0.55), "LIBRARY"), ((0.85, 0.85, 0.82), "SLOW"), ((0.9, 0.75, 0.1), "WORKS")),
         *(((0.12, 0.4, 0.2), "HALL B"), ((0.75, 0.1, 0.1), "STOP"), ((0.92, 0.9, 0.85), "MAP")),
         *(((0.95, 0.95, 0.9), "KA 214"), ((0.93, 0.8, 0.2), "RX 730")),
@@ -445,13 +440,12 @@ def paint_atlas(
     rng: Callable[[int], np.random.Generator], names: tuple[str, ...], colors: AtlasColors
 ) -> NDArray[np.float32]:
     """The image of an atlas in [0, 1]; `rng(k)` is the random generator of cell k."""
-    rows = max(8, -(-len(names) // 8))
-    image = np.zeros((rows * ATLAS_CELL, 8 * ATLAS_CELL, 3), np.float32)
+    rows, columns = atlas_shape(names)
+    image = np.zeros((rows, ATLAS_CELL, columns, ATLAS_CELL, 3), np.float32)
     for k, name in enumerate(names):
-        row, column = divmod(k, 8)
-        tile = _cell(rng(k), name, colors)
-        image[row * ATLAS_CELL : (row + 1) * ATLAS_CELL, column * ATLAS_CELL : (column + 1) * ATLAS_CELL] = tile
-    return image
+        row, column = divmod(k, columns)
+        image[row, :, column] = _cell(rng(k), name, colors)
+    return image.reshape(rows * ATLAS_CELL, columns * ATLAS_CELL, 3)
 
 
 def _cell(rng: np.random.Generator, name: str, colors: AtlasColors) -> Array32 | NDArray[np.float32]:
@@ -480,4 +474,5 @@ def _cell(rng: np.random.Generator, name: str, colors: AtlasColors) -> Array32 |
         return np.full((*square, 3), colors.lamp, np.float32)
     if name.startswith("sign"):
         return notice(rng, square, *colors.signs[int(name[-1])])
-    return resized(window(rng, name.startswith("lit"), colors.window, colors.frames), square)
+    pane = window(rng, name.startswith("lit"), colors.window, colors.frames)
+    return cv2.resize(pane, square, interpolation=cv2.INTER_CUBIC).astype(np.float32)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twin.geometry.mesh_rays import Surface
 from twin.reality import lighting as lightings
-from twin.reality import primitives, textures
+from twin.reality import primitives
 from twin.reality.lighting import Lighting
 from twin.reality.place_objects import KnownPlace, up
 from twin.reality.place_spec import LONGEST_DRAWN
@@ -120,7 +120,7 @@ def _add_geom(body: mujoco.MjsBody, model: mujoco.MjSpec, name: str, part: MeshP
 
 def _darkened(image: NDArray[np.uint8], factor: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Multiplies a texture by a coarse map of factors in [0, 1]."""
-    fine = textures.resized(factor.astype(np.float32), image.shape[:2], smooth=False)
+    fine = cv2.resize(factor.astype(np.float32), image.shape[1::-1])
     return (image * np.clip(fine, 0.0, 1.0)[..., None]).astype(np.uint8)
 
 

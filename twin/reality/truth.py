@@ -154,8 +154,8 @@ class Truth:
         """The filmed lines by name, "" for the driven line: line, first station, filmed length [m]."""
         out: dict[str, tuple[DrivenLine, float, float]] = {"": (self.route, self.start, self.length)}
         if isinstance(self.route, SampledRoad):
-            sides = {one.name: one for one in self.route.line.side_roads}
-            out |= {name: (SideLine(self.route, sides[name]), 0.0, length) for name, length in self.side_roads.items()}
+            axes = {axis.one.name: axis for axis in self.route.side_axes}
+            out |= {name: (SideLine(self.route, axes[name]), 0.0, length) for name, length in self.side_roads.items()}
         return out
 
     def ground_height(self, xy: Array) -> Array:
@@ -196,6 +196,7 @@ _INTRUSION_HEIGHTS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.5)  # [m] heights above the g
 _RAYS = (96, 54)  # columns and rows of rays per camera that find the visible surface
 _MAX_CAMERAS = 48  # largest number of cameras whose rays find the visible surface
 _MAX_DEPTH = 20.0  # [m] pixels with a larger true depth are not compared
+_DEPTH_KEYS = ("depth_median_m", "depth_relative")
 _MESH_KEYS = (
     *("mesh_accuracy_median_m", "mesh_accuracy_mean_m", "mesh_completeness_mean_m"),
     *("mesh_completeness_5cm", "mesh_completeness_10cm", "mesh_chamfer_m"),
@@ -254,7 +255,9 @@ def measure(scene: SceneDir) -> dict[str, Any]:
     mesh = scene.stage("mesh")
     figures |= _ground_errors(mesh, truth, to_truth)
     figures |= _surface_errors(mesh, truth, to_truth, true_poses)
-    figures |= _depth_errors(scene.stage("field"), truth, to_truth)
+    field = scene.stage("field")
+    baked = (field / "baked.json").exists()
+    figures |= depth_errors(BakedField.load(field), truth, to_truth) if baked else dict.fromkeys(_DEPTH_KEYS)
     true = true_poses[:, :3, 3]
     off = np.linalg.norm(umeyama(cameras.positions, true).points(cameras.positions) - true, axis=1)
     by_source = {name: off[[s == name for s in cameras.sources]].tolist() for name in dict.fromkeys(cameras.sources)}
@@ -455,12 +458,6 @@ def visible_points(surface: Surface, viewpoints: Array, truth: Truth) -> Array:
     return points[np.sort(first)]
 
 
-def _depth_errors(folder: Path, truth: Truth, to_truth: Similarity) -> dict[str, float | None]:
-    if not (folder / "baked.json").exists():
-        return {"depth_median_m": None, "depth_relative": None}
-    return depth_errors(BakedField.load(folder), truth, to_truth)
-
-
 def depth_errors(
     field: "BakedField | RadianceField", truth: Truth, to_truth: Similarity, reach: float = _MAX_DEPTH
 ) -> dict[str, float | None]:
@@ -479,8 +476,6 @@ def depth_errors(
         errors.append(np.abs(depth - true_depth)[valid])
         relative.append(errors[-1] / true_depth[valid])
     if not errors:
-        return {"depth_median_m": None, "depth_relative": None}
-    return {
-        "depth_median_m": float(np.median(np.concatenate(errors))),
-        "depth_relative": float(np.median(np.concatenate(relative))),
-    }
+        return dict.fromkeys(_DEPTH_KEYS)
+    values = (float(np.median(np.concatenate(parts))) for parts in (errors, relative))
+    return dict(zip(_DEPTH_KEYS, values, strict=True))
