@@ -276,16 +276,12 @@ def _corrected_coverage(data: PairedCells) -> Estimate:
         groups = data.training[members]
         if len(members) - np.bincount(groups).max() < MIN_PREDICTORS:
             continue
-        try:
-            _, low, high = leave_one_group_out(twin=f, real=y, groups=groups.tolist())
-        except UndefinedStatistic:
-            continue
-        known = np.isfinite(low)
-        hits += list(within(low, y, high)[known])
+        _, low, high = leave_one_group_out(twin=f, real=y, groups=groups.tolist())
+        hits += list(within(low, y, high)[np.isfinite(low)])
     if not hits:
         few = f"each policy needs {MIN_PREDICTORS} policies of other trainings on its task, whose rates scatter"
         return Estimate(missing=few)
-    return Estimate(int(sum(hits)) / len(hits), n=len(hits), no_interval=DEPENDENT)
+    return Estimate(float(np.mean(hits)), n=len(hits), no_interval=DEPENDENT)
 
 
 def within(low: Array, value: Array, high: Array) -> NDArray[np.bool_]:
@@ -324,24 +320,19 @@ def _probabilities(data: PairedCells, real: Sequence[Cell], twin: Cells) -> dict
     if several:
         logs[SHUFFLED] = shuffled_days(probability, data.weight, data.real, log_score)
         briers[SHUFFLED] = shuffled_days(probability, data.weight, data.real, brier)
-    gains = {TWIN: Estimate(missing="compared with itself")}
-    for name in list(logs)[1:]:
-        pair = score_pair(data, logs[TWIN], logs[name])
-        gains[name] = _with_interval(float(mean_bias(**pair.rates())), SCORE_DIFFERENCE, pair, data.cells)
-    scores = tuple(
-        PredictorScore(
-            name,
-            Estimate(mean_score(data, briers[name]), n=data.cells),
-            Estimate(mean_score(data, logs[name]), n=data.cells),
-            gains[name],
-        )
-        for name in logs
-    )
+    scores = []
+    for name in logs:
+        gain = Estimate(missing="compared with itself")
+        if name != TWIN:
+            pair = score_pair(data, logs[TWIN], logs[name])
+            gain = _with_interval(float(mean_bias(**pair.rates())), SCORE_DIFFERENCE, pair, data.cells)
+        mean_brier, mean_log = (Estimate(mean_score(data, each[name]), n=data.cells) for each in (briers, logs))
+        scores.append(PredictorScore(name, mean_brier, mean_log, gain))
     used = data.weight > 0
     cells = [cell for row in policy_rows(real) for cell in row]  # in the order of the mask `used`
     trials = np.array([cell.trials for cell in cells])
     return {
-        "scores": scores,
+        "scores": tuple(scores),
         "calibration": calibration(probability[used], data.real[used], trials),
         "errors": errors_by_day(probability[used], data.real[used], [cell.lighting for cell in cells]),
     }
@@ -367,19 +358,15 @@ _GAPS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)  # edges of the bins of `OrderedPai
 
 def _ordered(data: PairedCells) -> tuple[OrderedPairs, ...]:
     rates = data.rates()
-    gaps: list[float] = []
-    right: list[float] = []
-    for members in data.strata:
-        f, y = rates["twin"][members], rates["real"][members]
-        for i, j in zip(*np.triu_indices(len(members), 1), strict=True):
-            if abs(y[i] - y[j]) > _ROUNDING:
-                gap = f[i] - f[j]
-                gaps.append(abs(float(gap)))
-                right.append(0.5 if abs(gap) < _ROUNDING else float((gap > 0) == (y[i] > y[j])))
-    index = np.clip(np.searchsorted(_GAPS, np.array(gaps) + _ROUNDING, "right") - 1, 0, len(_GAPS) - 2)
-    index[np.array(gaps) < _ROUNDING] = -1
+    i, j = np.concatenate([members[np.array(np.triu_indices(len(members), 1))] for members in data.strata], 1)
+    twin, real = (rates[name][i] - rates[name][j] for name in ("twin", "real"))
+    twin, real = (difference[np.abs(real) > _ROUNDING] for difference in (twin, real))
+    tied = np.abs(twin) < _ROUNDING
+    right = np.where(tied, 0.5, (twin > 0) == (real > 0))
+    index = np.clip(np.searchsorted(_GAPS, np.abs(twin) + _ROUNDING, "right") - 1, 0, len(_GAPS) - 2)
+    index[tied] = -1
     return tuple(
-        OrderedPairs(_GAPS[max(b, 0)], _GAPS[b + 1], int(of.sum()), float(np.array(right)[of].sum()))
+        OrderedPairs(_GAPS[max(b, 0)], _GAPS[b + 1], int(of.sum()), float(right[of].sum()))
         for b in range(-1, len(_GAPS) - 1)
         if (of := index == b).any()
     )
