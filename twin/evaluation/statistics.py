@@ -235,10 +235,10 @@ def prediction_powered_mean(
         raise UndefinedStatistic(f"{more} policies driven in the twin only; 2 are needed: validate further policies")
     powers = _left_out_powers(f, y, n / more) if power is None else np.full(n, power)
     mean_power = float(powers.mean())
-    value = mean_power * further.mean() + float((y - powers * f).mean())
+    value = float(mean_power * further.mean() + (y - powers * f).mean())
     error = np.var(y - powers * f, ddof=1) / n + mean_power**2 * np.var(further, ddof=1) / more
     half = float(student.ppf(0.5 + CONFIDENCE / 2, n - 1) * np.sqrt(error))
-    return PredictionPoweredMean(float(value), float(value - half), float(value + half), mean_power)
+    return PredictionPoweredMean(value, value - half, value + half, mean_power)
 
 
 def _left_out_powers(f: Array, y: Array, ratio: float) -> Array:
@@ -277,7 +277,7 @@ class LinearCorrection:
         residual_std = float(np.sqrt(residual @ residual / (len(y) - 2)))
         return LinearCorrection(slope, float(f.mean()), float(y.mean()), residual_std, squares, len(y))
 
-    def predict(self, twin: ArrayLike, confidence: float = CONFIDENCE) -> tuple[Array, Array, Array]:
+    def predict(self, twin: ArrayLike) -> tuple[Array, Array, Array]:
         """Predicts the real scores of policies with these twin scores, in as many trials as the fitted policies had.
 
         Returns values and ends of their intervals, clipped to [0, 1], each of the shape of `twin`. The interval is the
@@ -293,13 +293,11 @@ class LinearCorrection:
         if squares <= _MIN_VARIANCE:
             middle = np.where(np.abs(away) > math.sqrt(_MIN_VARIANCE), np.nan, middle)
         spread = self.residual_std if self.residual_std >= _LEAST_SPREAD else np.nan
-        half = student.ppf(0.5 + confidence / 2, self.n - 2) * spread * np.sqrt(1.0 + 1.0 / self.n + lever)
+        half = student.ppf(0.5 + CONFIDENCE / 2, self.n - 2) * spread * np.sqrt(1.0 + 1.0 / self.n + lever)
         return middle, np.clip(middle - half, 0, 1), np.clip(middle + half, 0, 1)
 
 
-def leave_one_group_out(
-    *, twin: ArrayLike, real: ArrayLike, groups: Sequence[object], confidence: float = CONFIDENCE
-) -> tuple[Array, Array, Array]:
+def leave_one_group_out(*, twin: ArrayLike, real: ArrayLike, groups: Sequence[object]) -> tuple[Array, Array, Array]:
     """Predicts each real score by the line fitted to all other groups: values and ends of intervals, shapes (n,).
 
     They are nan where `LinearCorrection.predict` says so. `groups` contains the group of each score, such as its policy
@@ -309,7 +307,7 @@ def leave_one_group_out(
     out = np.empty((3, len(y)))
     for group in dict.fromkeys(groups):
         mine = np.array([other == group for other in groups])
-        out[:, mine] = LinearCorrection.fit(twin=f[~mine], real=y[~mine]).predict(f[mine], confidence)
+        out[:, mine] = LinearCorrection.fit(twin=f[~mine], real=y[~mine]).predict(f[mine])
     return out[0], out[1], out[2]
 
 
