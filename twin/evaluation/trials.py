@@ -147,10 +147,9 @@ def read_real_trials(table: Path, out: Path) -> list[Trial]:
     Raises InputError: the results table `out` has further trials, which `write_real_trials` would lose.
     """
     known = read_trials(table) if table.exists() else []
-    explained = {cell.key: cell for cell in tally(known)}
-    counts = read_counts(out) if _has_rows(out) else {}
-    for key, (trials, _) in counts.items():
-        mine = explained[key].trials if key in explained else 0
+    explained = Counter(trial.cell for trial in known)
+    for key, (where, row) in _recorded(out).items():
+        trials, mine = _parse_int(where, row, "trials"), explained[key]
         if trials > mine:
             raise InputError(
                 f"{out}: {trials} trials of {key[0]} under {key[2]}, but {table.name} has {mine} of them; give another "
@@ -161,10 +160,19 @@ def read_real_trials(table: Path, out: Path) -> list[Trial]:
 
 def recorded_twin_lighting(out: Path, cell: tuple[str, str, str]) -> str | None:
     """The twin's lighting with which the results table `out` compares a cell (policy, task, lighting), if it has it."""
-    for _, row in _rows(out, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS) if _has_rows(out) else ():
-        if (row["policy"], row.get("task", ""), row["lighting"]) == cell:
-            return row.get("twin_lighting") or row["lighting"]
-    return None
+    _, row = _recorded(out).get(cell, ("", {}))
+    return row.get("twin_lighting") or row.get("lighting")
+
+
+def _recorded(out: Path) -> dict[tuple[str, str, str], tuple[str, dict[str, str]]]:
+    """Location and fields of each row of a results table, by policy, task (empty if not given) and lighting.
+
+    Empty if there is no such table, or it has no rows. Names, counts and duplicates are not checked.
+    """
+    if not out.exists() or sum(bool(line.strip()) for line in _table_text(out).splitlines()) < 2:
+        return {}
+    rows = _rows(out, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS)
+    return {(row["policy"], row.get("task", ""), row["lighting"]): (where, row) for where, row in rows}
 
 
 def write_real_trials(
@@ -179,8 +187,7 @@ def write_real_trials(
     Cells that are already in `out` keep their `twin_lighting` and `SETUP_COLUMNS`. For other cells, `setup`, if given,
     returns the values of `SETUP_COLUMNS` for a lighting's name.
     """
-    recorded = _rows(out, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS) if _has_rows(out) else ()
-    known = {(row["policy"], row.get("task", ""), row["lighting"]): row for _, row in recorded}
+    known = {cell: row for cell, (_, row) in _recorded(out).items()}
     rows = []
     for c in tally(trials):
         new = {"twin_lighting": twin_lighting}
@@ -264,20 +271,6 @@ def _spelling(name: str) -> str:
     return " ".join(unicodedata.normalize("NFC", name).casefold().split())
 
 
-def read_counts(path: Path) -> dict[tuple[str, str, str], tuple[int, int]]:
-    """Trials and successes by policy, task (empty if not given) and lighting in a results table.
-
-    Raises InputError: no such file, or a malformed table. Names, duplicates and sums are not checked.
-    """
-    return {
-        (row["policy"], row.get("task", ""), row["lighting"]): (
-            _parse_int(where, row, "trials"),
-            _parse_int(where, row, "successes"),
-        )
-        for where, row in _rows(path, RESULT_COLUMNS, OPTIONAL_RESULT_COLUMNS)
-    }
-
-
 def _policy_and_task(where: str, row: dict[str, str], twin: Sequence[Cell]) -> tuple[str, str]:
     policy, task = row["policy"], row.get("task", "")
     policies = list(dict.fromkeys(cell.policy for cell in twin))
@@ -310,11 +303,6 @@ def _name_hint(name: str, valid: Sequence[str]) -> str:
     """End of an error message: "did you mean ...?", or the valid names."""
     longer = [one for one in valid if one.startswith(f"{name}+")]
     return f"did you mean {longer[0]!r}?" if longer else name_hint(name, valid)
-
-
-def _has_rows(path: Path) -> bool:
-    """True if a table exists and has more than a header."""
-    return path.exists() and sum(bool(line.strip()) for line in _table_text(path).splitlines()) > 1
 
 
 def _rows(path: Path, needed: Sequence[str], optional: Sequence[str]) -> Iterable[tuple[str, dict[str, str]]]:
