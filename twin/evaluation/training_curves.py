@@ -10,10 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from twin.errors import InputError
 from twin.evaluation.statistics import rate_summary, wilson
 from twin.evaluation.trials import RECENT_EPISODES
-from twin.files import digest_file, read_json, read_text, regular_file, wrap_read_errors
+from twin.files import digest_file, is_file, read_json, read_text, wrap_read_errors
 from twin.scene import SceneDir
 from twin.types import Indices
 
@@ -42,7 +41,7 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
         run, _, checkpoint = policy.partition("/")
         folder = root / "runs" / run
         head = (folder / "checkpoints" / checkpoint if checkpoint else folder) / "policy.json"
-        if not (_is_there(head) and _is_there(folder / "episodes.csv")) or digest_file(head) != digests.get(policy):
+        if not (is_file(head) and is_file(folder / "episodes.csv")) or digest_file(head) != digests.get(policy):
             continue
         with wrap_read_errors(head, "copy the whole run again"):
             trained = dict(read_json(head).get("trained", {}))
@@ -66,7 +65,7 @@ def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[st
 def _final_test(folder: Path) -> dict[str, Any] | None:
     """A run's final test: step of the policy, condition of the episodes, and `rate_summary`; None if there was none."""
     path = folder / CHOICE_FILE
-    if not _is_there(path):
+    if not is_file(path):
         return None
     with wrap_read_errors(path, "delete it, and the best policy is selected again"):
         chosen = dict(read_json(path)["chosen"])
@@ -84,14 +83,6 @@ def validated_digests(root: Path) -> dict[str, Any]:
         return {}
     with wrap_read_errors(record, f"move {record.parent} away and validate again"):
         return dict(read_json(record)["policies"])
-
-
-def _is_there(path: Path) -> bool:
-    """True for an existing regular file; False otherwise, also if the path is not a valid file name."""
-    try:
-        return bool(regular_file(path))
-    except InputError:
-        return False
 
 
 def read_episodes(folder: Path) -> tuple[Indices, Indices]:
