@@ -246,9 +246,9 @@ def _candidates(
         compared = {cell.twin_key[2] for cell in real}
         lightings = tuple(name for name in lightings if name in compared)
     policies = list(dict.fromkeys(cell.policy for cell in twin))
-    cells = [[c for c in twin if c.policy == p and c.lighting in lightings] for p in policies]
+    each = [[c for c in twin if c.policy == p] for p in policies]
     # A policy that was not validated under any compared lighting is scored over all its lightings instead.
-    cells = [mine or [c for c in twin if c.policy == p] for p, mine in zip(policies, cells, strict=True)]
+    cells = [[c for c in mine if c.lighting in lightings] or mine for mine in each]
     driven = [[c for c in real if c.policy == p] for p in policies]
     rng = np.random.default_rng([seed, 1])
     by_day = bool(real) and len(lightings) > 1
@@ -256,26 +256,25 @@ def _candidates(
     with_real = [i for i, mine in enumerate(driven) if mine]
     real_ranks: dict[int, Array] = {}
     if len(with_real) > 1:
-        each = rank_probabilities(_sampled_rates([driven[i] for i in with_real], True, rng))
-        real_ranks = dict(zip(with_real, each, strict=True))
+        sampled = _sampled_rates([driven[i] for i in with_real], True, rng)
+        real_ranks = dict(zip(with_real, rank_probabilities(sampled), strict=True))
     twin_rates = _rates_over_days(cells, road=False) if by_day else [_mean_rate(mine) for mine in cells]
     real_rates = dict(zip(with_real, _rates_over_days([driven[i] for i in with_real]), strict=True))
     corrected = _corrected(cells, driven, lightings, {cell.key: cell for cell in twin})
-    out = []
-    for i, policy in enumerate(policies):
-        out.append(
-            Candidate(
-                policy=policy,
-                task=task,
-                lightings=tuple(c.lighting for c in cells[i]),
-                twin=twin_rates[i],
-                twin_rank=Estimate(*rank_interval(ranks[i]), len(policies)),
-                twin_ranks=tuple(float(p) for p in ranks[i]),
-                real=real_rates.get(i, Estimate(missing="not driven on the road")),
-                real_ranks=tuple(float(p) for p in real_ranks.get(i, ())),
-                corrected=corrected[i],
-            )
+    out = [
+        Candidate(
+            policy=policy,
+            task=task,
+            lightings=tuple(c.lighting for c in cells[i]),
+            twin=twin_rates[i],
+            twin_rank=Estimate(*rank_interval(ranks[i]), len(policies)),
+            twin_ranks=tuple(float(p) for p in ranks[i]),
+            real=real_rates.get(i, Estimate(missing="not driven on the road")),
+            real_ranks=tuple(float(p) for p in real_ranks.get(i, ())),
+            corrected=corrected[i],
         )
+        for i, policy in enumerate(policies)
+    ]
     return sorted(out, key=lambda c: (c.twin_rank.value or 0.0, c.policy)), lightings
 
 
