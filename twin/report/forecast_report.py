@@ -12,6 +12,7 @@ from twin.evaluation.agreement import Agreement, CellPair, Estimate
 from twin.evaluation.forecasting import Candidate, Forecast
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
 from twin.files import write_text
+from twin.report import forecast_text
 from twin.report.figures import (
     CARD,
     FULL_WIDTH,
@@ -31,18 +32,6 @@ from twin.report.figures import (
     shorten_name,
     styled,
     svg,
-)
-from twin.report.forecast_text import (
-    INTERVALS_NOTE,
-    PERCENT_STATISTICS,
-    STATISTICS,
-    allocation_text,
-    format_estimate,
-    format_probability,
-    limitations,
-    next_trials,
-    percentage_points,
-    verdicts,
 )
 from twin.report.html import MAX_TABLE_ROWS, Chart, command, counted, render
 
@@ -209,7 +198,7 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
         title=f"{forecast.scene}: forecast",
         kicker=f"{policies} on {tasks}: {counted(forecast.twin_trials, 'trial')} in the twin, "
         f"{forecast.real_trials} on the road.",
-        verdicts=verdicts(forecast),
+        verdicts=forecast_text.verdicts(forecast),
         headings={
             "road": "Does the twin predict the road?",
             "stages": "From training to the road",
@@ -230,22 +219,16 @@ def forecast_page(forecast: Forecast, root: Path = Path("SCENE")) -> str:
         prediction_charts=predictions,
         unpredicted=unpredicted,
         beyond_chance=sum(not pair.within_chance for pair in forecast.pairs),
-        limitations=limitations(forecast),
+        limitations=forecast_text.limitations(forecast),
         next_steps=[
-            *((text, []) for text in next_trials(forecast)),
+            *((text, []) for text in forecast_text.next_trials(forecast)),
             ("Add the results to real.csv, and forecast again:", [command("forecast", root, "--real", "real.csv")]),
         ],
         MIN_POLICIES=MIN_POLICIES,
         MIN_TRIALS=MIN_TRIALS,
-        STATISTICS=STATISTICS,
-        PERCENT_STATISTICS=PERCENT_STATISTICS,
-        INTERVALS_NOTE=INTERVALS_NOTE,
+        text=forecast_text,
         calibration=calibration,
         last=measured[-1] if measured else None,
-        allocation_text=allocation_text,
-        format_estimate=format_estimate,
-        format_probability=format_probability,
-        percentage_points=percentage_points,
     )
 
 
