@@ -42,6 +42,7 @@ _MAP_MARGIN = 8.0  # [m] around the path
 _MAX_POINTS = 20_000  # largest number of points drawn in a map
 _LEGEND_LETTERS = 55  # letters per row of a legend; a marker counts as four letters
 _LEGEND_ROW = 0.175  # [in] height of a row of a legend
+_BOX = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}  # behind a text
 _STYLE: dict[str, Any] = {
     "font.size": 8.5,
     "font.family": "sans-serif",
@@ -175,27 +176,20 @@ def place_map(
     # Middle tones are visible on dark and on bright pages.
     colors = 0.25 + 0.5 * point_rgb[shown] / 255.0
     axes.scatter(points[shown, 0], points[shown, 1], s=0.8, c=colors, linewidths=0, rasterized=True)
-    _draw_route(axes, route, half_width)
+    if route is not None:
+        _draw_route(axes, route, half_width)
     _draw_passes(axes, passes)
-    _draw_branches(axes, branches or {}, half_width)
+    for name, line in (branches or {}).items():
+        _draw_route(axes, line, half_width, name)
     for i, source in enumerate(dict.fromkeys(sources)):
         mine = np.array([name == source for name in sources])
         color, marker = SERIES[i % len(SERIES)], MARKERS[i % len(MARKERS)]
         trained, unseen = positions[mine & ~held_out], positions[mine & held_out]
         # Films of one path overlap; later sources get smaller markers so that all remain visible.
         size = 16.0 / (1.0 + 0.8 * min(i, 5))
-        axes.scatter(
-            trained[:, 0],
-            trained[:, 1],
-            s=size,
-            c=color,
-            marker=marker,
-            linewidths=0,
-            label=legend_name(source),
-            zorder=4,
-        )
-        hollow: dict[str, Any] = {"facecolors": "none", "edgecolors": color, "lw": 0.8}
-        axes.scatter(unseen[:, 0], unseen[:, 1], s=size, marker=marker, zorder=4, **hollow)
+        look: dict[str, Any] = {"s": size, "marker": marker, "zorder": 4}
+        axes.scatter(trained[:, 0], trained[:, 1], c=color, linewidths=0, label=legend_name(source), **look)
+        axes.scatter(unseen[:, 0], unseen[:, 1], facecolors="none", edgecolors=color, lw=0.8, **look)
     axes.scatter([], [], s=12, facecolors="none", edgecolors=MUTED, lw=0.9, label="held out")
     steps = positions[np.array(contradicted, np.int64).reshape(-1, 2), :2]
     for k, step in enumerate(steps):
@@ -235,8 +229,10 @@ def ground_map(
         rasterized=True,
     )
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    _draw_route(axes, route, half_width)
-    _draw_branches(axes, branches, half_width)
+    if route is not None:
+        _draw_route(axes, route, half_width)
+    for name, line in branches.items():
+        _draw_route(axes, line, half_width, name)
     if len(parts):
         look: dict[str, Any] = {"facecolors": SERIES[1], "edgecolors": SERIES[1], "alpha": 0.55, "lw": 0.5}
         axes.add_collection(PolyCollection(list(parts), label="convex part", **look))
@@ -258,37 +254,22 @@ def _draw_passes(axes: Axes, passes: Sequence[FilmedPass]) -> None:
         axes.plot(*one.path.T, color=color, lw=0.9, ls=(0, (4, 2)), zorder=3)
         # Passes may coincide, so each name is at another fraction of its pass.
         at = one.path[len(one.path) * (k + 1) // (len(passes) + 1)]
-        box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
-        axes.annotate(
-            one.name, at, xytext=(4, -9), textcoords="offset points", fontsize=7, color=color, bbox=box, zorder=6
-        )
+        axes.annotate(one.name, at, (4, -9), textcoords="offset points", fontsize=7, color=color, bbox=_BOX, zorder=6)
         if one.ends_with != "end":
             axes.plot(*one.path[-1], "x", color=color, ms=6, zorder=5)
 
 
-def _draw_route(axes: Axes, route: Array | None, half_width: float) -> None:
-    if route is None or len(route) < 2:
-        return
+def _draw_route(axes: Axes, line: Array, half_width: float, branch: str = "") -> None:
+    """Draws a line (k, 2) with its corridor: the route, or a branch, which is dashed and has its name at its end."""
+    label, words = ("route", {"start": 0, "goal": -1}) if not branch else (f"branch {branch}", {branch: -1})
     if half_width > 0.0:
-        outline = corridor_outline(route, half_width)
-        axes.add_collection(PolyCollection([outline], facecolors=SERIES[2], alpha=0.25, label="corridor"))
-    axes.plot(*route.T, color=INK, lw=1.0, label="route", zorder=3)
-    axes.plot(*route[0], "o", color=INK, ms=4, zorder=3)
-    for word, at in (("start", route[0]), ("goal", route[-1])):
-        box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
-        axes.annotate(word, at, xytext=(5, 5), textcoords="offset points", fontsize=8, bbox=box, zorder=5)
-
-
-def _draw_branches(axes: Axes, branches: Mapping[str, Array], half_width: float) -> None:
-    """Draws the branches, dashed, with their corridors; each has its name at its end."""
-    for name, line in branches.items():
-        if half_width > 0.0 and len(line) > 1:
-            outline = corridor_outline(line, half_width)
-            axes.add_collection(PolyCollection([outline], facecolors=SERIES[2], alpha=0.25))
-        axes.plot(*line.T, color=INK, lw=1.0, ls="--", label=legend_name(f"branch {name}"), zorder=3)
-        axes.plot(*line[0], "o", color=INK, ms=4, zorder=3)
-        box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
-        axes.annotate(name, line[-1], xytext=(5, 5), textcoords="offset points", fontsize=8, bbox=box, zorder=5)
+        outline = corridor_outline(line, half_width)
+        look: dict[str, Any] = {} if branch else {"label": "corridor"}
+        axes.add_collection(PolyCollection([outline], facecolors=SERIES[2], alpha=0.25, **look))
+    axes.plot(*line.T, color=INK, lw=1.0, ls="--" if branch else "-", label=legend_name(label), zorder=3)
+    axes.plot(*line[0], "o", color=INK, ms=4, zorder=3)
+    for word, end in words.items():
+        axes.annotate(word, line[end], (5, 5), textcoords="offset points", fontsize=8, bbox=_BOX, zorder=5)
 
 
 # ---- curves and bars
@@ -346,8 +327,8 @@ def histogram(values: NDArray, label: str, counted: str, highest: float, integer
     axes.axvline(median, color=SERIES[1], lw=1.2)
     at = (median, axes.get_ylim()[1])
     text = f"median {median:.3g} (n = {len(values):,})"
-    box = {"facecolor": CARD, "alpha": 0.75, "edgecolor": "none", "pad": 0.5}
-    axes.annotate(text, at, (4, 0), textcoords="offset points", color=SERIES[1], va="top", fontsize=8, bbox=box)
+    look: dict[str, Any] = {"color": SERIES[1], "va": "top", "fontsize": 8, "bbox": {**_BOX, "pad": 0.5}}
+    axes.annotate(text, at, (4, 0), textcoords="offset points", **look)
     axes.grid(False, axis="x")
     axes.set(xlabel=label, ylabel=counted)
     return figure
