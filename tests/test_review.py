@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from films import video_info
+from tiny_world import tiny_ground
 
 from twin.config import ReviewConfig, SceneConfig, SourceConfig
 from twin.files import read_json
@@ -24,6 +25,7 @@ from twin.geometry.cameras import (
 )
 from twin.geometry.images import read_image, write_image
 from twin.geometry.poses import look_at
+from twin.mjcf.scene_xml import Parts
 from twin.report import review_video
 from twin.report.review_chapters import (
     Studio,
@@ -279,10 +281,10 @@ def test_the_map_runs_from_left_to_right() -> None:
     assert west[1] > 45
 
 
-def test_footprints_are_outlines_and_flat_parts_have_none() -> None:
-    cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-    wall = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]], float)
-    outlines = footprints(np.concatenate([cube, wall]), np.array([0, 8, 11]))
+def test_footprints_are_outlines_and_flat_or_high_parts_have_none() -> None:
+    cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)
+    wall = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]], np.float32)
+    outlines = footprints(Parts([cube, wall, cube + np.float32([0, 0, 5])], []), tiny_ground())
     assert len(outlines) == 1
     assert sorted(map(tuple, outlines[0])) == [(0, 0), (0, 1), (1, 0), (1, 1)]
 

@@ -17,6 +17,7 @@ from twin.files import read_json, wrap_read_errors, write_text
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.passes import find_passes
 from twin.geometry.route import BRANCH
+from twin.mjcf.scene_xml import Parts
 from twin.mjcf.world import SCENE_XML, World
 from twin.report import figures
 from twin.report.build_sections import SECTIONS
@@ -38,7 +39,7 @@ from twin.report.html import (
     pick,
     render,
 )
-from twin.report.video_layout import load_footprints
+from twin.report.video_layout import footprints
 from twin.report.visual_vs_collision import geometry_section
 from twin.scene import SceneDir, stage_result
 
@@ -170,7 +171,7 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     if (mesh / "ground.npz").exists():
         ground = Ground.load(mesh)
         path = cameras.positions[:, :2] if route is None else route
-        parts = load_footprints(mesh / "parts.npz", ground)
+        parts = footprints(Parts.load(mesh / "parts.npz"), ground)
         drawn = figures.ground_map(ground, path, route, wide, parts, branches)
         out.append(Chart("Ground and convex parts", figures.svg(drawn), "mesh"))
     return out

@@ -165,16 +165,14 @@ def appearance_of_frame(cameras: Cameras, i: int) -> str:
     """
     if not cameras.held_out[i]:
         return cameras.names[i]
-    mine = [k for k, name in enumerate(cameras.sources) if name == cameras.sources[i] and not cameras.held_out[k]]
-    before = max(
-        (k for k in mine if cameras.times[k] <= cameras.times[i]), key=lambda k: cameras.times[k], default=None
-    )
-    after = min((k for k in mine if cameras.times[k] > cameras.times[i]), key=lambda k: cameras.times[k], default=None)
-    if before is None or after is None:
-        only = before if before is not None else after
-        return cameras.lightings[i] if only is None else cameras.names[only]
-    span = cameras.times[after] - cameras.times[before]
-    return f"{cameras.names[before]}:{cameras.names[after]}:{(cameras.times[i] - cameras.times[before]) / span:.6g}"
+    film = (np.array(cameras.sources) == cameras.sources[i]) & ~cameras.held_out
+    mine = sorted(np.flatnonzero(film), key=lambda k: cameras.times[k])
+    after = np.searchsorted(cameras.times[mine], cameras.times[i], "right")
+    around = mine[max(0, after - 1) : after + 1]
+    names, times = [cameras.names[k] for k in around], cameras.times[around]
+    if 0 < after < len(mine):
+        return f"{names[0]}:{names[1]}:{(cameras.times[i] - times[0]) / (times[1] - times[0]):.6g}"
+    return names[0] if names else cameras.lightings[i]
 
 
 # ---- first and second chapter
@@ -455,12 +453,11 @@ def write_drive_chapter(
             chase_stills.append(from_behind)
         if i == instants[len(instants) // 2]:
             studio.save_picture("poster_drive", "poster", "the Husky in the twin", canvas)
-    studio.save_picture(
-        "drive_camera", "review", "views of the robot’s camera along the route", side_by_side(camera_stills, 200)
-    )
-    studio.save_picture(
-        "drive_chase", "review", "the same moments from behind the robot", side_by_side(chase_stills, 200)
-    )
+    for name, caption, stills in (
+        ("drive_camera", "views of the robot’s camera along the route", camera_stills),
+        ("drive_chase", "the same moments from behind the robot", chase_stills),
+    ):
+        studio.save_picture(name, "review", caption, side_by_side(stills, 200))
 
 
 def _drive_facts(

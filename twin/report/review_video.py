@@ -58,7 +58,7 @@ from twin.report.video_layout import (
     MapView,
     colored,
     draw_text,
-    load_footprints,
+    footprints,
     side_by_side,
 )
 from twin.report.video_writer import VideoWriter, frame_indices
@@ -190,11 +190,10 @@ def _compare_geometry(studio: Studio, scene: SceneDir, world: World, drive: Reco
     if not (folder / "ground.npz").exists():
         return None
     views = render_views(studio.field, world, view_poses(drive.camera_to_world), studio.field.lightings[0])
+    caption = "the field and the collision geometry at the same pose"
     for number, k in enumerate(spread_choice(range(len(views.visual_depth)), _GAP_ROWS + 2)[1:-1]):
         row = gap_row(views, k)
-        studio.save_picture(
-            f"seen_{number}", "seen_touched", "the field and the collision geometry at the same pose", row, row.shape[1]
-        )
+        studio.save_picture(f"seen_{number}", "seen_touched", caption, row, row.shape[1])
     return compare_geometry(views, world, studio.cameras, Ground.load(folder), Parts.load(folder / "parts.npz"))
 
 
@@ -211,25 +210,25 @@ def _scene_shots(cameras: Cameras, scene: SceneDir, world: World | None) -> tupl
 
 
 def load_ground_and_parts(scene: SceneDir) -> tuple[Ground | None, list[Array]]:
-    """Returns the ground of the mesh stage (None if there is none) and the outlines of its low parts, for the map."""
+    """Returns the ground of the mesh stage (None without this stage) and the outlines of its parts, for the map."""
     folder = scene.stage("mesh")
-    ground = Ground.load(folder) if (folder / "ground.npz").exists() else None
-    return ground, load_footprints(folder / "parts.npz", ground)
+    if not (folder / "ground.npz").exists():
+        return None, []
+    ground = Ground.load(folder)
+    return ground, footprints(Parts.load(folder / "parts.npz"), ground)
 
 
 def _longest_path(cameras: Cameras) -> Array:
     longest = max(dict.fromkeys(cameras.sources), key=cameras.sources.count)
-    return cameras.positions[[name == longest for name in cameras.sources], :2]
+    return cameras.positions[np.array(cameras.sources) == longest, :2]
 
 
 def _save_capture_pictures(studio: Studio) -> None:
     cameras = studio.cameras
     for number, lighting in enumerate(dict.fromkeys(cameras.lightings)):
-        mine = [i for i, name in enumerate(cameras.lightings) if name == lighting]
-        row = [studio.real_frame(i) for i in spread_choice(mine, 4)]
-        studio.save_picture(
-            f"capture_{number}", "capture", f"{lighting}: frames from start to end", side_by_side(row, 180)
-        )
+        mine = np.flatnonzero(np.array(cameras.lightings) == lighting)
+        row = side_by_side([studio.real_frame(i) for i in spread_choice(mine, 4)], 180)
+        studio.save_picture(f"capture_{number}", "capture", f"{lighting}: frames from start to end", row)
 
 
 # ---- numbers of the drive
@@ -343,15 +342,12 @@ def trust_metrics(s: Array, offsets: Array, trust: Array) -> dict[str, Any]:
 
 def trust_picture(s: Array, offsets: Array, trust: Array) -> Image:
     """Draws the result of `trust_grid`: arc length to the right, the route's left at the top, high trust bright."""
-    high = _CELL_HEIGHT
-    body = cv2.resize(
-        colored("viridis", trust[::-1]), (_MAP_WIDTH, high * len(offsets)), interpolation=cv2.INTER_NEAREST
-    )
-    out = np.empty((body.shape[0] + 2 * _MARGIN_ROWS, body.shape[1] + 64 + _MARGIN_RIGHT, 3), np.uint8)
-    out[:] = BACKGROUND
+    size = _MAP_WIDTH, _CELL_HEIGHT * len(offsets)
+    body = cv2.resize(colored("viridis", trust[::-1]), size, interpolation=cv2.INTER_NEAREST)
+    out = np.full((size[1] + 2 * _MARGIN_ROWS, size[0] + 64 + _MARGIN_RIGHT, 3), BACKGROUND, np.uint8)
     out[_MARGIN_ROWS : _MARGIN_ROWS + body.shape[0], 64:-_MARGIN_RIGHT] = body
     for k, offset in enumerate(offsets[::-1]):
-        draw_text(out, f"{offset:+.1f} m", 58, _MARGIN_ROWS + k * high + 1, 11, MUTED, align="right")
+        draw_text(out, f"{offset:+.1f} m", 58, _MARGIN_ROWS + k * _CELL_HEIGHT + 1, 11, MUTED, align="right")
     per_meter = _MAP_WIDTH / (len(s) * _TRUST_STEP)
     step = next(step for step in _LABEL_STEPS if step * per_meter >= _LABEL_ROOM)
     for at in np.arange(0, s[-1] + 1e-9, step):

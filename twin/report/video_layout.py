@@ -8,7 +8,6 @@ place.
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -22,6 +21,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from twin.assets.ground import Ground
 from twin.geometry.images import resize, to_uint8
+from twin.mjcf.scene_xml import Parts
 from twin.report.video_writer import even
 from twin.types import Array, Image
 
@@ -115,8 +115,7 @@ def fit(picture: NDArray, size: tuple[int, int]) -> Image:
     width, height = size
     scale = min(width / picture.shape[1], height / picture.shape[0])
     w, h = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
-    out = np.empty((height, width, 3), np.uint8)
-    out[:] = PANEL_BACKGROUND
+    out = np.full((height, width, 3), PANEL_BACKGROUND, np.uint8)
     x, y = (width - w) // 2, (height - h) // 2
     scaled = cv2.resize(picture, (w, h), interpolation=cv2.INTER_CUBIC) if scale > 1 else resize(picture, w, h)
     out[y : y + h, x : x + w] = scaled
@@ -194,8 +193,7 @@ class FrameLayout:
     def canvas(self, title: str, note: str = "") -> Image:
         """An empty canvas with its header: title at the left, note at the right."""
         width, height = self.size
-        out = np.empty((height, width, 3), np.uint8)
-        out[:] = BACKGROUND
+        out = np.full((height, width, 3), BACKGROUND, np.uint8)
         big = round(self.text * 1.25)
         y = (self.header - round(big * 1.3)) // 2
         beside = width - 4 * _MARGIN - text_width(title, big, bold=True)
@@ -218,8 +216,7 @@ class FrameLayout:
 
     def card(self, title: str, lines: list[str], color: Color = ACCENT) -> Image:
         width, height = self.size
-        out = np.empty((height, width, 3), np.uint8)
-        out[:] = BACKGROUND
+        out = np.full((height, width, 3), BACKGROUND, np.uint8)
         big, small = round(self.text * 2), round(self.text * 1.2)
         inset = round(0.08 * width)
         wrapped = [part for line in lines for part in wrap(line, width - 2 * inset, small)]
@@ -290,12 +287,12 @@ def draw_slider(canvas: Image, box: Box, lightings: tuple[str, ...], at: float, 
 
 _GAP = 6  # [px] between panels
 _TEXT = 15  # [px] text size
-_LINE_HEIGHT = 30  # [px] height of a line of text above or below a panel
+_HEAD, _BELOW = 30, 50  # [px] heights of the title above a panel, and of the caption or scale below it
 
 
 def scale_bar(width: int, ramp: Image, labels: list[tuple[float, str]]) -> Image:
     """Draws a color bar with labels at shares of its length. Labels that would overlap others are left out."""
-    out = np.full((2 * _LINE_HEIGHT - 10, width, 3), BACKGROUND, np.uint8)
+    out = np.full((_BELOW, width, 3), BACKGROUND, np.uint8)
     bar = ramp.shape[1]
     left = (width - bar) // 2
     out[8:18, left : left + bar] = ramp[:1]
@@ -313,14 +310,14 @@ def scale_bar(width: int, ramp: Image, labels: list[tuple[float, str]]) -> Image
 
 
 def caption_line(width: int, text: str, color: Color = MUTED) -> Image:
-    out = np.full((2 * _LINE_HEIGHT - 10, width, 3), BACKGROUND, np.uint8)
+    out = np.full((_BELOW, width, 3), BACKGROUND, np.uint8)
     draw_text(out, shorten(text, width - 8, _TEXT), 4, 8, _TEXT, color)
     return out
 
 
 def titled_panel(picture: Image, title: str, note: str, below: Image) -> Image:
     width = picture.shape[1]
-    head = np.full((_LINE_HEIGHT, width, 3), BACKGROUND, np.uint8)
+    head = np.full((_HEAD, width, 3), BACKGROUND, np.uint8)
     draw_text(head, title, 4, 5, _TEXT, INK, True)
     free = width - text_width(title, _TEXT, True) - 20
     if note and free > 20:
@@ -354,30 +351,21 @@ _MAX_HEIGHT = 3.0  # [m] above the ground; the robot does not reach parts that a
 _SUBPIXEL_BITS = 4  # fixed-point precision of OpenCV's drawing
 
 
-def footprints(vertices: NDArray, vertex_start: NDArray, ground: Ground | None = None) -> list[Array]:
+def footprints(parts: Parts, ground: Ground) -> list[Array]:
     """Outlines of convex parts from above, each shape (k, 2) [m], counterclockwise.
 
-    The vertices (v, 3) [m] of part i are those from `vertex_start[i]` to `vertex_start[i + 1]`. Parts that are
-    entirely more than `_MAX_HEIGHT` above the ground are dropped.
+    Parts that are entirely more than `_MAX_HEIGHT` above the ground are dropped.
     """
     outlines = []
-    for start, end in pairwise(vertex_start):
-        part = np.asarray(vertices[start:end], np.float64)
-        if ground is not None and (part[:, 2] - ground.at(part[:, :2])).min() > _MAX_HEIGHT:
+    for vertices in parts.vertices:
+        part = vertices.astype(np.float64)
+        if (part[:, 2] - ground.at(part[:, :2])).min() > _MAX_HEIGHT:
             continue
         try:
             outlines.append(part[ConvexHull(part[:, :2]).vertices, :2])
         except (QhullError, ValueError):  # degenerate: a vertical sheet has no area from above
             continue
     return outlines
-
-
-def load_footprints(path: Path, ground: Ground | None) -> list[Array]:
-    """Footprints of the parts in `parts.npz` of the mesh stage; an empty list if there is no such file."""
-    if not path.exists():
-        return []
-    with np.load(path, allow_pickle=False) as data:
-        return footprints(data["vertices"], data["vertex_start"], ground)
 
 
 def map_rotation(path: Array) -> Array:
@@ -410,12 +398,11 @@ class MapView:
     ) -> "MapView":
         """Draws the static map, centered on a path (n, 2) [m], for an image of `size` (width, height) [px].
 
-        `parts` are outlines from `footprints`. If the half width [m] of the corridor is 0, the corridor is not drawn.
+        `parts` are outlines from `footprints`. A corridor of half width 0 [m] is not drawn.
         """
         to_pixel = _map_transform(path, size)
         scale = float(np.hypot(*to_pixel[:, 0]))
-        picture: Image = np.empty((size[1], size[0], 3), np.uint8)
-        picture[:] = PANEL_BACKGROUND
+        picture: Image = np.full((size[1], size[0], 3), PANEL_BACKGROUND, np.uint8)
         if ground is not None:
             cell = np.array([[ground.cell, 0, ground.origin[0]], [0, ground.cell, ground.origin[1]], [0, 0, 1]])
             warp = to_pixel @ cell
