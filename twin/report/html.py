@@ -162,9 +162,10 @@ def cautions_above(report: dict[str, Any], *limits: Limit) -> list[Caution]:
 
     The caution in a `Limit` is a format string for the magnitude and the limit.
     """
-    found = [(as_number(pick(report, path)), limit, what, cure) for path, limit, what, cure in limits]
     return [
-        Caution(what.format(abs(x), limit), cure) for x, limit, what, cure in found if x is not None and abs(x) > limit
+        Caution(what.format(abs(x), limit), cure)
+        for path, limit, what, cure in limits
+        if (x := as_number(pick(report, path))) is not None and abs(x) > limit
     ]
 
 
@@ -174,8 +175,8 @@ def follower_verdict(report: dict[str, Any]) -> Verdict:
     if not isinstance(follower, dict):
         reason = pick(report, "review.not_applicable") or "this build has no drive"
         return Verdict(f"No robot was driven here: {reason}.")
-    length = number(pick(report, "mjcf.route_length_m"), "{:.1f} m ")
-    length = "" if length == NOT_MEASURED else length
+    meters, gone = as_number(pick(report, "mjcf.route_length_m")), as_number(follower.get("distance_m"))
+    length = "" if meters is None else f"{meters:.1f} m "
     touched = follower.get("touched")
     contact = "its contacts were not measured"
     if isinstance(touched, list):
@@ -194,11 +195,10 @@ def follower_verdict(report: dict[str, Any]) -> Verdict:
             f"The Husky followed {lines} from start to end and {contact}.{''.join(missed)}",
             "mixed" if touched or touched is None or missed else "good",
         )
-    gone = number(follower.get("distance_m"), "it drove {:.1f} m")
-    gone = "" if gone == NOT_MEASURED else f"{gone} and "
+    driven = "" if gone is None else f"it drove {gone:.1f} m and "
     also = [f" It followed {join_names(arrived)} from start to end."] if arrived else []
     rest = "".join(also + missed)
-    return Verdict(f"The Husky did not reach the end of the {length}route: {gone}{contact}.{rest}", "bad")
+    return Verdict(f"The Husky did not reach the end of the {length}route: {driven}{contact}.{rest}", "bad")
 
 
 # ---- HTML
