@@ -110,8 +110,7 @@ def _front_matter(policy: Policy, cells: Sequence[Cell]) -> str:
     if cells:
         lines += ["model-index:", f"- name: {json.dumps(policy.name)}", "  results:"]
     for cell in cells:
-        of = rate_summary(cell.successes, cell.trials)
-        told = f"success of {cell.trials} episodes ({_interval(of['low'], of['high'])})"
+        told = f"success of {cell.trials} episodes ({_interval(cell.successes, cell.trials)})"
         lines += [
             "  - task: {type: reinforcement-learning, name: driving}",
             f"    dataset: {{type: twin, name: {json.dumps(f'{cell.task}, {cell.lighting}')}}}",
@@ -127,12 +126,13 @@ def _selection(folder: Path) -> list[str]:
     with wrap_read_errors(folder / CHOICE_FILE, "delete it, and the best policy is selected again"):
         choice = read_json(folder / CHOICE_FILE)
         last, count = choice["chosen"], len(choice["candidates"])
-        measured = rate_summary(int(last["successes"]), int(last["trials"]))
+        won, trials = int(last["successes"]), int(last["trials"])
+        interval = _interval(won, trials)
         under = f" under `{last['condition']}`" if "condition" in last else ""  # older runs store no condition
     return [
         "",
         f"Selected among {count} tested checkpoints. In fresh episodes{under} it reached the goal "
-        f"{measured['successes']} times of {measured['trials']} ({_interval(measured['low'], measured['high'])}).",
+        f"{won} times of {trials} ({interval}).",
     ]
 
 
@@ -141,10 +141,8 @@ def _twin_table(cells: Sequence[Cell]) -> list[str]:
         return ["Not validated: run `twin validate`."]
     out = ["| task | lighting | goal reached | rate |", "|---|---|---|---|"]
     for cell in cells:
-        of = rate_summary(cell.successes, cell.trials)
-        interval = _interval(of["low"], of["high"])
-        count, rate = f"{cell.successes} of {cell.trials}", f"{of['rate']:.2f} ({interval})"
-        out.append(_row(cell.task, cell.lighting, count, rate))
+        rate = f"{cell.rate:.2f} ({_interval(cell.successes, cell.trials)})"
+        out.append(_row(cell.task, cell.lighting, f"{cell.successes} of {cell.trials}", rate))
     return [*out, "", f"Intervals contain the rate of further episodes with {CONFIDENCE:.0%} confidence."]
 
 
@@ -165,5 +163,7 @@ def _row(*columns: object) -> str:
     return f"| {' | '.join(str(column).replace('|', chr(92) + '|') for column in columns)} |"
 
 
-def _interval(low: float, high: float) -> str:
-    return f"{low:.2f} to {high:.2f}"
+def _interval(successes: int, trials: int) -> str:
+    """Interval of a rate, as "0.63 to 0.94"."""
+    of = rate_summary(successes, trials)
+    return f"{of['low']:.2f} to {of['high']:.2f}"
