@@ -59,8 +59,8 @@ class DriveDataset:
     """Collects drives in a folder; `finish` completes the dataset.
 
     Raises:
-        InputError: Pyarrow is not installed, the frame rate [1/s] is not a whole number, or the width or height of the
-            pictures is odd (the video format needs even ones).
+        InputError: The frame rate [1/s] is not a whole number, or the width or height of the pictures is odd (the video
+            format needs even ones).
     """
 
     folder: Path
@@ -77,7 +77,6 @@ class DriveDataset:
     _stats: list[dict[str, dict[str, Array]]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        require_pyarrow()
         self.fps = round(1.0 / self.timestep)
         if abs(self.fps * self.timestep - 1.0) > 1e-6:
             raise InputError(

@@ -70,11 +70,7 @@ def write_rerun_recording(
         world: The world of the episode.
         half_width: Half width of the corridor [m].
         name: Name of the recording.
-
-    Raises:
-        InputError: rerun-sdk is not installed.
     """
-    require_rerun()
     import rerun as rr
 
     recording = rr.RecordingStream("twin", recording_id=f"{name} {episode.seed}")
