@@ -84,7 +84,7 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
     u_axis, v_axis = ((corner[:, k] - corner[:, 0]) / (side - 1)[:, None] for k in (1, 2))
     normal = np.cross(u_axis, v_axis)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    baker = _Baker(views)
+    uploaded = _upload_views(views)
     means = np.full((len(faces), 3), np.nan)
     counts = side**2
     start = 0
@@ -94,7 +94,7 @@ def bake(vertices: Array, faces: NDArray, views: Views) -> tuple[Image, NDArray[
         within = np.arange(len(own)) - np.repeat(np.cumsum(counts[start:stop]) - counts[start:stop], counts[start:stop])
         j, i = np.divmod(within, side[own])
         points = corner[own, 0] + i[:, None] * u_axis[own] + j[:, None] * v_axis[own]
-        rgb, weight = baker.colors(points, normal[own])
+        rgb, weight = _colors(uploaded, points, normal[own])
         seen = weight > 0.0
         n = np.bincount(own[seen] - start, minlength=stop - start)
         total = np.stack([np.bincount(own[seen] - start, rgb[seen, c], stop - start) for c in range(3)], 1)
@@ -198,29 +198,25 @@ def _gather(
         out[t] = color / weight
 
 
-class _Baker:
-    """Computes colors of surface points from views, which are kept as Warp arrays."""
+def _upload(values: NDArray, kind: Any) -> Any:
+    return wp.array(np.ascontiguousarray(values), dtype=kind, device="cpu")
 
-    def __init__(self, views: Views) -> None:
-        def array(values: NDArray, kind: Any) -> Any:
-            return wp.array(np.ascontiguousarray(values), dtype=kind, device="cpu")
 
-        inverse = np.stack([inverse_pose(pose) for pose in views.camera_to_world])
-        self._views = (
-            array(inverse.astype(np.float32), wp.mat44),
-            array(views.intrinsics.astype(np.float32), wp.vec4),
-            array(views.rgb, wp.uint8),
-            array(views.depth.astype(np.float32), float),
-        )
+def _upload_views(views: Views) -> list[Any]:
+    """Views as Warp arrays: poses (world to camera), intrinsics, colors, depths."""
+    inverse = np.stack([inverse_pose(pose) for pose in views.camera_to_world])
+    kinds = ((inverse, wp.mat44), (views.intrinsics, wp.vec4), (views.depth, float))
+    poses, intrinsics, depth = (_upload(values.astype(np.float32), kind) for values, kind in kinds)
+    return [poses, intrinsics, _upload(views.rgb, wp.uint8), depth]
 
-    def colors(self, points: Array, normals: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Colors (k, 3) in [0, 255] of points (k, 3) with unit normals, and weights (k,), 0 for unseen points."""
-        given: list[Any] = [wp.array(x.astype(np.float32), dtype=wp.vec3, device="cpu") for x in (points, normals)]
-        out = wp.zeros(len(points), dtype=wp.vec3, device="cpu")
-        total = wp.zeros(len(points), dtype=float, device="cpu")
-        settings = [_TEXEL_TOLERANCE, _SHARPNESS]
-        wp.launch(_gather, len(points), [*given, *self._views, *settings], [out, total], device="cpu")
-        return out.numpy().copy(), total.numpy()
+
+def _colors(views: list[Any], points: Array, normals: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Colors (k, 3) in [0, 255] of points (k, 3) with unit normals, and weights (k,), 0 for unseen points."""
+    given = [_upload(x.astype(np.float32), wp.vec3) for x in (points, normals)]
+    out = wp.zeros(len(points), dtype=wp.vec3, device="cpu")
+    total = wp.zeros(len(points), dtype=float, device="cpu")
+    wp.launch(_gather, len(points), [*given, *views, _TEXEL_TOLERANCE, _SHARPNESS], [out, total], device="cpu")
+    return out.numpy().copy(), total.numpy()
 
 
 def vertex_colors(views: Views, vertices: Array) -> NDArray[np.uint8]:
