@@ -8,7 +8,6 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jinja2 import UndefinedError
+from page_text import Text
 
 from twin.build import summary
 from twin.commands import VERBS
@@ -94,47 +94,6 @@ def changed(path: str, value: Any, of: dict[str, Any] = REPORT) -> dict[str, Any
     return report
 
 
-class _Text(HTMLParser):
-    """The text of a page, its links and its tags; fails on tags closed out of order."""
-
-    _VOID = frozenset({"img", "meta", "source", "br"})
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.parts: list[str] = []
-        self.links: list[str] = []
-        self.tags: list[str] = []
-        self.open: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        if tag not in self._VOID:
-            self.open.append(tag)
-        self.links += [value or "" for name, value in attrs if name in ("src", "href", "poster", "xlink:href")]
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.handle_starttag(tag, attrs)
-        if tag not in self._VOID:
-            self.open.pop()
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.parts.append(data)
-
-    @property
-    def text(self) -> str:
-        return re.sub(r"\s+", " ", " ".join(self.parts))
-
-
-def read(html: str) -> _Text:
-    parser = _Text()
-    parser.feed(html)
-    assert not parser.open
-    return parser
-
-
 @pytest.fixture
 def scene(tmp_path: Path) -> SceneDir:
     scene = SceneDir(tmp_path / "road")
@@ -144,7 +103,7 @@ def scene(tmp_path: Path) -> SceneDir:
 
 def test_the_page_shows_the_results_of_every_stage(scene: SceneDir) -> None:
     write_page(scene, REPORT)
-    text = read(scene.report_html.read_text(encoding="utf-8")).text
+    text = Text(scene.report_html.read_text(encoding="utf-8")).text
     assert "The Husky followed the 59.8 m route from start to end and touched nothing but the ground." in text
     assert "158 of 160" in text
     assert "24.3 dB PSNR, 0.70 SSIM" in text
@@ -154,7 +113,7 @@ def test_the_page_shows_the_results_of_every_stage(scene: SceneDir) -> None:
 
 
 def test_an_empty_report_makes_a_page_that_makes_nothing_up(scene: SceneDir) -> None:
-    text = read(page(scene, {})).text
+    text = Text(page(scene, {})).text
     assert text.count("This stage has not run.") == len(SECTIONS)
     assert NOT_MEASURED in text
     assert not re.search(r"\d dB|\d m\b|\d %", text)
@@ -178,7 +137,7 @@ def test_every_missing_key_is_tolerated(scene: SceneDir) -> None:
             report[stage][key] = None
             SECTIONS[stage](report), headline_sections(report)
     for key in REPORT:
-        read(page(scene, {k: v for k, v in REPORT.items() if k != key}))
+        Text(page(scene, {k: v for k, v in REPORT.items() if k != key}))
 
 
 def test_names_from_files_are_text(scene: SceneDir) -> None:
@@ -196,7 +155,7 @@ def test_names_from_files_are_text(scene: SceneDir) -> None:
         scene.stage("review") / "review.json",
         {"pictures": [{"file": "pictures/a.jpg", "section": "field", "caption": evil}]},
     )
-    parser = read(page(scene, report))
+    parser = Text(page(scene, report))
     assert "script" not in parser.tags
     assert evil in parser.text
 
@@ -211,14 +170,14 @@ def test_nothing_is_fetched_from_elsewhere(scene: SceneDir) -> None:
     write_image(scene.stage("field") / "excluded.jpg", np.zeros((4, 4, 3), np.uint8))
     html = page(scene, REPORT)
     assert "were not used" in html
-    parser = read(html)
+    parser = Text(html)
     assert {link for link in parser.links if not link.startswith(("#", "data:"))} == {"review.mp4", "report.json"}
     assert "http" not in html and "url(" not in html.replace("url(#", "")
     assert "video" in parser.tags
 
 
 def test_a_page_without_a_video_has_no_player(scene: SceneDir) -> None:
-    assert "video" not in read(page(scene, REPORT)).tags
+    assert "video" not in Text(page(scene, REPORT)).tags
 
 
 def test_a_print_splits_no_figure(scene: SceneDir) -> None:
@@ -274,7 +233,7 @@ def test_no_drive_says_why(scene: SceneDir) -> None:
     report = changed("review.follower", None)
     report["review"]["not_applicable"] = "this is not a drive"
     assert follower_verdict(report).text == "No robot was driven here: this is not a drive."
-    assert "Does not apply here: this is not a drive." in read(page(scene, report)).text
+    assert "Does not apply here: this is not a drive." in Text(page(scene, report)).text
 
 
 CAUTIONS: list[tuple[str, str, Any, str]] = [
@@ -348,7 +307,7 @@ def no_charts() -> Iterator[None]:
 
 
 def header_of(html: str) -> str:
-    return read(html[html.index("<header") : html.index("</header>")] + "</header>").text
+    return Text(html[html.index("<header") : html.index("</header>")] + "</header>").text
 
 
 def test_a_start_without_parts_nearby_is_free() -> None:
@@ -401,7 +360,7 @@ def test_every_defect_gives_a_caution_with_a_cure_in_section_and_summary(
     above = header_of(html)
     assert f"{below.headline.word}:" in above and caution.what in above
     assert f'href="#{section}"' in html and f'id="{section}"' in html
-    assert read(html).text.count(caution.what) == 2  # above, and with its cure below
+    assert Text(html).text.count(caution.what) == 2  # above, and with its cure below
     printed = [line for line in summary(report).splitlines() if line.startswith("caution")]
     assert len(printed) == 1 and caution.what in printed[0] and caution.cure in printed[0]
 
@@ -475,7 +434,7 @@ def test_no_summary_has_a_better_mood_than_its_sections(
         assert headline is not None and headline.mood in ("mixed", "bad") and headline.word in ("caution", "bad")
     html = page(SceneDir(Path("nowhere")), report)
     header, printed = header_of(html), summary(report)
-    text = read(html[html.index("</header>") + len("</header>") :].removesuffix("</html>").rsplit("</main>", 1)[0]).text
+    text = Text(html[html.index("</header>") + len("</header>") :].removesuffix("</html>").rsplit("</main>", 1)[0]).text
     for _, caution in below:
         assert caution.what in header and caution.what in text and caution.what in printed
     assert [it["what"] for it in cautions(report)] == [caution.what for _, caution in below]
@@ -490,7 +449,7 @@ def test_a_failed_drive_says_what_to_try() -> None:
 
 
 def test_errors_against_ground_truth_are_shown_where_it_is_known(scene: SceneDir) -> None:
-    assert "ground truth" not in read(page(scene, REPORT)).text
+    assert "ground truth" not in Text(page(scene, REPORT)).text
     known = changed("truth", {"ate_m": 0.042, "ground_median_m": 0.09, "corridor_intrusions": 2, "scale_error": None})
     section = truth_section(known)
     values = {fact.name: fact.value for fact in section.facts}
@@ -500,7 +459,7 @@ def test_errors_against_ground_truth_are_shown_where_it_is_known(scene: SceneDir
 
 
 def test_charts_are_drawn_from_the_report(scene: SceneDir) -> None:
-    text = read(page(scene, REPORT)).text
+    text = Text(page(scene, REPORT)).text
     assert "24.3 dB (n = 10)" in text
     assert "PSNR during training" in text and "Cross-track error of the drive" in text
     assert "Ground and convex parts" not in text  # no mesh stage on disk
@@ -508,7 +467,7 @@ def test_charts_are_drawn_from_the_report(scene: SceneDir) -> None:
 
 def test_held_out_frames_are_told_from_scored_ones_and_photos_from_films(scene: SceneDir) -> None:
     """A report counts held-out frames of all lightings, and for each lighting those that were scored."""
-    text = read(page(scene, REPORT)).text
+    text = Text(page(scene, REPORT)).text
     assert "on 10 of its held-out frames" in text and "are scored under Radiance field" in text
     photos = {"day": {"kind": "images", "kept": 160}}
     assert "at regular spacing" not in capture_section(changed("capture.sources", photos)).done
@@ -531,7 +490,7 @@ def test_templates_escape_text_and_refuse_missing_data() -> None:
 def test_the_page_says_what_to_do_next_in_commands_that_parse(scene: SceneDir) -> None:
     """Also if the scene's folder needs quoting; without a drive, no training is proposed."""
     odd = SceneDir(scene.root.parent / "my road's")
-    text = read(page(odd, changed("mesh.parts", 0))).text
+    text = Text(page(odd, changed("mesh.parts", 0))).text
     assert "Look at the caution above." in text
     commands = [line for line in next_commands(odd, REPORT) if line.startswith("twin ")]
     for line in commands:

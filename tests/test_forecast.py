@@ -3,11 +3,11 @@
 import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from page_text import Text
 from scipy import stats
 from scipy.special import expit
 
@@ -96,38 +96,6 @@ def results(path: Path, real: list[Cell]) -> Path:
     rows = [(c.policy, c.lighting, str(c.trials), str(c.successes), c.task, c.twin_lighting) for c in real]
     path.write_text(csv_text(("policy", "lighting", "trials", "successes", "task", "twin_lighting"), rows))
     return path
-
-
-class Text(HTMLParser):
-    """The text of a page and its links; fails on tags closed out of order."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.parts: list[str] = []
-        self.links: list[str] = []
-        self.tags: list[str] = []
-        self._open: list[str] = []
-        self.feed(html)
-        assert not self._open
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.links += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
-        if tag not in ("img", "meta", "br"):
-            self._open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.links += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self._open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.parts.append(data)
-
-    @property
-    def text(self) -> str:
-        return re.sub(r"\s+", " ", " ".join(self.parts))
 
 
 def test_rates_are_those_of_the_tables() -> None:

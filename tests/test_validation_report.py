@@ -13,7 +13,7 @@ from films import video_info
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from test_forecast import Text
+from page_text import Text
 from tiny_runs import tiny_runs
 from tiny_twin import tiny_twin
 
