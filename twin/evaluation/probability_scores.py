@@ -13,6 +13,7 @@ recalibration are fitted to real trials; they predict each training from trials 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -152,18 +153,13 @@ def _logistic_line(x: Array, rate: Array) -> tuple[float, float]:
 
 def calibration(probability: Array, rate: Array, trials: Indices) -> tuple[CalibrationBin, ...]:
     """Calibration curve of cells, shapes (c,); bins without trials are left out."""
-    edges = np.array(CALIBRATION_EDGES)
-    index = np.clip(np.searchsorted(edges, probability, "right") - 1, 0, len(edges) - 2)
+    index = np.clip(np.searchsorted(CALIBRATION_EDGES, probability, "right") - 1, 0, len(CALIBRATION_EDGES) - 2)
     out = []
-    for b in range(len(edges) - 1):
+    for b, (low, high) in enumerate(pairwise(CALIBRATION_EDGES)):
         of = index == b
         if n := int(trials[of].sum()):
-            predicted, observed = ((trials[of] * value[of]).sum() / n for value in (probability, rate))
-            out.append(
-                CalibrationBin(
-                    float(edges[b]), float(edges[b + 1]), float(predicted), float(observed), int(of.sum()), n
-                )
-            )
+            predicted, observed = (float((trials[of] * value[of]).sum() / n) for value in (probability, rate))
+            out.append(CalibrationBin(low, high, predicted, observed, int(of.sum()), n))
     return tuple(out)
 
 
