@@ -66,13 +66,8 @@ def _write_model(folder: Path, cameras: Cameras, points: SparsePoints) -> None:
     model.mkdir(parents=True)
     keys = [(*size.tolist(), *k.tolist()) for size, k in zip(cameras.sizes, cameras.intrinsics, strict=True)]
     camera_ids = {key: i + 1 for i, key in enumerate(dict.fromkeys(keys))}
-    write_text(
-        model / "cameras.txt",
-        _lines(
-            "CAMERA_ID MODEL WIDTH HEIGHT fx fy cx cy",
-            ((number, "PINHOLE", *key) for key, number in camera_ids.items()),
-        ),
-    )
+    pinholes = ((number, "PINHOLE", *key) for key, number in camera_ids.items())
+    _write_lines(model / "cameras.txt", "CAMERA_ID MODEL WIDTH HEIGHT fx fy cx cy", pinholes)
     rows: list[tuple] = []
     tracks: list[list[int]] = [[] for _ in range(len(points))]
     for i, name in enumerate(cameras.names):
@@ -87,22 +82,15 @@ def _write_model(folder: Path, cameras: Cameras, points: SparsePoints) -> None:
         for k, point in enumerate(seen.tolist()):
             tracks[point] += [i + 1, k]
         rows.append(tuple(v for p, n in zip(pixels.tolist(), seen.tolist(), strict=True) for v in (*p, n + 1)))
-    write_text(
-        model / "images.txt", _lines("IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; then X Y POINT3D_ID ...", rows)
-    )
+    _write_lines(model / "images.txt", "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; then X Y POINT3D_ID ...", rows)
     records = zip(points.xyz.tolist(), points.rgb.tolist(), points.error.tolist(), tracks, strict=True)
-    write_text(
-        model / "points3D.txt",
-        _lines(
-            "POINT3D_ID X Y Z R G B ERROR, then IMAGE_ID POINT2D_INDEX ...",
-            ((k + 1, *xyz, *rgb, error, *track) for k, (xyz, rgb, error, track) in enumerate(records) if track),
-        ),
-    )
+    seen_points = ((k + 1, *xyz, *rgb, error, *track) for k, (xyz, rgb, error, track) in enumerate(records) if track)
+    _write_lines(model / "points3D.txt", "POINT3D_ID X Y Z R G B ERROR, then IMAGE_ID POINT2D_INDEX ...", seen_points)
 
 
-def _lines(head: str, rows: Iterable[tuple]) -> str:
-    """Text: a comment `head`, then one line per row; floating-point numbers keep all digits."""
-    return "\n".join([f"# {head}", *(" ".join(map(str, row)) for row in rows), ""])
+def _write_lines(path: Path, head: str, rows: Iterable[tuple]) -> None:
+    """Writes a comment `head`, then one line per row; floating-point numbers keep all digits."""
+    write_text(path, "\n".join([f"# {head}", *(" ".join(map(str, row)) for row in rows), ""]))
 
 
 # ---- nerfstudio
