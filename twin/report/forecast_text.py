@@ -20,9 +20,8 @@ from twin.report.html import Caution, Verdict, counted
 GOOD_CORRELATION, FAIR_CORRELATION = 0.9, 0.6
 """Lowest rank correlations for the verdict that the twin ranks, or roughly ranks, policies as the road does."""
 SMALL_REGRET = 0.05  # up to this regret, the verdict is good
-_SMALL_GAP = (
-    0.1  # verdicts are good only if the order is reliable for such differences of rates, and errors are smaller
-)
+# Verdicts are good only if the order is reliable for such differences of rates, and errors are smaller.
+_SMALL_GAP = 0.1
 
 STATISTICS = (
     ("spearman", "Spearman", "rank correlation of twin and road: 1 the same order, 0 no relation"),
@@ -126,9 +125,8 @@ def believable(group: Agreement) -> Verdict:
     many, days = counted(group.trainings, "training"), counted(group.days, "day")
     where = f"measured on {days} and {many}"
     if not pairs and not ties:
-        return Verdict(
-            f"These policies do not differ on the road, so no order in the twin could be confirmed ({where}).", "bad"
-        )
+        text = f"These policies do not differ on the road, so no order in the twin could be confirmed ({where})."
+        return Verdict(text, "bad")
     for start, _, _ in pairs:
         beyond = [(n, right) for low, n, right in pairs if low >= start]
         n, right = sum(n for n, _ in beyond), sum(right for _, right in beyond)
@@ -213,13 +211,9 @@ def _skill(group: Agreement) -> list[Verdict]:
             more = "and distinguishes days" if shuffled.low > 0 else "but it is not certain that it distinguishes days"
             text = f"{text}, {more}"
         return [Verdict(f"{text} (log scores).", "good")]
-    worse = gain.high < 0
-    text = "worse than" if worse else "not significantly better than"
-    return [
-        Verdict(
-            f"The twin predicts success on single days {text} the mean of other trainings does (log scores).", "bad"
-        )
-    ]
+    how = "worse than" if gain.high < 0 else "not significantly better than"
+    text = f"The twin predicts success on single days {how} the mean of other trainings does (log scores)."
+    return [Verdict(text, "bad")]
 
 
 def _leader(forecast: Forecast, task: str) -> Verdict:
