@@ -110,7 +110,7 @@ def test_shifts_stay_within_their_limit_and_repeat_edges():
     buffer = FrameReplayBuffer(40, SPACE, ACTION, "cpu", ENVS, shift=2)
     stacks = np.random.default_rng(0).integers(0, 256, (60, 12, *SIZE), np.uint8)
     shifts = set()
-    for before, after in zip(stacks, buffer._shifted(stacks, buffer._draw_shifts(60)), strict=True):
+    for before, after in zip(stacks, buffer._shifted(stacks), strict=True):
         found = [
             (y, x)
             for y in range(-2, 3)

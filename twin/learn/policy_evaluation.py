@@ -195,7 +195,7 @@ _CONNECT_TIMEOUT = 5.0  # [s]
 
 
 def run_chunks_on_ray(chunks: Sequence[EpisodeChunk], address: str) -> Iterator[list[EpisodeResult]]:
-    """Does the same as `campaign` on a Ray cluster; the address `auto` stands for the cluster on this machine.
+    """Does the same as `run_chunks` on a Ray cluster; the address `auto` stands for the cluster on this machine.
 
     Every node needs `twin`, and scene and policies under the same paths as here. Raises InputError: Ray is not
     installed, there is no such cluster, or an error of `run_chunk`.

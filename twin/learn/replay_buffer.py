@@ -266,17 +266,18 @@ class FrameReplayBuffer(ReplayBuffer):
         newest, age = self.newest[row, env_index], self.age[row, env_index]
         back = np.arange(self.stack - 1, -1, -1)
         first = (newest - age)[:, None]
-        out = []
-        for at in (newest, newest + 1):
-            where = np.maximum(at[:, None] - back, first) % self.length
-            frames = self.frames if self._on_gpu is None else self._on_gpu
-            out.append(frames[env_index[:, None], where].reshape(len(row), *self.obs_shape))
-        return out[0], out[1]
+        frames = self.frames if self._on_gpu is None else self._on_gpu
+
+        def until(last: NDArray) -> Any:
+            index = np.maximum(last[:, None] - back, first) % self.length
+            return frames[env_index[:, None], index].reshape(len(row), *self.obs_shape)
+
+        return until(newest), until(newest + 1)
 
     def _augmented(self, before: Any, after: Any) -> tuple[Any, Any]:
         """Stacks as updates see them: all are shifted, and half of those before transitions have other colors."""
         if self.shift:
-            before, after = (self._shifted(stacks, self._draw_shifts(len(stacks))) for stacks in (before, after))
+            before, after = self._shifted(before), self._shifted(after)
         if self.color_strength:
             # Stacks after transitions stay unchanged, since targets are computed from them (SVEA, Hansen et al. 2021).
             half = len(before) // 2
@@ -314,22 +315,17 @@ class FrameReplayBuffer(ReplayBuffer):
             self._on_gpu[env_index, at] = torch.as_tensor(np.ascontiguousarray(pictures), device=self.device)
         self.written[env_index] += 1
 
-    def _draw_shifts(self, count: int) -> NDArray[np.int64]:
-        """Shifts down and to the right, 0 to 2 · shift, where `shift` leaves a stack in its place; shape (count, 2)."""
-        return self.rng.integers(0, 2 * self.shift + 1, (count, 2))
-
-    def _shifted(self, stacks: Any, shifts: NDArray[np.int64]) -> Any:
+    def _shifted(self, stacks: Any) -> Any:
+        """Randomly shifted copies of stacks; edge pixels are repeated."""
         p, (height, width) = self.shift, self.obs_shape[1:]
+        shifts = self.rng.integers(0, 2 * p + 1, (len(stacks), 2))  # down and to the right; p leaves a stack in place
         if self._on_gpu is not None:
             y, x = torch.as_tensor(shifts.T - p, device=self.device)[..., None]
             rows = (torch.arange(height, device=self.device) + y).clamp(0, height - 1)[:, None, :, None]
             columns = (torch.arange(width, device=self.device) + x).clamp(0, width - 1)[:, None, None, :]
             k, channel = torch.arange(len(stacks), device=self.device), torch.arange(len(stacks[0]), device=self.device)
             return stacks[k[:, None, None, None], channel[:, None, None], rows, columns]
-        padded = np.empty((*stacks.shape[:2], height + 2 * p, width + 2 * p), np.uint8)
-        padded[..., p:-p, p:-p] = stacks
-        padded[..., :p, p:-p], padded[..., -p:, p:-p] = stacks[..., :1, :], stacks[..., -1:, :]
-        padded[..., :p], padded[..., -p:] = padded[..., p : p + 1], padded[..., -p - 1 : -p]
+        padded = np.pad(stacks, ((0, 0), (0, 0), (p, p), (p, p)), "edge")
         out = np.empty_like(stacks)
         for i, (y, x) in enumerate(shifts):
             out[i] = padded[i, :, y : y + height, x : x + width]

@@ -95,6 +95,10 @@ class DrivePolicy(SACPolicy):
 class PixelSAC(SAC):
     """SAC with a shared encoder and privileged states."""
 
+    replay_buffer: FrameReplayBuffer
+    ent_coef_optimizer: torch.optim.Adam
+    log_ent_coef: torch.Tensor
+    target_entropy: float
     averaged_actor: Actor
     """Running mean of the actor and its encoder, which is saved as the policy. The actor itself fluctuates between
     updates: a policy saved at a bad moment would leave the road."""
@@ -117,9 +121,6 @@ class PixelSAC(SAC):
             self.critic.optimizer.add_param_group({"params": list(self.state_head.parameters())})
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        assert isinstance(self.replay_buffer, FrameReplayBuffer)
-        assert self.ent_coef_optimizer is not None and self.log_ent_coef is not None
-        assert isinstance(self.target_entropy, float)
         self.policy.set_training_mode(True)
         critics, targets = (
             [p for q in c.q_networks for p in q.parameters()] for c in (self.critic, self.critic_target)
@@ -216,7 +217,6 @@ def save_state(folder: Path, model: PixelSAC, more: dict[str, Any]) -> None:
 
     Raises OSError: the disk is full; the previous state is intact.
     """
-    assert isinstance(model.replay_buffer, FrameReplayBuffer)
     name = f"state_{model.num_timesteps:09d}"
     remove(folder / name)
     (folder / name).mkdir(parents=True)
@@ -250,7 +250,6 @@ def load_state(folder: Path, model: PixelSAC) -> dict[str, Any]:
 
     Raises InputError: files are missing or damaged, or belong to another network.
     """
-    assert isinstance(model.replay_buffer, FrameReplayBuffer)
     with wrap_read_errors(folder, "train again under another name"):
         head = read_json(folder / _STATE)
         state = folder / Path(head["folder"]).name
@@ -264,7 +263,6 @@ def load_state(folder: Path, model: PixelSAC) -> dict[str, Any]:
 
 
 def _optimizers(model: PixelSAC) -> dict[str, torch.optim.Optimizer]:
-    assert model.ent_coef_optimizer is not None
     return {"actor": model.actor.optimizer, "critic": model.critic.optimizer, "entropy": model.ent_coef_optimizer}
 
 
@@ -273,7 +271,6 @@ def _modules(model: PixelSAC) -> dict[str, torch.nn.Module]:
 
 
 def _tensors(model: PixelSAC) -> dict[str, torch.Tensor]:
-    assert model.log_ent_coef is not None
     out = {"log_ent_coef": model.log_ent_coef.detach(), "rng": torch.get_rng_state()}
     for name, module in _modules(model).items():
         out |= {f"{name}.{key}": value for key, value in module.state_dict().items()}
@@ -287,7 +284,6 @@ def _tensors(model: PixelSAC) -> dict[str, torch.Tensor]:
 
 
 def _set_tensors(model: PixelSAC, tensors: dict[str, torch.Tensor]) -> None:
-    assert model.log_ent_coef is not None
     for name, module in _modules(model).items():
         own = {n.removeprefix(f"{name}."): value for n, value in tensors.items() if n.startswith(f"{name}.")}
         module.load_state_dict(own)

@@ -16,7 +16,8 @@ If the lighting varies, these episodes have held-out lightings and everything ra
 default; otherwise only the robot is randomized.
 """
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -215,8 +216,8 @@ def failure_summary(failures: Sequence[Failure]) -> str:
         return ""
     bins = [max(0, int(one.progress // _PLACE)) for one in failures]  # progress may be slightly negative at the start
     where, count = _most(bins)
-    cause, by_cause = _most([one.cause for one, b in zip(failures, bins, strict=True) if b == where])
-    light, by_light = _most([_main_light(one.lighting) for one in failures])
+    cause, by_cause = _most(one.cause for one, b in zip(failures, bins, strict=True) if b == where)
+    light, by_light = _most(_main_light(one.lighting) for one in failures)
     place = f"{count} of {len(failures)} failures at {where * _PLACE:g} to {(where + 1) * _PLACE:g} m"
     return f"{place} ({by_cause} by {cause}); {by_light} in lightings mostly like {light}"
 
@@ -227,10 +228,9 @@ def _main_light(lighting: str) -> str:
     return mixture.split(" ")[0] if mixture else lighting
 
 
-def _most(values: list[Any]) -> tuple[Any, int]:
+def _most(values: Iterable[Any]) -> tuple[Any, int]:
     """The most frequent value (the first one if several are tied), and its count."""
-    best = max(values, key=values.count)
-    return best, values.count(best)
+    return Counter(values).most_common(1)[0]
 
 
 def _test(config: TrainConfig, step: int, drive: Callable[[Sequence[int]], list[EpisodeResult]]) -> PolicyTest:

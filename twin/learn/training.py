@@ -251,9 +251,7 @@ def _learning_rate(config: TrainConfig, model: PixelSAC, segment: Segment, _: fl
 def cycle_rate(config: TrainConfig, step: int) -> float:
     """Learning rate at a step, without settling: constant in the first half of each cycle, then falling linearly.
 
-    Cycles have about `config.cycle` steps and divide `config.steps` evenly. After 12,000 steps in one place, 40 and 37
-    of 40 test episodes succeeded in two trainings with the falling rate, and 35 of 40 in one with a constant rate; see
-    docs/findings.md.
+    Cycles have about `config.cycle` steps and divide `config.steps` evenly; docs/findings.md compares a constant rate.
     """
     length = config.steps / max(1, round(config.steps / config.cycle))
     left = 1.0 - (step % length) / length if step < config.steps else 0.0
