@@ -39,7 +39,6 @@ from twin.types import Array, Image
 
 # ---- estimation from poses
 
-
 _MIN_FRAMES, _MIN_WAY = 16, 6.0  # least number of frames; shortest path [m]
 _PARTS = 8  # number of consecutive parts of the film for the jackknife
 _NOISE, _OUTLYING = 0.01, 0.03  # [m] standard deviation of a sum of sideways steps; threshold of the robust loss

@@ -24,11 +24,7 @@ EXTRA_SAMPLES = 5  # samples after a window's end, for poses measured after it
 _HISTORY = 20  # samples of the previous window from which delayed commands are taken
 _CHAIN = 3  # number of previous windows over which a ramp is simulated: six seconds
 _PER_SAMPLE = round(PERIOD / CONTROL_STEP)
-_LIMITS = {
-    "mean_limit": "max_speed",
-    "half_limit": "max_yaw_rate",
-    "wheel_limit": "max_wheel_speed",
-}  # and their fields
+_LIMITS = {"mean_limit": "max_speed", "half_limit": "max_yaw_rate", "wheel_limit": "max_wheel_speed"}  # → field
 _LIMIT_NATS = 3.0  # [nat] least loss of a log's likelihood without a limit from which the limit counts as reached
 _HELD = 0.9  # quantile of a window's speeds: the highest speed that the robot held for 0.2 s
 _EXCEEDED = 1.05  # a speed / the robot's limit above which the log contradicts the limit

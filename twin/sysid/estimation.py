@@ -8,6 +8,7 @@ identified; these are then fitted again.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,6 @@ from twin.types import Array
 # with ν = `DEGREES_OF_FREEDOM`. Components of one *kind*, such as x and y, share their scale. Maximum-likelihood
 # scales are estimated in alternation with the model; both steps increase the likelihood. *Scaled* residuals are in
 # units of σ √ν.
-
 
 Kinds = tuple[int, ...]
 """The kind of each residual component, numbered from 0."""
@@ -258,18 +258,9 @@ def _prior_weights(table: list[Parameter], kinds: Kinds) -> Array:
 
 
 def _cached(residuals: Callable[[dict[str, float]], Array]) -> Callable[[dict[str, float]], Array]:
-    """Adds a cache of the newest 4 (p + 1) results, since standard errors reuse the last ones of the search."""
-    seen: dict[tuple[float, ...], Array] = {}
-
-    def at(values: dict[str, float]) -> Array:
-        key = tuple(values.values())
-        if key not in seen:
-            seen[key] = residuals(values)
-            if len(seen) > 4 * (len(values) + 1):
-                del seen[next(iter(seen))]
-        return seen[key]
-
-    return at
+    """Adds a cache of the newest results, since standard errors reuse the last ones of the search."""
+    newest = lru_cache(64)(lambda items: residuals(dict(items)))
+    return lambda values: newest(tuple(values.items()))
 
 
 def _jacobian(

@@ -303,10 +303,9 @@ def published_windows(columns: dict[str, Array], where: str) -> Windows:
     `imu_acceleration_y` points out of the turn (correlations −0.16 and −0.11 over 16,000 samples). The yaw rate has the
     right sign.
     """
-    poses = [f"{{}}icp_{name}" for name in POSE]
+    poses, ends = ([f"{prefix}icp_{name}" for name in POSE] for prefix in ("", "gt_"))
     imu = ("imu_acceleration_x", "imu_acceleration_y")
-    names = [*WHEEL_COMMANDS, *WHEEL_SPEEDS, *(p.format("") for p in poses), *imu]
-    ends = [p.format("gt_") for p in poses]
+    names = [*WHEEL_COMMANDS, *WHEEL_SPEEDS, *poses, *imu]
     _need(columns, ("calib_step", *names, *ends), where)
     shape = columns["icp_x"].shape
     for name in names:
@@ -320,7 +319,7 @@ def published_windows(columns: dict[str, Array], where: str) -> Windows:
     def stacked(names: Iterable[str]) -> Array:
         return np.stack([columns[name] for name in names], -1)
 
-    pose = np.concatenate([stacked(p.format("") for p in poses), stacked(ends)[:, None]], 1)
+    pose = np.concatenate([stacked(poses), stacked(ends)[:, None]], 1)
     pose[..., 2] = np.unwrap(pose[..., 2], axis=1)
     wheels, step = stacked(WHEEL_SPEEDS), columns["calib_step"].astype(np.int64)
     jump, advance = np.abs(wheels[1:, 0] - wheels[:-1, -1]).sum(1), np.diff(step)
@@ -407,8 +406,12 @@ def check_log(windows: Windows, where: str) -> None:
                 f"{where}: {ACCELERATION[int(mean.argmax())]} is {mean.max():.1f} m/s² (median); expected at most "
                 f"{_MAX_ACCELERATION:g}: the IMU's x must point forward and y to the left; leave it out with --level"
             )
-    for ratio, expected, message, cures in _unit_ratios(windows):
-        _check_ratio(ratio, expected, where, message, cures)
+    for ratio, (low, high), message, cures in _unit_ratios(windows):
+        if ratio < low or ratio > high:
+            nearest = min(cures, key=lambda factor: abs(np.log(max(ratio, 1e-9) / factor)))
+            close = abs(np.log(max(ratio, 1e-9) / nearest)) < np.log(6)
+            cure = cures[nearest] if close else "check the units of the columns"
+            raise InputError(f"{where}: {message.format(ratio)}; expected {low:g} to {high:g}; {cure}")
     _check_directions(windows, where)
     turned = windows.poses[windows.fitting, -1, 2]
     left, right = int((turned > _TURN).sum()), int((turned < -_TURN).sum())
@@ -419,8 +422,11 @@ def check_log(windows: Windows, where: str) -> None:
         )
 
 
-def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, float], str, dict[float, str]]]:
-    """Ratios that reveal wrong units: value, expected range, message, and a cure per factor that wrong units cause."""
+def _unit_ratios(windows: Windows) -> Iterator[tuple[float, tuple[float, float], str, dict[float, str]]]:
+    """Ratios that reveal wrong units: value, expected range, message, and a cure per factor that wrong units cause.
+
+    A ratio is NaN if fewer than three windows are suitable.
+    """
     sides = windows.wheels.mean(1) * WHEEL_RADIUS
     mean, half = sides.mean(1), (sides[:, 1] - sides[:, 0]) / 2  # [m/s]
     distance = np.hypot(windows.poses[:, -1, 0], windows.poses[:, -1, 1]) / DURATION
@@ -454,19 +460,6 @@ def _unit_ratios(windows: Windows) -> Iterator[tuple[float | None, tuple[float, 
         yield ratio, (0.1, 6.0), f"the wheels turn {{:.3g}} times as fast as {name} requires", cures
 
 
-def _check_ratio(
-    ratio: float | None, expected: tuple[float, float], where: str, message: str, cures: dict[float, str]
-) -> None:
-    """Raises InputError if a ratio is out of range; the message has the cure of the nearest factor."""
-    low, high = expected
-    if ratio is None or low <= ratio <= high:
-        return
-    nearest = min(cures, key=lambda factor: abs(np.log(max(ratio, 1e-9) / factor)))
-    close = abs(np.log(max(ratio, 1e-9) / nearest)) < np.log(6)
-    cure = cures[nearest] if close else "check the units of the columns"
-    raise InputError(f"{where}: {message.format(ratio)}; expected {low:g} to {high:g}; {cure}")
-
-
 def _check_directions(windows: Windows, where: str) -> None:
     """Raises InputError if poses, wheel speeds and commands contradict each other in direction.
 
@@ -474,15 +467,13 @@ def _check_directions(windows: Windows, where: str) -> None:
     """
     path, ahead, turn, speed, difference = _signed_ratios(windows)
     bends = f"the path turns {path:.2g} times as far as yaw; expected more than 0"
-    moves = (
-        f"the robot moves {ahead:.2g} m along yaw for each meter in its wheels' direction; expected at least {_ALONG}"
-    )
+    moves = f"the robot moves {ahead:.2g} m along yaw per meter in its wheels' direction; expected at least {_ALONG}"
     turns = f"the robot turns {turn:.2g} times as fast as its wheels would have it without slip; expected more than 0"
     rolls = f"the wheels roll {speed:.2g} times as fast as commanded; expected more than 0"
     differ = f"the wheels' difference is {difference:.2g} times the commanded one; expected more than 0"
-    forward, sideways = ("cmd_v has", "cmd_yaw_rate is clockwise: negate it")
+    forward, sideways = "cmd_v has", "cmd_yaw_rate is clockwise: negate it"
     if not windows.twist:
-        forward, sideways = ("cmd_left and cmd_right have", "cmd_left and cmd_right are swapped")
+        forward, sideways = "cmd_left and cmd_right have", "cmd_left and cmd_right are swapped"
     cases = (
         (path < 0 and turn < 0, bends, "yaw is clockwise: negate it"),
         (path < 0, bends, "x and y are swapped, or one of them has the wrong sign"),
@@ -527,5 +518,5 @@ def _signed_ratios(windows: Windows) -> tuple[float, ...]:
     return tuple(float(np.median(a[u] / b[u])) if u.sum() >= _MIN_SIGNED else np.nan for a, b, u in ratios)
 
 
-def _median(values: Array) -> float | None:
-    return float(np.median(values)) if len(values) >= 3 else None
+def _median(values: Array) -> float:
+    return float(np.median(values)) if len(values) >= 3 else np.nan

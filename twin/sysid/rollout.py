@@ -25,7 +25,6 @@ from twin.types import Array
 
 # ---- slope of the ground
 
-
 Complex = NDArray[np.complex128]
 """Gravity along x (real part) and along y (imaginary part) [m/s²]."""
 

@@ -43,9 +43,7 @@ from twin.types import Array
 #     + ramps continued between windows (`drivetrain`)  0.12 m, 4.5°: wheel speeds lag and do not show them
 #     + residual scales from the log (`estimation`)     0.11 m, 4.6°: fixed scales weighted yaw too much
 #
-# The last row is the shipped model (`docs/benchmarks.md`). Alternatives to drag, tried before rolling resistance:
-# drag on all bodies, or on the chassis alone, had a 5 % higher loss; a sliding support that carries part of the weight
-# had a 1 % higher one (it was better straight on and worse in turns).
+# The last row is the shipped model (`docs/benchmarks.md`).
 #
 # In MuJoCo's elliptic cone (condim 6) sliding, spinning and rolling friction share one limit: a tire (friction μ,
 # rolling resistance Crr) that rolls at v and slides at u has the fraction u / √(u² + (v Crr / μ)²) of its grip
@@ -78,8 +76,6 @@ _TABLE: dict[str, tuple[float, float, float, float, str, str]] = {
     "pose_y": (0.0, 0.1, -1.0, 1.0, "m", "turns on the spot"),
     "pose_late": (0.0, 0.1, -MAX_POSE_LEAD * PERIOD, MAX_POSE_LAG * PERIOD, "s", "turns that begin and end"),
 }
-
-
 _COPIED = ("friction", "spin_friction", "rolling_resistance", "ground_viscosity")  # equal in `HuskyParams`
 
 
