@@ -10,16 +10,19 @@ from twin.robot import CONTROLLERS, TRACK, WHEEL_RADIUS, HuskyParams
 _PARAMS = HuskyParams()
 
 
-def drive(controller: Controller, command, start: float, steps: int) -> list[np.ndarray]:
-    """Gives one command every 0.1 s (None = none); returns the executed speeds and yaw rates, shapes (2,)."""
+def carried_out(wheels: np.ndarray) -> np.ndarray:
+    """The speed and yaw rate (2,) that the controller seeks by these wheel speeds (2,), if no wheel is at its limit."""
+    left, right = wheels * WHEEL_RADIUS
+    return np.array([(left + right) / 2, (right - left) / (_PARAMS.separation_multiplier * TRACK)])
+
+
+def drive(controller: Controller, command: tuple[float, float], steps: int) -> np.ndarray:
+    """Gives a command every 0.1 s; returns the carried out speeds and yaw rates, shape (steps, 2)."""
     out = []
-    for k in range(steps):
-        time = start + k * CONTROL_PERIOD
-        if command is not None:
-            controller.command(time, *command)
-        controller.update(time + controller.phase)
-        out.append(controller.limited_command)
-    return out
+    for time in np.arange(steps) * CONTROL_PERIOD:
+        controller.command(time, *command)
+        out.append(carried_out(controller.update(time + controller.phase)))
+    return np.array(out)
 
 
 def test_commands_stay_within_the_limits_of_speed_and_acceleration():
@@ -31,9 +34,9 @@ def test_commands_stay_within_the_limits_of_speed_and_acceleration():
 
 
 def test_a_step_command_is_a_ramp():
-    v, yaw_rate = np.array(drive(Controller(), (1.0, 2.0), 0.0, 6)).T
-    np.testing.assert_allclose(v, [0.3, 0.6, 0.9, 1.0, 1.0, 1.0])
-    np.testing.assert_allclose(yaw_rate, [0.6, 1.2, 1.8, 2.0, 2.0, 2.0])
+    fast, spot = HuskyParams(max_wheel_speed=3.0), (0.0, 2.0)
+    np.testing.assert_allclose(drive(Controller(), (1.0, 0.0), 6)[:, 0], [0.3, 0.6, 0.9, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(drive(Controller(fast), spot, 6)[:, 1], [0.6, 1.2, 1.8, 2.0, 2.0, 2.0])
 
 
 def test_sides_differ_by_the_multiplied_track():
@@ -55,11 +58,8 @@ def test_both_sides_are_scaled_down_alike():
 def test_a_command_expires_after_a_quarter_second():
     controller = Controller()
     controller.command(0.0, 0.3, 0.0)
-    carried_out = []
-    for time in (0.0, 0.1, 0.2, 0.3, 0.4):
-        controller.update(time)
-        carried_out.append(controller.limited_command[0])
-    assert carried_out == pytest.approx([0.3, 0.3, 0.3, 0.0, 0.0])
+    speeds = [carried_out(controller.update(time))[0] for time in (0.0, 0.1, 0.2, 0.3, 0.4)]
+    assert speeds == pytest.approx([0.3, 0.3, 0.3, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
@@ -68,15 +68,12 @@ def test_presets_differ_in_rate_and_time_out_only(name):
     timing, params = CONTROLLERS[name], HuskyParams(controller=name)
     controller = Controller(params)
     controller.command(0.0, 1.0, 0.0)
-    carried_out = []
-    for k in range(round(0.8 / timing.period)):
-        controller.update(k * timing.period)
-        carried_out.append(controller.limited_command[0])
+    speeds = [carried_out(controller.update(k * timing.period))[0] for k in range(round(0.8 / timing.period))]
     lapses = int(np.ceil(timing.timeout / timing.period - 1e-9))
     step = params.max_acceleration * timing.period
     up = np.minimum(1.0, step * np.arange(1, lapses + 1))
-    down = np.maximum(0.0, up[-1] - step * np.arange(1, len(carried_out) - lapses + 1))
-    np.testing.assert_allclose(carried_out, [*up, *down], atol=1e-12)
+    down = np.maximum(0.0, up[-1] - step * np.arange(1, len(speeds) - lapses + 1))
+    np.testing.assert_allclose(speeds, [*up, *down], atol=1e-12)
 
 
 def test_the_published_presets():
@@ -90,8 +87,8 @@ def test_the_published_presets():
 
 @pytest.mark.parametrize("latency", [0.0, 0.04, 0.1, 0.25, 0.3])
 def test_latency_delays_and_changes_nothing_else(latency):
-    prompt = drive(Controller(), (1.0, 0.5), 0.0, 10)
-    late = drive(Controller(HuskyParams(command_latency=latency)), (1.0, 0.5), 0.0, 10)
+    prompt = drive(Controller(), (1.0, 0.5), 10)
+    late = drive(Controller(HuskyParams(command_latency=latency)), (1.0, 0.5), 10)
     periods = int(latency / CONTROL_PERIOD + 1e-9)  # whole ones; the rest is the controller's phase
     np.testing.assert_allclose(late[periods:], prompt[: 10 - periods])
     assert not np.any(late[:periods])
@@ -102,8 +99,4 @@ def test_the_newest_command_counts():
     controller.command(0.0, 0.1, 0.0)
     controller.command(0.05, 0.2, 0.0)
     controller.command(0.15, 0.3, 0.0)  # not there yet
-    controller.update(0.1)
-    assert controller.limited_command[0] == pytest.approx(0.2)
-    controller.reset()
-    controller.update(0.2)
-    assert not controller.limited_command.any()
+    assert carried_out(controller.update(0.1))[0] == pytest.approx(0.2)

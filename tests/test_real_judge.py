@@ -10,8 +10,9 @@ import pytest
 from twin.config import CAUSES
 from twin.env.options import parse_options
 from twin.env.route_segments import RouteSegment
-from twin.env.task import Motion, RewardAndTermination, write_task
+from twin.env.task import Motion, RewardAndTermination, task_table
 from twin.errors import InputError
+from twin.files import write_json
 from twin.geometry.poses import Similarity
 from twin.mjcf.world import World, arc_lengths, heading_at, point_at
 from twin.reality.road_task import RealJudge, RoadTask, read_task
@@ -32,7 +33,7 @@ def winding_world() -> tuple[World, RouteSegment]:
 @pytest.fixture(scope="module")
 def task(tmp_path_factory) -> RoadTask:
     path = tmp_path_factory.mktemp("task") / "middle.json"
-    write_task(path, *winding_world(), OPTIONS)
+    write_json(path, task_table(*winding_world(), OPTIONS))
     return read_task(path)
 
 
@@ -107,7 +108,7 @@ def test_a_task_says_what_the_twin_does(task):
 def test_a_task_goes_from_the_scenes_frame_into_the_true_one(tmp_path, task):
     """The frames differ by a quarter turn and a shift; lengths do not change."""
     path = tmp_path / "task.json"
-    write_task(path, *winding_world(), OPTIONS)
+    write_json(path, task_table(*winding_world(), OPTIONS))
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     moved = read_task(path, Similarity(1.0, quarter, np.array([5.0, 6.0, 7.0])))
     np.testing.assert_allclose(moved.line, task.line @ quarter[:2, :2].T + [5.0, 6.0], atol=1e-12)
@@ -126,7 +127,7 @@ def test_a_task_goes_from_the_scenes_frame_into_the_true_one(tmp_path, task):
 )
 def test_impossible_tasks_are_refused_in_one_line(tmp_path, change, message):
     path = tmp_path / "task.json"
-    write_task(path, *winding_world(), OPTIONS)
+    write_json(path, task_table(*winding_world(), OPTIONS))
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     with pytest.raises(InputError, match=message) as raised:
         read_task(path)

@@ -55,14 +55,10 @@ def wheel_speeds(command: Array, params: HuskyParams) -> Array:
 
 
 class Controller:
-    """Controller of one robot. Times are in seconds on a clock that starts with `reset`."""
+    """Controller of one robot at rest. Times are in seconds on a clock that starts at 0."""
 
     def __init__(self, params: HuskyParams | None = None) -> None:
         self.params = params or HuskyParams()
-        self.reset()
-
-    def reset(self) -> None:
-        """Resets to rest, without pending commands."""
         self._pending: deque[tuple[float, Array]] = deque()
         self._latest: tuple[float, Array] | None = None
         self._limited = np.zeros(2)
@@ -73,11 +69,6 @@ class Controller:
         period = self.params.timing.period
         phase = self.params.command_latency % period
         return 0.0 if phase > period - _TIME_TOLERANCE else phase
-
-    @property
-    def limited_command(self) -> Array:
-        """Command of the last update after the limits: v [m/s], ω [rad/s], shape (2,)."""
-        return self._limited.copy()
 
     def command(self, time: float, v: float, yaw_rate: float) -> None:
         """Gives the controller a command at a time [s]; it arrives `command_latency` later."""
@@ -120,13 +111,9 @@ class VectorController:
     """Controllers of n robots that differ only in `command_latency`; results equal those of `HuskyPhysics.schedule`."""
 
     def __init__(self, params: HuskyParams, count: int, period: float, timestep: float, check_steps: int) -> None:
-        """
-        Args:
-            params: Shared by all robots.
-            count: Number of robots n.
-            period: Time between two commands [s].
-            timestep: Duration of a physics substep [s].
-            check_steps: Substeps between two contact checks.
+        """`period` [s] is the time between two commands, `timestep` [s] that of a physics substep.
+
+        `count` is the number of robots n, `check_steps` the number of substeps between two contact checks.
         """
         self._params, self.timestep, self._check_steps = params, timestep, check_steps
         self._steps, self._period = round(period / timestep), period

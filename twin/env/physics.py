@@ -36,13 +36,8 @@ class _Snapshot(NamedTuple):
     mocap_quat: Array
 
 
-class EpisodeState(NamedTuple):
-    """State of an episode that MuJoCo's data does not contain; see `HuskyPhysics`."""
-
-    controller: Controller
-    steps_to_update: int
-    touched: set[int]
-    snapshots: list[_Snapshot]
+EPISODE_STATE = ("controller", "steps_to_update", "touched_geoms", "snapshots")
+"""Attributes of `HuskyPhysics` that are an episode's state besides MuJoCo's data."""
 
 
 class HuskyPhysics:
@@ -111,16 +106,10 @@ class HuskyPhysics:
         phase_steps = int(np.ceil(self.controller.phase / self.model.opt.timestep - 1e-6))
         self.steps_to_update = phase_steps % self._steps_per_update
         """Substeps until the controller's next update."""
-        self._touched = self._contacts()
-        self._snapshots = [self._snapshot()]
-
-    def episode_state(self) -> EpisodeState:
-        """State of the episode besides `data`; shared with this instance, so copy it before either steps on."""
-        return EpisodeState(self.controller, self.steps_to_update, self._touched, self._snapshots)
-
-    def set_episode_state(self, state: EpisodeState) -> None:
-        """Goes on with an episode whose state `data` contains already."""
-        self.controller, self.steps_to_update, self._touched, self._snapshots = state
+        self.touched_geoms = self._contacts()
+        """Indices of the geoms touched during the last control step."""
+        self.snapshots = [self._snapshot()]
+        """State at the contact checks from which delayed pictures are taken."""
 
     def _ground_height(self, xy: Array) -> Array:
         relief = self.model.hfield_size[self.model.geom_dataid[self._ground], 2]
@@ -151,7 +140,7 @@ class HuskyPhysics:
             mujoco.mj_step(self.model, self.data, steps)
             touched |= self._contacts()
             if self.params.camera_latency:
-                self._snapshots.append(self._snapshot())
+                self.snapshots.append(self._snapshot())
         # After mj_step, poses and contacts are those at the start of the last substep; compute those at its end.
         mujoco.mj_forward(self.model, self.data)
         self._finish_step(touched | self._contacts())
@@ -188,13 +177,13 @@ class HuskyPhysics:
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
         if self.params.camera_latency:
-            self._snapshots = [_Snapshot(*one) for one in snapshots]
+            self.snapshots = [_Snapshot(*one) for one in snapshots]
         self._finish_step(touched)
 
     def _finish_step(self, touched: set[int]) -> None:
-        self._touched = touched
+        self.touched_geoms = touched
         oldest = self.time - self.params.camera_latency - 2 * _CHECK_PERIOD
-        self._snapshots = [one for one in self._snapshots if one.time > oldest]
+        self.snapshots = [one for one in self.snapshots if one.time > oldest]
 
     def _snapshot(self) -> _Snapshot:
         d = self.data
@@ -209,12 +198,7 @@ class HuskyPhysics:
     @property
     def touched(self) -> tuple[str, ...]:
         """Names of the geoms touched during the last control step, sorted."""
-        return tuple(sorted(self.model.geom(i).name for i in self._touched))
-
-    @property
-    def touched_geoms(self) -> frozenset[int]:
-        """Indices of the geoms touched during the last control step."""
-        return frozenset(self._touched)
+        return tuple(sorted(self.model.geom(i).name for i in self.touched_geoms))
 
     @property
     def time(self) -> float:
@@ -264,8 +248,8 @@ class HuskyPhysics:
         if not self.params.camera_latency:
             return self.data
         data, time = self._delayed, self.time - self.params.camera_latency
-        before = max(bisect_right(self._snapshots, time + TIME_TOLERANCE, key=lambda one: one.time) - 1, 0)
-        first, last = self._snapshots[before], self._snapshots[min(before + 1, len(self._snapshots) - 1)]
+        before = max(bisect_right(self.snapshots, time + TIME_TOLERANCE, key=lambda one: one.time) - 1, 0)
+        first, last = self.snapshots[before], self.snapshots[min(before + 1, len(self.snapshots) - 1)]
         data.time, data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = first
         if first.time + TIME_TOLERANCE < time < last.time:
             share, rate = (time - first.time) / (last.time - first.time), np.zeros(self.model.nv)

@@ -11,11 +11,9 @@ import copy
 import math
 import sys
 import warnings
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -27,10 +25,9 @@ from twin.config import CAUSES, STEERING, ObstacleConfig
 from twin.env.domain_randomization import NominalModel, RandomizationSample
 from twin.env.obstacles import EpisodeObstacles, ObstacleMotion
 from twin.env.options import STATE_SIZES, Options, check_actions
-from twin.env.physics import EpisodeState, HuskyPhysics
+from twin.env.physics import EPISODE_STATE, HuskyPhysics
 from twin.env.route_segments import RouteSegment
 from twin.errors import InputError, short_repr
-from twin.files import write_json
 from twin.geometry.poses import wrap_angle
 from twin.mjcf.world import World, heading_at, nearest_on_route, point_at
 from twin.robot import HuskyParams
@@ -84,11 +81,6 @@ class Motion:
     """Time since the start of the episodes [s], shape (k,)."""
 
 
-def default_time_limit(segment: RouteSegment, speed: float, robot: HuskyParams) -> float:
-    """Twice the time [s] that the route segment takes at a speed [m/s], or 1.5 times that at the robot's top speed."""
-    return segment.length * max(2.0 / speed, 1.5 / min(robot.max_speed, robot.max_wheel_speed))
-
-
 class RewardAndTermination:
     """Reward, termination and state of n drives along one route segment.
 
@@ -102,8 +94,9 @@ class RewardAndTermination:
         self.segment, self.options = segment, options
         self.half_width = options.half_width or world.half_width
         """Half width of the corridor [m]."""
-        self.time_limit = options.time_limit or default_time_limit(segment, options.speed, world.robot)
-        """[s]"""
+        top_speed = min(world.robot.max_speed, world.robot.max_wheel_speed)
+        self.time_limit = options.time_limit or segment.length * max(2.0 / options.speed, 1.5 / top_speed)
+        """[s]; by default twice the time that the segment takes at `speed`, or 1.5 times that at the top speed."""
         self.foot, self.cross_track = np.zeros(count), np.zeros(count)
         """Arc length of the foot, and signed distance from the route, positive to the left [m], shape (n,)."""
         self._cause = np.zeros(count, int)
@@ -229,15 +222,17 @@ class DrivePhysics(dm_mujoco.Physics):
         super().__setstate__(data)
         self._continue(*episode)
 
-    def _episode(self) -> tuple[HuskyParams, tuple[ObstacleConfig, ...] | None, EpisodeState]:
+    def _episode(self) -> tuple[HuskyParams, tuple[ObstacleConfig, ...] | None, dict[str, Any]]:
         """Robot, obstacles and state, which a copy needs besides `data` to go on with the episode."""
         moved = self.robot.move_obstacles
         obstacles = moved.obstacles if isinstance(moved, ObstacleMotion) else None
-        return self._params, obstacles, self.robot.episode_state()
+        return self._params, obstacles, {name: getattr(self.robot, name) for name in EPISODE_STATE}
 
-    def _continue(self, params: HuskyParams, obstacles: tuple[ObstacleConfig, ...] | None, state: EpisodeState) -> None:
+    def _continue(
+        self, params: HuskyParams, obstacles: tuple[ObstacleConfig, ...] | None, state: dict[str, Any]
+    ) -> None:
         self.set_robot(params)
-        self.robot.set_episode_state(state)
+        vars(self.robot).update(state)
         if obstacles is not None:
             self.robot.move_obstacles = ObstacleMotion(obstacles, self.data.ptr)
 
@@ -282,9 +277,7 @@ class DriveTask(control.Task):
     ) -> None:
         """
         Args:
-            world: Route, corridor and robot.
-            segment: Route segment to drive.
-            options: Options of the environment.
+            world, segment, options: As in `RewardAndTermination`.
             obstacles: Samples an episode's obstacles; its pool is in the model.
             model: The compiled model before randomization; it is not stepped.
             seed: Seed of the sequence of episodes; None: unpredictable.
@@ -356,22 +349,17 @@ class DriveTask(control.Task):
         terminated, truncated = self._evaluator.ended([self._index])
         return 0.0 if terminated[0] else 1.0 if truncated[0] else None
 
-    def get_observation(self, physics: DrivePhysics) -> "OrderedDict[str, Array]":
+    def get_observation(self, physics: DrivePhysics) -> dict[str, NDArray[np.float32]]:
         """Returns the components of the privileged state."""
-        ends = np.cumsum(list(STATE_SIZES.values()))
-        return OrderedDict(zip(STATE_SIZES, np.split(self.state(physics), ends[:-1]), strict=True))
+        return _by_component(self.state(physics))
 
     def state(self, physics: DrivePhysics) -> NDArray[np.float32]:
         """Returns the privileged state, shape (7,), see `RewardAndTermination.state`."""
         return self._evaluator.state([self._index], _robot_motion(physics))[0]
 
-    def observation_spec(self, physics: DrivePhysics) -> "OrderedDict[str, specs.BoundedArray]":
-        ends = np.cumsum(list(STATE_SIZES.values()))
-        lows, highs = (np.split(bound, ends[:-1]) for bound in self.state_bounds)
-        return OrderedDict(
-            (name, specs.BoundedArray(low.shape, np.float32, low, high, name))
-            for name, low, high in zip(STATE_SIZES, lows, highs, strict=True)
-        )
+    def observation_spec(self, physics: DrivePhysics) -> dict[str, specs.BoundedArray]:
+        lows, highs = map(_by_component, self.state_bounds)
+        return {name: specs.BoundedArray(low.shape, np.float32, low, highs[name], name) for name, low in lows.items()}
 
     def action_spec(self, physics: DrivePhysics) -> specs.BoundedArray:
         low, high = self._bounds()
@@ -443,25 +431,25 @@ class DriveTask(control.Task):
         return float(x), float(y), heading + float(turn)
 
 
+def _by_component(state: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+    ends = np.cumsum(list(STATE_SIZES.values()))
+    return dict(zip(STATE_SIZES, np.split(state, ends[:-1]), strict=True))
+
+
 def _robot_motion(physics: DrivePhysics) -> Motion:
     values = physics.speed, physics.yaw_rate, physics.uprightness, bool(physics.touched), physics.time()
     return Motion(physics.planar_pose[None], *(np.array([value]) for value in values))
 
 
 # ---- task file
-#
-# For programs that do not use this package:
-#
-#     {"format": "twin task", "version": 1, "name": "straight", "line": [[x, y, z], ...], "half_width": 1.0, ...}
-#
-# The file contains the numbers of `RewardAndTermination`, so that other programs can evaluate drives by the same rules.
 
 _TASK_FILE_VERSION = 1
 
 
 def task_table(world: World, segment: RouteSegment, options: Options) -> dict[str, Any]:
-    """The contents of the file, in the scene's frame (z up), meters, seconds, radians.
+    """A task for a JSON file, by which programs without this package evaluate drives by the same rules.
 
+    Its numbers are those of `RewardAndTermination`, in the scene's frame (z up), meters, seconds, radians.
     `line` (m, 3) is on the ground, in driving order; a *station* is a horizontal arc length along it. Trials start at
     `start.station`, up to `start.offset` beside the line and turned by up to `start.heading` from its direction. They
     succeed when the base reaches the station `goal`. They fail
@@ -493,8 +481,3 @@ def task_table(world: World, segment: RouteSegment, options: Options) -> dict[st
         "limits": {"speed": options.speed, "yaw_rate": options.yaw_rate},
         "control_timestep": options.control_timestep,
     }
-
-
-def write_task(path: Path, world: World, segment: RouteSegment, options: Options) -> None:
-    """Writes a task as a JSON file, see `task_table`."""
-    write_json(path, task_table(world, segment, options))

@@ -22,11 +22,11 @@ from twin.assets.views import render_views
 from twin.config_file import load_config
 from twin.env.options import Options
 from twin.env.route_segments import find_task
-from twin.env.task import write_task
+from twin.env.task import task_table
 from twin.errors import InputError
 from twin.export import gltf
 from twin.export.camera_formats import write_colmap, write_nerfstudio
-from twin.files import load_arrays, require_absent, require_parent, write_bytes
+from twin.files import load_arrays, require_absent, require_parent, write_bytes, write_json
 from twin.geometry.cameras import SparsePoints
 from twin.loading import Twin, load_scene
 from twin.mjcf.scene_xml import Parts
@@ -92,7 +92,7 @@ def export(
             raise InputError(f"{twin.scene.root}: has no route, so no tasks; set mjcf.route = true and build it again")
         world = twin.world()
         segment = find_task(task, world, load_config(twin.scene.config_file).task)
-        write_task(task_file, world.along(segment.route), segment, Options())
+        write_json(task_file, task_table(world.along(segment.route), segment, Options()))
         lines.append(f"{task_file}: {task}, {segment.length:.1f} m long, starts {segment.start:.1f} m along the route")
     if folders:
         if (twin.scene.root / PACK_JSON).exists():
