@@ -168,8 +168,6 @@ def test_batch_equals_single_renderings(box):
         alone = single.render([data], lighting)
         for name in ("rgb", "depth", "opacity"):
             assert np.array_equal(getattr(alone, name)[0], getattr(together, name)[k]), name
-    with pytest.raises(InputError, match="at most 3"):
-        Compositor(model, field, SIZE, max_envs=3).render([*datas, datas[0]], "day")
 
 
 def test_the_camera_of_the_model_is_that_of_the_pictures():

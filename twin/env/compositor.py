@@ -6,10 +6,10 @@ foreground by the foreground's opacity, so that leaves in front of an object hid
 """
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -19,7 +19,6 @@ from twin.env.irradiance import BOX_CORNERS, ContactShadows, Irradiance, Irradia
 from twin.env.mujoco_renderer import FRONT_CAMERA, RayCaster, camera_intrinsics, camera_poses, mujoco_rays
 from twin.env.obstacles import OBSTACLE_GROUP, stored_route
 from twin.env.picture_effects import CameraNoise, Weather, soft_clip
-from twin.errors import InputError
 from twin.geometry.cameras import Rendering, Viewpoints, opencv_to_mujoco, pixel_grid, unproject
 from twin.mjcf.husky_visuals import ROBOT_VISUAL_GROUP, camera_mount_geoms
 from twin.nerf.baked import BakedField
@@ -309,12 +308,12 @@ class Compositor:
             model: Contains the camera and the route. `add_obstacles` stores the route, also without obstacles.
             field: Radiance field of the place.
             size: Width, height of the pictures [px].
-            max_envs: Largest number of envs per call of `render`.
+            max_envs: Number of envs that are usually rendered together; it limits the number of threads.
             shaded: False draws obstacles in their own, unshaded colors, for comparison.
             camera: Name of the camera.
             lit: Lowest and highest arc length of the route [m] where objects are shaded, see `IrradianceEstimator`.
         """
-        self.size, self.max_envs, self._field = size, max_envs, field
+        self.size, self._field = size, field
         self._camera = model.camera(camera).id
         self.intrinsics = camera_intrinsics(model, self._camera, size)
         wp.set_device("cpu")  # see `RayCaster`
@@ -354,10 +353,8 @@ class Compositor:
             sunlight: Suns of each env's lighting; empty: the light of the film.
 
         Raises:
-            InputError: an unknown lighting, or more envs than `max_envs`.
+            InputError: an unknown lighting.
         """
-        if len(datas) > self.max_envs:
-            raise InputError(f"{len(datas)} envs to render; expected at most {self.max_envs}, see max_envs")
         poses = camera_poses(datas, self._camera, noise)
         one = isinstance(lighting, str) or (isinstance(lighting, np.ndarray) and lighting.ndim == 1)
         out = self._field.render(Viewpoints.of(poses, self.intrinsics, self.size), lighting)
@@ -424,8 +421,8 @@ class _CompositorWorker:
 
     def __init__(self, model: mujoco.MjModel, field: BakedField, camera: int, size: tuple[int, int]):
         self.renderer = ObjectRenderer(model, camera, size)
-        self._field = field
-        self._fields: OrderedDict[tuple[int, int], BakedField] = OrderedDict()
+        # A field keeps render targets for few sizes, so each window size has its own copy of the field.
+        self._field_of_size = lru_cache(_MAX_WINDOWS)(lambda size: field.single_threaded())
 
     def foreground(self, pose: Array, drawn: RenderedObjects, lighting: Lighting) -> Rendering:
         """Renders the part of the field in front of the drawn objects, in the objects' window."""
@@ -433,14 +430,8 @@ class _CompositorWorker:
         across, down = (-(-n // _WINDOW_STEP) * _WINDOW_STEP for n in (width, height))
         stop = np.zeros((1, down, across), np.float32)
         stop[0, :height, :width] = drawn.depth
-        # A field keeps render targets for few sizes, so each window size has its own copy of the field.
-        if (across, down) not in self._fields:
-            self._fields[across, down] = self._field.single_threaded()
-            if len(self._fields) > _MAX_WINDOWS:
-                self._fields.popitem(last=False)
-        self._fields.move_to_end((across, down))
         view = Viewpoints.of(pose, self.renderer.intrinsics - np.array([0.0, 0.0, left, top]), (across, down))
-        out = self._fields[across, down].render(view, lighting, stop=stop)
+        out = self._field_of_size((across, down)).render(view, lighting, stop=stop)
         inner = np.s_[0, :height, :width]
         return Rendering(out.rgb[inner], out.depth[inner], out.opacity[inner])
 

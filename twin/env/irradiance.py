@@ -22,6 +22,8 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
+from scipy.spatial import cKDTree
 
 from twin.env.obstacles import PREFIX
 from twin.errors import InputError
@@ -148,7 +150,8 @@ class IrradianceEstimator:
         self._lock = threading.Lock()
         self._cache: OrderedDict[tuple[bytes, Sunlight], Irradiance] = OrderedDict()
         points = _surface_points(baked, route, view_stations(float(arc_lengths(route)[-1]), *between))
-        height, lateral = _height_above(points.positions, route)
+        lateral, vertex = cKDTree(route[:, :2]).query(points.positions[:, :2])
+        height = points.positions[:, 2] - route[vertex, 2]
         flat = points.normals[:, 2] > 0.9
         ground = (np.abs(height) < _GROUND_TOLERANCE + 0.05 * np.abs(lateral)) & (points.depth < _MAX_GROUND_DEPTH)
         upright = (height > _MIN_UPRIGHT_HEIGHT) & (points.facing > 0.25)
@@ -161,15 +164,17 @@ class IrradianceEstimator:
                 "this scene? Compositor(..., shaded=False) needs no irradiance"
             )
         self._xy = self._ground.positions[:, :2]
-        self._neighbors = _nearest_indices(self._xy, self._upright.positions[:, :2])
+        count = min(_NEIGHBORS, len(self._xy))
+        self._neighbors = cKDTree(self._xy).query(self._upright.positions[:, :2], count)[1]
         names = baked.lightings
         grounds = [self._ground.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
         uprights = [self._upright.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
         # Lightings are scaled to the same brightness of the ground before their mean is taken.
         mean_ground = np.mean([colors / colors.mean(0) for colors in grounds], 0)
         self._mean = np.mean([c / ground.mean(0) for c, ground in zip(uprights, grounds, strict=True)], 0)
-        # Irradiance of the mean lighting at the upright probes.
-        sky = _uniform_sky_irradiance(self._upright.normals)[:, None]
+        # Irradiance of the mean lighting, a uniform sky over dim ground, at the upright probes.
+        tilt = self._upright.normals[:, 2:]
+        sky = 0.5 * (1.0 + tilt) + 0.5 * (1.0 - tilt) * _BOUNCE
         self._reference = sky * mean_ground[self._neighbors].mean(1) / GROUND_ALBEDO
         self._rows = _basis(self._upright.normals)
 
@@ -185,8 +190,6 @@ class IrradianceEstimator:
             return self._cache[key]
 
     def _estimate(self, embedding: NDArray, sunlight: Sunlight) -> Irradiance:
-        from scipy.optimize import nnls
-
         up = self._ground.probes.picture(embedding).astype(np.float64) / GROUND_ALBEDO
         colors = self._upright.probes.picture(embedding).astype(np.float64)
         known: tuple[Array, Array] | tuple[()] = ()
@@ -200,10 +203,9 @@ class IrradianceEstimator:
         seen = colors / np.maximum(self._mean, _MIN_COLOR) * self._reference
         sides = seen - np.maximum(self._upright.normals[:, 2:], 0.0) * ground
         if len(self._rows) < _MIN_PROBES:  # assume a uniform sky
-            return Irradiance(
-                *(self._xy, up, np.zeros((5, 3)), np.array([_UPRIGHT_SKY, 0.0, 0.0, 0.0, 0.0])[:, None] * np.ones(3)),
-                *known,
-            )
+            proportional = np.zeros((5, 3))
+            proportional[0] = _UPRIGHT_SKY
+            return Irradiance(self._xy, up, np.zeros((5, 3)), proportional, *known)
         found = np.empty((10, 3))
         for c in range(3):
             usable = (self._mean[:, c] > _MIN_COLOR) & (seen[:, c] < _MAX_BRIGHTNESS * up[:, c].max())
@@ -258,18 +260,15 @@ def view_stations(length: float, low: float, high: float) -> Array:
 def _surface_points(field: BakedField, route: Array, stations: Array) -> _SurfacePoints:
     """Surface points that are visible in views from stations of the route; pixels at depth edges are left out."""
     width, height = _VIEW_SIZE
-    poses = []
+    intrinsics = np.array([_FOCAL, _FOCAL, width / 2, height / 2])
+    rays = unproject(pixel_grid(width, height), intrinsics)
+    found = []
     for s in stations:
         eye = point_at(route, s) + np.array([0.0, 0.0, _CAMERA_HEIGHT])
         yaw, pitch = float(heading_at(route, s)), np.deg2rad(_CAMERA_PITCH)
         ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
-        poses.append(look_at(eye, eye + ahead))
-    intrinsics = np.array([_FOCAL, _FOCAL, width / 2, height / 2])
-    rays = unproject(pixel_grid(width, height), intrinsics)
-    parts: list[list[NDArray]] = [[] for _ in range(6)]
-    for pose in poses:
+        pose = look_at(eye, eye + ahead)
         out, channels = field.render_features(Viewpoints.of(pose, intrinsics, _VIEW_SIZE), field.lightings[0])
-        features = channels[0, 1:]
         depth = out.depth[0].astype(np.float64)
         points = (rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
         across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
@@ -286,18 +285,11 @@ def _surface_points(field: BakedField, route: Array, stations: Array) -> _Surfac
         valid &= z < _MAX_DEPTH
         directions = (inner - pose[:3, 3])[valid]
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-        values = (
-            features[:, 1:-1, 1:-1].transpose(1, 2, 0)[valid],
-            spherical_harmonics_numpy(directions),
-            inner[valid],
-            normals[valid],
-            z[valid],
-            facing[valid],
-        )
-        for part, value in zip(parts, values, strict=True):
-            part.append(value)
-    probe_features, harmonics, points, normals, depth, facing = (np.concatenate(part) for part in parts)
-    probes = Probes(probe_features.astype(np.float32), harmonics.astype(np.float32), field.network)
+        features = channels[0, 1:, 1:-1, 1:-1].transpose(1, 2, 0)[valid]
+        harmonics = spherical_harmonics_numpy(directions)
+        found.append((features, harmonics, inner[valid], normals[valid], z[valid], facing[valid]))
+    features, harmonics, points, normals, depth, facing = map(np.concatenate, zip(*found, strict=True))
+    probes = Probes(features.astype(np.float32), harmonics.astype(np.float32), field.network)
     return _SurfacePoints(probes, points, normals, depth, facing)
 
 
@@ -307,31 +299,9 @@ def spherical_harmonics_numpy(d: Array) -> Array:
     return np.stack([np.ones_like(x), *harmonics_of(x, y, z)], -1)
 
 
-def _height_above(points: Array, route: Array) -> tuple[Array, Array]:
-    """Height above the nearest vertex of the route, and distance from it [m], both (n,)."""
-    from scipy.spatial import cKDTree
-
-    distance, index = cKDTree(route[:, :2]).query(points[:, :2])
-    return points[:, 2] - route[index, 2], distance
-
-
 def _random_indices(rng: np.random.Generator, mask: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
     index = np.flatnonzero(mask)
     return np.sort(rng.choice(index, min(most, len(index)), replace=False))
-
-
-def _nearest_indices(positions: Array, xy: Array) -> NDArray[np.int64]:
-    """Indices of the positions (k, 2) nearest to points (n, 2), shape (n, `_NEIGHBORS`)."""
-    from scipy.spatial import cKDTree
-
-    _, index = cKDTree(positions).query(xy, min(_NEIGHBORS, len(positions)))
-    return index.reshape(len(xy), -1)
-
-
-def _uniform_sky_irradiance(normals: Array) -> Array:
-    """Irradiance (n,) for unit normals (n, 3) under a uniform sky over dim ground; 1 for a level surface."""
-    up = normals[:, 2]
-    return 0.5 * (1.0 + up) + 0.5 * (1.0 - up) * _BOUNCE
 
 
 # ---- contact shadows
@@ -416,8 +386,9 @@ def _light_loss(boxes: Array, points: Array, turn: Array, share: float, sun: Arr
     """
     local = points @ turn
     azimuth = sun[:2] / max(float(np.linalg.norm(sun[:2])), 1e-9)
+    across_sun = np.array([-azimuth[1], azimuth[0]])
     slope = float(np.linalg.norm(sun[:2])) / float(sun[2])
-    behind, beside = -points @ azimuth, points @ np.array([-azimuth[1], azimuth[0]])
+    behind, beside = -points @ azimuth, points @ across_sun
     spread = _PENUMBRA[0] + _PENUMBRA[1] * np.maximum(behind, 0.0)
     sunlit = np.ones(len(points))
     hidden = np.zeros(len(points))
@@ -432,10 +403,10 @@ def _light_loss(boxes: Array, points: Array, turn: Array, share: float, sun: Arr
         # Loss of sunlight: within the box's shadow, its projection onto the ground along the sun's rays.
         middle = turn @ center
         axes = turn * half  # columns: half sides in the world
-        across = float(np.abs(np.array([-azimuth[1], azimuth[0]]) @ axes).sum())
+        across = float(np.abs(across_sun @ axes).sum())
         along = float(np.abs(azimuth @ axes).sum())
         start, end = low[2] * slope - along, min(high[2] * slope, _MAX_SHADOW) + along
-        u, v = behind + middle @ azimuth, beside - middle @ np.array([-azimuth[1], azimuth[0]])
+        u, v = behind + middle @ azimuth, beside - middle @ across_sun
         shadow = _smooth_step((across - v) / spread) + _smooth_step((across + v) / spread) - 1.0
         shadow *= _smooth_step((u - start) / spread) + _smooth_step((end - u) / spread) - 1.0
         sunlit *= 1.0 - np.clip(shadow, 0.0, 1.0)
