@@ -21,12 +21,13 @@ from twin.config import CAUSES, ObstacleConfig
 from twin.env.domain_randomization import Ranges
 from twin.env.drivers import RouteDriver
 from twin.env.env_factory import EnvFactory
+from twin.env.episode_lighting import mixture_text
 from twin.env.gym_env import DriveEnv
 from twin.env.mujoco_renderer import chase_poses
 from twin.env.options import parse_options
 from twin.env.picture_effects import CameraOptions
 from twin.env.task import Motion
-from twin.env.vector_env_local import LocalVectorEnv, mixture_text
+from twin.env.vector_env_local import LocalVectorEnv
 from twin.errors import InputError
 from twin.geometry.images import resize
 from twin.nerf.lightings import Lightings

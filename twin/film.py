@@ -23,7 +23,6 @@ from twin.env.domain_randomization import condition_options
 from twin.env.drivers import Driver, PolicyDriver, RouteDriver
 from twin.env.env_factory import load
 from twin.env.episode import Episode, record_episode
-from twin.env.vector_env_local import sampled_text
 from twin.errors import InputError
 from twin.files import new_folder, require_absent, require_parent
 from twin.geometry.poses import inverse_pose
@@ -97,8 +96,7 @@ def film(
     driven, title = environment.task, f"{task.replace('_', ' ')}: {driver_name}"
     limits = driven.segment.start, driven.segment.end
     shown = driven.world, driven.half_width, limits, load_ground_and_parts(scene.scene)
-    lighting = environment.pixels.lightings[0]
-    told = episode.lighting + (sampled_text(lighting, scene.field()) if lighting and lighting.is_sampled else "")
+    told = episode.lighting + environment.pixels.lightings[0].mixture
     write_episode_video(path, replace(episode, lighting=told), images, shown, title)
     if rerun:
         place = driven.world, driven.half_width, f"{scene.scene.root.resolve().name}, {title}"

@@ -18,11 +18,12 @@ from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from twin.config import ANY, HELD_OUT, RESERVED_LIGHTINGS, TRAINING
 from twin.errors import InputError
 from twin.nerf.baked import BakedField
-from twin.nerf.lightings import Fog, mixed_fog
+from twin.nerf.lightings import Fog, Lightings, mixed_fog
 from twin.nerf.sun import Sunlight, mixed_sunlight
 from twin.types import Array32
 
@@ -57,11 +58,16 @@ class EpisodeLighting:
     """Suns at the beginning; empty: the light of the film."""
     end_sunlight: Sunlight = ()
     """Suns after `duration`."""
+    filmed: Lightings | None = None
+    """The field's filmed lightings, if this one was sampled from a set of lightings; `name` is then the set's."""
 
-    @property
-    def is_sampled(self) -> bool:
-        """True if the lighting was sampled from a set of lightings; `name` is then the set's."""
-        return not set(self.name.split(" → ")).isdisjoint(RESERVED_LIGHTINGS)
+    @cached_property
+    def mixture(self) -> str:
+        """The nearest mixture of filmed lightings, such as `: sun 0.62, night 0.38`; empty if it was not sampled."""
+        if self.filmed is None:
+            return ""
+        ends = [self.start] if self.end is None else [self.start, self.end]
+        return ": " + " → ".join(mixture_text(end, self.filmed) for end in ends)
 
     def at(self, time: float) -> Array32:
         """The embedding after `time` [s], shape (dim,)."""
@@ -110,23 +116,23 @@ class LightingSets:
     def __init__(self, field: BakedField) -> None:
         self.field = field
         # If photos added later moved the sets, a lighting used for training could become held out.
-        self._filmed = field.lightings_by_name.filmed()
+        self.filmed = field.lightings_by_name.filmed()
 
     @cached_property
     def anchors(self) -> Anchors:
         """Anchors of both sets. Raises InputError: the field has no probes, so lightings cannot be compared."""
-        filmed = list(self._filmed.vectors)
+        chosen = list(self.filmed.vectors)
         rng = np.random.default_rng(_SEED)
-        pool = [self._filmed.sample(rng) for _ in range(_POOL_SIZE)]
+        pool = [self.filmed.sample(rng) for _ in range(_POOL_SIZE)]
         pool_colors = np.stack([self._probe_colors(embedding) for embedding in pool])
-        chosen, chosen_colors = filmed, [self._probe_colors(embedding) for embedding in filmed]
+        chosen_colors = [self._probe_colors(embedding) for embedding in chosen]
         nearest = np.min([_distance(pool_colors, colors) for colors in chosen_colors], axis=0)
         for _ in range(_EXTRA_ANCHORS):
             best = int(nearest.argmax())
             chosen.append(pool[best])
             chosen_colors.append(pool_colors[best])
             nearest = np.minimum(nearest, _distance(pool_colors, pool_colors[best]))
-        extra = np.arange(len(chosen)) - len(self._filmed.vectors)
+        extra = np.arange(len(chosen)) - len(self.filmed.vectors)
         return Anchors(np.stack(chosen), np.stack(chosen_colors), (extra >= 0) & (extra % 2 == 0))
 
     def sample(self, which: str, rng: np.random.Generator) -> Array32:
@@ -137,7 +143,7 @@ class LightingSets:
         """
         own = np.flatnonzero(self.anchors.held_out == (which == HELD_OUT))
         anchor = int(rng.choice(own))
-        prior = self._filmed.prior
+        prior = self.filmed.prior
         # If no proposal is near the anchor, for example at the edge of the filmed lightings, the anchor itself is used.
         for embedding in chain((prior.propose(rng) for _ in range(_MAX_TRIES)), [self.anchors.embeddings[anchor]]):
             # Most proposals are plausible, but few are near the anchor, so nearness is tested first.
@@ -158,11 +164,25 @@ class LightingSets:
         return (HELD_OUT if to_training > _MARGIN * to_held_out else None), nearest
 
     def _probe_colors(self, embedding: Array32) -> Array32:
-        return self._filmed.prior.probes.picture(embedding).ravel()
+        return self.filmed.prior.probes.picture(embedding).ravel()
 
 
 def _distance(many: Array32, one: Array32) -> NDArray[np.float64]:
     return np.sqrt(((many - one) ** 2).mean(-1))
+
+
+def mixture_text(embedding: Array32, filmed: Lightings) -> str:
+    """Text of the mixture of filmed lightings that is nearest to an embedding (dim,), such as `sun 0.62, night 0.38`.
+
+    The fractions are nonnegative and add up to 1; those below 0.005 are omitted. A sampled embedding deviates somewhat
+    from its mixture, like the embedding of a single frame; the text omits this deviation.
+    """
+    vectors = filmed.vectors.astype(np.float64)
+    sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # weight of the equation Σ fractions = 1
+    equations = np.vstack([vectors.T, np.full(len(vectors), sum_weight)])
+    parts, _ = nnls(equations, np.append(embedding, sum_weight))
+    order = np.argsort(-parts, kind="stable")
+    return ", ".join(f"{filmed.names[k]} {parts[k]:.2f}" for k in order if parts[k] >= 0.005)
 
 
 def check_lighting_names(lighting: str | Sequence[str], field: BakedField) -> None:
@@ -184,14 +204,16 @@ def sample_lighting(
         lighting = lighting[0]
     name, start, fog, suns = _sample_one(lighting, sets, rng)
     if not drift:
-        return EpisodeLighting(name, start, fog=fog, sunlight=suns)
+        filmed = sets.filmed if name in RESERVED_LIGHTINGS else None
+        return EpisodeLighting(name, start, fog=fog, sunlight=suns, filmed=filmed)
     other, end, end_fog, end_suns = _sample_one(lighting, sets, rng)
     if isinstance(lighting, str) and lighting not in RESERVED_LIGHTINGS:
-        names = [n for n in sets.field.lightings_by_name.filmed().names if n != lighting]
+        names = [n for n in sets.filmed.names if n != lighting]
         if not names:
             raise InputError(f"lighting {lighting!r} cannot drift: the field has no other; give lighting_drift=False")
         other, end, end_fog, end_suns = _sample_one(tuple(names), sets, rng)
-    return EpisodeLighting(f"{name} → {other}", start, end, duration, fog, end_fog, suns, end_suns)
+    filmed = sets.filmed if {name, other} & set(RESERVED_LIGHTINGS) else None
+    return EpisodeLighting(f"{name} → {other}", start, end, duration, fog, end_fog, suns, end_suns, filmed)
 
 
 def _sample_one(

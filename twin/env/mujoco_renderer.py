@@ -134,7 +134,7 @@ class CollisionCaster:
         self.count = len(names)
         numbers = {name: number for number, name in enumerate(names)}
         rays = mujoco_rays(unproject(pixel_grid(*size), intrinsics))
-        self._casters, self._cameras, self._identities = [], [], []
+        self._casters = []
         for start in range(0, max(len(names), int(ground)), _PARTS_PER_MODEL):
             spec = world.spec(frozenset(names[start : start + _PARTS_PER_MODEL]).__contains__, visuals=False)
             spec.worldbody.add_camera(name="free")
@@ -151,12 +151,11 @@ class CollisionCaster:
                 enabled_geom_groups=[PART_GROUP, GROUND_GROUP] if ground else [PART_GROUP],
             )
             caster.set_rays(rays)
-            self._casters.append(caster)
-            self._cameras.append((data, model.camera("free").id))
             hit = [numbers.get(model.geom(geom).name, ON_GROUND) for geom in range(model.ngeom)]
-            self._identities.append(np.array([*hit, NOTHING]))  # the index of no geom is −1
+            identities = np.array([*hit, NOTHING])  # the index of no geom is −1
+            self._casters.append((caster, data, model.camera("free").id, identities))
         if self._casters:
-            self.cast(np.eye(4))  # compiles the kernels, see `SceneCamera`
+            self.cast(np.eye(4))  # compiles the kernels, see `_SceneWorker`
 
     def cast(self, camera_to_world: Array) -> tuple[Array32, Array32, NDArray[np.int64]]:
         """Casts the rays of a picture from an OpenCV camera pose.
@@ -169,7 +168,11 @@ class CollisionCaster:
             empty = np.zeros((height, width), np.float32)
             return np.zeros((height, width, 3), np.float32), empty, np.full(empty.shape, NOTHING)
         pose = opencv_to_mujoco(camera_to_world)
-        found = [self._cast_one(number, pose) for number in range(len(self._casters))]
+        found = []
+        for caster, data, camera, identities in self._casters:
+            data.cam_xpos[camera], data.cam_xmat[camera] = pose[:3, 3], pose[:3, :3].ravel()
+            caster.set_poses(cam_xpos=data.cam_xpos, cam_xmat=data.cam_xmat)
+            found.append((*caster.cast(), identities[caster.hit_geoms()]))
         depths = np.stack([depth for _, depth, _ in found])
         nearest = np.where(depths > 0.0, depths, np.inf).argmin(0)
         rgb, depth, identity = (
@@ -178,20 +181,12 @@ class CollisionCaster:
         )
         return rgb.reshape(height, width, 3), depth.reshape(height, width), identity.reshape(height, width)
 
-    def _cast_one(self, number: int, pose: Array) -> tuple[Array32, Array32, NDArray[np.int64]]:
-        data, camera = self._cameras[number]
-        data.cam_xpos[camera], data.cam_xmat[camera] = pose[:3, 3], pose[:3, :3].ravel()
-        caster = self._casters[number]
-        caster.set_poses(cam_xpos=data.cam_xpos, cam_xmat=data.cam_xmat)
-        rgb, depth = caster.cast()
-        return rgb, depth, self._identities[number][caster.hit_geoms()]
-
 
 # ---- the whole scene
 
 
 class SceneRenderer:
-    """Renders the front cameras' views with MuJoCo's own shading; interface of `Compositor` without `sunlight`.
+    """Renders the front cameras' views with MuJoCo's own shading; interface of `Compositor`.
 
     Obstacles and the robot are lit by the model's own lights. The place is drawn either as ground and visual mesh, in
     the filmed colors, or as Gaussian splats. Splats and geoms occlude each other, and the ground shows through the gaps
@@ -213,10 +208,11 @@ class SceneRenderer:
         model.geom_group[camera_mount_geoms(model, self._camera)] = ROBOT_COLLISION_GROUP  # not drawn
         if splats is not None:
             model.geom_pos[model.geom("ground").id, 2] -= _GROUND_BELOW_SPLATS
-        # Workers are created one after the other: each compiles Warp kernels, see `SceneCamera`.
         threads = min(max_envs, available_cores())
         settings = _SCENE_SETTINGS if splats is None else _SPLAT_SETTINGS | splats.render_settings()
-        self._workers = [_SceneWorker(model, size, self._rays, settings) for _ in range(threads)]
+        self._workers = [_SceneWorker(model, FRONT_CAMERA, size, settings) for _ in range(threads)]
+        for worker in self._workers:
+            worker.caster.set_rays(mujoco_rays(self._rays))
         self._pool = ThreadPoolExecutor(threads)
         if splats is not None:
             data = mujoco.MjData(model)
@@ -232,8 +228,9 @@ class SceneRenderer:
         lighting: Any = None,
         noise: Sequence[CameraNoise] | None = None,
         weather: Sequence[Weather | None] = (),
+        sunlight: Any = (),
     ) -> Rendering:
-        """See `Compositor.render`; `lighting` has no effect."""
+        """See `Compositor.render`; `lighting` and `sunlight` have no effect."""
         poses = camera_poses(datas, self._camera, noise)
         width, height = self.size
         rgb = np.empty((len(datas), height, width, 3), np.float32)
@@ -241,7 +238,8 @@ class SceneRenderer:
 
         def render_share(number: int) -> None:
             for k in range(number, len(datas), len(self._workers)):
-                rgb[k], depth[k] = self._workers[number].render(datas[k], poses[k])
+                colors, depth[k] = self._workers[number].render(datas[k], poses[k])
+                rgb[k] = colors / 255.0
 
         list(self._pool.map(render_share, range(len(self._workers))))
         far = np.where(depth > 0.0, depth, np.float32(FAR))
@@ -254,34 +252,31 @@ class SceneRenderer:
 
 
 class _SceneWorker:
-    """Renders the scene for one thread."""
+    """Renders a scene by one of its cameras, for one thread.
 
-    def __init__(self, model: mujoco.MjModel, size: tuple[int, int], rays: Array, settings: dict[str, Any]) -> None:
+    Warp compiles kernels at their first launch; compiling in two threads at once corrupts them (observed: pictures
+    without ground). So each worker renders once when it is made.
+    """
+
+    def __init__(self, model: mujoco.MjModel, camera: str, size: tuple[int, int], settings: dict[str, Any]) -> None:
         self._model, self._data = model, mujoco.MjData(model)
-        self._size, self._camera = size, model.camera(FRONT_CAMERA).id
+        self._size, self._camera = size, model.camera(camera).id
         mujoco.mj_forward(model, self._data)
-        self._caster = RayCaster(
-            model,
-            self._data,
-            cam_res=size,
-            cam_active=[FRONT_CAMERA],
-            **settings,
-        )
-        self._caster.set_rays(mujoco_rays(rays))
-        self.render(self._data, camera_pose(self._data, self._camera))  # compiles the kernels
+        self.caster = RayCaster(model, self._data, cam_res=size, cam_active=[camera], **settings)
+        self.render(self._data, camera_pose(self._data, self._camera))
 
     def render(self, data: mujoco.MjData, pose: Array) -> tuple[Array32, Array32]:
-        """Renders from an OpenCV pose; returns colors (h, w, 3) in [0, 1] and z-depth (h, w) [m], 0 for the sky."""
+        """Renders from an OpenCV pose; returns colors (h, w, 3) in [0, 255] and z-depth (h, w) [m], 0 for the sky."""
         mine = self._data
         mine.qpos[:], mine.mocap_pos[:], mine.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
         mujoco.mj_kinematics(self._model, mine)
         mujoco.mj_camlight(self._model, mine)
         camera = opencv_to_mujoco(pose)
         mine.cam_xpos[self._camera], mine.cam_xmat[self._camera] = camera[:3, 3], camera[:3, :3].ravel()
-        self._caster.set_poses(**{name: getattr(mine, name) for name in _POSES})
-        rgb, depth = self._caster.cast()
+        self.caster.set_poses(**{name: getattr(mine, name) for name in _POSES})
+        rgb, depth = self.caster.cast()
         width, height = self._size
-        return rgb.reshape(height, width, 3) / 255.0, depth.reshape(height, width)
+        return rgb.reshape(height, width, 3), depth.reshape(height, width)
 
 
 # ---- free camera poses
@@ -297,12 +292,7 @@ _OCCLUSION_TOLERANCE = 0.6  # [m] parts at most this far behind the visible surf
 class SceneCamera:
     """Renders a world from free camera poses."""
 
-    def __init__(
-        self,
-        world: World,
-        size: tuple[int, int],
-        obstacles: Sequence[ObstacleConfig] = (),
-    ) -> None:
+    def __init__(self, world: World, size: tuple[int, int], obstacles: Sequence[ObstacleConfig] = ()) -> None:
         """`size`: width, height [px]. To show only some of `obstacles`, set the attribute `obstacles` to these."""
         spec = world.spec(keeps_part=lambda name: False)
         self.obstacles = tuple(obstacles)
@@ -311,42 +301,24 @@ class SceneCamera:
         self.model = spec.compile()
         """The scene without convex parts."""
         self.data = mujoco.MjData(self.model)
-        self.size = size
-        self._camera = self.model.camera("free").id
-        mujoco.mj_forward(self.model, self.data)
-        self._caster = RayCaster(self.model, self.data, cam_res=size, cam_active=["free"], **_SCENE_SETTINGS)
-        # Warp compiles kernels at their first launch; compiling in two threads at once corrupts them (observed:
-        # pictures without ground). So each caster runs once here.
-        self._cast()
-        parts = CollisionCaster(world, size, camera_intrinsics(self.model, self._camera, size))
+        self._worker = _SceneWorker(self.model, "free", size, _SCENE_SETTINGS)
+        parts = CollisionCaster(world, size, camera_intrinsics(self.model, self.model.camera("free").id, size))
         self._parts = parts if parts.count else None
 
     def render(self, qpos: Array, camera_to_world: Array, time: float = 0.0) -> Image:
         """Picture of the scene at a time [s], with the robot at `qpos`, from an OpenCV camera pose; shape (h, w, 3)."""
         self.data.qpos[:] = qpos
         place(self.obstacles, self.data, time)
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_camlight(self.model, self.data)
-        pose = opencv_to_mujoco(camera_to_world)
-        self.data.cam_xpos[self._camera] = pose[:3, 3]
-        self.data.cam_xmat[self._camera] = pose[:3, :3].ravel()
         if self._parts is None:
-            return self._cast()[0]
+            return self._worker.render(self.data, camera_to_world)[0].astype(np.uint8)
         # Warp's CPU kernels run on one thread each and release the GIL, so the two casts run in parallel.
         with ThreadPoolExecutor(1) as pool:
             parts = pool.submit(self._parts.cast, camera_to_world)
-            rgb, depth = self._cast()
+            rgb, depth = self._worker.render(self.data, camera_to_world)
             return blend_parts(rgb, depth, *parts.result())
 
-    def _cast(self) -> tuple[Image, Array32]:
-        """Colors (height, width, 3) and z-depth (height, width) [m] at the present poses."""
-        self._caster.set_poses(**{name: getattr(self.data, name) for name in _POSES})
-        rgb, depth = self._caster.cast()
-        width, height = self.size
-        return rgb.reshape(height, width, 3).astype(np.uint8), depth.reshape(height, width)
 
-
-def blend_parts(rgb: Image, depth: NDArray, part_rgb: NDArray, part_depth: NDArray, identity: NDArray) -> Image:
+def blend_parts(rgb: NDArray, depth: NDArray, part_rgb: NDArray, part_depth: NDArray, identity: NDArray) -> Image:
     """Draws the visible collision parts half transparent, with outlines, over a picture (h, w, 3).
 
     The z-depths `depth` and `part_depth` [m] have shape (h, w); `depth` is 0 where rays hit nothing. `identity` (h, w)
@@ -356,7 +328,7 @@ def blend_parts(rgb: Image, depth: NDArray, part_rgb: NDArray, part_depth: NDArr
     edge = np.zeros_like(visible)
     edge[:, 1:] |= identity[:, 1:] != identity[:, :-1]
     edge[1:] |= identity[1:] != identity[:-1]
-    out = rgb.astype(np.float32)
+    out = rgb.astype(np.float32)  # a copy
     out[visible] = (1 - _PART_ALPHA) * out[visible] + _PART_ALPHA * part_rgb[visible]
     line = edge & visible
     out[line] = 0.4 * out[line] + 0.6 * np.array(_EDGE_RGB)

@@ -40,20 +40,13 @@ class PixelObserver:
         options: Options,
         envs: Sequence[tuple[DrivePhysics, DriveTask]],
     ) -> None:
-        """
-        Args:
-            renderer: Renders the envs.
-            field: Contains the lightings; None if MuJoCo renders the mesh, or splats, under MuJoCo's lights.
-            trust: Computes the trust of the images, see `trust.py`.
-            options: Options of the envs.
-            envs: Physics and task of every env.
-        """
+        """`field` contains the lightings; None if MuJoCo renders the mesh, or splats, under MuJoCo's lights."""
         self._renderer, self.options, self.envs = renderer, options, list(envs)
         self._trust, self._sets = trust, LightingSets(field) if field else None
         width, height = options.size
         self.stacks = np.zeros((len(self.envs), options.stack, 3, height, width), np.uint8)
         """Frame stacks, channels first, shape (n, stack, 3, height, width)."""
-        self.lightings: list[EpisodeLighting | None] = [None] * len(self.envs)
+        self.lightings = [_no_lighting(options)] * len(self.envs)
         self._noise: list[CameraNoise | None] = [None] * len(self.envs)
         self._weather: list[Weather | None] = [None] * len(self.envs)
         self.trust = np.zeros(len(self.envs))
@@ -64,7 +57,6 @@ class PixelObserver:
         o = self.options
         for i in which:
             task = self.envs[i][1]
-            self.lightings[i] = EpisodeLighting(o.observe, np.zeros(0, np.float32))
             if self._sets:
                 self.lightings[i] = sample_lighting(
                     o.lighting, o.lighting_drift, task.time_limit, self._sets, task.rng(LIGHTING)
@@ -85,12 +77,12 @@ class PixelObserver:
     def _begin_weather(self, i: int) -> None:
         """Sets up the weather of env i's episode under its lighting."""
         o, task = self.options, self.envs[i][1]
-        fog = self.lightings[i].fog_at(0.0)  # type: ignore[union-attr]
+        fog = self.lightings[i].fog_at(0.0)
         # Lightings fitted to a photo always have a fog; for a clear day, its extinction is 0.
         if fog is not None and o.randomise and o.randomise.hold_known:
             task.sample = task.sample.for_known_weather()
         has_weather = fog is not None or o.randomise
-        sun = main_sun(self.lightings[i].sunlight_at(0.0))  # type: ignore[union-attr]
+        sun = main_sun(self.lightings[i].sunlight_at(0.0))
         known_sun = sun.toward if sun else None
         self._weather[i] = Weather(task.sample, task.rng(WEATHER), fog, known_sun) if has_weather else None
 
@@ -101,8 +93,7 @@ class PixelObserver:
 
     def info(self, i: int) -> dict[str, Any]:
         """Entries of env i's info: `lighting` (the name used in tables) and `trust`."""
-        lighting = self.lightings[i]
-        name = str(Condition(lighting.name, bool(self.options.randomise))) if lighting else ""
+        name = str(Condition(self.lightings[i].name, bool(self.options.randomise)))
         return {"lighting": name, "trust": float(self.trust[i])}
 
     def _add_frames(self, which: Sequence[int], fill: bool) -> None:
@@ -113,20 +104,22 @@ class PixelObserver:
     def _render(self, which: Sequence[int]) -> Image:
         physics = [self.envs[i][0] for i in which]
         datas, poses = [one.delayed_data for one in physics], np.array([one.camera_to_world for one in physics])
-        embeddings = [
-            self.lightings[i].at(data.time)  # type: ignore[union-attr]
-            for i, data in zip(which, datas, strict=True)
-        ]
         noise = [self._noise[i] for i in which] if self.options.camera else None
         weather = [self._weather[i] for i in which]
-        for i, one, data in zip(which, weather, datas, strict=True):
+        moments = [(self.lightings[i], data.time) for i, data in zip(which, datas, strict=True)]
+        for one, (lighting, time) in zip(weather, moments, strict=True):
             if one:
-                one.fog = self.lightings[i].fog_at(data.time)  # type: ignore[union-attr]
-        suns = [self.lightings[i].sunlight_at(data.time) for i, data in zip(which, datas, strict=True)]  # type: ignore[union-attr]
-        sunlight: dict[str, Any] = {"sunlight": suns} if any(suns) else {}
-        out = self._renderer.render(datas, embeddings, noise, weather, **sunlight)
+                one.fog = lighting.fog_at(time)
+        embeddings = [lighting.at(time) for lighting, time in moments]
+        suns = [lighting.sunlight_at(time) for lighting, time in moments]
+        out = self._renderer.render(datas, embeddings, noise, weather, suns)
         self.trust[list(which)] = self._trust.of(poses, out)
         return (np.clip(out.rgb.transpose(0, 3, 1, 2), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def _no_lighting(options: Options) -> EpisodeLighting:
+    """Lighting before the first episode, and of images that do not come from a field."""
+    return EpisodeLighting(options.observe, np.zeros(0, np.float32))
 
 
 # ---- frame stacks on the GPU
@@ -181,7 +174,7 @@ class GpuPixelObserver(PixelObserver):
         model, (width, height), n = envs[0][0].robot.model, options.size, len(envs)
         self._intrinsics = camera_intrinsics(model, model.camera(FRONT_CAMERA).id, options.size)
         self._stacks: Any = wp.zeros((n, options.stack, 3, width * height), dtype=wp.uint8, device=field.device)
-        self.lightings: list[EpisodeLighting | None] = [None] * n
+        self.lightings = [_no_lighting(options)] * n
         self.trust = np.zeros(n)
         self._noise, self._weather = [None] * n, [None] * n
         self.camera_poses: CameraPoses = self._camera_poses
@@ -208,10 +201,7 @@ class GpuPixelObserver(PixelObserver):
     def _add_frames(self, which: Sequence[int], fill: bool) -> None:
         width, height = self.options.size
         poses, times = self.camera_poses(np.array(which))
-        embeddings = [
-            self.lightings[i].at(time)  # type: ignore[union-attr]
-            for i, time in zip(which, times.tolist(), strict=True)
-        ]
+        embeddings = [self.lightings[i].at(time) for i, time in zip(which, times.tolist(), strict=True)]
         # The number of environments that begin an episode changes from step to step; rounded up to a power of two, it
         # needs fewer render targets.
         count = min(1 << (len(which) - 1).bit_length(), len(self.envs)) - len(which)

@@ -16,14 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.env.env_factory import EnvFactory
-from twin.env.episode_lighting import EpisodeLighting
 from twin.env.observation import PixelObserver
 from twin.env.options import check_actions
 from twin.env.task import DrivePhysics, DriveTask, control
-from twin.nerf.baked import BakedField
-from twin.nerf.lightings import Lightings
 from twin.runtime import available_cores
-from twin.types import Array, Array32
+from twin.types import Array
 
 T = TypeVar("T")
 
@@ -50,8 +47,6 @@ class LocalVectorEnv:
         """`seeds`: seed of each environment's sequence of episodes; None: unpredictable."""
         envs = self._make_envs(factory, seeds)
         self.factory = factory
-        self._mixtures: list[tuple[EpisodeLighting, str] | None] = [None] * len(envs)
-        """Cache of `_mixture`: last lighting of each environment, with its text."""
         self._physics, self.tasks = [p for p, _ in envs], [t for _, t in envs]
         self.pixels = factory.make_observer(envs)
         self.options = factory.options
@@ -138,24 +133,15 @@ class LocalVectorEnv:
         """Info of environment i's episode so far, JSON-able.
 
         With images, `lighting` is the name that tables use, such as `training`. `sampled_lighting` also contains the
-        sampled mixture: `training: sun 0.62, night 0.38`, see `mixture_text`.
+        sampled mixture: `training: sun 0.62, night 0.38`, see `EpisodeLighting.mixture`.
         """
         return self.tasks[i].info(self._physics[i]) | self._pixel_info(i)
 
     def _pixel_info(self, i: int) -> dict[str, Any]:
         if not self.pixels:
             return {}
-        info, lighting = self.pixels.info(i), self.pixels.lightings[i]
-        return info | {"sampled_lighting": info["lighting"] + (self._mixture(i, lighting) if lighting else "")}
-
-    def _mixture(self, i: int, lighting: EpisodeLighting) -> str:
-        """The text after the name in environment i's `sampled_lighting`; empty if the lighting was not sampled."""
-        known, field = self._mixtures[i], self.factory.field
-        if known is not None and known[0] is lighting:
-            return known[1]
-        text = sampled_text(lighting, field) if field and lighting.is_sampled else ""
-        self._mixtures[i] = lighting, text
-        return text
+        info = self.pixels.info(i)
+        return info | {"sampled_lighting": info["lighting"] + self.pixels.lightings[i].mixture}
 
     def make_view(self, size: tuple[int, int]) -> PixelObserver:
         """Returns an observer that renders current episodes at another size (width, height), without camera noise.
@@ -187,29 +173,6 @@ class LocalVectorEnv:
 
     def _each(self, function: Callable[[int], T], which: Iterable[int]) -> list[T]:
         return list(self._pool.map(function, which)) if self._pool else [function(i) for i in which]
-
-
-def sampled_text(lighting: EpisodeLighting, field: BakedField) -> str:
-    """Text of a sampled lighting's mixture, such as `: sun 0.62, night 0.38`."""
-    ends = [lighting.start] if lighting.end is None else [lighting.start, lighting.end]
-    filmed = field.lightings_by_name.filmed()
-    return ": " + " → ".join(mixture_text(end, filmed) for end in ends)
-
-
-def mixture_text(embedding: Array32, filmed: Lightings) -> str:
-    """Text of the mixture of filmed lightings that is nearest to an embedding (dim,), such as `sun 0.62, night 0.38`.
-
-    The fractions are nonnegative and add up to 1; those below 0.005 are omitted. A sampled embedding deviates somewhat
-    from its mixture, like the embedding of a single frame; the text omits this deviation.
-    """
-    from scipy.optimize import nnls  # slow to import
-
-    vectors = filmed.vectors.astype(np.float64)
-    sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # weight of the equation Σ fractions = 1
-    equations = np.vstack([vectors.T, np.full(len(vectors), sum_weight)])
-    parts, _ = nnls(equations, np.append(embedding, sum_weight))
-    order = np.argsort(-parts, kind="stable")
-    return ", ".join(f"{filmed.names[k]} {parts[k]:.2f}" for k in order if parts[k] >= 0.005)
 
 
 def frame_stack(stacks: NDArray[np.uint8]) -> NDArray[np.uint8]:
