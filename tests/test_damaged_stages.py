@@ -85,7 +85,6 @@ def test_arrays_that_are_missing_pickled_or_of_another_shape(build, tmp_path, re
         (World, "5_mjcf", "world.json", "spawn", [1, 2]),
         (World, "5_mjcf", "world.json", "route", [[0, 0, 0]]),
         (World, "5_mjcf", "world.json", "half_width", "wide"),
-        (World, "5_mjcf", "world.json", "names", {}),
         (Cameras, "2_metric", "cameras.json", "names", None),
         (Cameras, "2_metric", "cameras.json", "lightings", ["day"]),
         (Capture, "more", "capture.json", "sources", [{}]),

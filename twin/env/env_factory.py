@@ -234,16 +234,10 @@ _REACH = 1.5  # [m] reach beyond the corridor's edge; exceeds half the robot's l
 
 
 def episode_spec(world: World, start: float, end: float, half_width: float) -> mujoco.MjSpec:
-    """Returns the physics model of episodes between two arc lengths [m] of a scene's route.
+    """Returns the physics model of episodes between two arc lengths [m] of a scene's route; `half_width` [m].
 
     An episode ends when the robot leaves the corridor, so the robot never touches collision parts beyond its reach.
     The model lacks these parts. This changes no result, but saves a fifth of the physics' time and most of its memory.
-
-    Args:
-        world: The scene.
-        start: Arc length of the start [m].
-        end: Arc length of the end [m].
-        half_width: Half width of the corridor [m].
     """
     line = cKDTree(point_at(world.route[:, :2], np.arange(start, end + 0.1, 0.1)))
 
@@ -252,7 +246,7 @@ def episode_spec(world: World, start: float, end: float, half_width: float) -> m
         return line.query(center[:2])[0] - radius <= half_width + _REACH
 
     spec = world.spec(within_reach, visuals=False)
-    base = spec.body(world.names["body"])
+    base = spec.body("base_link")
     payload = base.add_body(name=PAYLOAD, pos=world.robot.payload_position)
     payload.explicitinertial = True
     payload.mass, payload.ipos, payload.inertia = 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)

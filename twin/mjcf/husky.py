@@ -1,8 +1,8 @@
 """MuJoCo model of the Clearpath Husky A200, and its quasi-static skid steering; `husky_visuals.py` adds visual geoms.
 
 `twin.robot` defines constants and frames; `add_husky` lists the names in the model. `python -m twin.mjcf.husky` writes
-`twin/assets/husky/`: the robot alone in `husky.xml`, and on a plane in `scene.xml`. To attach the robot to another
-scene, and to list the options of that scene that are wrong for the robot:
+the robot alone to `twin/assets/husky/husky.xml`. To attach the robot to another scene, and to list the options of that
+scene that are wrong for the robot:
 
     husky.set_options(spec)     # MuJoCo keeps the parent's options, and the tires need these
     robot = mujoco.MjSpec.from_file(str(husky.HUSKY_XML))
@@ -417,33 +417,6 @@ _XML_HEADER = """<!--
 """
 
 
-SCENE = """<!-- The Husky on a plane, made by python -m twin.mjcf.husky; do not edit. Controls of -3 and 3 turn it. -->
-<mujoco model="husky scene">
-  <include file="husky.xml"/>
-
-  <statistic center="0 0 0.3" extent="1.5"/>
-
-  <visual>
-    <headlight diffuse="0.6 0.6 0.6" ambient="0.3 0.3 0.3" specular="0 0 0"/>
-    <global azimuth="-140" elevation="-20" offwidth="1280" offheight="720"/>
-  </visual>
-
-  <asset>
-    <texture type="skybox" builtin="gradient" rgb1="0.55 0.68 0.85" rgb2="0.9 0.92 0.94" width="64" height="384"/>
-    <texture type="2d" name="floor" builtin="checker" rgb1="0.36 0.38 0.4" rgb2="0.3 0.32 0.34" width="256"
-      height="256"/>
-    <material name="floor" texture="floor" texuniform="true" texrepeat="1 1" reflectance="0.05"/>
-  </asset>
-
-  <worldbody>
-    <light pos="0 0 4" dir="0.2 0.3 -1" directional="true"/>
-    <geom name="floor" type="plane" size="20 20 0.1" material="floor"/>
-  </worldbody>
-</mujoco>
-"""
-
-
 if __name__ == "__main__":
     HUSKY_XML.write_text(standalone_xml(), encoding="utf-8")
-    HUSKY_SCENE_XML.write_text(SCENE, encoding="utf-8")
-    print(f"wrote {HUSKY_XML} and {HUSKY_SCENE_XML}")
+    print(f"wrote {HUSKY_XML}")

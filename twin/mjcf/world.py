@@ -22,6 +22,8 @@ from twin.types import Array
 SCENE_XML = "scene.xml"
 GROUND_GROUP, VISUAL_GROUP, PART_GROUP, ROUTE_GROUP = 0, 2, 3, 4
 """Geom groups of ground, visual mesh and convex parts (for collision); site group of route, corridor and goal."""
+_NAMES = {"body": "base_link", "camera": "front", "ground": "ground", "keyframe": "spawn"}
+"""Names in the MJCF, for other programs that read `world.json`."""
 _CHORD = 1.0  # [m] length of the chord whose direction is the heading of a route
 
 
@@ -41,11 +43,6 @@ class World:
     """The front camera at its native size."""
     robot: HuskyParams = field(default_factory=HuskyParams)
     """Parameters of the robot in the scene, of its controller and of its camera."""
-    names: dict[str, str] = field(
-        default_factory=lambda: {"body": "base_link", "camera": "front", "ground": "ground", "keyframe": "spawn"}
-    )
-    """Names in the MJCF of the `body`, `camera`, `ground` and `keyframe`."""
-
     branches: dict[str, Array] = field(default_factory=dict)
     """Points of other routes through the place, as `route`, by name."""
 
@@ -113,7 +110,7 @@ class World:
                     "native_size": list(self.camera.size),
                 },
                 "robot": asdict(self.robot),
-                "names": self.names,
+                "names": _NAMES,
                 "model": SCENE_XML,
                 **({"branches": {k: v.tolist() for k, v in self.branches.items()}} if self.branches else {}),
             },
@@ -134,7 +131,6 @@ class World:
                 camera=PixelCamera((float(fx), float(fy), float(cx), float(cy)), (int(width), int(height))),
                 robot=parse_table(HuskyParams, head["robot"], str(path)),
                 folder=folder,
-                names={require_text(key): require_text(name) for key, name in head["names"].items()},
                 branches={
                     require_text(name): np.array(line, np.float64) for name, line in head.get("branches", {}).items()
                 },
@@ -147,9 +143,6 @@ class World:
                     f"{m} route points, half width {world.half_width} m, a camera of {width} × {height} px with focal "
                     f"lengths {fx:g}, {fy:g} px; expected at least 2 points, and positive sizes"
                 )
-            missing = {"body", "camera", "ground", "keyframe"} - world.names.keys()
-            if missing:
-                raise ValueError(f"names of {', '.join(sorted(missing))} missing")
         return world
 
 
