@@ -138,7 +138,7 @@ def test_random_obstacles_leave_room_and_repeat(world):
     assert drawn == random_obstacles(world, np.random.default_rng(3), 4)
     assert drawn != random_obstacles(world, np.random.default_rng(4), 4)
     for seed in range(40):
-        many = random_obstacles(world, np.random.default_rng(seed), 4, OBSTACLE_KINDS)
+        many = random_obstacles(world, np.random.default_rng(seed), 4)
         stations = np.array([one.station for one in many])
         assert (
             (np.diff(stations) > 3.0).all() and stations.min() >= 4.0 and stations.max() <= arc_lengths(ROUTE)[-1] - 3.0

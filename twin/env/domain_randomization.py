@@ -12,8 +12,7 @@ others. With `Ranges.hold_known`, measured parameters of the robot are not sampl
 when a photo of the day is available.
 """
 
-from dataclasses import asdict, dataclass, fields, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import mujoco
@@ -34,16 +33,13 @@ VERSION = 4
 KNOWN_WEATHER_FRACTION = 0.6
 """When a photo of the day is available, the strengths of sun and shadows are multiplied by this fraction.
 
-It was tuned with `benchmarks/day.py` in the simulated world of `twin.reality`, where true pictures of each day are
-available. The benchmark renders the twin with a photo's appearance and fog. It compares two changes of a policy's
-steering: (a) from these renderings to the true pictures of the day; (b) from these renderings to ones with sampled sun
-and shadows. At a ratio (a) / (b) of 1, the sampled weather changes the steering as much as the day does. The ratio,
-with 90 % intervals over policies and days, is 0.8 (0.6 to 0.96) for the full randomization. With this fraction it is
-1.1 (0.8 to 1.4) for the part of the change that is constant over a day, and 1.2 (1.0 to 1.4) for the part that varies
-along the route.
+It was tuned with `benchmarks/day.py` in the simulated world of `twin.reality`. The ratio of a policy's change of
+steering by the true day to that by the sampled sun and shadows, with 90 % intervals over policies and days, is 0.8
+(0.6 to 0.96) for the full randomization. With this fraction it is 1.1 (0.8 to 1.4) for the part of the change that is
+constant over a day, and 1.2 (1.0 to 1.4) for the part that varies along the route.
 
-The policies are the twelve finished ones of Table 1 in docs/benchmarks.md; the days are ten of its twenty: the five
-designed weathers and days 1 to 5. So a forecast for these policies and days is not independent of this value."""
+The policies are the twelve finished ones of Table 1 in docs/benchmarks.md; the days are the five designed weathers and
+days 1 to 5. So a forecast for these policies and days is not independent of this value."""
 
 _PAYLOAD_SIDE = 0.3  # [m] the payload has the inertia of a cube with this side
 _TIRE_SUFFIX = "_tyre"
@@ -174,11 +170,7 @@ class RandomizationSample:
 
     def record(self) -> dict[str, Any]:
         """The values for the episode's record, JSON-able; a new dict at each call."""
-        return dict(self._record)
-
-    @cached_property
-    def _record(self) -> dict[str, Any]:  # `asdict` takes 0.1 ms, and every step returns a record
-        return asdict(self)
+        return dict(vars(self))
 
 
 EVALUATION_RANGES = Ranges(sunlight=(0.35, 0.7), shade=(0.35, 0.75), hold_known=True)

@@ -95,13 +95,7 @@ class PurePursuit:
     """
 
     def __init__(self, route: Array, speed: float, max_yaw_rate: float, start: float = 0.0) -> None:
-        """
-        Args:
-            route: [m], shape (m, ≥2).
-            speed: [m/s].
-            max_yaw_rate: Largest yaw rate [rad/s].
-            start: Arc length of the start [m].
-        """
+        """`route` [m] has shape (m, ≥2), `speed` is in m/s, `max_yaw_rate` in rad/s; `start` is an arc length [m]."""
         self._route, self._speed, self._max_yaw_rate = route[:, :2], speed, max_yaw_rate
         self._length = float(arc_lengths(route)[-1])
         self.s = start

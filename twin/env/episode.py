@@ -12,8 +12,6 @@ from twin.env.drivers import Driver
 from twin.env.task import control
 from twin.types import Array
 
-_ARRAY_FIELDS = ("times", "base_to_world", "qpos", "actions", "rewards", "speed", "cross_track", "progress", "trust")
-
 
 @dataclass(frozen=True)
 class Episode:
@@ -60,13 +58,9 @@ def record_episode(
     on_step: Callable[[dm_env.TimeStep], None] | None = None,
     max_steps: int | None = None,
 ) -> Episode:
-    """Drives and records one episode.
+    """Drives and records one episode; it is cut off after `max_steps` control steps.
 
-    Args:
-        environment: See `twin.load`.
-        driver: Chooses the actions.
-        on_step: Called with every time step.
-        max_steps: Control steps after which the episode is cut off; None: no limit.
+    `on_step` is called with every time step.
     """
     task, physics, pixels = environment.task, environment.physics, getattr(environment, "pixels", None)
     rows: list[dict[str, Any]] = []
@@ -94,7 +88,7 @@ def record_episode(
         if not end:
             step = environment.step(action)
     return Episode(
-        **{name: np.array([row[name] for row in rows]) for name in _ARRAY_FIELDS},
+        **{name: np.array([row[name] for row in rows]) for name in rows[0]},
         cause=task.cause,
         touched=physics.touched,
         task=task.segment.name,

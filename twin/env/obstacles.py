@@ -12,7 +12,6 @@ are in group `OBSTACLE_GROUP`; those that only collide are in the robot's collis
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import mujoco
@@ -102,11 +101,6 @@ def _cone(shape: ObstacleModel, color: Color) -> None:
     for low, high, tone in ((0.03, 0.18, color), (0.18, 0.28, _WHITE), (0.28, 0.38, color), (0.38, 0.46, _WHITE)):
         shape.frustum(low, high, (radius(low), radius(high)), tone)
     shape.frustum(0.46, 0.55, (radius(0.46), radius(0.55)), color)
-
-
-def _box(shape: ObstacleModel, color: Color, size: Sequence[float] = ()) -> None:
-    length, width, height = size or _BOX_SIZE
-    shape.box((length, width, height), (0, 0, height / 2), color)
 
 
 def _bollard(shape: ObstacleModel, color: Color) -> None:
@@ -199,9 +193,8 @@ def _husky(shape: ObstacleModel, color: Color) -> None:
         solid.cylinder((x, y - half, z + up), (x, y + half, z + up), husky.WHEEL_RADIUS, _DARK)
 
 
-_BUILDERS: dict[str, Callable[..., None]] = {
+_BUILDERS = {
     "cone": _cone,
-    "box": _box,
     "bollard": _bollard,
     "car": _car,
     "pedestrian": _pedestrian,
@@ -215,15 +208,18 @@ def add_obstacle_geoms(
 ) -> None:
     """Adds an obstacle's geoms to a body; `ObstacleConfig` explains kind, color and size."""
     red, green, blue = color or _COLORS[kind]
-    build = partial(_BUILDERS[kind], size=size) if kind == "box" else _BUILDERS[kind]
-    build(shape, (red, green, blue))
+    if kind == "box":
+        length, width, height = size or _BOX_SIZE
+        shape.box((length, width, height), (0, 0, height / 2), (red, green, blue))
+    else:
+        _BUILDERS[kind](shape, (red, green, blue))
 
 
 # ---- obstacles of a model and of an episode
 
 PREFIX = "obstacle_"
 STATIC_KINDS = ("cone", "box", "bollard")
-"""Default kinds of `random_obstacles`: static objects that occur on a path."""
+"""Kinds of random obstacles and distractor objects: static objects that occur on a path."""
 
 _ROUTE_NUMERIC = "obstacle_route"
 _PARKED_HEIGHT = -100.0  # [m], far below the ground
@@ -330,9 +326,7 @@ def ground_height(model: mujoco.MjModel, x: float, y: float) -> float:
     return float(geom.pos[2] + high * (np.array([1 - u, u]) @ corners @ np.array([1 - v, v])))
 
 
-def random_obstacles(
-    world: World, rng: np.random.Generator, count: int, kinds: Sequence[str] = STATIC_KINDS
-) -> tuple[ObstacleConfig, ...]:
+def random_obstacles(world: World, rng: np.random.Generator, count: int) -> tuple[ObstacleConfig, ...]:
     """Samples static obstacles `random_<number>` along the route; within the corridor, a robot can pass each of them.
 
     Raises:
@@ -344,12 +338,12 @@ def random_obstacles(
     free = np.sort(rng.uniform(0.0, room - spacing * (count - 1), count)) if count else np.zeros(0)
     out = []
     for k, station in enumerate(_FREE_ENDS[0] + free + spacing * np.arange(count)):
-        kind = str(rng.choice(list(kinds)))
+        kind = str(rng.choice(STATIC_KINDS))
         radius = RADIUS[kind]
         nearest = max(0.0, radius + _ROBOT_HALF_WIDTH + _CLEARANCE - world.half_width)
         farthest = max(nearest, world.half_width + _RANDOM_MARGIN) + radius
         lateral = rng.uniform(nearest, farthest) * rng.choice([-1.0, 1.0])
-        yaw = float(rng.uniform(-180.0, 180.0)) if kind in STATIC_KINDS else 0.0
+        yaw = float(rng.uniform(-180.0, 180.0))
         out.append(ObstacleConfig(f"random_{k}", kind, float(station), float(lateral), yaw))
     return tuple(out)
 
@@ -371,7 +365,7 @@ def random_distractors(world: World, rng: np.random.Generator, count: int) -> tu
     route, out = world.route[:, :2], []
     length = float(arc_lengths(world.route)[-1])
     for k in range(count):
-        kind = str(rng.choice(list(STATIC_KINDS)))
+        kind = str(rng.choice(STATIC_KINDS))
         nearest = world.half_width + _ROBOT_RADIUS + RADIUS[kind]
         for _ in range(_MAX_TRIES):
             station = float(rng.uniform(0.0, length))

@@ -125,10 +125,6 @@ def _is_sequence(value: Any) -> bool:
     return isinstance(value, Sequence) and not isinstance(value, str)
 
 
-def _are_numbers(record: Any) -> bool:
-    return all(map(_is_number, vars(record).values()))
-
-
 def _one_of(*names: str) -> Check:
     return lambda value: isinstance(value, str) and value in names, " or ".join(map(repr, names))
 
@@ -148,7 +144,7 @@ IMAGE_SIZE: Check = (
 
 _CHECKS: dict[str, Check] = {
     "rewards": (
-        lambda value: isinstance(value, Rewards) and _are_numbers(value),
+        lambda value: isinstance(value, Rewards) and all(map(_is_number, vars(value).values())),
         f"Rewards, or a dict of numbers, within ±{_MAX_NUMBER:,.0f}",
     ),
     "control_timestep": (

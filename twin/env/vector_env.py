@@ -318,9 +318,7 @@ def make_vector_env(
     """Returns n environments on the device of the options; see `LocalVectorEnv` for their interface.
 
     Args:
-        scene: See `twin.load`.
-        task: See `twin.load`.
-        options: See `twin.env.options.Options`.
+        scene, task, options: See `twin.load`.
         seeds: Seed of each environment's sequence of episodes; None: unpredictable.
         processes: Number of processes on a CPU; None: see `default_processes`.
 
@@ -331,13 +329,12 @@ def make_vector_env(
         raise InputError("0 environments; expected at least 1")
     if processes is not None and processes < 1:
         raise InputError(f"processes = {processes}; expected at least 1")
-    if parse_options(options).device == CPU:
-        if processes is None:
-            processes = default_processes(len(seeds))
-        if processes > 1:
-            return ProcessVectorEnv(scene, task, options, seeds, min(processes, len(seeds)))
-        return LocalVectorEnv(EnvFactory.open(scene, task, options), seeds)
-    from twin.env.vector_env_gpu import GpuVectorEnv  # slow to import
+    device = parse_options(options).device
+    if device != CPU:
+        from twin.env.vector_env_gpu import GpuVectorEnv  # slow to import
 
-    factory = EnvFactory.open(scene, task, options)
-    return GpuVectorEnv(factory, seeds, factory.options.device)
+        return GpuVectorEnv(EnvFactory.open(scene, task, options), seeds, device)
+    processes = min(processes or default_processes(len(seeds)), len(seeds))
+    if processes > 1:
+        return ProcessVectorEnv(scene, task, options, seeds, processes)
+    return LocalVectorEnv(EnvFactory.open(scene, task, options), seeds)
