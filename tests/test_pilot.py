@@ -130,8 +130,8 @@ def test_a_bag_gives_the_environments_stacks_and_the_policys_commands(episode, t
     scene, _, stacks, commands = episode
     bag = write(tmp_path / "bag", recorded(episode, encoding), mcap)
     found, given, pilot = play(bag, OnnxPolicy(scene / "runs" / "a"))
-    assert pilot.is_identity and pilot.counts == {"used": len(stacks)}
-    np.testing.assert_array_equal(found, stacks)
+    assert pilot.counts == {"used": len(stacks)}
+    np.testing.assert_array_equal(found, stacks)  # so pictures reach the policy unchanged
     assert given == commands  # bit for bit
 
 

@@ -11,7 +11,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-_CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
+# Number of channels, and OpenCV's conversion to RGB.
+_PACKED = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+    "8UC1": (1, cv2.COLOR_GRAY2RGB),
+    "8UC3": (3, cv2.COLOR_BGR2RGB),
+}
 # OpenCV names a Bayer pattern by its second row and column, ROS by its first.
 _BAYER = {
     "bayer_rggb8": cv2.COLOR_BayerBG2RGB,
@@ -27,15 +36,7 @@ _YUV = {
 }
 # The colors follow the brightness, in half as many rows.
 _PLANAR = {"nv12": cv2.COLOR_YUV2RGB_NV12, "nv21": cv2.COLOR_YUV2RGB_NV21}
-_TO_RGB = {
-    "bgr8": cv2.COLOR_BGR2RGB,
-    "8UC3": cv2.COLOR_BGR2RGB,
-    "rgba8": cv2.COLOR_RGBA2RGB,
-    "bgra8": cv2.COLOR_BGRA2RGB,
-    "mono8": cv2.COLOR_GRAY2RGB,
-    "8UC1": cv2.COLOR_GRAY2RGB,
-}
-ENCODINGS = (*_CHANNELS, *_BAYER, *_YUV, *_PLANAR)
+ENCODINGS = (*_PACKED, *_BAYER, *_YUV, *_PLANAR)
 """Supported encodings of raw pictures."""
 
 _COEFFICIENTS = {"": (0,), "none": (0,), "plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
@@ -65,7 +66,7 @@ class RawPicture:
         name, width, height = self.encoding, self.width, self.height
         if name not in ENCODINGS:
             raise PictureError(f"encoding {name!r}; expected one of {', '.join(ENCODINGS)}")
-        channels = 2 if name in _YUV else _CHANNELS.get(name, 1)
+        channels, code = _PACKED.get(name, (2 if name in _YUV else 1, (_BAYER | _YUV | _PLANAR).get(name)))
         lines = height + height // 2 if name in _PLANAR else height
         flat = np.frombuffer(self.data, np.uint8)
         sides = 1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE
@@ -76,11 +77,10 @@ class RawPicture:
             )
         rows = flat[: self.step * lines].reshape(lines, self.step)[:, : width * channels]
         picture = np.ascontiguousarray(rows).reshape(lines, width, channels)
-        if code := (_BAYER | _YUV | _PLANAR).get(name):
-            if width % 2 or (height % 2 and name not in _YUV) or min(width, height) < 4:
-                raise PictureError(f"{name} picture of {width} x {height} px; expected even sides of 4 px or more")
-            return cv2.cvtColor(picture, code)
-        return cv2.cvtColor(picture, _TO_RGB[name]) if name in _TO_RGB else picture
+        odd = width % 2 or (height % 2 and name not in _YUV)
+        if name not in _PACKED and (odd or min(width, height) < 4):
+            raise PictureError(f"{name} picture of {width} x {height} px; expected even sides of 4 px or more")
+        return picture if code is None else cv2.cvtColor(picture, code)
 
 
 @dataclass(frozen=True)

@@ -196,11 +196,6 @@ class Pilot:
                 self._stop(f"newest picture is {age * 1e-9:.2f} s old; expected at most {self.limits.timeout:g}")
         return self._command
 
-    @property
-    def is_identity(self) -> bool:
-        """True if pictures reach the policy unchanged."""
-        return self._rectifier is not None and self._rectifier.is_identity
-
     # ---- state
 
     def _may_drive(self) -> bool:
