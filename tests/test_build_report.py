@@ -1,6 +1,5 @@
 """The report page: what it says follows from the numbers, nothing is made up, and no name can break it."""
 
-import argparse
 import ast
 import copy
 import inspect
@@ -19,7 +18,7 @@ from jinja2 import UndefinedError
 from page_text import Text
 
 from twin.build import summary
-from twin.commands import VERBS
+from twin.commands import parser_of
 from twin.errors import join_names
 from twin.files import write_json
 from twin.geometry.cameras import Cameras
@@ -496,9 +495,7 @@ def test_the_page_says_what_to_do_next_in_commands_that_parse(scene: SceneDir) -
     for line in commands:
         _, verb, *arguments = shlex.split(line)
         assert str(odd.root) in arguments
-        parser = argparse.ArgumentParser()
-        VERBS[verb].define(parser)
-        parser.parse_args(arguments)
+        parser_of(verb).parse_args(arguments)
     assert [line.split()[1] for line in commands] == ["view", "align", "build", "train", "validate"]
     without = changed("review.not_applicable", "this is not a drive")
     assert [line.split()[1] for line in next_commands(odd, without)] == ["view", "export"]
