@@ -18,7 +18,6 @@ from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from twin.config import ANY, HELD_OUT, RESERVED_LIGHTINGS, TRAINING
 from twin.errors import InputError
@@ -177,6 +176,8 @@ def mixture_text(embedding: Array32, filmed: Lightings) -> str:
     The fractions are nonnegative and add up to 1; those below 0.005 are omitted. A sampled embedding deviates somewhat
     from its mixture, like the embedding of a single frame; the text omits this deviation.
     """
+    from scipy.optimize import nnls  # slow to import
+
     vectors = filmed.vectors.astype(np.float64)
     sum_weight = 1e3 * max(float(np.abs(vectors).max()), 1.0)  # weight of the equation Σ fractions = 1
     equations = np.vstack([vectors.T, np.full(len(vectors), sum_weight)])

@@ -22,8 +22,6 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
-from scipy.spatial import cKDTree
 
 from twin.env.obstacles import PREFIX
 from twin.errors import InputError
@@ -146,6 +144,8 @@ class IrradianceEstimator:
 
         Raises InputError: no ground is seen.
         """
+        from scipy.spatial import cKDTree  # slow to import, and a first picture needs no irradiance
+
         self._field = baked
         self._lock = threading.Lock()
         self._cache: OrderedDict[tuple[bytes, Sunlight], Irradiance] = OrderedDict()
@@ -165,7 +165,8 @@ class IrradianceEstimator:
             )
         self._xy = self._ground.positions[:, :2]
         count = min(_NEIGHBORS, len(self._xy))
-        self._neighbors = cKDTree(self._xy).query(self._upright.positions[:, :2], count)[1]
+        nearest = np.arange(1, count + 1)  # as an array, so that the result has two axes if there is one
+        self._neighbors = cKDTree(self._xy).query(self._upright.positions[:, :2], nearest)[1]
         names = baked.lightings
         grounds = [self._ground.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
         uprights = [self._upright.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
@@ -190,6 +191,8 @@ class IrradianceEstimator:
             return self._cache[key]
 
     def _estimate(self, embedding: NDArray, sunlight: Sunlight) -> Irradiance:
+        from scipy.optimize import nnls
+
         up = self._ground.probes.picture(embedding).astype(np.float64) / GROUND_ALBEDO
         colors = self._upright.probes.picture(embedding).astype(np.float64)
         known: tuple[Array, Array] | tuple[()] = ()
