@@ -237,7 +237,7 @@ class Mapper:
         options.mapper.track_required_tracks_per_view = _TRACKS_PER_VIEW
         if self._fixed == set(self._cameras):
             bundle.refine_focal_length = bundle.refine_extra_params = False
-        send_message(bar="mapping", total=0)
+        send_message(say="  mapping, without a progress bar")
         folder = fresh_folder(self._work, "global")
         model = _largest(pycolmap.global_mapping(database, matcher.images, folder, options))
         if model is not None and self._fixed and self._fixed != set(self._cameras):

@@ -366,7 +366,7 @@ def estimate_focal_lengths(database: Path, seed: int) -> None:
         for camera in cameras.values():
             if camera.has_prior_focal_length:
                 continue
-            send_message(bar=f"focal length of camera {camera.camera_id}", total=0)
+            send_message(say=f"  focal length of camera {camera.camera_id}")
             own = [
                 (first, second, matches[:: 1 + len(matches) // _FOCAL_MATCHES])
                 for (first, second), matches in verified
