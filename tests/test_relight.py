@@ -1,6 +1,7 @@
 """Lighting of a photo: the fit, the file, its field, and the errors of `twin.relight`."""
 
 import json
+import shutil
 from dataclasses import asdict
 
 import numpy as np
@@ -201,6 +202,19 @@ def test_unusable_input_ends_with_one_line_and_status_2(scene, tmp_path, capsys)
         error = capsys.readouterr().err.strip()
         assert error.startswith("error: ") and words in error and "\n" not in error
     assert not (scene.lightings / "x.json").exists()
+
+
+def test_a_damaged_build_is_found_before_the_photo_is_fitted(scene, monkeypatch, capsys):
+    monkeypatch.setattr("twin.relight.fit_photo", lambda *_: pytest.fail("the photo was fitted first"))
+    mesh = scene.stage("mesh")
+    mesh.mkdir()
+    try:
+        write_stamp(mesh, "mesh")  # the stage field has no baked field
+        arguments = [str(scene.root), str(scene.root / "photo.png"), "--name", "x", "--sun", "120,35", "--quiet"]
+        assert commands.main("relight", arguments) == 2
+    finally:
+        shutil.rmtree(mesh)
+    assert "baked.json" in capsys.readouterr().err
 
 
 def test_error_names_a_damaged_file(scene):

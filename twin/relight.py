@@ -320,8 +320,10 @@ def relight(
     check_new_name(name, field.lightings)
     source = find_sun(scene, sun, time, location, heading)
     if source:
-        require_stage(scene, "mesh")  # before the photo is fitted
+        require_stage(scene, "mesh")  # checked first, since reading the baked field takes time
     image, facts = load_photo(photo, None)
+    # Before the photo is fitted, which takes a minute and would be lost if the build is damaged.
+    casters = shadow_casters(scene, BakedField.load(scene.stage("field"))) if source else None
     try:
         found = register_photo(image, facts, scene)
     except InputError as error:
@@ -332,8 +334,7 @@ def relight(
     lens = lens.scaled(round(lens.width * scale), round(lens.height * scale))
     small = np.asarray(resize(flat, lens.width, lens.height), np.float32) / 255.0
     relit = fit_photo(field, small, found.camera_to_world, lens.intrinsics)
-    if source:
-        casters = shadow_casters(scene, BakedField.load(scene.stage("field")))
+    if source and casters:
         relit = with_sun(field, relit, casters, source)
     away = float(np.linalg.norm(Cameras.load(scene.stage("metric")).positions - position, axis=1).min())
     figures = {
