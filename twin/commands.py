@@ -472,22 +472,28 @@ VERBS = {
         "look at a built scene and drive in it, in the browser",
         _view,
         "twin.view.__main__",
-        "no progress, no address, no summary",
+        quiet="no progress, no address, no summary",
     ),
     "film": Verb("film a drive in a built scene", _film, "twin.film"),
     "export": Verb("write the place for other programs: USD, glTF, splats, cameras", _export, "twin.export.__main__"),
     "pack": Verb("pack a built scene into one file, with policies, for another machine", _pack, "twin.pack"),
-    "unpack": Verb("unpack such a file into a scene folder", _unpack, "twin.unpack", "no summary"),
+    "unpack": Verb("unpack such a file into a scene folder", _unpack, "twin.unpack", quiet="no summary"),
     "train": Verb("train a policy on a task of a built scene", _train, "twin.train"),
     "validate": Verb(
-        "measure how often policies succeed, lighting by lighting", _validate, "twin.validate", "no progress, no table"
+        "measure how often policies succeed, lighting by lighting",
+        _validate,
+        "twin.validate",
+        quiet="no progress, no table",
     ),
     "trial": Verb("evaluate a trial on the road from the robot's recording", _trial, "twin.trial"),
     "forecast": Verb(
-        "predict success on the real road from success in the twin", _forecast, "twin.forecast", "no summary"
+        "predict success on the real road from success in the twin",
+        _forecast,
+        "twin.forecast",
+        quiet="no summary",
     ),
     "reality": Verb(
-        "a generated place whose truth is known: film it, drive in it", _reality, "twin.reality.__main__", ""
+        "a generated place whose truth is known: film it, drive in it", _reality, "twin.reality.__main__", quiet=""
     ),
 }
 """The verbs, in the order in which a user needs them."""
