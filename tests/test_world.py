@@ -3,16 +3,20 @@
 import re
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 from tiny_world import box, export, tiny_config, tiny_ground, tiny_route, tiny_scene, tiny_world
 
+from twin.config import RouteConfig, SceneConfig
 from twin.errors import InputError
+from twin.geometry.cameras import Cameras, depth_determined, project
 from twin.geometry.images import read_image
 from twin.mjcf.scene_xml import (
     add_ground,
+    camera_pose,
     check_portable,
     covered_by_ground,
     face_texture,
@@ -189,6 +193,60 @@ def test_a_route_that_is_too_short_or_starts_off_the_ground_is_refused(tmp_path,
     np.savez(scene.stage("mesh") / "route.npz", xy=xy, z=tiny_ground().at(xy))
     with pytest.raises(InputError, match=words):
         export(scene)
+
+
+def filmed_from(tmp_path: Path, first: float, config: SceneConfig | None = None) -> tuple[World, float, Cameras]:
+    """The tiny scene, filmed every 0.3 m along x from `first` [m] to 6 m, 1.2 m above ground, with a level camera.
+
+    The lowest ray of a frame meets level ground 2.4 m ahead.
+    """
+    scene = tiny_scene(tmp_path)
+    x = np.arange(first, 6.0, 0.3)
+    pose = np.zeros((len(x), 4, 4))
+    pose[:, :3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # right, down and ahead
+    pose[:, :2, 3] = np.stack([x, np.zeros(len(x))], 1)
+    pose[:, 2, 3], pose[:, 3, 3] = tiny_ground().at(pose[:, :2, 3]) + 1.2, 1.0
+    cameras = Cameras(
+        names=tuple(f"day/{i:06d}" for i in range(len(x))),
+        camera_to_world=pose,
+        intrinsics=np.tile([360.0, 360.0, 320.0, 180.0], (len(x), 1)),
+        sizes=np.tile([640, 360], (len(x), 1)),
+        lightings=("day",) * len(x),
+        sources=("day",) * len(x),
+        times=np.arange(len(x), dtype=float),
+        held_out=np.zeros(len(x), bool),
+        images=scene.stage("cameras") / "images",
+    )
+    cameras.save(scene.stage("metric"))
+    out, metrics = export(scene, config)
+    return World.load(out), metrics["route_skipped_m"], cameras
+
+
+def test_route_starts_where_the_robot_sees_ground_that_a_film_shows_twice(tmp_path):
+    world, skipped, cameras = filmed_from(tmp_path, 0.0)
+    # The robot's lowest ray meets level ground 1.2 m ahead of its base, so at x = 1.2 m it sees what is filmed. A hill,
+    # the margin of the picture, and the second frame 0.3 m after the first add to it.
+    assert 1.2 <= skipped <= 2.3
+    np.testing.assert_allclose(world.route[:, :2], tiny_route()[round(skipped / 0.25) :])
+    np.testing.assert_allclose(world.spawn[:2], [skipped, 0.0], atol=0.03)
+    x, y = np.meshgrid(np.arange(skipped + 0.05, 6.0, 0.05), np.linspace(-1.0, 1.0, 21))
+    points = np.stack([x, y, tiny_ground().at(np.stack([x, y], -1))], -1).reshape(-1, 3)
+    slope = (
+        tiny_ground().at(np.array([skipped + 0.25, 0.0])) - tiny_ground().at(np.array([skipped - 0.25, 0.0]))
+    ) / 0.5
+    ahead = np.array([1.0, 0.0, slope]) / np.hypot(1.0, slope)
+    base = np.stack([ahead, [0.0, 1.0, 0.0], np.cross(ahead, [0.0, 1.0, 0.0])], 1)
+    pixels, depth = project(points, camera_pose(world.robot, np.array(world.spawn[:3]), base), world.intrinsics)
+    shown = (depth > 0.0) & (pixels >= 0.0).all(1) & (pixels <= CAMERA_SIZE).all(1)
+    assert shown.sum() > 500 and depth_determined(cameras, points[shown]).all()
+    assert not depth_determined(cameras, points[x.ravel() < 2.2]).any()
+
+
+def test_nothing_is_left_out_if_the_film_begins_earlier_or_the_user_gave_points(tmp_path):
+    assert filmed_from(tmp_path / "earlier", -3.0)[1] == 0.0
+    given = replace(tiny_config(), route=RouteConfig(points=((0.0, 0.0), (5.0, 0.0))))
+    world, skipped, _ = filmed_from(tmp_path / "given", 0.0, given)
+    assert skipped == 0.0 and len(world.route) == len(tiny_route())
 
 
 def test_geoms_touched_at_the_start_are_reported(tmp_path):

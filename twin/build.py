@@ -46,7 +46,7 @@ PIPELINE = (
     Stage("metric", "twin.capture.metric", 3, ("metric",), ("capture", "cameras")),
     Stage("field", "twin.nerf.trainer", 9, ("nerf", "mjcf.route"), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 7, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
-    Stage("mjcf", "twin.mjcf.scene_xml", 4, ("mjcf", "robot"), ("metric", "mesh")),
+    Stage("mjcf", "twin.mjcf.scene_xml", 5, ("mjcf", "robot"), ("metric", "mesh")),
     Stage(
         "review",
         "twin.report.review_video",

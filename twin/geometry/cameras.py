@@ -19,6 +19,7 @@ from twin.geometry.poses import Similarity, inverse_pose
 from twin.types import Array
 
 _CV_TO_GL = np.diag([1.0, -1.0, -1.0, 1.0])
+_MIN_PARALLAX = 1.0  # [°] two views determine a point's depth if their directions differ by at least this
 _CAMERA_ARRAYS: dict[str, tuple[tuple[int, ...], str]] = {
     "camera_to_world": ((4, 4), "f"),
     "intrinsics": ((4,), "f"),
@@ -180,6 +181,30 @@ def project(points: Array, camera_to_world: Array, intrinsics: Array) -> tuple[A
     fx, fy, cx, cy = intrinsics
     safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
     return np.stack([fx * local[..., 0] / safe + cx, fy * local[..., 1] / safe + cy], -1), depth
+
+
+def depth_determined(cameras: Cameras, points: Array) -> NDArray[np.bool_]:
+    """Mask (n,) of the points (n, 3) [m] that one film shows from directions at least `_MIN_PARALLAX` apart.
+
+    Frames are matched within a film, so only there do cameras and field determine depth. Only training frames count.
+    Directions are compared with that of the film's first frame that shows the point. Occlusions and image masks are
+    ignored.
+    """
+    found = np.zeros(len(points), bool)
+    films, trained = np.array(cameras.sources), ~np.asarray(cameras.held_out, bool)
+    for film in dict.fromkeys(cameras.sources):
+        first = np.full((len(points), 3), np.nan)  # first direction from which the film shows a point
+        for i in np.flatnonzero((films == film) & trained):
+            left = np.flatnonzero(~found)
+            pixels, depth = project(points[left], cameras.camera_to_world[i], cameras.intrinsics[i])
+            shown = left[(depth > 0.0) & (pixels >= 0.0).all(1) & (pixels <= cameras.sizes[i]).all(1)]
+            ray = cameras.positions[i] - points[shown]
+            ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+            # Chords are compared, because the arc cosine is imprecise for small angles. NaN in `first` gives False.
+            found[shown] = np.linalg.norm(ray - first[shown], axis=1) >= 2.0 * np.sin(np.radians(_MIN_PARALLAX) / 2.0)
+            new = np.isnan(first[shown, 0])
+            first[shown[new]] = ray[new]
+    return found
 
 
 def scaled_intrinsics(intrinsics: Array, size: tuple[int, int] | NDArray, new_size: tuple[int, int]) -> Array:

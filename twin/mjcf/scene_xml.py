@@ -23,7 +23,7 @@ from twin.assets.ground import Ground
 from twin.config import SceneConfig
 from twin.errors import InputError
 from twin.files import load_arrays
-from twin.geometry.cameras import Cameras
+from twin.geometry.cameras import Cameras, depth_determined, opencv_to_mujoco, project
 from twin.geometry.images import read_image, write_image
 from twin.geometry.route import BRANCH
 from twin.mjcf import husky
@@ -40,7 +40,7 @@ from twin.mjcf.world import (
     point_at,
     total_turn,
 )
-from twin.robot import BASE_HEIGHT, HuskyParams, PixelCamera
+from twin.robot import BASE_HEIGHT, CAMERA_SIZE, HuskyParams, PixelCamera
 from twin.scene import SceneDir
 from twin.types import Array
 
@@ -49,6 +49,8 @@ _GROUND_OVERLAP = 0.15  # [m] up to this height above the height field, the visu
 _SETTLE_TIME = 2.0  # [s] simulated time in which the robot comes to rest before its state is stored
 _MIN_ROUTE = 2.0  # [m] least length of a route
 _SITE_SPACING = 1.0  # [m] between sites along the route
+_MAX_SKIPPED = 6.0  # [m], and a quarter of the route: the most that is left out at its beginning
+_VIEW_MARGIN = 8  # [px] by which the robot's picture is enlarged when its first view is checked, since starts differ
 
 
 @dataclass(frozen=True)
@@ -100,13 +102,22 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     if route is None:
         metrics |= {"route_length_m": None, "note": "no route: scene without a robot, corridor or goal"}
     else:
-        camera = config.robot.camera(film_camera(Cameras.load(scene.stage("metric"))))
+        cameras = Cameras.load(scene.stage("metric"))
+        camera = config.robot.camera(film_camera(cameras))
+        view = ground, cameras, config.robot, camera
+        skipped = 0.0
+        if not config.route.points:  # a start that the user gave stays
+            first = first_filmed(route, config.mjcf.half_width, *view)
+            skipped, route = float(arc_lengths(route)[first]), route[first:]
+        for name in [one.name for one in config.branch if not one.points]:
+            branches[name] = branches[name][first_filmed(branches[name], config.mjcf.half_width, *view) :]
         spawn, initial_contacts = _add_robot(spec, ground, route, config.robot, camera)
         _add_route(spec, route, config.mjcf.half_width)
         world = World(route, config.mjcf.half_width, spawn, out, camera, config.robot, branches=branches)
         world.save()
         metrics |= {
             "route_length_m": float(arc_lengths(route)[-1]),
+            "route_skipped_m": skipped,
             "turn_deg": float(np.rad2deg(total_turn(route))),
             "half_width_m": config.mjcf.half_width,
             "camera_intrinsics_px": world.intrinsics.tolist(),
@@ -136,6 +147,35 @@ def film_camera(cameras: Cameras) -> PixelCamera:
     return PixelCamera((fx, fy, cx, cy), (width, height))
 
 
+def first_filmed(
+    route: Array, half_width: float, ground: Ground, cameras: Cameras, params: HuskyParams, camera: PixelCamera
+) -> int:
+    """First vertex of the route (m, 3) from which the robot sees only corridor ground whose depth the films determine.
+
+    A film's first frames show the ground from some meters ahead on; a robot at the same place, whose camera is lower,
+    would see ground that no frame shows. 0 if no vertex of the first `_MAX_SKIPPED` and the first quarter is such.
+    """
+    knots = arc_lengths(route)
+    most = min(_MAX_SKIPPED, knots[-1] / 4)
+    stations, aside = np.arange(0.0, most + _MAX_SKIPPED, 0.1), np.linspace(-half_width, half_width, 11)
+    heading = heading_at(route, stations)
+    left = np.stack([-np.sin(heading), np.cos(heading)], -1)
+    xy = point_at(route[:, :2], stations)[:, None] + aside[:, None] * left[:, None]
+    points = np.concatenate([xy, ground.at(xy)[..., None]], -1).reshape(-1, 3)
+    along, undetermined = stations.repeat(len(aside)), ~depth_determined(cameras, points)
+    size, intrinsics = np.array(CAMERA_SIZE), np.array(camera.resized(CAMERA_SIZE).intrinsics)
+    rotation = np.zeros(9)
+    for k in range(int(np.searchsorted(knots, most, "right"))):
+        ahead = points[undetermined & (along > knots[k])]
+        base, quaternion = rest_pose(ground.at, route[k, :2], float(heading_at(route, knots[k])))
+        mujoco.mju_quat2Mat(rotation, quaternion)
+        pixels, depth = project(ahead, camera_pose(params, base, rotation.reshape(3, 3)), intrinsics)
+        in_view = ((pixels >= -_VIEW_MARGIN) & (pixels <= size + _VIEW_MARGIN)).all(1)
+        if not (in_view & (depth > 0.0)).any():
+            return k
+    return 0
+
+
 def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tuple[Array, Array]:
     """Base position [m] and quaternion (wxyz) of a robot on the plane fitted to the ground below its wheels.
 
@@ -154,6 +194,14 @@ def rest_pose(height_at: Callable[[Array], Array], xy: Array, yaw: float) -> tup
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, rotation.ravel())
     return np.array([*xy, height]) + z_axis * BASE_HEIGHT, quaternion
+
+
+def camera_pose(params: HuskyParams, base: Array, rotation: Array) -> Array:
+    """camera_to_world (4, 4), OpenCV axes, of the front camera; position (3,) [m] and axes (3, 3) of the base."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation @ params.camera_rotation
+    pose[:3, 3] = base + rotation @ params.camera_position
+    return opencv_to_mujoco(pose)  # this conversion is its own inverse
 
 
 def covered_by_ground(vertices: NDArray, ground: Ground) -> NDArray[np.bool_]:

@@ -376,9 +376,11 @@ def mjcf_section(report: dict[str, Any]) -> Section:
     if routeless:
         done = "Ground, parts and lights as a folder that MuJoCo loads, without a robot because there is no route: "
     else:
+        unfilmed = "there, a camera at the robot’s height would see ground that no film shows twice"
         route = facts_of(
             report,
             ("mjcf.route_length_m", "route", "{:.1f} m", _route_choice(report)),
+            ("mjcf.route_skipped_m", "left out before its start", "{:.1f} m", unfilmed),
             ("mjcf.turn_deg", "turn", "{:+.0f}°", "from the first heading to the last; right is negative"),
             ("mjcf.half_width_m", "corridor", "± {:.2f} m", "kept free of convex parts"),
         )

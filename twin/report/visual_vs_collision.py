@@ -10,8 +10,8 @@ but is not visible. Differences are measured in three ways:
   collision-only ground by the height above what is visible
 
 Frames are matched within a film, so the field's depth is determined only where one film shows a place from two
-directions. At other places (mainly just ahead of a film's first frame) the depth may differ from build to build.
-Collision-only geometry at such places is reported separately, as `unfilmed_ghost_m`.
+directions. At other places the depth may differ from build to build. Collision-only geometry there is reported
+separately, as `unfilmed_ghost_m`. Where the route's beginning shows such ground, the stage `mjcf` leaves it out.
 """
 
 from collections.abc import Callable
@@ -30,8 +30,8 @@ from twin.geometry.cameras import (
     Cameras,
     RenderableField,
     Viewpoints,
+    depth_determined,
     pixel_grid,
-    project,
     unproject,
 )
 from twin.mjcf.scene_xml import Parts
@@ -59,7 +59,6 @@ _THINNING_CELL = 0.05  # [m]; point clouds are thinned to one point per cell
 _MIN_OBSTACLE_HEIGHT = 0.2  # [m] above the ground
 _ROUTE_STEP = 0.05  # [m] between stations; a point is assigned to the nearest one
 _BIN = 1.0  # [m] of the route per bin of `along`
-_MIN_PARALLAX = 1.0  # [°] two views determine a point's depth if their directions differ by at least this
 
 
 @dataclass(frozen=True)
@@ -148,7 +147,8 @@ def compare_geometry(
     depth_below = np.where(np.isfinite(height), -np.minimum(height, 0.0), FAR)
     behind = np.where(views.visual_depth > views.collision_depth, np.where(views.is_ground, depth_below, gap), 0.0)
     behind = np.minimum(behind, MAX_DEPTH)  # where nothing is visible, the gap would be almost FAR
-    filmed = _depth_determined(cameras, collision, hit)
+    filmed = np.zeros(hit.shape, bool)
+    filmed[hit] = depth_determined(cameras, collision[hit])
     visual_only, collision_only = np.where(inside, height, 0.0), np.where(hit & filmed, behind, 0.0)
     out["corridor_leak_m"], out["corridor_ghost_m"] = float(max(visual_only.max(), 0.0)), float(collision_only.max())
     out["unfilmed_ghost_m"] = float(np.where(hit & ~filmed, behind, 0.0).max())
@@ -187,32 +187,6 @@ def _in_corridor(world: World, points: Array, among: NDArray[np.bool_]) -> tuple
     # Points whose nearest point is an end of the route are excluded, since they may be beyond it.
     inside[among] = (distance <= world.half_width) & (index > 0) & (index < len(stations) - 2)
     return station, inside
-
-
-def _depth_determined(cameras: Cameras, points: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask of the points (..., 3) in `among` that one film shows from directions at least `_MIN_PARALLAX` apart.
-
-    Only training frames count. Directions are compared with that of the film's first frame that shows the point.
-    Occlusions and image masks are ignored.
-    """
-    selected = points[among]
-    found = np.zeros(len(selected), bool)
-    films, trained = np.array(cameras.sources), ~np.asarray(cameras.held_out, bool)
-    for film in dict.fromkeys(cameras.sources):
-        first = np.full((len(selected), 3), np.nan)  # first direction from which the film shows a point
-        for i in np.flatnonzero((films == film) & trained):
-            left = np.flatnonzero(~found)
-            pixels, depth = project(selected[left], cameras.camera_to_world[i], cameras.intrinsics[i])
-            shown = left[(depth > 0.0) & (pixels >= 0.0).all(1) & (pixels <= cameras.sizes[i]).all(1)]
-            ray = cameras.positions[i] - selected[shown]
-            ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-            # Chords are compared, because the arc cosine is imprecise for small angles. NaN in `first` gives False.
-            found[shown] = np.linalg.norm(ray - first[shown], axis=1) >= 2.0 * np.sin(np.radians(_MIN_PARALLAX) / 2.0)
-            new = np.isnan(first[shown, 0])
-            first[shown[new]] = ray[new]
-    out = np.zeros(among.shape, bool)
-    out[among] = found
-    return out
 
 
 def _collision_surface(ground: Ground, parts: Parts) -> Any:
@@ -301,10 +275,7 @@ def geometry_section(report: dict[str, Any]) -> Section:
     )
     leak = "Something in the corridor is visible but has no collision geometry" + beyond
     ghost = "Collision geometry in the corridor is not visible" + beyond
-    earlier = (
-        "film from a few meters before the start; without a new film, let tasks start further along ([[task]] with "
-        "start = 3.0, for example), which avoids these meters but leaves this caution."
-    )
+    earlier = "film from a few meters before the start, or begin [route] points further along."
     apart = "Visual and collision geometry differ by {:.3f} m in the median, more than {:g} m."
     cautions = cautions_above(
         found,

@@ -28,11 +28,11 @@ from twin.capture.localize import FilmRegistration, register_film
 from twin.capture.video import FilmStatistics, read_film, video_film
 from twin.config import CaptureConfig
 from twin.errors import InputError
-from twin.geometry.cameras import Viewpoints, opencv_to_mujoco
+from twin.geometry.cameras import Viewpoints
 from twin.geometry.images import psnr, to_uint8, write_image
 from twin.geometry.passes import path_length
 from twin.loading import load_scene
-from twin.mjcf.scene_xml import rest_pose
+from twin.mjcf.scene_xml import camera_pose, rest_pose
 from twin.robot import BASE_HEIGHT, CAMERA_AHEAD, HuskyParams, PixelCamera
 from twin.scene import SceneDir, require_stage
 from twin.types import Array, Image
@@ -110,10 +110,7 @@ def camera_pose_on_ground(
         ground_at: Returns the ground's height [m], shape (n,), at points (n, 2).
     """
     base, rotation = _base_pose(position, heading, ground_at, np.array(params.camera_position))
-    pose = np.eye(4)
-    pose[:3, :3] = rotation @ params.camera_rotation
-    pose[:3, 3] = base + rotation @ params.camera_position
-    return opencv_to_mujoco(pose)  # this conversion is its own inverse
+    return camera_pose(params, base, rotation)
 
 
 def base_below_camera(params: HuskyParams, camera_to_world: Array, ground_at: Callable[[Array], Array]) -> Array:
