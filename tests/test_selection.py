@@ -23,7 +23,7 @@ from twin.learn import selection, training
 from twin.learn.policy import load_policy
 from twin.learn.policy_evaluation import EpisodeResult, run_episodes
 from twin.learn.selection import FRESH_EPISODES, TESTS_FILE, Failure, PolicyTest, next_segment, train_until_learnt
-from twin.learn.train_config import TrainConfig
+from twin.learn.train_config import TrainConfig, steps_for
 
 CONFIG = replace(SHORT, steps=160, save_every=160, checkpoints=8, test_every=40, settle=40)
 PLAN = TrainConfig(steps=24_000, test_every=2_000, settle=2_000, cycle=12_000, success=0.95)
@@ -86,6 +86,17 @@ def test_a_training_that_gets_no_better_ends():
     assert next_segment(PLAN, more).why == ""  # no further, but more episodes arrive
 
 
+def test_a_training_that_went_on_is_not_held_to_its_earlier_tests():
+    ended = [*_tests(5.0, 9.0, 9.0, 9.0, 9.1, 9.1), PolicyTest(14_000, 8, 0, 9.1, 0.0, (), True)]
+    flat = [PolicyTest(14_000 + 2000 * k, 8, 0, 9.1, 0.0) for k in (1, 2, 3, 4)]
+    assert next_segment(PLAN, ended).why == "" and next_segment(PLAN, [*ended, *flat[:3]]).why == ""
+    assert next_segment(PLAN, [*ended, *flat]) == selection.Segment(24_000, 22_000, "no better")
+
+
+def test_a_longer_task_is_trained_for_longer():
+    assert [steps_for(length) for length in (5.0, 30.0, 49.0, 58.2, 77.5)] == [24_000] * 3 + [36_000, 48_000]
+
+
 def test_the_largest_number_of_steps_ends_it():
     tests = _tests(*(float(k + 1) for k in range(11)))
     assert next_segment(PLAN, tests[:10]) == selection.Segment(22_000, None)
@@ -137,6 +148,23 @@ def test_the_best_of_a_run_that_did_not_learn_is_kept(scene, tmp_path, scripted)
     assert choice["failures"] == "50 of 50 failures at 0 to 5 m (50 by out_of_bounds); 50 in lightings mostly like day"
 
 
+def test_finalists_drive_only_what_they_have_not_driven(scene, tmp_path, scripted):
+    """Four policies go on to 20 episodes, two of them to 40; what the tests of the training drove counts."""
+    script, asked = scripted
+    script |= {32: (1, 0.0), 64: (5, 0.0), 96: (14, 0.0), 128: (12, 0.0), 160: (3, 0.0)}
+    choice = learn(scene, tmp_path, replace(CONFIG, test_every=32))
+    order = selection._seeds(CONFIG)
+    tested = len([one for one in asked if len(one[1]) in (8, 12)])
+    rounds = [(at, seeds) for at, seeds, _ in asked if set(seeds) <= set(order[:40])]
+    by_step = {step: [seed for at, seeds in rounds if at == step for seed in seeds] for step in script}
+    assert {step: len(seeds) for step, seeds in by_step.items()} == {32: 8, 64: 20, 96: 40, 128: 40, 160: 20}
+    assert all(seeds == list(order[: len(seeds)]) for seeds in by_step.values()) and tested > 5
+    assert choice["chosen"]["step"] == 96 and asked[-1][:2] == (96, order[40:])
+    found = {one["step"]: (one["trials"], one["successes"], len(one["failures"])) for one in choice["candidates"]}
+    assert found == {32: (8, 1, 7), 64: (20, 5, 15), 96: (40, 14, 26), 128: (40, 12, 28), 160: (20, 3, 17)}
+    assert choice["candidates"][2]["progress"] == pytest.approx(1.0 + 14 / 40, abs=2e-3)
+
+
 def test_a_stopped_run_can_end_where_it_was_stopped(scene, tmp_path, scripted):
     """By fewer steps than were done: the policy at hand is tested, too."""
 
@@ -161,6 +189,9 @@ def test_a_choice_stays_until_more_is_asked(scene, tmp_path, scripted):
     assert len(asked) == count and json.loads((tmp_path / CHOICE_FILE).read_text()) == first
     more = learn(scene, tmp_path, replace(CONFIG, steps=240))
     assert more["steps"] == 240 and more["reached"] and more["chosen"]["step"] == 240
+    assert [(one["step"], one["resumed"]) for one in more["candidates"]] == [
+        (40, False), (80, False), (120, False), (160, True), (200, False), (240, False)
+    ]  # fmt: skip
     (tmp_path / CHOICE_FILE).write_text('{"steps": 240, "chosen": {}}')
     with pytest.raises(InputError, match=r"choice\.json is damaged .*; delete it"):
         learn(scene, tmp_path, replace(CONFIG, steps=240))

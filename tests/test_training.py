@@ -20,12 +20,15 @@ from tiny_twin import tiny_twin
 
 import twin
 from twin import commands, runtime
+from twin import train as train_verb
+from twin.config_file import load_config
 from twin.env.domain_randomization import Ranges
+from twin.env.route_segments import find_task
 from twin.errors import InputError
 from twin.evaluation.training_curves import read_episodes
 from twin.evaluation.trials import csv_text
 from twin.files import write_json
-from twin.learn import selection
+from twin.learn import selection, train_config
 from twin.learn.policy import load_policy
 from twin.learn.sac import PixelSAC
 from twin.learn.sb3_env import DriveVecEnv
@@ -128,8 +131,20 @@ def test_a_run_is_resumed_with_its_configuration_and_road_alone(scene, tmp_path)
     assert json.loads((tmp_path / "state" / "state.json").read_text())["steps"] == 16
 
 
+def test_the_default_number_of_steps_follows_from_the_length_of_the_task(scene, monkeypatch, capsys):
+    def told(twin, folder, config, *_):
+        raise InputError(f"{config.steps} steps")
+
+    monkeypatch.setattr(train_verb, "_train", told)
+    length = find_task("ahead", twin.load_scene(scene).world(), load_config(scene / "scene.toml").task).length
+    monkeypatch.setattr(train_config, "steps_for", lambda asked: round(1000 * asked))
+    for options, steps in (([], round(1000 * length)), (["--steps", "7"], 7), (["--preset", "gpu"], 60_000)):
+        assert commands.main("train", [str(scene), "--run", "steps", "--task", "ahead", *options]) == 2
+        assert f"{steps} steps" in capsys.readouterr().err
+
+
 def test_the_verb_trains_and_refuses_what_it_cannot_begin_or_resume(scene, capsys, monkeypatch):
-    for name, value in (("_BATCHES", (2,)), ("_TEST_EPISODES", 2), ("_FINALISTS", 1), ("FRESH_EPISODES", 3)):
+    for name, value in (("_BATCHES", (2,)), ("_TEST_EPISODES", 2), ("_ROUNDS", ((1, 2),)), ("FRESH_EPISODES", 3)):
         monkeypatch.setattr(selection, name, value)
     common = [str(scene), "--run", "one", "--quiet", "--worlds", "2", "--processes", "1", "--steps", "4"]
     assert commands.main("train", [*common, "--task", "strait"]) == 2

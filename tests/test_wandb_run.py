@@ -82,7 +82,7 @@ def stand_in(tmp_path, monkeypatch):
     import wandb
 
     # Two episodes in each test, as nothing here depends on their number.
-    for name, value in (("_BATCHES", (2,)), ("_TEST_EPISODES", 2), ("_FINALISTS", 1), ("FRESH_EPISODES", 2)):
+    for name, value in (("_BATCHES", (2,)), ("_TEST_EPISODES", 2), ("_ROUNDS", ((1, 2),)), ("FRESH_EPISODES", 2)):
         monkeypatch.setattr(selection, name, value)
     yield wandb
     sys.modules.pop("wandb")

@@ -284,7 +284,8 @@ def _train(parser: argparse.ArgumentParser, add: _Add) -> None:
     add("--preset", choices=("cpu", "gpu"), default="cpu", help="sizes of network, batch and run")
     add("--action", choices=("steering", "twist"), help="default: steering, at fixed speed")
     add("--success", type=float, help="success rate in tests at which the training ends (default: 0.95)")
-    add("--steps", type=int, help="largest number of control steps of all environments (default: 24000; gpu: 60000)")
+    steps = "largest number of control steps of all environments (default: 24000, more from 50 m on; gpu: 60000)"
+    add("--steps", type=int, help=steps)
     add("--worlds", type=int, help="number of parallel environments (default: 8; gpu: 32)")
     add("--processes", type=int, help="processes that step the environments (default: one per core, at most 16)")
     add("--device", choices=("cpu", "cuda"), help="where the networks are trained (default: cpu; preset gpu: cuda)")

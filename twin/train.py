@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from twin import commands, runtime
+from twin.config_file import load_config
 from twin.env.domain_randomization import condition_options
+from twin.env.route_segments import find_task
 from twin.errors import InputError
 from twin.evaluation.statistics import wilson
 from twin.evaluation.training_curves import write_success_curve
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 
 def command(given: argparse.Namespace) -> None:
     """Runs `twin train` with the options parsed by `twin.commands`."""
-    from twin.learn.train_config import PRESETS, TrainConfig
+    from twin.learn.train_config import PRESETS, TrainConfig, steps_for
     from twin.report.policy_card import write_policy_cards
 
     names = {field.name for field in dataclasses.fields(TrainConfig)}
@@ -40,6 +42,9 @@ def command(given: argparse.Namespace) -> None:
     twin = load_writable(given.scene)
     folder = run_folder(twin.scene, given.run)
     require_stage(twin.scene, "mjcf")  # checked before the run's folder is created
+    if "steps" not in {**PRESETS[given.preset], **settings}:
+        task = find_task(config.task, twin.world(), load_config(twin.scene.config_file).task)
+        config = dataclasses.replace(config, steps=steps_for(task.length))
     with exclusive_lock(folder.with_name(f".{folder.name}.lock"), f"{folder} is being trained"):
         choice = _train(twin, folder, config, given.processes, given.wandb)
     picture = write_success_curve(folder)

@@ -21,6 +21,8 @@ heading error [rad], and the turns up to 1, 2 and 4 m ahead [rad]."""
 
 _CHOICES = {"observe": (NERF, SIMULATOR), "action": (STEERING, TWIST), "device": (CPU, CUDA)}
 
+_PER_CYCLE = 20.0  # [m] of a task per cycle of the learning rate
+
 _ROBOT_ONLY = Ranges(extinction=(0.0, 0.0), sunlight=(0.0, 0.0), shade=(0.0, 0.0), bystanders=(0, 0))
 """Randomizes only the robot; the place looks as filmed."""
 
@@ -29,6 +31,15 @@ def _numbers(value: Any) -> list[Any]:
     """All numbers in `value`: a number, a tuple of numbers, or a tuple of such tuples."""
     groups = value if isinstance(value, tuple | list) else (value,)
     return [number for group in groups for number in (group if isinstance(group, tuple | list) else (group,))]
+
+
+def steps_for(length: float) -> int:
+    """Largest number of steps that `twin train` allows by default on a CPU, for a task of `length` [m].
+
+    They are whole cycles of the learning rate. On 77.5 m, tests were still improving after 24,000 steps, the number for
+    up to 50 m.
+    """
+    return TrainConfig.cycle * max(2, round(length / _PER_CYCLE))
 
 
 @dataclass(frozen=True)
@@ -47,7 +58,7 @@ class TrainConfig:
     success: Annotated[float, Range(0, 1)] = 0.95
     """Success rate at which the training ends (`selection.py`)."""
     steps: Annotated[int, Range(1, 10**10)] = 24_000
-    """Largest number of steps."""
+    """Largest number of steps; see `steps_for`."""
     worlds: Annotated[int, Range(1, 4096)] = 8
     """Number of environments."""
     action: str = STEERING
