@@ -18,7 +18,7 @@ from twin.geometry.cameras import Cameras, SparsePoints
 from twin.geometry.passes import find_passes
 from twin.geometry.route import BRANCH
 from twin.mjcf.scene_xml import Parts
-from twin.mjcf.world import SCENE_XML, World
+from twin.mjcf.world import SCENE_XML, World, arc_lengths
 from twin.report import figures
 from twin.report.build_sections import SECTIONS
 from twin.report.html import (
@@ -159,6 +159,7 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     if (mesh / "route.npz").exists():
         with np.load(mesh / "route.npz", allow_pickle=False) as data:
             route = data["xy"].astype(np.float64)
+            route = route[arc_lengths(route) >= (as_number(pick(report, "mjcf.route_skipped_m")) or 0.0) - 1e-6]
             branches = {name.removeprefix(BRANCH): data[name][:, :2] for name in data if name.startswith(BRANCH)}
     wide = as_number(pick(report, "mjcf.half_width_m")) or 0.0
     passes = find_passes(cameras) if route is not None else []
