@@ -129,7 +129,7 @@ def test_the_real_test_runs_without_the_twin():
 def test_tasks_are_the_twins():
     """`straight` is 30 m and `right_turn` 60 m of the filmed path, which is always near the road's center."""
     line = true_route()
-    world = World(line, MjcfConfig().half_width, (0.0, 0.0, 0.0, 0.0), Path())
+    world = World(line, MjcfConfig().half_width, (0.0, 0.0, 0.0, 0.0), Path(), start=2.0)
     options = parse_options({"pixels": False, "action": "steering"})
     for name in CAMPUS_TASKS:
         theirs = parse_task(task_table(world, find_task(name, world), options))
@@ -292,7 +292,7 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
     ):
         real_test.run([left], "straight", ["rain"], 4, out, setup=Setup(robot=1))
     out.with_name("results_setup.json").unlink()
-    with pytest.raises(InputError, match="has trials of version 1 of the real test; this is version 2; give another"):
+    with pytest.raises(InputError, match="has trials of version 1 of the real test; this is version 3; give another"):
         real_test.run([left], "straight", ["rain"], 4, out)
 
 

@@ -86,7 +86,7 @@ def test_a_training_that_gets_no_better_ends():
     assert next_segment(PLAN, more).why == ""  # no further, but more episodes arrive
 
 
-def test_a_training_that_went_on_is_not_held_to_its_earlier_tests():
+def test_a_training_that_goes_on_has_patience_again():
     ended = [*_tests(5.0, 9.0, 9.0, 9.0, 9.1, 9.1), PolicyTest(14_000, 8, 0, 9.1, 0.0, (), True)]
     flat = [PolicyTest(14_000 + 2000 * k, 8, 0, 9.1, 0.0) for k in (1, 2, 3, 4)]
     assert next_segment(PLAN, ended).why == "" and next_segment(PLAN, [*ended, *flat[:3]]).why == ""
@@ -154,11 +154,10 @@ def test_finalists_drive_only_what_they_have_not_driven(scene, tmp_path, scripte
     script |= {32: (1, 0.0), 64: (5, 0.0), 96: (14, 0.0), 128: (12, 0.0), 160: (3, 0.0)}
     choice = learn(scene, tmp_path, replace(CONFIG, test_every=32))
     order = selection._seeds(CONFIG)
-    tested = len([one for one in asked if len(one[1]) in (8, 12)])
     rounds = [(at, seeds) for at, seeds, _ in asked if set(seeds) <= set(order[:40])]
     by_step = {step: [seed for at, seeds in rounds if at == step for seed in seeds] for step in script}
     assert {step: len(seeds) for step, seeds in by_step.items()} == {32: 8, 64: 20, 96: 40, 128: 40, 160: 20}
-    assert all(seeds == list(order[: len(seeds)]) for seeds in by_step.values()) and tested > 5
+    assert all(seeds == list(order[: len(seeds)]) for seeds in by_step.values())
     assert choice["chosen"]["step"] == 96 and asked[-1][:2] == (96, order[40:])
     found = {one["step"]: (one["trials"], one["successes"], len(one["failures"])) for one in choice["candidates"]}
     assert found == {32: (8, 1, 7), 64: (20, 5, 15), 96: (40, 14, 26), 128: (40, 12, 28), 160: (20, 3, 17)}
@@ -195,6 +194,22 @@ def test_a_choice_stays_until_more_is_asked(scene, tmp_path, scripted):
     (tmp_path / CHOICE_FILE).write_text('{"steps": 240, "chosen": {}}')
     with pytest.raises(InputError, match=r"choice\.json is damaged .*; delete it"):
         learn(scene, tmp_path, replace(CONFIG, steps=240))
+
+
+@pytest.mark.slow
+def test_a_run_that_got_no_better_goes_on_with_all_of_its_tests(scene, tmp_path, scripted, monkeypatch):
+    script, asked = scripted
+    monkeypatch.setattr(selection, "PATIENCE", 1)
+    first = learn(scene, tmp_path, CONFIG)  # no episode arrives in any test
+    assert (first["steps"], first["why"], len(first["candidates"])) == (120, "no better", 3)
+    script |= {200: (40, 1.0), 240: (40, 1.0)}
+    (tmp_path / TESTS_FILE).unlink()
+    more = learn(scene, tmp_path, replace(CONFIG, steps=240))
+    tests = [(one["step"], one["resumed"]) for one in more["candidates"]]
+    assert more["reached"] and tests == [(40, False), (80, False), (120, True), (160, False), (200, False)]
+    del asked[:]
+    stricter = learn(scene, tmp_path, replace(CONFIG, steps=200, success=1.0))
+    assert not {at for at, _, _ in asked} - {more["steps"]} and stricter["candidates"][-1]["step"] == more["steps"]
 
 
 @pytest.mark.slow

@@ -10,10 +10,14 @@ import numpy as np
 import pytest
 from tiny_world import box, export, tiny_config, tiny_ground, tiny_route, tiny_scene, tiny_world
 
-from twin.config import RouteConfig, SceneConfig
+from twin.config import BranchConfig, RouteConfig, SceneConfig, TaskConfig
+from twin.env.drivers import follow_route
+from twin.env.physics import HuskyPhysics
+from twin.env.route_segments import RouteSegment, scene_tasks
 from twin.errors import InputError
 from twin.geometry.cameras import Cameras, depth_determined, project
 from twin.geometry.images import read_image
+from twin.geometry.route import BRANCH
 from twin.mjcf.scene_xml import (
     add_ground,
     camera_pose,
@@ -219,21 +223,20 @@ def filmed_from(tmp_path: Path, first: float, config: SceneConfig | None = None)
     )
     cameras.save(scene.stage("metric"))
     out, metrics = export(scene, config)
-    return World.load(out), metrics["route_skipped_m"], cameras
+    return World.load(out), metrics["route_start_m"], cameras
 
 
 def test_route_starts_where_the_robot_sees_ground_that_a_film_shows_twice(tmp_path):
-    world, skipped, cameras = filmed_from(tmp_path, 0.0)
+    world, start, cameras = filmed_from(tmp_path, 0.0)
     # The robot's lowest ray meets level ground 1.2 m ahead of its base, so at x = 1.2 m it sees what is filmed. A hill,
     # the margin of the picture, and the second frame 0.3 m after the first add to it.
-    assert 1.2 <= skipped <= 2.3
-    np.testing.assert_allclose(world.route[:, :2], tiny_route()[round(skipped / 0.25) :])
-    np.testing.assert_allclose(world.spawn[:2], [skipped, 0.0], atol=0.03)
-    x, y = np.meshgrid(np.arange(skipped + 0.05, 6.0, 0.05), np.linspace(-1.0, 1.0, 21))
+    assert 1.2 <= start <= 2.3 and world.start == start
+    assert world.length == pytest.approx(arc_lengths(tiny_route())[-1] - start)
+    np.testing.assert_allclose(world.route[:, :2], tiny_route())  # stations count from the first frame
+    np.testing.assert_allclose(world.spawn[:2], [start, 0.0], atol=0.03)
+    x, y = np.meshgrid(np.arange(start + 0.05, 6.0, 0.05), np.linspace(-1.0, 1.0, 21))
     points = np.stack([x, y, tiny_ground().at(np.stack([x, y], -1))], -1).reshape(-1, 3)
-    slope = (
-        tiny_ground().at(np.array([skipped + 0.25, 0.0])) - tiny_ground().at(np.array([skipped - 0.25, 0.0]))
-    ) / 0.5
+    slope = (tiny_ground().at(np.array([start + 0.25, 0.0])) - tiny_ground().at(np.array([start - 0.25, 0.0]))) / 0.5
     ahead = np.array([1.0, 0.0, slope]) / np.hypot(1.0, slope)
     base = np.stack([ahead, [0.0, 1.0, 0.0], np.cross(ahead, [0.0, 1.0, 0.0])], 1)
     pixels, depth = project(points, camera_pose(world.robot, np.array(world.spawn[:3]), base), world.intrinsics)
@@ -242,11 +245,52 @@ def test_route_starts_where_the_robot_sees_ground_that_a_film_shows_twice(tmp_pa
     assert not depth_determined(cameras, points[x.ravel() < 2.2]).any()
 
 
-def test_nothing_is_left_out_if_the_film_begins_earlier_or_the_user_gave_points(tmp_path):
+def test_a_route_starts_at_the_first_frame_if_the_film_begins_earlier_or_the_user_gave_points(tmp_path):
     assert filmed_from(tmp_path / "earlier", -3.0)[1] == 0.0
     given = replace(tiny_config(), route=RouteConfig(points=((0.0, 0.0), (5.0, 0.0))))
-    world, skipped, _ = filmed_from(tmp_path / "given", 0.0, given)
-    assert skipped == 0.0 and len(world.route) == len(tiny_route())
+    world, start, _ = filmed_from(tmp_path / "given", 0.0, given)
+    assert start == world.start == 0.0 and world.spawn[0] == pytest.approx(0.0, abs=0.03)
+
+
+def test_a_route_that_shows_unfilmed_ground_for_too_long_starts_at_the_first_frame(tmp_path):
+    world, start, _ = filmed_from(tmp_path, 3.0)  # the route is 10.5 m long: it may start 2.6 m further along
+    assert start == world.start == 0.0
+
+
+def test_no_task_begins_before_the_start(tmp_path):
+    world, start, _ = filmed_from(tmp_path, 0.0)
+    end = world.start + world.length
+    assert scene_tasks(world)["route"] == RouteSegment("route", start, world.length)
+    asked = tuple(TaskConfig(*one) for one in (("early", 0.0, 5.0), ("late", 3.0, 5.0), ("all", 0.0, end)))
+    found = scene_tasks(world, asked)
+    assert (found["early"].start, found["early"].end) == (start, pytest.approx(5.0))
+    assert found["late"] == RouteSegment("late", 3.0, 5.0)
+    assert found["all"].end == pytest.approx(end)
+    with pytest.raises(InputError, match=rf"from 0 m to 1 m, but its route is .* long and starts at {start:.2f} m"):
+        scene_tasks(world, (TaskConfig("before", 0.0, 1.0),))
+    drive = follow_route(world, HuskyPhysics(world.model(), world.robot))
+    assert drive.outcome == "goal" and drive.progress[0] == pytest.approx(start, abs=0.05)
+
+
+def test_a_branch_has_its_own_start(tmp_path):
+    """A branch along the route, which is filmed from its beginning on, but named by passes."""
+    scene = tiny_scene(tmp_path / "place")
+    route = np.column_stack([tiny_route(), tiny_ground().at(tiny_route())])
+    np.savez(
+        scene.stage("mesh") / "route.npz",
+        xy=route[:, :2],
+        z=route[:, 2],
+        **{f"{BRANCH}side": route, f"{BRANCH}given": route[4:]},
+    )
+    filmed_from(tmp_path / "film", 0.0)[2].save(scene.stage("metric"))
+    sides = BranchConfig(passes=("day:1",), name="side"), BranchConfig(points=((1.0, 0.0), (5.0, 0.0)), name="given")
+    world = World.load(export(scene, replace(tiny_config(), branch=sides))[0])
+    assert world.along("side").start == world.start > 1.0 and world.along("given").start == 0.0
+    assert {name: (one.start, one.route) for name, one in scene_tasks(world).items() if one.route} == {
+        "side": (world.start, "side"), "given": (0.0, "given")
+    }  # fmt: skip
+    drive = follow_route(world, HuskyPhysics(world.model(), world.robot), branch="side")
+    np.testing.assert_allclose(drive.base_to_world[0, :2, 3], [world.start, 0.0], atol=0.05)
 
 
 def test_geoms_touched_at_the_start_are_reported(tmp_path):

@@ -141,14 +141,14 @@ def follow_route(
     length = float(arc_lengths(world.route)[-1])
     timeout = 3.0 * length / speed + 10.0 if timeout is None else timeout
     if branch:
-        x, y, _ = world.route[0].tolist()
-        physics.set_pose(x, y, float(heading_at(world.route, 0.0)))
+        x, y, _ = point_at(world.route, world.start).tolist()
+        physics.set_pose(x, y, float(heading_at(world.route, world.start)))
     else:
         physics.reset()
 
     rows: list[dict[str, Any]] = []
     touched: set[str] = set()
-    driver = PurePursuit(world.route, speed, physics.params.max_yaw_rate)
+    driver = PurePursuit(world.route, speed, physics.params.max_yaw_rate, world.start)
     outcome = ""
     while not outcome:
         pose = physics.planar_pose

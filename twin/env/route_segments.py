@@ -2,7 +2,8 @@
 
 The *standard tasks* of DriveEnv-NeRF are `straight` (30 m) and `right_turn` (60 m): segments of the route with a given
 length and total turn. `[[task]]` entries of `scene.toml` define further tasks, and `route` is the whole route.
-A [[branch]] of `scene.toml`, another route through the place, is a task of its own.
+A [[branch]] of `scene.toml`, another route through the place, is a task of its own. No task begins before
+`World.start`; one that begins earlier in `scene.toml` is cut.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 
 from twin.config import TaskConfig
 from twin.errors import InputError
-from twin.mjcf.world import World, arc_lengths, heading_at
+from twin.mjcf.world import World, heading_at
 from twin.types import Array
 
 
@@ -61,9 +62,8 @@ def find_task(name: str, world: World, configured: tuple[TaskConfig, ...] = ()) 
     there = ", ".join(f"{s.name} ({s.length:.1f} m long, starts at {s.start:.1f} m)" for s in found.values())
     why = "unknown"
     if name in _STANDARD_SPECS:
-        longest = _longest_fit(world.route, _STANDARD_SPECS[name])
-        total, length = arc_lengths(world.route)[-1], _STANDARD_SPECS[name].length
-        why = f"the route ({total:.1f} m) has no such segment of {length:g} m"
+        longest = _longest_fit(world, _STANDARD_SPECS[name])
+        why = f"the route ({world.length:.1f} m) has no such segment of {_STANDARD_SPECS[name].length:g} m"
         if longest:
             why += f"; the longest is {longest[1]:.1f} m long and starts at {longest[0]:.1f} m"
     raise InputError(
@@ -78,38 +78,36 @@ def scene_tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[s
     Raises:
         InputError: a configured task extends beyond the route.
     """
-    total = float(arc_lengths(world.route)[-1])
-    found = {"route": RouteSegment("route", 0.0, total)}
+    found = {"route": RouteSegment("route", world.start, world.length)}
     for name, standard in _STANDARD_SPECS.items():
-        length = min(standard.length, total)
+        length = min(standard.length, world.length)
         long_enough = length >= (1.0 - _LENGTH_TOLERANCE) * standard.length
-        if long_enough and (starts := _fitting_starts(world.route, standard, length)).size:
+        if long_enough and (starts := _fitting_starts(world, standard, length)).size:
             found[name] = RouteSegment(name, float(starts[0]), length)
-    found |= {name: RouteSegment(name, 0.0, _length(world, name), name) for name in world.branches}
+    for name in world.branches:
+        found[name] = RouteSegment(name, world.along(name).start, world.along(name).length, name)
     for task in configured:
         if task.route and task.route not in world.branches:
             raise InputError(f"task {task.name!r}: the build has no branch {task.route!r}; build the scene again")
-        length = _length(world, task.route)
-        if task.start + task.length > length + 1e-6:
+        along, end = world.along(task.route), task.start + task.length
+        total = along.start + along.length
+        if not along.start < end <= total + 1e-6:
             raise InputError(
-                f"task {task.name!r}: from {task.start:g} m to {task.start + task.length:g} m, but its route is "
-                f"{length:.2f} m long; shorten the task in scene.toml"
+                f"task {task.name!r}: from {task.start:g} m to {end:g} m, but its route is {total:.2f} m long and "
+                f"starts at {along.start:.2f} m; change the task in scene.toml"
             )
-        found[task.name] = RouteSegment(task.name, task.start, task.length, task.route)
+        cut = max(along.start - task.start, 0.0)
+        found[task.name] = RouteSegment(task.name, task.start + cut, task.length - cut, task.route)
     return found
 
 
-def _length(world: World, branch: str) -> float:
-    return float(arc_lengths(world.along(branch).route)[-1])
-
-
-def _fitting_starts(route: Array, standard: _StandardTask, length: float) -> Array:
+def _fitting_starts(world: World, standard: _StandardTask, length: float) -> Array:
     """Start arc lengths [m] of segments of a given length that fit a standard task; the most central turn first."""
-    total = float(arc_lengths(route)[-1])
+    route, total = world.route, world.start + world.length
     s = np.append(np.arange(0.0, total, _STEP), total)
     heading = np.unwrap(heading_at(route, s))
     starts, off_center = [], []
-    for start in np.arange(0.0, total - length + 1e-9, _STEP):
+    for start in np.arange(world.start, total - length + 1e-9, _STEP):
         inside = heading[(s >= start - 1e-9) & (s <= start + length + 1e-9)]
         turn, low, high = inside[-1] - inside[0], min(inside[0], inside[-1]), max(inside[0], inside[-1])
         excursion = max(low - inside.min(), inside.max() - high)
@@ -121,9 +119,9 @@ def _fitting_starts(route: Array, standard: _StandardTask, length: float) -> Arr
     return np.array(starts)[np.argsort(np.array(off_center), kind="stable")] if starts else np.zeros(0)
 
 
-def _longest_fit(route: Array, standard: _StandardTask) -> tuple[float, float] | None:
+def _longest_fit(world: World, standard: _StandardTask) -> tuple[float, float] | None:
     """Start and length [m] of the longest fitting segment, to within 1 m; None if none exceeds 2 m."""
-    for length in np.arange(min(standard.length, float(arc_lengths(route)[-1])), 2.0, -1.0):
-        if (starts := _fitting_starts(route, standard, float(length))).size:
+    for length in np.arange(min(standard.length, world.length), 2.0, -1.0):
+        if (starts := _fitting_starts(world, standard, float(length))).size:
             return float(starts[0]), float(length)
     return None

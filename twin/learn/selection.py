@@ -9,7 +9,7 @@ required success rate `config.success` allows. The training ends
 - at the largest number of steps.
 
 In the first two cases, `config.settle` more steps with a falling learning rate (`training.py`) and one more test
-follow. If a later call allows more steps, the training goes on, and earlier tests no longer count against it.
+follow. If a later call allows more steps, the training goes on, and the count of tests without improvement begins anew.
 
 The kept policy is the one with most successes among those that drove a whole test; the mean reward breaks ties. If no
 policy reached the required rate, the best ones drive the rest of their tests first, in rounds (`_ROUNDS`; successive
@@ -170,21 +170,22 @@ def train_until_learnt(
     if before := earlier_choice(twin, folder, config):
         return before
     tests = read_tests(folder)
-    if (ended := read_choice(folder)) and not (tests and tests[-1].step == ended["steps"]):
-        last = [_parse_test(one) for one in ended["candidates"] if one["step"] == ended["steps"]]
-        tests += [replace(one, resumed=True) for one in last]
+    if ended := read_choice(folder):  # its tests include those of the end
+        tests = [_parse_test(one) for one in ended["candidates"]]
+        tests[-1] = replace(tests[-1], resumed=True)
         write_json(folder / TESTS_FILE, [asdict(one) for one in tests])
     planned: list[Segment] = []
 
     def referee(step: int, drive: Drive) -> Segment | None:
         if planned and step >= planned[-1].until:
-            with runtime.bar(f"test at {step:,}", _TEST_EPISODES, "episode") as bar:
-                tests.append(
-                    _test(config, step, lambda seeds: drive(checkpoint_folder(folder, step), seeds, bar.update))
-                )
-            scores = {"success": tests[-1].rate, "progress": tests[-1].progress, "reward": tests[-1].reward}
-            for writer in writers:
-                writer.write({f"tests/{name}": value for name, value in scores.items()}, {}, step)
+            if not (tests and tests[-1].step == step):  # else no step was left to train
+                with runtime.bar(f"test at {step:,}", _TEST_EPISODES, "episode") as bar:
+                    tests.append(
+                        _test(config, step, lambda seeds: drive(checkpoint_folder(folder, step), seeds, bar.update))
+                    )
+                scores = {"success": tests[-1].rate, "progress": tests[-1].progress, "reward": tests[-1].reward}
+                for writer in writers:
+                    writer.write({f"tests/{name}": value for name, value in scores.items()}, {}, step)
             if planned[-1].why:
                 return None
             write_json(folder / TESTS_FILE, [asdict(one) for one in tests])

@@ -49,8 +49,8 @@ _GROUND_OVERLAP = 0.15  # [m] up to this height above the height field, the visu
 _SETTLE_TIME = 2.0  # [s] simulated time in which the robot comes to rest before its state is stored
 _MIN_ROUTE = 2.0  # [m] least length of a route
 _SITE_SPACING = 1.0  # [m] between sites along the route
-_MAX_SKIPPED = 6.0  # [m], and a quarter of the route: the most that is left out at its beginning
-_VIEW_MARGIN = 8  # [px] by which the robot's picture is enlarged when its first view is checked, since starts differ
+_LATEST_START = 6.0  # [m] largest station at which the robot starts; also at most a quarter of the route
+_VIEW_MARGIN = 8  # [px] by which the robot's picture is enlarged when its first view is checked
 
 
 @dataclass(frozen=True)
@@ -105,19 +105,22 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         cameras = Cameras.load(scene.stage("metric"))
         camera = config.robot.camera(film_camera(cameras))
         view = ground, cameras, config.robot, camera
-        skipped = 0.0
-        if not config.route.points:  # a start that the user gave stays
-            first = first_filmed(route, config.mjcf.half_width, *view)
-            skipped, route = float(arc_lengths(route)[first]), route[first:]
-        for name in [one.name for one in config.branch if not one.points]:
-            branches[name] = branches[name][first_filmed(branches[name], config.mjcf.half_width, *view) :]
-        spawn, initial_contacts = _add_robot(spec, ground, route, config.robot, camera)
-        _add_route(spec, route, config.mjcf.half_width)
-        world = World(route, config.mjcf.half_width, spawn, out, camera, config.robot, branches=branches)
+        half_width = config.mjcf.half_width
+        # Where the user gave way points, he gave the start.
+        first = 0 if config.route.points else first_filmed(route, half_width, *view)
+        starts = {
+            one.name: float(arc_lengths(line)[first_filmed(line, half_width, *view)])
+            for one in config.branch
+            if not one.points and (line := branches.get(one.name)) is not None
+        }
+        spawn, initial_contacts = _add_robot(spec, ground, route[first:], config.robot, camera)
+        _add_route(spec, route, half_width)
+        start = float(arc_lengths(route)[first])
+        world = World(route, half_width, spawn, out, camera, config.robot, branches, start, starts)
         world.save()
         metrics |= {
-            "route_length_m": float(arc_lengths(route)[-1]),
-            "route_skipped_m": skipped,
+            "route_length_m": world.length,
+            "route_start_m": world.start,
             "turn_deg": float(np.rad2deg(total_turn(route))),
             "half_width_m": config.mjcf.half_width,
             "camera_intrinsics_px": world.intrinsics.tolist(),
@@ -153,11 +156,11 @@ def first_filmed(
     """First vertex of the route (m, 3) from which the robot sees only corridor ground whose depth the films determine.
 
     A film's first frames show the ground from some meters ahead on; a robot at the same place, whose camera is lower,
-    would see ground that no frame shows. 0 if no vertex of the first `_MAX_SKIPPED` and the first quarter is such.
+    would see ground that no frame shows. 0 if there is no such vertex up to `_LATEST_START` and a quarter of the route.
     """
     knots = arc_lengths(route)
-    most = min(_MAX_SKIPPED, knots[-1] / 4)
-    stations, aside = np.arange(0.0, most + _MAX_SKIPPED, 0.1), np.linspace(-half_width, half_width, 11)
+    most = max(min(_LATEST_START, knots[-1] / 4, knots[-1] - _MIN_ROUTE), 0.0)
+    stations, aside = np.arange(0.0, most + _LATEST_START, 0.1), np.linspace(-half_width, half_width, 11)
     heading = heading_at(route, stations)
     left = np.stack([-np.sin(heading), np.cos(heading)], -1)
     xy = point_at(route[:, :2], stations)[:, None] + aside[:, None] * left[:, None]

@@ -45,10 +45,19 @@ class World:
     """Parameters of the robot in the scene, of its controller and of its camera."""
     branches: dict[str, Array] = field(default_factory=dict)
     """Points of other routes through the place, as `route`, by name."""
+    start: float = 0.0
+    """Arc length [m] at which the robot starts, and before which no task begins (`scene_xml.first_filmed`)."""
+    branch_starts: dict[str, float] = field(default_factory=dict)
+    """The same of the branches; 0 for others than these."""
 
     def along(self, branch: str) -> "World":
         """The world with a branch as its route; "" is the route itself. The robot's `spawn` stays where it is."""
-        return replace(self, route=self.branches[branch]) if branch else self
+        return replace(self, route=self.branches[branch], start=self.branch_starts.get(branch, 0.0)) if branch else self
+
+    @property
+    def length(self) -> float:
+        """Length of the route from `start` on [m]."""
+        return float(arc_lengths(self.route)[-1]) - self.start
 
     @property
     def intrinsics(self) -> Array:
@@ -100,6 +109,7 @@ class World:
             self.folder / "world.json",
             {
                 "route": self.route.tolist(),
+                "start": self.start,
                 "half_width": self.half_width,
                 "goal": self.goal.tolist(),
                 "spawn": list(self.spawn),
@@ -113,6 +123,7 @@ class World:
                 "names": _NAMES,
                 "model": SCENE_XML,
                 **({"branches": {k: v.tolist() for k, v in self.branches.items()}} if self.branches else {}),
+                **({"branch_starts": self.branch_starts} if self.branch_starts else {}),
             },
         )
 
@@ -134,6 +145,8 @@ class World:
                 branches={
                     require_text(name): np.array(line, np.float64) for name, line in head.get("branches", {}).items()
                 },
+                start=float(head.get("start", 0.0)),  # earlier builds have no starts
+                branch_starts={require_text(name): float(at) for name, at in head.get("branch_starts", {}).items()},
             )
             m = min(len(line) for line in (world.route, *world.branches.values()))
             lines = {"route": world.route} | {f"branch {name}": line for name, line in world.branches.items()}
@@ -143,6 +156,9 @@ class World:
                     f"{m} route points, half width {world.half_width} m, a camera of {width} × {height} px with focal "
                     f"lengths {fx:g}, {fy:g} px; expected at least 2 points, and positive sizes"
                 )
+            for one in (world, *map(world.along, world.branches)):
+                if not (one.start >= 0.0 and one.length > 0.0):
+                    raise ValueError(f"a route starts at {one.start:g} m; expected 0 m to less than its length")
         return world
 
 

@@ -5,5 +5,6 @@ Only `truth.measure`, `twin reality drive` with a task file, benchmarks and test
 """
 
 SEED = 20  # seed of all that is random in this world: places, textures, skies, films, robots, cameras; not of trials
-REALITY_VERSION = 2
-"""Version of the robot, camera and judge of the real test. In version 1 these three were parts of the twin."""
+REALITY_VERSION = 3
+"""Version of the real test: robot, camera, judge, and tasks of place 0. In version 1 the first three were parts of the
+twin; in version 2 the tasks began at the first frame."""

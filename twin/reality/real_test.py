@@ -9,8 +9,8 @@ outside the ranges of training (`outside_training`).
 The k-th trial in a weather has the same seed for every policy, hence the same start, shake and noise, so that policies
 can be compared in pairs.
 
-Tables of version 1 can be read and reported on, but not continued (`REALITY_VERSION`). Two constants of the twin were
-measured on images of this world (`twin.env.domain_randomization.KNOWN_WEATHER_FRACTION`,
+Tables of earlier versions can be read and reported on, but not continued (`REALITY_VERSION`). Two constants of the
+twin were measured on images of this world (`twin.env.domain_randomization.KNOWN_WEATHER_FRACTION`,
 `twin.env.irradiance.GROUND_ALBEDO`).
 """
 

@@ -31,7 +31,7 @@ from twin.reality.place_spec import tasks
 from twin.reality.sampled_place import build_number
 from twin.types import Array
 
-CAMPUS_TASKS = {"straight": (0.0, 30.0), "right_turn": (0.25, 60.0), "route": (0.0, 60.349)}
+CAMPUS_TASKS = {"straight": (2.0, 30.0), "right_turn": (2.0, 58.349), "route": (2.0, 58.349)}
 """Start and length [m] of the tasks of place 0, by name; a test compares them with those that the twin finds."""
 
 _WRITE = "write one: twin export SCENE --task NAME --task-file FILE"

@@ -156,10 +156,13 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     cameras = Cameras.load(folder)
     points = SparsePoints.load(folder) if (folder / "points.npz").exists() else SparsePoints.empty()
     route, branches = None, {}
-    if (mesh / "route.npz").exists():
+    if scene.has_route:
+        world = World.load(scene.stage("mjcf"))
+        route = world.route[arc_lengths(world.route) >= world.start, :2]
+        branches = {name: line[:, :2] for name, line in world.branches.items()}
+    elif (mesh / "route.npz").exists():
         with np.load(mesh / "route.npz", allow_pickle=False) as data:
             route = data["xy"].astype(np.float64)
-            route = route[arc_lengths(route) >= (as_number(pick(report, "mjcf.route_skipped_m")) or 0.0) - 1e-6]
             branches = {name.removeprefix(BRANCH): data[name][:, :2] for name in data if name.startswith(BRANCH)}
     wide = as_number(pick(report, "mjcf.half_width_m")) or 0.0
     passes = find_passes(cameras) if route is not None else []

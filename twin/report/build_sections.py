@@ -376,11 +376,14 @@ def mjcf_section(report: dict[str, Any]) -> Section:
     if routeless:
         done = "Ground, parts and lights as a folder that MuJoCo loads, without a robot because there is no route: "
     else:
-        unfilmed = "there, a camera at the robot’s height would see ground that no film shows twice"
+        before = "after the first frame; before it, the robot’s camera would see ground that no film shows twice"
+        start = (
+            before if as_number(pick(report, "mjcf.route_start_m")) else "at the first frame, or where [route] begins"
+        )
         route = facts_of(
             report,
             ("mjcf.route_length_m", "route", "{:.1f} m", _route_choice(report)),
-            ("mjcf.route_skipped_m", "left out before its start", "{:.1f} m", unfilmed),
+            ("mjcf.route_start_m", "start", "{:.1f} m", start),
             ("mjcf.turn_deg", "turn", "{:+.0f}°", "from the first heading to the last; right is negative"),
             ("mjcf.half_width_m", "corridor", "± {:.2f} m", "kept free of convex parts"),
         )

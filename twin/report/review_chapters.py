@@ -419,7 +419,7 @@ def write_drive_chapter(
         studio,
         "3  The Husky drives",
         [
-            f"A scripted driver without camera follows the {arc_lengths(world.route)[-1]:.1f} m route in MuJoCo, to "
+            f"A scripted driver without camera follows the {world.length:.1f} m route in MuJoCo, to "
             "test whether the route is drivable.",
             "Left: the radiance field, from the robot’s camera. Right: the MuJoCo scene from behind the robot, "
             "with its convex parts outlined. " + (f"{shown_speed:.3g}× speed." if shown_speed > 1.01 else ""),

@@ -118,9 +118,7 @@ def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: R
             metrics["trust"] = trust_metrics(*along)
             caption = "trust in views of the robot's camera: high near filmed poses where the road has no holes"
             studio.save_picture("trust", "review", caption, trust_picture(*along))
-        verdict = follower_verdict(
-            {"review": metrics, "mjcf": {"route_length_m": float(arc_lengths(world.route)[-1]) if world else None}}
-        )
+        verdict = follower_verdict({"review": metrics, "mjcf": {"route_length_m": world.length if world else None}})
         studio.writer.write(layout.card(verdict.text, [], _MOOD_COLORS[verdict.mood]), 3 * studio.fps)
     metrics |= {"frames": writer.frames, "duration_s": writer.frames / writer.fps, "renders": studio.renders}
     metrics |= {"trace": drive_trace(drive)} if drive else {}
