@@ -124,7 +124,7 @@ def robot_at(world: World, model: mujoco.MjModel, data: mujoco.MjData, station: 
     about_z = np.array([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)])
     mujoco.mju_mulQuat(data.qpos[3:7], about_z, rest)
     data.qpos[:2] = point_at(world.route[:, :2], station)
-    data.qpos[2] += float(point_at(world.route, station)[2] - world.route[0, 2])
+    data.qpos[2] += float(point_at(world.route, station)[2] - point_at(world.route, world.start)[2])
     mujoco.mj_forward(model, data)
     return camera_pose(data, model.camera("front").id)
 
@@ -164,7 +164,7 @@ def round_trip(scene_path: Path, pictures: Path | None = None, kinds: tuple[str,
                 if kind == "car":  # a car needs more room
                     lateral, ahead = lateral + 1.8, ahead + 3.0
                 placed = (ObstacleConfig(kind, kind, station, lateral, yaw),)
-                eye = robot_at(world, model, data, max(0.0, station - ahead))
+                eye = robot_at(world, model, data, max(world.start, station - ahead))
                 place((), data, 0.0)
                 mujoco.mj_forward(model, data)
                 empty = compositors["shaded"].render([data], lighting)

@@ -127,7 +127,7 @@ def test_the_real_test_runs_without_the_twin():
 
 
 def test_tasks_are_the_twins():
-    """`straight` is 30 m and `right_turn` 60 m of the filmed path, which is always near the road's center."""
+    """`straight` is 30 m and `right_turn` 58 m of the filmed path, which is always near the road's center."""
     line = true_route()
     world = World(line, MjcfConfig().half_width, (0.0, 0.0, 0.0, 0.0), Path(), start=2.0)
     options = parse_options({"pixels": False, "action": "steering"})

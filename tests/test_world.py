@@ -266,8 +266,10 @@ def test_no_task_begins_before_the_start(tmp_path):
     assert (found["early"].start, found["early"].end) == (start, pytest.approx(5.0))
     assert found["late"] == RouteSegment("late", 3.0, 5.0)
     assert found["all"].end == pytest.approx(end)
-    with pytest.raises(InputError, match=rf"from 0 m to 1 m, but its route is .* long and starts at {start:.2f} m"):
-        scene_tasks(world, (TaskConfig("before", 0.0, 1.0),))
+    with pytest.raises(
+        InputError, match=rf"from 0 m to 2 m, but its route is .* long, and robots start at {start:.2f} m"
+    ):
+        scene_tasks(world, (TaskConfig("before", 0.0, 2.0),))  # of which less than a meter is left
     drive = follow_route(world, HuskyPhysics(world.model(), world.robot))
     assert drive.outcome == "goal" and drive.progress[0] == pytest.approx(start, abs=0.05)
 

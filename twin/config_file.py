@@ -39,7 +39,7 @@ from twin.types import Range, setting_ranges
 
 ROBOT_TOML = "robot.toml"
 
-_MIN_TASK_LENGTH = 1.0  # [m]; the goal is reached `twin.env.task.BUMPER_OFFSET` before the end
+MIN_TASK_LENGTH = 1.0  # [m]; the goal is reached `twin.env.task.BUMPER_OFFSET` before the end
 _SECTIONS = ("capture", "cameras", "metric", "nerf", "mesh", "route", "mjcf", "review")
 
 
@@ -250,9 +250,9 @@ def check_lighting(name: str, what: str) -> None:
 def _check_tasks(tasks: tuple[TaskConfig, ...]) -> None:
     for task in tasks:
         _require(
-            task.name and task.start >= 0.0 and task.length >= _MIN_TASK_LENGTH,
+            task.name and task.start >= 0.0 and task.length >= MIN_TASK_LENGTH,
             f"a [[task]] has name = {task.name!r}, start = {task.start}, length = {task.length}; "
-            f"expected a name, start ≥ 0 and length ≥ {_MIN_TASK_LENGTH:g} [m]: a shorter task would be done at once",
+            f"expected a name, start ≥ 0 and length ≥ {MIN_TASK_LENGTH:g} [m]: a shorter task would be done at once",
         )
         _check_name(task.name, "[[task]] name")
     _check_unique([task.name for task in tasks], "[[task]]")

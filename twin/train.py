@@ -60,7 +60,7 @@ def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
     asked = f"required success rate of {choice['success']:.0%}"
     ends = {
         "reached": f"a test reached the {asked}",
-        "no better": f"tests got no better, and stayed below the {asked}",
+        "no better": f"tests got no better, and stayed below the {asked}; more --steps may help",
         "steps": f"tests stayed below the {asked}; give more --steps",
     }
     lines = [

@@ -204,8 +204,7 @@ class PlaceRun:
 
     def drive(self) -> None:
         task = self.scene / f"{self.protocol.task}.json"
-        if not task.exists():
-            self.run.must("twin.export", self.scene, "--task", self.protocol.task, "--task-file", task)
+        self.run.must("twin.export", self.scene, "--task", self.protocol.task, "--task-file", task)
         days = [day.removeprefix("day_") for day in self.days]
 
         def one(setup: str) -> None:

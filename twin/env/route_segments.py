@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.config import TaskConfig
+from twin.config_file import MIN_TASK_LENGTH
 from twin.errors import InputError
 from twin.mjcf.world import World, heading_at
 from twin.types import Array
@@ -90,13 +91,12 @@ def scene_tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[s
         if task.route and task.route not in world.branches:
             raise InputError(f"task {task.name!r}: the build has no branch {task.route!r}; build the scene again")
         along, end = world.along(task.route), task.start + task.length
-        total = along.start + along.length
-        if not along.start < end <= total + 1e-6:
+        total, cut = along.start + along.length, max(along.start - task.start, 0.0)
+        if end > total + 1e-6 or task.length - cut < MIN_TASK_LENGTH:
             raise InputError(
-                f"task {task.name!r}: from {task.start:g} m to {end:g} m, but its route is {total:.2f} m long and "
-                f"starts at {along.start:.2f} m; change the task in scene.toml"
+                f"task {task.name!r}: from {task.start:g} m to {end:g} m, but its route is {total:.2f} m long, and robots "
+                f"start at {along.start:.2f} m; change the task in scene.toml"
             )
-        cut = max(along.start - task.start, 0.0)
         found[task.name] = RouteSegment(task.name, task.start + cut, task.length - cut, task.route)
     return found
 

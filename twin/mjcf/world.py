@@ -1,8 +1,8 @@
 """A drivable scene on disk (`world.json` beside `scene.xml`), and the geometry of its route.
 
 *Route*: the filmed path on the ground, a polyline in driving order. *Arc length* s: distance along the route in the
-plane, 0 at its start. *Cross-track error*: distance from the route in the plane, positive to its left. *Heading*: angle
-from the x axis, positive towards y. *Corridor*: the area within `half_width` of the route.
+plane, 0 at its first point. *Cross-track error*: distance from the route in the plane, positive to its left.
+*Heading*: angle from the x axis, positive towards y. *Corridor*: the area within `half_width` of the route.
 """
 
 from collections.abc import Callable

@@ -158,8 +158,9 @@ def _map_charts(scene: SceneDir, report: dict[str, Any]) -> list[Chart]:
     route, branches = None, {}
     if scene.has_route:
         world = World.load(scene.stage("mjcf"))
-        route = world.route[arc_lengths(world.route) >= world.start, :2]
-        branches = {name: line[:, :2] for name, line in world.branches.items()}
+        lines = [world.along(branch) for branch in ("", *world.branches)]
+        route, *others = (line.route[arc_lengths(line.route) >= line.start, :2] for line in lines)
+        branches = dict(zip(world.branches, others, strict=True))
     elif (mesh / "route.npz").exists():
         with np.load(mesh / "route.npz", allow_pickle=False) as data:
             route = data["xy"].astype(np.float64)

@@ -432,7 +432,7 @@ def write_drive_chapter(
     camera_stills, chase_stills = [], []
     for i, from_behind in zip(instants, chase, strict=True):
         if i in rendered or rgb is None:
-            share = float(drive.progress[i] / max(arc_lengths(world.route)[-1], 1e-9))
+            share = float((drive.progress[i] - world.start) / world.length)
             lighting, label = lighting_at(studio.field.lightings, float(np.clip(share, 0.0, 1.0)))
             view = studio.render(drive.camera_to_world[i], world.intrinsics, CAMERA_SIZE, lighting)
             rgb = to_uint8(view.rgb[0])

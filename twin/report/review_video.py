@@ -115,7 +115,7 @@ def write_review_video(scene: SceneDir, config: SceneConfig, out: Path, field: R
         _write_chapters(studio, scene, config, world, drive)
         if world:
             along = trust_grid(field, cameras, world)
-            metrics["trust"] = trust_metrics(*along)
+            metrics["trust"] = trust_metrics(*along, world.start)
             caption = "trust in views of the robot's camera: high near filmed poses where the road has no holes"
             studio.save_picture("trust", "review", caption, trust_picture(*along))
         verdict = follower_verdict({"review": metrics, "mjcf": {"route_length_m": world.length if world else None}})
@@ -328,8 +328,10 @@ def trust_grid(field: RenderableField, cameras: Cameras, world: World) -> tuple[
     return s, offsets, np.concatenate(out).reshape(len(offsets), len(s))
 
 
-def trust_metrics(s: Array, offsets: Array, trust: Array) -> dict[str, Any]:
-    trust = trust[np.abs(offsets) <= np.abs(offsets[offsets != 0.0]).min() + 1e-9]
+def trust_metrics(s: Array, offsets: Array, trust: Array, start: float) -> dict[str, Any]:
+    """Figures of the result of `trust_grid` in the corridor, from the arc length `start` [m] on."""
+    inside = np.abs(offsets) <= np.abs(offsets[offsets != 0.0]).min() + 1e-9
+    s, trust = s[s >= start], trust[inside][:, s >= start]
     return {
         "mean": float(trust.mean()),
         "lowest": float(trust.min()),
