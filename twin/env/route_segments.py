@@ -94,8 +94,8 @@ def scene_tasks(world: World, configured: tuple[TaskConfig, ...] = ()) -> dict[s
         total, cut = along.start + along.length, max(along.start - task.start, 0.0)
         if end > total + 1e-6 or task.length - cut < MIN_TASK_LENGTH:
             raise InputError(
-                f"task {task.name!r}: from {task.start:g} m to {end:g} m, but its route is {total:.2f} m long, and robots "
-                f"start at {along.start:.2f} m; change the task in scene.toml"
+                f"task {task.name!r}: from {task.start:g} m to {end:g} m, but its route is {total:.2f} m long, and "
+                f"robots start at {along.start:.2f} m; change the task in scene.toml"
             )
         found[task.name] = RouteSegment(task.name, task.start + cut, task.length - cut, task.route)
     return found

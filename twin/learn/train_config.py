@@ -36,7 +36,7 @@ def _numbers(value: Any) -> list[Any]:
 def steps_for(length: float) -> int:
     """Largest number of steps that `twin train` allows by default on a CPU, for a task of `length` [m].
 
-    They are whole cycles of the learning rate. On 77.5 m, tests were still improving after 24,000 steps, the number for
+    They are whole cycles of the learning rate. On 73 m, tests were still improving after 24,000 steps, the number for
     up to 50 m.
     """
     return TrainConfig.cycle * max(2, round(length / _PER_CYCLE))
