@@ -59,13 +59,14 @@ def _help(capsys, *arguments):
 
 
 def test_help_of_train_states_its_defaults(capsys):
-    from twin.learn.train_config import PRESETS, TrainConfig
+    from twin.learn.train_config import PRESETS, TrainConfig, steps_for
 
     shown, plain = _help(capsys, "train"), TrainConfig()
     for name in ("task", "observe", "preset"):
         assert f"(default: {getattr(plain, name, 'cpu')})" in shown
-    for name in ("steps", "worlds"):
-        assert f"(default: {getattr(plain, name)}; gpu: {PRESETS['gpu'][name]})" in shown
+    assert f"(default: {plain.worlds}; gpu: {PRESETS['gpu']['worlds']})" in shown
+    assert f"(default: {plain.steps}, more from 50 m on; gpu: {PRESETS['gpu']['steps']})" in shown
+    assert steps_for(49.9) == plain.steps < steps_for(50.1)
     for name in ("updates", "steering", "entropy", "colours", "seed"):
         option = shown[shown.index(f"--{name} {name.upper()} ") :]
         assert option[option.index("(default: ") :].startswith(f"(default: {getattr(plain, name)})"), name

@@ -26,7 +26,7 @@ from twin.geometry.images import read_image
 from twin.learn.policy import Control, Policy, load_policy, save_policy
 from twin.learn.policy_network import Architecture
 from twin.mjcf.world import World, arc_lengths, point_at
-from twin.reality import campus_road, real_test, recordings, true_world
+from twin.reality import REALITY_VERSION, campus_road, real_test, recordings, true_world
 from twin.reality.campus_road import RoadLine
 from twin.reality.lighting import LIGHTINGS, WEATHER, weather, weather_index
 from twin.reality.real_camera import native_size
@@ -369,7 +369,9 @@ def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):
     with out.open(newline="") as file:
         assert list(csv.DictReader(file)) == rows
     record = json.loads((tmp_path / "results_setup.json").read_text())
-    assert (record["place"], record["robot"], record["camera"]) == (3, 2, 5) and record["version"] == 2
+    assert (record["place"], record["robot"], record["camera"]) == (3, 2, 5) and record[
+        "version"
+    ] == REALITY_VERSION == 3
     assert record["robot_values"]["payload"] == pytest.approx(23.97, abs=0.01)
     assert read_results([out], [Cell("left", "whole", "held-out+randomised", 10, 5)])
     assert commands.main("reality", [*given, "--place", "3", "--robot", "-1"]) == 2
