@@ -37,7 +37,7 @@ from twin.report.review_chapters import (
     lighting_at,
     spread_choice,
 )
-from twin.report.review_video import overview_pose, prefetched, write_review_video
+from twin.report.review_video import overview_pose, prefetched, trust_metrics, write_review_video
 from twin.report.video_layout import (
     FrameLayout,
     MapView,
@@ -368,6 +368,15 @@ def test_labels_of_a_scale_do_not_overlap() -> None:
     ramp = np.zeros((1, 60, 3), np.uint8)
     crowded = scale_bar(80, ramp, [(0.0, "near"), (0.4, "between"), (0.5, "both"), (1.0, "far")])
     assert np.array_equal(crowded, scale_bar(80, ramp, [(0.0, "near"), (1.0, "far")]))
+
+
+def test_trust_counts_from_the_start_and_in_the_corridor() -> None:
+    s, offsets = np.array([0.0, 1.5, 3.0]), np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    trust = np.tile([0.1, 0.9, 0.7], (5, 1))
+    trust[0] = 0.0  # beside the corridor
+    found = trust_metrics(s, offsets, trust, 1.0)
+    assert found == {"mean": pytest.approx(0.8), "lowest": 0.7, "lowest_at_m": 3.0, "low_share": 0.0}
+    assert trust_metrics(s, offsets, trust, 0.0)["lowest_at_m"] == 0.0
 
 
 @pytest.mark.parametrize("length", [3.0, 60.0, 300.0, 5000.0])

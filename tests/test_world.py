@@ -28,7 +28,9 @@ from twin.mjcf.scene_xml import (
     rest_pose,
 )
 from twin.mjcf.world import World, arc_lengths, corridor_edges, heading_at, nearest_on_route, point_at, total_turn
+from twin.report import build_report, figures
 from twin.robot import BASE_HEIGHT, CAMERA_SIZE, HuskyParams
+from twin.scene import SceneDir
 
 
 @pytest.fixture(scope="module")
@@ -272,6 +274,18 @@ def test_no_task_begins_before_the_start(tmp_path):
         scene_tasks(world, (TaskConfig("before", 0.0, 2.0),))  # of which less than a meter is left
     drive = follow_route(world, HuskyPhysics(world.model(), world.robot))
     assert drive.outcome == "goal" and drive.progress[0] == pytest.approx(start, abs=0.05)
+
+
+def test_maps_draw_the_route_from_its_start(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "place_map", lambda *given: drawn.append(given[5]))
+    monkeypatch.setattr(figures, "ground_map", lambda *given: drawn.append(given[2]))
+    monkeypatch.setattr(figures, "svg", str)
+    world, start, _ = filmed_from(tmp_path, 0.0)
+    build_report._map_charts(SceneDir(tmp_path), {})
+    assert len(drawn) == 2
+    for route in drawn:
+        assert route[0] == pytest.approx([start, 0.0]) and len(route) == (arc_lengths(world.route) >= start).sum()
 
 
 def test_a_branch_has_its_own_start(tmp_path):

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.assets.ground import Ground
-from twin.config import SceneConfig
+from twin.config import RouteConfig, SceneConfig
 from twin.errors import InputError
 from twin.files import load_arrays
 from twin.geometry.cameras import Cameras, depth_determined, opencv_to_mujoco, project
@@ -50,6 +50,7 @@ _SETTLE_TIME = 2.0  # [s] simulated time in which the robot comes to rest before
 _MIN_ROUTE = 2.0  # [m] least length of a route
 _SITE_SPACING = 1.0  # [m] between sites along the route
 _LATEST_START = 6.0  # [m] largest station at which the robot starts; also at most a quarter of the route
+_LOOK_AHEAD = 6.0  # [m] length of the corridor ahead of the latest start whose ground is checked
 _VIEW_MARGIN = 8  # [px] by which the robot's picture is enlarged when its first view is checked
 
 
@@ -104,15 +105,16 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
     else:
         cameras = Cameras.load(scene.stage("metric"))
         camera = config.robot.camera(film_camera(cameras))
-        view = ground, cameras, config.robot, camera
         half_width = config.mjcf.half_width
-        # Where the user gave way points, he gave the start.
-        first = 0 if config.route.points else first_filmed(route, half_width, *view)
-        starts = {
-            one.name: float(arc_lengths(line)[first_filmed(line, half_width, *view)])
-            for one in config.branch
-            if not one.points and (line := branches.get(one.name)) is not None
-        }
+
+        def first_vertex(line: Array, chosen: RouteConfig) -> int:
+            if chosen.points:  # who gives way points gives the start
+                return 0
+            return first_filmed(line, half_width, ground, cameras, config.robot, camera)
+
+        first = first_vertex(route, config.route)
+        lines = {one.name: (branches[one.name], one) for one in config.branch if one.name in branches}
+        starts = {name: float(arc_lengths(line)[first_vertex(line, one)]) for name, (line, one) in lines.items()}
         spawn, initial_contacts = _add_robot(spec, ground, route[first:], config.robot, camera)
         _add_route(spec, route, half_width)
         start = float(arc_lengths(route)[first])
@@ -160,7 +162,7 @@ def first_filmed(
     """
     knots = arc_lengths(route)
     most = max(min(_LATEST_START, knots[-1] / 4, knots[-1] - _MIN_ROUTE), 0.0)
-    stations, aside = np.arange(0.0, most + _LATEST_START, 0.1), np.linspace(-half_width, half_width, 11)
+    stations, aside = np.arange(0.0, most + _LOOK_AHEAD, 0.1), np.linspace(-half_width, half_width, 11)
     heading = heading_at(route, stations)
     left = np.stack([-np.sin(heading), np.cos(heading)], -1)
     xy = point_at(route[:, :2], stations)[:, None] + aside[:, None] * left[:, None]

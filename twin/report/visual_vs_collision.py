@@ -11,7 +11,7 @@ but is not visible. Differences are measured in three ways:
 
 Frames are matched within a film, so the field's depth is determined only where one film shows a place from two
 directions. At other places the depth may differ from build to build. Collision-only geometry there is reported
-separately, as `unfilmed_ghost_m`. Where the route's beginning shows such ground, the stage `mjcf` leaves it out.
+separately, as `unfilmed_ghost_m`. The robot starts where it does not see such ground (`scene_xml.first_filmed`).
 """
 
 from collections.abc import Callable
