@@ -1,5 +1,6 @@
 """Branches: other routes through the same place, by name."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,12 @@ def test_scripted_driver_follows_the_branch(root):
     drive = follow_route(world, HuskyPhysics(world.model(), world.robot), branch="side")
     assert np.linalg.norm(drive.base_to_world[0, :2, 3] - side()[0, :2]) < 0.05
     assert drive.reached_goal and np.linalg.norm(drive.base_to_world[-1, :2, 3] - side()[-1, :2]) < 1.1
+
+
+def test_scripted_driver_begins_at_the_start_of_the_branch(root):
+    world = replace(World.load(SceneDir(root).stage("mjcf")), branch_starts={"side": 6.0})
+    drive = follow_route(world, HuskyPhysics(world.model(), world.robot), branch="side")
+    assert drive.progress[0] == pytest.approx(6.0, abs=0.05) and drive.reached_goal
 
 
 def test_report_tells_the_drives_along_branches(root):

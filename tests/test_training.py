@@ -140,7 +140,7 @@ def test_the_default_number_of_steps_follows_from_the_length_of_the_task(scene, 
     monkeypatch.setattr(train_config, "steps_for", lambda asked: round(1000 * asked))
     for options, steps in (([], round(1000 * length)), (["--steps", "7"], 7), (["--preset", "gpu"], 60_000)):
         assert commands.main("train", [str(scene), "--run", "steps", "--task", "ahead", *options]) == 2
-        assert f"{steps} steps" in capsys.readouterr().err
+        assert f" {steps} steps" in capsys.readouterr().err
 
 
 def test_the_verb_trains_and_refuses_what_it_cannot_begin_or_resume(scene, capsys, monkeypatch):
