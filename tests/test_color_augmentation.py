@@ -32,6 +32,23 @@ def test_augmentation_is_shared_within_a_stack():
     assert len({stack.tobytes() for stack in after}) == len(after)
 
 
+def test_edges_become_sharper_or_softer_and_uniform_areas_stay_uniform():
+    edge = np.full((3, 18, 32), 100, np.uint8)
+    edge[..., 16:] = 140
+    changes = draw_color_changes(400, (18, 32), 1.0, np.random.default_rng(5))
+    plain = changes._replace(
+        curves=np.broadcast_to(np.arange(256, dtype=np.uint8), changes.curves.shape).copy(),
+        knots=np.ones_like(changes.knots),
+        covers=np.zeros_like(changes.covers),
+    )
+    after = plain.applied(np.repeat(np.tile(edge, (4, 1, 1))[None], 400, 0)).astype(int)
+    assert (after[..., :14] == 100).all() and (after[..., 18:] == 140).all()
+    step = (after[..., 16] - after[..., 15])[:, 0, 0]
+    # The step is 40 before, a third of it with the strongest blur, and 7/3 of it with the strongest sharpening.
+    assert step.min() in range(13, 17) and step.max() in range(91, 95)
+    assert 0.27 < (step < 40).mean() < 0.4
+
+
 def test_augmentation_is_unbiased_and_repeats_with_the_seed():
     before = stacks(200)
     after = augment_colors(before, 1.0, np.random.default_rng(2))

@@ -296,26 +296,42 @@ def test_starts_are_spread_as_stated(scene):
     assert np.allclose(along, 0.5, atol=0.1)
 
 
-def test_start_along_moves_half_of_the_starts(scene):
+def test_start_along_moves_most_starts_along_and_beside_the_route(scene):
     plain = twin.load(scene, "route", pixels=False)
     environment = twin.load(scene, "route", pixels=False, start_along=0.6)
-    length = environment.task.segment.length
-    starts = []
-    for seed in range(80):
+    length, half_width = environment.task.segment.length, environment.task.half_width
+    starts, offsets = [], []
+    for seed in range(120):
         for one in (plain, environment):
             one.task.seed(seed)
             one.reset()
         info = environment.task.info(environment.physics)
         starts.append(info["start"])
-        assert info["progress"] == pytest.approx(info["start"], abs=0.1)
-        assert abs(info["cross_track"]) < 0.32 and environment.task.cause == ""
+        offsets.append(info["cross_track"])
+        assert info["progress"] == pytest.approx(info["start"], abs=0.1) and environment.task.cause == ""
         if not info["start"]:
             np.testing.assert_array_equal(environment.physics.planar_pose, plain.physics.planar_pose)
-    share = np.array(starts) / length
-    assert 0.35 < (share == 0.0).mean() < 0.65
+    share, beside = np.array(starts) / length, np.abs(offsets)
+    assert 0.1 < (share == 0.0).mean() < 0.3
     assert 0.5 < share.max() <= 0.6 and np.std(share[share > 0.0]) > 0.1
+    assert beside[share == 0.0].max() < 0.32 and 0.6 < beside[share > 0.0].max() / half_width < 0.72
     with pytest.raises(InputError, match="start_along"):
         twin.load(scene, "route", pixels=False, start_along=1.0)
+
+
+def test_episodes_that_start_along_the_route_are_cut_off(scene):
+    environment = twin.load(scene, "route", pixels=False, start_along=0.6)
+    ends = set()
+    for seed in range(12):
+        environment.task.seed(seed)
+        step, count = environment.reset(), 0
+        while not step.last():
+            step, count = environment.step([0.1, 0.0] if count % 40 else [0.0, 0.0]), count + 1
+        along = environment.task.info(environment.physics)["start"] > 0.0
+        cut = environment.task.cause == ""
+        assert cut == (along and count == 150) and (not cut or (step.discount, step.reward) == (1.0, 0.1))
+        ends.add((along, cut))
+    assert ends >= {(True, True), (False, False)}
 
 
 def test_lighting_and_robot_do_not_change_the_start(scene):

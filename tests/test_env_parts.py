@@ -245,6 +245,15 @@ def test_invalid_ranges_are_refused():
             Ranges(**ranges)
 
 
+def test_clear_air_is_more_common_than_fog():
+    samples = [Ranges().sample(np.random.default_rng(k)) for k in range(2000)]
+    extinction = np.array([one.extinction for one in samples])
+    assert extinction.min() >= 0.0 and 0.045 < extinction.max() <= 0.05
+    assert (extinction < 3.0 / 480.0).mean() == pytest.approx(0.5, abs=0.03)  # visibility above 480 m
+    assert (extinction > 3.0 / 120.0).mean() == pytest.approx(0.2, abs=0.03)
+    assert np.mean([one.shade for one in samples]) == pytest.approx(0.375, abs=0.02)  # the others stay uniform
+
+
 def test_measured_parameters_are_held_in_evaluation():
     robot = HuskyParams(friction=0.6, wheel_radius=(0.162, 0.163), center_of_mass=(-0.05, 0.0, 0.06))
     draws = [EVALUATION_RANGES.for_robot(robot).sample(np.random.default_rng(k)) for k in range(9)]

@@ -140,7 +140,7 @@ def test_samples_on_a_gpu_equal_those_on_the_host(device, monkeypatch):
         for name in ("actions", "next_observations", "dones", "rewards", "states", "next_states"):
             np.testing.assert_array_equal(getattr(plain, name), getattr(other, name).cpu(), err_msg=name)
         off = np.abs(plain.observations.numpy().astype(int) - other.observations.cpu().numpy())
-        assert off.max() <= 1 and off.mean() < 0.1 and off[20:].max() == 0
+        assert off.max() <= 3 and off.mean() < 0.1 and off[20:].max() == 0
         assert not np.array_equal(plain.observations[:20], plain.next_observations[:20])
 
 

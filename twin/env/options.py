@@ -82,8 +82,9 @@ class Options:
     start_heading: float = 10.0
     """The start's heading relative to the route is sampled uniformly within ± this [°]."""
     start_along: float = 0.0
-    """If positive, half of the episodes start beyond the segment's start, by a fraction of the segment's length that is
-    sampled uniformly between 0 and this."""
+    """If positive, for training: four of five episodes start beyond the segment's start, by a fraction of its length
+    that is sampled uniformly between 0 and this, up to 0.7 half widths of the corridor beside the route. After 15 s
+    they are cut off (truncated, with an empty cause)."""
     observe: str = NERF
     """Origin of the images. `nerf`: the field. `simulator`: MuJoCo's renderer with the extracted mesh, under MuJoCo's
     lights. `splats`: MuJoCo's renderer with the Gaussian splats of a file; obstacles and robot have MuJoCo's lights."""

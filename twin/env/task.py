@@ -57,6 +57,13 @@ _SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point of the route is searched th
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, as multiples of the controller's limits
+START_VERSION = 2
+"""Version of the starts with `Options.start_along`. Increase it whenever a change of the code changes the starts of a
+seed, or when their episodes are cut off."""
+# With `Options.start_along`: the share of episodes that start beyond the segment's start, their largest distance from
+# the route at the start, as a fraction of the corridor's half width, and the time after which they are cut off [s].
+# Without them, a training on a long route sees few lightings, and few pictures from beside the route.
+_ALONG_SHARE, _ALONG_OFFSET, _ALONG_TIME = 0.8, 0.7, 15.0
 _LOOKAHEADS = (1.0, 2.0, 4.0)  # [m] along the route; the state contains the change of heading up to these points
 
 
@@ -104,6 +111,7 @@ class RewardAndTermination:
         self._previous_foot, self._steering = np.zeros(count), np.zeros(count)
         # Position and time at which each robot last completed a motion of STUCK_DISTANCE.
         self._anchor, self._anchor_time = np.zeros((count, 2)), np.zeros(count)
+        self._cut_time, self._cut = np.full(count, np.inf), np.zeros(count, bool)
         terms = options.rewards
         speed, yaw_rate = (_STATE_MARGIN * x for x in (world.robot.max_wheel_speed, world.robot.max_yaw_rate))
         # `cross_track` is bounded, since an episode ends at most one control step after the robot leaves the corridor.
@@ -114,8 +122,12 @@ class RewardAndTermination:
         self._cause_rewards = np.array([0.0, *(getattr(terms, cause) for cause in CAUSES)])
         self._cause_rewards[[0, _CODES["goal"]]] += terms.step
 
-    def begin(self, which: EnvIndices, foot: Array, position: Array) -> None:
-        """Starts k episodes at positions, shape (k, 2) [m], near the arc lengths `foot`, shape (k,) [m]."""
+    def begin(self, which: EnvIndices, foot: Array, position: Array, cut_time: float = np.inf) -> None:
+        """Starts k episodes at positions, shape (k, 2) [m], near the arc lengths `foot`, shape (k,) [m].
+
+        An episode that has not ended after `cut_time` [s] is cut off: truncated without a cause.
+        """
+        self._cut_time[which], self._cut[which] = cut_time, False
         self._cause[which], self._anchor_time[which], self._steering[which] = 0, 0.0, 0.0
         self.foot[which], self.cross_track[which] = self._nearest(position, foot)
         self._previous_foot[which], self._anchor[which] = self.foot[which], position
@@ -141,9 +153,10 @@ class RewardAndTermination:
             "stuck": motion.time - self._anchor_time[which] >= STUCK_TIME,
         }
         self._cause[which] = np.select(list(conditions.values()), [_CODES[cause] for cause in conditions], 0)
+        self._cut[which] = motion.time > self._cut_time[which] - 1e-6
 
     def cause(self, i: int) -> str:
-        """The cause of drive i's end, one of `CAUSES`; empty while the episode goes on."""
+        """The cause of drive i's end, one of `CAUSES`; empty while the episode goes on, and if it was cut off."""
         code = self._cause[i]
         return CAUSES[code - 1] if code else ""
 
@@ -155,9 +168,10 @@ class RewardAndTermination:
         return self._cause_rewards[self._cause[which]] + motion + terms.steering * self._steering[which] ** 2
 
     def ended(self, which: EnvIndices) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Returns which drives are terminated, and which are truncated by the time limit, each shape (k,)."""
+        """Returns which drives are terminated, and which are truncated (time limit, cut off), each of shape (k,)."""
         timeout = self._cause[which] == _CODES["timeout"]
-        return (self._cause[which] > 0) & ~timeout, timeout
+        ended = (self._cause[which] > 0) & ~timeout
+        return ended, timeout | (self._cut[which] & ~ended)
 
     def state(self, which: EnvIndices, motion: Motion) -> NDArray[np.float32]:
         """Returns the privileged state of a driver that knows the map, shape (k, 7).
@@ -330,7 +344,9 @@ class DriveTask(control.Task):
                 f"task {self.segment.name!r}: the robot touches {', '.join(physics.touched)} at each of {_START_TRIES} "
                 "sampled starts; move the obstacle or the start"
             )
-        self._evaluator.begin([self._index], np.array([self._start_station]), physics.planar_pose[None, :2])
+        along = self._start_station > self.segment.start
+        position, cut_time = physics.planar_pose[None, :2], _ALONG_TIME if along else np.inf
+        self._evaluator.begin([self._index], np.array([self._start_station]), position, cut_time)
 
     def before_step(self, action: Any, physics: DrivePhysics) -> None:
         """Raises ValueError: the action is invalid; the episode is unchanged."""
@@ -375,7 +391,7 @@ class DriveTask(control.Task):
 
     @property
     def cause(self) -> str:
-        """The cause of the episode's end; empty while it goes on."""
+        """The cause of the episode's end; empty while it goes on, and if it was cut off."""
         return self._evaluator.cause(self._index)
 
     @property
@@ -424,7 +440,9 @@ class DriveTask(control.Task):
         o = self.options
         offset = rng.uniform(-o.start_offset, o.start_offset)
         turn = np.deg2rad(rng.uniform(-o.start_heading, o.start_heading))
-        share = max(0.0, rng.uniform(-1.0, 1.0)) if o.start_along else 0.0
+        share = max(0.0, rng.uniform(1.0 - 1.0 / _ALONG_SHARE, 1.0)) if o.start_along else 0.0
+        if share and o.start_offset:
+            offset *= max(1.0, _ALONG_OFFSET * self.half_width / o.start_offset)
         s = self._start_station = self.segment.start + share * o.start_along * self.segment.length
         heading = float(heading_at(self.world.route[:, :2], s))
         x, y = point_at(self.world.route[:, :2], s) + offset * np.array([-np.sin(heading), np.cos(heading)])

@@ -27,14 +27,18 @@ from twin.types import Array32
 # ---- color augmentation
 
 _GAMMA, _CONTRAST, _TINT = 0.25, 0.25, 0.08  # standard deviations of the logarithms of the random factors
+_SHARPNESS = 1.0, 2.0  # strongest blur (1: to the mean of 3 × 3 pixels) and strongest sharpening
 _KNOTS, _SHADING = (3, 5), 0.4  # brightness pattern: knots down and across; standard deviation of the logarithm
 _MAX_COVERS, _COVER_SIDES = 3, (0.1, 0.5)  # rectangles: largest number; range of sides / the picture's
 _LEVELS = np.arange(256) / 255.0
+_IDENTITY = np.pad(np.ones((1, 1), np.float32), 1)  # the kernel that changes nothing
 
 
 class ColorChanges(NamedTuple):
     """Random changes of the colors of k stacks, see `draw_color_changes`."""
 
+    kernels: Array32
+    """Convolution that sharpens or blurs, shape (k, 3, 3)."""
     curves: NDArray[np.uint8]
     """Tone curve of each color, shape (k, 3, 256)."""
     knots: Array32
@@ -52,7 +56,8 @@ class ColorChanges(NamedTuple):
         for i in range(count):
             shading = cv2.resize(self.knots[i], (width, height), interpolation=cv2.INTER_CUBIC)
             for channel in range(channels):
-                toned = cv2.LUT(stacks[i, channel], self.curves[i, channel % 3])
+                sharp = cv2.filter2D(stacks[i, channel], -1, self.kernels[i], borderType=cv2.BORDER_REPLICATE)
+                toned = cv2.LUT(sharp, self.curves[i, channel % 3])
                 cv2.multiply(toned, shading, out[i, channel], dtype=cv2.CV_8U)
         for i, n in np.argwhere(self.covers[..., 1]):
             top, bottom, left, right = self.covers[i, n]
@@ -60,8 +65,12 @@ class ColorChanges(NamedTuple):
         return out
 
     def applied_on_gpu(self, stacks: torch.Tensor) -> torch.Tensor:
-        """Like `applied`, for a tensor; colors may differ by 1, since OpenCV rounds differently."""
+        """Like `applied`, for a tensor; a few colors differ by up to 3, since OpenCV rounds differently."""
         (channels, height, width), device = stacks.shape[1:], stacks.device
+        padded = nn.functional.pad(stacks.float(), (1, 1, 1, 1), mode="replicate").transpose(0, 1)
+        kernels = torch.as_tensor(self.kernels, device=device)[:, None]
+        sharp = nn.functional.conv2d(padded, kernels, groups=len(stacks)).transpose(0, 1)
+        stacks = sharp.round().clamp(0, 255).to(torch.uint8)
         curves = torch.as_tensor(self.curves, device=device).repeat(1, channels // 3, 1)
         toned = curves.gather(2, stacks.flatten(2).long()).reshape(stacks.shape)
         knots = torch.as_tensor(self.knots, device=device)[:, None]
@@ -84,16 +93,20 @@ def draw_color_changes(count: int, size: tuple[int, ...], strength: float, rng: 
     The policy's normalization removes brightness, contrast and tint of the whole ground; the changes randomize what
     remains. Each stack is changed in its own way, but all pictures of a stack alike, which preserves motion:
 
-        tone     v → v^gamma, then a change of contrast about the middle
-        tint     one gain per color
-        shading  a smooth pattern of brightness
-        covers   rectangles in uniform colors, so that steering does not rely on a single object in the background
+        sharpness  blur or sharpening, since a field shows edges less sharply than a camera
+        tone       v → v^gamma, then a change of contrast about the middle
+        tint       one gain per color
+        shading    a smooth pattern of brightness
+        covers     rectangles in uniform colors, so that steering does not rely on a single object in the background
 
     Args:
         count: Number of stacks.
         size: Height and width of the pictures.
         strength: Factor by which the standard deviations are multiplied; 0 changes nothing.
     """
+    blur, sharpening = (strength * most for most in _SHARPNESS)
+    amount = rng.uniform(-min(blur, 1.0), sharpening, (count, 1, 1)).astype(np.float32)
+    kernels = (1.0 + amount) * _IDENTITY - amount / np.float32(9.0)
     curves = _curves(count, strength, rng)
     knots = np.exp(strength * _SHADING * rng.normal(size=(count, *_KNOTS))).astype(np.float32)
     covers, colors = np.zeros((count, _MAX_COVERS, 4), np.int64), np.zeros((count, _MAX_COVERS, 3), np.uint8)
@@ -103,7 +116,7 @@ def draw_color_changes(count: int, size: tuple[int, ...], strength: float, rng: 
             top, left = (rng.uniform(size=2) * (size[0] - height, size[1] - width)).astype(int)
             covers[i, n] = top, top + height, left, left + width
             colors[i, n] = rng.integers(0, 256, 3, np.uint8)
-    return ColorChanges(curves, knots, covers, colors)
+    return ColorChanges(kernels, curves, knots, covers, colors)
 
 
 def _curves(count: int, strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:

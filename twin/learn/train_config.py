@@ -73,8 +73,9 @@ class TrainConfig:
     """Target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 means a standard
     deviation of 0.15, and -1 means 0.09."""
     start_along: Annotated[float, Range(0, 0.999)] = 0.9
-    """Half of the episodes start at a random point in this first fraction of the route segment, the others at its
-    beginning. All start beside the route and at an angle to it, so that a policy practices returning to the middle."""
+    """Four of five episodes start at a random point in this first fraction of the route segment, further beside the
+    route, and are cut off after 15 s (`Options.start_along`). So a policy practices returning to the middle, and on a
+    long route, too, a training has many episodes, each with another lighting, weather and robot."""
     randomise: bool = True
     """Randomizes the robot in every episode; if the lighting varies, also the weather and distractor objects."""
     privileged: bool = True

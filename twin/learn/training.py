@@ -37,6 +37,7 @@ from twin import runtime
 from twin.config import Condition
 from twin.env.env_factory import fingerprint
 from twin.env.options import CUDA
+from twin.env.task import START_VERSION
 from twin.env.vector_env import default_processes
 from twin.errors import InputError
 from twin.evaluation.training_curves import CHOICE_FILE
@@ -283,12 +284,14 @@ def checkpoint_folder(folder: Path, step: int) -> Path:
 
 
 def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
-    """Settings that `check_same` compares between calls of a run: the configuration, and the road's fingerprint.
+    """Settings that `check_same` compares between calls of a run: the configuration, the road's fingerprint, and the
+    version of the starts.
 
     The values are JSON types, as read from `config.json`.
     """
     road = fingerprint(twin, config.task, Condition(config.lighting, config.randomise))
-    return dict(json.loads(json.dumps({**dataclasses.asdict(config), "road": road})))
+    settings = {**dataclasses.asdict(config), "road": road, "start_version": START_VERSION}
+    return dict(json.loads(json.dumps(settings)))
 
 
 def check_same(folder: Path, settings: dict[str, Any]) -> None:
