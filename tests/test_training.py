@@ -28,7 +28,7 @@ from twin.errors import InputError
 from twin.evaluation.training_curves import read_episodes
 from twin.evaluation.trials import csv_text
 from twin.files import write_json
-from twin.learn import selection, train_config
+from twin.learn import selection, train_config, training
 from twin.learn.policy import load_policy
 from twin.learn.sac import PixelSAC
 from twin.learn.sb3_env import DriveVecEnv
@@ -174,8 +174,6 @@ def test_two_trainings_of_one_run_do_not_mix(scene, capsys):
 
 @pytest.mark.slow
 def test_resumptions_have_episodes_of_their_own(scene, tmp_path, monkeypatch):
-    from twin.learn import training
-
     given, whole = [], training.PreprocessedVecEnv.seed
 
     def spy(worlds, seed):
@@ -296,7 +294,6 @@ def test_tests_break_off_no_episode_of_the_training(scene, tmp_path):
 @pytest.mark.parametrize(("given", "expected"), [(None, 2), (1, 1)])
 def test_environments_for_tests_add_no_processes(scene, tmp_path, monkeypatch, given, expected):
     """Four environments get two processes, as without the four of the tests."""
-    from twin.learn import training
 
     class Made(Exception):
         """Ends the training as soon as its environments would be made."""
@@ -329,6 +326,15 @@ def test_a_run_of_an_earlier_version_is_refused(tmp_path):
     with pytest.raises(InputError, match="by an earlier version, which had no centring; give another --run"):
         check_same(tmp_path, {"road": "x", "steps": 8, "centring": 1.0})
     check_same(tmp_path, {"road": "x", "steps": 9})
+
+
+def test_a_run_with_other_starts_is_refused(scene, tmp_path, monkeypatch):
+    place = twin.load_scene(scene)
+    write_json(tmp_path / "config.json", training.run_settings(place, SHORT))
+    check_same(tmp_path, training.run_settings(place, SHORT))
+    monkeypatch.setattr(training, "START_VERSION", training.START_VERSION + 1)
+    with pytest.raises(InputError, match="changed the sampling of episodes"):
+        check_same(tmp_path, training.run_settings(place, SHORT))
 
 
 def test_configurations_set_the_environment():

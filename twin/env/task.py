@@ -127,7 +127,7 @@ class RewardAndTermination:
 
         An episode that has not ended after `cut_time` [s] is cut off: truncated without a cause.
         """
-        self._cut_time[which], self._cut[which] = cut_time, False
+        self._cut_time[which] = cut_time
         self._cause[which], self._anchor_time[which], self._steering[which] = 0, 0.0, 0.0
         self.foot[which], self.cross_track[which] = self._nearest(position, foot)
         self._previous_foot[which], self._anchor[which] = self.foot[which], position

@@ -104,8 +104,8 @@ def draw_color_changes(count: int, size: tuple[int, ...], strength: float, rng: 
         size: Height and width of the pictures.
         strength: Factor by which the standard deviations are multiplied; 0 changes nothing.
     """
-    blur, sharpening = (strength * most for most in _SHARPNESS)
-    amount = rng.uniform(-min(blur, 1.0), sharpening, (count, 1, 1)).astype(np.float32)
+    blur, sharpening = min(strength, 1.0) * _SHARPNESS[0], strength * _SHARPNESS[1]
+    amount = rng.uniform(-blur, sharpening, (count, 1, 1)).astype(np.float32)
     kernels = (1.0 + amount) * _IDENTITY - amount / np.float32(9.0)
     curves = _curves(count, strength, rng)
     knots = np.exp(strength * _SHADING * rng.normal(size=(count, *_KNOTS))).astype(np.float32)

@@ -42,7 +42,7 @@ from twin.env.vector_env import default_processes
 from twin.errors import InputError
 from twin.evaluation.training_curves import CHOICE_FILE
 from twin.evaluation.trials import RECENT_EPISODES, csv_text
-from twin.files import read_json, wrap_read_errors, write_json, write_text
+from twin.files import digest_json, read_json, wrap_read_errors, write_json, write_text
 from twin.learn.policy import load_policy, save_policy
 from twin.learn.policy_evaluation import EpisodeResult, run_episodes
 from twin.learn.policy_network import preprocess
@@ -284,14 +284,12 @@ def checkpoint_folder(folder: Path, step: int) -> Path:
 
 
 def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
-    """Settings that `check_same` compares between calls of a run: the configuration, the road's fingerprint, and the
-    version of the starts.
+    """Settings that `check_same` compares between calls of a run: the configuration, and the road's fingerprint.
 
     The values are JSON types, as read from `config.json`.
     """
-    road = fingerprint(twin, config.task, Condition(config.lighting, config.randomise))
-    settings = {**dataclasses.asdict(config), "road": road, "start_version": START_VERSION}
-    return dict(json.loads(json.dumps(settings)))
+    road = digest_json([fingerprint(twin, config.task, Condition(config.lighting, config.randomise)), START_VERSION])
+    return dict(json.loads(json.dumps({**dataclasses.asdict(config), "road": road})))
 
 
 def check_same(folder: Path, settings: dict[str, Any]) -> None:
