@@ -121,7 +121,7 @@ def plot_success_curve(axes: Axes, steps: Indices, success: Indices, color: str)
     """Plots the success rate over steps, with its interval; see `binned_rates`. Needs at least one episode."""
     step, won, count, low, high = np.array(binned_rates(steps, success), float).T
     axes.fill_between(step, low, high, color=color, alpha=0.2, linewidth=0, label="90 % interval")
-    label = f"{len(steps)} episodes, {_range_text(count.astype(int).tolist())} per point"
+    label = f"{len(steps)} episodes from the start, {_range_text(count.astype(int).tolist())} per point"
     axes.plot(step, won / count, ".-", color=color, label=label)
 
 
