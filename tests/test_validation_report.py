@@ -377,7 +377,7 @@ def test_a_curve_has_points_of_five_episodes_and_no_more_than_it_can_show(count)
     axes = Figure().subplots()
     plot_success_curve(axes, np.arange(count), won, SERIES[0])
     sizes = "5 to 6" if count == 27 else str(points[0][2])
-    assert axes.lines[0].get_label() == f"{count} episodes, {sizes} per point"
+    assert axes.lines[0].get_label() == f"{count} episodes from the start, {sizes} per point"
 
 
 def test_a_robot_without_identified_parameters_gives_a_caution():
