@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 import trimesh
+from PIL import Image
 from test_gaussians import floor_views
 from tiny_twin import filmed_tiny_twin
 
@@ -162,6 +163,11 @@ def test_a_baked_texture_shows_what_the_views_show() -> None:
     # The face that no view sees has the mean color of the nearest one.
     u, v = np.floor(coordinates[2].mean(0) * texture.shape[1::-1]).astype(int)
     assert texture[v, u].min() > 30
+    # The file has the texture as it was encoded, not encoded once more at another quality.
+    read = trimesh.load(io.BytesIO(gltf.textured_glb(vertices, faces, views)), file_type="glb").to_geometry()
+    encoded = io.BytesIO()
+    Image.fromarray(texture).save(encoded, "JPEG", quality=95, subsampling=0)
+    assert (np.asarray(read.visual.material.baseColorTexture) == np.asarray(Image.open(encoded))).all()
 
 
 def test_tiles_do_not_overlap() -> None:

@@ -49,8 +49,11 @@ def textured_glb(vertices: Array, faces: NDArray, views: Views) -> bytes:
     texture, coordinates = bake(vertices, faces, views)
     encoded = io.BytesIO()
     PillowImage.fromarray(texture).save(encoded, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
+    picture = PillowImage.open(encoded)
+    # trimesh would encode the picture again, at Pillow's default quality.
+    picture.save = lambda file, **_: file.write(encoded.getvalue())  # type: ignore[method-assign]
     material = trimesh.visual.material.PBRMaterial(
-        name="baked", baseColorTexture=PillowImage.open(encoded), metallicFactor=0.0, roughnessFactor=1.0
+        name="baked", baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0
     )
     corners = faces.ravel()
     uv = coordinates.reshape(-1, 2) * [1.0, -1.0] + [0.0, 1.0]  # trimesh measures v from the bottom
