@@ -1,6 +1,7 @@
 """Detail: where rays meet the ground, interpolation and its gradient, the mipmap, the fit, and files."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,12 +9,13 @@ from devices import DEVICES
 from test_fit import CONFIG, HEIGHT, WIDTH, K, floor_points, make_cameras
 
 from twin.errors import InputError
-from twin.geometry.cameras import SparsePoints, Viewpoints
+from twin.geometry.cameras import SparsePoints, Viewpoints, pixel_grid, unproject
 from twin.geometry.poses import look_at
+from twin.nerf import detail
 from twin.nerf.bake import bake
 from twin.nerf.baked import BakedField
 from twin.nerf.baked_arrays import BakedSection, Detail, detail_grid
-from twin.nerf.dataset import TrainingPixels
+from twin.nerf.dataset import DepthSupervision, TrainingPixels, join_depths
 from twin.nerf.detail import fit_detail
 from twin.nerf.kernels import surface_detail as kernels
 from twin.nerf.kernels.volume import CHANNELS, Channels
@@ -80,6 +82,79 @@ def test_rays_meet_the_ground_where_the_height_map_says_not_where_the_depth_says
     assert (above[inside, 3] < 0).all()
     assert np.allclose(above[inside, :3], (o + 0.6 * exact[:, None] * ray)[inside] - [*ORIGIN, 0.0], atol=1e-4)
     assert not hits_of(sloping_ground(), pose, -np.ones_like(exact))[:, 3].any()
+
+
+def test_rays_meet_a_kerb_at_its_face():
+    """A ray that meets the face of a kerb neither passes it nor stops before it, even if its depth is imprecise."""
+    cell, low, high = 0.1, 0.0, 0.12
+    y = np.tile(np.arange(81) * cell - 4.0, (81, 1))
+    kerb = Detail.without_features(np.where(y < 1.0, low, high).astype(np.float32), np.array([-4.0, -4.0]), cell)
+
+    def height(at):  # what the map's bilinear interpolation gives
+        return low + (high - low) * np.clip((at - 0.9) / cell, 0.0, 1.0)
+
+    pose = look_at(np.array([-2.0, 0.0, 0.45]), np.array([1.5, 1.2, 0.05]))
+    o, ray = pose[:3, 3], rays_of(pose)
+    t = np.linspace(0.5, 6.0, 20_000)
+    z, y = o[2] + np.outer(ray[:, 2], t), o[1] + np.outer(ray[:, 1], t)
+    below = z < height(y)
+    exact = np.where(below.any(1), t[below.argmax(1)], -1.0)
+    point = o + exact[:, None] * ray
+    face = (exact > 0) & (np.abs(point[:, 1] - 0.95) < 0.05) & (np.abs(point[:, 0]) < 3.5)
+    assert face.sum() > 20
+    for factor in (0.97, 1.0, 1.03):
+        hits = hits_of(kerb, pose, factor * exact)
+        assert (hits[face, 3] > 0).all()
+        assert np.abs(hits[face, :2] - 4.0 - point[face, :2]).max() < 0.08
+        assert np.abs(hits[face, 2] - height(hits[face, 1] - 4.0)).max() < 0.02
+
+
+class Floor:
+    """Stands for a baked field that shows a level floor at z = 0, smooth where there is a kerb."""
+
+    lightings = ("day",)
+
+    def render(self, cameras, lighting, size):
+        k = cameras.intrinsics * (np.array([*size, *size]) / np.tile(cameras.sizes, 2))
+        rays = unproject(pixel_grid(*size), k[0]) @ cameras.camera_to_world[0, :3, :3].T
+        depth = cameras.camera_to_world[0, 2, 3] / np.maximum(-rays[..., 2], 1e-3)
+        return SimpleNamespace(depth=np.minimum(depth, 100.0)[None])
+
+
+def test_stereo_makes_the_height_map_sharp_where_it_sees_the_ground(tmp_path):
+    cameras = make_cameras(tmp_path)
+    pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
+    smooth, origin = detail._height_map(Floor(), pixels)
+    known = smooth < kernels.NO_GROUND
+    assert known.sum() > 500 and np.abs(smooth[known]).max() < 1e-6
+    # The floor is 0.1 m higher where y > 0.2 m; a bin, 0.5 m high, stands on it.
+    rng = np.random.default_rng(0)
+    parts = []
+    for i in range(len(pixels.cameras)):
+        pixel = rng.uniform(0.0, [WIDTH, HEIGHT], (6000, 2))
+        ray = unproject(pixel, pixels.intrinsics[i])
+        pose = pixels.cameras.camera_to_world[i]
+        world = ray @ pose[:3, :3].T
+        t = (pose[2, 3] - 0.1) / np.maximum(-world[:, 2], 1e-3)
+        raised = pose[1, 3] + t * world[:, 1] > 0.2
+        t = np.where(raised, t, pose[2, 3] / np.maximum(-world[:, 2], 1e-3))
+        bin_there = (np.abs(pose[:2, 3] + t[:, None] * world[:, :2] - [4.0, -0.5]) < 0.2).all(1)
+        t = np.where(bin_there, (pose[2, 3] - 0.5) / np.maximum(-world[:, 2], 1e-3), t)
+        far = np.full(len(t), i, np.int32), pixel, (t * np.linalg.norm(ray, axis=1)).astype(np.float32)
+        parts.append(DepthSupervision(*far).select(world[:, 2] < -0.1))
+    pixels.stereo = join_depths(parts)
+    sharp, same = detail._height_map(Floor(), pixels)
+    assert np.array_equal(same, origin) and np.array_equal(sharp < kernels.NO_GROUND, known)
+    x, y = np.moveaxis(np.indices(sharp.shape), 0, -1).reshape(-1, 2).T * detail._HEIGHT_CELL + origin[:, None]
+    near = known.ravel() & (np.abs(x - 4.0) < 1.5) & (np.abs(y) < 1.0)
+    z = sharp.ravel()
+    assert np.abs(z[near & (y > 0.32)] - 0.1).max() < 0.01
+    assert np.abs(z[near & (y < 0.08)]).max() < 0.01  # and where the bin stands
+    # Frames of another section do not count.
+    few = pixels.of_frames(np.arange(7))
+    few.stereo = pixels.stereo.select(pixels.stereo.frame > 6)
+    alone, _ = detail._height_map(Floor(), few)
+    assert np.abs(alone[alone < kernels.NO_GROUND]).max() < 1e-6
 
 
 def random_hits(rng: np.random.Generator, n: int) -> np.ndarray:

@@ -44,7 +44,7 @@ PIPELINE = (
     Stage("capture", "twin.capture.frames", 3, ("source", "capture"), ()),
     Stage("cameras", "twin.capture.sfm", 5, ("cameras",), ("capture",)),
     Stage("metric", "twin.capture.metric", 3, ("metric",), ("capture", "cameras")),
-    Stage("field", "twin.nerf.trainer", 9, ("nerf", "mjcf.route"), ("cameras", "metric")),
+    Stage("field", "twin.nerf.trainer", 10, ("nerf", "mjcf.route"), ("cameras", "metric")),
     Stage("mesh", "twin.assets.mesh", 7, ("mesh", "route", "branch", *_MJCF_OF_MESH), ("cameras", "metric", "field")),
     # It also reads `route` and `branch`; if these change, so does the result of `mesh`.
     Stage("mjcf", "twin.mjcf.scene_xml", 5, ("mjcf", "robot"), ("metric", "mesh")),

@@ -5,6 +5,7 @@ blocked. The point where it meets the surface is known more precisely: on the gr
 height of the ground is smooth. Detail adds features at that point, which correct those of the bricks.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, median_filter
 
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.nerf import network
@@ -24,17 +25,20 @@ from twin.nerf.dataset import TrainingPixels
 from twin.nerf.kernels import surface_detail as kernels
 from twin.nerf.kernels import volume
 from twin.runtime import bar
+from twin.types import Array
 from twin.warp_runtime import wp
 
 _TEXEL = 0.025  # [m] least side of the finest texels
 _MAX_TILES = 6000  # texels grow until there are at most this many tiles, 33 MB
 _CELL = 0.06  # [m] side of the hash grid's cells
 _LOG2_ROWS = 20  # binary logarithm of the number of rows of the hash grid's table, 16 MB
-_HEIGHT_CELL = 0.25  # [m] spacing of the height map
+_HEIGHT_CELL = 0.1  # [m] spacing of the height map
+_SMOOTH_CELL = 0.25  # [m] spacing of the heights from rendered depth
+_STEREO_GATE = 0.2  # [m] stereo depths farther from these heights are not on the ground
 _HEIGHT_VIEW = 160  # [px] width of the rendered views in which the ground is searched
-_REACH = 12.0  # [m] greatest z-depth at which ground is searched in a view
+_REACH = 12.0  # [m] greatest z-depth of rendered ground, and greatest distance of stereo depths
 _MIN_UPRIGHT = 0.94  # least z of the ground's unit normal (20° from level)
-_MIN_SEEN = 8  # least number of rendered points that determine a height
+_MIN_SEEN = 8  # least number of points that determine a height
 _MIN_OPACITY = 0.98  # rays of greater opacity show a surface and nothing behind it
 _MIN_HITS = 24  # least number of training pixels in a stored tile
 _MAX_HITS = 8_000_000  # approximate upper limit of the training pixels used, which take 0.5 GB
@@ -111,7 +115,56 @@ def _section_detail(
 
 
 def _height_map(baked: BakedField, pixels: TrainingPixels) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Heights of level surfaces (along x, along y) [m], and the lowest corner of their grid."""
+    """Heights of the ground (along x, along y) [m], and the lowest corner of their grid.
+
+    Rendered depth shows where the ground is, but it smooths kerbs. Stereo depths near the ground replace it where there
+    are enough of them.
+    """
+    rendered = _level_points(baked, pixels)
+    if not len(rendered):
+        return np.full((2, 2), kernels.NO_GROUND, np.float32), pixels.cameras.positions[:, :2].min(0)
+    origin = rendered[:, :2].min(0) - _SMOOTH_CELL
+    smooth, seen = _medians(rendered, origin, _SMOOTH_CELL)
+    weight = gaussian_filter(seen.astype(float), 1.0)
+    smooth = gaussian_filter(smooth, 1.0) / np.maximum(weight, 1e-9)
+    fine = _SMOOTH_CELL / _HEIGHT_CELL
+    shape = tuple(math.ceil((n - 1) * fine) + 1 for n in smooth.shape)
+    nodes = np.indices(shape) / fine
+    known = map_coordinates(weight, nodes, order=1, mode="nearest") > 0.3
+    heights = map_coordinates(smooth, nodes, order=1, mode="nearest")
+
+    stereo = _stereo_points(pixels)
+    node = np.floor((stereo[:, :2] - origin) / _HEIGHT_CELL + 0.5).astype(np.int64)
+    inside = ((node >= 0) & (node < shape)).all(1)
+    node, stereo = node[inside], stereo[inside]
+    near = known[tuple(node.T)] & (np.abs(stereo[:, 2] - heights[tuple(node.T)]) < _STEREO_GATE)
+    sharp, seen = _medians(stereo[near], origin, _HEIGHT_CELL, shape)
+    heights = median_filter(np.where(seen, sharp, heights), 3)
+    return np.where(known, heights, kernels.NO_GROUND).astype(np.float32), origin
+
+
+def _medians(
+    xyz: Array, origin: Array, cell: float, shape: tuple[int, ...] | None = None
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Median z of the points within half a cell of each node of a grid, 0 where there are few, and the mask of others.
+
+    The default `shape` covers all points.
+    """
+    node = np.floor((xyz[:, :2] - origin) / cell + 0.5).astype(np.int64)
+    size = tuple(node.max(0) + 2) if shape is None else shape
+    flat = node[:, 0] * size[1] + node[:, 1]
+    order = np.lexsort((xyz[:, 2], flat))
+    first = np.flatnonzero(np.diff(flat[order], prepend=-1))
+    count = np.diff(first, append=len(order))
+    enough = count >= _MIN_SEEN
+    at = np.unravel_index(flat[order[first[enough]]], size)
+    out, seen = np.zeros(size), np.zeros(size, bool)
+    out[at], seen[at] = xyz[order[(first + count // 2)[enough]], 2], True
+    return out, seen
+
+
+def _level_points(baked: BakedField, pixels: TrainingPixels) -> Array:
+    """Points (k, 3) [m] of rendered pixels on level surfaces."""
     found = [np.zeros((0, 3))]
     for i in pixels.frames.tolist():
         width = min(_HEIGHT_VIEW, int(pixels.width[i]))
@@ -126,26 +179,20 @@ def _height_map(baked: BakedField, pixels: TrainingPixels) -> tuple[NDArray[np.f
         points = points[1:, 1:]
         level = (normal[..., 2] > _MIN_UPRIGHT) & (depth[1:, 1:] < _REACH) & (points[..., 2] < pose[2, 3])
         found.append(points[level])
-    xyz = np.concatenate(found)
-    if not len(xyz):
-        return np.full((2, 2), kernels.NO_GROUND, np.float32), pixels.cameras.positions[:, :2].min(0)
-    origin = xyz[:, :2].min(0) - _HEIGHT_CELL
-    # Node i of the map is the median of the points within half a cell.
-    node = np.floor((xyz[:, :2] - origin) / _HEIGHT_CELL + 0.5).astype(np.int64)
-    shape = node.max(0) + 2
-    flat = node[:, 0] * shape[1] + node[:, 1]
-    order = np.lexsort((xyz[:, 2], flat))
-    first = np.flatnonzero(np.diff(flat[order], prepend=-1))
-    count = np.diff(first, append=len(order))
-    median = xyz[order[first + count // 2], 2]
-    known = np.zeros(shape)
-    heights = np.zeros(shape)
-    seen = count >= _MIN_SEEN
-    at = np.unravel_index(flat[order[first[seen]]], tuple(shape))
-    known[at], heights[at] = 1.0, median[seen]
-    weight = gaussian_filter(known, 1.0)
-    smooth = gaussian_filter(heights, 1.0) / np.maximum(weight, 1e-9)
-    return np.where(weight > 0.3, smooth, kernels.NO_GROUND).astype(np.float32), origin
+    return np.concatenate(found)
+
+
+def _stereo_points(pixels: TrainingPixels) -> Array:
+    """Points (k, 3) [m] of the stereo depths in `pixels.frames`, up to `_REACH` away."""
+    found = [np.zeros((0, 3))]
+    for i in pixels.frames.tolist():
+        rows = pixels.stereo.of_frame(i)
+        rays, distance = unproject(pixels.stereo.pixel[rows], pixels.intrinsics[i]), pixels.stereo.distance[rows]
+        near = distance < _REACH
+        depth = distance[near] / np.linalg.norm(rays[near], axis=1)
+        pose = pixels.cameras.camera_to_world[i]
+        found.append(rays[near] * depth[:, None] @ pose[:3, :3].T + pose[:3, 3])
+    return np.concatenate(found)
 
 
 def _surface_pixels(baked: BakedField, pixels: TrainingPixels, ground: Detail, seed: int) -> SurfacePixels:

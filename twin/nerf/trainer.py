@@ -35,7 +35,15 @@ from twin.nerf.buffers import (
     single_threaded_torch,
     warp_view,
 )
-from twin.nerf.dataset import RayBatch, TrainingPixels, constant_height, free_segments, join_depths, random_free_points
+from twin.nerf.dataset import (
+    DepthSupervision,
+    RayBatch,
+    TrainingPixels,
+    constant_height,
+    free_segments,
+    join_depths,
+    random_free_points,
+)
 from twin.nerf.detail import fit_detail
 from twin.nerf.evaluate import cross_lighting, evaluate
 from twin.nerf.field import FieldSection, RadianceField, untrained_field
@@ -383,8 +391,10 @@ def train_field(
     seed: int = 0,
     camera_height: float = 0.0,
     device: str | None = None,
-) -> tuple[RadianceField, dict[str, Any], Cameras, list[NDArray[np.bool_]], Poles]:
-    """Trains a field; returns it, training metrics, cameras (refined if configured), `Trainer.excluded`, and poles.
+) -> tuple[RadianceField, dict[str, Any], Cameras, list[NDArray[np.bool_]], Poles, DepthSupervision]:
+    """Trains a field.
+
+    Returns it, training metrics, cameras (refined if configured), `Trainer.excluded`, poles, and stereo depths.
 
     `camera_height` [m] is the constant height of the camera above the ground, 0 if it is not constant; for `device` see
     `buffers.resolve_device`. Raises InputError if training diverges.
@@ -438,6 +448,7 @@ def train_field(
         cameras,
         trainer.excluded,
         trainer.poles,
+        trainer.pixels.stereo,
     )
 
 
@@ -466,9 +477,10 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
     height = constant_height(read_json(scene.stage("metric") / "metric.json")) if config.mjcf.route else 0.0
     # A capture around an object has no road to divide.
     nerf = config.nerf if config.mjcf.route else replace(config.nerf, section_length=0.0)
-    field, metrics, cameras, excluded, poles = train_field(cameras, points, nerf, config.seed, height, device)
+    field, metrics, cameras, excluded, poles, stereo = train_field(cameras, points, nerf, config.seed, height, device)
     return_memory()
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
+    pixels.stereo = stereo
     if any(mask.any() for mask in excluded):
         pixels.exclude(excluded)
         write_image(out / "excluded.jpg", excluded_picture(pixels, excluded))

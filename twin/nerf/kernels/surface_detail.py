@@ -33,6 +33,7 @@ MAX_FOOTPRINT = 1.5
 _UNKNOWN = 1.0e3  # [m] a greater interpolated height comes from a node without ground
 _MIN_DESCENT = 0.01  # least descent per meter along a ray that can meet the ground
 _TOLERANCE, _TOLERANCE_PER_METER = 0.08, 0.01  # [m], [m/m] a surface this close to the height map is ground
+_CONVERGED, _BISECTIONS = 0.01, 5  # share of the depth by which the last step of a converged iteration moves a hit
 _MAX_STRETCH = 4.0  # if a pixel's projection to the ground is longer than this times its width, the footprint grows
 _PRIME_Y = wp.uint32(2654435761)
 _PRIME_Z = wp.uint32(805459861)
@@ -102,8 +103,8 @@ def height_at(grid: DetailGrid, x: wp.float32, y: wp.float32) -> wp.float32:
 def surface_hit(grid: DetailGrid, o: wp.vec3f, ray: wp.vec3f, depth: wp.float32, per_pixel: wp.float32) -> Hit:
     """The hit of a ray from `o` that meets a surface at the z-depth `depth` [m].
 
-    `ray` is the ray's direction with unit z-depth, and `per_pixel` the width of a pixel per meter of depth. The ground
-    is nearly level, so two steps of a fixed-point iteration find it.
+    `ray` is the ray's direction with unit z-depth, and `per_pixel` the width of a pixel per meter of depth. Two steps
+    of a fixed-point iteration find level ground. At a kerb, they end on its two sides, and bisection finds it between.
     """
     x0 = o[0] - grid.origin[0]
     y0 = o[1] - grid.origin[1]
@@ -114,9 +115,19 @@ def surface_hit(grid: DetailGrid, o: wp.vec3f, ray: wp.vec3f, depth: wp.float32,
     per_descent = 1.0 / wp.max(-ray[2], _MIN_DESCENT * length)
     height = height_at(grid, x, y)
     if wp.abs(z - height) < _TOLERANCE + _TOLERANCE_PER_METER * depth and ray[2] < -_MIN_DESCENT * length:
+        first = wp.clamp((o[2] - height) * per_descent, 0.5 * depth, 1.5 * depth)
+        height = height_at(grid, x0 + ray[0] * first, y0 + ray[1] * first)
         t = wp.clamp((o[2] - height) * per_descent, 0.5 * depth, 1.5 * depth)
-        height = height_at(grid, x0 + ray[0] * t, y0 + ray[1] * t)
-        t = wp.clamp((o[2] - height) * per_descent, 0.5 * depth, 1.5 * depth)
+        if wp.abs(t - first) > _CONVERGED * depth:
+            near = wp.min(t, first)
+            far = wp.max(t, first)
+            for _ in range(_BISECTIONS):
+                t = 0.5 * (near + far)
+                height = height_at(grid, x0 + ray[0] * t, y0 + ray[1] * t)
+                if o[2] + ray[2] * t > height:
+                    near = t
+                else:
+                    far = t
         stretch = wp.max(1.0, length * per_descent * (1.0 / _MAX_STRETCH))
         if height < NO_GROUND:
             return Hit(x0 + ray[0] * t, y0 + ray[1] * t, height, t * per_pixel * stretch)
