@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates, median_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, median_filter
 
 from twin.geometry.cameras import pixel_grid, unproject
 from twin.nerf import network
@@ -38,7 +38,8 @@ _STEREO_GATE = 0.2  # [m] stereo depths farther from these heights are not on th
 _HEIGHT_VIEW = 160  # [px] width of the rendered views in which the ground is searched
 _REACH = 12.0  # [m] greatest z-depth of rendered ground, and greatest distance of stereo depths
 _MIN_UPRIGHT = 0.94  # least z of the ground's unit normal (20° from level)
-_MIN_SEEN = 8  # least number of points that determine a height
+_MIN_RENDERED, _MIN_STEREO = 8, 3  # least numbers of points that determine a height
+_MAX_GAP = 0.3  # [m] stereo heights extend this far into gaps
 _MIN_OPACITY = 0.98  # rays of greater opacity show a surface and nothing behind it
 _MIN_HITS = 24  # least number of training pixels in a stored tile
 _MAX_HITS = 8_000_000  # approximate upper limit of the training pixels used, which take 0.5 GB
@@ -124,7 +125,7 @@ def _height_map(baked: BakedField, pixels: TrainingPixels) -> tuple[NDArray[np.f
     if not len(rendered):
         return np.full((2, 2), kernels.NO_GROUND, np.float32), pixels.cameras.positions[:, :2].min(0)
     origin = rendered[:, :2].min(0) - _SMOOTH_CELL
-    smooth, seen = _medians(rendered, origin, _SMOOTH_CELL)
+    smooth, seen = _medians(rendered, origin, _SMOOTH_CELL, _MIN_RENDERED)
     weight = gaussian_filter(seen.astype(float), 1.0)
     smooth = gaussian_filter(smooth, 1.0) / np.maximum(weight, 1e-9)
     fine = _SMOOTH_CELL / _HEIGHT_CELL
@@ -138,17 +139,20 @@ def _height_map(baked: BakedField, pixels: TrainingPixels) -> tuple[NDArray[np.f
     inside = ((node >= 0) & (node < shape)).all(1)
     node, stereo = node[inside], stereo[inside]
     near = known[tuple(node.T)] & (np.abs(stereo[:, 2] - heights[tuple(node.T)]) < _STEREO_GATE)
-    sharp, seen = _medians(stereo[near], origin, _HEIGHT_CELL, shape)
-    heights = median_filter(np.where(seen, sharp, heights), 3)
+    sharp, seen = _medians(stereo[near], origin, _HEIGHT_CELL, _MIN_STEREO, shape)
+    if seen.any():
+        # The smooth heights in a small gap would be a dent in a kerb.
+        gap, nearest = distance_transform_edt(~seen, return_indices=True)
+        heights = median_filter(np.where(gap * _HEIGHT_CELL < _MAX_GAP, sharp[tuple(nearest)], heights), 3)
     return np.where(known, heights, kernels.NO_GROUND).astype(np.float32), origin
 
 
 def _medians(
-    xyz: Array, origin: Array, cell: float, shape: tuple[int, ...] | None = None
+    xyz: Array, origin: Array, cell: float, least: int, shape: tuple[int, ...] | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Median z of the points within half a cell of each node of a grid, 0 where there are few, and the mask of others.
+    """Median z of the points within half a cell of each node of a grid, and the mask of nodes with `least` points.
 
-    The default `shape` covers all points.
+    Where there are fewer, the median is 0. The default `shape` covers all points.
     """
     node = np.floor((xyz[:, :2] - origin) / cell + 0.5).astype(np.int64)
     size = tuple(node.max(0) + 2) if shape is None else shape
@@ -156,7 +160,7 @@ def _medians(
     order = np.lexsort((xyz[:, 2], flat))
     first = np.flatnonzero(np.diff(flat[order], prepend=-1))
     count = np.diff(first, append=len(order))
-    enough = count >= _MIN_SEEN
+    enough = count >= least
     at = np.unravel_index(flat[order[first[enough]]], size)
     out, seen = np.zeros(size), np.zeros(size, bool)
     out[at], seen[at] = xyz[order[(first + count // 2)[enough]], 2], True
