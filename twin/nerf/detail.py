@@ -1,8 +1,8 @@
 """Fits the detail of a baked field to the training frames; `kernels/surface_detail.py` defines the terms.
 
 Bricks blur surfaces that are seen at grazing angles, above all the ground: a ray passes through many cells before it is
-blocked. The point where it meets the surface is known more precisely: on the ground to a few centimeters, as the
-height of the ground is smooth. Detail adds features at that point, which correct those of the bricks.
+blocked. The point where it meets the surface is known more precisely: on the ground to about a centimeter, as stereo
+shows its height. Detail adds features at that point, which correct those of the bricks.
 """
 
 import math
