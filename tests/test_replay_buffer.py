@@ -37,13 +37,17 @@ class NaiveEnvs:
         action, reward = self.rng.uniform(-1, 1, (ENVS, 2)).astype(np.float32), self.rng.normal(size=ENVS)
         self.left -= 1
         done, cut = self.left == 0, self.rng.random(ENVS) < 0.5
-        infos = [{"TimeLimit.truncated": bool(d and c)} for d, c in zip(done, cut, strict=True)]
+        arrived = self.rng.random(ENVS) < 0.3  # which is no end, either
+        infos = [
+            {"TimeLimit.truncated": bool(d and c), "cause": ("goal" if a else "out_of_bounds") if d else ""}
+            for d, c, a in zip(done, cut, arrived, strict=True)
+        ]
         states, firsts = self.rng.normal(size=(2, ENVS, STATES)).astype(np.float32)
         for info, state, first in zip(infos, states, firsts, strict=True):
             info |= {"state": state, "first_state": first}
         buffer.add(before, after, action, reward, done, infos)
         for i in range(ENVS):
-            end = done[i] and not cut[i]
+            end = done[i] and not cut[i] and not arrived[i]
             told = self.state[i].copy(), states[i]
             self.seen[i].append((before[i], after[i], action[i], np.float32(reward[i]), end, told))
         self.state = np.where(done[:, None], firsts, states)

@@ -57,9 +57,9 @@ _SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point of the route is searched th
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, as multiples of the controller's limits
-START_VERSION = 2
-"""Version of the starts with `Options.start_along`. Increase it whenever a change of the code changes the starts of a
-seed, or when their episodes are cut off."""
+EPISODE_VERSION = 3
+"""Version of the episodes of a training. Increase it whenever a change of the code changes the starts of a seed with
+`Options.start_along`, when these episodes are cut off, or which ends of episodes are terminal."""
 # With `Options.start_along`: the share of episodes that start beyond the segment's start, their largest distance from
 # the route at the start, as a fraction of the corridor's half width, and the time after which they are cut off [s].
 # Without them, a training on a long route sees few lightings, and few pictures from beside the route.

@@ -160,11 +160,9 @@ class TrainConfig:
         return Condition(HELD_OUT, True) if self.lighting_varies else Condition(self.lighting)
 
     def options(self) -> dict[str, Any]:
-        # The goal's reward equals the discounted sum of step rewards for ever; for less, a policy would linger before
-        # the goal. The loss of reward beside the route keeps policies off the curb, where one disturbance ends an
-        # episode.
-        goal = Rewards.step * self.gamma / (1.0 - self.gamma)
-        rewards = Rewards(goal=goal, cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
+        # The loss of reward beside the route keeps policies off the curb, where one disturbance ends an episode. The goal
+        # needs no reward, since a training goes on there as if the road did (`FrameReplayBuffer.add`).
+        rewards = Rewards(cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
         ranges = Ranges() if self.lighting_varies else _ROBOT_ONLY
         return {
             **dataclasses.asdict(self.control),

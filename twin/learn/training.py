@@ -37,7 +37,7 @@ from twin import runtime
 from twin.config import Condition
 from twin.env.env_factory import fingerprint
 from twin.env.options import CUDA
-from twin.env.task import START_VERSION
+from twin.env.task import EPISODE_VERSION
 from twin.env.vector_env import default_processes
 from twin.errors import InputError
 from twin.evaluation.training_curves import CHOICE_FILE
@@ -288,7 +288,7 @@ def run_settings(twin: Twin, config: TrainConfig) -> dict[str, Any]:
 
     The values are JSON types, as read from `config.json`.
     """
-    road = digest_json([fingerprint(twin, config.task, Condition(config.lighting, config.randomise)), START_VERSION])
+    road = digest_json([fingerprint(twin, config.task, Condition(config.lighting, config.randomise)), EPISODE_VERSION])
     return dict(json.loads(json.dumps({**dataclasses.asdict(config), "road": road})))
 
 
