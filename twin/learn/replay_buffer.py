@@ -246,8 +246,8 @@ class FrameReplayBuffer(ReplayBuffer):
                 self._state[i] = infos[i]["first_state" if done[i] else "state"]
         self.actions[self.pos] = action.reshape(self.n_envs, self.action_dim)
         self.rewards[self.pos] = reward
-        # An episode cut off by its time limit does not end in a terminal state. Nor does one at the goal: as if the road
-        # went on, the middle of the corridor is worth as much there as before. With a reward for the goal instead,
+        # An episode cut off by its time limit does not end in a terminal state. Nor does one at the goal: the middle of
+        # the corridor is worth as much there as before, as if the road went on. With a reward for the goal instead,
         # however large, policies steered half as much in the last 2 m, and left the corridor.
         self.ends[self.pos] = [
             d and not (info.get("TimeLimit.truncated") or info.get("cause") == "goal")

@@ -160,8 +160,8 @@ class TrainConfig:
         return Condition(HELD_OUT, True) if self.lighting_varies else Condition(self.lighting)
 
     def options(self) -> dict[str, Any]:
-        # The loss of reward beside the route keeps policies off the curb, where one disturbance ends an episode. The goal
-        # needs no reward, since a training goes on there as if the road did (`FrameReplayBuffer.add`).
+        # The loss of reward beside the route keeps policies off the curb, where one disturbance ends an episode. The
+        # goal needs no reward, since it is no end for the replay buffer.
         rewards = Rewards(cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
         ranges = Ranges() if self.lighting_varies else _ROBOT_ONLY
         return {
