@@ -124,7 +124,7 @@ class Floor:
 def test_stereo_makes_the_height_map_sharp_where_it_sees_the_ground(tmp_path):
     cameras = make_cameras(tmp_path)
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
-    smooth, origin = detail._height_map(Floor(), pixels)
+    smooth, origin = detail._height_map(Floor(), pixels, join_depths([]))
     known = smooth < kernels.NO_GROUND
     assert known.sum() > 500 and np.abs(smooth[known]).max() < 1e-6
     # The floor is 0.1 m higher where y > 0.2 m; a bin, 0.5 m high, stands on it.
@@ -142,8 +142,8 @@ def test_stereo_makes_the_height_map_sharp_where_it_sees_the_ground(tmp_path):
         t = np.where(bin_there, (pose[2, 3] - 0.5) / np.maximum(-world[:, 2], 1e-3), t)
         far = np.full(len(t), i, np.int32), pixel, (t * np.linalg.norm(ray, axis=1)).astype(np.float32)
         parts.append(DepthSupervision(*far).select(world[:, 2] < -0.1))
-    pixels.stereo = join_depths(parts)
-    sharp, same = detail._height_map(Floor(), pixels)
+    stereo = join_depths(parts)
+    sharp, same = detail._height_map(Floor(), pixels, stereo)
     assert np.array_equal(same, origin) and np.array_equal(sharp < kernels.NO_GROUND, known)
     x, y = np.moveaxis(np.indices(sharp.shape), 0, -1).reshape(-1, 2).T * detail._HEIGHT_CELL + origin[:, None]
     near = known.ravel() & (np.abs(x - 4.0) < 1.5) & (np.abs(y) < 1.0)
@@ -152,8 +152,7 @@ def test_stereo_makes_the_height_map_sharp_where_it_sees_the_ground(tmp_path):
     assert np.abs(z[near & (y < 0.08)]).max() < 0.01  # and where the bin stands
     # Frames of another section do not count.
     few = pixels.of_frames(np.arange(7))
-    few.stereo = pixels.stereo.select(pixels.stereo.frame > 6)
-    alone, _ = detail._height_map(Floor(), few)
+    alone, _ = detail._height_map(Floor(), few, stereo.select(stereo.frame > 6))
     assert np.abs(alone[alone < kernels.NO_GROUND]).max() < 1e-6
 
 
@@ -282,7 +281,7 @@ def test_a_ray_shows_detail_by_its_opacity():
 def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path, device):
     cameras = make_cameras(tmp_path)
     config = replace(CONFIG, steps=120, rays=512, samples=12, levels=4, log2_table=12)
-    field, *_ = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device=device)
+    field, *_, stereo = train_field(cameras, floor_points(cameras), config, seed=0, camera_height=1.5, device=device)
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     plain, _ = bake(field, pixels, seed=1, steps=60, max_bricks=1500)
     view = Viewpoints.of(cameras.camera_to_world[2:3], K, (WIDTH, HEIGHT))
@@ -290,7 +289,7 @@ def test_detail_sharpens_repeats_and_survives_the_disk(tmp_path, device):
     fields = []
     for _ in range(2):
         fields.append(plain.alone(0))
-        facts = fit_detail(fields[-1], field.appearance, pixels, seed=0, passes=30.0)
+        facts = fit_detail(fields[-1], field.appearance, pixels, stereo, seed=0, passes=30.0)
         assert facts["pixels"] > 100 and facts["psnr_after"] > facts["psnr_before"] + 0.2
     after, again = (f.render(view, "day") for f in fields)
     # On a GPU, the order of sums changes from run to run.

@@ -20,7 +20,7 @@ from twin.nerf import road as road_module
 from twin.nerf.bake import bake
 from twin.nerf.baked import BakedField
 from twin.nerf.baked_arrays import BakedSection
-from twin.nerf.dataset import TrainingPixels
+from twin.nerf.dataset import TrainingPixels, join_depths
 from twin.nerf.detail import fit_detail
 from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
@@ -264,7 +264,7 @@ def test_field_of_two_sections_learns_renders_and_survives_the_disk(tmp_path, mo
     pixels = TrainingPixels(cameras, SparsePoints.empty(), WIDTH)
     baked, facts = bake(field, pixels, steps=30, max_bricks=1500)
     assert facts["bricks_near"] + facts["bricks_far"] <= 3000
-    assert fit_detail(baked, field.appearance, pixels, seed=0, passes=2.0)["pixels"] > 0
+    assert fit_detail(baked, field.appearance, pixels, join_depths([]), seed=0, passes=2.0)["pixels"] > 0
     scores = evaluate(field, cameras, WIDTH, baked=baked)
     for name in ("day", "night"):
         assert scores["psnr"][name] > 16.0

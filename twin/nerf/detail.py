@@ -21,7 +21,7 @@ from twin.nerf.appearance import Appearance
 from twin.nerf.baked import BakedField
 from twin.nerf.baked_arrays import Detail, detail_grid
 from twin.nerf.buffers import parallel, part_count, shard_count, single_threaded_torch, warp_view
-from twin.nerf.dataset import TrainingPixels
+from twin.nerf.dataset import DepthSupervision, TrainingPixels
 from twin.nerf.kernels import surface_detail as kernels
 from twin.nerf.kernels import volume
 from twin.runtime import bar
@@ -66,7 +66,12 @@ class SurfacePixels:
 
 
 def fit_detail(
-    baked: BakedField, appearance: Appearance, pixels: TrainingPixels, seed: int, passes: float
+    baked: BakedField,
+    appearance: Appearance,
+    pixels: TrainingPixels,
+    stereo: DepthSupervision,
+    seed: int,
+    passes: float,
 ) -> dict[str, Any]:
     """Fits detail to the training frames and adds it to a baked field; returns a summary.
 
@@ -74,12 +79,13 @@ def fit_detail(
         baked: The field that the detail is added to.
         appearance: Embeddings of the training frames.
         pixels: Training frames of the field.
+        stereo: Depths in these frames, from which the height of the ground is known; may be empty.
         seed: Seed of the order of pixels.
         passes: How often every usable training pixel is used.
     """
     facts = []
     for k, frames in enumerate(baked.road.frames(pixels.cameras.positions)):
-        detail, about = _section_detail(baked.alone(k), appearance, pixels.of_frames(frames), seed + k, passes)
+        detail, about = _section_detail(baked.alone(k), appearance, pixels.of_frames(frames), stereo, seed + k, passes)
         if detail is not None:
             baked.set_detail(k, detail)
             facts.append(about)
@@ -91,10 +97,15 @@ def fit_detail(
 
 
 def _section_detail(
-    baked: BakedField, appearance: Appearance, pixels: TrainingPixels, seed: int, passes: float
+    baked: BakedField,
+    appearance: Appearance,
+    pixels: TrainingPixels,
+    stereo: DepthSupervision,
+    seed: int,
+    passes: float,
 ) -> tuple[Detail | None, dict[str, Any]]:
     """Detail of a field of one section, or None if no pixel shows a near surface; and a summary."""
-    ground = Detail.without_features(*_height_map(baked, pixels), _HEIGHT_CELL)
+    ground = Detail.without_features(*_height_map(baked, pixels, stereo), _HEIGHT_CELL)
     seen = _surface_pixels(baked, pixels, ground, seed)
     if not len(seen.hits):
         return None, {}
@@ -115,7 +126,9 @@ def _section_detail(
     }
 
 
-def _height_map(baked: BakedField, pixels: TrainingPixels) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+def _height_map(
+    baked: BakedField, pixels: TrainingPixels, stereo: DepthSupervision
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Heights of the ground (along x, along y) [m], and the lowest corner of their grid.
 
     Rendered depth shows where the ground is, but it smooths kerbs. Stereo depths near the ground replace it where there
@@ -134,12 +147,12 @@ def _height_map(baked: BakedField, pixels: TrainingPixels) -> tuple[NDArray[np.f
     known = map_coordinates(weight, nodes, order=1, mode="nearest") > 0.3
     heights = map_coordinates(smooth, nodes, order=1, mode="nearest")
 
-    stereo = _stereo_points(pixels)
-    node = np.floor((stereo[:, :2] - origin) / _HEIGHT_CELL + 0.5).astype(np.int64)
+    points = _stereo_points(pixels, stereo)
+    node = np.floor((points[:, :2] - origin) / _HEIGHT_CELL + 0.5).astype(np.int64)
     inside = ((node >= 0) & (node < shape)).all(1)
-    node, stereo = node[inside], stereo[inside]
-    near = known[tuple(node.T)] & (np.abs(stereo[:, 2] - heights[tuple(node.T)]) < _STEREO_GATE)
-    sharp, seen = _medians(stereo[near], origin, _HEIGHT_CELL, _MIN_STEREO, shape)
+    node, points = node[inside], points[inside]
+    near = known[tuple(node.T)] & (np.abs(points[:, 2] - heights[tuple(node.T)]) < _STEREO_GATE)
+    sharp, seen = _medians(points[near], origin, _HEIGHT_CELL, _MIN_STEREO, shape)
     if seen.any():
         # The smooth heights in a small gap would be a dent in a kerb.
         gap, nearest = distance_transform_edt(~seen, return_indices=True)
@@ -186,12 +199,12 @@ def _level_points(baked: BakedField, pixels: TrainingPixels) -> Array:
     return np.concatenate(found)
 
 
-def _stereo_points(pixels: TrainingPixels) -> Array:
+def _stereo_points(pixels: TrainingPixels, stereo: DepthSupervision) -> Array:
     """Points (k, 3) [m] of the stereo depths in `pixels.frames`, up to `_REACH` away."""
     found = [np.zeros((0, 3))]
     for i in pixels.frames.tolist():
-        rows = pixels.stereo.of_frame(i)
-        rays, distance = unproject(pixels.stereo.pixel[rows], pixels.intrinsics[i]), pixels.stereo.distance[rows]
+        rows = stereo.of_frame(i)
+        rays, distance = unproject(stereo.pixel[rows], pixels.intrinsics[i]), stereo.distance[rows]
         near = distance < _REACH
         depth = distance[near] / np.linalg.norm(rays[near], axis=1)
         pose = pixels.cameras.camera_to_world[i]

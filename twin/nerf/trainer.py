@@ -480,14 +480,13 @@ def run(scene: SceneDir, config: SceneConfig, out: Path, device: str | None = No
     field, metrics, cameras, excluded, poles, stereo = train_field(cameras, points, nerf, config.seed, height, device)
     return_memory()
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
-    pixels.stereo = stereo
     if any(mask.any() for mask in excluded):
         pixels.exclude(excluded)
         write_image(out / "excluded.jpg", excluded_picture(pixels, excluded))
     baked, metrics["bake"] = bake(field, pixels, config.seed, config.nerf.bake_steps, config.nerf.max_bricks)
     return_memory()
     if config.nerf.detail_passes > 0.0:
-        metrics["detail"] = fit_detail(baked, field.appearance, pixels, config.seed, config.nerf.detail_passes)
+        metrics["detail"] = fit_detail(baked, field.appearance, pixels, stereo, config.seed, config.nerf.detail_passes)
     metrics |= evaluate(field, cameras, config.nerf.max_width, baked=baked)
     metrics["cross_lighting"] = cross_lighting(baked, cameras)
     about = {
