@@ -325,7 +325,7 @@ def test_a_run_of_an_earlier_version_is_refused(tmp_path):
     check_same(tmp_path, {"road": "x", "steps": 9})
 
 
-def test_a_run_with_other_starts_is_refused(scene, tmp_path, monkeypatch):
+def test_a_run_with_other_episodes_is_refused(scene, tmp_path, monkeypatch):
     place = twin.load_scene(scene)
     write_json(tmp_path / "config.json", training.run_settings(place, SHORT))
     check_same(tmp_path, training.run_settings(place, SHORT))

@@ -248,7 +248,7 @@ class FrameReplayBuffer(ReplayBuffer):
         self.rewards[self.pos] = reward
         # An episode cut off by its time limit does not end in a terminal state. Nor does one at the goal: the middle of
         # the corridor is worth as much there as before, as if the road went on. With a reward for the goal instead,
-        # however large, policies steered half as much in the last 2 m, and left the corridor.
+        # however large, a policy steers the less, the nearer the goal is (docs/findings.md, "The end of a task").
         self.ends[self.pos] = [
             d and not (info.get("TimeLimit.truncated") or info.get("cause") == "goal")
             for d, info in zip(done, infos, strict=True)
