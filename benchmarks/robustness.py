@@ -198,7 +198,7 @@ import twin
 from twin.learn.train_config import TrainConfig
 from twin.learn.training import train
 small = TrainConfig(task="ahead", lighting="day", steps=int(sys.argv[3]), worlds=4, starts=40, batch=16, buffer=400,
-    convolutions=((8, 8, 8),), features=16, hidden=(16,), save_every=80, checkpoints=6, updates=0.25)
+    convolutions=((8, 8, 8),), features=16, hidden=(16,), save_every=80, checkpoints=6, updates=0.25, teacher_steps=80)
 train(twin.load_scene(sys.argv[1]), Path(sys.argv[2]), small)
 """
 

@@ -61,7 +61,7 @@ import twin
 from twin.learn.training import TrainConfig, train
 
 small = TrainConfig(task="route", lighting="training", steps=96, worlds=4, starts=40, batch=16, buffer=400, updates=0.5,
-    convolutions=((8, 8, 8),), features=16, hidden=(16,), save_every=48, checkpoints=2)
+    teacher_steps=80, convolutions=((8, 8, 8),), features=16, hidden=(16,), save_every=48, checkpoints=2)
 train(twin.load_scene(sys.argv[1]), Path(sys.argv[2]), small)
 """
 

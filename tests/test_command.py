@@ -72,7 +72,7 @@ def test_help_of_train_states_its_defaults(capsys):
         assert option[option.index("(default: ") :].startswith(f"(default: {getattr(plain, name)})"), name
         assert PRESETS["gpu"].get(name, getattr(plain, name)) == getattr(plain, name)
     assert f"default: {plain.action}" in shown and f"default: {plain.lighting}," in shown
-    assert plain.randomise and plain.privileged
+    assert plain.randomise
 
 
 def test_help_agrees_with_what_the_verbs_take(capsys):

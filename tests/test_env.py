@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -24,6 +25,7 @@ from twin.env.env_factory import EnvFactory
 from twin.env.episode_lighting import mixture_text
 from twin.env.gym_env import DriveEnv
 from twin.env.mujoco_renderer import chase_poses
+from twin.env.obstacles import RADIUS
 from twin.env.options import parse_options
 from twin.env.picture_effects import CameraOptions
 from twin.env.task import Motion
@@ -147,7 +149,7 @@ def test_vector_environment_equals_single_environments(scene, name):
     envs.close()
 
 
-@pytest.mark.parametrize(("state", "size"), [("odometry", 2), ("privileged", 7)])
+@pytest.mark.parametrize(("state", "size"), [("odometry", 2), ("privileged", 10)])
 def test_images_and_state_come_as_a_dict(scene, state, size):
     from stable_baselines3 import PPO
 
@@ -296,42 +298,70 @@ def test_starts_are_spread_as_stated(scene):
     assert np.allclose(along, 0.5, atol=0.1)
 
 
-def test_start_along_moves_most_starts_along_and_beside_the_route(scene):
-    plain = twin.load(scene, "route", pixels=False)
+def test_start_along_moves_starts_along_and_beside_the_route(scene):
     environment = twin.load(scene, "route", pixels=False, start_along=0.6)
     length, half_width = environment.task.segment.length, environment.task.half_width
-    starts, offsets = [], []
+    starts, offsets, turns = [], [], []
     for seed in range(120):
-        for one in (plain, environment):
-            one.task.seed(seed)
-            one.reset()
+        environment.task.seed(seed)
+        environment.reset()
         info = environment.task.info(environment.physics)
         starts.append(info["start"])
         offsets.append(info["cross_track"])
+        turns.append(environment.task.state(environment.physics)[3])
         assert info["progress"] == pytest.approx(info["start"], abs=0.1) and environment.task.cause == ""
-        if not info["start"]:
-            np.testing.assert_array_equal(environment.physics.planar_pose, plain.physics.planar_pose)
-    share, beside = np.array(starts) / length, np.abs(offsets)
-    assert 0.1 < (share == 0.0).mean() < 0.3
-    assert 0.5 < share.max() <= 0.6 and np.std(share[share > 0.0]) > 0.1
-    assert beside[share == 0.0].max() < 0.32 and 0.6 < beside[share > 0.0].max() / half_width < 0.72
-    with pytest.raises(InputError, match="start_along"):
-        twin.load(scene, "route", pixels=False, start_along=1.0)
+    share = np.array(starts) / length
+    assert 0.5 < share.max() <= 0.6 and 0.0 < share.min() < 0.05 and np.std(share) > 0.1
+    assert 0.7 < np.abs(offsets).max() / half_width < 0.82
+    assert 17.0 < np.rad2deg(np.abs(turns).max()) < 21.0
+    for wrong in ({"start_along": 1.0}, {"along_time": 0.0}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            twin.load(scene, "route", pixels=False, **wrong)
 
 
-def test_episodes_that_start_along_the_route_are_cut_off(scene):
-    environment = twin.load(scene, "route", pixels=False, start_along=0.6)
-    ends = set()
-    for seed in range(12):
-        environment.task.seed(seed)
-        step, count = environment.reset(), 0
-        while not step.last():
-            step, count = environment.step([0.1, 0.0] if count % 40 else [0.0, 0.0]), count + 1
-        along = environment.task.info(environment.physics)["start"] > 0.0
-        cut = environment.task.cause == ""
-        assert cut == (along and count == 150) and (not cut or (step.discount, step.reward) == (1.0, 0.1))
-        ends.add((along, cut))
-    assert ends >= {(True, True), (False, False)}
+@pytest.mark.parametrize(("along", "time", "count"), [(0.6, 3.0, 30), (0.6, 0.8, 8), (0.0, 0.8, 40)])
+def test_episodes_that_start_along_the_route_are_cut_off(scene, along, time, count):
+    options = {"pixels": False, "start_along": along, "along_time": time, "start_offset": 0.0, "start_heading": 0.0}
+    environment = twin.load(scene, "route", seed=1, **options)
+    step, steps = environment.reset(), 0
+    while not step.last() and steps < count:
+        step, steps = environment.step([0.1, 0.0]), steps + 1
+    assert steps == count and environment.task.cause == "" and step.last() == (along > 0.0)
+    assert step.reward == 0.1 and step.discount == 1.0
+
+
+def test_the_state_has_the_first_obstacle_in_reach(scene):
+    """Behind the robot, too, until it has passed; not beyond 6 m, nor where the robot cannot touch it."""
+    still = {"start_offset": 0.0, "start_heading": 0.0, "pixels": False}
+    cones = [
+        ObstacleConfig("far", "cone", 9.0, 0.2),
+        ObstacleConfig("near", "box", 3.0, -0.3, size=(0.6, 0.8, 0.5)),
+        ObstacleConfig("aside", "cone", 2.0, 3.0),
+        ObstacleConfig("walker", "pedestrian", 4.5, 3.0, to=(4.5, -3.0), speed=1.0),
+    ]
+
+    def told(obstacles: list[ObstacleConfig], steps: int = 0) -> list[float]:
+        environment = twin.load(scene, "route", obstacles=obstacles, **still)
+        out = environment.reset()
+        for _ in range(steps):
+            out = environment.step([1.0, 0.0])
+        own = environment.task.state(environment.physics)
+        np.testing.assert_array_equal(own[7:], out.observation["obstacle"])
+        return (own[7:] + np.array([own_station(environment), own[2], 0.0])).tolist()
+
+    def own_station(environment) -> float:
+        return environment.task.progress + environment.task.segment.start
+
+    start = twin.load(scene, "route", **still)
+    start.reset()
+    assert told([]) == pytest.approx([6.0 + own_station(start), start.task.cross_track, 0.0], abs=0.02)
+    assert told(cones[:1]) == told([])  # too far away
+    assert told(cones[:3]) == pytest.approx([3.0, -0.3, 0.5], abs=0.02)
+    assert told(cones[2:3]) == told([])
+    assert told(cones[2:]) == told([])  # the walker is still aside
+    assert told([cones[0]], steps=45)[:2] == pytest.approx([9.0, 0.2], abs=0.05)
+    crossing = told([replace(cones[3], station=6.0, to=(6.0, -3.0))], steps=25)
+    assert crossing == pytest.approx([6.0, 0.5, RADIUS["pedestrian"]], abs=0.05)
 
 
 def test_lighting_and_robot_do_not_change_the_start(scene):
@@ -552,8 +582,8 @@ def test_a_chase_view_follows_the_robot_and_shows_its_obstacles(scene):
 def test_a_state_never_leaves_its_bounds(scene):
     environment = DriveEnv(scene, "bend", pixels=False, start_offset=2.0, start_heading=180.0)
     space = environment.observation_space
-    assert np.isfinite(space.low).all() and np.isfinite(space.high).all() and space.shape == (7,)
-    np.testing.assert_allclose(space.high[3:], np.pi, rtol=1e-6)
+    assert np.isfinite(space.low).all() and np.isfinite(space.high).all() and space.shape == (10,)
+    np.testing.assert_allclose(space.high[3:7], np.pi, rtol=1e-6)
     rng = np.random.default_rng(0)
     for seed in range(20):
         observation, _ = environment.reset(seed=seed)
@@ -577,7 +607,7 @@ def test_a_fresh_process_makes_it_by_its_full_name_without_torch(scene):
         "print(env.reset(seed=0)[0].shape, 'torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout.strip() == "(7,) False", done.stderr
+    assert done.stdout.strip() == "(10,) False", done.stderr
 
 
 def test_wrong_gymnasium_arguments_are_refused(scene):

@@ -5,7 +5,6 @@ import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -113,7 +112,7 @@ def test_the_learning_rate_falls_in_the_second_half_of_a_cycle_and_while_settlin
     assert training.cycle_rate(short, 1_500) == rate and training.cycle_rate(short, 2_250) == pytest.approx(0.55 * rate)
 
     def settling(step):
-        return training._learning_rate(PLAN, SimpleNamespace(num_timesteps=step), selection.Segment(10_000, 8_000), 0.0)
+        return training._learning_rate(PLAN, step, selection.Segment(10_000, 8_000))
 
     assert settling(8_000) == training.cycle_rate(PLAN, 8_000) == pytest.approx(0.7 * rate)
     assert settling(9_000) == pytest.approx(0.4 * rate) and settling(10_000) == pytest.approx(0.1 * rate)

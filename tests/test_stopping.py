@@ -73,7 +73,8 @@ def cases(tmp_path_factory) -> dict[str, Case]:
     write_image(corridor / "photo.png", picture(pose_at(2.4, 0.2), tint=(0.9, 0.6, 0.4)))
     many, steps = str(_WOULD_TAKE["validate"]), str(_WOULD_TAKE["train"])
     validate = ("--policy", "ahead", "--task", "ahead", "--lightings", "day", "--episodes", many, "--processes", "2")
-    train = ("--task", "ahead", "--lighting", "day", "--run", "new", "--steps", steps, "--processes", "2")
+    short = ("--teacher-steps", "8", "--processes", "2")
+    train = ("--task", "ahead", "--lighting", "day", "--run", "new", "--steps", steps, *short)
     return {
         "build": Case((str(filmed), "--until", "metric"), "twin.capture.worker"),
         "train": Case((str(driven), *train), "twin.env.vector_env import serve", 2),

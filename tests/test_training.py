@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
 
@@ -30,8 +31,8 @@ from twin.evaluation.trials import csv_text
 from twin.files import write_json
 from twin.learn import selection, train_config, training
 from twin.learn.policy import load_policy
-from twin.learn.sac import PixelSAC
 from twin.learn.sb3_env import DriveVecEnv
+from twin.learn.teacher import STATE_SCALES, Teacher, load_teacher, teacher_result, train_teacher
 from twin.learn.train_config import TrainConfig
 from twin.learn.training import TRAINING_EPISODE_COLUMNS, Segment, _keep_rows, check_same, checkpoint_folder
 from twin.learn.training import train as train_policy
@@ -58,6 +59,8 @@ SHORT = TrainConfig(
     save_every=80,
     checkpoints=3,
     updates=0.25,
+    teacher_steps=80,
+    whole_worlds=4,
 )
 
 
@@ -95,9 +98,9 @@ def test_a_run_killed_at_random_three_times_finishes(scene, tmp_path):
     seeds = [r["seed"] for r in rows(folder / "episodes.csv")]
     assert len(set(seeds)) == len(seeds)
     assert [int(r["step"]) for r in rows(folder / "log.csv")] == [80, 160, 240]
-    with np.load(folder / "state" / head["folder"] / "replay.npz") as data:
-        assert data["age"].shape[0] == SHORT.buffer // SHORT.worlds
-        assert (data["written"] >= SHORT.steps // SHORT.worlds).all()
+    assert head["buffer"]["written"] >= SHORT.steps // SHORT.worlds
+    with np.load(folder / "state" / head["folder"] / "buffer.npz") as data:
+        assert data["ages"].shape[0] == SHORT.worlds and data["states"].shape[2] == len(STATE_SCALES)
     assert load_policy(folder)(np.zeros((12, 90, 160), np.uint8)).shape == (1,)
     assert len(list((folder / "checkpoints").iterdir())) >= 2
     assert load_file(folder / "state" / head["folder"] / "tensors.safetensors")
@@ -147,6 +150,7 @@ def test_the_verb_trains_and_refuses_what_it_cannot_begin_or_resume(scene, capsy
     for name, value in (("_BATCHES", (2,)), ("_TEST_EPISODES", 2), ("_ROUNDS", ((1, 2),)), ("FRESH_EPISODES", 3)):
         monkeypatch.setattr(selection, name, value)
     common = [str(scene), "--run", "one", "--quiet", "--worlds", "2", "--processes", "1", "--steps", "4"]
+    common += ["--teacher-steps", "8"]
     assert commands.main("train", [*common, "--task", "strait"]) == 2
     assert commands.main("train", [*common, "--task", "ahead", "--lighting", "dusk"]) == 2
     told = capsys.readouterr().err
@@ -174,17 +178,18 @@ def test_two_trainings_of_one_run_do_not_mix(scene, capsys):
 
 @pytest.mark.slow
 def test_resumptions_have_episodes_of_their_own(scene, tmp_path, monkeypatch):
-    given, whole = [], training.PreprocessedVecEnv.seed
+    given, whole = [], training.DriveVecEnv.seed
 
-    def spy(worlds, seed):
+    def spy(worlds, seed=None):
         given.append(seed)
         return whole(worlds, seed)
 
-    monkeypatch.setattr(training.PreprocessedVecEnv, "seed", spy)
+    monkeypatch.setattr(training, "_new_teacher", lambda *_: Teacher(1))
+    monkeypatch.setattr(training.DriveVecEnv, "seed", spy)
     for seed in (0, 1):
         for steps in (8, 16, 24):
             training.train(twin.load_scene(scene), tmp_path / str(seed), replace(SHORT, seed=seed, steps=steps))
-    assert len(given) == 12  # stable-baselines3 seeds with the run's seed before, which is without effect
+    assert len(given) == 12  # the environment is made with the run's seed, which is without effect
     worlds = [seed + i for seed in given[1::2] for i in range(SHORT.worlds)]
     assert len(set(worlds)) == len(worlds)
     others = [
@@ -239,7 +244,7 @@ def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run(twin.load_scene(scene), tmp_path, SHORT, interrupt)
     head = json.loads((tmp_path / "state" / "state.json").read_text())
-    assert (head["steps"], head["replay"]["pos"]) == (120, 30)
+    assert (head["steps"], head["buffer"]["written"]) == (120, 31)
     seen = []
     run(twin.load_scene(scene), tmp_path, SHORT, lambda steps, recent: seen.append(steps), processes=1)
     assert seen[0] == 124 and seen[-1] == SHORT.steps
@@ -247,14 +252,58 @@ def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     assert checkpoints == ["000000080", "000000160", "000000240"]
 
 
-def test_a_save_at_the_end_of_an_episode_logs_the_critics_values(scene, tmp_path, monkeypatch):
-    """stable-baselines3 clears what it logged every `log_interval` episodes; with few updates, some steps have none."""
-    learn = PixelSAC.learn
-    monkeypatch.setattr(PixelSAC, "learn", lambda *given, **rest: learn(*given, **(rest | {"log_interval": 1})))
-    config = replace(SHORT, steps=120, save_every=4, starts=0, updates=0.1)
+def test_the_log_has_the_policys_errors(scene, tmp_path):
+    config = replace(SHORT, steps=120, save_every=40, starts=0, updates=0.1)
     train_policy(twin.load_scene(scene), tmp_path, config, processes=1)
-    assert all(float(row["value"]) > -10 for row in rows(tmp_path / "log.csv")[5:])  # not NaN
-    assert rows(tmp_path / "episodes.csv")
+    errors = [(float(row["action_error"]), float(row["state_error"])) for row in rows(tmp_path / "log.csv")]
+    assert len(errors) == 3 and all(0.0 < one < 3.0 for row in errors for one in row)
+
+
+def test_a_teacher_is_trained_once_and_repeatably(scene, tmp_path, monkeypatch):
+    built = twin.load_scene(scene)
+    given = []
+    monkeypatch.setattr(training, "train_teacher", lambda *a: given.append(train_teacher(*a)) or given[-1])
+    for steps in (8, 16):
+        train_policy(built, tmp_path / "run", replace(SHORT, steps=steps), processes=1)
+    assert len(given) == 1
+    kept = load_teacher(tmp_path / "run/state", 1)
+    again, successes = train_teacher(built, SHORT, processes=1)
+    for a, b in zip(kept.state_dict().values(), again.state_dict().values(), strict=True):
+        assert torch.equal(a, b)
+    assert teacher_result(tmp_path / "run/state") == {"successes": successes, "trials": SHORT.worlds}
+    other, _ = train_teacher(built, replace(SHORT, seed=1), processes=1)
+    assert not torch.equal(other.mean.weight, again.mean.weight)
+    (tmp_path / "run/state/teacher.safetensors").write_bytes(b"")
+    with pytest.raises(InputError, match=r"teacher\.safetensors.*train again under another name"):
+        train_policy(built, tmp_path / "run", replace(SHORT, steps=24), processes=1)
+
+
+@pytest.mark.slow
+def test_a_teacher_learns_to_drive(scene):
+    teacher, successes = train_teacher(twin.load_scene(scene), TrainConfig(task="bend", lighting="day"))
+    assert successes == TrainConfig().worlds
+    states = torch.zeros((2, len(STATE_SCALES)))
+    states[:, 0], states[:, 2] = 1.0, torch.tensor([-0.5, 0.5])  # to the right of the route, and to the left
+    left, right = teacher(states).ravel().tolist()
+    assert left > 0.05 and right < -0.05
+
+
+def test_a_signal_stops_the_teacher(scene, tmp_path, monkeypatch):
+    whole = training.train_teacher
+
+    def interrupted(built, config, processes, watch):
+        def also(steps):
+            signal.raise_signal(signal.SIGTERM)
+            watch(steps)
+
+        return whole(built, config, processes, also)
+
+    monkeypatch.setattr(training, "train_teacher", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train_policy(twin.load_scene(scene), tmp_path, SHORT, processes=1)
+    assert not (tmp_path / "state/state.json").exists() and not (tmp_path / "state/teacher.safetensors").exists()
+    monkeypatch.setattr(training, "train_teacher", whole)
+    train_policy(twin.load_scene(scene), tmp_path, replace(SHORT, steps=8), processes=1)  # it begins again
 
 
 def test_fractions_of_updates_add_up(scene, tmp_path):
@@ -342,7 +391,9 @@ def test_configurations_set_the_environment():
     assert TrainConfig(observe="simulator").options()["randomise"] == day["randomise"]
     assert varied["rewards"].cross_track == -varied["rewards"].step and varied["start_along"] > 0.0
     assert varied["rewards"].steering == -0.5 * varied["rewards"].step
-    assert len(TrainConfig().state_scales) == 7 and TrainConfig(privileged=False).state_scales == ()
+    blind = TrainConfig(observe="simulator").teacher_options()
+    assert not blind["pixels"] and blind["randomise"] == day["randomise"] and blind["rewards"] == varied["rewards"]
+    assert TrainConfig(randomise=False).teacher_options()["randomise"] is None
 
 
 def test_states_are_those_of_the_environment(scene):
@@ -353,7 +404,7 @@ def test_states_are_those_of_the_environment(scene):
         *_, done, infos = env.step(np.array([[0.5], [-0.5]], np.float32))
         assert not done.any() and all("first_state" not in info for info in infos)
         for i, info in enumerate(infos):
-            assert info["state"].shape == (len(TrainConfig().state_scales),)
+            assert info["state"].shape == (len(STATE_SCALES),)
             assert info["state"][2] == pytest.approx(info["cross_track"], abs=1e-6)
             assert info["state"][0] == pytest.approx(info["speed"], abs=1e-6)
             assert np.sign(info["state"][1]) == (1, -1)[i]

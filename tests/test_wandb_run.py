@@ -90,6 +90,7 @@ def stand_in(tmp_path, monkeypatch):
 
 def trained(scene: Path, name: str, steps: int, *options: str) -> int:
     common = ["--task", "ahead", "--lighting", "day", "--worlds", "2", "--processes", "1", "--quiet"]
+    common += ["--teacher-steps", "8"]
     return commands.main("train", [str(scene), *common, "--run", name, "--steps", str(steps), *options])
 
 
@@ -125,7 +126,7 @@ def test_a_run_gets_the_numbers_of_the_tables(scene, tmp_path, stand_in):
         train_run(twin.load_scene(scene), tmp_path / "run", replace(SHORT, steps=160), processes=1, writers=[writer])
     assert stand_in.runs[0].given["name"] == "run"
     logged = stand_in.runs[0].rows
-    for table, columns in (("episodes", ("success", "progress_m", "reward")), ("log", ("steps_per_s", "ent_coef"))):
+    for table, columns in (("episodes", ("success", "progress_m", "reward")), ("log", ("steps_per_s", "updates"))):
         rows = list(csv.DictReader((tmp_path / "run" / f"{table}.csv").open(newline="")))
         assert rows
         for column in columns:
@@ -163,6 +164,7 @@ def test_the_package_writes_the_run_offline(scene):
     if importlib.util.find_spec("wandb") is None:
         pytest.skip("wandb is not installed")
     options = ["--task", "ahead", "--lighting", "day", "--worlds", "2", "--steps", "80", "--run", "offline", "--quiet"]
+    options += ["--teacher-steps", "8"]
     command = [sys.executable, "-m", "twin.train", str(scene), *options, "--wandb", "roads"]
     done = subprocess.run(command, env={**os.environ, "WANDB_MODE": "offline"}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -286,12 +286,18 @@ def _train(parser: argparse.ArgumentParser, add: _Add) -> None:
     add("--success", type=float, help="success rate in tests at which the training ends (default: 0.95)")
     steps = "largest number of control steps of all environments (default: 24000, more from 50 m on; gpu: 60000)"
     add("--steps", type=int, help=steps)
+    add("--teacher-steps", type=int, help="control steps of the teacher, which needs no pictures (default: 20000)")
     add("--worlds", type=int, help="number of parallel environments (default: 8; gpu: 32)")
     add("--processes", type=int, help="processes that step the environments (default: one per core, at most 16)")
     add("--device", choices=("cpu", "cuda"), help="where the networks are trained (default: cpu; preset gpu: cuda)")
-    add("--updates", type=float, help="network updates per control step (default: 0.5)")
-    add("--steering", type=float, help="penalty of full steering, as a share of a step's reward (default: 0.5)")
-    add("--entropy", type=float, help="target entropy per action component [nat]; higher explores more (default: -0.5)")
+    add("--updates", type=float, help="updates of the policy per control step (default: 0.5)")
+    add(
+        "--steering",
+        type=float,
+        help="teacher's penalty of full steering, as share of a step's reward (default: 0.5)",
+    )
+    entropy = "teacher's target entropy per action component [nat]; higher explores more (default: -0.5)"
+    add("--entropy", type=float, help=entropy)
     add("--colours", type=float, help="strength of color augmentation where the lighting varies (default: 1.0)")
     add("--seed", type=int, help="seed of every random draw (default: 0)")
     add(
@@ -299,12 +305,6 @@ def _train(parser: argparse.ArgumentParser, add: _Add) -> None:
         action=argparse.BooleanOptionalAction,
         default=None,
         help="randomize the robot and, where the lighting varies, weather and distractor objects (the default)",
-    )
-    add(
-        "--privileged",
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help="critics receive the robot's pose in training (the default); the policy never does",
     )
     add(
         "--wandb",

@@ -2,9 +2,9 @@
 
     twin train scenes/demo --task straight --run first
 
-A training ends when the success rate in tests without exploration reaches `--success`, when tests no longer improve, or
-at `--steps`. If a run was stopped or killed, the same command continues it. The policy is saved in `runs/<name>` of the
-scene's folder.
+First a teacher learns to drive by the robot's state; from pictures, the policy learns to act like it. A training ends
+when the success rate in tests without exploration reaches `--success`, when tests no longer improve, or at `--steps`. If
+a run was stopped or killed, the same command continues it. The policy is saved in `runs/<name>` of the scene's folder.
 """
 
 import argparse
@@ -54,6 +54,8 @@ def command(given: argparse.Namespace) -> None:
 
 
 def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
+    from twin.learn.teacher import teacher_result
+
     chosen = choice["chosen"]
     won, trials = chosen["successes"], chosen["trials"]
     low, high = wilson(won, trials)
@@ -68,6 +70,12 @@ def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
         f"The policy of step {chosen['step']:,} is kept. In {trials} fresh episodes ({chosen['condition']}) it arrives "
         f"{won} times (rate {won / trials:.2f}, 90 % interval {low:.2f} to {high:.2f}).",
     ]
+    taught = teacher_result(folder / "state")
+    if taught["successes"] < taught["trials"]:
+        lines.append(
+            f"Its teacher, which knows where the robot is, arrives only {taught['successes']} times in "
+            f"{taught['trials']} episodes; more --teacher-steps may help, or an easier task."
+        )
     if choice["failures"]:
         lines.append(f"Where the kept policy fails: {choice['failures']}.")
     return [*lines, f"Success during the training: {picture}"]

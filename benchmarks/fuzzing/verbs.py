@@ -23,7 +23,9 @@ _VALUES = (
 _OPTIONS: dict[str, dict[str, Sequence[str]]] = {
     "build": {"--until": ("mesh", "review"), "--force": ("mesh",), "--device": ("cuda", "tpu"), "--set": ()},
     "train": {
-        **dict.fromkeys(("--task", "--run", "--lighting", "--steps", "--worlds", "--processes", "--updates"), ()),
+        **dict.fromkeys(
+            ("--task", "--run", "--lighting", "--steps", "--teacher-steps", "--worlds", "--processes", "--updates"), ()
+        ),
         **dict.fromkeys(("--steering", "--entropy", "--colours", "--seed", "--observe", "--preset", "--action"), ()),
         "--device": ("cuda", "tpu"),
     },
@@ -52,7 +54,7 @@ _OPTIONS: dict[str, dict[str, Sequence[str]]] = {
 """Options of a verb that take a value, each with further values besides `_VALUES`."""
 _OUTPUTS = ("--out", "--glb", "--ply", "--usd", "--nerfstudio", "--colmap")
 _FLAGS = {
-    "train": ("--randomise", "--no-privileged"),
+    "train": ("--randomise", "--no-randomise"),
     "validate": ("--worst", "--films", "--trust"),
     "align": ("--level",),
     "film": ("--drift", "--randomise", "--trust"),

@@ -10,6 +10,7 @@ to its front, y to its left and z up; the origin is on the ground below its cent
 are in group `OBSTACLE_GROUP`; those that only collide are in the robot's collision group.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -280,20 +281,35 @@ def place(obstacles: Sequence[ObstacleConfig], data: mujoco.MjData, time: float)
 
 def obstacle_pose(obstacle: ObstacleConfig, route: Array, time: float) -> tuple[float, float, float]:
     """x, y [m] and yaw [rad] of an obstacle at a time [s]; a moving one goes back and forth along its line."""
+    station, lateral, direction = obstacle_station(obstacle, time)
+    x, y = _route_point(route, station, lateral)
+    return x, y, float(heading_at(route, station) + direction) + np.deg2rad(obstacle.yaw)
+
+
+def obstacle_station(obstacle: ObstacleConfig, time: float) -> tuple[float, float, float]:
+    """Station, lateral [m] and direction of motion relative to the route [rad] of an obstacle at a time [s]."""
     start = np.array([obstacle.station, obstacle.lateral])
-    turn = np.deg2rad(obstacle.yaw)
     step = np.array(obstacle.to) - start if obstacle.to else np.zeros(2)
     length = float(np.linalg.norm(step))
     if length < 1e-9:
-        return (*_route_point(route, *start), float(heading_at(route, start[0])) + turn)
+        return obstacle.station, obstacle.lateral, 0.0
     passes = (time + obstacle.delay) * obstacle.speed / length
     back = bool(passes // 1.0 % 2.0)  # true on the way back; correct for times before 0, too
     share = passes % 1.0
     station, lateral = start + step * (1.0 - share if back else share)
-    x, y = _route_point(route, station, lateral)
     direction = -step if back else step
-    yaw = float(heading_at(route, station) + np.arctan2(direction[1], direction[0]))
-    return x, y, yaw + turn
+    return float(station), float(lateral), float(np.arctan2(direction[1], direction[0]))
+
+
+def obstacles_in_reach(obstacles: Sequence[ObstacleConfig], half_width: float, time: float) -> Array:
+    """Station, lateral and radius [m], shape (k, 3), of those obstacles that a robot in the corridor could touch."""
+    placed = [(*obstacle_station(one, time)[:2], _radius(one)) for one in obstacles]
+    return np.array([row for row in placed if abs(row[1]) < half_width + _ROBOT_HALF_WIDTH + row[2]]).reshape(-1, 3)
+
+
+def _radius(obstacle: ObstacleConfig) -> float:
+    """Radius of a vertical cylinder around an obstacle [m]."""
+    return math.hypot(*obstacle.size[:2]) / 2.0 if obstacle.size else RADIUS[obstacle.kind]
 
 
 def _route_point(route: Array, station: float, lateral: float) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from twin.mjcf.husky import TIMESTEP
 from twin.types import Array
 from twin.warp_runtime import wp
 
-STATE_SIZES = {"speed": 1, "yaw_rate": 1, "cross_track": 1, "heading_error": 1, "turns": 3}
+STATE_SIZES = {"speed": 1, "yaw_rate": 1, "cross_track": 1, "heading_error": 1, "turns": 3, "obstacle": 3}
 """Components of the state and their sizes; see `RewardAndTermination.state`."""
 
 NERF, SIMULATOR, SPLATS = "nerf", "simulator", "splats"
@@ -82,9 +82,10 @@ class Options:
     start_heading: float = 10.0
     """The start's heading relative to the route is sampled uniformly within ± this [°]."""
     start_along: float = 0.0
-    """If positive, for training: four of five episodes start beyond the segment's start, by a fraction of its length
-    that is sampled uniformly between 0 and this, up to 0.7 half widths of the corridor beside the route. After 15 s
-    they are cut off (truncated, with an empty cause)."""
+    """If positive, for training: episodes start beyond the segment's start, by a fraction of its length that is sampled
+    uniformly between 0 and this, up to 0.8 half widths of the corridor beside the route and turned by twice as much."""
+    along_time: float = 3.0
+    """With `start_along`, the time after which episodes are cut off (truncated, with an empty cause) [s]."""
     observe: str = NERF
     """Origin of the images. `nerf`: the field. `simulator`: MuJoCo's renderer with the extracted mesh, under MuJoCo's
     lights. `splats`: MuJoCo's renderer with the Gaussian splats of a file; obstacles and robot have MuJoCo's lights."""
@@ -168,6 +169,7 @@ _CHECKS: dict[str, Check] = {
     "start_offset": _NONNEGATIVE,
     "start_heading": _NONNEGATIVE,
     "start_along": (lambda x: _is_number(x) and 0.0 <= x < 1.0, "0 or more, and less than 1"),
+    "along_time": (lambda x: _is_number(x) and x > 0.0, f"a number above 0, at most {_MAX_NUMBER:,.0f}"),
     "observe": _one_of(NERF, SIMULATOR, SPLATS),
     "splats": (lambda value: value is None or (isinstance(value, str | Path) and str(value) != ""), "a path, or None"),
     "lighting": (

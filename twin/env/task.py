@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from twin.config import CAUSES, STEERING, ObstacleConfig
 from twin.env.domain_randomization import NominalModel, RandomizationSample
-from twin.env.obstacles import EpisodeObstacles, ObstacleMotion
+from twin.env.obstacles import EpisodeObstacles, ObstacleMotion, obstacles_in_reach
 from twin.env.options import STATE_SIZES, Options, check_actions
 from twin.env.physics import EPISODE_STATE, HuskyPhysics
 from twin.env.route_segments import RouteSegment
@@ -57,14 +57,14 @@ _SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point of the route is searched th
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, as multiples of the controller's limits
-EPISODE_VERSION = 3
+EPISODE_VERSION = 4
 """Version of the episodes of a training. Increase it whenever a change of the code changes the starts of a seed with
 `Options.start_along`, when these episodes are cut off, or which ends of episodes are terminal."""
-# With `Options.start_along`: the share of episodes that start beyond the segment's start, their largest distance from
-# the route at the start, as a fraction of the corridor's half width, and the time after which they are cut off [s].
-# Without them, a training on a long route sees few lightings, and few pictures from beside the route.
-_ALONG_SHARE, _ALONG_OFFSET, _ALONG_TIME = 0.8, 0.7, 15.0
+# With `Options.start_along`: at the start, largest distance from the route / corridor half width, largest heading /
+# `start_heading`. Beyond them, a policy would not know what to do.
+_ALONG_OFFSET, _ALONG_HEADING = 0.8, 2.0
 _LOOKAHEADS = (1.0, 2.0, 4.0)  # [m] along the route; the state contains the change of heading up to these points
+_OBSTACLE_RANGE = (-1.0, 6.0)  # [m] the state contains the first obstacle that is this far along the route
 
 
 # ---- reward and termination of n drives at once
@@ -116,17 +116,29 @@ class RewardAndTermination:
         speed, yaw_rate = (_STATE_MARGIN * x for x in (world.robot.max_wheel_speed, world.robot.max_yaw_rate))
         # `cross_track` is bounded, since an episode ends at most one control step after the robot leaves the corridor.
         cross_track = max(self.half_width, options.start_offset) + speed * options.control_timestep
-        high = np.array([speed, yaw_rate, cross_track, *[np.pi] * 4], np.float32)
+        beside = 2.0 * cross_track + _OBSTACLE_RANGE[1]
+        high = np.array([speed, yaw_rate, cross_track, *[np.pi] * 4, _OBSTACLE_RANGE[1], beside, beside], np.float32)
         self.state_bounds = np.stack([-high, high])
-        """Lowest and highest values of the components of `state`, float32, shape (2, 7)."""
+        """Lowest and highest values of the components of `state`, float32, shape (2, 10)."""
+        self._obstacles: list[tuple[ObstacleConfig, ...]] = [()] * count
         self._cause_rewards = np.array([0.0, *(getattr(terms, cause) for cause in CAUSES)])
         self._cause_rewards[[0, _CODES["goal"]]] += terms.step
 
-    def begin(self, which: EnvIndices, foot: Array, position: Array, cut_time: float = np.inf) -> None:
+    def begin(
+        self,
+        which: EnvIndices,
+        foot: Array,
+        position: Array,
+        cut_time: float = np.inf,
+        obstacles: tuple[ObstacleConfig, ...] = (),
+    ) -> None:
         """Starts k episodes at positions, shape (k, 2) [m], near the arc lengths `foot`, shape (k,) [m].
 
-        An episode that has not ended after `cut_time` [s] is cut off: truncated without a cause.
+        An episode that has not ended after `cut_time` [s] is cut off: truncated without a cause. `obstacles`: those of
+        the episodes, for `state`.
         """
+        for i in which:
+            self._obstacles[i] = obstacles
         self._cut_time[which] = cut_time
         self._cause[which], self._anchor_time[which], self._steering[which] = 0, 0.0, 0.0
         self.foot[which], self.cross_track[which] = self._nearest(position, foot)
@@ -174,11 +186,12 @@ class RewardAndTermination:
         return ended, timeout | (self._cut[which] & ~ended)
 
     def state(self, which: EnvIndices, motion: Motion) -> NDArray[np.float32]:
-        """Returns the privileged state of a driver that knows the map, shape (k, 7).
+        """Returns the privileged state of a driver that knows the map, shape (k, 10).
 
         Its components are `speed` [m/s], `yaw_rate` [rad/s], `cross_track` [m] (positive to the left), `heading_error`
-        [rad] (the robot's heading minus the route's) and `turns` [rad] (changes of the route's heading until 1, 2 and
-        4 m ahead).
+        [rad] (the robot's heading minus the route's), `turns` [rad] (changes of the route's heading until 1, 2 and 4 m
+        ahead) and `obstacle`: of the first obstacle within 6 m in the corridor, the distance along the route, the
+        distance to the left of the robot, and the radius [m]; without one 6, 0 and 0.
 
         The state is clipped to `state_bounds`. This changes it only if the robot moves more than ten times as fast as
         its controller allows, for example when it falls.
@@ -188,7 +201,20 @@ class RewardAndTermination:
         turns = wrap_angle(heading_at(self._route, foot[:, None] + np.array(_LOOKAHEADS)) - heading[:, None])
         error = wrap_angle(motion.pose[:, 2] - heading)
         columns = (motion.speed, motion.yaw_rate, self.cross_track[which], error)
-        return np.clip(np.column_stack([*columns, turns]).astype(np.float32), *self.state_bounds)
+        obstacles = np.array([self._first_obstacle(i, time) for i, time in zip(which, motion.time, strict=True)])
+        return np.clip(np.column_stack([*columns, turns, obstacles]).astype(np.float32), *self.state_bounds)
+
+    def _first_obstacle(self, i: int, time: float) -> tuple[float, float, float]:
+        """The part `obstacle` of the state of drive i at a time [s]."""
+        near, far = _OBSTACLE_RANGE
+        if self._obstacles[i]:
+            placed = obstacles_in_reach(self._obstacles[i], self.half_width, time)
+            ahead = placed[:, 0] - self.foot[i]
+            seen = np.flatnonzero((ahead > near) & (ahead < far))
+            if len(seen):
+                first = seen[ahead[seen].argmin()]
+                return float(ahead[first]), float(placed[first, 1] - self.cross_track[i]), float(placed[first, 2])
+        return far, 0.0, 0.0
 
     def _nearest(self, position: Array, foot: Array) -> tuple[Array, Array]:
         return nearest_on_route(self._route, position, (foot - _SEARCH_WINDOW[0], foot + _SEARCH_WINDOW[1]))
@@ -344,9 +370,9 @@ class DriveTask(control.Task):
                 f"task {self.segment.name!r}: the robot touches {', '.join(physics.touched)} at each of {_START_TRIES} "
                 "sampled starts; move the obstacle or the start"
             )
-        along = self._start_station > self.segment.start
-        position, cut_time = physics.planar_pose[None, :2], _ALONG_TIME if along else np.inf
-        self._evaluator.begin([self._index], np.array([self._start_station]), position, cut_time)
+        cut_time = self.options.along_time if self.options.start_along else np.inf
+        position = physics.planar_pose[None, :2]
+        self._evaluator.begin([self._index], np.array([self._start_station]), position, cut_time, self.obstacles)
 
     def before_step(self, action: Any, physics: DrivePhysics) -> None:
         """Raises ValueError: the action is invalid; the episode is unchanged."""
@@ -370,7 +396,7 @@ class DriveTask(control.Task):
         return _by_component(self.state(physics))
 
     def state(self, physics: DrivePhysics) -> NDArray[np.float32]:
-        """Returns the privileged state, shape (7,), see `RewardAndTermination.state`."""
+        """Returns the privileged state, shape (10,), see `RewardAndTermination.state`."""
         return self._evaluator.state([self._index], _robot_motion(physics))[0]
 
     def observation_spec(self, physics: DrivePhysics) -> dict[str, specs.BoundedArray]:
@@ -440,10 +466,12 @@ class DriveTask(control.Task):
         o = self.options
         offset = rng.uniform(-o.start_offset, o.start_offset)
         turn = np.deg2rad(rng.uniform(-o.start_heading, o.start_heading))
-        share = max(0.0, rng.uniform(1.0 - 1.0 / _ALONG_SHARE, 1.0)) if o.start_along else 0.0
-        if share and o.start_offset:
-            offset *= max(1.0, _ALONG_OFFSET * self.half_width / o.start_offset)
-        s = self._start_station = self.segment.start + share * o.start_along * self.segment.length
+        share = 0.0
+        if o.start_along:
+            offset *= max(1.0, _ALONG_OFFSET * self.half_width / o.start_offset) if o.start_offset else 1.0
+            turn *= _ALONG_HEADING
+            share = o.start_along * rng.random()
+        s = self._start_station = self.segment.start + share * self.segment.length
         heading = float(heading_at(self.world.route[:, :2], s))
         x, y = point_at(self.world.route[:, :2], s) + offset * np.array([-np.sin(heading), np.cos(heading)])
         return float(x), float(y), heading + float(turn)

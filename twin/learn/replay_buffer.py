@@ -1,10 +1,8 @@
-"""A replay buffer that stores single pictures instead of stacks, and color augmentation of its samples.
+"""The pictures that a training has seen, with the robot's states, and color augmentation of samples.
 
-Each environment has a *ring* buffer in a file, to which its pictures are written once, in order, across episodes. A
-*transition* stores its *age*, the number of steps since its episode began, and the index of the newest picture before
-it. The stack before the transition ends with this picture, the stack after it with the next picture of the ring. If the
-episode has too few pictures for a stack, its first one is repeated. A buffer that stores both stacks, of four pictures
-each, would take eight times the memory.
+Each environment has a *ring* buffer in a file, to which its pictures are written in order, across episodes. The stack
+that ends with a picture has the pictures before it; if its episode has too few, its first one is repeated. A buffer
+that stores stacks of four pictures would take four times the memory.
 """
 
 from pathlib import Path
@@ -13,10 +11,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
-from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from twin.env.options import CUDA
@@ -131,79 +126,55 @@ def _curves(count: int, strength: float, rng: np.random.Generator) -> NDArray[np
 
 # ---- the buffer
 
-_SHORT = 8  # [steps] the ring has room for all transitions if episodes have on average at least this length
-_ROWS = ("actions", "rewards", "ends", "newest", "age", "states", "states_after")
 
+class PictureBuffer:
+    """Pictures (3, height, width) and states (k,) of n environments.
 
-class ReplaySamples(NamedTuple):
-    """Samples as in stable-baselines3, and the robot's states before and after, which only the critics receive."""
-
-    observations: torch.Tensor
-    actions: torch.Tensor
-    next_observations: torch.Tensor
-    dones: torch.Tensor
-    rewards: torch.Tensor
-    states: torch.Tensor
-    next_states: torch.Tensor
-
-
-class FrameReplayBuffer(ReplayBuffer):
-    """Transitions of n environments; observations are stacks (3 · stack, height, width), the newest picture last.
-
-    The rings are longer than the transitions need, by a length that `slack` sets. So pictures written after a save do
-    not overwrite those of saved transitions, and a killed training resumes with all of them.
+    The rings are longer than `capacity`, by a length that `slack` sets. So pictures written after a save do not
+    overwrite the saved ones, and a killed training resumes with all of them.
     """
 
     def __init__(
         self,
-        buffer_size: int,
-        observation_space: spaces.Space,
-        action_space: spaces.Space,
-        device: torch.device | str = "auto",
-        n_envs: int = 1,
-        optimize_memory_usage: bool = False,
+        capacity: int,
+        n_envs: int,
+        size: tuple[int, int],
+        stack: int,
+        state_size: int,
         file: Path | None = None,
         slack: int = 0,
         shift: int = 0,
         color_strength: float = 0.0,
         seed: int = 0,
-        state_size: int = 0,
+        device: torch.device | str = "cpu",
     ) -> None:
         """
         Args:
-            buffer_size: Number of transitions, of all environments together.
-            observation_space: uint8 (3 · stack, height, width).
+            capacity: Number of pictures that are sampled, of all environments together: the newest ones.
+            size: Height and width of the pictures.
+            stack: Number of pictures in a stack.
             file: File of the pictures; None: they are in memory. An existing file is kept, see `set_state`.
-            slack: Largest number of transitions, of all environments together, added between two saves.
+            slack: Largest number of pictures, of all environments together, added between two saves.
             shift: Samples are shifted at random, by at most this in each direction [px]; edge pixels are repeated
                 (DrQ, Kostrikov et al. 2020).
-            color_strength: Strength of `draw_color_changes`, for half of the stacks before transitions.
+            color_strength: Strength of `draw_color_changes`, for half of the samples.
             device: On a GPU, it holds a second copy of all pictures.
-            state_size: Number of components of the `state` in an `info`.
 
         Raises:
             InputError: an existing file has another size.
             OSError: the disk has no room for the whole file.
         """
-        BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
-        self.buffer_size = max(buffer_size // n_envs, 1)
-        self.optimize_memory_usage, self.handle_timeout_termination = False, True
-        channels, height, width = self.obs_shape
-        self.stack, self.shift, self.color_strength = channels // 3, shift, color_strength
+        self.n_envs, self.size, self.stack = n_envs, size, stack
+        self.shift, self.color_strength, self.device = shift, color_strength, torch.device(device)
         self.rng = np.random.default_rng(seed)
-        size = (self.buffer_size, n_envs)
-        self.actions = np.zeros((*size, self.action_dim), np.float32)
-        self.rewards, self.ends = np.zeros(size, np.float32), np.zeros(size, np.float32)
-        self.newest, self.age = np.zeros(size, np.int64), np.zeros(size, np.int64)
-        self.states = np.zeros((*size, state_size), np.float32)
-        """The robot's state before each transition; NaN for the first transition after `break_off`."""
-        self.states_after = np.zeros((*size, state_size), np.float32)
-        self._state = np.full((n_envs, state_size), np.nan, np.float32)
-        slack = -(-2 * slack // n_envs)
-        self._reach = self.buffer_size + self.buffer_size // _SHORT + self.stack + 2
-        self.length = self._reach + slack
+        self.capacity = max(capacity // n_envs, 1)
+        """Number of pictures of one environment that are sampled."""
+        self.length = self.capacity + stack - 1 + -(-slack // n_envs)
         """Number of pictures in a ring."""
-        shape = (n_envs, self.length, 3, height, width)
+        self.ages = np.zeros((n_envs, self.length), np.int64)
+        """Number of earlier pictures in each picture's episode."""
+        self.states = np.zeros((n_envs, self.length, state_size), np.float32)
+        shape = (n_envs, self.length, 3, *size)
         if file is None:
             self.frames = np.zeros(shape, np.uint8)
         else:
@@ -216,92 +187,48 @@ class FrameReplayBuffer(ReplayBuffer):
             self.frames = np.memmap(file, np.uint8, "r+", shape=shape)
         # On a GPU, updates would wait for pictures that the processor gathers and changes.
         self._on_gpu = torch.as_tensor(self.frames, device=self.device) if self.device.type == CUDA else None
-        self.written = np.zeros(n_envs, np.int64)
+        self.written = 0
         """Number of pictures written to each ring so far."""
-        self._ages = np.full(n_envs, -1)  # steps since each environment's episode began; -1: no episode
 
-    def add(
-        self,
-        obs: NDArray,
-        next_obs: NDArray,
-        action: NDArray,
-        reward: NDArray,
-        done: NDArray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """Adds one transition per environment.
+    def add(self, pictures: NDArray[np.uint8], states: Array32, first: NDArray[np.bool_]) -> None:
+        """Adds each environment's newest picture, shape (n, 3, height, width), and its state, shape (n, k).
 
-        An environment's observations must be consecutive until its episode is `done`, or until `break_off`.
+        `first`: whether the picture is the first of an episode, shape (n,).
         """
-        new = self._ages < 0
-        self._write(np.flatnonzero(new), obs[new, -3:])
-        self._ages[new] = 0
-        self.newest[self.pos], self.age[self.pos] = self.written - 1, self._ages
-        self._write(np.arange(self.n_envs), next_obs[:, -3:])
-        self._ages = np.where(done, -1, self._ages + 1)
-        for i in range(self.n_envs):
-            if self._state.shape[1]:
-                self.states[self.pos, i] = self._state[i]
-                self.states_after[self.pos, i] = infos[i]["state"]
-                self._state[i] = infos[i]["first_state" if done[i] else "state"]
-        self.actions[self.pos] = action.reshape(self.n_envs, self.action_dim)
-        self.rewards[self.pos] = reward
-        # An episode cut off by its time limit does not end in a terminal state. Nor does one at the goal: the middle of
-        # the corridor is worth as much there as before, as if the road went on. With a reward for the goal instead,
-        # however large, a policy steers the less, the nearer the goal is (docs/findings.md, "The end of a task").
-        self.ends[self.pos] = [
-            d and not (info.get("TimeLimit.truncated") or info.get("cause") == "goal")
-            for d, info in zip(done, infos, strict=True)
-        ]
-        self.pos += 1
-        if self.pos == self.buffer_size:
-            self.full, self.pos = True, 0
+        at, before = self.written % self.length, (self.written - 1) % self.length
+        self.frames[:, at], self.states[:, at] = pictures, states
+        self.ages[:, at] = np.where(first, 0, self.ages[:, before] + 1)
+        if self._on_gpu is not None:
+            self._on_gpu[:, at] = torch.as_tensor(np.ascontiguousarray(pictures), device=self.device)
+        self.written += 1
 
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplaySamples:  # type: ignore[override]
-        """Samples uniformly from the complete transitions (see `is_complete`); stacks are uint8."""
-        filled = self.buffer_size if self.full else self.pos
-        row, env_index = np.empty(0, int), np.empty(0, int)
-        while len(row) < batch_size:
-            more = self.rng.integers(filled, size=batch_size), self.rng.integers(self.n_envs, size=batch_size)
-            complete = self.is_complete(*more)
-            row, env_index = np.append(row, more[0][complete]), np.append(env_index, more[1][complete])
-        row, env_index = row[:batch_size], env_index[:batch_size]
-        before, after = self._augmented(*self.stacks(row, env_index))
-        rest = self.actions[row, env_index], after, self.ends[row, env_index, None], self.rewards[row, env_index, None]
-        parts = (before, *rest, self.states[row, env_index], self.states_after[row, env_index])
-        return ReplaySamples(*(torch.as_tensor(part, device=self.device) for part in parts))
+    def sample(self, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Samples uniformly; returns stacks, uint8 (count, 3 · stack, height, width), and states (count, k).
 
-    def is_complete(self, row: NDArray, env_index: NDArray) -> NDArray[np.bool_]:
-        """True for each transition whose pictures are all among the newest `_reach` of the ring; shapes (k,) → (k,)."""
-        oldest = self.newest[row, env_index] - np.minimum(self.age[row, env_index], self.stack - 1)
-        return oldest >= self.written[env_index] - self._reach
-
-    def stacks(self, row: NDArray, env_index: NDArray) -> tuple[Any, Any]:
-        """The stacks before, and the stacks after, k transitions; each has the shape (k, 3 · stack, height, width).
-
-        They are tensors on the buffer's device if that is a GPU, else arrays.
+        The stacks are shifted, and half of them have other colors.
         """
-        newest, age = self.newest[row, env_index], self.age[row, env_index]
-        back = np.arange(self.stack - 1, -1, -1)
-        first = (newest - age)[:, None]
-        frames = self.frames if self._on_gpu is None else self._on_gpu
-
-        def until(last: NDArray) -> Any:
-            index = np.maximum(last[:, None] - back, first) % self.length
-            return frames[env_index[:, None], index].reshape(len(row), *self.obs_shape)
-
-        return until(newest), until(newest + 1)
-
-    def _augmented(self, before: Any, after: Any) -> tuple[Any, Any]:
-        """Stacks as updates see them: all are shifted, and half of those before transitions have other colors."""
+        newest = self.written - 1 - self.rng.integers(min(self.written, self.capacity), size=count)
+        env_index = self.rng.integers(self.n_envs, size=count)
+        stacks = self.stacks(newest, env_index)
         if self.shift:
-            before, after = self._shifted(before), self._shifted(after)
+            stacks = self._shifted(stacks)
         if self.color_strength:
-            # Stacks after transitions stay unchanged, since targets are computed from them (SVEA, Hansen et al. 2021).
-            half = len(before) // 2
-            changes = draw_color_changes(half, self.obs_shape[1:], self.color_strength, self.rng)
-            before[:half] = (changes.applied if self._on_gpu is None else changes.applied_on_gpu)(before[:half])
-        return before, after
+            half = count // 2
+            changes = draw_color_changes(half, self.size, self.color_strength, self.rng)
+            stacks[:half] = (changes.applied if self._on_gpu is None else changes.applied_on_gpu)(stacks[:half])
+        states = self.states[env_index, newest % self.length]
+        return torch.as_tensor(stacks, device=self.device), torch.as_tensor(states, device=self.device)
+
+    def stacks(self, newest: NDArray, env_index: NDArray) -> Any:
+        """Stacks of k environments that end with their picture number `newest`, counted over the whole training.
+
+        The result, shape (k, 3 · stack, height, width), is a tensor on the buffer's device if that is a GPU, else an
+        array.
+        """
+        back = np.minimum(np.arange(self.stack - 1, -1, -1), self.ages[env_index, newest % self.length][:, None])
+        frames = self.frames if self._on_gpu is None else self._on_gpu
+        stacks = frames[env_index[:, None], (newest[:, None] - back) % self.length]
+        return stacks.reshape(len(newest), 3 * self.stack, *self.size)
 
     def state(self) -> tuple[dict[str, NDArray], dict[str, Any]]:
         """Returns the buffer's state except for the pictures: arrays, and JSON-able values.
@@ -310,32 +237,20 @@ class FrameReplayBuffer(ReplayBuffer):
         """
         if isinstance(self.frames, np.memmap):
             self.frames.flush()
-        arrays = {name: getattr(self, name) for name in _ROWS} | {"written": self.written}
-        return arrays, {"pos": self.pos, "full": self.full, "rng": self.rng.bit_generator.state}
+        return {"ages": self.ages, "states": self.states}, {
+            "written": self.written,
+            "rng": self.rng.bit_generator.state,
+        }
 
     def set_state(self, arrays: dict[str, NDArray], rest: dict[str, Any]) -> None:
-        """Restores a state; the pictures are already in the file. All environments begin new episodes."""
-        for name in (*_ROWS, "written"):
-            getattr(self, name)[:] = arrays[name]
-        self.pos, self.full = rest["pos"], rest["full"]
+        """Restores a state; the pictures are already in the file. The next pictures must be the first of episodes."""
+        self.ages[:], self.states[:] = arrays["ages"], arrays["states"]
+        self.written = int(rest["written"])
         self.rng.bit_generator.state = rest["rng"]
-        self.break_off()
-
-    def break_off(self) -> None:
-        """Call this before the next transition if all environments begin new episodes with it."""
-        self._ages[:], self._state[:] = -1, np.nan
-
-    def _write(self, env_index: NDArray[np.int64], pictures: NDArray) -> None:
-        """Adds a picture to the ring of each of k environments."""
-        at = self.written[env_index] % self.length
-        self.frames[env_index, at] = pictures
-        if self._on_gpu is not None and len(at):
-            self._on_gpu[env_index, at] = torch.as_tensor(np.ascontiguousarray(pictures), device=self.device)
-        self.written[env_index] += 1
 
     def _shifted(self, stacks: Any) -> Any:
         """Randomly shifted copies of stacks; edge pixels are repeated."""
-        p, (height, width) = self.shift, self.obs_shape[1:]
+        p, (height, width) = self.shift, self.size
         shifts = self.rng.integers(0, 2 * p + 1, (len(stacks), 2))  # down and to the right; p leaves a stack in place
         if self._on_gpu is not None:
             y, x = torch.as_tensor(shifts.T - p, device=self.device)[..., None]

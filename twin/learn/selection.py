@@ -34,9 +34,9 @@ from twin.env.domain_randomization import condition_options
 from twin.env.vector_env import make_vector_env
 from twin.evaluation.training_curves import CHOICE_FILE
 from twin.files import read_json, wrap_read_errors, write_json
+from twin.learn.distillation import has_state, saved_steps
 from twin.learn.policy import copy_policy, load_policy
 from twin.learn.policy_evaluation import EpisodeResult, run_episodes
-from twin.learn.sac import has_state, saved_steps
 from twin.learn.train_config import TrainConfig
 from twin.learn.training import Drive, Segment, Watch, check_same, checkpoint_folder, run_settings, train
 from twin.loading import Twin

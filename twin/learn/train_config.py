@@ -15,10 +15,6 @@ from twin.learn.policy import Control
 from twin.learn.policy_network import Architecture
 from twin.types import Range, setting_ranges
 
-_STATE_SCALES = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3, 0.3)
-"""Typical magnitudes of the privileged state's components: speed [m/s], yaw rate [rad/s], cross-track error [m],
-heading error [rad], and the turns up to 1, 2 and 4 m ahead [rad]."""
-
 _CHOICES = {"observe": (NERF, SIMULATOR), "action": (STEERING, TWIST), "device": (CPU, CUDA)}
 
 _PER_CYCLE = 20.0  # [m] of a task per cycle of the learning rate
@@ -69,37 +65,41 @@ class TrainConfig:
     """Fraction of the step reward that is lost at the corridor's edge; on the route, nothing is lost."""
     steering: Annotated[float, Range(0, 1e3)] = 0.5
     """Fraction of the step reward that is lost at full steering."""
+    teacher_steps: Annotated[int, Range(1, 10**8)] = 20_000
+    """Number of steps of the teacher's training (`teacher.py`)."""
     entropy: Annotated[float, Range(-1e3, 1e3)] = -0.5
-    """Target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 means a standard
-    deviation of 0.15, and -1 means 0.09."""
-    start_along: Annotated[float, Range(0, 0.999)] = 0.9
-    """Four of five episodes start at a random point in this first fraction of the route segment, further beside the
-    route, and are cut off after 15 s (`Options.start_along`). So a policy practices returning to the middle, and on a
-    long route, too, a training has many episodes, each with another lighting, weather and robot."""
+    """The teacher's target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 means
+    a standard deviation of 0.15, and -1 means 0.09."""
+    start_along: Annotated[float, Range(0, 0.999)] = 0.95
+    """Episodes start at a random point in this first fraction of the route segment, up to 0.8 half widths beside the
+    route (`Options.start_along`)."""
+    along_time: Annotated[float, Range(0.1, 1e4)] = 0.8
+    """Length of these episodes [s]. Each has another lighting, weather and robot; short ones, of which there are many,
+    teach far more than long ones (docs/findings.md, "A teacher")."""
+    whole_worlds: Annotated[int, Range(0, 4096)] = 1
+    """Number of environments whose episodes begin at the segment's start and are not cut off."""
     randomise: bool = True
     """Randomizes the robot in every episode; if the lighting varies, also the weather and distractor objects."""
-    privileged: bool = True
-    """The critics, but not the policy, receive the robot's state; the encoder learns to predict it (`sac.py`)."""
     pool: Annotated[int, Range(1, 16)] = 2
-    convolutions: Annotated[tuple[tuple[int, int, int], ...], Range(1, 4096)] = ((16, 5, 3), (32, 3, 2), (32, 3, 1))
+    convolutions: Annotated[tuple[tuple[int, int, int], ...], Range(1, 4096)] = ((32, 5, 3), (64, 3, 2), (64, 3, 1))
     """Number of channels, side of the kernel and stride of each convolution."""
-    features: Annotated[int, Range(1, 65_536)] = 64
+    features: Annotated[int, Range(1, 65_536)] = 128
     hidden: Annotated[tuple[int, ...], Range(1, 65_536)] = (256, 256)
     batch: Annotated[int, Range(1, 65_536)] = 128
     buffer: Annotated[int, Range(1, 10**8)] = 50_000
-    """Number of transitions in the replay buffer."""
-    starts: Annotated[int, Range(0, 10**10)] = 1_000
-    """Number of steps with random actions before learning begins."""
+    """Number of pictures from which the policy learns: the newest ones."""
+    starts: Annotated[int, Range(0, 10**10)] = 500
+    """Number of steps before learning begins."""
     updates: Annotated[float, Range(1e-6, 1e3)] = 0.5
     """Number of updates per step."""
     gamma: Annotated[float, Range(0, 0.999999)] = 0.97
-    """Discount per step; at 0.97, a reward 36 steps (3.6 s) ahead counts a third."""
+    """The teacher's discount per step; at 0.97, a reward 36 steps (3.6 s) ahead counts a third."""
     learning_rate: Annotated[float, Range(1e-9, 1)] = 5e-4
     """Largest learning rate; see `training.cycle_rate`."""
     cycle: Annotated[int, Range(1, 10**10)] = 12_000
     """Number of steps in a cycle of the learning rate, which falls within each cycle and starts high in the next."""
     tau: Annotated[float, Range(1e-9, 1)] = 0.01
-    """Averaging rate of the target critics, per update."""
+    """Averaging rate of the teacher's target critics, per update."""
     shift: Annotated[int, Range(0, 64)] = 2
     """Largest random shift of preprocessed pictures in updates [px]."""
     colours: Annotated[float, Range(0, 100)] = 1.0
@@ -146,11 +146,6 @@ class TrainConfig:
         return Control(self.action, self.speed, self.yaw_rate)
 
     @property
-    def state_scales(self) -> tuple[float, ...]:
-        """Typical magnitudes of the privileged state's components; empty if no state is used."""
-        return _STATE_SCALES if self.privileged else ()
-
-    @property
     def lighting_varies(self) -> bool:
         return self.observe == NERF and self.lighting == TRAINING
 
@@ -161,7 +156,7 @@ class TrainConfig:
 
     def options(self) -> dict[str, Any]:
         # The loss of reward beside the route keeps policies off the curb, where one disturbance ends an episode. The
-        # goal needs no reward, since it is no end for the replay buffer.
+        # goal needs no reward, since it is no end for the teacher's critics.
         rewards = Rewards(cross_track=-self.centring * Rewards.step, steering=-self.steering * Rewards.step)
         ranges = Ranges() if self.lighting_varies else _ROBOT_ONLY
         return {
@@ -171,7 +166,13 @@ class TrainConfig:
             "randomise": ranges if self.randomise else None,
             "rewards": rewards,
             "start_along": self.start_along,
+            "along_time": self.along_time,
         }
+
+    def teacher_options(self) -> dict[str, Any]:
+        """Options of the teacher's environments, which render no pictures."""
+        ranges = _ROBOT_ONLY if self.randomise else None
+        return {**self.options(), "pixels": False, "lighting": TRAINING, "observe": NERF, "randomise": ranges}
 
 
 PRESETS: dict[str, dict[str, Any]] = {

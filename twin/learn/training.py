@@ -1,4 +1,5 @@
-"""A training run: SAC in many environments. `selection.py` decides when it ends and which policy is kept.
+"""A training run: first a teacher (`teacher.py`), then a policy that learns from it in many environments
+(`distillation.py`). `selection.py` decides when the training ends and which policy is kept.
 
 runs/<name>/
   config.json                             the configuration
@@ -6,9 +7,9 @@ runs/<name>/
   tests.json, choice.json                 tests of policies, and the selection (`selection.py`)
   checkpoints/<steps>/                    policies saved during the training
   episodes.csv                            episodes driven in training
-  log.csv                                 speed, memory, entropy coefficient and the critics' mean value at every save
-  tensorboard/                            losses and other values logged by stable-baselines3
-  state/                                  the saved state (`sac.py`) and the replay buffer's pictures
+  log.csv                                 speed, memory, and the policy's errors in training, at every save
+  tensorboard/                            the curves of episodes.csv and log.csv
+  state/                                  the teacher, the saved state (`distillation.py`) and the pictures seen
 """
 
 import csv
@@ -20,18 +21,14 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter, configure
-from stable_baselines3.common.vec_env import VecEnvWrapper
+from stable_baselines3.common.logger import KVWriter, TensorBoardOutputFormat
 
 from twin import runtime
 from twin.config import Condition
@@ -43,12 +40,13 @@ from twin.errors import InputError
 from twin.evaluation.training_curves import CHOICE_FILE
 from twin.evaluation.trials import RECENT_EPISODES, csv_text
 from twin.files import digest_json, read_json, wrap_read_errors, write_json, write_text
+from twin.learn.distillation import Distillation, has_state, load_state, save_state
 from twin.learn.policy import load_policy, save_policy
 from twin.learn.policy_evaluation import EpisodeResult, run_episodes
 from twin.learn.policy_network import preprocess
-from twin.learn.replay_buffer import FrameReplayBuffer
-from twin.learn.sac import DrivePolicy, Encoder, PixelSAC, actor_weights, has_state, load_state, save_state
+from twin.learn.replay_buffer import PictureBuffer
 from twin.learn.sb3_env import DriveVecEnv
+from twin.learn.teacher import STATE_SCALES, Teacher, load_teacher, save_teacher, train_teacher
 from twin.learn.train_config import TrainConfig
 from twin.loading import Twin
 from twin.runtime import StopNotice, Stopped, stop_noted
@@ -56,7 +54,7 @@ from twin.runtime import StopNotice, Stopped, stop_noted
 TRAINING_EPISODE_COLUMNS = (
     *("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward", "start_m"),
 )
-LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "ent_coef", "value")
+LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "action_error", "state_error")
 Watch = Callable[[int, Sequence[bool]], None]
 """Receives the steps done, and the success of the last `RECENT_EPISODES` episodes that started at the beginning of the
 task's route segment."""
@@ -81,37 +79,12 @@ Referee = Callable[[int, Drive], Segment | None]
 """Receives the number of steps done and a function that drives policies. Returns the next segment, or None to end the
 training."""
 
+_MEAN_ERRORS = 200  # number of the newest updates whose mean errors are logged
 _NO_CURVES = ("step", "seed", "lighting", "cause")  # columns that are not sent to the writers as curves
 _FINAL_RATE = 0.1  # lowest learning rate / `config.learning_rate`
 # Seeds derive from the run's seed, the number of resumptions and this number. It differs from `selection._STREAM`, so
 # that no random stream is used twice.
 _TRAINING_STREAM = 6
-
-
-class PreprocessedVecEnv(VecEnvWrapper):
-    """Environments with the policy's preprocessing; during their steps, the networks can be updated (`meanwhile`)."""
-
-    def __init__(self, envs: DriveVecEnv, pool: int) -> None:
-        channels, height, width = envs.observation_space.shape  # type: ignore[misc]
-        super().__init__(envs, spaces.Box(0, 255, (channels, height // pool, width // pool), np.uint8))
-        self._pool, self._thread = pool, ThreadPoolExecutor(1)
-        self.meanwhile: Callable[[], None] = lambda: None
-        """Called while the environments step; the step must not depend on it."""
-
-    def reset(self) -> NDArray:
-        return preprocess(np.asarray(self.venv.reset()), self._pool)
-
-    def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:
-        stepped = self._thread.submit(self.venv.step_wait)
-        self.meanwhile()
-        pictures, rewards, dones, infos = stepped.result()
-        for i in np.flatnonzero(dones):
-            infos[i]["terminal_observation"] = preprocess(infos[i]["terminal_observation"], self._pool)
-        return preprocess(np.asarray(pictures), self._pool), rewards, dones, infos
-
-    def close(self) -> None:
-        self._thread.shutdown()
-        super().close()
 
 
 def train(
@@ -132,7 +105,7 @@ def train(
         processes: See `make_vector_env`, by default for `config.worlds`; the number does not change the result.
         referee: Plans the training; by default, the training is one segment of `config.steps`. With a referee, there
             are as many environments again for its tests.
-        writers: Also receive the numbers that are written to `tensorboard/`, `episodes.csv` and `log.csv`.
+        writers: Also receive the numbers that are written to `tensorboard/`: those of `episodes.csv` and `log.csv`.
 
     Raises:
         InputError: there is no CUDA device and the configuration needs one, an existing run has another configuration
@@ -152,97 +125,120 @@ def train(
         for stale in (folder / "episodes.csv", folder / "log.csv", pictures):
             stale.unlink(missing_ok=True)
         shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-    # Tests have separate environments. In shared ones, a test would break off training episodes, mostly long ones,
-    # which are the successes, so the success rate would be too low.
-    spare = range(config.worlds, 2 * config.worlds) if referee else range(0)
-    # The two sets of environments never step at the same time, so they share the processes.
-    processes = default_processes(config.worlds) if processes is None else processes
-    vec_env = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, len(spare), **config.options())
-    for i in spare:
-        vec_env.vector_env.set(i, "options", dataclasses.replace(vec_env.vector_env.options, start_along=0.0))
-    with closing(PreprocessedVecEnv(vec_env, config.pool)) as envs:
-        model = _model(envs, config, pictures)
-        model.logger.output_formats.extend(writers)
-        before: dict[str, Any] = load_state(folder / "state", model) if resume else {"wall": 0.0, "resumed": -1}
-        resumed = before["resumed"] + 1
-        seeds = np.random.SeedSequence([config.seed, resumed, _TRAINING_STREAM])
-        envs.seed(int(seeds.generate_state(1, np.uint64)[0]))
-
-        def learn() -> None:
-            done = model.num_timesteps
-            updates = int(config.updates * (done + config.worlds) + 1e-9) - int(config.updates * done + 1e-9)
-            if done > config.starts and updates:
-                model.train(updates, config.batch)
-
-        envs.meanwhile = learn
-        with stop_noted() as stop:
+    with stop_noted() as stop:
+        teacher = load_teacher(folder / "state", config.control.actions) if resume else None
+        if teacher is None:
+            teacher = _new_teacher(twin, folder, config, processes, stop)
+        # Tests have separate environments: in shared ones, a test would break off training episodes. The two sets of
+        # environments never step at the same time, so they share the processes.
+        spare = range(config.worlds, 2 * config.worlds) if referee else range(0)
+        processes = default_processes(config.worlds) if processes is None else processes
+        envs = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, len(spare), **config.options())
+        with closing(envs):
+            for i in (*range(config.whole_worlds), *spare):
+                envs.vector_env.set(i, "options", dataclasses.replace(envs.vector_env.options, start_along=0.0))
+            learner = _learner(config, teacher, pictures)
+            before: dict[str, Any] = load_state(folder / "state", learner) if resume else {"wall": 0.0, "resumed": -1}
+            resumed = before["resumed"] + 1
+            seeds = np.random.SeedSequence([config.seed, resumed, _TRAINING_STREAM])
+            envs.seed(int(seeds.generate_state(1, np.uint64)[0]))
             camera = twin.world().camera.resized(config.architecture.size)
             origin = {"scene": twin.scene.root.resolve().name, "camera": list(camera.intrinsics)}
-            recorder = _RunRecorder(folder, config, settings, origin, before["wall"], resumed, watch, stop, writers)
+            recorder = _RunRecorder(
+                folder, config, settings, origin, learner, before["wall"], resumed, watch, stop, writers
+            )
 
             def drive(policy: Path, seeds: Sequence[int], on_episode: Callable[[], object]) -> list[EpisodeResult]:
                 if stop.number:
                     raise Stopped(stop.number)
-                return run_episodes(load_policy(policy), vec_env.vector_env, seeds, on_episode, spare)
+                return run_episodes(load_policy(policy), envs.vector_env, seeds, on_episode, spare)
 
             plan: Referee = referee or (lambda step, _: None if step >= whole.until else whole)
             whole = Segment(config.steps, None)
-            while segment := plan(model.num_timesteps, drive):
-                left = segment.until - model.num_timesteps
-                if left <= 0:  # a resumed training may already be at or beyond the segment's end
-                    recorder.init_callback(model)
+            drives = _Drives(envs, config, learner)
+            while segment := plan(learner.steps, drive):
+                if learner.steps >= segment.until:  # a resumed training may already be at or beyond the segment's end
                     recorder.save_checkpoint()
                     continue
                 (folder / CHOICE_FILE).unlink(missing_ok=True)  # more steps invalidate the selection
-                model.lr_schedule = partial(_learning_rate, config, model, segment)
-                model.learn(left, recorder, log_interval=10, reset_num_timesteps=False)
+                recorder.begin()
+                while learner.steps < segment.until:
+                    recorder.before_step()
+                    infos, errors = drives.step(_learning_rate(config, learner.steps, segment))
+                    recorder.after_step(infos, errors)
                 recorder.end()
                 if stop.number:
                     raise Stopped(stop.number)
 
 
-def _model(envs: PreprocessedVecEnv, config: TrainConfig, pictures: Path) -> PixelSAC:
-    model = PixelSAC(
-        DrivePolicy,
-        envs,
-        learning_rate=config.learning_rate,
-        buffer_size=config.buffer,
-        learning_starts=config.starts,
-        batch_size=config.batch,
-        tau=config.tau,
-        gamma=config.gamma,
-        train_freq=1,
-        gradient_steps=0,  # updates run in `meanwhile`
-        ent_coef="auto_0.1",
-        target_entropy=config.entropy * config.control.actions,
-        replay_buffer_class=FrameReplayBuffer,
-        replay_buffer_kwargs={
-            "file": pictures,
-            "slack": config.save_every + config.worlds,
-            "shift": config.shift,
-            "color_strength": config.colours if config.lighting_varies else 0.0,
-            "seed": config.seed,
-            "state_size": len(config.state_scales),
-        },
-        state_scales=config.state_scales,
-        policy_kwargs={
-            "features_extractor_class": Encoder,
-            "features_extractor_kwargs": {"architecture": config.architecture},
-            "net_arch": list(config.hidden),
-            "share_features_extractor": True,
-            "normalize_images": False,  # the encoder scales the pixel values
-            "state_size": len(config.state_scales),
-        },
+class _Drives:
+    """Environments that the policy in training drives; during their steps, it is updated."""
+
+    def __init__(self, envs: DriveVecEnv, config: TrainConfig, learner: Distillation) -> None:
+        self._envs, self._config, self._learner, self._thread = envs, config, learner, ThreadPoolExecutor(1)
+        self._stacks: NDArray[np.uint8] | None = None
+        """Preprocessed stacks of the environments; None: no episode has begun."""
+
+    def step(self, rate: float) -> tuple[list[dict[str, Any]], list[tuple[float, float]]]:
+        """One step of all environments, and the updates that are due, with this learning rate.
+
+        Returns the infos of the environments, and the errors of the updates, see `Distillation.update`.
+        """
+        c, learner = self._config, self._learner
+        if self._stacks is None:
+            self._observe(self._envs.reset(), np.ones(c.worlds, bool))
+        assert self._stacks is not None
+        self._envs.step_async(learner.act(self._stacks))
+        stepped = self._thread.submit(self._envs.step_wait)
+        done = learner.steps
+        due = int(c.updates * (done + c.worlds) + 1e-9) - int(c.updates * done + 1e-9)
+        errors = [learner.update(c.batch, rate) for _ in range(due if done >= c.starts else 0)]
+        pictures, _, over, infos = stepped.result()
+        self._observe(pictures, over)
+        learner.steps += c.worlds
+        learner.episodes += int(over.sum())
+        return infos, errors
+
+    def _observe(self, pictures: Any, first: NDArray[np.bool_]) -> None:
+        self._stacks = preprocess(np.asarray(pictures), self._config.pool)
+        states = np.stack([self._envs.vector_env.state(i) for i in range(self._config.worlds)])
+        self._learner.buffer.add(self._stacks[:, -3:], states, first)
+
+
+def _new_teacher(twin: Twin, folder: Path, config: TrainConfig, processes: int | None, stop: StopNotice) -> Teacher:
+    """Trains and saves a teacher. Raises Stopped if a signal comes."""
+    with runtime.bar("teacher, by the robot's state", config.teacher_steps, "step") as bar:
+
+        def watch(steps: int) -> None:
+            bar.update(steps - bar.n)
+            if stop.number:
+                raise Stopped(stop.number)
+
+        teacher, successes = train_teacher(twin, config, processes, watch)
+    save_teacher(folder / "state", teacher, successes, config.worlds)
+    return teacher
+
+
+def _learner(config: TrainConfig, teacher: Teacher, pictures: Path) -> Distillation:
+    buffer = PictureBuffer(
+        config.buffer,
+        config.worlds,
+        config.architecture.pooled_size[::-1],
+        config.architecture.stack,
+        len(STATE_SCALES),
+        pictures,
+        slack=config.save_every + 2 * config.worlds,
+        shift=config.shift,
+        color_strength=config.colours if config.lighting_varies else 0.0,
         seed=config.seed,
         device=config.device,
     )
-    model.set_logger(configure(str(pictures.parent.parent / "tensorboard"), ["tensorboard"]))
-    return model
+    return Distillation(config.architecture, teacher, buffer, config.seed, config.device)
 
 
-def _learning_rate(config: TrainConfig, model: PixelSAC, segment: Segment, _: float) -> float:
+def _learning_rate(config: TrainConfig, step: int, segment: Segment) -> float:
     """Learning rate of the next update; in a settling segment, it falls linearly to its lowest value at the end."""
-    step, lowest = model.num_timesteps, _FINAL_RATE * config.learning_rate
+    lowest = _FINAL_RATE * config.learning_rate
     if segment.settle_from is None or step <= segment.settle_from:
         return cycle_rate(config, step)
     left = max(0.0, (segment.until - step) / (segment.until - segment.settle_from))
@@ -313,7 +309,7 @@ def check_same(folder: Path, settings: dict[str, Any]) -> None:
             )
 
 
-class _RunRecorder(BaseCallback):
+class _RunRecorder:
     """Writes the tables, checkpoints and states of a run."""
 
     def __init__(
@@ -322,6 +318,7 @@ class _RunRecorder(BaseCallback):
         config: TrainConfig,
         settings: dict[str, Any],
         origin: dict[str, Any],
+        learner: Distillation,
         wall: float,
         resumed: int,
         watch: Watch | None,
@@ -329,50 +326,49 @@ class _RunRecorder(BaseCallback):
         writers: Sequence[KVWriter],
     ) -> None:
         """`origin`: name of the scene, and intrinsics fx, fy, cx, cy [px] of the pictures."""
-        super().__init__()
-        self.model: PixelSAC
         self._folder, self._config, self._settings, self._origin = folder, config, settings, origin
-        self._wall, self._resumed, self._started = wall, resumed, time.monotonic()
-        self._watch, self._stop, self._writers = watch, stop, writers
-        self._logged = dict.fromkeys(("ent_coef", "value"), float("nan"))
+        self._learner, self._wall, self._resumed, self._started = learner, wall, resumed, time.monotonic()
+        self._watch, self._stop = watch, stop
+        self._writers = [TensorBoardOutputFormat(str(folder / "tensorboard")), *writers]
+        self._errors: list[tuple[float, float]] = []
 
     @property
     def wall(self) -> float:
         """Wall time of the whole training [s]."""
         return self._wall + time.monotonic() - self._started
 
-    def _on_training_start(self) -> None:
+    def begin(self) -> None:
+        """Call this before the steps of a segment."""
         # Written only now: the environments have started, so the configuration is valid.
         write_json(self._folder / "config.json", self._settings)
-        self._saved = self._first = self.model.num_timesteps
-        self._first_updates, self._first_time = self.model._n_updates, time.monotonic()
+        self._saved = self._first = self._learner.steps
+        self._first_updates, self._first_time = self._learner.updates, time.monotonic()
         kept = _keep_rows(self._folder / "episodes.csv", TRAINING_EPISODE_COLUMNS, self._saved)
         self._recent: list[bool] = kept[-RECENT_EPISODES:]
         _keep_rows(self._folder / "log.csv", LOG_COLUMNS, self._saved)
 
-    def _on_rollout_start(self) -> None:
-        # Here the buffer contains all collected transitions; in _on_step the newest are missing.
-        if self._stop.number or self.model.num_timesteps - self._saved >= self._config.save_every:
+    def before_step(self) -> None:
+        """Saves what is due. Raises Stopped if a signal came."""
+        if self._stop.number or self._learner.steps - self._saved >= self._config.save_every:
             self.save()
         if self._stop.number:
             raise Stopped(self._stop.number)
         self._checkpoint()
 
-    def _on_step(self) -> bool:
-        logged = self.model.logger.name_to_value  # copied, since stable-baselines3 clears it after some episodes
-        self._logged = {name: logged.get(f"train/{name}", last) for name, last in self._logged.items()}
+    def after_step(self, infos: list[dict[str, Any]], errors: list[tuple[float, float]]) -> None:
+        """Records the environments' infos and the updates' errors."""
+        self._errors = (self._errors + errors)[-_MEAN_ERRORS:]
         rows = []
-        for info in (one for one in self.locals["infos"] if "episode" in one):
+        for info in (one for one in infos if "episode" in one):
             if not info["start"]:
                 self._recent = [*self._recent, info["is_success"]][-RECENT_EPISODES:]
             episode = info["episode"]
-            head = (self.model.num_timesteps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"])
+            head = (self._learner.steps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"])
             outcome = (int(info["is_success"]), info["cause"], f"{info['progress']:.2f}", episode["l"])
             rows.append((*head, *outcome, f"{episode['r']:.3f}", f"{info['start']:.2f}"))
         self._append("episodes", TRAINING_EPISODE_COLUMNS, rows)
         if self._watch:
-            self._watch(self.model.num_timesteps, self._recent)
-        return True
+            self._watch(self._learner.steps, self._recent)
 
     def end(self) -> None:
         """Saves the last checkpoint and state."""
@@ -381,20 +377,21 @@ class _RunRecorder(BaseCallback):
 
     def save(self) -> None:
         """Saves the policy, the state and a row of the log, unless no step was done since the last save."""
-        if self.model.num_timesteps == self._saved:
+        learner, elapsed = self._learner, max(time.monotonic() - self._first_time, 1e-9)
+        if learner.steps == self._saved:
             return
-        model, elapsed = self.model, max(time.monotonic() - self._first_time, 1e-9)
+        errors = np.mean(self._errors, 0) if self._errors else np.full(2, np.nan)
         row = (
-            *(model.num_timesteps, f"{self.wall:.1f}", model._n_updates),
-            f"{(model.num_timesteps - self._first) / elapsed:.2f}",
-            f"{(model._n_updates - self._first_updates) / elapsed:.2f}",
+            *(learner.steps, f"{self.wall:.1f}", learner.updates),
+            f"{(learner.steps - self._first) / elapsed:.2f}",
+            f"{(learner.updates - self._first_updates) / elapsed:.2f}",
             round(runtime.resident_memory() / 2**20),
-            *(f"{value:.4g}" for value in self._logged.values()),
+            *(f"{error:.4g}" for error in errors),
         )
         self._append("log", LOG_COLUMNS, [row])
         self._save_policy(self._folder)
-        save_state(self._folder / "state", model, {"wall": self.wall, "resumed": self._resumed})
-        self._saved = model.num_timesteps
+        save_state(self._folder / "state", learner, {"wall": self.wall, "resumed": self._resumed})
+        self._saved = learner.steps
 
     def _append(self, table: str, columns: tuple[str, ...], rows: list[tuple]) -> None:
         """Appends rows to a table of the run, and sends their numbers to the writers, as `<table>/<column>`."""
@@ -405,23 +402,23 @@ class _RunRecorder(BaseCallback):
         for row, writer in product(rows, self._writers):
             named = dict(zip(columns, row, strict=True))
             numbers = {f"{table}/{name}": float(named[name]) for name in columns if name not in _NO_CURVES}
-            writer.write(numbers, {}, named["step"])
+            writer.write(numbers, dict.fromkeys(numbers, ()), named["step"])
 
     def _checkpoint(self) -> None:
         every = self._config.steps / self._config.checkpoints
-        number = int(self.model.num_timesteps / every)
-        if number and self.model.num_timesteps - number * every < self._config.worlds:
+        number = int(self._learner.steps / every)
+        if number and self._learner.steps - number * every < self._config.worlds:
             self.save_checkpoint()
 
     def save_checkpoint(self) -> None:
-        self._save_policy(checkpoint_folder(self._folder, self.model.num_timesteps))
+        self._save_policy(checkpoint_folder(self._folder, self._learner.steps))
 
     def _save_policy(self, folder: Path) -> None:
         c = self._config
         trained: dict[str, Any] = {**self._origin, "run": self._folder.name}
         trained |= {name: getattr(c, name) for name in ("task", "observe", "lighting", "seed")}
-        trained["step"] = self.model.num_timesteps
-        save_policy(folder, c.architecture, c.control, actor_weights(self.model, c.architecture), trained)
+        trained["step"] = self._learner.steps
+        save_policy(folder, c.architecture, c.control, self._learner.averaged.weights(c.architecture), trained)
 
 
 def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> list[bool]:

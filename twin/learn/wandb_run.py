@@ -1,9 +1,9 @@
 """Shows a training as a run of Weights & Biases (wandb.ai), if the package `wandb` is installed.
 
-The run gets the training's configuration, and curves over its steps: those of `tensorboard/` under the same names, and
-those of `episodes.csv`, `log.csv` and `tests.json` as `episodes/...`, `log/...` and `tests/...`. At the end, it gets
-the plot of the success rate and a film of the selected policy. A resumed training continues its run. wandb's own
-environment variables apply: with `WANDB_MODE=offline`, the run is only written to `runs/<name>/wandb`.
+The run gets the training's configuration, and curves over its steps: those of `episodes.csv`, `log.csv` and
+`tests.json` as `episodes/...`, `log/...` and `tests/...`. At the end, it gets the plot of the success rate and a film of
+the selected policy. A resumed training continues its run. wandb's own environment variables apply: with
+`WANDB_MODE=offline`, the run is only written to `runs/<name>/wandb`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import KVWriter
 
 from twin.errors import InputError
 from twin.files import read_json, wrap_read_errors, write_json
-from twin.learn.sac import has_state
+from twin.learn.distillation import has_state
 
 if TYPE_CHECKING:
     import wandb
