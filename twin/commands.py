@@ -274,7 +274,7 @@ def _export(parser: argparse.ArgumentParser, add: _Add) -> None:
 
 
 def _train(parser: argparse.ArgumentParser, add: _Add) -> None:
-    parser.description = "Train a policy by SAC from pixels."
+    parser.description = "Train a policy from pixels, by a teacher that SAC trains from the robot's state."
     parser.set_defaults(resumes=True)
     add("scene", type=Path, help="folder of a built scene")
     add("--task", default="straight", help="straight, right_turn, route, or one of scene.toml")

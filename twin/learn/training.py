@@ -18,7 +18,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import product
@@ -134,7 +134,7 @@ def train(
         spare = range(config.worlds, 2 * config.worlds) if referee else range(0)
         processes = default_processes(config.worlds) if processes is None else processes
         envs = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, len(spare), **config.options())
-        with closing(envs):
+        with closing(envs), ThreadPoolExecutor(1) as thread:
             for i in (*range(config.whole_worlds), *spare):
                 envs.vector_env.set(i, "options", dataclasses.replace(envs.vector_env.options, start_along=0.0))
             learner = _learner(config, teacher, pictures)
@@ -155,7 +155,7 @@ def train(
 
             plan: Referee = referee or (lambda step, _: None if step >= whole.until else whole)
             whole = Segment(config.steps, None)
-            drives = _Drives(envs, config, learner)
+            drives = _Drives(envs, config, learner, thread)
             while segment := plan(learner.steps, drive):
                 if learner.steps >= segment.until:  # a resumed training may already be at or beyond the segment's end
                     recorder.save_checkpoint()
@@ -174,8 +174,8 @@ def train(
 class _Drives:
     """Environments that the policy in training drives; during their steps, it is updated."""
 
-    def __init__(self, envs: DriveVecEnv, config: TrainConfig, learner: Distillation) -> None:
-        self._envs, self._config, self._learner, self._thread = envs, config, learner, ThreadPoolExecutor(1)
+    def __init__(self, envs: DriveVecEnv, config: TrainConfig, learner: Distillation, thread: Executor) -> None:
+        self._envs, self._config, self._learner, self._thread = envs, config, learner, thread
         self._stacks: NDArray[np.uint8] | None = None
         """Preprocessed stacks of the environments; None: no episode has begun."""
 
