@@ -3,8 +3,9 @@
     twin train scenes/demo --task straight --run first
 
 First a teacher learns to drive by the robot's state; from pictures, the policy learns to act like it. A training ends
-when the success rate in tests without exploration reaches `--success`, when tests no longer improve, or at `--steps`. If
-a run was stopped or killed, the same command continues it. The policy is saved in `runs/<name>` of the scene's folder.
+when the success rate in tests without exploration reaches `--success`, when tests no longer improve, or at `--steps`.
+If a run was stopped or killed, the same command continues it. The policy is saved in `runs/<name>` of the scene's
+folder.
 """
 
 import argparse

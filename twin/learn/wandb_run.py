@@ -1,8 +1,8 @@
 """Shows a training as a run of Weights & Biases (wandb.ai), if the package `wandb` is installed.
 
 The run gets the training's configuration, and curves over its steps: those of `episodes.csv`, `log.csv` and
-`tests.json` as `episodes/...`, `log/...` and `tests/...`. At the end, it gets the plot of the success rate and a film of
-the selected policy. A resumed training continues its run. wandb's own environment variables apply: with
+`tests.json` as `episodes/...`, `log/...` and `tests/...`. At the end, it gets the plot of the success rate and a film
+of the selected policy. A resumed training continues its run. wandb's own environment variables apply: with
 `WANDB_MODE=offline`, the run is only written to `runs/<name>/wandb`.
 """
 
