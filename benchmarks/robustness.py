@@ -252,20 +252,20 @@ def _rows(run: Path) -> list[dict[str, Any]]:
 
 
 def _is_complete(run: Path, steps: int) -> bool:
-    """True if a finished training is complete: all steps, tables without gaps or repetitions, a whole replay buffer."""
+    """True if a finished training is complete: all steps, tables without gaps or repetitions, all pictures."""
     head = json.loads((run / "state" / "state.json").read_text())
     rows = _rows(run)
     at = [int(row["step"]) for row in rows]
     seeds = [row["seed"] for row in rows]
-    with np.load(run / "state" / head["folder"] / "replay.npz", allow_pickle=False) as data:
-        written, newest, age = data["written"], data["newest"], data["age"]
-    filled = head["replay"]["full"] or head["replay"]["pos"] * written.size == head["steps"]
-    stored = np.fromfile(run / "state" / "pictures.bin", np.uint8)
-    images = stored.reshape(len(written), -1, 3 * 45 * 80)
-    # Every image that a transition refers to has been written: none is entirely black.
-    written_images = [images[i, newest[:, i] % images.shape[1]].any(-1).all() for i in range(len(written))]
+    with np.load(run / "state" / head["folder"] / "buffer.npz", allow_pickle=False) as data:
+        ages = data["ages"]
+    written = head["buffer"]["written"]
+    filled = written * len(ages) > head["steps"]  # each resumption adds the first picture of an episode
+    images = np.fromfile(run / "state" / "pictures.bin", np.uint8).reshape(*ages.shape, 3 * 45 * 80)
+    # Every picture that may be sampled has been written: none is entirely black.
+    newest = np.arange(max(0, written - 100), written) % ages.shape[1]
     tables = head["steps"] == steps and at == sorted(at) and len(set(seeds)) == len(seeds)
-    return bool(tables and filled and all(written_images) and (age >= 0).all() and (newest < written).all())
+    return bool(tables and filled and images[:, newest].any(-1).all() and (ages >= 0).all())
 
 
 def _killed_validations(times: int, folder: Path, rng: np.random.Generator) -> dict[str, Any]:

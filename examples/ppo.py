@@ -1,8 +1,8 @@
 """PPO of stable-baselines3 on pictures and odometry: python examples/ppo.py scenes/demo --steps 200000
 
-Needs pip install 'twin[learn]'. PPO needs more steps than `twin train`, whose SAC is tuned to this task; the example
-shows how to connect any algorithm of stable-baselines3. For a policy that `twin validate --policy ppo.zip --trust` can
-drive, leave out `state` and use CnnPolicy.
+Needs pip install 'twin[learn]'. PPO needs more steps than `twin train`, whose teacher knows where the robot is; the
+example shows how to connect any algorithm of stable-baselines3. For a policy that `twin validate --policy ppo.zip
+--trust` can drive, leave out `state` and use CnnPolicy.
 """
 
 import argparse

@@ -330,8 +330,8 @@ def test_episodes_that_start_along_the_route_are_cut_off(scene, along, time, cou
     assert step.reward == 0.1 and step.discount == 1.0
 
 
-def test_the_state_has_the_first_obstacle_in_reach(scene):
-    """Behind the robot, too, until it has passed; not beyond 6 m, nor where the robot cannot touch it."""
+def test_the_state_has_the_nearest_obstacle_in_reach(scene):
+    """Until the robot has passed it; not beyond 6 m, nor where the robot cannot touch it."""
     still = {"start_offset": 0.0, "start_heading": 0.0, "pixels": False}
     cones = [
         ObstacleConfig("far", "cone", 9.0, 0.2),
@@ -360,6 +360,12 @@ def test_the_state_has_the_first_obstacle_in_reach(scene):
     assert told(cones[2:3]) == told([])
     assert told(cones[2:]) == told([])  # the walker is still aside
     assert told([cones[0]], steps=45)[:2] == pytest.approx([9.0, 0.2], abs=0.05)
+    behind, beside, ahead = (ObstacleConfig(f"c{k}", "cone", 2.0 + k, 0.8) for k in (-1.0, -0.5, 1.0))
+    here = own_station(start)
+    passed = [replace(one, station=one.station + here - 2.0) for one in (behind, beside, ahead)]
+    assert told(passed)[:2] == pytest.approx([here - 0.5, 0.8], abs=0.03)
+    assert told([passed[0], passed[2]])[:2] == pytest.approx([here + 1.0, 0.8], abs=0.03)
+    assert told(passed[:1]) == told([])
     crossing = told([replace(cones[3], station=6.0, to=(6.0, -3.0))], steps=25)
     assert crossing == pytest.approx([6.0, 0.5, RADIUS["pedestrian"]], abs=0.05)
 

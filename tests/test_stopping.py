@@ -126,6 +126,7 @@ def test_nothing_outlives_a_verb(cases, name, number):
         if any("glfwGetVersion" in " ".join(_command(one)) for one in psutil.Process(process.pid).children(True)):
             alone = time.monotonic()
         time.sleep(0.05)
+    children += psutil.Process(process.pid).children(recursive=True)  # a teacher's processes have ended meanwhile
     if number == signal.SIGINT:
         os.killpg(process.pid, number)  # as a terminal does
     else:

@@ -184,7 +184,7 @@ def test_resumptions_have_episodes_of_their_own(scene, tmp_path, monkeypatch):
         given.append(seed)
         return whole(worlds, seed)
 
-    monkeypatch.setattr(training, "_new_teacher", lambda *_: Teacher(1))
+    monkeypatch.setattr(training, "train_teacher", lambda *_: (Teacher(1), 0))
     monkeypatch.setattr(training.DriveVecEnv, "seed", spy)
     for seed in (0, 1):
         for steps in (8, 16, 24):
@@ -259,6 +259,26 @@ def test_the_log_has_the_policys_errors(scene, tmp_path):
     assert len(errors) == 3 and all(0.0 < one < 3.0 for row in errors for one in row)
 
 
+def test_all_but_some_environments_drive_short_episodes(scene, tmp_path):
+    """With few and with many processes alike."""
+    config = replace(SHORT, steps=160, whole_worlds=1, along_time=0.5, speed=0.2)
+    for processes in (1, 2):
+        train_policy(twin.load_scene(scene), tmp_path / str(processes), config, processes=processes)
+    one, two = ([{**row, "wall_s": ""} for row in rows(tmp_path / n / "episodes.csv")] for n in "12")
+    assert one == two
+    assert len(one) >= 3 * (160 // 4 // 5 - 1)
+    for row in one:
+        assert float(row["start_m"]) > 0.0 and int(row["steps"]) <= 5
+        assert (row["cause"] == "") == (row["steps"] == "5") or row["cause"] == "goal"
+
+
+@pytest.mark.parametrize("whole", [0, 5])
+def test_at_least_one_environment_drives_short_episodes(scene, tmp_path, whole):
+    config = replace(SHORT, steps=24, worlds=2, whole_worlds=whole, along_time=0.2)
+    train_policy(twin.load_scene(scene), tmp_path, config, processes=1)
+    assert len(rows(tmp_path / "episodes.csv")) == pytest.approx(12 if whole == 0 else 6, abs=1 + (whole == 0))
+
+
 def test_a_teacher_is_trained_once_and_repeatably(scene, tmp_path, monkeypatch):
     built = twin.load_scene(scene)
     given = []
@@ -302,8 +322,33 @@ def test_a_signal_stops_the_teacher(scene, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         train_policy(twin.load_scene(scene), tmp_path, SHORT, processes=1)
     assert not (tmp_path / "state/state.json").exists() and not (tmp_path / "state/teacher.safetensors").exists()
-    monkeypatch.setattr(training, "train_teacher", whole)
-    train_policy(twin.load_scene(scene), tmp_path, replace(SHORT, steps=8), processes=1)  # it begins again
+
+    def ended(built, config, processes, watch):
+        out = whole(built, config, processes, watch)
+        signal.raise_signal(signal.SIGTERM)
+        return out
+
+    monkeypatch.setattr(training, "train_teacher", ended)
+    with pytest.raises(KeyboardInterrupt):
+        train_policy(twin.load_scene(scene), tmp_path, SHORT, processes=1)
+    assert json.loads((tmp_path / "state/state.json").read_text())["steps"] == 0
+    train_policy(twin.load_scene(scene), tmp_path, replace(SHORT, steps=8), processes=1)  # with the same teacher
+    assert json.loads((tmp_path / "state/state.json").read_text())["steps"] == 8
+
+
+def test_teachers_of_neighboring_seeds_drive_other_episodes(scene, monkeypatch):
+    given, whole = [], DriveVecEnv.seed
+
+    def spy(worlds, seed=None):
+        given.append(seed)
+        return whole(worlds, seed)
+
+    monkeypatch.setattr(DriveVecEnv, "seed", spy)
+    used = []
+    for seed in (0, 1):
+        train_teacher(twin.load_scene(scene), replace(SHORT, seed=seed), processes=1)
+        used += [given[-2], given[-1]]  # of training and test; before, the environments are made with the run's seed
+    assert len({seed + i for seed in used for i in range(SHORT.worlds)}) == 4 * SHORT.worlds
 
 
 def test_fractions_of_updates_add_up(scene, tmp_path):

@@ -11,6 +11,7 @@ folder.
 import argparse
 import dataclasses
 import sys
+import time
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -75,7 +76,7 @@ def _summary(folder: Path, choice: dict[str, Any], picture: Path) -> list[str]:
     if taught["successes"] < taught["trials"]:
         lines.append(
             f"Its teacher, which knows where the robot is, arrives only {taught['successes']} times in "
-            f"{taught['trials']} episodes; more --teacher-steps may help, or an easier task."
+            f"{taught['trials']} episodes; train under another name with more --teacher-steps, or on an easier task."
         )
     if choice["failures"]:
         lines.append(f"Where the kept policy fails: {choice['failures']}.")
@@ -105,6 +106,7 @@ def _train(
         def watch(steps: int, recent: Sequence[bool]) -> None:
             if not bar.n:  # the bar's speed must not include the steps of earlier calls
                 bar.initial = bar.n = bar.last_print_n = steps
+                bar.start_t = bar.last_print_t = time.time()  # nor its time that of the teacher
             bar.update(steps - bar.n)
             if recent:
                 low, high = wilson(sum(recent), len(recent))

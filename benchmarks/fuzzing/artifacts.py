@@ -151,7 +151,7 @@ def forecast(case: Case) -> None:
 def run_metadata(case: Case) -> None:
     """JSON files of runs and validations: summaries of trainings, configs, checkpoints, choices."""
     from twin.evaluation.training_curves import CHOICE_FILE, write_success_curve
-    from twin.learn import sac, selection, training
+    from twin.learn import distillation, selection, training
 
     rng, root = case.rng, case.folder / "scene"
     which = rng.random()
@@ -164,11 +164,11 @@ def run_metadata(case: Case) -> None:
         training.check_same(root, config)
     elif which < 0.9:
         (root / "state").mkdir(parents=True)
-        names = [name for name in vars(sac).values() if isinstance(name, str) and name.endswith(".json")]
+        names = [name for name in vars(distillation).values() if isinstance(name, str) and name.endswith(".json")]
         for name in names:
             state = {"steps": 100, "updates": 50, "resumed": 0}
             (root / "state" / name).write_bytes(mutated_json(rng, state))
-        sac.saved_steps(root / "state")
+        distillation.saved_steps(root / "state")
     else:
         (root / "state").mkdir(parents=True)
         (root / "state" / "state.json").write_text('{"steps": 200}')

@@ -302,7 +302,8 @@ def obstacle_station(obstacle: ObstacleConfig, time: float) -> tuple[float, floa
 
 
 def obstacles_in_reach(obstacles: Sequence[ObstacleConfig], half_width: float, time: float) -> Array:
-    """Station, lateral and radius [m], shape (k, 3), of those obstacles that a robot in the corridor could touch."""
+    """Station, lateral and radius [m], shape (k, 3), of those obstacles whose surrounding cylinder a robot in
+    the corridor could touch."""
     placed = [(*obstacle_station(one, time)[:2], _radius(one)) for one in obstacles]
     return np.array([row for row in placed if abs(row[1]) < half_width + _ROBOT_HALF_WIDTH + row[2]]).reshape(-1, 3)
 

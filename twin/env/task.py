@@ -61,10 +61,10 @@ EPISODE_VERSION = 4
 """Version of the episodes of a training. Increase it whenever a change of the code changes the starts of a seed with
 `Options.start_along`, when these episodes are cut off, or which ends of episodes are terminal."""
 # With `Options.start_along`: at the start, largest distance from the route / corridor half width, largest heading /
-# `start_heading`. Beyond them, a policy would not know what to do.
+# `start_heading`. A policy has to know what to do there, since it gets there sometimes.
 _ALONG_OFFSET, _ALONG_HEADING = 0.8, 2.0
 _LOOKAHEADS = (1.0, 2.0, 4.0)  # [m] along the route; the state contains the change of heading up to these points
-_OBSTACLE_RANGE = (-1.0, 6.0)  # [m] the state contains the first obstacle that is this far along the route
+_OBSTACLE_RANGE = (-0.5, 6.0)  # [m] the state contains the nearest obstacle between here and there along the route
 
 
 # ---- reward and termination of n drives at once
@@ -120,25 +120,16 @@ class RewardAndTermination:
         high = np.array([speed, yaw_rate, cross_track, *[np.pi] * 4, _OBSTACLE_RANGE[1], beside, beside], np.float32)
         self.state_bounds = np.stack([-high, high])
         """Lowest and highest values of the components of `state`, float32, shape (2, 10)."""
-        self._obstacles: list[tuple[ObstacleConfig, ...]] = [()] * count
+        self.obstacles: list[tuple[ObstacleConfig, ...]] = [()] * count
+        """Obstacles of each drive's present episode."""
         self._cause_rewards = np.array([0.0, *(getattr(terms, cause) for cause in CAUSES)])
         self._cause_rewards[[0, _CODES["goal"]]] += terms.step
 
-    def begin(
-        self,
-        which: EnvIndices,
-        foot: Array,
-        position: Array,
-        cut_time: float = np.inf,
-        obstacles: tuple[ObstacleConfig, ...] = (),
-    ) -> None:
+    def begin(self, which: EnvIndices, foot: Array, position: Array, cut_time: float = np.inf) -> None:
         """Starts k episodes at positions, shape (k, 2) [m], near the arc lengths `foot`, shape (k,) [m].
 
-        An episode that has not ended after `cut_time` [s] is cut off: truncated without a cause. `obstacles`: those of
-        the episodes, for `state`.
+        An episode that has not ended after `cut_time` [s] is cut off: truncated without a cause.
         """
-        for i in which:
-            self._obstacles[i] = obstacles
         self._cut_time[which] = cut_time
         self._cause[which], self._anchor_time[which], self._steering[which] = 0, 0.0, 0.0
         self.foot[which], self.cross_track[which] = self._nearest(position, foot)
@@ -190,8 +181,8 @@ class RewardAndTermination:
 
         Its components are `speed` [m/s], `yaw_rate` [rad/s], `cross_track` [m] (positive to the left), `heading_error`
         [rad] (the robot's heading minus the route's), `turns` [rad] (changes of the route's heading until 1, 2 and 4 m
-        ahead) and `obstacle`: of the first obstacle within 6 m in the corridor, the distance along the route, the
-        distance to the left of the robot, and the radius [m]; without one 6, 0 and 0.
+        ahead) and `obstacle`: of the nearest obstacle in reach of the corridor, until 6 m ahead, its distance from the
+        robot along and across the route (positive ahead and to the left) and its radius [m]; without one 6, 0 and 0.
 
         The state is clipped to `state_bounds`. This changes it only if the robot moves more than ten times as fast as
         its controller allows, for example when it falls.
@@ -201,19 +192,20 @@ class RewardAndTermination:
         turns = wrap_angle(heading_at(self._route, foot[:, None] + np.array(_LOOKAHEADS)) - heading[:, None])
         error = wrap_angle(motion.pose[:, 2] - heading)
         columns = (motion.speed, motion.yaw_rate, self.cross_track[which], error)
-        obstacles = np.array([self._first_obstacle(i, time) for i, time in zip(which, motion.time, strict=True)])
-        return np.clip(np.column_stack([*columns, turns, obstacles]).astype(np.float32), *self.state_bounds)
+        nearest = [self._nearest_obstacle(i, time) for i, time in zip(which, motion.time, strict=True)]
+        obstacle = np.array(nearest).reshape(-1, STATE_SIZES["obstacle"])
+        return np.clip(np.column_stack([*columns, turns, obstacle]).astype(np.float32), *self.state_bounds)
 
-    def _first_obstacle(self, i: int, time: float) -> tuple[float, float, float]:
+    def _nearest_obstacle(self, i: int, time: float) -> tuple[float, float, float]:
         """The part `obstacle` of the state of drive i at a time [s]."""
-        near, far = _OBSTACLE_RANGE
-        if self._obstacles[i]:
-            placed = obstacles_in_reach(self._obstacles[i], self.half_width, time)
-            ahead = placed[:, 0] - self.foot[i]
-            seen = np.flatnonzero((ahead > near) & (ahead < far))
+        behind, far = _OBSTACLE_RANGE
+        if self.obstacles[i]:
+            station, lateral, radius = obstacles_in_reach(self.obstacles[i], self.half_width, time).T
+            ahead = station - self.foot[i]
+            seen = np.flatnonzero((ahead + radius > behind) & (ahead < far))
             if len(seen):
-                first = seen[ahead[seen].argmin()]
-                return float(ahead[first]), float(placed[first, 1] - self.cross_track[i]), float(placed[first, 2])
+                k = seen[(np.abs(ahead[seen]) - radius[seen]).argmin()]
+                return float(ahead[k]), float(lateral[k] - self.cross_track[i]), float(radius[k])
         return far, 0.0, 0.0
 
     def _nearest(self, position: Array, foot: Array) -> tuple[Array, Array]:
@@ -333,8 +325,6 @@ class DriveTask(control.Task):
         """Seed of the current episode."""
         self.sample = RandomizationSample()
         """Randomized robot and weather of the current episode."""
-        self.obstacles: tuple[ObstacleConfig, ...] = ()
-        """Obstacles of the current episode."""
         self._start_station = segment.start
 
     def seed(self, seed: int | None) -> None:
@@ -372,7 +362,7 @@ class DriveTask(control.Task):
             )
         cut_time = self.options.along_time if self.options.start_along else np.inf
         position = physics.planar_pose[None, :2]
-        self._evaluator.begin([self._index], np.array([self._start_station]), position, cut_time, self.obstacles)
+        self._evaluator.begin([self._index], np.array([self._start_station]), position, cut_time)
 
     def before_step(self, action: Any, physics: DrivePhysics) -> None:
         """Raises ValueError: the action is invalid; the episode is unchanged."""
@@ -409,6 +399,15 @@ class DriveTask(control.Task):
         return specs.BoundedArray(low.shape, np.float64, low, high, name=name)
 
     # ---- state of the episode
+
+    @property
+    def obstacles(self) -> tuple[ObstacleConfig, ...]:
+        """Obstacles of the current episode."""
+        return self._evaluator.obstacles[self._index]
+
+    @obstacles.setter
+    def obstacles(self, obstacles: tuple[ObstacleConfig, ...]) -> None:
+        self._evaluator.obstacles[self._index] = obstacles
 
     @property
     def state_bounds(self) -> NDArray[np.float32]:

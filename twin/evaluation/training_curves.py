@@ -135,7 +135,7 @@ def _plot_choice(axes: Axes, choice: dict[str, Any]) -> None:
     tried, chosen = choice["candidates"], choice["chosen"]
     shares = [one["successes"] / one["trials"] for one in tried]
     label = f"tests without exploration, {_range_text(one['trials'] for one in tried)} episodes each"
-    axes.plot([one["step"] for one in tried], shares, "o", color="#d95f02", fillstyle="none", label=label)
+    axes.plot([one["step"] for one in tried], shares, "o-", color="#d95f02", fillstyle="none", label=label)
     rate = chosen["successes"] / chosen["trials"]
     low, high = wilson(chosen["successes"], chosen["trials"])
     label = f"the chosen policy in {chosen['trials']} new episodes"
@@ -149,7 +149,7 @@ def write_success_curve(folder: Path) -> Path:
     path = folder / "success.png"
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     axes = figure.subplots()
-    if len(steps):
+    if len(steps) >= _MIN_EPISODES:
         plot_success_curve(axes, steps, success, "#1f77b4")
     if (folder / CHOICE_FILE).exists():
         with wrap_read_errors(folder / CHOICE_FILE, "delete it, and the best policy is selected again"):

@@ -110,7 +110,7 @@ class Distillation:
         self.averaged.load_state_dict(self.network.state_dict())
         self.teacher, self.buffer = teacher.to(self.device), buffer
         self.optimizer = torch.optim.Adam(self.network.parameters())
-        self.steps, self.updates, self.episodes = 0, 0, 0
+        self.steps, self.updates = 0, 0
 
     @torch.no_grad()
     def act(self, stacks: NDArray[np.uint8]) -> Array32:
@@ -164,7 +164,7 @@ def save_state(folder: Path, learner: Distillation, more: dict[str, Any]) -> Non
     except OSError:  # free some space, so that the error can be logged
         remove(folder / name)
         raise
-    counts = {"steps": learner.steps, "updates": learner.updates, "episodes": learner.episodes}
+    counts = {"steps": learner.steps, "updates": learner.updates}
     write_json(folder / _STATE, {"folder": name, **counts, "buffer": pictures, "more": more})
     for old in folder.glob("state_*"):
         if old.name != name:
@@ -192,7 +192,7 @@ def load_state(folder: Path, learner: Distillation) -> dict[str, Any]:
         tensors = load_file(regular_file(state / _TENSORS))
         learner.buffer.set_state(load_arrays(state / _BUFFER), head["buffer"])
         _set_tensors(learner, tensors)
-        learner.steps, learner.updates, learner.episodes = (int(head[n]) for n in ("steps", "updates", "episodes"))
+        learner.steps, learner.updates = int(head["steps"]), int(head["updates"])
         return dict(head["more"])
 
 

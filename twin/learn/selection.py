@@ -1,7 +1,7 @@
 """Decides when a training ends and which of its policies is kept, by tests between segments of the training.
 
-A *test* drives the newest policy, without exploration, in whole episodes like those of the training. All tests of a run
-use the same episodes, and the training never uses these. A test stops as soon as more episodes have failed than the
+A *test* drives the newest policy, without exploration, in whole episodes in the training's conditions. All tests of a
+run use the same episodes, and the training never uses these. A test stops as soon as more episodes have failed than the
 required success rate `config.success` allows. The training ends
 
 - when a test *reaches* the required rate;

@@ -29,7 +29,7 @@ from twin.loading import Twin
 
 STATE_SCALES = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3, 0.3, 3.0, 1.0, 1.0)
 """Typical magnitudes of the components of `RewardAndTermination.state`: speed [m/s], yaw rate [rad/s], cross-track
-error [m], heading error [rad], turns up to 1, 2 and 4 m ahead [rad], and place and size of the first obstacle [m]."""
+error [m], heading error [rad], turns up to 1, 2 and 4 m ahead [rad], and place and size of the nearest obstacle [m]."""
 
 _MAX_STATE = 3.0  # states are clamped to ± this multiple of their scales
 _HIDDEN = (128, 128)
@@ -99,6 +99,7 @@ def train_teacher(
             seed=config.seed,
             device="cpu",
         )
+        envs.seed(seed)  # stable-baselines3 has seeded them with the run's seed, which the policy's tests may share
         model.learn(config.teacher_steps, _Watch(watch))
     actor = model.policy.actor
     teacher = Teacher(config.control.actions)

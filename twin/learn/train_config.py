@@ -77,7 +77,7 @@ class TrainConfig:
     """Length of these episodes [s]. Each has another lighting, weather and robot; short ones, of which there are many,
     teach far more than long ones (docs/findings.md, "A teacher")."""
     whole_worlds: Annotated[int, Range(0, 4096)] = 1
-    """Number of environments whose episodes begin at the segment's start and are not cut off."""
+    """Number of environments whose episodes begin at the segment's start and are not cut off; at least one is left."""
     randomise: bool = True
     """Randomizes the robot in every episode; if the lighting varies, also the weather and distractor objects."""
     pool: Annotated[int, Range(1, 16)] = 2

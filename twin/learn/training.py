@@ -60,7 +60,7 @@ Watch = Callable[[int, Sequence[bool]], None]
 task's route segment."""
 
 Drive = Callable[[Path, Sequence[int], Callable[[], object]], list[EpisodeResult]]
-"""Drives the policy of a folder in whole episodes like those of the training, one per seed; see `run_episodes`."""
+"""Drives the policy of a folder in whole episodes in the training's conditions, one per seed; see `run_episodes`."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,8 @@ def train(
 ) -> None:
     """Trains a policy, or resumes a training that was stopped or killed.
 
-    On SIGINT, SIGTERM and SIGHUP, it saves the state and raises `Stopped`, a KeyboardInterrupt.
+    On SIGINT, SIGTERM and SIGHUP, it saves the state and raises `Stopped`, a KeyboardInterrupt. A teacher that is still
+    in training is not saved.
 
     Args:
         config: Must equal that of an existing run, except for `steps`, `success` and `device`.
@@ -134,8 +135,9 @@ def train(
         spare = range(config.worlds, 2 * config.worlds) if referee else range(0)
         processes = default_processes(config.worlds) if processes is None else processes
         envs = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, len(spare), **config.options())
-        with closing(envs), ThreadPoolExecutor(1) as thread:
-            for i in (*range(config.whole_worlds), *spare):
+        board = TensorBoardOutputFormat(str(folder / "tensorboard"))
+        with closing(envs), ThreadPoolExecutor(1) as thread, closing(board):
+            for i in (*range(min(config.whole_worlds, config.worlds - 1)), *spare):
                 envs.vector_env.set(i, "options", dataclasses.replace(envs.vector_env.options, start_along=0.0))
             learner = _learner(config, teacher, pictures)
             before: dict[str, Any] = load_state(folder / "state", learner) if resume else {"wall": 0.0, "resumed": -1}
@@ -145,8 +147,11 @@ def train(
             camera = twin.world().camera.resized(config.architecture.size)
             origin = {"scene": twin.scene.root.resolve().name, "camera": list(camera.intrinsics)}
             recorder = _RunRecorder(
-                folder, config, settings, origin, learner, before["wall"], resumed, watch, stop, writers
+                folder, config, settings, origin, learner, before["wall"], resumed, watch, stop, [board, *writers]
             )
+            if not resume:  # from now on, a stopped training need not train its teacher again
+                recorder.begin()
+                save_state(folder / "state", learner, {"wall": recorder.wall, "resumed": resumed})
 
             def drive(policy: Path, seeds: Sequence[int], on_episode: Callable[[], object]) -> list[EpisodeResult]:
                 if stop.number:
@@ -196,7 +201,6 @@ class _Drives:
         pictures, _, over, infos = stepped.result()
         self._observe(pictures, over)
         learner.steps += c.worlds
-        learner.episodes += int(over.sum())
         return infos, errors
 
     def _observe(self, pictures: Any, first: NDArray[np.bool_]) -> None:
@@ -328,8 +332,7 @@ class _RunRecorder:
         """`origin`: name of the scene, and intrinsics fx, fy, cx, cy [px] of the pictures."""
         self._folder, self._config, self._settings, self._origin = folder, config, settings, origin
         self._learner, self._wall, self._resumed, self._started = learner, wall, resumed, time.monotonic()
-        self._watch, self._stop = watch, stop
-        self._writers = [TensorBoardOutputFormat(str(folder / "tensorboard")), *writers]
+        self._watch, self._stop, self._writers = watch, stop, writers
         self._errors: list[tuple[float, float]] = []
 
     @property
@@ -365,7 +368,9 @@ class _RunRecorder:
             episode = info["episode"]
             head = (self._learner.steps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"])
             outcome = (int(info["is_success"]), info["cause"], f"{info['progress']:.2f}", episode["l"])
-            rows.append((*head, *outcome, f"{episode['r']:.3f}", f"{info['start']:.2f}"))
+            # Readers take 0.00 for the start of the route segment.
+            start = max(info["start"], 0.01) if info["start"] else 0.0
+            rows.append((*head, *outcome, f"{episode['r']:.3f}", f"{start:.2f}"))
         self._append("episodes", TRAINING_EPISODE_COLUMNS, rows)
         if self._watch:
             self._watch(self._learner.steps, self._recent)

@@ -106,7 +106,7 @@ def card(policy: Policy, folder: Path, cells: Sequence[Cell], known: Sequence[Ca
 def _front_matter(policy: Policy, cells: Sequence[Cell]) -> str:
     """YAML front matter in the format of model hubs; strings and numbers are written as JSON, which is valid YAML."""
     lines = ["---", "library_name: twin", "pipeline_tag: reinforcement-learning"]
-    lines += [f"tags: {json.dumps(['robotics', 'mujoco', 'husky', 'sac', 'navigation'])}"]
+    lines += [f"tags: {json.dumps(['robotics', 'mujoco', 'husky', 'imitation-learning', 'navigation'])}"]
     if cells:
         lines += ["model-index:", f"- name: {json.dumps(policy.name)}", "  results:"]
     for cell in cells:
