@@ -404,8 +404,9 @@ def _fault_or_ok(mounted: Path, leave: int, command: list[str], root: Path) -> s
 _VERB_TRAIN = _TRAIN.replace(
     "train(twin.load_scene(sys.argv[1]), Path(sys.argv[2]), small)",
     """
-from twin import command_line
+from twin import command_line, runtime
 def work(options):
+    runtime.set_quiet(True)
     train(twin.load_scene(sys.argv[1]), Path(sys.argv[1]) / "runs" / sys.argv[2], small)
 sys.exit(command_line.run(command_line.Parser(), work, []))
 """,

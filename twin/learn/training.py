@@ -127,6 +127,7 @@ def train(
             stale.unlink(missing_ok=True)
         shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     with stop_noted() as stop:
+        buffer = _buffer(config, pictures)  # before the teacher, since the disk may be too full
         teacher = load_teacher(folder / "state", config.control.actions) if resume else None
         if teacher is None:
             teacher = _new_teacher(twin, folder, config, processes, stop)
@@ -139,7 +140,7 @@ def train(
         with closing(envs), ThreadPoolExecutor(1) as thread, closing(board):
             for i in (*range(min(config.whole_worlds, config.worlds - 1)), *spare):
                 envs.vector_env.set(i, "options", dataclasses.replace(envs.vector_env.options, start_along=0.0))
-            learner = _learner(config, teacher, pictures)
+            learner = Distillation(config.architecture, teacher, buffer, config.seed, config.device)
             before: dict[str, Any] = load_state(folder / "state", learner) if resume else {"wall": 0.0, "resumed": -1}
             resumed = before["resumed"] + 1
             seeds = np.random.SeedSequence([config.seed, resumed, _TRAINING_STREAM])
@@ -223,8 +224,8 @@ def _new_teacher(twin: Twin, folder: Path, config: TrainConfig, processes: int |
     return teacher
 
 
-def _learner(config: TrainConfig, teacher: Teacher, pictures: Path) -> Distillation:
-    buffer = PictureBuffer(
+def _buffer(config: TrainConfig, pictures: Path) -> PictureBuffer:
+    return PictureBuffer(
         config.buffer,
         config.worlds,
         config.architecture.pooled_size[::-1],
@@ -237,7 +238,6 @@ def _learner(config: TrainConfig, teacher: Teacher, pictures: Path) -> Distillat
         seed=config.seed,
         device=config.device,
     )
-    return Distillation(config.architecture, teacher, buffer, config.seed, config.device)
 
 
 def _learning_rate(config: TrainConfig, step: int, segment: Segment) -> float:
