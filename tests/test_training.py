@@ -300,9 +300,8 @@ def test_a_teacher_is_trained_once_and_repeatably(scene, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_teacher_learns_to_drive(scene):
-    teacher, successes = train_teacher(
-        twin.load_scene(scene), TrainConfig(task="bend", lighting="day", teacher_steps=8_000)
-    )
+    config = TrainConfig(task="bend", lighting="day", teacher_steps=8_000)
+    teacher, successes = train_teacher(twin.load_scene(scene), config, processes=1)
     assert successes == TrainConfig().worlds
     states = torch.zeros((2, len(STATE_SCALES)))
     states[:, 0], states[:, 2] = 1.0, torch.tensor([-0.5, 0.5])  # to the right of the route, and to the left
