@@ -29,7 +29,7 @@ from twin.errors import InputError
 from twin.evaluation.training_curves import read_episodes
 from twin.evaluation.trials import csv_text
 from twin.files import write_json
-from twin.learn import selection, train_config, training
+from twin.learn import selection, teacher, train_config, training
 from twin.learn.policy import load_policy
 from twin.learn.sb3_env import DriveVecEnv
 from twin.learn.teacher import STATE_SCALES, Teacher, load_teacher, teacher_result, train_teacher
@@ -301,12 +301,26 @@ def test_a_teacher_is_trained_once_and_repeatably(scene, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_teacher_learns_to_drive(scene):
     config = TrainConfig(task="bend", lighting="day", teacher_steps=8_000)
-    teacher, successes = train_teacher(twin.load_scene(scene), config, processes=1)
+    learnt, successes = train_teacher(twin.load_scene(scene), config, processes=1)
     assert successes == TrainConfig().worlds
     states = torch.zeros((2, len(STATE_SCALES)))
     states[:, 0], states[:, 2] = 1.0, torch.tensor([-0.5, 0.5])  # to the right of the route, and to the left
-    left, right = teacher(states).ravel().tolist()
+    left, right = learnt(states).ravel().tolist()
     assert left > 0.05 and right < -0.05
+
+
+@pytest.mark.parametrize(("action", "cause", "cut"), [(0.0, "goal", True), (1.0, "out_of_bounds", False)])
+def test_the_goal_is_no_terminal_state_for_a_teacher(scene, action, cause, cut):
+    straight = {"start_along": 0.0, "start_offset": 0.0, "start_heading": 0.0}
+    config = replace(SHORT, worlds=1)
+    envs = teacher._StateVecEnv(twin.load_scene(scene), config, 0, 1, {**config.teacher_options(), **straight})
+    envs.reset()
+    over = [False]
+    while not over[0]:
+        _, _, over, infos = envs.step(np.full((1, 1), action, np.float32))
+    assert (infos[0]["cause"], infos[0]["TimeLimit.truncated"]) == (cause, cut)
+    assert np.abs(infos[0]["terminal_observation"]).max() <= 3.0
+    envs.close()
 
 
 def test_a_signal_stops_the_teacher(scene, tmp_path, monkeypatch):
