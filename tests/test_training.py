@@ -323,6 +323,12 @@ def test_the_goal_is_no_terminal_state_for_a_teacher(scene, action, cause, cut):
     envs.close()
 
 
+def test_a_mistake_is_told_before_the_teacher_is_trained(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "train_teacher", lambda *_: pytest.fail("trained"))
+    with pytest.raises(InputError, match="dusk"):
+        train_policy(twin.load_scene(scene), tmp_path, replace(SHORT, lighting="dusk"), processes=1)
+
+
 def test_a_signal_stops_the_teacher(scene, tmp_path, monkeypatch):
     whole = training.train_teacher
 

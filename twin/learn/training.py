@@ -127,10 +127,6 @@ def train(
             stale.unlink(missing_ok=True)
         shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     with stop_noted() as stop:
-        buffer = _buffer(config, pictures)  # before the teacher, since the disk may be too full
-        teacher = load_teacher(folder / "state", config.control.actions) if resume else None
-        if teacher is None:
-            teacher = _new_teacher(twin, folder, config, processes, stop)
         # Tests have separate environments: in shared ones, a test would break off training episodes. The two sets of
         # environments never step at the same time, so they share the processes.
         spare = range(config.worlds, 2 * config.worlds) if referee else range(0)
@@ -138,6 +134,12 @@ def train(
         envs = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, len(spare), **config.options())
         board = TensorBoardOutputFormat(str(folder / "tensorboard"))
         with closing(envs), ThreadPoolExecutor(1) as thread, closing(board):
+            # Environments and buffer come before the teacher's training, which takes minutes: a lighting may be
+            # unknown, or the disk too full.
+            buffer = _buffer(config, pictures)
+            teacher = load_teacher(folder / "state", config.control.actions) if resume else None
+            if teacher is None:
+                teacher = _new_teacher(twin, folder, config, processes, stop)
             for i in (*range(min(config.whole_worlds, config.worlds - 1)), *spare):
                 envs.vector_env.set(i, "options", dataclasses.replace(envs.vector_env.options, start_along=0.0))
             learner = Distillation(config.architecture, teacher, buffer, config.seed, config.device)
