@@ -19,7 +19,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -132,8 +132,7 @@ def train(
         spare = range(config.worlds, 2 * config.worlds) if referee else range(0)
         processes = default_processes(config.worlds) if processes is None else processes
         envs = DriveVecEnv(twin, config.task, config.worlds, config.seed, processes, len(spare), **config.options())
-        board = TensorBoardOutputFormat(str(folder / "tensorboard"))
-        with closing(envs), ThreadPoolExecutor(1) as thread, closing(board):
+        with closing(envs), ThreadPoolExecutor(1) as thread, ExitStack() as opened:
             # Environments and buffer come before the teacher's training, which takes minutes: a lighting may be
             # unknown, or the disk too full.
             buffer = _buffer(config, pictures)
@@ -142,6 +141,7 @@ def train(
                 teacher = _new_teacher(twin, folder, config, processes, stop)
             for i in (*range(min(config.whole_worlds, config.worlds - 1)), *spare):
                 envs.vector_env.set(i, "options", dataclasses.replace(envs.vector_env.options, start_along=0.0))
+            board = opened.enter_context(closing(TensorBoardOutputFormat(str(folder / "tensorboard"))))
             learner = Distillation(config.architecture, teacher, buffer, config.seed, config.device)
             before: dict[str, Any] = load_state(folder / "state", learner) if resume else {"wall": 0.0, "resumed": -1}
             resumed = before["resumed"] + 1
