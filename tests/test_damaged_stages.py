@@ -9,7 +9,7 @@ from tiny_twin import tiny_twin
 from twin.assets.ground import Ground
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.errors import InputError
-from twin.evaluation.training_curves import read_episodes, training_summaries
+from twin.evaluation.training_curves import TESTS_FILE, read_test_counts, training_summaries
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
@@ -100,12 +100,14 @@ def test_json_values_of_wrong_type(build, tmp_path, reader, stage, name, key, va
 
 
 @pytest.mark.parametrize(
-    "line", ["x,1,0.0", "1,,0.0", "1,2,0.0", "1", "1,1,far", "5,1,0.0\n1,1,0.0", "1,1," + "9" * 200_000]
+    "tests",
+    ["{", "{}", "[3]", '[{"step": 1, "successes": 2}]', '[{"step": 1, "successes": 2, "trials": 1}]']
+    + [json.dumps([{"step": 1, "successes": 0, "trials": n}]) for n in (0, "many", None)],
 )
-def test_damaged_episodes_of_a_training(tmp_path, line):
-    (tmp_path / "episodes.csv").write_text(f"step,success,start_m\n{line}\n")
-    with pytest.raises(InputError, match=r"episodes\.csv"):
-        read_episodes(tmp_path)
+def test_damaged_tests_of_a_training(tmp_path, tests):
+    (tmp_path / TESTS_FILE).write_text(tests)
+    with pytest.raises(InputError, match=r"tests\.json"):
+        read_test_counts(tmp_path)
 
 
 def test_damaged_records_of_a_validation(tmp_path):

@@ -75,7 +75,6 @@ def test_a_validated_and_driven_policy_has_its_rates(scene):
 
 
 def test_a_forecast_has_the_final_test_of_a_training(scene):
-    (scene.root / "runs/first/episodes.csv").write_text("step,success\n" + "9,0\n" * 20)
     validate(scene, {"held-out": "g" * 9 + "x"})
     (candidate,) = forecast(scene.root).candidates
     assert (candidate.trained.value, candidate.trained.n) == (17 / 20, 20)

@@ -166,7 +166,7 @@ def test_finalists_drive_only_what_they_have_not_driven(scene, tmp_path, scripte
 def test_a_stopped_run_can_end_where_it_was_stopped(scene, tmp_path, scripted):
     """By fewer steps than were done: the policy at hand is tested, too."""
 
-    def interrupt(steps, recent) -> None:
+    def interrupt(steps, tests) -> None:
         if steps == 60:
             signal.raise_signal(signal.SIGTERM)
 

@@ -26,7 +26,6 @@ from twin.config_file import load_config
 from twin.env.domain_randomization import Ranges
 from twin.env.route_segments import find_task
 from twin.errors import InputError
-from twin.evaluation.training_curves import read_episodes
 from twin.evaluation.trials import csv_text
 from twin.files import write_json
 from twin.learn import selection, teacher, train_config, training
@@ -237,7 +236,7 @@ def test_networks_that_do_not_exist_are_refused(sizes):
 def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     from twin.learn.training import train as run
 
-    def interrupt(steps, recent) -> None:
+    def interrupt(steps) -> None:
         if steps == 120:
             signal.raise_signal(signal.SIGTERM)
 
@@ -246,7 +245,7 @@ def test_a_stopped_run_is_saved_and_resumes(scene, tmp_path):
     head = json.loads((tmp_path / "state" / "state.json").read_text())
     assert (head["steps"], head["buffer"]["written"]) == (120, 31)
     seen = []
-    run(twin.load_scene(scene), tmp_path, SHORT, lambda steps, recent: seen.append(steps), processes=1)
+    run(twin.load_scene(scene), tmp_path, SHORT, seen.append, processes=1)
     assert seen[0] == 124 and seen[-1] == SHORT.steps
     checkpoints = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert checkpoints == ["000000080", "000000160", "000000240"]
@@ -420,17 +419,24 @@ def test_environments_for_tests_add_no_processes(scene, tmp_path, monkeypatch, g
         training.train(twin.load_scene(scene), tmp_path, SHORT, processes=given, referee=lambda *_: None)
 
 
-def test_episodes_that_start_along_the_route_do_not_count(tmp_path):
-    some = [("8", 1, "0.00"), ("16", 0, "7.50"), ("24", 0, "0.00"), ("32", 1, "0.10"), ("40", 1, "0.00")]
-    rows = [[step, "1.0", "7", "training", str(won), "goal", "3.0", "8", "1.0", start] for step, won, start in some]
-    (tmp_path / "episodes.csv").write_text(csv_text(TRAINING_EPISODE_COLUMNS, rows))
-    steps, success = read_episodes(tmp_path)
-    assert steps.tolist() == [8, 24, 40] and success.tolist() == [1, 0, 1]
-    assert _keep_rows(tmp_path / "episodes.csv", TRAINING_EPISODE_COLUMNS, 32) == [True, False]
-    assert (tmp_path / "episodes.csv").read_text().count("\n") == 5  # all that was driven is kept
-    before = [row[:-1] for row in rows]  # as trainings of before wrote them
-    (tmp_path / "episodes.csv").write_text(csv_text(TRAINING_EPISODE_COLUMNS[:-1], before))
-    assert read_episodes(tmp_path)[1].tolist() == [1, 0, 0, 1, 1]
+def test_a_resumed_training_keeps_the_episodes_before_its_state(tmp_path):
+    path = tmp_path / "episodes.csv"
+    rows = [
+        (str(step), "1.0", "7", "training", "1", "goal", "3.0", "8", "1.0", start)
+        for step, start in ((8, "0.00"), (16, "7.50"), (32, "0.10"), (40, "0.00"))
+    ]
+    path.write_text(csv_text(TRAINING_EPISODE_COLUMNS, rows) + "24,1.0,7,train")  # it was killed while it wrote
+    _keep_rows(path, TRAINING_EPISODE_COLUMNS, 32)
+    assert path.read_text() == csv_text(TRAINING_EPISODE_COLUMNS, rows[:3])
+
+
+@pytest.mark.parametrize("line", ["x" + 9 * ",1", "8" + 8 * ",1" + "," + "9" * 200_000, "8\x00" + 9 * ",1"])
+def test_a_resumed_training_refuses_damaged_episodes(tmp_path, line):
+    path = tmp_path / "episodes.csv"
+    path.write_text(csv_text(TRAINING_EPISODE_COLUMNS, ()) + line + "\n")
+    with pytest.raises(InputError, match=r"episodes\.csv .*; delete its damaged lines, or train again"):
+        _keep_rows(path, TRAINING_EPISODE_COLUMNS, 32)
+    assert line in path.read_text()
 
 
 def test_a_run_of_an_earlier_version_is_refused(tmp_path):

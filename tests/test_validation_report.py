@@ -1,6 +1,5 @@
 """The page of a validation says what its tables hold, and its films are the episodes of the table."""
 
-import csv
 import json
 import re
 import shutil
@@ -19,11 +18,10 @@ from tiny_twin import tiny_twin
 
 from twin import commands, film, runtime, validate
 from twin.errors import InputError
-from twin.evaluation.statistics import rate_summary
-from twin.evaluation.training_curves import binned_rates, plot_success_curve, training_summaries
+from twin.evaluation.statistics import rate_summary, wilson
+from twin.evaluation.training_curves import plot_tests, read_test_counts, training_summaries
 from twin.evaluation.trials import (
     EPISODE_COLUMNS,
-    RECENT_EPISODES,
     Trial,
     csv_text,
     read_trials,
@@ -51,7 +49,7 @@ from twin.report.validation_report import (
 )
 
 TRAINED = {"run": "ahead", "task": "ahead", "observe": "nerf", "lighting": "training", "step": 300}
-EPISODES = [(10 * k, int(k > 15)) for k in range(1, 41)]  # of the run `ahead`: step, success
+TESTS = [(100, 2, 8), (200, 13, 20), (300, 39, 40)]  # of the run `ahead`: step, successes, episodes
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +57,7 @@ def scene(tmp_path_factory):
     runtime.set_quiet(True)
     root = tiny_twin(tmp_path_factory.mktemp("twin"))
     tiny_runs(root, TRAINED)
-    write_episodes(root / "runs" / "ahead", EPISODES)
+    write_tests(root / "runs" / "ahead", TESTS)
     return root
 
 
@@ -70,9 +68,13 @@ def fresh(scene):
     return scene
 
 
-def write_episodes(run: Path, rows) -> None:
-    with (run / "episodes.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([("step", "success"), *rows])
+def write_tests(run: Path, tests) -> None:
+    write_json(run / "tests.json", [dict(zip(("step", "successes", "trials"), one, strict=True)) for one in tests])
+
+
+def result(won: int, trials: int, **more) -> dict:
+    """A test in `training_summaries`."""
+    return {"final": False, "condition": "", **rate_summary(won, trials)} | more
 
 
 def trial(
@@ -115,35 +117,32 @@ def test_the_worst_episode_failed_earliest_or_has_the_lowest_trust():
 # ---- training
 
 
-def test_training_is_the_last_episodes_before_the_policy_was_saved(tmp_path):
+def test_the_result_of_a_training_is_the_test_of_the_policy(tmp_path):
     run = tmp_path / "runs" / "r"
     heads = {"r": run / "policy.json", "r/5": run / "checkpoints" / "5" / "policy.json"}
     (run / "checkpoints" / "5").mkdir(parents=True)
+    about = {"task": "t", "observe": "nerf", "lighting": "sun"}
     for (name, head), step in zip(heads.items(), (3000, 1500), strict=True):
-        write_json(head, {"trained": {"run": name, "step": step, "task": "t", "observe": "nerf", "lighting": "sun"}})
-    rng = np.random.default_rng(0)
-    rows = [(10 * k, int(rng.random() < k / 400)) for k in range(1, 401)]
-    write_episodes(run, rows)
+        write_json(head, {"trained": {"run": name, "step": step, **about}})
     (tmp_path / "validation").mkdir()
     noted = {"policies": {name: digest_file(head) for name, head in heads.items()}}
     write_json(tmp_path / "validation" / "validated.json", noted)
-    found = training_summaries(tmp_path, ["r", "r/5", "my_module:act", "r/6"])
-    assert set(found) == {"r", "r/5"}
-    for name, step in (("r", 3000), ("r/5", 1500)):
-        won = [success for at, success in rows if at <= step][-RECENT_EPISODES:]
-        assert {k: found[name][k] for k in ("successes", "trials")} == {
-            "successes": sum(won),
-            "trials": RECENT_EPISODES,
-        }
-        assert (found[name]["first_step"], found[name]["test"]) == (step - 10 * (RECENT_EPISODES - 1), None)
-    assert found["r"]["low"] < found["r"]["rate"] < found["r"]["high"] and found["r/5"]["run"] == "r"
-    # A final test counts for the policy that drove it.
+    names = ["r", "r/5", "my_module:act", "r/6"]
+    untested = {name: {"run": "r", "step": step, **about, "test": None} for name, step in (("r", 3000), ("r/5", 1500))}
+    assert training_summaries(tmp_path, names) == untested and read_test_counts(run) == []
+    write_tests(run, [(3000, 38, 40), (1000, 2, 8), (1500, 7, 20)])
+    found = training_summaries(tmp_path, names)
+    assert [found[name]["test"] for name in heads] == [result(38, 40), result(7, 20)]
+    assert found["r"]["test"]["low"] < 38 / 40 < found["r"]["test"]["high"]
+    assert read_test_counts(run) == [(1000, 2, 8), (1500, 7, 20), (3000, 38, 40)]
+    # The final test counts for the policy that drove it. The choice has more tests than tests.json.
     final = {"step": 3000, "successes": 39, "trials": 40}
-    write_json(run / "choice.json", {"chosen": final | {"condition": "held-out+randomised"}})
+    candidates = [{"step": 1500, "successes": 30, "trials": 40}]
+    write_json(run / "choice.json", {"chosen": final | {"condition": "held-out+randomised"}, "candidates": candidates})
     tested = training_summaries(tmp_path, heads)
-    assert tested["r"]["test"] == {"step": 3000, "condition": "held-out+randomised", **rate_summary(39, 40)}
-    assert tested["r"] | {"test": None} == found["r"] and tested["r/5"] == found["r/5"]
-    write_json(run / "choice.json", {"chosen": final | {"successes": 41, "condition": ""}})
+    assert tested["r"]["test"] == result(39, 40, final=True, condition="held-out+randomised")
+    assert tested["r/5"]["test"] == result(30, 40)
+    write_json(run / "choice.json", {"chosen": final | {"successes": 41}, "candidates": candidates})
     with pytest.raises(InputError, match=r"choice\.json is damaged .*41 successes in 40 trials"):
         training_summaries(tmp_path, heads)
     (run / "choice.json").unlink()
@@ -211,20 +210,19 @@ def test_the_page_shows_the_numbers_of_the_tables(tmp_path):
     trials = [trial("a", k, "goal" if k < 31 else "collision", trust=0.9 if k % 2 else 0.5) for k in range(40)]
     trials += [trial("b", k, "goal" if k < 12 else "timeout", light=light) for k in range(40) for light in ("day", "n")]
     trials += [trial("a", 7, "stuck", task="bend", light="any")]
-    trained = {"a": TRAINED | {"run": "a", "first_step": 20, "test": None} | rate_summary(96, 100)}
+    trained = {"a": TRAINED | {"run": "a", "test": result(13, 20)}}
     worst = [summarize([trial("a", k, "rollover", light="drawn_3") for k in range(5)])["cells"][0] | {"of": 16}]
-    curve = ("a", np.arange(10, 400, 10), np.arange(39) % 2)
+    curve = ("a", TESTS)
     said = told(trials, training=trained, worst=worst)
     text = page(tmp_path, said, curve).text
     for cell in [*said["cells"], *worst]:
         assert rate_text(cell) in text and failure_text(cell) in text
-    assert rate_text(trained["a"]) in text
-    assert "the last 100 training episodes that began at the task’s start (the first of them ended at step 20)" in text
+    assert rate_text(trained["a"]["test"]) in text and "test during the training, n = 20;" in text
     assert "trained on ahead, in varying lighting, for 300 steps" in text
-    tested = {"a": trained["a"] | {"test": {"step": 300, "condition": "held-out"} | rate_summary(37, 40)}}
+    tested = {"a": trained["a"] | {"test": result(37, 40, final=True, condition="held-out")}}
     shown = page(tmp_path, told(trials, training=tested)).text
     assert rate_text(tested["a"]["test"]) in shown and "final test, n = 40, lighting held-out" in shown
-    assert rate_text(trained["a"]) not in shown
+    assert rate_text(trained["a"]["test"]) not in shown
     assert "19" in text and "only A arrived" in text and "“a” is better" in text  # 31 - 12 episodes
     assert rate_text(said["cells"][0]["low_trust"]) in text
     assert "drawn_3" in text and "5 rolled over" in text
@@ -249,9 +247,8 @@ def test_the_verb_writes_a_page_that_needs_nothing_else(fresh):
     links = {link for link in shown.links if not link.startswith(("#", "data:"))}
     assert links == {"summary.json", "cells.csv", "episodes.csv"} and all((folder / link).exists() for link in links)
     assert json.loads((folder / "summary.json").read_text()) == said
-    assert list(said["training"]) == ["ahead"]  # the other's run has no episodes
-    won = [success for step, success in EPISODES if step <= TRAINED["step"]][-RECENT_EPISODES:]
-    assert rate_text(rate_summary(sum(won), len(won))) in shown.text and "How the policies were trained" in shown.text
+    assert list(said["training"]) == ["ahead"]  # the other does not say how it was trained
+    assert rate_text(rate_summary(39, 40)) in shown.text and "How the policies were trained" in shown.text
     assert f"twin forecast {fresh} --real real.csv" in shown.text and "ahead,ahead,LIGHTING" in shown.text
     assert html.count("<svg") == html.count('<svg role="img" aria-label="') > 0
 
@@ -367,17 +364,16 @@ def test_films_of_other_drivers_and_obstacles_have_other_names(fresh, monkeypatc
     assert names == [f"ahead_day_{end}.mp4" for end in ends]
 
 
-@pytest.mark.parametrize("count", [1, 4, 27, 1000])
-def test_a_curve_has_points_of_five_episodes_and_no_more_than_it_can_show(count):
-    won = np.arange(count) % 3 == 0
-    points = binned_rates(np.arange(count), won)
-    assert sum(n for _, _, n, _, _ in points) == count and sum(k for _, k, _, _, _ in points) == won.sum()
-    assert all(n >= min(5, count) and low - 1e-9 <= k / n <= high + 1e-9 for _, k, n, low, high in points)
-    assert len(points) == min(25, max(1, count // 5))
+@pytest.mark.parametrize(("count", "sizes"), [(1, "8"), (3, "8 to 40")])
+def test_a_curve_has_a_point_with_an_interval_for_each_test(count, sizes):
     axes = Figure().subplots()
-    plot_success_curve(axes, np.arange(count), won, SERIES[0])
-    sizes = "5 to 6" if count == 27 else str(points[0][2])
-    assert axes.lines[0].get_label() == f"{count} episodes from the start, {sizes} per point"
+    plot_tests(axes, TESTS[:count][::-1], SERIES[0])
+    (drawn,) = axes.containers
+    points = np.column_stack(drawn.lines[0].get_data())
+    assert points == pytest.approx(np.array([(step, won / n) for step, won, n in TESTS[:count]]))
+    bars = [segment[:, 1] for segment in drawn.lines[2][0].get_segments()]
+    assert bars == [pytest.approx(wilson(won, n)) for _, won, n in TESTS[:count]]
+    assert drawn.get_label() == f"tests, {sizes} episodes each"
 
 
 def test_a_robot_without_identified_parameters_gives_a_caution():
@@ -441,7 +437,7 @@ def test_the_heatmap_of_a_task_has_no_training_on_another_task(tmp_path):
     trials = [
         trial(seed=seed, task=task, light=f"day_{k}") for task in ("ahead", "bend") for k in range(6) for seed in (0, 1)
     ]
-    trained = {"a": TRAINED | {"run": "a", "first_step": 20, "test": None} | rate_summary(96, 100)}
+    trained = {"a": TRAINED | {"run": "a", "test": result(38, 40)}}
     page(tmp_path, said := told(trials, training=trained))
     html = validation_page("road", tmp_path, said, [])
     charts = [svg[: svg.index("</svg>")] for svg in html.split("<svg")[1:]]

@@ -40,9 +40,9 @@ def forecast(root: Path, real: Sequence[Path] = (), seed: int = 0) -> Forecast:
     twin = tally(read_trials(scene.episodes_csv))
     cells = read_results(real, twin)
     trained = {
-        (policy, row["task"]): Estimate(best["rate"], best["low"], best["high"], best["trials"])
+        (policy, row["task"]): Estimate(test["rate"], test["low"], test["high"], test["trials"])
         for policy, row in training_summaries(root, {cell.policy for cell in twin}).items()
-        if (best := row["test"] or row)["trials"]  # as on the validation page
+        if (test := row["test"])
     }
     result = make_forecast(root.resolve().name, twin, cells, seed, trained)
     result.save(scene.forecast)

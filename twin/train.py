@@ -30,6 +30,7 @@ from twin.runtime import exclusive_lock
 from twin.scene import require_stage, run_folder
 
 if TYPE_CHECKING:
+    from twin.learn.selection import PolicyTest
     from twin.learn.train_config import TrainConfig
 
 
@@ -103,14 +104,13 @@ def _train(
     logging = wandb_run(project, folder, settings) if project else nullcontext()
     with logging as log, runtime.bar("train (may end earlier)", config.steps, "step") as bar:
 
-        def watch(steps: int, recent: Sequence[bool]) -> None:
+        def watch(steps: int, tests: "Sequence[PolicyTest]") -> None:
             if not bar.n:  # the bar's speed must not include the steps of earlier calls
                 bar.initial = bar.n = bar.last_print_n = steps
                 bar.start_t = bar.last_print_t = time.time()  # nor its time that of the teacher
             bar.update(steps - bar.n)
-            if recent:
-                low, high = wilson(sum(recent), len(recent))
-                bar.set_postfix_str(f"success {sum(recent)}/{len(recent)} ({low:.2f} to {high:.2f})", refresh=False)
+            if tests:
+                bar.set_postfix_str(f"last test {tests[-1].successes}/{tests[-1].trials}", refresh=False)
 
         choice = train_until_learnt(twin, folder, config, watch, processes, [log] if log else [])
         if log:

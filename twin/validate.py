@@ -21,7 +21,7 @@ from twin.env.domain_randomization import condition_options, measured_parameters
 from twin.env.env_factory import fingerprint
 from twin.env.route_segments import find_task
 from twin.errors import InputError
-from twin.evaluation.training_curves import read_episodes, training_summaries
+from twin.evaluation.training_curves import read_test_counts, training_summaries
 from twin.evaluation.trials import (
     EPISODE_COLUMNS,
     Trial,
@@ -153,7 +153,7 @@ def _write_results(twin: Twin) -> dict:
     write_json(folder / "summary.json", results)
     _draw_maps(twin, folder, trials)
     runs = dict.fromkeys(trained["run"] for trained in results["training"].values())
-    curves = [(run, *read_episodes(twin.scene.root / "runs" / run)) for run in runs]
+    curves = [(run, read_test_counts(twin.scene.root / "runs" / run)) for run in runs]
     write_validation_page(twin.scene, results, curves)
     write_policy_cards(twin.scene, [t.policy for t in trials])
     return results

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from fuzzing.cases import Case
-from fuzzing.samples import TRAINING_CSV
 from fuzzing.values import corrupted, json_text, mutated, mutated_json, mutated_text
 
 STAGES = {"2_metric": "metric", "3_field": "field", "4_mesh": "mesh", "5_mjcf": "mjcf"}
@@ -172,7 +171,6 @@ def run_metadata(case: Case) -> None:
     else:
         (root / "state").mkdir(parents=True)
         (root / "state" / "state.json").write_text('{"steps": 200}')
-        (root / "episodes.csv").write_text(TRAINING_CSV)
         failure = {"cause": "stuck", "progress": 3.0, "lighting": "training: sun 1.00"}
         one = {"step": 100, "trials": 8, "successes": 4, "progress": 9.0, "reward": 1.0, "failures": [failure]}
         ends = {"most": 300, "success": 0.95, "reached": False, "why": "steps", "failures": ""}
@@ -196,6 +194,8 @@ def _training_summary(case: Case, root: Path) -> None:
         table["trained"] = mutated(rng, table["trained"])
     head.write_bytes(json_text(table).encode("utf-8", "surrogatepass"))
     validated: dict[str, Any] = {"roads": {"ahead, day": "x"}, "policies": {"ahead": digest_file(head)}}
+    tests = [{"step": step, "trials": 20, "successes": 9} for step in (100, 200)]
+    (root / "runs" / "ahead" / "tests.json").write_bytes(mutated_json(rng, tests))
     (root / "validation").mkdir()
     text = json_text(mutated(rng, validated) if rng.random() < 0.5 else validated)
     (root / "validation" / "validated.json").write_bytes(mutated_text(rng, text))

@@ -60,7 +60,7 @@ def _readers(samples: Samples) -> list[tuple[str, Callable[[Path], Any]]]:
     from twin.capture.video import probe
     from twin.config_file import load_config, read_robot
     from twin.evaluation.forecasting import Forecast
-    from twin.evaluation.training_curves import read_episodes
+    from twin.evaluation.training_curves import read_test_counts
     from twin.evaluation.trials import read_results, read_trials
     from twin.geometry.cameras import Cameras, SparsePoints
     from twin.geometry.images import read_image
@@ -84,7 +84,7 @@ def _readers(samples: Samples) -> list[tuple[str, Callable[[Path], Any]]]:
         ("any.mp4", frames.detect_kind),
         ("results.csv", lambda p: read_results([p], samples.cells)),
         ("table.csv", read_trials),
-        ("episodes.csv", lambda p: read_episodes(p.parent)),
+        ("tests.json", lambda p: read_test_counts(p.parent)),
         ("log.csv", read_log),
         ("log.npz", read_log),
         ("policy.json", load_policy),

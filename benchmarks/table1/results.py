@@ -9,8 +9,8 @@ from scores import counts, over_days
 
 from twin.config import HELD_OUT, Condition
 from twin.evaluation.statistics import wilson
-from twin.evaluation.training_curves import CHOICE_FILE, read_episodes
-from twin.evaluation.trials import RECENT_EPISODES, Trial, read_trials
+from twin.evaluation.training_curves import CHOICE_FILE
+from twin.evaluation.trials import Trial, read_trials
 from twin.files import read_json
 
 _EVALUATIONS = ("validate", "validate_randomised", "validate_by_photo", "real")
@@ -81,15 +81,11 @@ def _training(folder: Path) -> dict[str, Any]:
     choice = read_json(folder / CHOICE_FILE) if (folder / CHOICE_FILE).exists() else None
     # The chosen policy's test in the training's lighting; `choice["chosen"]` is its test under held-out lightings.
     tests = {one["step"]: one for one in choice["candidates"]} if choice else {}
-    ended, success = read_episodes(folder)
-    before = success[ended <= choice["chosen"]["step"]] if choice else success
     return {
         "steps": int(last["step"]),
         "updates": int(last["updates"]),
         "wall_s": float(last["wall_s"]),
         "memory_mb": float(last["memory_mb"]),
-        "whole_episodes": len(success),
-        "exploring": _rate((before[-RECENT_EPISODES:] == 1).tolist()),
         "train": tests[choice["chosen"]["step"]] if choice else _rate([]),
     }
 

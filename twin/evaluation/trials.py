@@ -43,9 +43,6 @@ SETUP_COLUMNS = ("place", "day", "robot", "camera", "outside_training")
 that lie outside the training's ranges."""
 OPTIONAL_RESULT_COLUMNS = ("task", "twin_lighting", *SETUP_COLUMNS)
 """Further columns that a results table may have."""
-RECENT_EPISODES = 20
-"""Number of episodes over which a training's success rate is measured. They are the newest of those that started at the
-beginning of the task's route segment."""
 
 _MAX_COUNT, _MAX_SEED = 10**6, 2**63 - 1  # largest count in a table, and largest seed
 _VALIDATE_COMMAND = "twin validate"

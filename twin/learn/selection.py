@@ -32,16 +32,15 @@ from stable_baselines3.common.logger import KVWriter
 from twin import runtime
 from twin.env.domain_randomization import condition_options
 from twin.env.vector_env import make_vector_env
-from twin.evaluation.training_curves import CHOICE_FILE
+from twin.evaluation.training_curves import CHOICE_FILE, TESTS_FILE
 from twin.files import read_json, wrap_read_errors, write_json
 from twin.learn.distillation import has_state, saved_steps
 from twin.learn.policy import copy_policy, load_policy
 from twin.learn.policy_evaluation import EpisodeResult, run_episodes
 from twin.learn.train_config import TrainConfig
-from twin.learn.training import Drive, Segment, Watch, check_same, checkpoint_folder, run_settings, train
+from twin.learn.training import Drive, Segment, check_same, checkpoint_folder, run_settings, train
 from twin.loading import Twin
 
-TESTS_FILE = "tests.json"
 FRESH_EPISODES = 40
 """Number of episodes of the final test."""
 PATIENCE = 4
@@ -151,15 +150,15 @@ def train_until_learnt(
     twin: Twin,
     folder: Path,
     config: TrainConfig,
-    watch: Watch | None = None,
+    watch: Callable[[int, Sequence[PolicyTest]], object] = lambda *_: None,
     processes: int | None = None,
     writers: Sequence[KVWriter] = (),
 ) -> dict[str, Any]:
     """Trains and tests until the training ends (see the module), and saves the kept policy as that of the run.
 
     An earlier choice is returned unchanged unless `config` asks for more steps or a higher success rate. If a call was
-    killed, the next one resumes its training. Arguments and errors are those of `train`; `writers` also receive the
-    tests' scores, as `tests/...`.
+    killed, the next one resumes its training. Arguments and errors are those of `train`, but `watch` also receives the
+    tests so far, and `writers` the tests' scores, as `tests/...`.
 
     Returns:
         The contents of `choice.json`: the steps done and allowed; the required success rate and whether it is reached;
@@ -191,7 +190,7 @@ def train_until_learnt(
         planned.append(next_segment(config, tests))
         return planned[-1]
 
-    train(twin, folder, config, watch, processes, referee, writers)
+    train(twin, folder, config, lambda steps: watch(steps, tests), processes, referee, writers)
     return _choose(twin, folder, config, tests, planned[-1].why, processes)
 
 

@@ -14,6 +14,7 @@ runs/<name>/
 
 import csv
 import dataclasses
+import io
 import json
 import shutil
 import time
@@ -38,8 +39,8 @@ from twin.env.task import EPISODE_VERSION
 from twin.env.vector_env import default_processes
 from twin.errors import InputError
 from twin.evaluation.training_curves import CHOICE_FILE
-from twin.evaluation.trials import RECENT_EPISODES, csv_text
-from twin.files import digest_json, read_json, wrap_read_errors, write_json, write_text
+from twin.evaluation.trials import csv_text
+from twin.files import digest_json, read_json, read_text, wrap_read_errors, write_json, write_text
 from twin.learn.distillation import Distillation, has_state, load_state, save_state
 from twin.learn.policy import load_policy, save_policy
 from twin.learn.policy_evaluation import EpisodeResult, run_episodes
@@ -55,9 +56,8 @@ TRAINING_EPISODE_COLUMNS = (
     *("step", "wall_s", "seed", "lighting", "success", "cause", "progress_m", "steps", "reward", "start_m"),
 )
 LOG_COLUMNS = ("step", "wall_s", "updates", "steps_per_s", "updates_per_s", "memory_mb", "action_error", "state_error")
-Watch = Callable[[int, Sequence[bool]], None]
-"""Receives the steps done, and the success of the last `RECENT_EPISODES` episodes that started at the beginning of the
-task's route segment."""
+Watch = Callable[[int], object]
+"""Receives the number of steps done."""
 
 Drive = Callable[[Path, Sequence[int], Callable[[], object]], list[EpisodeResult]]
 """Drives the policy of a folder in whole episodes in the training's conditions, one per seed; see `run_episodes`."""
@@ -348,8 +348,7 @@ class _RunRecorder:
         write_json(self._folder / "config.json", self._settings)
         self._saved = self._first = self._learner.steps
         self._first_updates, self._first_time = self._learner.updates, time.monotonic()
-        kept = _keep_rows(self._folder / "episodes.csv", TRAINING_EPISODE_COLUMNS, self._saved)
-        self._recent: list[bool] = kept[-RECENT_EPISODES:]
+        _keep_rows(self._folder / "episodes.csv", TRAINING_EPISODE_COLUMNS, self._saved)
         _keep_rows(self._folder / "log.csv", LOG_COLUMNS, self._saved)
 
     def before_step(self) -> None:
@@ -365,17 +364,13 @@ class _RunRecorder:
         self._errors = (self._errors + errors)[-_MEAN_ERRORS:]
         rows = []
         for info in (one for one in infos if "episode" in one):
-            if not info["start"]:
-                self._recent = [*self._recent, info["is_success"]][-RECENT_EPISODES:]
             episode = info["episode"]
             head = (self._learner.steps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"])
             outcome = (int(info["is_success"]), info["cause"], f"{info['progress']:.2f}", episode["l"])
-            # Readers take 0.00 for the start of the route segment.
-            start = max(info["start"], 0.01) if info["start"] else 0.0
-            rows.append((*head, *outcome, f"{episode['r']:.3f}", f"{start:.2f}"))
+            rows.append((*head, *outcome, f"{episode['r']:.3f}", f"{info['start']:.2f}"))
         self._append("episodes", TRAINING_EPISODE_COLUMNS, rows)
         if self._watch:
-            self._watch(self._learner.steps, self._recent)
+            self._watch(self._learner.steps)
 
     def end(self) -> None:
         """Saves the last checkpoint and state."""
@@ -428,18 +423,12 @@ class _RunRecorder:
         save_policy(folder, c.architecture, c.control, self._learner.averaged.weights(c.architecture), trained)
 
 
-def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> list[bool]:
-    """Creates a table, or drops its rows after `steps`.
-
-    Returns the success of the kept episodes that started at the segment's beginning; empty for a table without success.
-    """
+def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> None:
+    """Creates a table, or drops its rows after `steps`. Raises InputError: the table is damaged."""
     rows: list[list[str]] = []
     if path.exists():
-        with path.open(newline="", encoding="utf-8") as file:
+        with wrap_read_errors(path, "delete its damaged lines, or train again under another name"):
             # A killed training may leave the last line incomplete.
-            rows = [row for row in list(csv.reader(file))[1:] if len(row) == len(columns) and int(row[0]) <= steps]
+            table = [row for row in csv.reader(io.StringIO(read_text(path))) if len(row) == len(columns)]
+            rows = [row for row in table[1:] if int(row[0]) <= steps]
     write_text(path, csv_text(columns, rows))
-    if "success" not in columns:
-        return []
-    success, start = columns.index("success"), columns.index("start_m")
-    return [row[success] == "1" for row in rows if float(row[start]) == 0.0]

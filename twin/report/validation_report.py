@@ -11,14 +11,13 @@ from urllib.parse import quote
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from twin.config import ANY, HELD_OUT, TRAINING, Condition
 from twin.errors import join_names
 from twin.evaluation.agreement import Estimate
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
-from twin.evaluation.training_curves import plot_success_curve
-from twin.evaluation.trials import RECENT_EPISODES, Trial, csv_text
+from twin.evaluation.training_curves import TestCount, plot_tests
+from twin.evaluation.trials import Trial, csv_text
 from twin.files import write_text
 from twin.mjcf.world import World, point_at
 from twin.report.figures import (
@@ -94,15 +93,11 @@ def lighting_text(lighting: str) -> str:
 
 
 def training_text(trained: dict[str, Any]) -> str:
-    """Describes a training and the episodes that measured its result; see `training_summaries`."""
+    """Describes a training and the test that measured its result; see `training_summaries`."""
     test = trained["test"]
-    if test:
-        episodes = f"final test, n = {test['trials']}" + (
-            f", lighting {test['condition']}" if test["condition"] else ""
-        )
-    else:
-        since = f"the first of them ended at step {trained['first_step']:,}"
-        episodes = f"the last {trained['trials']} training episodes that began at the task’s start ({since})"
+    episodes = f"{'final test' if test['final'] else 'test during the training'}, n = {test['trials']}" + (
+        f", lighting {test['condition']}" if test["condition"] else ""
+    )
     light = "in varying lighting" if trained["lighting"] in (TRAINING, ANY) else f"in lighting {trained['lighting']}"
     light = "from MuJoCo’s pictures of the mesh" if trained["observe"] == "simulator" else light
     return f"{episodes}; trained on {trained['task']}, {light}, for {trained['step']:,} steps"
@@ -278,17 +273,14 @@ def pair_heatmap(pairs: Sequence[dict[str, Any]]) -> Figure:
 
 
 @styled
-def training_figure(steps: NDArray[np.int64], success: NDArray[np.int64], saved: Sequence[int]) -> Figure:
-    """Success rate over training steps, with its interval; dashed lines mark the `saved` steps.
-
-    `steps` (ascending) and `success` (0 or 1) have one value per episode, shape (n,).
-    """
+def training_figure(tests: Sequence[TestCount], saved: Sequence[int]) -> Figure:
+    """Success in a training's tests over its steps, with intervals; dashed lines mark the `saved` steps."""
     figure, axes = new_figure(2.2)
-    plot_success_curve(axes, steps, success, SERIES[0])
+    plot_tests(axes, tests, SERIES[0])
     for one in saved:
         axes.axvline(one, color=INK, lw=0.9, ls="--")
     limits, ticks = RATE_AXIS.values()
-    axes.set(xlabel="training step", ylabel="success rate in training", ylim=limits, yticks=ticks)
+    axes.set(xlabel="training step", ylabel="success rate in tests", ylim=limits, yticks=ticks)
     axes.set_xlim(left=0)
     return figure
 
@@ -334,8 +326,8 @@ def failure_map(path: Path, trials: Sequence[Trial], world: World, segment: tupl
 # ---- page
 
 
-TrainingCurve = tuple[str, NDArray[np.int64], NDArray[np.int64]]
-"""A training run, and steps and success of its episodes (`twin.evaluation.training_curves.read_episodes`)."""
+TrainingCurve = tuple[str, Sequence[TestCount]]
+"""A training run, and its tests."""
 
 
 def write_validation_page(scene: SceneDir, results: dict[str, Any], curves: Sequence[TrainingCurve]) -> None:
@@ -346,7 +338,7 @@ def write_validation_page(scene: SceneDir, results: dict[str, Any], curves: Sequ
 
 def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: Sequence[TrainingCurve]) -> str:
     """The HTML of the page of a scene; `folder` contains the maps and videos."""
-    cells, curves = results["cells"], [curve for curve in curves if len(curve[1])]
+    cells, curves = results["cells"], [curve for curve in curves if curve[1]]
     policies, lights = (dict.fromkeys(c[key] for c in cells) for key in ("policy", "lighting"))
     headings = {
         "arrive": "How often does each policy reach the goal?",
@@ -385,7 +377,6 @@ def validation_page(scene: str, folder: Path, results: dict[str, Any], curves: S
         training=[_training_chart(results, curve) for curve in curves],
         limitations=limitations(results),
         next_steps=_next_steps(results, folder.parent),
-        RECENT_EPISODES=RECENT_EPISODES,
         MAX_P_VALUE=MAX_P_VALUE,
         percent="{:.0%}".format,
         failure_text=failure_text,
@@ -405,8 +396,8 @@ def _task(results: dict[str, Any], task: str) -> dict[str, Any]:
         title, figure = f"Share of episodes that reached the goal, with 90% intervals ({each})", rate_figure(mine)
     else:
         # A rate on another task says nothing about overfitting.
-        known = {policy: row for policy, row in results["training"].items() if row["task"] == task}
-        trained = {policy: (row["test"] or row)["rate"] for policy, row in known.items()}
+        known = {policy: row for policy, row in results["training"].items() if row["task"] == task and row["test"]}
+        trained = {policy: row["test"]["rate"] for policy, row in known.items()}
         title = f"Episodes that reached the goal [%] ({each}); means: lightings that all policies drove in"
         figure = rate_heatmap(mine, trained)
     pair_title = (
@@ -424,9 +415,9 @@ def _task(results: dict[str, Any], task: str) -> dict[str, Any]:
 
 
 def _training_chart(results: dict[str, Any], curve: TrainingCurve) -> Chart:
-    run, steps, success = curve
+    run, tests = curve
     saved = sorted(t["step"] for t in results["training"].values() if t["run"] == run)
-    return Chart(f"{run} (n = {len(steps)} episodes)", svg(training_figure(steps, success, saved)))
+    return Chart(run, svg(training_figure(tests, saved)))
 
 
 def _next_steps(results: dict[str, Any], root: Path) -> list[tuple[str, list[str]]]:
