@@ -114,8 +114,10 @@ def test_cycles_and_the_rasterizer_see_the_same_place(cycles):
 def test_trials_are_drawn_from_a_complete_place_only(cycles, tmp_path):
     """After an interruption, a draw from the recorded part would be another one than that from all trials."""
     command = cycles.command
-    record = tmp_path / "version_2" / "place_106"
-    command.keep(record / command.TRIALS, [_trial("varied", "day_1061", 1, True)])
-    given = SimpleNamespace(minutes=1.0, places=[106], results=tmp_path)
-    with pytest.raises(InputError, match="place_106 is not complete; first run benchmarks/forecast at place 106 to"):
-        command._repeat(command.read_protocol(), given)
+    protocol = command.read_protocol()
+    place = protocol.places[0]
+    record = tmp_path / protocol.name / f"place_{place}"
+    command.keep(record / command.TRIALS, [_trial("varied", protocol.days_of(place)[0], 1, True)])
+    given = SimpleNamespace(minutes=1.0, places=[place], results=tmp_path)
+    with pytest.raises(InputError, match=f"place_{place} is not complete; first run .* at place {place} to"):
+        command._repeat(protocol, given)

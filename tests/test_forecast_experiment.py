@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,8 @@ from twin.files import read_json, write_json, write_text
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "benchmarks" / "forecast"
+PROTOCOL = tomllib.loads((FOLDER / "protocol.toml").read_text(encoding="utf-8"))
+VERSION, PLACES = PROTOCOL["version"], PROTOCOL["places"]
 SETUPS = ("varied", "short", "shorter", "not_randomised", "one_light", "simulator")
 SEEN_EVERYWHERE = "held-out+randomised"
 
@@ -61,10 +64,10 @@ def test_the_protocol_takes_places_that_nobody_looked_at(forecast):
     [
         ("\ntrials = 5", "\ntrials = 4", "trials = 4; expected 5 or more"),
         ("days = 10", "days = 11", "expected 1 to 10, the days of a place"),
-        ("places = [106, 107,", "places = [106, 106,", "expected different numbers"),
+        (f"places = [{PLACES[0]}, {PLACES[1]},", f"places = [{PLACES[0]}, {PLACES[0]},", "expected different numbers"),
         ("short = [", "varied = [", "Cannot overwrite a value"),
-        ("version = 2", "version = 2\nday = 3", "unexpected keyword argument 'day'"),
-        ("version = 2", "", "missing 1 required positional argument: 'version'"),
+        (f"version = {VERSION}", f"version = {VERSION}\nday = 3", "unexpected keyword argument 'day'"),
+        (f"version = {VERSION}", "", "missing 1 required positional argument: 'version'"),
     ],
 )
 def test_a_protocol_that_cannot_be_scored_is_refused(forecast, tmp_path, old, new, words):
@@ -157,22 +160,22 @@ def filmed(monkeypatch, forecast):
 
 def _place(forecast, tmp_path, run, name="a"):
     protocol = forecast.protocol.read_protocol()
-    return forecast.command.PlaceRun(protocol, 106, tmp_path / name, tmp_path / f"results_{name}", run, 1)
+    return forecast.command.PlaceRun(protocol, PLACES[0], tmp_path / name, tmp_path / f"results_{name}", run, 1)
 
 
 def test_a_place_that_cannot_be_built_is_recorded_as_failed_and_not_run_again(forecast, tmp_path, capsys):
     protocol = forecast.protocol.read_protocol()
     run = StandIn(forecast)
     run.must = lambda *arguments, cores=1: _fails_at(run, "twin.build", arguments, forecast.command.Refused)
-    place = forecast.command.PlaceRun(protocol, 106, tmp_path / "work", tmp_path / "results", run, 1)
+    place = forecast.command.PlaceRun(protocol, PLACES[0], tmp_path / "work", tmp_path / "results", run, 1)
     with pytest.raises(InputError, match="no reconstructed point"):
         forecast.command.run_place(place, None)
     failure = {"step": "build", "message": "robot.mp4: no reconstructed point"}  # without the machine's folders
-    assert read_json(tmp_path / "results" / "version_2" / "place_106" / "failure.json") == failure
+    assert read_json(tmp_path / "results" / f"version_{VERSION}" / f"place_{PLACES[0]}" / "failure.json") == failure
     forecast.command.run_place(place, None)
     assert run.calls == ["film"]
     found = forecast.place_scores.score(protocol, tmp_path / "results")
-    assert found["places"]["106"] == "failed: build: robot.mp4: no reconstructed point"
+    assert found["places"][str(PLACES[0])] == "failed: build: robot.mp4: no reconstructed point"
     assert "failed: build: robot.mp4: no reconstructed point" in forecast.place_scores.tables(protocol, found)
 
 
@@ -185,7 +188,7 @@ def _fails_at(run, command, arguments, kind):
 def test_a_full_disk_leaves_the_place_unfinished(forecast, tmp_path, monkeypatch):
     monkeypatch.setattr(forecast.command.shutil, "disk_usage", lambda _: SimpleNamespace(free=2**30))
     place = forecast.command.PlaceRun(
-        forecast.protocol.read_protocol(), 106, tmp_path / "work", tmp_path / "results", StandIn(forecast), 1
+        forecast.protocol.read_protocol(), PLACES[0], tmp_path / "work", tmp_path / "results", StandIn(forecast), 1
     )
     with pytest.raises(InputError, match=r"1\.0 GiB are free \(need 8 GiB\)"):
         forecast.command.run_place(place, None)
@@ -196,7 +199,7 @@ def test_a_command_that_is_killed_leaves_the_place_unfinished(forecast, tmp_path
     run = StandIn(forecast)
     run.must = lambda *arguments, cores=1: _fails_at(run, "twin.build", arguments, InputError)
     place = forecast.command.PlaceRun(
-        forecast.protocol.read_protocol(), 106, tmp_path / "work", tmp_path / "results", run, 1
+        forecast.protocol.read_protocol(), PLACES[0], tmp_path / "work", tmp_path / "results", run, 1
     )
     with pytest.raises(InputError):
         forecast.command.run_place(place, None)
@@ -216,11 +219,11 @@ def test_policies_are_frozen_before_anything_drives_and_a_repeat_changes_nothing
     assert max(i for i, call in enumerate(run.calls) if call == "train") < run.calls.index("validate")
     assert max(i for i, call in enumerate(run.calls) if call == "validate") < run.calls.index("drive")
     assert set(read_json(one.record / "policies.json")) == set(SETUPS)
-    assert read_json(one.record / "place.json")["setup"] == {"robot": "106"}
+    assert read_json(one.record / "place.json")["setup"] == {"robot": str(PLACES[0])}
     before = {path.name: path.read_bytes() for path in one.record.iterdir()}
     forecast.command.run_place(one, None)
     assert before == {path.name: path.read_bytes() for path in one.record.iterdir()}
-    record = forecast.place_record.read_place(one.record, 106, one.protocol)
+    record = forecast.place_record.read_place(one.record, PLACES[0], one.protocol)
     assert record.real.shape == (6, 10, 2) and record.real[0].tolist() == [[5, 5]] * 10
     assert record.twin[1].tolist() == [[2, 5]] * 10 and record.held_out.tolist() == [[20, 20]] + [[10, 20]] * 5
 
@@ -241,9 +244,9 @@ def test_an_experiment_stopped_at_every_command_ends_with_the_same_record(foreca
 
 
 def test_a_day_whose_photo_cannot_be_placed_is_left_to_the_held_out_lightings(forecast, filmed, tmp_path):
-    one = _place(forecast, tmp_path, StandIn(forecast, unplaced=("day_1063",)))
+    one = _place(forecast, tmp_path, StandIn(forecast, unplaced=(f"day_{PLACES[0]}3",)))
     forecast.command.run_place(one, None)
-    record = forecast.place_record.read_place(one.record, 106, one.protocol)
+    record = forecast.place_record.read_place(one.record, PLACES[0], one.protocol)
     assert record.twin[1, 2].tolist() == [10, 20] and record.twin[1, 3].tolist() == [2, 5]
 
 
@@ -254,8 +257,8 @@ def test_a_place_that_was_stopped_within_a_day_is_not_scored(forecast, filmed, t
     trials = read_trials(one.record / name)
     (one.record / name).unlink()
     forecast.place_record.keep(one.record / name, trials[:-1])
-    assert forecast.place_record.read_place(one.record, 106, one.protocol) is None
-    assert forecast.place_scores.score(one.protocol, one.record.parents[1])["places"]["106"] == "trained"
+    assert forecast.place_record.read_place(one.record, PLACES[0], one.protocol) is None
+    assert forecast.place_scores.score(one.protocol, one.record.parents[1])["places"][str(PLACES[0])] == "trained"
 
 
 def test_a_record_never_loses_or_changes_a_row(forecast, filmed, tmp_path):
@@ -358,9 +361,9 @@ def test_few_places_have_no_intervals_and_what_is_incomplete_is_named(forecast, 
     empty = forecast.place_scores.score(protocol, tmp_path)
     assert set(empty["places"].values()) == {"not begun"} and "ranking" not in empty
     _records(forecast, protocol, tmp_path, lambda rate, _: rate, places=2)
-    (tmp_path / protocol.name / "place_109").mkdir()
+    (tmp_path / protocol.name / f"place_{PLACES[3]}").mkdir()
     found = forecast.place_scores.score(protocol, tmp_path)
-    assert [found["places"][str(n)] for n in (106, 107, 108, 109)] == ["complete", "complete", "not begun", "begun"]
+    assert [found["places"][str(n)] for n in PLACES[:4]] == ["complete", "complete", "not begun", "begun"]
     best = found["ranking"][forecast.place_scores.TWIN]
     assert best["spearman_within"] == {"value": pytest.approx(1.0), "low": None, "high": None}
     assert found["met"]["log_score_better"] is None
