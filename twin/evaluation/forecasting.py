@@ -80,7 +80,7 @@ class Candidate:
     """Real rate, predicted from its twin rates, in which each lighting counts as often as real days are compared with
     it, and from the rates of the driven candidates of other trainings."""
     trained: Estimate = _NOT_KNOWN
-    """Success rate in the last training episodes before the policy was saved."""
+    """Success rate in the test of the policy by its training."""
 
     @property
     def driven(self) -> bool:
