@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_route_follower import on_a_plane
 
-from twin.env.controller import Controller, VectorController
+from twin.env.controller import Controller, VectorController, wheel_speeds
 from twin.env.physics import HuskyPhysics
 from twin.robot import HuskyParams
 
@@ -18,11 +18,15 @@ def test_vector_controller_equals_single_controllers(period, controller):
     params = replace(PARAMS, controller=controller)
     rng = np.random.default_rng(0)
     model = on_a_plane().model
-    latencies = np.array([0.0, 0.013, 0.1, 0.237, 0.05, 0.4])
+    latencies, rolling = np.array([0.0, 0.013, 0.1, 0.237, 0.05, 0.4]), np.array([0.0, 0.5, 0.0, 0.3, 0.7, 0.6])
     n, steps = len(latencies), round(period / model.opt.timestep)
 
     def husky(i: int) -> HuskyPhysics:
-        return HuskyPhysics(model, replace(params, command_latency=latencies[i]))
+        robot = HuskyPhysics(model, replace(params, command_latency=latencies[i]))
+        robot.data.ctrl[robot.actuators] = wheel_speeds(np.array([rolling[i], 0.0]), params)
+        robot.begin()
+        assert robot.controller.speed == pytest.approx(rolling[i])
+        return robot
 
     robots = [husky(i) for i in range(n)]
     many = VectorController(params, n, period, model.opt.timestep, robots[0].check_steps)
@@ -31,7 +35,7 @@ def test_vector_controller_equals_single_controllers(period, controller):
         for i in which:
             robots[i] = husky(i)
         until = np.array([robots[i].steps_to_update for i in which])
-        many.begin(which, latencies[which], until)
+        many.begin(which, latencies[which], until, np.array([robots[i].controller.speed for i in which]))
 
     begin(np.arange(n))
     for k in range(30):
@@ -45,8 +49,8 @@ def test_vector_controller_equals_single_controllers(period, controller):
             robot = robots[i]
             robot.command(*command)
             course, done = robot.schedule(period), 0
-            for p, (some, speeds) in enumerate(course):
-                np.testing.assert_array_equal(told.speeds[p, i], speeds)
+            for p, (some, sides) in enumerate(course):
+                np.testing.assert_array_equal(told.speeds[p, i], sides)
                 assert (told.segment[done : done + some, i] == p).all()
                 assert told.checks[done : done + some, i].tolist() == [0] * (some - 1) + [1]
                 done += some

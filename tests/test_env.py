@@ -310,6 +310,7 @@ def test_start_along_moves_starts_along_and_beside_the_route(scene):
         offsets.append(info["cross_track"])
         turns.append(environment.task.state(environment.physics)[3])
         assert info["progress"] == pytest.approx(info["start"], abs=0.1) and environment.task.cause == ""
+        assert environment.physics.speed == pytest.approx(1.0, abs=1e-3)
     share = np.array(starts) / length
     assert 0.5 < share.max() <= 0.6 and 0.0 < share.min() < 0.05 and np.std(share) > 0.1
     assert 0.7 < np.abs(offsets).max() / half_width < 0.82
@@ -317,6 +318,28 @@ def test_start_along_moves_starts_along_and_beside_the_route(scene):
     for wrong in ({"start_along": 1.0}, {"along_time": 0.0}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             twin.load(scene, "route", pixels=False, **wrong)
+
+
+@pytest.mark.parametrize(("along", "speed"), [(0.6, 0.8), (0.6, 0.3), (0.0, 0.8)])
+@pytest.mark.parametrize("randomise", [None, Ranges(latency=(0.0, 0.4))])
+def test_robots_that_start_along_the_route_are_rolling(scene, along, speed, randomise):
+    """As if they had been driving for a while; others accelerate from rest."""
+    options = {"start_along": along, "speed": speed, "along_time": 2.0, "randomise": randomise}
+    environment = twin.load(scene, "route", pixels=False, start_heading=0.0, **options)
+    for seed in range(4):
+        environment.task.seed(seed)
+        environment.reset()
+        speeds = [environment.physics.speed]
+        wheels = [environment.physics.data.ctrl.copy()]
+        for _ in range(8):
+            environment.step([speed, 0.0])
+            speeds.append(environment.physics.speed)
+            wheels.append(environment.physics.data.ctrl.copy())
+        if along:
+            assert speeds == pytest.approx([speed] * 9, rel=0.06)  # wheels and slopes differ
+            assert np.ptp(wheels) < 1e-6
+        else:
+            assert abs(speeds[0]) < 1e-3 and speeds[-1] > 0.7 * speed
 
 
 @pytest.mark.parametrize(("along", "time", "count"), [(0.6, 3.0, 30), (0.6, 0.8, 8), (0.0, 0.8, 40)])

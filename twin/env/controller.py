@@ -55,13 +55,17 @@ def wheel_speeds(command: Array, params: HuskyParams) -> Array:
 
 
 class Controller:
-    """Controller of one robot at rest. Times are in seconds on a clock that starts at 0."""
+    """Controller of one robot. Times are in seconds on a clock that starts at 0."""
 
-    def __init__(self, params: HuskyParams | None = None) -> None:
+    def __init__(self, params: HuskyParams | None = None, speed: float = 0.0) -> None:
+        """Begins at rest, or in the course of commands to drive straight on at `speed` [m/s]."""
         self.params = params or HuskyParams()
+        self.speed = speed
+        """Speed at the beginning [m/s]."""
         self._pending: deque[tuple[float, Array]] = deque()
-        self._latest: tuple[float, Array] | None = None
-        self._limited = np.zeros(2)
+        # The commands before time 0 arrive until the first one after it does.
+        self._latest = (self.params.command_latency, np.array([speed, 0.0]))
+        self._limited = np.array([speed, 0.0])
 
     @property
     def phase(self) -> float:
@@ -80,7 +84,7 @@ class Controller:
             self._latest = self._pending.popleft()
         wanted = np.zeros(2)
         timing = self.params.timing
-        if self._latest is not None and time - self._latest[0] <= timing.timeout - _TIME_TOLERANCE:
+        if time - self._latest[0] <= timing.timeout - _TIME_TOLERANCE:
             wanted = self._latest[1]
         self._limited = limit_command(wanted, self._limited, self.params, timing.period)
         return wheel_speeds(self._limited, self.params)
@@ -126,10 +130,13 @@ class VectorController:
         self._arrivals, self._commands = np.full((2, count), -np.inf), np.zeros((2, count, 2))  # the newest last
         self._limited, self._speeds = np.zeros((count, 2)), np.zeros((count, 2))
 
-    def begin(self, which: NDArray[np.int64], latency: Array, steps_to_update: NDArray[np.int64]) -> None:
-        """Resets the k robots `which` to rest, without pending commands.
+    def begin(
+        self, which: NDArray[np.int64], latency: Array, steps_to_update: NDArray[np.int64], speed: Array | float = 0.0
+    ) -> None:
+        """Resets the k robots `which`, without pending commands, to rest or to driving straight on.
 
-        `latency` (k,) is their `command_latency` [s], `steps_to_update` (k,) the substeps until their first update.
+        `latency` (k,) is their `command_latency` [s], `steps_to_update` (k,) the substeps until their first update,
+        `speed` (k,) that of `Controller` [m/s].
         """
         self._latency[which], self._steps_to_update[which], self.time[which] = latency, steps_to_update, 0.0
         missing = int(np.ceil(self._latency.max() / self._period)) + 2 - len(self._commands)
@@ -137,7 +144,10 @@ class VectorController:
             n = len(self._latency)
             self._arrivals = np.concatenate([np.full((missing, n), -np.inf), self._arrivals])
             self._commands = np.concatenate([np.zeros((missing, n, 2)), self._commands])
-        self._arrivals[:, which], self._limited[which], self._speeds[which] = -np.inf, 0.0, 0.0
+        rolling = np.stack(np.broadcast_arrays(np.broadcast_to(speed, len(which)), 0.0), -1)
+        self._arrivals[:, which], self._arrivals[-1, which] = -np.inf, 0.0
+        self._commands[-1, which] = self._limited[which] = rolling
+        self._speeds[which] = wheel_speeds(rolling, self._params)
 
     def schedules(self, which: NDArray[np.int64], commands: Array) -> SubstepSchedules:
         """Gives commands to the k robots `which` and runs their controllers for one control step.

@@ -84,7 +84,7 @@ class Options:
     start_along: float = 0.0
     """If positive, for training: episodes start beyond the segment's start, by a fraction of its length that is sampled
     uniformly between 0 and this, up to 0.8 half widths of the corridor beside the route (or `start_offset`, if that is
-    more or 0), and turned by up to twice `start_heading`."""
+    more or 0), turned by up to twice `start_heading`, and rolling at `speed`."""
     along_time: float = 3.0
     """With `start_along`, the time after which episodes are cut off (truncated, with an empty cause) [s]."""
     observe: str = NERF

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from twin.env.controller import CONTROL_PERIOD, Controller
+from twin.env.controller import CONTROL_PERIOD, Controller, wheel_speeds
 from twin.errors import InputError
 from twin.geometry.cameras import opencv_to_mujoco
 from twin.mjcf.scene_xml import rest_pose
-from twin.robot import GEAR_RATIO, SIDES, HuskyParams
+from twin.robot import GEAR_RATIO, SIDES, WHEEL_RADIUS, WHEELS, HuskyParams
 from twin.types import Array
 
 TIME_TOLERANCE = 1e-6  # [s] simulation times that differ by less count as equal, because of rounding
@@ -85,8 +85,10 @@ class HuskyPhysics:
         mujoco.mj_forward(self.model, self.data)
         self.begin()
 
-    def set_pose(self, x: float, y: float, yaw: float) -> None:
-        """Sets the robot at rest on the ground at x, y [m] and yaw [rad], lets it settle, and sets the time to 0.
+    def set_pose(self, x: float, y: float, yaw: float, speed: float = 0.0) -> None:
+        """Sets the robot on the ground at x, y [m] and yaw [rad], lets it settle, and sets the time to 0.
+
+        It is at rest, or drives straight on at `speed` [m/s], as if it had been commanded so for a while.
 
         Raises InputError: there is no ground below a wheel.
         """
@@ -97,12 +99,28 @@ class HuskyPhysics:
             self.move_obstacles(0.0)
         mujoco.mj_step(self.model, self.data, round(_SETTLE_TIME / self.model.opt.timestep))
         self.data.qvel[:], self.data.time = 0.0, 0.0
+        if speed:
+            self._roll(speed)
         mujoco.mj_forward(self.model, self.data)
         self.begin()
 
+    def _roll(self, speed: float) -> None:
+        """Sets wheels, motors and body in motion, straight on at `speed` [m/s]."""
+        sides = wheel_speeds(np.array([speed, 0.0]), self.params)
+        self.data.ctrl[self.actuators] = sides
+        if self.model.na:  # the motors' lag
+            self.data.act[self.model.actuator_actadr[self.actuators]] = sides
+        self.data.qvel[[self.model.joint(f"{name}_wheel").dofadr[0] for name in WHEELS]] = np.tile(sides, 2)
+        forward = np.zeros(3)
+        mujoco.mju_rotVecQuat(forward, np.array([speed, 0.0, 0.0]), self.data.qpos[3:7])
+        self.data.qvel[:3] = forward
+
     def begin(self) -> None:
-        """Starts an episode in the present state; drops pending commands and earlier contacts."""
-        self.controller = Controller(self.params)
+        """Starts an episode in the present state; drops pending commands and earlier contacts.
+
+        If the wheels are commanded to turn (`data.ctrl`), the robot has been commanded to drive straight on.
+        """
+        self.controller = Controller(self.params, float(self.data.ctrl[self.actuators].mean()) * WHEEL_RADIUS)
         phase_steps = int(np.ceil(self.controller.phase / self.model.opt.timestep - 1e-6))
         self.steps_to_update = phase_steps % self._steps_per_update
         """Substeps until the controller's next update."""

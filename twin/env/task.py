@@ -57,7 +57,7 @@ _SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point of the route is searched th
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, as multiples of the controller's limits
-EPISODE_VERSION = 4
+EPISODE_VERSION = 5
 """Version of the episodes of a training. Increase it whenever a change of the code changes the starts of a seed with
 `Options.start_along`, when these episodes are cut off, or which ends of episodes are terminal."""
 # With `Options.start_along`: at the start, largest distance from the route / corridor half width, largest heading /
@@ -350,9 +350,9 @@ class DriveTask(control.Task):
         physics.set_robot(replace(params, command_latency=params.command_latency + self.sample.latency))
         self.obstacles = self._obstacles.sample(self.rng(OBSTACLES), self.sample.bystanders)
         physics.robot.move_obstacles = ObstacleMotion(self.obstacles, physics.data.ptr)
-        rng = self.rng(START)
+        rng, speed = self.rng(START), self.options.speed if self.options.start_along else 0.0
         for _ in range(_START_TRIES):
-            physics.robot.set_pose(*self._sample_start(rng))
+            physics.robot.set_pose(*self._sample_start(rng), speed)
             if not physics.touched:
                 break
         else:

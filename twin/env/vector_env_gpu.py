@@ -189,7 +189,10 @@ class GpuSimulation:
         self._touched[which] = [np.isin(np.arange(len(robot.is_robot)), list(robot.touched_geoms)) for robot in robots]
         self._moving[which] = [isinstance(r.move_obstacles, ObstacleMotion) and r.move_obstacles.moving for r in robots]
         latency = np.array([robot.params.command_latency for robot in robots])
-        self._controllers.begin(which, latency, np.array([robot.steps_to_update for robot in robots]))
+        until, speeds = (
+            np.array(v) for v in zip(*((r.steps_to_update, r.controller.speed) for r in robots), strict=True)
+        )
+        self._controllers.begin(which, latency, until, speeds)
 
     def step(self, which: Indices, commands: Array) -> None:
         """Runs a control step of k environments with commands v [m/s] and ω [rad/s], shape (k, 2).

@@ -1,9 +1,10 @@
 """Distillation: a policy learns from pictures what the teacher does by the robot's state (`teacher.py`).
 
 This is *learning by cheating* (Chen et al. 2019). SAC from pixels has to learn from rewards what to see and what to do
-at once; the teacher has learned the latter, so the policy is fitted by regression. The policy itself drives, so that it
-also learns what to do beside the route (DAgger, Ross et al. 2011). Its loss is the squared error of its actions and,
-from its features, of the robot's state.
+at once; the teacher has learned the latter, so the policy is fitted by regression. Most pictures are from very short
+episodes, which start anywhere on the route, beside it and turned; the others from whole drives of the policy itself, so
+that it knows what it will see (DAgger, Ross et al. 2011). Its loss is the squared error of its actions and, from its
+features, of the robot's state.
 """
 
 import shutil

@@ -70,10 +70,10 @@ class TrainConfig:
     entropy: Annotated[float, Range(-1e3, 1e3)] = -0.5
     """The teacher's target entropy per component of an action [nat]. For components in [-1, 1], a target of -0.5 means
     a standard deviation of 0.15, and -1 means 0.09."""
-    start_along: Annotated[float, Range(0, 0.999)] = 0.95
+    start_along: Annotated[float, Range(0, 0.999)] = 0.999
     """Episodes start at a random point in this first fraction of the route segment, up to 0.8 half widths beside the
-    route (`Options.start_along`)."""
-    along_time: Annotated[float, Range(0.1, 1e4)] = 0.8
+    route, and rolling (`Options.start_along`)."""
+    along_time: Annotated[float, Range(0.1, 1e4)] = 0.2
     """Length of these episodes [s]. Each has another lighting, weather and robot; short ones, of which there are many,
     teach far more than long ones (docs/findings.md, "A teacher")."""
     whole_worlds: Annotated[int, Range(0, 4096)] = 1
