@@ -103,6 +103,21 @@ def test_gpu_physics_agrees_with_mujoco(scene, device_name):
     plain.close(), device.close()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("device_name", DEVICES)
+def test_gpu_robots_that_start_along_the_route_are_rolling(scene, device_name):
+    stage = EnvFactory.open(scene, "bend", {**OPTIONS, "start_along": 0.5, "speed": 0.6})
+    plain, device = LocalVectorEnv(stage, [1, 2]), GpuVectorEnv(stage, [1, 2], device_name)
+    for envs in (plain, device):
+        envs.begin(range(2))
+        for _ in range(3):
+            envs.step(np.array([[1.0, 0.0], [1.0, 0.0]]))
+    for one, other in zip(plain.physics, device.physics, strict=True):
+        assert other.speed == pytest.approx(0.6, abs=0.05) and one.speed == pytest.approx(other.speed, abs=0.02)
+        np.testing.assert_allclose(one.planar_pose, other.planar_pose, atol=6e-3)
+    plain.close(), device.close()
+
+
 @pytest.mark.parametrize("device_name", DEVICES)
 @pytest.mark.parametrize("obstacles", [pytest.param((), marks=pytest.mark.slow), (WALKER,)])
 def test_gpu_observations_agree_with_the_cpu(scene, obstacles, device_name):
