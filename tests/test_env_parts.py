@@ -29,7 +29,7 @@ from twin.geometry.cameras import Rendering, Viewpoints
 from twin.geometry.poses import look_at
 from twin.mjcf.world import World
 from twin.report.video_writer import read_frames
-from twin.robot import TRACK, HuskyParams
+from twin.robot import TRACK, WHEEL_RADIUS, WHEELS, HuskyParams
 
 SMALL = {"size": (32, 18)}
 
@@ -286,6 +286,29 @@ def test_parts_out_of_reach_change_no_result(tmp_path):
             physics.command(0.8, 0.1)
             physics.step()
     np.testing.assert_array_equal(whole.data.qpos, small.data.qpos)
+
+
+def test_a_rolling_robot_goes_on_as_one_that_has_accelerated(tmp_path):
+    """Body, wheels and lagging motors."""
+    robot = HuskyParams(servo_lag=0.2, wheel_radius=(0.168, 0.164))
+    model = twin.load_scene(tiny_twin(tmp_path, robot=robot)).world().model()
+    assert model.na == 2
+    accelerated, rolling = (HuskyPhysics(model, robot) for _ in range(2))
+    accelerated.set_pose(0.0, 0.0, 0.1)
+    rolling.set_pose(1.0, 0.1, 0.1, speed=0.7)
+    wheels = [model.joint(f"{name}_wheel").dofadr[0] for name in WHEELS]
+    np.testing.assert_allclose(rolling.data.qvel[wheels], 0.7 / WHEEL_RADIUS)
+    np.testing.assert_allclose(rolling.data.act, 0.7 / WHEEL_RADIUS)
+    assert rolling.speed == pytest.approx(0.7) and rolling.yaw_rate == pytest.approx(0.0)
+    for k in range(30):
+        accelerated.command(0.7, 0.0)
+        accelerated.step()
+        if k >= 20:
+            rolling.command(0.7, 0.0)
+            rolling.step()
+            assert rolling.speed == pytest.approx(accelerated.speed, abs=0.01)
+            np.testing.assert_allclose(rolling.data.act, accelerated.data.act, atol=1e-3)
+            np.testing.assert_allclose(rolling.data.qvel[wheels], accelerated.data.qvel[wheels], atol=0.1)
 
 
 def test_the_robot_stands_on_a_hundred_meters_of_relief(tmp_path):
