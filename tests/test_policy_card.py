@@ -78,6 +78,9 @@ def test_a_forecast_has_the_final_test_of_a_training(scene):
     validate(scene, {"held-out": "g" * 9 + "x"})
     (candidate,) = forecast(scene.root).candidates
     assert (candidate.trained.value, candidate.trained.n) == (17 / 20, 20)
+    (scene.root / "runs/first/choice.json").unlink()  # the policy has no test at all
+    (candidate,) = forecast(scene.root).candidates
+    assert candidate.trained.value is None and "not known" in candidate.trained.missing
 
 
 def test_a_policy_that_was_trained_further_is_not_validated(scene):
