@@ -9,7 +9,7 @@ from tiny_twin import tiny_twin
 from twin.assets.ground import Ground
 from twin.capture.capture_data import Capture, SourceInfo
 from twin.errors import InputError
-from twin.evaluation.training_curves import TESTS_FILE, read_test_counts, training_summaries
+from twin.evaluation.training_curves import CHOICE_FILE, TESTS_FILE, read_test_counts, training_summaries
 from twin.geometry.cameras import Cameras, SparsePoints
 from twin.mjcf.world import World
 from twin.nerf.baked import BakedField
@@ -102,11 +102,18 @@ def test_json_values_of_wrong_type(build, tmp_path, reader, stage, name, key, va
 @pytest.mark.parametrize(
     "tests",
     ["{", "{}", "[3]", '[{"step": 1, "successes": 2}]', '[{"step": 1, "successes": 2, "trials": 1}]']
-    + [json.dumps([{"step": 1, "successes": 0, "trials": n}]) for n in (0, "many", None)],
+    + [json.dumps([{"step": 1, "successes": 0, "trials": n}]) for n in (0, "many", None, "9" * 400, 1e300, 10**30)],
 )
 def test_damaged_tests_of_a_training(tmp_path, tests):
     (tmp_path / TESTS_FILE).write_text(tests)
-    with pytest.raises(InputError, match=r"tests\.json"):
+    with pytest.raises(
+        InputError, match=r"tests\.json(: no valid JSON| .*; delete it, and the policies are tested again)"
+    ):
+        read_test_counts(tmp_path)
+    (tmp_path / CHOICE_FILE).write_text(f'{{"candidates": {tests}}}')
+    with pytest.raises(
+        InputError, match=r"choice\.json(: no valid JSON| .*; delete it, and the best policy is selected again)"
+    ):
         read_test_counts(tmp_path)
 
 

@@ -1,6 +1,7 @@
 """Parts of the environment: stretches of a route, lightings and their sets, randomization, trust, the scene's model,
 recorded episodes, the audit and the film."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -300,6 +301,10 @@ def test_a_rolling_robot_goes_on_as_one_that_has_accelerated(tmp_path):
     np.testing.assert_allclose(rolling.data.qvel[wheels], 0.7 / WHEEL_RADIUS)
     np.testing.assert_allclose(rolling.data.act, 0.7 / WHEEL_RADIUS)
     assert rolling.speed == pytest.approx(0.7) and rolling.yaw_rate == pytest.approx(0.0)
+    for limit in ("max_speed", "max_wheel_speed"):
+        limited = HuskyPhysics(model, replace(robot, **{limit: 0.4}))
+        limited.set_pose(1.0, 0.1, 0.1, speed=0.7)
+        assert limited.speed == pytest.approx(0.4) == limited.controller.speed
     for k in range(30):
         accelerated.command(0.7, 0.0)
         accelerated.step()

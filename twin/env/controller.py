@@ -63,7 +63,7 @@ class Controller:
         self.speed = speed
         """Speed at the beginning [m/s]."""
         self._pending: deque[tuple[float, Array]] = deque()
-        # The commands before time 0 arrive until the first one after it does.
+        # The earlier commands hold until the first new one arrives.
         self._latest = (self.params.command_latency, np.array([speed, 0.0]))
         self._limited = np.array([speed, 0.0])
 
@@ -183,8 +183,7 @@ class VectorController:
         """See `Controller.update`; shape (k, 2)."""
         time, arrivals = self.time[which], self._arrivals[:, which]
         newest = len(arrivals) - 1 - np.argmax((arrivals <= time + _TIME_TOLERANCE)[::-1], axis=0)
-        arrived = np.take_along_axis(arrivals, newest[None], 0)[0]
         # No command expires: each control step brings one and is no longer than COMMAND_TIMEOUT.
-        wanted = np.where(np.isfinite(arrived)[:, None], self._commands[newest, which], 0.0)
+        wanted = self._commands[newest, which]
         self._limited[which] = limit_command(wanted, self._limited[which], self._params, self._params.timing.period)
         return wheel_speeds(self._limited[which], self._params)

@@ -82,9 +82,9 @@ class Options:
     start_heading: float = 10.0
     """The start's heading relative to the route is sampled uniformly within ± this [°]."""
     start_along: float = 0.0
-    """If positive, for training: episodes start beyond the segment's start, by a fraction of its length that is sampled
-    uniformly between 0 and this, up to 0.8 half widths of the corridor beside the route (or `start_offset`, if that is
-    more or 0), turned by up to twice `start_heading`, and rolling at `speed`."""
+    """If positive, for training: episodes start on the way to the goal, after a fraction of it that is uniform between
+    0 and this, up to 0.8 half widths of the corridor beside the route (or `start_offset`, if that is more or 0), turned
+    by up to twice `start_heading`, and rolling at `speed`."""
     along_time: float = 3.0
     """With `start_along`, the time after which episodes are cut off (truncated, with an empty cause) [s]."""
     observe: str = NERF

@@ -88,7 +88,8 @@ class HuskyPhysics:
     def set_pose(self, x: float, y: float, yaw: float, speed: float = 0.0) -> None:
         """Sets the robot on the ground at x, y [m] and yaw [rad], lets it settle, and sets the time to 0.
 
-        It is at rest, or drives straight on at `speed` [m/s], as if it had been commanded so for a while.
+        It is at rest, or drives straight on as if `speed` [m/s] had been commanded for a while: no faster than the
+        controller lets it. Pictures begin at time 0; a camera's latency does not reach back before it.
 
         Raises InputError: there is no ground below a wheel.
         """
@@ -105,20 +106,21 @@ class HuskyPhysics:
         self.begin()
 
     def _roll(self, speed: float) -> None:
-        """Sets wheels, motors and body in motion, straight on at `speed` [m/s]."""
-        sides = wheel_speeds(np.array([speed, 0.0]), self.params)
+        """Sets wheels, motors and body in motion, straight on, as a command of `speed` [m/s] does in the end."""
+        sides = wheel_speeds(np.array([min(speed, self.params.max_speed), 0.0]), self.params)
         self.data.ctrl[self.actuators] = sides
         if self.model.na:  # the motors' lag
             self.data.act[self.model.actuator_actadr[self.actuators]] = sides
         self.data.qvel[[self.model.joint(f"{name}_wheel").dofadr[0] for name in WHEELS]] = np.tile(sides, 2)
         forward = np.zeros(3)
-        mujoco.mju_rotVecQuat(forward, np.array([speed, 0.0, 0.0]), self.data.qpos[3:7])
+        mujoco.mju_rotVecQuat(forward, np.array([sides.mean() * WHEEL_RADIUS, 0.0, 0.0]), self.data.qpos[3:7])
         self.data.qvel[:3] = forward
 
     def begin(self) -> None:
         """Starts an episode in the present state; drops pending commands and earlier contacts.
 
-        If the wheels are commanded to turn (`data.ctrl`), the robot has been commanded to drive straight on.
+        The controller begins at the mean speed that the wheels are commanded (`data.ctrl`): dm_control calls this again
+        after `set_pose`, which may have set the robot in motion.
         """
         self.controller = Controller(self.params, float(self.data.ctrl[self.actuators].mean()) * WHEEL_RADIUS)
         phase_steps = int(np.ceil(self.controller.phase / self.model.opt.timestep - 1e-6))

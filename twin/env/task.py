@@ -1,10 +1,10 @@
 """Driving along a route segment in dm_control, without images: physics, start, state, reward and termination.
 
-`options.Rewards` has the weights of the reward. In an *episode*, the robot starts at rest near the segment's start; the
-episode ends with one of `CAUSES`. The discount at the end is 0, or 1 after a timeout, which truncates the episode. An
-episode's seed determines all its randomness, so that policies can be compared on the same episodes. Start, robot,
-lighting, obstacles, camera and weather have separate random generators: a change in the sampling of one leaves the
-others unchanged.
+`options.Rewards` has the weights of the reward. In an *episode*, the robot starts at rest near the segment's start, or
+with `Options.start_along` anywhere on the segment and rolling. The episode ends with one of `CAUSES`. The discount at
+the end is 0, or 1 after a timeout, which truncates the episode. An episode's seed determines all its randomness, so
+that policies can be compared on the same episodes. Start, robot, lighting, obstacles, camera and weather have separate
+random generators: a change in the sampling of one leaves the others unchanged.
 """
 
 import copy
@@ -57,7 +57,7 @@ _SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point of the route is searched th
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, as multiples of the controller's limits
-EPISODE_VERSION = 5
+EPISODE_VERSION = 6
 """Version of the episodes of a training. Increase it whenever a change of the code changes the starts of a seed with
 `Options.start_along`, when these episodes are cut off, or which ends of episodes are terminal."""
 # With `Options.start_along`: at the start, largest distance from the route / corridor half width, largest heading /
@@ -470,7 +470,7 @@ class DriveTask(control.Task):
             offset *= max(1.0, _ALONG_OFFSET * self.half_width / o.start_offset) if o.start_offset else 1.0
             turn *= _ALONG_HEADING
             share = o.start_along * rng.random()
-        s = self._start_station = self.segment.start + share * self.segment.length
+        s = self._start_station = self.segment.start + share * (self.segment.length - BUMPER_OFFSET)
         heading = float(heading_at(self.world.route[:, :2], s))
         x, y = point_at(self.world.route[:, :2], s) + offset * np.array([-np.sin(heading), np.cos(heading)])
         return float(x), float(y), heading + float(turn)

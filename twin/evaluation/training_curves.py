@@ -20,6 +20,9 @@ TESTS_FILE, CHOICE_FILE = "tests.json", "choice.json"
 TestCount = tuple[int, int, int]
 """Of a test: the step at which the policy was saved, its successes, and its episodes."""
 
+_CHOOSE_AGAIN = "delete it, and the best policy is selected again"
+_MAX_COUNT = 10**12  # largest number of steps or episodes
+
 
 def training_summaries(root: Path, policies: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Summarizes the trainings of those policies in `runs/` that are unchanged since their validation.
@@ -65,7 +68,7 @@ def _final_test(folder: Path) -> tuple[int, dict[str, Any]] | None:
     path = folder / CHOICE_FILE
     if not is_file(path):
         return None
-    with wrap_read_errors(path, "delete it, and the best policy is selected again"):
+    with wrap_read_errors(path, _CHOOSE_AGAIN):
         chosen = dict(read_json(path)["chosen"])
         step, won, trials = _count(chosen)
         condition = str(chosen.get("condition", ""))  # older runs do not store it
@@ -73,8 +76,10 @@ def _final_test(folder: Path) -> tuple[int, dict[str, Any]] | None:
 
 
 def _count(test: dict[str, Any]) -> TestCount:
-    step, won, trials = (int(test[name]) for name in ("step", "successes", "trials"))
-    if not 0 <= won <= trials or not trials:
+    step, won, trials = (test[name] for name in ("step", "successes", "trials"))
+    if not all(isinstance(value, int) and 0 <= value <= _MAX_COUNT for value in (step, won, trials)):
+        raise ValueError(f"step {step!r}: {won!r} successes in {trials!r} trials; expected whole numbers")
+    if won > trials or not trials:
         raise ValueError(f"{won} successes in {trials} trials")
     return step, won, trials
 
@@ -90,10 +95,13 @@ def validated_digests(root: Path) -> dict[str, Any]:
 
 def read_test_counts(folder: Path) -> list[TestCount]:
     """The tests of a run so far, by step; empty if it had none yet. Raises InputError: a file is damaged."""
-    for name, key in ((CHOICE_FILE, "candidates"), (TESTS_FILE, "")):
+    for name, key, cure in (
+        (CHOICE_FILE, "candidates", _CHOOSE_AGAIN),
+        (TESTS_FILE, "", "delete it, and the policies are tested again"),
+    ):
         path = folder / name
         if is_file(path):
-            with wrap_read_errors(path, "delete it, and the policies are tested again"):
+            with wrap_read_errors(path, cure):
                 contents = read_json(path)
                 tests = contents[key] if key else contents
                 if not isinstance(tests, list):
@@ -105,7 +113,7 @@ def read_test_counts(folder: Path) -> list[TestCount]:
 def plot_tests(axes: Axes, tests: Sequence[TestCount], color: str) -> None:
     """Plots the success rates of one test or more over steps, with their intervals."""
     steps, won, trials = np.array(sorted(tests), float).T
-    _plot_rates(axes, steps, won, trials, fmt="o-", color=color, label=f"tests, {_range_text(trials)} episodes each")
+    _plot_rates(axes, steps, won, trials, fmt="o-", color=color, label=f"tests, {range_text(trials)} episodes each")
 
 
 def _plot_rates(axes: Axes, steps: Array, won: Array, trials: Array, **look: Any) -> None:
@@ -114,7 +122,7 @@ def _plot_rates(axes: Axes, steps: Array, won: Array, trials: Array, **look: Any
     axes.errorbar(steps, rates, lengths, capsize=3, elinewidth=0.8, markersize=4, **look)
 
 
-def _range_text(counts: Iterable[float]) -> str:
+def range_text(counts: Iterable[float]) -> str:
     """Smallest and largest of some whole numbers, as "5 to 6" or "5"."""
     ends = sorted(map(int, counts))
     return " to ".join(map(str, dict.fromkeys((ends[0], ends[-1]))))

@@ -75,7 +75,7 @@ class TrainConfig:
     route, and rolling (`Options.start_along`)."""
     along_time: Annotated[float, Range(0.1, 1e4)] = 0.2
     """Length of these episodes [s]. Each has another lighting, weather and robot; short ones, of which there are many,
-    teach far more than long ones (docs/findings.md, "A teacher")."""
+    teach far more than long ones (docs/findings.md, "Very short episodes that roll")."""
     whole_worlds: Annotated[int, Range(0, 4096)] = 1
     """Number of environments whose episodes begin at the segment's start and are not cut off; at least one is left."""
     randomise: bool = True

@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from itertools import product
+from itertools import compress, product
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +80,7 @@ Referee = Callable[[int, Drive], Segment | None]
 training."""
 
 _MEAN_ERRORS = 200  # number of the newest updates whose mean errors are logged
+_MAX_TABLE = 2**32  # [bytes] largest table of a run
 _NO_CURVES = ("step", "seed", "lighting", "cause")  # columns that are not sent to the writers as curves
 _FINAL_RATE = 0.1  # lowest learning rate / `config.learning_rate`
 # Seeds derive from the run's seed, the number of resumptions and this number. It differs from `selection._STREAM`, so
@@ -368,7 +369,9 @@ class _RunRecorder:
             head = (self._learner.steps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"])
             outcome = (int(info["is_success"]), info["cause"], f"{info['progress']:.2f}", episode["l"])
             rows.append((*head, *outcome, f"{episode['r']:.3f}", f"{info['start']:.2f}"))
-        self._append("episodes", TRAINING_EPISODE_COLUMNS, rows)
+        # Episodes that start along the route are cut off: their curves would say nothing.
+        whole = [float(row[-1]) == 0.0 for row in rows]
+        self._append("episodes", TRAINING_EPISODE_COLUMNS, rows, whole)
         if self._watch:
             self._watch(self._learner.steps)
 
@@ -395,13 +398,13 @@ class _RunRecorder:
         save_state(self._folder / "state", learner, {"wall": self.wall, "resumed": self._resumed})
         self._saved = learner.steps
 
-    def _append(self, table: str, columns: tuple[str, ...], rows: list[tuple]) -> None:
-        """Appends rows to a table of the run, and sends their numbers to the writers, as `<table>/<column>`."""
+    def _append(self, table: str, columns: tuple[str, ...], rows: list[tuple], shown: Sequence[bool] = (True,)) -> None:
+        """Appends rows to a table of the run; the writers get the numbers of `shown` ones, as `<table>/<column>`."""
         if not rows:
             return
         with (self._folder / f"{table}.csv").open("a", newline="", encoding="utf-8") as file:
             csv.writer(file, lineterminator="\n").writerows(rows)
-        for row, writer in product(rows, self._writers):
+        for row, writer in product(compress(rows, shown), self._writers):
             named = dict(zip(columns, row, strict=True))
             numbers = {f"{table}/{name}": float(named[name]) for name in columns if name not in _NO_CURVES}
             writer.write(numbers, dict.fromkeys(numbers, ()), named["step"])
@@ -429,6 +432,6 @@ def _keep_rows(path: Path, columns: tuple[str, ...], steps: int) -> None:
     if path.exists():
         with wrap_read_errors(path, "delete its damaged lines, or train again under another name"):
             # A killed training may leave the last line incomplete.
-            table = [row for row in csv.reader(io.StringIO(read_text(path))) if len(row) == len(columns)]
-            rows = [row for row in table[1:] if int(row[0]) <= steps]
+            table = list(csv.reader(io.StringIO(read_text(path, _MAX_TABLE))))[1:]
+            rows = [row for row in table if len(row) == len(columns) and int(row[0]) <= steps]
     write_text(path, csv_text(columns, rows))

@@ -16,7 +16,7 @@ from twin.config import ANY, HELD_OUT, TRAINING, Condition
 from twin.errors import join_names
 from twin.evaluation.agreement import Estimate
 from twin.evaluation.statistics import MIN_POLICIES, MIN_TRIALS
-from twin.evaluation.training_curves import TestCount, plot_tests
+from twin.evaluation.training_curves import TestCount, plot_tests, range_text
 from twin.evaluation.trials import Trial, csv_text
 from twin.files import write_text
 from twin.mjcf.world import World, point_at
@@ -417,7 +417,9 @@ def _task(results: dict[str, Any], task: str) -> dict[str, Any]:
 def _training_chart(results: dict[str, Any], curve: TrainingCurve) -> Chart:
     run, tests = curve
     saved = sorted(t["step"] for t in results["training"].values() if t["run"] == run)
-    return Chart(run, svg(training_figure(tests, saved)))
+    return Chart(
+        f"{run} ({range_text(trials for *_, trials in tests)} episodes per test)", svg(training_figure(tests, saved))
+    )
 
 
 def _next_steps(results: dict[str, Any], root: Path) -> list[tuple[str, list[str]]]:
