@@ -128,10 +128,11 @@ def test_a_run_gets_the_numbers_of_the_tables(scene, tmp_path, stand_in):
     logged = stand_in.runs[0].rows
     for table, columns in (("episodes", ("success", "progress_m", "reward")), ("log", ("steps_per_s", "updates"))):
         rows = list(csv.DictReader((tmp_path / "run" / f"{table}.csv").open(newline="")))
-        assert rows
+        whole = [row for row in rows if float(row.get("start_m", 0.0)) == 0.0]  # the others are cut off
+        assert whole and (len(whole) < len(rows)) == (table == "episodes")
         for column in columns:
             found = [(row["step"], row[f"{table}/{column}"]) for row in logged if f"{table}/{column}" in row]
-            np.testing.assert_array_equal(found, [(int(row["step"]), float(row[column])) for row in rows])
+            np.testing.assert_array_equal(found, [(int(row["step"]), float(row[column])) for row in whole])
     assert not [name for row in logged for name in row if name.endswith(("cause", "lighting", "seed"))]
 
 
