@@ -144,7 +144,8 @@ class VectorController:
             n = len(self._latency)
             self._arrivals = np.concatenate([np.full((missing, n), -np.inf), self._arrivals])
             self._commands = np.concatenate([np.zeros((missing, n, 2)), self._commands])
-        rolling = np.stack(np.broadcast_arrays(np.broadcast_to(speed, len(which)), 0.0), -1)
+        rolling = np.zeros((len(which), 2))
+        rolling[:, 0] = speed
         self._arrivals[:, which], self._arrivals[-1, which] = -np.inf, 0.0
         self._commands[-1, which] = self._limited[which] = rolling
         self._speeds[which] = wheel_speeds(rolling, self._params)

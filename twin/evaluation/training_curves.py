@@ -18,7 +18,7 @@ TESTS_FILE, CHOICE_FILE = "tests.json", "choice.json"
 `learn/selection.py`."""
 
 TestCount = tuple[int, int, int]
-"""Of a test: the step at which the policy was saved, its successes, and its episodes."""
+"""A test: the step at which its policy was saved, the number of successes, and that of episodes."""
 
 _CHOOSE_AGAIN = "delete it, and the best policy is selected again"
 _MAX_COUNT = 10**12  # largest number of steps or episodes

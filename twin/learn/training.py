@@ -363,14 +363,14 @@ class _RunRecorder:
     def after_step(self, infos: list[dict[str, Any]], errors: list[tuple[float, float]]) -> None:
         """Records the environments' infos and the updates' errors."""
         self._errors = (self._errors + errors)[-_MEAN_ERRORS:]
-        rows = []
+        rows, whole = [], []
         for info in (one for one in infos if "episode" in one):
             episode = info["episode"]
             head = (self._learner.steps, f"{self.wall:.1f}", info["episode_seed"], info["lighting"])
             outcome = (int(info["is_success"]), info["cause"], f"{info['progress']:.2f}", episode["l"])
             rows.append((*head, *outcome, f"{episode['r']:.3f}", f"{info['start']:.2f}"))
+            whole.append(not info["start"])
         # Episodes that start along the route are cut off: their curves would say nothing.
-        whole = [float(row[-1]) == 0.0 for row in rows]
         self._append("episodes", TRAINING_EPISODE_COLUMNS, rows, whole)
         if self._watch:
             self._watch(self._learner.steps)
