@@ -1,6 +1,6 @@
 """Plays a ROS bag to a policy and prints the commands that it would give to a robot. Needs neither a robot nor ROS.
 
-    pip install 'twin[ros]'
+    pip install '.[ros]'
     twin unpack demo theirs
     twin reality bag --policy theirs/runs/first --task straight --lighting haze --out haze_1
     python examples/play_bag.py theirs/runs/first haze_1

@@ -1,6 +1,6 @@
 """PPO of stable-baselines3 on pictures and odometry: python examples/ppo.py scenes/demo --steps 200000
 
-Needs pip install 'twin[learn]'. PPO needs more steps than `twin train`, whose teacher knows where the robot is; the
+Needs pip install '.[learn]'. PPO needs more steps than `twin train`, whose teacher knows where the robot is; the
 example shows how to connect any algorithm of stable-baselines3. For a policy that `twin validate --policy ppo.zip
 --trust` can drive, leave out `state` and use CnnPolicy.
 """

@@ -1,7 +1,7 @@
 """SAC in one file, in the manner of CleanRL: python examples/sac.py scenes/demo --steps 20000
 
 The algorithm is that of Haarnoja et al., arXiv 1812.05905. Networks with their optimizers and the replay buffer are
-those of stable-baselines3: pip install 'twin[learn]'
+those of stable-baselines3: pip install '.[learn]'
 """
 
 import argparse

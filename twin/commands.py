@@ -67,8 +67,10 @@ def _new(parser: argparse.ArgumentParser, add: _Add) -> None:
         "also brings the camera's calibration, GPS and odometry for the scale, and the camera's pose on the robot."
     )
     add("scene", type=Path, help="folder to make, such as scenes/my_road")
-    add("films", type=Path, nargs="+", metavar="VIDEO", help="films, bags or image folders, one per lighting")
-    add("--camera-height", type=float, metavar="METERS", help="height of the lens above the ground")
+    films = "films, bags, photo folders, COLMAP models or transforms.json"
+    add("films", type=Path, nargs="+", metavar="VIDEO", help=films)
+    height = "height of the lens above the ground (default: that of a bag)"
+    add("--camera-height", type=float, metavar="METERS", help=height)
     add("--topic", help="topic of a bag's pictures; default: that with the most pictures")
 
 
@@ -187,7 +189,7 @@ def _drive(parser: argparse.ArgumentParser, add: _Add) -> None:
     add("--policy", help="a run, a checkpoint, an ONNX file or module:function")
     add("--trust", action="store_true", help="load a policy file that may run code")
     add("--task", help="straight, right_turn, route, or one of scene.toml")
-    add("--lighting", help="a name, or a mixture sun:night:0.5 (default: random)")
+    add("--lighting", help="a name, or a mixture sun:night:0.5 (default: sampled; with --view the first filmed one)")
     add("--seed", type=int, default=0, help="seed of the episode")
     add("--port", type=int, default=8080, help="port of the page; if taken, the next free one; 0: any")
     add("--out", type=Path, help="the mp4; default: in SCENE/films; for a pack, in this folder")
@@ -282,13 +284,15 @@ def _train(parser: argparse.ArgumentParser, add: _Add) -> None:
     add("--observe", choices=("nerf", "simulator"), help="source of the pictures (default: nerf)")
     add("--lighting", help="one lighting by name (default: training, which varies between episodes)")
     add("--preset", choices=("cpu", "gpu"), default="cpu", help="sizes of network, batch and run")
-    add("--action", choices=("steering", "twist"), help="default: steering, at fixed speed")
+    action = "yaw rate at 1 m/s, or also the speed, up to 1 m/s (default: steering)"
+    add("--action", choices=("steering", "twist"), help=action)
     add("--success", type=float, help="success rate in tests at which the training ends (default: 0.95)")
     steps = "largest number of control steps of all environments (default: 24000, more from 50 m on; gpu: 60000)"
     add("--steps", type=int, help=steps)
     add("--teacher-steps", type=int, help="control steps of the teacher, which needs no pictures (default: 20000)")
     add("--worlds", type=int, help="number of parallel environments (default: 8; gpu: 32)")
-    add("--processes", type=int, help="processes that step the environments (default: one per core, at most 16)")
+    processes = "processes that step the environments, two or more each (default: one per core, at most 16)"
+    add("--processes", type=int, help=processes)
     add("--device", choices=("cpu", "cuda"), help="where the networks are trained (default: cpu; preset gpu: cuda)")
     add("--updates", type=float, help="updates of the policy per control step (default: 0.5)")
     add(
@@ -331,7 +335,7 @@ def _validate(parser: argparse.ArgumentParser, add: _Add) -> None:
     add("--worst", action="store_true", help="search for each policy's worst lighting")
     add("--films", action="store_true", help="film each policy's typical and worst episode")
     add("--trust", action="store_true", help="load policy files that may run code")
-    add("--processes", type=int, default=1, help="processes on this machine; each uses two cores")
+    add("--processes", type=int, default=1, help="processes on this machine, such as one per core")
     add("--ray", metavar="ADDRESS", help="use a Ray cluster; auto: the one on this machine")
 
 
@@ -385,7 +389,8 @@ If the twin has no lighting of a name, a column twin_lighting names the lighting
 held-out+randomised.
 """
     add("scene", type=Path, help="folder of a scene with validated policies")
-    add("--real", type=Path, nargs="+", default=[], metavar="CSV", help="tables of trials on the road; see below")
+    real = "tables of trials on the road, such as SCENE/real.csv, see below; without them: ranks in the twin alone"
+    add("--real", type=Path, nargs="+", default=[], metavar="CSV", help=real)
     add("--seed", type=int, default=0, help="seed of the sampling from posteriors")
 
 
@@ -412,9 +417,11 @@ def _reality(parser: argparse.ArgumentParser, add: _Add) -> None:
         if camera:
             add("--camera", type=int, default=0, metavar="NUMBER", help="number of that robot's camera")
 
+    designed = "dawn, afternoon, evening, haze, rain"
+
     def one_weather(one: argparse.ArgumentParser) -> None:
         either = one.add_mutually_exclusive_group(required=True)
-        either.add_argument("--lighting", metavar="NAME", help="a designed weather")
+        either.add_argument("--lighting", metavar="NAME", help=f"{designed}, or day_N")
         either.add_argument("--day", type=int, nargs=1, metavar="NUMBER", help="number of a random day, from 1")
 
     _, add = command("film", "film the place into a scene folder")
@@ -429,7 +436,7 @@ def _reality(parser: argparse.ArgumentParser, add: _Add) -> None:
     add("--shake", type=float, metavar="FACTOR", help="shake of the camera; 1: as on a cart")
     _, add = command("compare", "compare a build of a filmed place with its truth, and show it in the build's report")
     add("scene", type=Path, help="folder of a built scene")
-    one, add = command("drive", "the real test: drive policy files in weather that was not filmed")
+    one, add = command("drive", "drive policy files on the simulated road, in weather that was not filmed")
     one.set_defaults(resumes=True)
     add("--policy", type=Path, nargs="+", required=True, help="policy folders or .onnx files")
     task = "{straight,right_turn}; a sampled place names its own; or a .json of twin export --task-file"
@@ -437,7 +444,8 @@ def _reality(parser: argparse.ArgumentParser, add: _Add) -> None:
     add("--scene", type=Path, help="the built scene from which the .json was exported")
     robot(add)
     add("--trials", type=int, default=5, help="per policy and lighting; twin forecast takes 5 or more")
-    add("--lightings", nargs="+", metavar="NAME", help="designed weathers (default: all)")
+    what = f"{designed}, day_N (default: these five and day_1 to day_15; with --day none)"
+    add("--lightings", nargs="+", metavar="NAME", help=what)
     add("--day", type=int, nargs="+", metavar="NUMBER", help="numbers of random days, from 1")
     out = "real.csv, with a table of trials beside it; only one command at a time may write it"
     add("--out", type=Path, required=True, help=out)

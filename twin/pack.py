@@ -52,7 +52,7 @@ _MESH = ("ground.npz", "parts.npz", "visual.npz")
 _TEXT = """\
 A pack of {name}, made by twin {version}: a MuJoCo simulation of a place, which `twin build` made from films.
 
-  pip install twin                       the program, see its README
+  twin: the program that opens it; its README says how to install it
   twin drive {file}     the Husky drives in it{driver}
   twin unpack {file} FOLDER              a scene folder, in which all commands work that need no films
 

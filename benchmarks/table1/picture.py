@@ -3,8 +3,8 @@
     python benchmarks/table1/picture.py SCENE docs/forecast.jpg
 
 Shows randomized episodes of the twin, test days of the simulated reality, the twin under lightings from a photo of each
-of these days, success on the road against success in the twin for every policy, and a training's success curve. SCENE
-holds the results of `benchmarks/table1`.
+of these days, and success on the road against success in the twin for every policy. SCENE holds the results of
+`benchmarks/table1`.
 """
 
 import argparse
@@ -21,7 +21,6 @@ from matplotlib.text import Text
 
 import twin
 from twin.evaluation.forecasting import Forecast
-from twin.evaluation.training_curves import write_success_curve
 from twin.learn.policy import load_policy
 from twin.reality.lighting import WEATHER
 from twin.reality.real_test import RealTest, task_for
@@ -48,14 +47,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--run", default="straight_varied_0", help="run whose success curve is shown")
+    parser.add_argument(
+        "--run", default="straight_varied_0", help="run whose policy has the camera of the test road's pictures"
+    )
     given = parser.parse_args()
     run = given.scene / "runs" / given.run
     policy = load_policy(run)
     test = RealTest(task_for(policy, "straight", 0), size=policy.size)
     road = [test.reset(name, _TRIAL).capture(test.robot) for name in _SHOWN]
     agreement = rates_against_road(Forecast.load(given.scene / "forecast"))
-    curve = cv2.imread(str(write_success_curve(run)))[..., ::-1]
     parts = [
         _caption("The twin in training: randomized lighting, sun, shadows and haze"),
         *_rows([_first(given.scene, seed, randomise=True) for seed in _SEEDS]),
@@ -65,7 +65,7 @@ def main() -> None:
         *_rows(road, _SHOWN),
         _caption("The twin with appearance and haze fitted to one photo of each of these days"),
         *_rows([_first(given.scene, 1, lighting=name) for name in _SHOWN], _SHOWN),
-        _side_by_side(_in_paper_colors(agreement), curve),
+        _middle(_in_paper_colors(agreement)),
     ]
     page = np.concatenate([np.full((_GAP, _WIDTH, 3), 255, np.uint8), *parts])
     if not cv2.imwrite(str(given.out), page[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 86]):
@@ -119,16 +119,12 @@ def _row(pictures: list[Image], names: Sequence[str]) -> Image:
     return out
 
 
-def _side_by_side(*drawings: Image) -> Image:
-    height = min(round(d.shape[0] * (_WIDTH / len(drawings)) / d.shape[1]) for d in drawings)
-    scaled = [
-        cv2.resize(d, (height * d.shape[1] // d.shape[0], height), interpolation=cv2.INTER_AREA) for d in drawings
-    ]
+def _middle(drawing: Image) -> Image:
+    """A drawing, scaled to half the width and centered."""
+    width = _WIDTH // 2
+    height = round(drawing.shape[0] * width / drawing.shape[1])
     out = np.full((height, _WIDTH, 3), 255, np.uint8)
-    for i, drawing in enumerate(scaled):
-        middle = (2 * i + 1) * _WIDTH // (2 * len(scaled))
-        left = middle - drawing.shape[1] // 2
-        out[:, left : left + drawing.shape[1]] = drawing
+    out[:, width // 2 : width // 2 + width] = cv2.resize(drawing, (width, height), interpolation=cv2.INTER_AREA)
     return out
 
 
