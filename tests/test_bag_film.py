@@ -20,7 +20,7 @@ from bag_of_film import (
     write,
     write_ros1,
 )
-from filmed_wall import HEIGHT, WIDTH, captured, refused, views
+from filmed_wall import HEIGHT, WIDTH, captured, film, refused, views
 from picture_bag import MESSAGES, TYPES, Recorded, command
 from rosbags.rosbag2 import CompressionMode
 from scipy.spatial.transform import Rotation
@@ -279,6 +279,19 @@ def test_new_takes_what_the_bag_has_and_says_so(tmp_path: Path, capsys: pytest.C
     assert robot["camera_pitch"] == pytest.approx(np.degrees(0.1), abs=1e-3)
     assert commands.main("new", [str(tmp_path / "other"), str(bag), "--topic", "/rear/image"]) == 0
     assert load_config(tmp_path / "other/scene.toml").source[0].topic == "/rear/image"
+
+
+def test_the_height_of_a_bag_is_not_that_of_another_film(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    bag = write(tmp_path / "drive", whole())
+    phone = film(tmp_path / "phone.mp4", views([5 * i for i in range(6)]))
+    assert commands.main("new", [str(tmp_path / "scene"), str(phone), str(bag)]) == 0
+    config = load_config(tmp_path / "scene/scene.toml")
+    assert config.metric.camera_height == 0.0 and config.metric.camera_height_tolerance == 0.02
+    assert [one.camera_height for one in config.source] == [0.0, pytest.approx(0.7)]
+    assert "metric scale: camera_height" in capsys.readouterr().out
+    assert commands.main("new", [str(tmp_path / "given"), str(phone), str(bag), "--camera-height", "1.1"]) == 0
+    config = load_config(tmp_path / "given/scene.toml")
+    assert config.metric.camera_height == 1.1 and [one.camera_height for one in config.source] == [0.0, 0.0]
 
 
 def test_new_says_whether_the_bag_is_also_a_log(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

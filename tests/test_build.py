@@ -179,6 +179,20 @@ def test_until_stops_after_its_stage_and_the_report_is_written(pipeline):
     assert written["peak_memory_bytes"] > 1e6 and written["seed"] == 0 and written["versions"]["numpy"]
 
 
+def test_a_route_that_was_not_filmed_is_refused_before_the_field_is_trained(pipeline, monkeypatch):
+    def refuse(cameras, config):
+        raise verb.InputError(f"route: no pass {config.passes[0]!r}")
+
+    monkeypatch.setattr("twin.geometry.cameras.Cameras.load", lambda _: None)
+    monkeypatch.setattr("twin.geometry.route.filmed_route", refuse)
+    (pipeline.root / "scene.toml").write_text(_TOML + '[route]\npasses = ["dusk:2"]\n')
+    with pytest.raises(verb.InputError, match="no pass 'dusk:2'"):
+        verb.build(pipeline.root)
+    assert pipeline.ran == ["capture", "cameras"]
+    verb.build(pipeline.root, overrides=("mjcf.route=false",))
+    assert pipeline.ran[-1] == "field"
+
+
 def test_until_keeps_later_stages_in_the_report_if_they_are_up_to_date(pipeline):
     """Without a change, `--until` loses no numbers; after a change, numbers of stale stages are left out."""
     verb.build(pipeline.root)

@@ -123,6 +123,11 @@ def test_decomposition_covers_its_pieces_within_the_bound_and_is_cached(tmp_path
     again = decompose(pieces, BOUND, tmp_path, seed=0)
     assert again.cached == 1
     assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(made.parts, again.parts, strict=True))
+    for file in tmp_path.glob("*.npz"):
+        file.write_bytes(file.read_bytes()[:100])
+    mended = decompose(pieces, BOUND, tmp_path, seed=0)
+    assert mended.cached == 0 and mended.failed == 0
+    assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(made.parts, mended.parts, strict=True))
 
 
 def test_a_crash_costs_one_piece_only(tmp_path: Path):

@@ -183,6 +183,23 @@ def test_a_damaged_stage_names_its_file(tmp_path):
         require_stage(scene, "mjcf")
 
 
+def test_stages_of_different_builds_are_not_used_together(tmp_path):
+    scene = SceneDir(tmp_path)
+    results = {}
+    for stage, upstream in (("metric", ()), ("field", ("metric",)), ("mesh", ("field",)), ("mjcf", ("mesh",))):
+        scene.stage(stage).mkdir(parents=True)
+        (scene.stage(stage) / "result.txt").write_text(stage)
+        depends = {"upstream": {name: results[name] for name in upstream}}
+        results[stage] = write_stamp(scene.stage(stage), stage, depends).result
+    require_stage(scene, "mjcf")
+    (scene.stage("metric") / "result.txt").write_text("another scale")
+    write_stamp(scene.stage("metric"), "metric", {"upstream": {}})  # then the build was interrupted
+    assert require_stage(scene, "metric") == scene.stage("metric")
+    for stage in ("field", "mesh", "mjcf"):
+        with pytest.raises(InputError, match=r"3_field was built from an earlier 2_metric, .*; run twin build"):
+            require_stage(scene, stage)
+
+
 @pytest.mark.parametrize("count", ["9223372036854775808", "9" * 5000, "1000001", "-1", "1.5", "٣"])
 def test_implausible_counts_of_trials_are_refused(tmp_path, count):
     path = tmp_path / "real.csv"

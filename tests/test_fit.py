@@ -194,6 +194,10 @@ def test_camera_height_is_used_only_if_known_and_constant():
     assert constant_height(metric) == 1.2
     assert constant_height(metric | {"local_height_spread_m": 0.5}) == 0.0
     assert constant_height(metric | {"road_reliable": False, "scale_source": "gps"}) == 0.0
+    assert constant_height(metric | {"camera_height_m_of": {"low": 0.6, "high": 1.2}}) == 0.0
+    by_gps = {"camera_height_median_m": 1.2, "road_reliable": True, "scale_source": "gps"}
+    assert constant_height(by_gps | {"camera_height_spread_m": 0.02}) == 1.2
+    assert constant_height(by_gps | {"camera_height_spread_m": 0.5}) == 0.0
     assert constant_height({}) == 0.0
 
 

@@ -1,15 +1,19 @@
 """Films: frame selection, rotation, scaling, masks, the held-out split and refused input."""
 
+import contextlib
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
 import cv2
 import numpy as np
 import pytest
+from av.video.frame import PictureType
 from filmed_wall import HEIGHT, WIDTH, captured, film, refused, views, wall
 
+from twin.capture import video
 from twin.capture.frames import held_out_frames, source_names
 from twin.capture.video import (
     FilmStatistics,
@@ -209,6 +213,25 @@ def test_a_film_cut_off_gives_the_frames_it_still_has(tmp_path: Path, capsys: py
     decoded = metrics["sources"]["a"]["decoded"]
     assert 2 <= len(capture.names) == decoded < 40
     assert f"{decoded} of 40 frames could be decoded" in capsys.readouterr().err
+
+
+def test_a_film_of_b_frames_alone_is_not_held_in_memory(monkeypatch) -> None:
+    decoded = 0
+
+    class Packet:
+        def decode(self):
+            nonlocal decoded
+            decoded += 1
+            kind = PictureType.B if decoded % 250 != 1 else PictureType.I
+            return [SimpleNamespace(time=decoded, is_corrupt=False, key_frame=decoded % 250 == 1, pict_type=kind)]
+
+    monkeypatch.setattr(video, "open_film", lambda _: contextlib.nullcontext((None, SimpleNamespace())))
+    monkeypatch.setattr(video, "_packets", lambda *_: iter([Packet() for _ in range(300)]))
+    most, times = 0, []
+    for time, _ in video._intact_frames(Path("film.mp4"), FilmStatistics()):
+        times.append(time)
+        most = max(most, decoded - len(times))
+    assert times == list(range(1, 301)) and most <= 16
 
 
 def test_no_frame_predicted_from_a_damaged_one_is_used(tmp_path: Path) -> None:

@@ -130,6 +130,17 @@ def test_pieces_do_not_end_at_borders_of_sections(stood, monkeypatch):
         np.testing.assert_array_equal(a.faces, b.faces)
 
 
+@pytest.mark.parametrize("half_width", [1.0, 14.0])
+def test_a_wide_corridor_leaves_what_stands_beside_it(stood, half_width):
+    """The columns farther than the corridor's reach are kept, however wide it is."""
+    views, ground, _, path, box = stood
+    corridor = Corridor((path + np.array([0.0, -40.0]),), half_width)
+    solid = mesh._fuse_sections(views, ground, corridor, path, box, SETTINGS)[1]
+    alone = mesh._fuse_sections(views, ground, None, path, box, SETTINGS)[1]
+    np.testing.assert_array_equal(solid.index, alone.index)
+    np.testing.assert_array_equal(solid.field, alone.field)
+
+
 def test_components_touch_at_corners_and_are_numbered_by_their_first_voxels():
     solid = np.random.default_rng(0).random((9, 11, 7)) < 0.06
     mine = solids._components(solids._keys(np.argwhere(solid)))

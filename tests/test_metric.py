@@ -163,6 +163,7 @@ def test_sources_carried_at_different_heights_agree(tmp_path: Path) -> None:
     metrics = world.run(tmp_path / "out")
     _check_level(world, tmp_path / "out", tilt_deg=0.5, scale=0.01, floor=0.02)
     assert metrics["scale_per_source_relative"] == pytest.approx([1.0, 1.0], abs=0.02)
+    assert metrics["camera_height_m_of"] == pytest.approx({"film0": 0.6, "film1": 1.5}, abs=0.03)
 
 
 def test_a_height_of_a_film_that_was_not_placed_is_refused(tmp_path: Path) -> None:
@@ -199,6 +200,17 @@ def test_a_pitched_camera_does_not_tilt_the_world() -> None:
     assert road is None
     assert np.degrees(np.arccos(up.direction[2])) < 0.1  # the path gives the pitch, the level right axes the roll
     assert up.uncertainty < np.radians(2.0)
+
+
+def test_films_at_two_heights_do_not_tilt_the_world() -> None:
+    """A low camera films only the end of the road: without its film's name, the path seems to slope."""
+    high, low = _path(turn=False), _path(turn=False, height=0.5)[30:]
+    both = np.concatenate([high, low])
+    tilts = []
+    for sources in ((), ("high",) * len(high) + ("low",) * len(low)):
+        up, _ = up_from_ground(both, np.zeros((0, 3)), sources)
+        tilts.append(np.degrees(np.arccos(up.direction[2])))
+    assert tilts[0] > 0.5 and tilts[1] < 0.05
 
 
 def test_up_is_signed_by_the_cameras() -> None:

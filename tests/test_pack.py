@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import multiprocessing
+import re
 import resource
 import signal
 import stat
@@ -231,6 +232,16 @@ def test_what_came_with_the_pack_drives_it(packed, tmp_path):
     assert chosen_policy(opened, "other") == "other" and chosen_task(opened, "bend", policy, False) == "bend"
 
 
+@pytest.mark.parametrize("name", ["os:getcwd", "../outside", "/etc/hosts", "runs/ahead/policy.json"])
+def test_an_unpacked_scene_drives_by_no_other_policy_than_its_own(packed, tmp_path, name):
+    unpack.unpack(packed, tmp_path / "there")
+    assert chosen_policy(twin.load_scene(tmp_path / "there"), None) == "ahead"
+    manifest = tmp_path / "there" / "pack.json"
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"policies": [name]}))
+    assert unpack.packed_policies(tmp_path / "there") == []
+    assert chosen_policy(twin.load_scene(tmp_path / "there"), None) == "ahead"  # its only run
+
+
 def test_drive_films_a_pack_by_its_name(packed, tmp_path, monkeypatch, capsys):
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes" / "tiny.twin").write_bytes(packed.read_bytes())
@@ -432,6 +443,10 @@ def masks_in(folder: str):
     return lambda content: json.dumps(json.loads(content) | {"masks": folder}).encode()
 
 
+def source_at(path: bytes):
+    return lambda content: re.sub(rb'"path" = "[^"]*"', b'"path" = "' + path + b'"', content, count=1)
+
+
 def wrong_digest(manifest, _):
     manifest["files"]["scene.toml"]["sha256"] = "0" * 64
 
@@ -468,6 +483,10 @@ HOSTILE = {
     "masks": (edit(CAMERAS, masks_in("/etc")), "etc' names a file"),
     "masks above": (edit(CAMERAS, masks_in("1_capture/../../../x")), "x' names a file"),
     "config": (edit("scene.toml", lambda b: b + b"surprise = 1\n"), "surprise"),
+    "source": (edit("scene.toml", source_at(b"/etc")), "'/etc' names a file"),
+    "source above": (edit("scene.toml", source_at(b"../x")), "'../x' names a file"),
+    "function": (declare("policies", ["pickle:loads"]), "policy 'pickle:loads' is not in the pack"),
+    "policy above": (declare("policies", ["../ahead"]), "policy '../ahead' is not in the pack"),
     "untrusted": (add("policies/a.zip"), "if you trust its sender, twin unpack --trust"),
 }  # fmt: skip
 

@@ -126,6 +126,36 @@ def test_a_listed_mask_that_is_missing_is_reported(tmp_path: Path, capsys: pytes
     assert "posed: 1 masks are listed but do not exist; these images are used whole" in capsys.readouterr().err
 
 
+def test_masks_of_images_in_subfolders_are_their_own(tmp_path: Path) -> None:
+    frames = []
+    for i, name in enumerate(("left/0", "right/0", "left/1")):
+        write_image(tmp_path / f"posed/{name}.png", views([9 * i])[0])
+        frames.append({"file_path": f"{name}.png", "transform_matrix": np.eye(4).tolist()})
+        if name != "right/0":
+            mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+            mask[: i * HEIGHT // 4] = 0
+            write_image(tmp_path / f"masks/{name}.png", mask)
+    write_image(tmp_path / "masks/0.png", np.zeros((HEIGHT, WIDTH), np.uint8))  # of which of the two?
+    (tmp_path / "posed/transforms.json").write_text(json.dumps({"frames": frames, "fl_x": 150.0}))
+    _, _, out = captured(tmp_path, [SourceConfig(path="posed", mask="masks")])
+    found = {path.name: read_image(path)[0, 0].max() for path in (out / "masks/posed").iterdir()}
+    assert found == {"000000.png.png": 255, "000002.png.png": 0}
+
+
+def test_a_focal_length_that_differs_is_not_held_for_all_images(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    _posed(tmp_path, [{"fl_x": 150.0}, {"fl_x": 300.0}, {"fl_x": 150.0}], w=WIDTH, h=HEIGHT)
+    film(tmp_path / "film.mp4", views([5 * i for i in range(6)]))
+    capture, _, _ = captured(tmp_path, [SourceConfig(path="posed"), SourceConfig(path="film.mp4")], frames=6)
+    assert not capture.sources[0].calibrated
+    assert "posed: its focal lengths differ, so one is estimated" in capsys.readouterr().err
+
+
+def test_photos_that_are_left_out_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    _posed(tmp_path, [{}] * 5, fl_x=150.0)
+    captured(tmp_path, [SourceConfig(path="posed")], max_frames=3)
+    assert "posed: 3 of 5 images are kept, as capture.max_frames = 3" in capsys.readouterr().err
+
+
 def test_poses_are_used_only_if_every_source_has_them(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     _posed(tmp_path, [{}] * 3, fl_x=150.0)
     film(tmp_path / "film.mp4", views([5 * i for i in range(6)]))

@@ -1,6 +1,8 @@
 """Sun of an added lighting: shadow map, gain, fit to a photo, position from time and place, and pictures in it."""
 
+import base64
 import json
+import struct
 import tracemalloc
 from dataclasses import replace
 
@@ -148,9 +150,18 @@ def test_shadow_map_survives_its_file():
     assert (OrthographicShadowMap.from_json(nothing.to_json()).visibility(points) == 1.0).all()
 
 
+# The header of a PNG of 100,000 x 100,000 pixels, and no pixel.
+HUGE = base64.b64encode(
+    b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBBI", 13, b"IHDR", 100_000, 100_000, 16, 0, 0, 0, 0, 0xFEC2B29A)
+).decode()
+
+
 @pytest.mark.parametrize(
     "change",
-    [{"toward": [0.0, 0.0, 2.0]}, {"toward": [1.0, 0.0, 0.0]}, {"texel_m": 0.0}, {"png": "AAAA"}, {"png": "?"}],
+    [
+        *({"toward": [0.0, 0.0, 2.0]}, {"toward": [1.0, 0.0, 0.0]}, {"texel_m": 0.0}),
+        *({"png": "AAAA"}, {"png": ""}, {"png": "?"}, {"png": HUGE}),
+    ],
 )
 def test_damaged_shadow_maps_are_refused(change):
     table = ShadowCasters(*_mesh()).seen_from(direction(30.0, 40.0)).to_json()

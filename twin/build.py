@@ -111,6 +111,8 @@ def build(
             if stamp is None or not current:
                 if finished:
                     break
+                if stage.name == "field":
+                    _check_routes(scene, config)
                 done = {name: it.seconds for name, it in stamps.items() if not skipped[name]}
                 changes = ["--force"] if forced else stamp and stamp.depends and _changes(depends, stamp.depends)
                 _announce(stage, done, until, f", again because of {join_names(changes, 4)}" if changes else "")
@@ -120,6 +122,17 @@ def build(
         report = _report(config, stamps, skipped)
         publish(scene, report)
     return report
+
+
+def _check_routes(scene: SceneDir, config: SceneConfig) -> None:
+    """Raises InputError if `[route]` or a `[[branch]]` does not fit what was filmed: before the field is trained."""
+    if config.mjcf.route and (config.branch or config.route != RouteConfig()):
+        from twin.geometry.cameras import Cameras
+        from twin.geometry.route import filmed_branches, filmed_route
+
+        cameras = Cameras.load(scene.stage("metric"))
+        filmed_route(cameras, config.route)
+        filmed_branches(cameras, config.branch)
 
 
 def _changes(depends: dict[str, Any], before: dict[str, Any]) -> list[str]:

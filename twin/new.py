@@ -56,7 +56,7 @@ name = {name}
 _SOURCE = """
 [[source]]
 path = {path}
-{topic}lighting = {lighting}  # sources filmed under the same light may share a name
+{topic}{height}lighting = {lighting}  # sources filmed under the same light may share a name
 # Mask image or folder of masks: pixels of value 0 are ignored, such as the robot's hood or a person ahead.
 {mask}
 # Calibrate the camera if possible: forward motion biases self-calibration. Lengths in pixels of the upright image.
@@ -146,6 +146,9 @@ def _write_scene(
     notes: list[str] = []
     lightings: list[str] = []
     paths: list[Path] = []
+    seated = next((bag for bag in bags.values() if bag.seat), None)
+    seat = _write_seat(root / ROBOT_TOML, seated) if seated else None
+    own_heights = {} if camera_height is not None or seat is None else _own_heights(films, bags)
     for film in films:
         path = _import_film(film, inputs)
         if path in paths:
@@ -173,10 +176,9 @@ def _write_scene(
             )
         elif film in bags:
             notes += [f"{film.name}: {note}" for note in timing_notes(bags[film].film().timing)]
-        text += _SOURCE.format(path=path_text, topic=chosen, lighting=toml_string(lighting), mask=mask)
-    seated = next((bag for bag in bags.values() if bag.seat), None)
-    seat = _write_seat(root / ROBOT_TOML, seated) if seated else None
-    scales = _scale_lines(list(bags.values()), camera_height, seat)
+        height = f"camera_height = {own_heights[film]:.4g}  # [m] by /tf_static\n" if film in own_heights else ""
+        text += _SOURCE.format(path=path_text, topic=chosen, height=height, lighting=toml_string(lighting), mask=mask)
+    scales = _scale_lines(list(bags.values()), camera_height, seat, bool(own_heights))
     write_text(scene.config_file, text + _REST.format(**scales))
     for note in (*map(_taken, bags.values()), *notes):
         runtime.log_line(note)
@@ -216,13 +218,28 @@ def _mask_lines(check: FilmCheck, inputs: Path, path: Path) -> tuple[list[str], 
     return [f"{check.static_note}; masked by {name}: look at it"], _MASK.format(path=toml_string(name))
 
 
-def _scale_lines(bags: list[BagContents], camera_height: float | None, seat: CameraSeat | None) -> dict[str, str]:
-    """Lines for [metric]; a line is commented out if its value is not known."""
+def _own_heights(films: list[Path], bags: dict[Path, BagContents]) -> dict[Path, float]:
+    """Camera height [m] of each bag that has one, if it does not hold for all films; else empty."""
+    heights = {film: bag.seat.height for film, bag in bags.items() if bag.seat}
+    alike = max(heights.values()) - min(heights.values()) < _SEAT_TOLERANCE
+    return {} if alike and len(heights) == len(films) else heights
+
+
+def _scale_lines(
+    bags: list[BagContents], camera_height: float | None, seat: CameraSeat | None, own_heights: bool
+) -> dict[str, str]:
+    """Lines for [metric]; a line is commented out if its value is not known.
+
+    `own_heights`: camera heights are given under the sources.
+    """
     if camera_height is not None:
         height = f"camera_height = {camera_height:<14g} # lens above the ground [m], carried at a constant height"
     elif seat is not None:
         height = (
-            f"camera_height = {seat.height:<14.4g} # lens above the ground [m], by /tf_static\n"
+            "# camera_height = 1.2          # lens above the ground [m] in all sources that do not give their own\n"
+            if own_heights
+            else f"camera_height = {seat.height:<14.4g} # lens above the ground [m], by /tf_static\n"
+        ) + (
             f"camera_height_tolerance = {_SEAT_TOLERANCE:<4g} # its standard deviation [m]; smaller if measured by hand"
         )
     else:
@@ -408,7 +425,10 @@ def command(options: argparse.Namespace) -> None:
     """Runs `twin new` with the options parsed by `twin.commands`."""
     config = new_scene(options.scene, options.films, options.camera_height, options.topic or "")
     print(f"wrote {config}")
-    sources = [name for name, value in read_toml(config)["metric"].items() if value and "tolerance" not in name]
+    table = read_toml(config)
+    sources = [name for name, value in table["metric"].items() if value and "tolerance" not in name]
+    if any("camera_height" in source for source in table["source"]):
+        sources.insert(0, "camera_height")
     if sources:
         print(f"metric scale: {join_names(sources)}")
     else:

@@ -201,16 +201,23 @@ class Stamp:
 
         Files larger than `max_hashed` [bytes] are compared by size only.
         """
-        path, cure = folder / "stamp.json", _cure(folder)
-        with wrap_read_errors(path, cure):
-            read = read_json(path)
-            stamp = Stamp(**read)
-            if stamp.itself and stamp.itself != stamp._digest():
-                raise ValueError("it is not as it was written")
+        cure = _cure(folder)
+        stamp = Stamp._read(folder)
+        with wrap_read_errors(folder / "stamp.json", cure):
             for name, size in stamp.files.items():
                 stamp._check(folder / name, name, int(size), max_hashed, cure)
             if not stamp.sha256 and digest_folder(folder)[0] != stamp.result:
                 raise InputError(f"{folder} is damaged (its files are not as they were written); {cure}")
+        return stamp
+
+    @staticmethod
+    def _read(folder: Path) -> "Stamp":
+        """The stamp itself; the files are not looked at. Raises InputError if it is missing or damaged."""
+        path = folder / "stamp.json"
+        with wrap_read_errors(path, _cure(folder)):
+            stamp = Stamp(**read_json(path))
+            if stamp.itself and stamp.itself != stamp._digest():
+                raise ValueError("it is not as it was written")
         return stamp
 
     def _check(self, file: Path, name: str, size: int, max_hashed: int | None, cure: str) -> None:
@@ -276,10 +283,26 @@ def require_stage(scene: SceneDir, stage: str) -> Path:
     Files larger than 256 MiB are compared by size only. A build hashes every file, and so finds all changes.
 
     Raises:
-        InputError: the stage has not been built, or one of its files is damaged.
+        InputError: the stage has not been built, one of its files is damaged, or a stage on which it depends was built
+            again since, as after an interrupted build.
     """
-    _verified_stamp(scene, stage)
+    _check_upstream(scene, stage, _verified_stamp(scene, stage))
     return scene.stage(stage)
+
+
+def _check_upstream(scene: SceneDir, stage: str, stamp: Stamp) -> None:
+    """Raises InputError if the stages on which a stage depends are not those from which it was built."""
+    for name, result in stamp.depends.get("upstream", {}).items():
+        folder = scene.stage(name)
+        if not (folder / "stamp.json").exists():
+            continue
+        upstream = Stamp._read(folder)
+        if upstream.result != result:
+            raise InputError(
+                f"{scene.root}: {STAGE_FOLDERS[stage]} was built from an earlier {STAGE_FOLDERS[name]}, as after an "
+                f"interrupted build; run twin build {shlex.quote(str(scene.root))}"
+            )
+        _check_upstream(scene, name, upstream)
 
 
 def stage_result(scene: SceneDir, stage: str) -> str:

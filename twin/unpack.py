@@ -294,7 +294,18 @@ def _checked_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         raise InputError(f"{path} unpacks to {total:,} bytes; expected at most {bound:,} for a file of its size")
     head["name"] = require_text(head["name"])
     head["policies"] = list(map(require_text, head["policies"]))
+    for name in head["policies"]:
+        if _policy_file(name) not in head["files"]:
+            raise InputError(f"{path}: policy {short_repr(name)} is not in the pack; {_CURE}")
     return head
+
+
+def _policy_file(name: str) -> str:
+    """The file in a pack for the name of a policy: `run`, `run/checkpoint` or `policies/file`."""
+    if name.startswith("policies/"):
+        return name
+    run, _, checkpoint = name.partition("/")
+    return f"runs/{run}/checkpoints/{checkpoint}/policy.json" if checkpoint else f"runs/{run}/policy.json"
 
 
 def _extract(archive: zipfile.ZipFile, name: str, facts: dict[str, Any], target: Path) -> None:
@@ -317,12 +328,13 @@ def _check_contents(root: Path, path: Path) -> None:
     """Raises InputError if a file of the scene refers to a file outside it, or if `scene.xml` has entities."""
     scene = SceneDir(root)
     try:
-        load_config(scene.config_file)
+        config = load_config(scene.config_file)
         cameras = Cameras.load(scene.stage("metric"))
         folders = [os.path.relpath(one, scene.build.resolve()) for one in (cameras.images, cameras.masks) if one]
     except ValueError as error:  # also InputError
         raise InputError(f"{path}: {str(error).replace(f'{root}{os.sep}', '')}") from None
-    read = (*folders, *cameras.names)
+    inputs = (one for source in config.source for one in (source.path, source.images, source.mask) if one)
+    read = (*folders, *cameras.names, *inputs)
     bad = next((one for one in read if one.startswith("/") or ".." in one.split("/")), None)
     xml = scene.stage("mjcf") / SCENE_XML
     if bad is None and xml.exists():
@@ -415,8 +427,13 @@ def _cache() -> Path:
 
 
 def packed_policies(root: Path) -> list[str]:
-    """Names of the policies that came in a scene's pack; empty for a scene that was built here."""
-    return [str(name) for name in read_json(root / PACK_JSON)["policies"]] if (root / PACK_JSON).exists() else []
+    """Names of the policies that came in a scene's pack; empty for a scene that was built here.
+
+    Only names of files in the scene: another name, such as `module:function`, would run code.
+    """
+    names = map(str, read_json(root / PACK_JSON)["policies"]) if (root / PACK_JSON).exists() else ()
+    files = {name: _policy_file(name) for name in names}
+    return [name for name, file in files.items() if PLACES.fullmatch(file) and (root / file).is_file()]
 
 
 def command(given: argparse.Namespace) -> None:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from twin import runtime
+from twin.errors import InputError
 from twin.files import digest_json, load_arrays, save_arrays
 from twin.runtime import child_environment, die_with_parent
 from twin.types import Array
@@ -204,11 +205,18 @@ def _run_coacd(
     cache.mkdir(parents=True, exist_ok=True)
     setting = {**_SEARCH, "bound": bound, "seed": seed, "faces": _MAX_COACD_FACES, "coacd": metadata.version("coacd")}
     jobs = []
+    known: dict[Path, list[ConvexPart] | None] = {}
     for piece in pieces:
         shape = hashlib.sha256(piece.vertices.tobytes() + piece.faces.tobytes()).hexdigest()
         key = digest_json({**setting, "shape": shape})[:32]
-        jobs.append((cache / f"{key}.in.npz", cache / f"{key}.npz", piece))
-    pending = [job for job in jobs if not job[1].exists()]
+        source, target = cache / f"{key}.in.npz", cache / f"{key}.npz"
+        jobs.append((source, target, piece))
+        if target.exists() and target not in known:
+            try:
+                known[target] = _read_parts(target)
+            except InputError:  # a damaged file, which is computed again
+                target.unlink()
+    pending = [job for job in jobs if job[1] not in known]
     for source, _, piece in pending:
         np.savez(source, vertices=piece.vertices, faces=piece.faces, bound=bound, seed=seed)
     waiting = deque((source, target) for source, target, _ in sorted(pending, key=lambda job: -len(job[2].samples)))
@@ -222,7 +230,9 @@ def _run_coacd(
     results: list[list[ConvexPart] | None] = []
     for source, target, _ in jobs:
         source.unlink(missing_ok=True)
-        results.append(_read_parts(target) if target.exists() else None)
+        if target not in known and target.exists():
+            known[target] = _read_parts(target)
+        results.append(known.get(target))
     return results, len(jobs) - len(pending)
 
 

@@ -107,7 +107,7 @@ def solid_voxels(
     field = np.maximum(field, (distance - config.margin)[..., None].astype(np.float32))
     if corridor is not None:
         near = distance < corridor.reach + 2.0
-        exact = np.full(distance.shape, 10.0)
+        exact = np.full(distance.shape, np.inf)
         exact[near] = corridor.distance(xy[near], corridor.reach + 2.0 + 2.0 * voxel)
         inside = (corridor.reach + _CORRIDOR_SLACK - exact)[..., None].astype(np.float32)
         field = np.where(above < HEADROOM + voxel, np.maximum(field, inside), field)

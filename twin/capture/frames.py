@@ -7,6 +7,7 @@ name is `<source>/<index>`, where the index is its position in the whole film, o
 order. *Held-out* frames are never trained on.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from twin.files import is_file, is_folder, require_folder
 from twin.scene import SceneDir
 from twin.types import Image
 
+_SAME_FOCAL = 0.01  # focal lengths that differ by more than this share are not of one camera
 # Path components that do not identify a source.
 _GENERIC_NAMES = ("images", "image", "sparse", "colmap", "input", "0", "dense", "data")
 
@@ -234,6 +236,7 @@ def _merged(kept: list[KeptFrames], config: CaptureConfig) -> Capture:
     if 0 < len(without) < len(kept):
         bare = ", ".join(without)
         runtime.log_line(f"  the given poses are not used: {bare} has none, so all cameras are reconstructed together")
+        kept = [_with_one_camera(one) for one in kept]
     counts = [len(one.index) for one in kept]
     odometry = [row for one in kept for row in one.odometry or [NO_GPS] * len(one.index)]
     return Capture(
@@ -247,6 +250,17 @@ def _merged(kept: list[KeptFrames], config: CaptureConfig) -> Capture:
         intrinsics=None if without else np.stack([k for one in kept for k in one.intrinsics]),
         odometry=np.array(odometry, np.float64).reshape(-1, 3) if np.isfinite(odometry).any() else None,
     )
+
+
+def _with_one_camera(kept: KeptFrames) -> KeptFrames:
+    """Frames whose poses are not used: their camera is calibrated only if all of them have the same focal length."""
+    if not kept.poses:
+        return kept
+    focal = np.array(kept.intrinsics)[:, 0]
+    if np.ptp(focal) <= _SAME_FOCAL * np.median(focal):
+        return kept
+    runtime.log_line(f"  {kept.info.name}: its focal lengths differ, so one is estimated for all of its images")
+    return replace(kept, info=replace(kept.info, calibrated=False))
 
 
 def _source_name(path: str) -> str:

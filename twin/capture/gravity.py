@@ -11,6 +11,7 @@ The *drop* of a point is its depth below the horizontally nearest camera; its *o
 that camera.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,14 +72,17 @@ def camera_up(camera_to_world: Array) -> Array:
     return mean / max(float(np.linalg.norm(mean)), 1e-12)
 
 
-def up_from_path(camera_to_world: Array) -> tuple[Array, Array]:
+def up_from_path(camera_to_world: Array, sources: Sequence[str] = ()) -> tuple[Array, Array]:
     """Returns up (3,), estimated from the cameras' right axes and path, and the matrix E (3, 3) of this evidence.
 
-    n·E·n is the squared error [standard deviations] if a unit vector n is taken as up.
+    `sources` names the source of each frame, empty: all are of one. Sources may have different camera heights, so only
+    slopes within a source count. n·E·n is the squared error [standard deviations] if a unit vector n is taken as up.
     """
     right = camera_to_world[:, :3, 0]
     evidence = right.T @ right / len(right) / _SIGMA_RIGHT**2
-    centers = camera_to_world[:, :3, 3] - camera_to_world[:, :3, 3].mean(0)
+    centers = camera_to_world[:, :3, 3].copy()
+    for mine in _each(sources, len(centers)):
+        centers[mine] -= centers[mine].mean(0)
     variances, axes = np.linalg.eigh(centers.T @ centers / len(centers))
     undulation = max(variances[0], _UNDULATION**2 * variances[2])
     for variance, axis in zip(variances[1:], axes.T[1:], strict=True):
@@ -86,6 +90,12 @@ def up_from_path(camera_to_world: Array) -> tuple[Array, Array]:
             sigma2 = undulation / (_PATH_SAMPLES * variance) + _SIGMA_PATH**2
             evidence += np.outer(axis, axis) / sigma2
     return _solve_up(evidence, camera_up(camera_to_world))[0], evidence
+
+
+def _each(sources: Sequence[str], count: int) -> list[NDArray[np.bool_]]:
+    """The mask (count,) of each source's frames."""
+    names = np.array(sources or [""] * count)
+    return [names == source for source in dict.fromkeys(names.tolist())]
 
 
 def _solve_up(evidence: Array, prior_up: Array) -> tuple[Array, float]:
@@ -149,30 +159,35 @@ def _layer(drop: Array, offset: Array, reach: float) -> Road | None:
     return Road(below[chosen], height, spread, reach)
 
 
-def up_from_ground(camera_to_world: Array, points: Array) -> tuple[Gravity, Road | None]:
-    """Returns the up direction and the road below the path, computed from poses (n, 4, 4) and sparse points (m, 3)."""
+def up_from_ground(camera_to_world: Array, points: Array, sources: Sequence[str] = ()) -> tuple[Gravity, Road | None]:
+    """Returns the up direction and the road below the path, computed from poses (n, 4, 4) and sparse points (m, 3).
+
+    `sources` names the source of each frame, see `up_from_path`.
+    """
     prior_up = camera_up(camera_to_world)
     centers = camera_to_world[:, :3, 3]
-    up, evidence = up_from_path(camera_to_world)
+    up, evidence = up_from_path(camera_to_world, sources)
     road = find_road(points, centers, up)
-    sources = ["path and cameras"]
+    basis = ["path and cameras"]
     if road is not None and road.reliable:
-        normal = _road_normal(points[road.points], centers, up)
+        normal = _road_normal(points[road.points], centers, up, sources)
         if normal is not None and np.arccos(np.clip(normal @ prior_up, -1, 1)) < _MAX_TILT:
             evidence = evidence + (np.eye(3) - np.outer(normal, normal)) / _SIGMA_ROAD**2
-            sources.append("road")
+            basis.append("road")
     up, sigma = _solve_up(evidence, prior_up)
-    return Gravity(up, sigma, " + ".join(sources)), find_road(points, centers, up)
+    return Gravity(up, sigma, " + ".join(basis)), find_road(points, centers, up)
 
 
-def _road_normal(road: Array, centers: Array, up: Array) -> Array | None:
+def _road_normal(road: Array, centers: Array, up: Array, sources: Sequence[str]) -> Array | None:
     """Mean normal of the road; None if its points lie on a line.
 
     Each point is taken relative to the camera above it, so that a climbing road counts as level.
     """
     nearest, _, _ = below_path(road, centers, up)
     local = road - centers[nearest]
-    local = local - np.median(local, axis=0)
+    for mine in _each(sources, len(centers)):
+        if (of := mine[nearest]).any():
+            local[of] -= np.median(local[of], axis=0)
     weight = np.ones(len(local))
     for _ in range(10):  # iteratively reweighted total least squares, Huber-like
         variances, axes = np.linalg.eigh((local * weight[:, None]).T @ local / weight.sum())

@@ -33,6 +33,7 @@ MIN_INLIERS = 25
 _MAX_SIZE = 1280  # [px] longer side of the image from which features are extracted
 _GUESSED_FOCAL = 1.2  # [longer sides]
 _FEATURES = 4000
+_MAX_FRAMES = 100  # frames whose features are kept; those of one take up to 2 MB
 _FIRST_FRAMES = 48  # scene frames matched first, evenly spaced over all films
 _BEST_FRAMES = 4  # number of first frames, those with the most matches, whose neighbors are matched next
 _NEIGHBOR_FRAMES = 8  # number of frames, of any lighting, that are matched near each best frame
@@ -119,7 +120,7 @@ def _write_gray(path: Path, image: Image, size: tuple[int, int]) -> None:
 
 
 class LocalizationMap:
-    """A built scene's frames and sparse points, with the features of the frames that were used so far."""
+    """A built scene's frames and sparse points, with the features of the frames that were used last."""
 
     def __init__(self, metric: Path) -> None:
         self.cameras, self.points = Cameras.load(metric), SparsePoints.load(metric)
@@ -138,9 +139,11 @@ class LocalizationMap:
 
     def matches(self, descriptors: NDArray[np.float32], i: int) -> NDArray[np.int64]:
         """Matches frame i with the photo that has these descriptors (k, 128), see `match_frame`."""
-        if i not in self._features:
-            self._features[i] = self.features(self.cameras.image_path(i))
-        return match_frame(*self._features[i], descriptors, self.cameras, self.points, i)
+        found = self._features.pop(i, None) or self.features(self.cameras.image_path(i))
+        self._features[i] = found  # the last used ones are at the end
+        if len(self._features) > _MAX_FRAMES:
+            del self._features[next(iter(self._features))]
+        return match_frame(*found, descriptors, self.cameras, self.points, i)
 
     def nearest_frames(self, positions: Array, count: int) -> set[int]:
         """The `count` frames nearest to each of the positions (n, 3)."""

@@ -33,6 +33,7 @@ from twin.types import Array
 _INITIAL_FRACTION = 0.08
 """Fraction of the first source's path, from its start, that gives the initial driving direction."""
 _MAX_OFFSET = 10_000.0  # [m] largest coordinate of a camera; later stages compute in single precision
+_SAME_HEIGHT = 0.1  # camera heights of sources that differ by more than this share are not the same
 _FLOOR_QUANTILE = 0.02  # if no road is found, the floor is at this quantile of the points' heights
 
 
@@ -90,7 +91,7 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
 
 def _find_up(cameras: Cameras, points: Array, method: str, capture: Capture) -> tuple[Gravity, Road | None]:
     if method == "ground":
-        return up_from_ground(cameras.camera_to_world, points)
+        return up_from_ground(cameras.camera_to_world, points, cameras.sources)
     if method == "cameras":
         up = camera_up(cameras.camera_to_world)
         tilt = np.arccos(np.clip(-cameras.camera_to_world[:, :3, 1] @ up, -1.0, 1.0))
@@ -154,10 +155,12 @@ def _metrics(
     similarity: Similarity,
 ) -> dict[str, Any]:
     heights = cameras.positions[:, 2]
+    apart: dict[str, float] = {}
     if road is not None and road.reliable:
         z_up = np.array([0.0, 0.0, 1.0])
         local = heights_above_road(points.xyz[road.points], cameras.positions, z_up, road.drop * scale.value)
         if local is not None:
+            apart = _different_heights(local, cameras.sources)
             heights = local[np.isfinite(local)]
     spread = 1.4826 * float(np.median(np.abs(heights - np.median(heights))))
     sources = np.array(cameras.sources)
@@ -173,6 +176,7 @@ def _metrics(
         "road_reliable": bool(road is not None and road.reliable),
         "camera_height_median_m": float(np.median(heights)),
         "camera_height_spread_m": spread,
+        **({"camera_height_m_of": apart} if apart else {}),
         "path_length_m": max(lengths),
         "similarity": {
             "scale": similarity.scale,
@@ -181,3 +185,12 @@ def _metrics(
         },
         **scale.notes,
     }
+
+
+def _different_heights(local: Array, sources: tuple[str, ...]) -> dict[str, float]:
+    """Median camera height [m] of each source, given those of the frames (n,), NaN if unknown; empty if they agree."""
+    names = np.array(sources)
+    of = {name: local[(names == name) & np.isfinite(local)] for name in dict.fromkeys(sources)}
+    found = {name: float(np.median(heights)) for name, heights in of.items() if len(heights)}
+    differ = max(found.values()) - min(found.values()) > _SAME_HEIGHT * np.median(list(found.values()))
+    return found if differ else {}

@@ -7,6 +7,7 @@ rotated by its EXIF orientation. A focal length *prior* comes from the header; s
 import hashlib
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -167,6 +168,12 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
     available = _in_kept_segments(task, images)
     limit = min(task.config.frames or task.config.max_frames, task.config.max_frames)
     chosen = [int(available[i]) for i in evenly_spaced(len(available), limit)]
+    if len(available) > limit and not task.config.frames:
+        runtime.log_line(
+            f"  {task.name}: {limit} of {len(available)} images are kept, as capture.max_frames = {limit}; raise it if "
+            "they are more than 2 m apart, as on a long road"
+        )
+    names = Counter(path.stem for path in images.paths)
     index: list[int] = []
     gps: list[tuple[float, float, float]] = []
     clock: list[float | None] = []
@@ -198,7 +205,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
             blank += 1
             continue
         own = images.masks[i] if images.masks and not task.masks else None
-        mask = read_mask(own, *size) if own else task.mask((path.stem, path.name), *size)
+        mask = read_mask(own, *size) if own else task.mask(_mask_names(path, names[path.stem] > 1), *size)
         unmasked += mask is None
         if lenses and images.camera_to_world is not None:
             lens = lenses[i].scaled(*size)
@@ -241,6 +248,12 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
         "height": size[1],
     }
     return KeptFrames(info, index, photo_times(clock, index), gps, metrics, poses, intrinsics)
+
+
+def _mask_names(path: Path, several: bool) -> tuple[str, ...]:
+    """Names of an image's mask in a folder of masks, the best first; `several` images have the name, in subfolders."""
+    below = f"{path.parent.name}/"
+    return (below + path.stem, below + path.name, *(() if several else (path.stem, path.name)))
 
 
 def _load_ahead(

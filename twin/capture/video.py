@@ -9,6 +9,7 @@ divide these segments as if the rest were cut out; indices and times remain thos
 """
 
 import contextlib
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -48,6 +49,7 @@ _MIN_DECODED_FRACTION = 0.98  # the user gets a note if a smaller fraction of th
 
 # ---- decoding
 
+_MAX_REORDERED = 16  # frames by which H.264 and H.265 may reorder
 _UNKNOWN = 2  # FFmpeg's AVCOL_SPC_UNSPECIFIED
 _SD = 1280, 576  # [px] frames of unknown color matrix are BT.709 from this width on, or if they are higher than this
 _DEINTERLACE = "mode=send_frame:parity=auto:deint=interlaced"
@@ -118,7 +120,8 @@ def _intact_frames(path: Path, count: FilmStatistics) -> Iterator[tuple[float | 
     """
     with open_film(path) as (container, stream):
         stream.thread_type = "AUTO"
-        pending: list[av.VideoFrame] = []  # B frames that wait for the undamaged frame on which they depend
+        # B frames that wait for the undamaged frame on which they depend. Some encoders use B frames alone.
+        pending: deque[av.VideoFrame] = deque()
         broken = False
         for packet in _packets(container, stream):
             frames: list[av.VideoFrame | None] = []
@@ -134,9 +137,9 @@ def _intact_frames(path: Path, count: FilmStatistics) -> Iterator[tuple[float | 
                     continue
                 broken = False
                 pending.append(frame)
-                if frame.pict_type != PictureType.B:
-                    yield from ((intact.time, intact) for intact in pending)
-                    pending.clear()
+                while pending and (frame.pict_type != PictureType.B or len(pending) > _MAX_REORDERED):
+                    intact = pending.popleft()
+                    yield intact.time, intact
         yield from ((intact.time, intact) for intact in pending)
 
 

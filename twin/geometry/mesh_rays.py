@@ -12,6 +12,7 @@ the edges of shadows are soft.
 # (mypy does not know the types that Warp uses inside kernels)
 
 import base64
+import contextlib
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -197,7 +198,9 @@ class OrthographicShadowMap:
         if origin.shape != (2,) or not np.isfinite([*origin, texel, low, step]).all() or min(texel, step) <= 0.0:
             raise ValueError(f"shadow map: origin {origin.tolist()}, texel {texel} m, step {step} m; expected > 0")
         data = np.frombuffer(base64.b64decode(table["png"], validate=True), np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        image = None
+        with contextlib.suppress(cv2.error):  # no data, or a size that OpenCV refuses
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
         if image is None or image.dtype != np.uint16 or image.ndim != 2 or max(image.shape) > _MAX_SIDE + 1:
             raise ValueError(f"shadow map: expected a 16-bit gray picture, at most {_MAX_SIDE + 1} px a side")
         height = np.where(image > 0, low + step * (image.astype(np.float64) - 1.0), -np.inf).astype(np.float32)

@@ -326,8 +326,13 @@ def random_free_points(
 
 
 def constant_height(metric: dict[str, Any]) -> float:
-    """Camera height above the ground [m] if stage `metric` found a reliable, constant one, else 0."""
-    height, spread = metric.get("camera_height_median_m"), metric.get("local_height_spread_m")
-    if not height or not (metric.get("road_reliable") or metric.get("scale_source") == "camera_height"):
+    """Camera height above the ground [m] if stage `metric` found one that is reliable and constant, else 0."""
+    height = metric.get("camera_height_median_m")
+    spread = metric.get("local_height_spread_m", metric.get("camera_height_spread_m"))
+    if (
+        not height
+        or metric.get("camera_height_m_of")
+        or not (metric.get("road_reliable") or metric.get("scale_source") == "camera_height")
+    ):
         return 0.0
     return 0.0 if spread is not None and spread > _HEIGHT_SPREAD * height else float(height)
