@@ -184,11 +184,11 @@ def main() -> int:
                 write_bag(root / "input" / file, film, truth, name, k)
                 continue
             shutil.copyfile(film, root / "input" / file)
-            camera = one["camera"]
-            lines.append(
-                f'camera = {{ model = "{camera["model"]}", params = {camera["params"]}, '
-                f"width = {camera['width']}, height = {camera['height']} }}"
-            )
+            if camera := one.get("camera"):  # a phone's film has no calibration
+                lines.append(
+                    f'camera = {{ model = "{camera["model"]}", params = {camera["params"]}, '
+                    f"width = {camera['width']}, height = {camera['height']} }}"
+                )
         write_text(root / "scene.toml", "\n".join(lines) + "\n")
     shown = options.work / "new"
     remove(shown)

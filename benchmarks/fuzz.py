@@ -207,7 +207,11 @@ def _command_line(k: int, seed: int, work: Path, seconds: float) -> Outcome:
     (work / "kept" / "notes.txt").write_text("kept\n")
     arguments = command_of(Case(Random(f"{seed}/command line/{k}"), work / "case", None))
     before = snapshot(work)
-    environment = {**os.environ, MARKER_VARIABLE: str(work / "marker"), "PYTHONPATH": str(_ROOT)}
+    environment = {
+        **os.environ,
+        MARKER_VARIABLE: str(work / "marker"),
+        "PYTHONPATH": f"{_ROOT}{os.pathsep}{_ROOT}/ros2/twin_policy",
+    }
     start = time.perf_counter()
     accepted, failure = False, ""
     try:

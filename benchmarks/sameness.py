@@ -22,6 +22,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 QUICK = ("nerf.steps=80", "nerf.rays=1024", "nerf.max_width=160", "nerf.bake_steps=20", "nerf.max_bricks=1200")
 QUICK += ("mesh.voxel=0.2", "review.fps=3", "review.width=160")
 """Settings for a complete build in one to two minutes."""
+_PILOT = "ros2/twin_policy"  # folder of the package `twin_policy`
 _STAGES = ("3_field", "4_mesh", "5_mjcf")
 _EPISODES = """
 import hashlib, itertools, json, sys
@@ -77,7 +78,12 @@ class Tree:
         done = subprocess.run(
             [sys.executable, *map(str, arguments)],
             cwd=self.root,
-            env={**os.environ, "PYTHONPATH": str(self.root), "CUDA_VISIBLE_DEVICES": ""},
+            # The environment's own `twin_policy` may be that of another tree.
+            env={
+                **os.environ,
+                "PYTHONPATH": f"{self.root}{os.pathsep}{self.root / _PILOT}",
+                "CUDA_VISIBLE_DEVICES": "",
+            },
             capture_output=True,
             text=True,
         )

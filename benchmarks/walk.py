@@ -23,10 +23,10 @@ _INHERITED = ("PYTHONPATH", "VIRTUAL_ENV")  # would make the copy use another ch
 
 
 def commands(text: str, index: bool) -> list[str]:
-    """Commands in the shell blocks of a page, without the skipped ones; a line with `&&` gives several."""
+    """Commands in the shell blocks of a page, without comments and skipped ones; a line with `&&` gives several."""
     blocks = re.findall(r"^```sh\n(.*?)^```$", text, re.S | re.M)
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines() if line.strip()]
-    lines = [line for line in lines if "my_road" not in line and "pytest" not in line]
+    lines = [line.partition("  #")[0] for line in lines if "my_road" not in line and "pytest" not in line]
     return [one for line in lines if index or "--index-url" not in line for one in line.split(" && ")]
 
 

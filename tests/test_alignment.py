@@ -338,6 +338,10 @@ def test_fields_of_the_scene_that_override_fitted_ones_are_named(tmp_path, monke
         assert "overrides fitted values: friction;" in capsys.readouterr().out, target
     assert commands.main("align", [str(scene), str(log), "--out", str(tmp_path / "out")]) == 0
     assert "overrides fitted values" not in capsys.readouterr().out  # that folder is not the scene's
+    found = tmp_path / "out" / "robot.toml"
+    found.write_text(found.read_text() + "\nrolling_resistance = 0.0321\n")  # as an earlier log gave it
+    assert commands.main("align", ["husky", str(log), "--out", str(tmp_path / "out")]) == 0
+    assert read_robot(found)["rolling_resistance"] == 0.0321
 
 
 @pytest.mark.parametrize("out", ["file/out", "taken"])

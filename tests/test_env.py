@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 from dm_env import StepType
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from tiny_twin import tiny_twin
 
@@ -23,7 +24,7 @@ from twin.env.domain_randomization import Ranges
 from twin.env.drivers import RouteDriver
 from twin.env.env_factory import EnvFactory
 from twin.env.episode_lighting import mixture_text
-from twin.env.gym_env import DriveEnv
+from twin.env.gym_env import DriveEnv, DriveVectorEnv
 from twin.env.mujoco_renderer import chase_poses
 from twin.env.obstacles import RADIUS
 from twin.env.options import parse_options
@@ -216,7 +217,7 @@ def test_vector_environments_reset_in_the_same_step(scene):
 
 
 def test_every_cause_ends_an_episode_with_its_reward_and_discount(scene, tmp_path):
-    ends = {}
+    ends, times = {}, {}
 
     def ended(name: str, action, options, where=scene, before=None):
         environment = twin.load(where, "bend", seed=0, pixels=False, start_offset=0.0, start_heading=0.0, **options)
@@ -227,6 +228,7 @@ def test_every_cause_ends_an_episode_with_its_reward_and_discount(scene, tmp_pat
             last, step = step, environment.step(np.array(action))
         assert environment.task.cause == name, environment.task.info(environment.physics)
         assert last.reward is None or last.reward == pytest.approx(0.1)
+        times[name] = environment.physics.time()
         ends[name] = step.reward, step.discount
 
     def tip(environment):
@@ -242,6 +244,7 @@ def test_every_cause_ends_an_episode_with_its_reward_and_discount(scene, tmp_pat
     ends["goal"] = step.reward, step.discount
     assert environment.task.cause == "goal" and environment.task.progress >= 9.5
     assert set(ends) == set(CAUSES)
+    assert times["stuck"] == pytest.approx(5.0, abs=1e-6)  # though the clock's sum of steps is short of it
     assert ends == {
         "collision": (-4.0, 0.0),
         "out_of_bounds": (-5.0, 0.0),
@@ -585,6 +588,22 @@ def test_motion_blur_leaves_the_sky_of_the_simulator_sharp(scene):
         pictures.append(step.observation["pixels"][-1].astype(float))
     blur = np.abs(pictures[1] - pictures[0]).mean((1, 2))
     assert blur[17:22].mean() > 0.2 and blur[:12].max() < 0.05  # horizon, sky
+
+
+def test_a_vector_environment_shows_what_it_has(scene):
+    with pytest.raises(InputError, match="vector environments show their images, which pixels=False leaves out"):
+        DriveVectorEnv(2, scene, "bend", "rgb_array", pixels=False)
+    environment = DriveVectorEnv(2, scene, "bend", "rgb_array", size=(32, 18))
+    with pytest.raises(ResetNeeded):
+        environment.render()
+    environment.close()
+
+
+def test_randomized_latencies_stay_within_the_robots(scene):
+    with pytest.raises(InputError, match=r"randomise: latency: .* \+ 2.5 s; expected at most 2 s together"):
+        twin.load(scene, "bend", pixels=False, randomise=Ranges(latency=(0.0, 2.5)))
+    with pytest.raises(InputError, match="bystanders"):
+        Ranges(bystanders=(0.0, 1e5))
 
 
 def test_a_chase_view_follows_the_robot_and_shows_its_obstacles(scene):

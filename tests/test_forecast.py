@@ -18,6 +18,7 @@ from twin.evaluation.agreement import OTHERS, SHUFFLED, TWIN, Estimate
 from twin.evaluation.agreement_intervals import STATISTICS as WITH_INTERVAL
 from twin.evaluation.agreement_intervals import jackknife_interval, pair_cells
 from twin.evaluation.forecasting import ALL_TASKS, Forecast, make_forecast
+from twin.evaluation.rate_model import RateModel, rank_probabilities
 from twin.evaluation.statistics import (
     MIN_POLICIES,
     mean_rate,
@@ -96,6 +97,22 @@ def results(path: Path, real: list[Cell]) -> Path:
     rows = [(c.policy, c.lighting, str(c.trials), str(c.successes), c.task, c.twin_lighting) for c in real]
     path.write_text(csv_text(("policy", "lighting", "trials", "successes", "task", "twin_lighting"), rows))
     return path
+
+
+def test_ranks_in_the_twin_are_by_the_twins_own_prior() -> None:
+    """On the road, trials of a day are expected to end alike; in the twin, they are not."""
+    rng = np.random.default_rng(1)
+    twin = [
+        Cell(f"p{i}", "straight", light, 20, int(rng.binomial(20, 0.3 + 0.12 * i)))
+        for i in range(6)
+        for light in LIGHTS
+    ]
+    made = make_forecast("road", twin, [replace(c, trials=5, successes=c.successes // 4) for c in twin])
+    won = np.array([[c.successes for c in twin if c.policy == f"p{i}"] for i in range(6)])
+    model = RateModel.fit(won, np.full(won.shape, 20), road=False, shared_days=False)
+    expected = rank_probabilities(model.sample(np.random.default_rng(7), 20_000))
+    for one in made.candidates:
+        assert one.twin_ranks == pytest.approx(expected[int(one.policy[1:])], abs=0.02)
 
 
 def test_rates_are_those_of_the_tables() -> None:

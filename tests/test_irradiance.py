@@ -149,6 +149,10 @@ def test_darker_lighting_has_less_irradiance():
         assert np.allclose(mine.irradiance(level, up), level)
         assert (mine.irradiance(level, side) >= 0.0).all()
     assert found.estimate("day") is day
+    field.add_lightings({"dusk": np.full_like(field.embedding("day"), 2.0)})  # as a photo does
+    again = IrradianceEstimator(field, ROUTE)
+    level = night.ground(here)
+    np.testing.assert_array_equal(again.estimate("night").irradiance(level, side), night.irradiance(level, side))
     mixed = found.estimate("day:night:0.5").ground(here)
     assert ((night.ground(here) < mixed) & (mixed < day.ground(here))).all()
 

@@ -139,7 +139,7 @@ def test_masks_of_images_in_subfolders_are_their_own(tmp_path: Path) -> None:
     (tmp_path / "posed/transforms.json").write_text(json.dumps({"frames": frames, "fl_x": 150.0}))
     _, _, out = captured(tmp_path, [SourceConfig(path="posed", mask="masks")])
     found = {path.name: read_image(path)[0, 0].max() for path in (out / "masks/posed").iterdir()}
-    assert found == {"000000.png.png": 255, "000002.png.png": 0}
+    assert found == {"000000.png": 255, "000001.png": 0}
 
 
 def test_a_focal_length_that_differs_is_not_held_for_all_images(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -19,12 +19,16 @@ from twin import commands, trial
 from twin.capture.bag_film import read_contents
 from twin.commands import parser_of
 from twin.config import CAUSES
+from twin.env.env_factory import EnvFactory
 from twin.errors import InputError
+from twin.evaluation.trial_judge import view
 from twin.evaluation.trials import Cell, Trial, read_results, read_trials
 from twin.learn.policy import Control, load_policy, save_policy
 from twin.learn.policy_network import Architecture
+from twin.nerf.lightings import Fog
 from twin.report.drive_dataset import write_bag_dataset
 from twin.report.video_writer import read_frames
+from twin.robot import PixelCamera
 from twin.sysid.trial_recording import fit_frame, read_trial
 
 STEP = 100_000_000  # [ns]
@@ -204,6 +208,19 @@ def _luma_error(shown: list[np.ndarray], wanted: list[np.ndarray]) -> float:
 
 def _column(messages: list[Recorded], topic: str, value) -> np.ndarray:
     return np.array([value(one.message) for one in messages if one.topic == topic])
+
+
+def test_pictures_are_compared_with_those_of_the_days_photo(place):
+    """Its fog is in the twin's pictures, as in those of an episode under this lighting."""
+    scene, _ = place
+    factory = EnvFactory.open(scene, "ahead", {"size": (64, 36)})
+    day, fog = factory.field.embedding("day"), Fog(0.1, (0.9, 0.8, 0.7))
+    factory.field.add_lightings({"monday": day}, fogs={"monday": fog})
+    camera = PixelCamera((60.0, 60.0, 32.0, 18.0), (64, 36))
+    gray = [np.full((36, 64, 3), 100, np.uint8)]
+    clear, foggy = (view(factory, np.zeros((1, 3)), gray, camera, name).twin[0] for name in ("day", "monday"))
+    sky = np.array([0.9, 0.8, 0.7]) * 255.0
+    assert np.abs(foggy[0] - sky).mean() < np.abs(clear[0] - sky).mean() - 10.0
 
 
 def test_trials_add_up_and_a_bag_counts_once(place, tmp_path):

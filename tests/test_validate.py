@@ -235,11 +235,34 @@ def test_a_changed_scene_is_refused(fresh):
         toml.write_text(text + '\n[[obstacle]]\nkind = "cone"\nstation = 2.0\n')
         with pytest.raises(InputError, match="obstacles, photo or"):
             run(fresh, "left", lightings=["day"], episodes=1)
-        run(fresh, "left", lightings=["night"], episodes=1)  # of which nothing was driven yet
+        with pytest.raises(InputError, match="under day that were driven before"):
+            run(fresh, "left", lightings=["night"], episodes=1)  # the page would show both as one experiment
     finally:
         toml.write_text(text)
-    with pytest.raises(InputError, match="under night that were driven before"):
-        run(fresh, "left", lightings=["night"], episodes=2)
+    run(fresh, "left", lightings=["night"], episodes=1)
+
+
+def test_a_task_that_is_gone_is_refused_before_anything_is_driven(fresh):
+    toml = fresh / "scene.toml"
+    text = toml.read_text()
+    toml.write_text(text + '\n[[task]]\nname = "gate"\nstart = 0.0\nlength = 3.0\n')
+    validate.validate(fresh, ["ahead"], "gate", ["day"], 1)
+    toml.write_text(text)
+    with pytest.raises(InputError, match=r"has episodes of gate \(task 'gate': unknown.*\); move it away"):
+        run(fresh, "ahead", lightings=["day"], episodes=1)
+    assert len(read_trials(fresh / "validation" / "episodes.csv")) == 1
+
+
+def test_a_policy_that_was_trained_again_is_refused_whoever_drives_next(fresh):
+    run(fresh, "ahead", lightings=["day"], episodes=1)
+    trained = fresh / "runs" / "ahead" / "policy.json"
+    before = trained.read_text()
+    try:
+        trained.write_text(json.dumps(json.loads(before), indent=3))
+        with pytest.raises(InputError, match=r"'ahead': .* is not the file that was validated under this name"):
+            run(fresh, "left", lightings=["day"], episodes=1)
+    finally:
+        trained.write_text(before)
 
 
 def test_a_table_without_a_record_is_refused(fresh):

@@ -23,6 +23,7 @@ from twin.env.task import WEATHER, DriveTask
 from twin.geometry.cameras import Viewpoints, pixel_grid, unproject
 from twin.nerf.lightings import AddedLighting, Fog
 from twin.scene import SceneDir, stage_result
+from twin.view.camera_path import named_lighting
 
 SMALL = {"size": (32, 18)}
 
@@ -205,6 +206,11 @@ def test_known_weather_weakens_the_randomization(photos, lighting):
     weaker = {"sunlight": KNOWN_WEATHER_FRACTION * unknown.sunlight, "shade": KNOWN_WEATHER_FRACTION * unknown.shade}
     assert known == replace(unknown, extinction=0.0, airlight=1.0, **weaker)
     assert draw(lighting, replace(EVALUATION_RANGES, hold_known=False)) == unknown  # as in training
+    environment = twin.load(photos, "ahead", 5, lighting=lighting, **SMALL, randomise=EVALUATION_RANGES)
+    environment.reset()
+    for shown, expected in ((lighting, known), ("day", unknown), (lighting, known)):
+        environment.pixels.set_lighting(0, named_lighting(photos.field(), shown), fill=False)
+        assert environment.task.sample == expected
 
 
 def test_fingerprint_covers_the_known_weather_fraction(photos, monkeypatch):

@@ -30,7 +30,7 @@ from twin import commands, runtime
 from twin.capture.bag import is_bag
 from twin.config_file import ROBOT_TOML, load_config, merge_robot, parse_table, read_robot
 from twin.errors import InputError
-from twin.files import digest_file, read_toml, write_json, write_text
+from twin.files import digest_file, is_file, read_toml, write_json, write_text
 from twin.mjcf.husky import coulomb_track_ratio
 from twin.robot import WHEEL_RADIUS, HuskyParams
 from twin.scene import SceneDir
@@ -59,7 +59,8 @@ def align_to_log(
     Args:
         target: Folder of a scene, a `robot.toml`, or `PUBLISHED_ROBOT`.
         log: See `twin.sysid.logs`.
-        out: Folder for the results; by default that of the scene or the `robot.toml`.
+        out: Folder for the results; by default that of the scene or the `robot.toml`. Values of a `robot.toml` there
+            that neither the robot nor this log gives are kept.
         use_slope: Accounts for the ground's slope, which is estimated from the log's accelerations (if it has any).
         topic: Topic of a bag's poses; empty: the best one that does not come from the wheels.
 
@@ -67,6 +68,8 @@ def align_to_log(
         InputError: the robot is unknown, the folder is not writable, or the log is unusable.
     """
     params, kept, folder = _robot(target)
+    if out and is_file(out / ROBOT_TOML):
+        kept = {**read_robot(out / ROBOT_TOML), **kept}
     folder = out or folder
     if folder is None:
         raise InputError(f"{target}: the published robot has no folder for its robot.toml; give one with --out")

@@ -24,7 +24,7 @@ from twin.env.drivers import Driver, PolicyDriver, RouteDriver
 from twin.env.env_factory import load
 from twin.env.episode import Episode, record_episode
 from twin.errors import InputError
-from twin.files import new_folder, require_absent, require_parent
+from twin.files import atomic_path, new_folder, require_absent, require_parent
 from twin.geometry.poses import inverse_pose
 from twin.learn.policy import find_policy, load_policy
 from twin.loading import Twin, load_scene
@@ -103,7 +103,8 @@ def film(
         commands = episode.actions
         if driven.options.action == STEERING:
             commands = np.column_stack([np.full(len(commands), driven.options.speed), commands])
-        write_rerun_recording(rerun, episode, images, np.array(motion), commands, cameras[0], *place)
+        with atomic_path(rerun) as partial:
+            write_rerun_recording(partial, episode, images, np.array(motion), commands, cameras[0], *place)
     return path, episode
 
 

@@ -23,6 +23,7 @@ SIDES = ("left", "right")
 
 CHASSIS_MASS = 46.034  # [kg]
 WHEEL_MASS = 2.637  # [kg]
+MAX_LATENCY = 2.0  # [s]
 WHEEL_RADIUS = 0.1651  # [m] nominal, used by the robot's controller
 WHEEL_WIDTH = 0.1143  # [m]
 WHEELBASE = 0.512  # [m]
@@ -155,7 +156,7 @@ class HuskyParams:
     factor."""
     separation_multiplier: Annotated[float, Range(0.5, 5)] = 1.875
     """Clearpath's `wheel_separation_multiplier`: the controller's estimate of chi."""
-    command_latency: Annotated[float, Range(0, 2)] = 0.0
+    command_latency: Annotated[float, Range(0, MAX_LATENCY)] = 0.0
     """Delay from a command to the controller's action [s]."""
 
     # Front camera.

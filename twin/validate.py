@@ -265,32 +265,40 @@ def _named(root: Path, sources: Sequence[str], trust: bool) -> dict[str, str]:
 def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], policies: dict[str, str]) -> None:
     """Records digests of policies and of roads (a task under a lighting).
 
-    Raises InputError if a policy or road that is in the tables has changed.
+    Raises InputError if any policy or road that is in the tables has changed.
     """
     path = folder / "validated.json"
-    recorded: dict[str, Any] = {"roads": {}, "policies": {}}
+    recorded: dict[str, Any] = {"roads": {}, "policies": {}, "sources": {}}
     if path.exists():
         with wrap_read_errors(path, f"move {folder} away to validate again"):
             stored = dict(read_json(path))
             recorded |= {name: dict(stored[name]) for name in recorded if name in stored}
     trials = [*_read_table(folder / "episodes.csv"), *_read_table(folder / "worst.csv")]
-    driven = {t.policy for t in trials} | {_road(t.task, t.lighting) for t in trials}
-    for lighting in lightings:
-        road, digest = _road(task, lighting), fingerprint(twin, task, Condition.parse(lighting))
+    driven = {_road(t.task, t.lighting): (t.task, t.lighting) for t in trials}
+    for road, (of, lighting) in (driven | {_road(task, one): (task, one) for one in lightings}).items():
+        try:
+            digest = fingerprint(twin, of, Condition.parse(lighting))
+        except InputError as error:
+            if road not in driven:
+                raise
+            raise InputError(f"{folder} has episodes of {of} ({error}); move it away to validate again") from None
         if road in driven and recorded["roads"].get(road) != digest:
             raise InputError(
-                f"{folder} has episodes of {task} under {lighting} that were driven before the scene, task, obstacles, "
+                f"{folder} has episodes of {of} under {lighting} that were driven before the scene, task, obstacles, "
                 "photo or twin's sampling of episodes changed; move it away to validate again"
             )
         recorded["roads"][road] = digest
-    for name, source in policies.items():
+    driven_by = {t.policy for t in trials}
+    before = {name: one for name, one in recorded["sources"].items() if name in driven_by and Path(one).exists()}
+    for name, source in (before | policies).items():
         digest = _digest(source)
-        if name in driven and recorded["policies"].get(name) != digest:
+        if name in driven_by and recorded["policies"].get(name) != digest:
             raise InputError(
                 f"policy {name!r}: {source} is not the file that was validated under this name; move {folder} away, or "
                 "copy the policy to another name"
             )
         recorded["policies"][name] = digest
+    recorded["sources"] |= policies
     folder.mkdir(parents=True, exist_ok=True)
     write_json(path, recorded)
 

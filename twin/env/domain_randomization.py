@@ -28,7 +28,7 @@ Interval = tuple[float, float]
 PAYLOAD = "payload"
 """Name of a body on the top plate; its mass is zero until an episode sets a payload."""
 
-VERSION = 5
+VERSION = 6
 """Version of a sample's effects. Increase it whenever a change of the code changes the pictures of a sample."""
 
 KNOWN_WEATHER_FRACTION = 0.6
@@ -50,7 +50,7 @@ _ABOVE_ZERO = float(np.nextafter(0.0, 1.0))
 _BOUNDS = {
     **dict.fromkeys(("friction", "wheel_radius"), (_ABOVE_ZERO, _MAX_BOUND)),
     **dict.fromkeys(("payload", "latency", "extinction", "airlight", "sunlight", "shade"), (0.0, _MAX_BOUND)),
-    "bystanders": (0.0, _MAX_BOUND),
+    "bystanders": (0.0, 1000.0),
     "wheel_difference": (-0.5, 0.5),
 }
 """Allowed values of ranges; ranges that are not listed must be within ±`_MAX_BOUND`."""

@@ -222,7 +222,8 @@ class RouteDriver:
     def __call__(self, environment: "control.Environment", step: "dm_env.TimeStep") -> Array:
         task, pose = environment.task, environment.physics.planar_pose
         if step.first():
-            self._pursuit = PurePursuit(task.world.route, task.options.speed, task.options.yaw_rate, task.segment.start)
+            speed = min(task.options.speed, task.world.robot.max_speed)
+            self._pursuit = PurePursuit(task.world.route, speed, task.options.yaw_rate, task.segment.start)
         self._pursuit.update(pose)
         v, yaw_rate = self._pursuit.command(pose)
         return np.array([yaw_rate]) if task.options.action == STEERING else np.array([v, yaw_rate])

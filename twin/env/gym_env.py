@@ -177,11 +177,11 @@ class DriveEnv(gymnasium.Env):
         """
         if self.render_mode is None:
             return None
+        if not self._started:
+            raise ResetNeeded("render before reset; call reset() first")
         if self._render_size is None:
             assert self.vector_env.pixels
             return self.vector_env.pixels.stacks[0, -1].transpose(1, 2, 0).copy()
-        if not self._started:
-            raise ResetNeeded("render before reset; call reset() first")
         envs = self._local
         physics = envs.physics[0]  # with physics on a GPU, this downloads the state
         if self._chase:
@@ -220,6 +220,8 @@ class DriveVectorEnv(VectorEnv):
     ) -> None:
         """See `twin.load` and, for `processes`, `make_vector_env`."""
         self.num_envs, self.render_mode = num_envs, _check_render_mode(render_mode)
+        if render_mode and not parse_options(options).pixels:
+            raise InputError("render_mode: vector environments show their images, which pixels=False leaves out")
         self._started = False
         self.vector_env = make_vector_env(scene, task, options, [None] * num_envs, processes)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vector_env.options.control_timestep)}
@@ -263,8 +265,11 @@ class DriveVectorEnv(VectorEnv):
 
     def render(self) -> tuple[NDArray, ...] | None:
         """The newest image of each environment, uint8 (height, width, 3)."""
-        if self.render_mode is None or not self.vector_env.pixels:
+        if self.render_mode is None:
             return None
+        if not self._started:
+            raise ResetNeeded("render before reset; call reset() first")
+        assert self.vector_env.pixels
         return tuple(stack[-1].transpose(1, 2, 0).copy() for stack in self.vector_env.pixels.stacks)
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -167,7 +167,7 @@ class IrradianceEstimator:
         count = min(_NEIGHBORS, len(self._xy))
         nearest = np.arange(1, count + 1)  # as an array, so that the result has two axes if there is one
         self._neighbors = cKDTree(self._xy).query(self._upright.positions[:, :2], nearest)[1]
-        names = baked.lightings
+        names = baked.lightings_by_name.filmed().names  # added lightings change no other one
         grounds = [self._ground.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
         uprights = [self._upright.probes.picture(baked.embedding(name)).astype(np.float64) for name in names]
         # Lightings are scaled to the same brightness of the ground before their mean is taken.

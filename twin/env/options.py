@@ -70,7 +70,8 @@ class Options:
     action: str = TWIST
     """`twist`: v [m/s] and ω [rad/s]; `steering`: ω [rad/s] only, at a fixed speed."""
     speed: float = 1.0
-    """For `twist`, the highest speed [m/s]; for `steering`, the fixed speed [m/s]; not above the robot's."""
+    """For `twist`, the highest speed [m/s]; for `steering`, the fixed speed [m/s]. A robot whose limit is
+    lower drives at its limit."""
     yaw_rate: float = 1.0
     """Largest yaw rate to either side [rad/s]."""
     half_width: float | None = None

@@ -57,7 +57,7 @@ _SEARCH_WINDOW = (1.0, 3.0)  # [m] the nearest point of the route is searched th
 ROLLOVER_COSINE = 0.5  # cosine of the tilt beyond which the robot has rolled over
 STUCK_TIME, STUCK_DISTANCE = 5.0, 0.1  # [s], [m]: a robot that moves less than this distance in this time is stuck
 _STATE_MARGIN = 10.0  # bounds of speed and yaw rate in the state, as multiples of the controller's limits
-EPISODE_VERSION = 6
+EPISODE_VERSION = 7
 """Version of the episodes of a training. Increase it whenever a change of the code changes the starts of a seed with
 `Options.start_along`, when these episodes are cut off, or which ends of episodes are terminal."""
 # With `Options.start_along`: at the start, largest distance from the route / corridor half width, largest heading /
@@ -153,7 +153,7 @@ class RewardAndTermination:
             "out_of_bounds": np.abs(cross) > self.half_width,
             "goal": foot >= self.segment.end - BUMPER_OFFSET,
             "timeout": motion.time > self.time_limit - 1e-6,
-            "stuck": motion.time - self._anchor_time[which] >= STUCK_TIME,
+            "stuck": motion.time - self._anchor_time[which] > STUCK_TIME - 1e-6,
         }
         self._cause[which] = np.select(list(conditions.values()), [_CODES[cause] for cause in conditions], 0)
         self._cut[which] = motion.time > self._cut_time[which] - 1e-6
@@ -324,7 +324,9 @@ class DriveTask(control.Task):
         self.episode_seed = 0
         """Seed of the current episode."""
         self.sample = RandomizationSample()
-        """Randomized robot and weather of the current episode."""
+        """Randomized robot and weather of the current episode; the weather is reduced where a photo shows it."""
+        self.drawn = self.sample
+        """The same before any reduction."""
         self._start_station = segment.start
 
     def seed(self, seed: int | None) -> None:
@@ -343,7 +345,7 @@ class DriveTask(control.Task):
     def initialize_episode(self, physics: DrivePhysics) -> None:
         self.episode_seed = int(self._rng.integers(2**63))
         ranges = self.options.randomise
-        self.sample = ranges.sample(self.rng(ROBOT)) if ranges else RandomizationSample()
+        self.sample = self.drawn = ranges.sample(self.rng(ROBOT)) if ranges else RandomizationSample()
         if self._nominal:
             self._nominal.apply(self.sample, physics.model.ptr)
         params = self.world.robot

@@ -252,7 +252,7 @@ def _candidates(
     driven = [[c for c in real if c.policy == p] for p in policies]
     rng = np.random.default_rng([seed, 1])
     by_day = bool(real) and len(lightings) > 1
-    ranks = rank_probabilities(_sampled_rates(cells, by_day, rng))
+    ranks = rank_probabilities(_sampled_rates(cells, by_day, rng, road=False))
     with_real = [i for i, mine in enumerate(driven) if mine]
     real_ranks: dict[int, Array] = {}
     if len(with_real) > 1:
@@ -319,12 +319,12 @@ def _scores(real: Sequence[Cell], twin: Cells) -> tuple[float, float]:
     return float(np.mean([twin[c.twin_key].rate for c in real])), float(np.mean([c.rate for c in real]))
 
 
-def _sampled_rates(rows: Sequence[Sequence[Cell]], by_day: bool, rng: np.random.Generator) -> Array:
-    """Samples of the policies' true rates, shape (samples, n).
+def _sampled_rates(rows: Sequence[Sequence[Cell]], by_day: bool, rng: np.random.Generator, road: bool = True) -> Array:
+    """Samples of the policies' true rates on the road or in the twin, shape (samples, n).
 
     Effects of a day on all policies are not modeled, since they hardly change ranks.
     """
-    return RateModel.fit(*unit_counts(rows, by_day), shared_days=False).sample(rng, SAMPLES)
+    return RateModel.fit(*unit_counts(rows, by_day), road=road, shared_days=False).sample(rng, SAMPLES)
 
 
 def _rates_over_days(rows: Sequence[Sequence[Cell]], road: bool = True) -> list[Estimate]:
@@ -396,7 +396,7 @@ def _allocation(task: str, twin: Sequence[Cell], real: Sequence[Cell], seed: int
         return TrialAllocation(task, len(policies), basis, None, None, 0, 0)
     rows = [[c for c in cells if c.policy == policy] for policy in policies]
     by_day = on_road or (bool(real) and len({c.lighting for c in twin}) > 1)  # as in `_candidates`
-    rates = _sampled_rates(rows, by_day, np.random.default_rng([seed, 3]))
+    rates = _sampled_rates(rows, by_day, np.random.default_rng([seed, 3]), on_road)
     now = expected_confidence(rates, 0, seed, on_road)
     more = [trials_needed(rates, what, seed, on_road) for what in ("winner", "order")]
     return TrialAllocation(task, len(policies), basis, now.winner, now.order, *more)

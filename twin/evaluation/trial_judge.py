@@ -13,10 +13,11 @@ import numpy as np
 from twin.env.env_factory import EnvFactory
 from twin.env.task import Motion, RewardAndTermination
 from twin.errors import InputError
-from twin.geometry.cameras import Rendering, Viewpoints, evenly_spaced
+from twin.geometry.cameras import Rendering, Viewpoints, evenly_spaced, pixel_grid, unproject
 from twin.geometry.images import psnr, to_uint8
 from twin.geometry.poses import wrap_angle
 from twin.mjcf.world import heading_at
+from twin.nerf.sun import relit
 from twin.robot import PixelCamera
 from twin.types import Array, Image
 
@@ -150,8 +151,15 @@ def view(
     real = [one / np.float32(255.0) for one in pictures]
     intrinsics = np.array(camera.intrinsics)
 
+    rays = unproject(pixel_grid(*camera.size), intrinsics)
+
     def render(i: int, name: str) -> Rendering:
-        return field.render(Viewpoints.of(seen[i], intrinsics, camera.size), name)
+        """The picture of an episode under this lighting: with its sun and fog, if it was fitted to a photo."""
+        out = field.render(Viewpoints.of(seen[i], intrinsics, camera.size), name)
+        rgb, fog = relit(out.rgb[0], out.depth[0], rays, seen[i], field.sunlight(name)), field.fog(name)
+        if fog:
+            rgb = fog.apply(rgb, out.depth[0] * np.linalg.norm(rays, axis=-1).astype(np.float32))
+        return replace(out, rgb=rgb[None])
 
     if lighting is None:
         some = evenly_spaced(len(seen), _PROBES).tolist()

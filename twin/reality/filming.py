@@ -18,6 +18,7 @@ from av.video.reformatter import Colorspace
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from twin.files import atomic_path
 from twin.geometry.cameras import evenly_spaced, opencv_to_mujoco, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.reality import SEED, primitives, true_world
@@ -348,7 +349,7 @@ def write_video(frames: Iterable[NDArray[np.uint8]], plan: FilmingPlan, path: Pa
     """Writes RGB frames (h, w, 3) as H.264; equal frames give equal files."""
     # x264's fast paths depend on the processor and on memory alignment; these settings make its output reproducible.
     options = {"crf": str(plan.crf), "preset": "slower", "threads": "1", "x264-params": "cpu-independent=1"}
-    with av.open(str(path), "w") as container:
+    with atomic_path(path) as partial, av.open(str(partial), "w") as container:
         stream = container.add_stream("libx264", rate=plan.fps, options=options)
         stream.width, stream.height, stream.pix_fmt = plan.width, plan.height, "yuv420p"
         matrix = Colorspace.ITU709 if plan.height >= _HD_HEIGHT else Colorspace.ITU601

@@ -265,7 +265,7 @@ class RealJudge:
             self.cause = "goal"
         elif time > task.time_limit - 1e-6:
             self.cause = "timeout"
-        elif time - self._since >= patience:
+        elif time - self._since > patience - 1e-6:
             self.cause = "stuck"
         return self.cause
 

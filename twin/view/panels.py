@@ -19,6 +19,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from twin.capture.formats import IMAGE_SUFFIXES
 from twin.env.episode_lighting import EpisodeLighting
 from twin.errors import InputError
 from twin.files import exists
@@ -96,13 +97,16 @@ class LightingPanel:
         with self._viewer.locked():
             if len(content) > _MAX_PHOTO:
                 raise InputError(f"{name}: {len(content) >> 20} MB; expected a photo of at most {_MAX_PHOTO >> 20} MB")
+            suffix = Path(name).suffix.lower()
+            if suffix not in IMAGE_SUFFIXES:
+                raise InputError(f"{name}: expected a photo ({', '.join(IMAGE_SUFFIXES)})")
             lighting = self._name.value.strip() or self._unused_name(Path(name).stem)
             check_name(lighting, "name")
             self._upload.disabled = True
             self._pending.add(lighting)
             text = f"{name}: finding its camera pose and fitting its lighting; this takes about a minute."
             self._viewer.notify("Relighting", text)
-            self._viewer.submit(self._relight, lighting, Path(name).suffix, content)
+            self._viewer.submit(self._relight, lighting, suffix, content)
 
     def _unused_name(self, stem: str) -> str:
         """A name made from a photo's; numbered if it exists, as phones upload every photo as "image.jpg"."""
@@ -169,6 +173,7 @@ class FilmPanel:
         self.index: int | None = None
         """Index of the frame that is compared; None while nothing is compared."""
         self._share, self._placed = 0.5, 0.0
+        self._comparing: set[int] = set()  # ids of the pages that show the frame; one that opens later does not
         self._read_frame = lru_cache(_FRAME_CACHE)(lambda i: read_image(self._cameras.image_path(i)))
         gui = viewer.server.gui
         gui.add_markdown("Compares a filmed frame with the twin from the same pose; move the line between them.")
@@ -197,7 +202,7 @@ class FilmPanel:
     def moved(self, client: viser.ClientHandle) -> None:
         """Ends the comparison if a page's camera has moved away from the frame's camera."""
         index = self.index  # other threads change it
-        if index is not None and time.monotonic() - self._placed > _ECHO_TIME:
+        if index is not None and client.client_id in self._comparing and time.monotonic() - self._placed > _ECHO_TIME:
             pose = self._cameras.camera_to_world[index]
             axis = camera_pose_of(client)[:3, 2]
             away = np.linalg.norm(client.camera.position - pose[:3, 3]) > MOVED
@@ -238,6 +243,7 @@ class FilmPanel:
         self._note.content = f"`{cameras.names[index]}`, {used}"
         pose, focal = cameras.camera_to_world[index], cameras.intrinsics[index, 1]
         fov = float(2.0 * np.arctan(cameras.sizes[index, 1] / 2.0 / focal))
+        self._comparing = {client.client_id for client in self._viewer.clients()}
         for client in self._viewer.clients():
             self._viewer.place(client, pose, fov, level=False)
 
@@ -408,7 +414,7 @@ class PathPanel:
         try:
             frames = write_path_film(out, path, self._viewer.picture, _FILM_SIZE, _FILM_FPS, on_frame)
             self._viewer.notify("Film rendered", f"{out}: {frames} frames", "green")
-        except OSError as error:
+        except (InputError, OSError) as error:
             self._viewer.notify("No film", str(error), "red")
         finally:
             self._film_button.disabled, self._progress.visible = False, False
