@@ -411,4 +411,13 @@ def test_films_repeat_byte_for_byte(tmp_path):
     plan = filming.FilmingPlan(width=320, height=180)
     for name in ("a.mp4", "b.mp4", "c.mp4"):
         filming.write_video(iter(frames), plan, tmp_path / name)
-    assert len({(tmp_path / name).read_bytes() for name in ("a.mp4", "b.mp4", "c.mp4")}) == 1
+    whole = (tmp_path / "a.mp4").read_bytes()
+    assert {(tmp_path / name).read_bytes() for name in ("b.mp4", "c.mp4")} == {whole}
+    with pytest.raises(KeyboardInterrupt):
+        filming.write_video(_interrupted(frames[:3]), plan, tmp_path / "a.mp4")
+    assert (tmp_path / "a.mp4").read_bytes() == whole and len(list(tmp_path.iterdir())) == 3
+
+
+def _interrupted(frames):
+    yield from frames
+    raise KeyboardInterrupt

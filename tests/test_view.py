@@ -642,6 +642,23 @@ def _views(field, apart: float) -> list:
     return [(pose, 60.0, named_lighting(field, name)) for pose, name in zip(poses, ("day", "night"), strict=True)]
 
 
+def test_another_page_does_not_end_a_comparison(page, monkeypatch):
+    client, film = _Client(), page.film
+    monkeypatch.setattr(page.viewer, "clients", lambda: [client])
+    monkeypatch.setattr(page.viewer, "place", lambda *given, **more: None)
+    film._compare.value = True
+    _wait(lambda: film.index == 0)
+    film._placed = -100.0
+    later = _Client()
+    later.client_id = 8
+    for one in (later, client):
+        one.camera.wxyz, one.camera.position = np.array([1.0, 0.0, 0.0, 0.0]), np.array([50.0, 0.0, 0.0])
+    film.moved(later)
+    assert film._compare.value
+    film.moved(client)
+    _wait(lambda: film.index is None)
+
+
 def test_a_flight_ends_in_the_lighting_of_before_or_in_the_one_chosen_meanwhile(page, field, monkeypatch):
     viewer, panel, client = page.viewer, page._path, _Client()
     monkeypatch.setattr(viewer, "clients", lambda: [client])
@@ -829,6 +846,8 @@ def test_a_photo_replaces_no_lighting_but_the_named_one(page, notices, monkeypat
     panel._pending.clear()
     panel._upload.disabled = False
     assert given == ["day_2", "new_year", "day", "image", "image_2"]
+    panel._photo_given("notes.txt", b"")
+    assert len(given) == 5 and "notes.txt: expected a photo (.jpg" in notices[-1]
 
 
 def test_a_damaged_lighting_takes_no_other_away(page, field):
