@@ -1,6 +1,7 @@
 """Bags as films: the same frames as pictures, calibration, positions and seat; bad bags get one line."""
 
 import re
+import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -40,6 +41,7 @@ from twin.errors import InputError
 from twin.files import remove
 from twin.geometry.cameras import Cameras
 from twin.geometry.images import read_image
+from twin.new import new_scene
 
 SHIFTS = [6 * i for i in range(30)]
 TIMES = np.arange(30) / 10.0
@@ -292,6 +294,24 @@ def test_the_height_of_a_bag_is_not_that_of_another_film(tmp_path: Path, capsys:
     assert commands.main("new", [str(tmp_path / "given"), str(phone), str(bag), "--camera-height", "1.1"]) == 0
     config = load_config(tmp_path / "given/scene.toml")
     assert config.metric.camera_height == 1.1 and [one.camera_height for one in config.source] == [0.0, 0.0]
+
+
+def test_a_failed_start_of_a_scene_leaves_no_robot(tmp_path: Path) -> None:
+    bag = write(tmp_path / "drive", whole())
+    again = tmp_path / "again"
+    shutil.copytree(bag, again / "drive")
+    root = tmp_path / "scene"
+    with pytest.raises(InputError, match="has the same content"):
+        new_scene(root, [bag, again / "drive"])
+    assert not (root / "robot.toml").exists() and not (root / "scene.toml").exists()
+
+
+def test_a_camera_below_the_ground_gives_no_height(tmp_path: Path) -> None:
+    below = [one for one in whole() if one.topic != "/tf_static"] + seat(-0.4, 0.3, 0.1)
+    bags = [write(tmp_path / "left", whole()), write(tmp_path / "right", below)]
+    new_scene(tmp_path / "scene", bags)
+    config = load_config(tmp_path / "scene/scene.toml")
+    assert [one.camera_height for one in config.source] == [pytest.approx(0.7), 0.0]
 
 
 def test_new_says_whether_the_bag_is_also_a_log(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

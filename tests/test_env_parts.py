@@ -340,6 +340,15 @@ def test_parts_within_reach_stay(tmp_path):
     assert "part_0001" not in {geom.name for geom in episode_spec(world, 0.0, 1.0, 0.2).geoms}
 
 
+def test_parts_behind_the_start_stay_as_far_as_a_robot_may_get_back(tmp_path):
+    more = '[[task]]\nname = "end"\nstart = 8.5\nlength = 1.0\n'
+    root, kept = tiny_twin(tmp_path, more=more), []
+    for limit in (None, 30.0):
+        model = EnvFactory.open(root, "end", {"pixels": False, "half_width": 0.2, "time_limit": limit}).model
+        kept.append({model.geom(k).name for k in range(model.ngeom) if model.geom(k).name.startswith("part_")})
+    assert kept[0] < kept[1]
+
+
 # ---- trust
 
 

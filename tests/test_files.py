@@ -5,6 +5,7 @@ import os
 import re
 import tomllib
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -198,6 +199,20 @@ def test_stages_of_different_builds_are_not_used_together(tmp_path):
     for stage in ("field", "mesh", "mjcf"):
         with pytest.raises(InputError, match=r"3_field was built from an earlier 2_metric, .*; run twin build"):
             require_stage(scene, stage)
+
+
+@pytest.mark.parametrize(
+    "depends", [[], None, {"upstream": []}, {"upstream": 3}, {"upstream": {"nope": "x"}}, {"upstream": {"mjcf": "x"}}]
+)
+def test_what_a_foreign_stamp_depends_on_is_no_traceback(tmp_path, depends):
+    folder = SceneDir(tmp_path).stage("mjcf")
+    folder.mkdir(parents=True)
+    stamp = write_stamp(folder, "mjcf")
+    replace(stamp, depends=depends).save(folder)
+    try:
+        require_stage(SceneDir(tmp_path), "mjcf")  # what is unknown, or the stage itself, is passed over
+    except InputError as error:
+        assert "stamp.json" in str(error) and "build the scene again" in str(error)
 
 
 @pytest.mark.parametrize("count", ["9223372036854775808", "9" * 5000, "1000001", "-1", "1.5", "٣"])

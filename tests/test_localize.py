@@ -5,6 +5,7 @@ import pytest
 from textured import SIZE, K, filmed_corridor, picture, pose_at
 
 from twin import runtime
+from twin.capture import localize
 from twin.capture.localize import MIN_INLIERS, candidate_lenses, register_photo
 from twin.capture.photos import PhotoExif
 from twin.errors import InputError
@@ -48,6 +49,17 @@ def test_another_camera_is_found_with_its_focal_length(scene):
         metres, degrees = error(found, pose)
         assert metres < 0.15
         assert degrees < 0.5
+
+
+def test_features_of_few_frames_are_kept(scene, monkeypatch):
+    monkeypatch.setattr(localize, "_MAX_FRAMES", 2)
+    known = localize.LocalizationMap(scene.stage("metric"))
+    descriptors = known.features(known.cameras.image_path(0))[1]
+    first = known.matches(descriptors, 0)
+    for i in (1, 0, 2):
+        known.matches(descriptors, i)
+    assert list(known._features) == [0, 2]
+    np.testing.assert_array_equal(known.matches(descriptors, 0), first)
 
 
 def test_a_photo_of_something_else_is_refused(scene):

@@ -164,6 +164,9 @@ def test_sources_carried_at_different_heights_agree(tmp_path: Path) -> None:
     _check_level(world, tmp_path / "out", tilt_deg=0.5, scale=0.01, floor=0.02)
     assert metrics["scale_per_source_relative"] == pytest.approx([1.0, 1.0], abs=0.02)
     assert metrics["camera_height_m_of"] == pytest.approx({"film0": 0.6, "film1": 1.5}, abs=0.03)
+    few = _points(high, np.random.default_rng(0), on_road=12)[:12]  # heights cannot be measured; the given ones differ
+    sparse = _world(tmp_path / "few", [low, high], few, _similarity(1), heights=(0.6, 1.5)).run(tmp_path / "out_few")
+    assert not sparse["road_reliable"] and sparse["camera_height_m_of"] == {"film0": 0.6, "film1": 1.5}
 
 
 def test_a_height_of_a_film_that_was_not_placed_is_refused(tmp_path: Path) -> None:

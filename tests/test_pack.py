@@ -593,6 +593,14 @@ def test_a_policy_whose_name_unpack_would_refuse_is_refused(root, tmp_path):
     assert not (tmp_path / "x.twin").exists()
 
 
+def test_a_scene_inside_the_folder_of_its_photos_is_packed(tmp_path):
+    root = tiny_twin(tmp_path / "photos" / "place")
+    toml = root / "scene.toml"
+    toml.write_text(re.sub(r'path = "[^"]*"', 'path = ".."', toml.read_text(), count=1))
+    file, _ = pack(root, tmp_path / "place.twin")
+    assert twin.load_scene(file).world().route.shape[1] >= 2
+
+
 def test_two_policies_of_one_name_are_refused(root, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

@@ -9,7 +9,7 @@ import pytest
 from filmed_wall import HEIGHT, WIDTH, captured, film, refused, views
 from PIL import ExifTags, Image
 
-from twin.capture.photos import photo_times, read_exif
+from twin.capture.photos import _mask_names, photo_times, read_exif
 from twin.config import SourceConfig
 from twin.geometry.cameras import evenly_spaced
 from twin.geometry.images import read_image, write_image
@@ -140,6 +140,14 @@ def test_masks_of_images_in_subfolders_are_their_own(tmp_path: Path) -> None:
     _, _, out = captured(tmp_path, [SourceConfig(path="posed", mask="masks")])
     found = {path.name: read_image(path)[0, 0].max() for path in (out / "masks/posed").iterdir()}
     assert found == {"000000.png": 255, "000001.png": 0}
+
+
+def test_names_of_masks() -> None:
+    two = _mask_names([Path("/a/left/data/0.png"), Path("/a/right/data/0.png"), Path("/a/right/data/1.png")])
+    assert two[0] == ("left/data/0", "left/data/0.png") and two[1] == ("right/data/0", "right/data/0.png")
+    assert two[2] == ("right/data/1", "right/data/1.png", "1", "1.png")
+    one = _mask_names([Path("/a/IMG_1.jpg"), Path("/a/IMG_1.png")])
+    assert one == [("IMG_1", "IMG_1.jpg", "IMG_1", "IMG_1.jpg"), ("IMG_1", "IMG_1.png", "IMG_1", "IMG_1.png")]
 
 
 def test_a_focal_length_that_differs_is_not_held_for_all_images(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

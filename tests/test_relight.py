@@ -204,6 +204,20 @@ def test_unusable_input_ends_with_one_line_and_status_2(scene, tmp_path, capsys)
     assert not (scene.lightings / "x.json").exists()
 
 
+def test_a_field_of_another_scale_is_refused(scene, monkeypatch, capsys):
+    """`metric` was built again, `field` was not."""
+    monkeypatch.setattr("twin.capture.localize.register_photo", lambda *_: pytest.fail("the photo was registered"))
+    folder = scene.stage("field")
+    before = (folder / "stamp.json").read_bytes()
+    try:
+        write_stamp(folder, "field", {"upstream": {"metric": "0" * 64}})
+        arguments = [str(scene.root), str(scene.root / "photo.png"), "--name", "x", "--quiet"]
+        assert commands.main("relight", arguments) == 2
+        assert "3_field was built from an earlier 2_metric" in capsys.readouterr().err
+    finally:
+        (folder / "stamp.json").write_bytes(before)
+
+
 def test_a_damaged_build_is_found_before_the_photo_is_fitted(scene, monkeypatch, capsys):
     monkeypatch.setattr("twin.relight.fit_photo", lambda *_: pytest.fail("the photo was fitted first"))
     mesh = scene.stage("mesh")

@@ -261,8 +261,16 @@ def test_a_policy_that_was_trained_again_is_refused_whoever_drives_next(fresh):
         trained.write_text(json.dumps(json.loads(before), indent=3))
         with pytest.raises(InputError, match=r"'ahead': .* is not the file that was validated under this name"):
             run(fresh, "left", lightings=["day"], episodes=1)
+        there = fresh.parent / "there"
+        shutil.copytree(fresh, there)
+        (there / "runs" / "ahead" / "policy.json").write_text(before)  # a copy is judged by its own run
+        run(there, "left", lightings=["day"], episodes=1)
     finally:
         trained.write_text(before)
+    record = fresh / "validation" / "validated.json"
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"sources": {"ahead": 5}}))
+    with pytest.raises(InputError, match=r"validated.json is damaged.*to validate again"):
+        run(fresh, "left", lightings=["day"], episodes=1)
 
 
 def test_a_table_without_a_record_is_refused(fresh):

@@ -59,17 +59,18 @@ def align_to_log(
     Args:
         target: Folder of a scene, a `robot.toml`, or `PUBLISHED_ROBOT`.
         log: See `twin.sysid.logs`.
-        out: Folder for the results; by default that of the scene or the `robot.toml`. Values of a `robot.toml` there
-            that neither the robot nor this log gives are kept.
+        out: Folder for the results; by default that of the scene or the `robot.toml`. The fit of the published robot
+            starts from a `robot.toml` that is there.
         use_slope: Accounts for the ground's slope, which is estimated from the log's accelerations (if it has any).
         topic: Topic of a bag's poses; empty: the best one that does not come from the wheels.
 
     Raises:
         InputError: the robot is unknown, the folder is not writable, or the log is unusable.
     """
+    if out and target == PUBLISHED_ROBOT and is_file(out / ROBOT_TOML):
+        target = str(out / ROBOT_TOML)
+        runtime.log_line(f"{target}: the fit starts from it, and keeps what the log does not determine")
     params, kept, folder = _robot(target)
-    if out and is_file(out / ROBOT_TOML):
-        kept = {**read_robot(out / ROBOT_TOML), **kept}
     folder = out or folder
     if folder is None:
         raise InputError(f"{target}: the published robot has no folder for its robot.toml; give one with --out")

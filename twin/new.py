@@ -19,6 +19,7 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -147,7 +148,7 @@ def _write_scene(
     lightings: list[str] = []
     paths: list[Path] = []
     seated = next((bag for bag in bags.values() if bag.seat), None)
-    seat = _write_seat(root / ROBOT_TOML, seated) if seated else None
+    seat = _known_seat(root / ROBOT_TOML, seated) if seated else None
     own_heights = {} if camera_height is not None or seat is None else _own_heights(films, bags)
     for film in films:
         path = _import_film(film, inputs)
@@ -178,6 +179,8 @@ def _write_scene(
             notes += [f"{film.name}: {note}" for note in timing_notes(bags[film].film().timing)]
         height = f"camera_height = {own_heights[film]:.4g}  # [m] by /tf_static\n" if film in own_heights else ""
         text += _SOURCE.format(path=path_text, topic=chosen, height=height, lighting=toml_string(lighting), mask=mask)
+    if seated and seat:
+        _write_seat(root / ROBOT_TOML, seated)
     scales = _scale_lines(list(bags.values()), camera_height, seat, bool(own_heights))
     write_text(scene.config_file, text + _REST.format(**scales))
     for note in (*map(_taken, bags.values()), *notes):
@@ -219,9 +222,10 @@ def _mask_lines(check: FilmCheck, inputs: Path, path: Path) -> tuple[list[str], 
 
 
 def _own_heights(films: list[Path], bags: dict[Path, BagContents]) -> dict[Path, float]:
-    """Camera height [m] of each bag that has one, if it does not hold for all films; else empty."""
-    heights = {film: bag.seat.height for film, bag in bags.items() if bag.seat}
-    alike = max(heights.values()) - min(heights.values()) < _SEAT_TOLERANCE
+    """Camera height [m] of each bag that has a possible one, if it does not hold for all films; else empty."""
+    found = {film: bag.seat.height for film, bag in bags.items() if bag.seat}
+    heights = {film: height for film, height in found.items() if 0.01 <= height <= MAX_CAMERA_HEIGHT}
+    alike = max(heights.values(), default=0.0) - min(heights.values(), default=0.0) < _SEAT_TOLERANCE
     return {} if alike and len(heights) == len(films) else heights
 
 
@@ -271,20 +275,26 @@ def _odometry_way(bag: BagContents) -> float:
     return path_length(some[:: max(1, len(some) // 1000)])
 
 
-def _write_seat(path: Path, bag: BagContents) -> CameraSeat | None:
-    """Writes `robot.toml` with the camera's extrinsics in a bag, unless the file exists; returns them.
+def _seat_fields(bag: BagContents) -> dict[str, Any]:
+    """The camera's extrinsics in a bag as fields of `robot.toml`."""
+    return {f"camera_{name}": getattr(bag.seat, name) for name in _SEAT_FIELDS}
 
-    Returns None if they are out of the ranges for a Husky.
-    """
-    fields = {f"camera_{name}": getattr(bag.seat, name) for name in _SEAT_FIELDS}
+
+def _known_seat(path: Path, bag: BagContents) -> CameraSeat | None:
+    """The camera's extrinsics in a bag; None if they are out of the ranges for a Husky."""
+    fields = _seat_fields(bag)
     try:
         parse_table(HuskyParams, {k: list(v) if isinstance(v, tuple) else v for k, v in fields.items()}, str(path))
     except InputError:
         return None
+    return bag.seat
+
+
+def _write_seat(path: Path, bag: BagContents) -> None:
+    """Writes `robot.toml` with the camera's extrinsics in a bag, unless the file exists."""
     if not exists(path):
         comment = f"The camera's pose on the robot is that of {bag.topics['transforms']} in {bag.path.name}."
-        write_text(path, toml_text(comment, {}, {name: (value, None) for name, value in fields.items()}))
-    return bag.seat
+        write_text(path, toml_text(comment, {}, {name: (value, None) for name, value in _seat_fields(bag).items()}))
 
 
 def _short(way: float, needed: float) -> str:

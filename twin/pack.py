@@ -133,8 +133,14 @@ def _scene_toml(scene: SceneDir, name: str) -> bytes:
     """`scene.toml` without comments and without the folders of its films."""
     table = read_toml(scene.config_file)
     for source in table.get("source", ()):
-        source |= {key: PurePath(source[key]).name for key in ("path", "images", "mask") if source.get(key)}
+        source |= {key: _last_part(source[key]) for key in ("path", "images", "mask") if source.get(key)}
     return _toml({"name": name} | table)
+
+
+def _last_part(path: str) -> str:
+    """The last part of a path; `unpack` refuses `..`."""
+    name = PurePath(path).name
+    return "input" if name in ("", "..") else name
 
 
 def _toml(table: dict[str, Any]) -> bytes:

@@ -314,7 +314,7 @@ def relight(
     from twin.nerf.baked import BakedField
     from twin.nerf.field import RadianceField
 
-    for stage in ("capture", "cameras", "metric"):
+    for stage in ("capture", "cameras", "metric", "field"):
         require_stage(scene, stage)
     field = RadianceField.load(scene.stage("field"))
     check_new_name(name, field.lightings)

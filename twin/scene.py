@@ -262,6 +262,11 @@ def write_stamp(folder: Path, stage: str, depends: dict[str, Any] | None = None,
 
 
 @lru_cache(maxsize=64)
+def _read_once(folder: Path, _stamped: tuple[int, int]) -> Stamp:
+    return Stamp._read(folder)
+
+
+@lru_cache(maxsize=64)
 def _verified_once(folder: Path, _stamped: tuple[int, int]) -> Stamp:
     return Stamp.verified(folder, MAX_HASHED)
 
@@ -292,11 +297,15 @@ def require_stage(scene: SceneDir, stage: str) -> Path:
 
 def _check_upstream(scene: SceneDir, stage: str, stamp: Stamp) -> None:
     """Raises InputError if the stages on which a stage depends are not those from which it was built."""
-    for name, result in stamp.depends.get("upstream", {}).items():
-        folder = scene.stage(name)
-        if not (folder / "stamp.json").exists():
+    order = list(STAGE_FOLDERS)
+    for name in order[: order.index(stage)]:
+        path = scene.stage(name).resolve() / "stamp.json"
+        with wrap_read_errors(scene.stage(stage) / "stamp.json", _cure(scene.stage(stage))):
+            result = dict(stamp.depends.get("upstream", {})).get(name)
+        if result is None or not path.exists():
             continue
-        upstream = Stamp._read(folder)
+        facts = regular_file(path).stat()
+        upstream = _read_once(path.parent, (facts.st_mtime_ns, facts.st_size))
         if upstream.result != result:
             raise InputError(
                 f"{scene.root}: {STAGE_FOLDERS[stage]} was built from an earlier {STAGE_FOLDERS[name]}, as after an "
@@ -306,7 +315,7 @@ def _check_upstream(scene: SceneDir, stage: str, stamp: Stamp) -> None:
 
 
 def stage_result(scene: SceneDir, stage: str) -> str:
-    """Content digest of a built stage. Raises InputError as `require_stage` does."""
+    """Content digest of a built stage. Raises InputError: the stage has not been built, or it is damaged."""
     return _verified_stamp(scene, stage).result
 
 

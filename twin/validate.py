@@ -33,7 +33,16 @@ from twin.evaluation.trials import (
     typical_episode,
     worst_episode,
 )
-from twin.files import digest_file, digest_json, read_json, wrap_read_errors, write_bytes, write_json, write_text
+from twin.files import (
+    digest_file,
+    digest_json,
+    read_json,
+    require_text,
+    wrap_read_errors,
+    write_bytes,
+    write_json,
+    write_text,
+)
 from twin.learn.policy import JSON, find_policy, load_policy
 from twin.learn.policy_evaluation import CHUNK, EpisodeChunk, EpisodeResult, run_chunks, run_chunks_on_ray
 from twin.loading import Twin, load_writable
@@ -269,10 +278,12 @@ def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], p
     """
     path = folder / "validated.json"
     recorded: dict[str, Any] = {"roads": {}, "policies": {}, "sources": {}}
+    before: dict[str, Path] = {}
     if path.exists():
         with wrap_read_errors(path, f"move {folder} away to validate again"):
             stored = dict(read_json(path))
             recorded |= {name: dict(stored[name]) for name in recorded if name in stored}
+            before = {name: twin.scene.root / require_text(one) for name, one in recorded["sources"].items()}
     trials = [*_read_table(folder / "episodes.csv"), *_read_table(folder / "worst.csv")]
     driven = {_road(t.task, t.lighting): (t.task, t.lighting) for t in trials}
     for road, (of, lighting) in (driven | {_road(task, one): (task, one) for one in lightings}).items():
@@ -289,16 +300,19 @@ def _check_same(folder: Path, twin: Twin, task: str, lightings: Sequence[str], p
             )
         recorded["roads"][road] = digest
     driven_by = {t.policy for t in trials}
-    before = {name: one for name, one in recorded["sources"].items() if name in driven_by and Path(one).exists()}
-    for name, source in (before | policies).items():
+    others = {name: str(one) for name, one in before.items() if name not in policies and one.exists()}
+    for name, source in (others | policies).items():
         digest = _digest(source)
         if name in driven_by and recorded["policies"].get(name) != digest:
+            instead = ", or copy the policy to another name" if name in policies else " to validate again"
             raise InputError(
-                f"policy {name!r}: {source} is not the file that was validated under this name; move {folder} away, or "
-                "copy the policy to another name"
+                f"policy {name!r}: {source} is not the file that was validated under this name; move {folder} away"
+                + instead
             )
         recorded["policies"][name] = digest
-    recorded["sources"] |= policies
+    root = twin.scene.root.resolve()
+    inside = {name: Path(one) for name, one in policies.items() if Path(one).is_relative_to(root)}
+    recorded["sources"] |= {name: path.relative_to(root).as_posix() for name, path in inside.items()}
     folder.mkdir(parents=True, exist_ok=True)
     write_json(path, recorded)
 

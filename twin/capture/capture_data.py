@@ -177,7 +177,7 @@ class SourceTask:
         if self.masks and unmasked == count:
             raise InputError(
                 f"{self.masks}: no mask here is named like a frame; "
-                "call them 000012.png (frame of the film, from 0) or like the photo"
+                "call them 000012.png (frame of the film, from 0) or like the photo, in a subfolder like its own"
             )
         if self.masks and unmasked:
             runtime.log_line(f"  {self.masks.name}: {unmasked} of {count} frames have no mask and are used whole")

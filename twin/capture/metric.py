@@ -84,7 +84,8 @@ def run(scene: SceneDir, config: SceneConfig, out: Path) -> dict[str, Any]:
         )
     cameras.save(out)
     points.save(out)
-    metrics = _metrics(cameras, points, " + ".join(scales), scale, up, road, floor_source, similarity)
+    stated = {name: heights[name] or given.camera_height for name in dict.fromkeys(cameras.sources)}
+    metrics = _metrics(cameras, points, " + ".join(scales), scale, up, road, floor_source, similarity, stated)
     write_json(out / "metric.json", metrics)
     return metrics
 
@@ -153,9 +154,10 @@ def _metrics(
     road: Road | None,
     floor_source: str,
     similarity: Similarity,
+    stated: dict[str, float],
 ) -> dict[str, Any]:
     heights = cameras.positions[:, 2]
-    apart: dict[str, float] = {}
+    apart = _different_heights(np.array([stated[name] for name in cameras.sources]), cameras.sources)
     if road is not None and road.reliable:
         z_up = np.array([0.0, 0.0, 1.0])
         local = heights_above_road(points.xyz[road.points], cameras.positions, z_up, road.drop * scale.value)

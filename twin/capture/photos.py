@@ -7,8 +7,9 @@ rotated by its EXIF orientation. A focal length *prior* comes from the header; s
 import hashlib
 import itertools
 import math
+import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
@@ -173,7 +174,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
             f"  {task.name}: {limit} of {len(available)} images are kept, as capture.max_frames = {limit}; raise it if "
             "they are more than 2 m apart, as on a long road"
         )
-    names = Counter(path.stem for path in images.paths)
+    mask_names = _mask_names(images.paths)
     index: list[int] = []
     gps: list[tuple[float, float, float]] = []
     clock: list[float | None] = []
@@ -205,7 +206,7 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
             blank += 1
             continue
         own = images.masks[i] if images.masks and not task.masks else None
-        mask = read_mask(own, *size) if own else task.mask(_mask_names(path, names[path.stem] > 1), *size)
+        mask = read_mask(own, *size) if own else task.mask(mask_names[i], *size)
         unmasked += mask is None
         if lenses and images.camera_to_world is not None:
             lens = lenses[i].scaled(*size)
@@ -250,10 +251,18 @@ def read_photos(task: SourceTask, images: ImageSet) -> KeptFrames:
     return KeptFrames(info, index, photo_times(clock, index), gps, metrics, poses, intrinsics)
 
 
-def _mask_names(path: Path, several: bool) -> tuple[str, ...]:
-    """Names of an image's mask in a folder of masks, the best first; `several` images have the name, in subfolders."""
-    below = f"{path.parent.name}/"
-    return (below + path.stem, below + path.name, *(() if several else (path.stem, path.name)))
+def _mask_names(paths: Sequence[Path]) -> list[tuple[str, ...]]:
+    """Names that each image's mask may have in a folder of masks, the best first.
+
+    They are relative to the images' common folder; without subfolders only if no other subfolder has such an image.
+    """
+    top = Path(os.path.commonpath([path.parent for path in paths]))
+    folders = Counter(stem for _, stem in {(path.parent, path.stem) for path in paths})
+    below = [path.relative_to(top) for path in paths]
+    return [
+        (one.with_suffix("").as_posix(), one.as_posix(), *((one.stem, one.name) if folders[one.stem] == 1 else ()))
+        for one in below
+    ]
 
 
 def _load_ahead(

@@ -29,7 +29,7 @@ from twin.env.obstacles import EpisodeObstacles, add_obstacles
 from twin.env.options import CPU, NERF, Options, parse_options, state_size
 from twin.env.physics import camera_pose
 from twin.env.route_segments import RouteSegment, find_task
-from twin.env.task import DrivePhysics, DriveTask, RewardAndTermination, control
+from twin.env.task import EPISODE_VERSION, DrivePhysics, DriveTask, RewardAndTermination, control
 from twin.env.trust import Trust
 from twin.errors import InputError
 from twin.files import digest_file, digest_json
@@ -84,7 +84,9 @@ class EnvFactory:
         beside = round(parsed.randomise.bystanders[1]) if parsed.randomise else 0
         half_width = parsed.half_width or world.half_width
         obstacles = EpisodeObstacles(wanted, dataclasses.replace(world, half_width=half_width), segment, beside)
-        spec = episode_spec(world, segment.start, segment.end, half_width)
+        # How far a robot may get that turns around and drives back.
+        back = parsed.speed * (parsed.time_limit or 2.0 * (segment.end - segment.start) / parsed.speed)
+        spec = episode_spec(world, max(0.0, segment.start - back), segment.end, half_width)
         add_obstacles(spec, obstacles.pool, world)
         trust = Trust(twin.cameras()) if parsed.pixels else None
         field = twin.field(parsed.device) if parsed.pixels and parsed.observe == NERF else None
@@ -154,6 +156,7 @@ def fingerprint(twin: Twin, task: str, condition: Condition) -> str:
             "stages": [stage_result(twin.scene, factory) for factory in ("field", "mjcf")],
             "stretch": _without_route(segment),
             "obstacles": [_without_route(one) for one in config.obstacle if one.route == segment.route],
+            "episodes": EPISODE_VERSION,
             **({"randomise": randomization} if randomization else {}),
             **({"lights": episode_lighting.VERSION} if condition.lighting in (TRAINING, HELD_OUT) else {}),
             "photos": [digest_file(path) for path in photos],
@@ -244,8 +247,7 @@ def episode_spec(world: World, start: float, end: float, half_width: float) -> m
     An episode ends when the robot leaves the corridor, so the robot never touches collision parts beyond its reach.
     The model lacks these parts. This changes no result, but saves a fifth of the physics' time and most of its memory.
     """
-    behind = max(0.0, start - 2.0 * (end - start))  # a robot that turns around gets no farther in the usual time limit
-    line = cKDTree(point_at(world.route[:, :2], np.arange(behind, end + 0.1, 0.1)))
+    line = cKDTree(point_at(world.route[:, :2], np.arange(start, end + 0.1, 0.1)))
 
     def within_reach(part: str) -> bool:
         center, radius = _bounding_sphere(world.folder / "assets" / f"{part}.obj")

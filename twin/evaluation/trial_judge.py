@@ -150,7 +150,6 @@ def view(
         seen.append(robot.camera_to_world)
     real = [one / np.float32(255.0) for one in pictures]
     intrinsics = np.array(camera.intrinsics)
-
     rays = unproject(pixel_grid(*camera.size), intrinsics)
 
     def render(i: int, name: str) -> Rendering:

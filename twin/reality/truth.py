@@ -37,7 +37,7 @@ from twin.reality.place_spec import FREE_HALF_WIDTH
 from twin.reality.sampled_place import build_number
 from twin.reality.sampled_road import SampledRoad
 from twin.reality.side_roads import SideLine
-from twin.scene import SceneDir, stage_result
+from twin.scene import SceneDir, require_stage, stage_result
 from twin.types import Array
 
 HALF_WIDTH = FREE_HALF_WIDTH  # [m] half width of the free corridor around the route
@@ -216,6 +216,7 @@ def compare(scene: SceneDir) -> dict[str, Any]:
     """
     if not (scene.truth / "truth.npz").exists():
         raise InputError(f"{scene.root} has no truth; only scenes of `twin reality film` have one")
+    require_stage(scene, "mesh")  # which is of the same build as the others
     of = {stage: stage_result(scene, stage) for stage in ("metric", "field", "mesh")}
     compared = {"of": of, **measure(scene)}
     write_json(scene.truth_json, compared)
