@@ -15,7 +15,7 @@
 - drive: drives every policy in the simulated reality, on each day, on the task that the twin exported.
 
 WORK holds the scenes (5 GB a place). After a kill, or at the end of `--minutes`, the same command continues. A place of
-60 m takes seven to nine hours on two cores. No recorded row is removed. A place that cannot be filmed, built or trained
+70 m takes about three hours on two cores. No recorded row is removed. A place that cannot be filmed, built or trained
 is recorded as failed, and the next place begins.
 """
 
