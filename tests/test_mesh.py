@@ -1,6 +1,7 @@
 """The mesh stage on a known place: a road, a wall, a post, and a crate that reaches into the corridor."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -130,15 +131,19 @@ def test_pieces_do_not_end_at_borders_of_sections(stood, monkeypatch):
         np.testing.assert_array_equal(a.faces, b.faces)
 
 
-@pytest.mark.parametrize("half_width", [1.0, 14.0])
-def test_a_wide_corridor_leaves_what_stands_beside_it(stood, half_width):
-    """The columns farther than the corridor's reach are kept, however wide it is."""
-    views, ground, _, path, box = stood
-    corridor = Corridor((path + np.array([0.0, -40.0]),), half_width)
-    solid = mesh._fuse_sections(views, ground, corridor, path, box, SETTINGS)[1]
-    alone = mesh._fuse_sections(views, ground, None, path, box, SETTINGS)[1]
-    np.testing.assert_array_equal(solid.index, alone.index)
-    np.testing.assert_array_equal(solid.field, alone.field)
+@pytest.mark.parametrize("reach", [1.0, 10.5])
+def test_a_wide_corridor_leaves_what_stands_beside_it(stood, reach):
+    """The crate is 13 m away from this line across the place, so it stays."""
+    views, ground, _, _, box = stood
+    line = np.stack([np.full(30, -4.4), np.linspace(-4.4, 4.4, 30)], -1)
+    settings = replace(SETTINGS, margin=40.0)
+    found = [
+        mesh._fuse_sections(views, ground, one, line, box, settings)[1] for one in (Corridor((line,), reach), None)
+    ]
+    beside = [box[0, 0] + SETTINGS.voxel * solid.index[:, 0] > 8.4 for solid in found]
+    assert beside[1].sum() > 100
+    for name in ("index", "field"):
+        np.testing.assert_array_equal(*(getattr(one, name)[of] for one, of in zip(found, beside, strict=True)))
 
 
 def test_components_touch_at_corners_and_are_numbered_by_their_first_voxels():
