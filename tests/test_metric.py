@@ -167,6 +167,8 @@ def test_sources_carried_at_different_heights_agree(tmp_path: Path) -> None:
     few = _points(high, np.random.default_rng(0), on_road=12)[:12]  # heights cannot be measured; the given ones differ
     sparse = _world(tmp_path / "few", [low, high], few, _similarity(1), heights=(0.6, 1.5)).run(tmp_path / "out_few")
     assert not sparse["road_reliable"] and sparse["camera_height_m_of"] == {"film0": 0.6, "film1": 1.5}
+    half = _world(tmp_path / "half", [low, high], few, _similarity(1), heights=(0.0, 1.5)).run(tmp_path / "out_half")
+    assert "camera_height_m_of" not in half  # that of the first film is not known
 
 
 def test_a_height_of_a_film_that_was_not_placed_is_refused(tmp_path: Path) -> None:

@@ -240,6 +240,10 @@ def test_an_unpacked_scene_drives_by_no_other_policy_than_its_own(packed, tmp_pa
     manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"policies": [name]}))
     assert unpack.packed_policies(tmp_path / "there") == []
     assert chosen_policy(twin.load_scene(tmp_path / "there"), None) == "ahead"  # its only run
+    for damaged in ("{}", "[]", '{"policies": 5}', '{"policies": [5]}'):
+        manifest.write_text(damaged)
+        with pytest.raises(InputError, match=r"pack\.json is damaged"):
+            unpack.packed_policies(tmp_path / "there")
 
 
 def test_drive_films_a_pack_by_its_name(packed, tmp_path, monkeypatch, capsys):

@@ -431,7 +431,10 @@ def packed_policies(root: Path) -> list[str]:
 
     Only names of files in the scene: another name, such as `module:function`, would run code.
     """
-    names = map(str, read_json(root / PACK_JSON)["policies"]) if (root / PACK_JSON).exists() else ()
+    path, names = root / PACK_JSON, []
+    if path.exists():
+        with wrap_read_errors(path, _CURE):
+            names = list(map(require_text, read_json(path)["policies"]))
     files = {name: _policy_file(name) for name in names}
     return [name for name, file in files.items() if PLACES.fullmatch(file) and (root / file).is_file()]
 

@@ -157,7 +157,7 @@ def _metrics(
     stated: dict[str, float],
 ) -> dict[str, Any]:
     heights = cameras.positions[:, 2]
-    apart = _different_heights(np.array([stated[name] for name in cameras.sources]), cameras.sources)
+    apart = _different_heights(np.array([stated[name] or np.nan for name in cameras.sources]), cameras.sources)
     if road is not None and road.reliable:
         z_up = np.array([0.0, 0.0, 1.0])
         local = heights_above_road(points.xyz[road.points], cameras.positions, z_up, road.drop * scale.value)
@@ -194,5 +194,5 @@ def _different_heights(local: Array, sources: tuple[str, ...]) -> dict[str, floa
     names = np.array(sources)
     of = {name: local[(names == name) & np.isfinite(local)] for name in dict.fromkeys(sources)}
     found = {name: float(np.median(heights)) for name, heights in of.items() if len(heights)}
-    differ = max(found.values()) - min(found.values()) > _SAME_HEIGHT * np.median(list(found.values()))
-    return found if differ else {}
+    values = np.array(list(found.values()))
+    return found if len(found) > 1 and np.ptp(values) > _SAME_HEIGHT * np.median(values) else {}
