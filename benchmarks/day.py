@@ -73,12 +73,14 @@ def ratios(gaps: list[NDArray], randomised: list[NDArray], rng: np.random.Genera
     Args:
         gaps: Steering changes between twin and truth, (days, stations) per policy.
         randomised: Steering changes under randomized weather, (samples, stations) per policy.
+            Sample k belongs to day k modulo the number of days.
         rng: Resamples policies and days for a bootstrap, if given.
     """
     policies = np.arange(len(gaps))
-    days, others = np.arange(len(gaps[0])), np.arange(len(randomised[0]))
+    days, draws = np.arange(len(gaps[0])), np.arange(0, len(randomised[0]), len(gaps[0]))
     if rng:
-        policies, days, others = (rng.choice(one, len(one)) for one in (policies, days, others))
+        policies, days = (rng.choice(one, len(one)) for one in (policies, days))
+    others = (draws[:, None] + days).ravel()  # samples of one day share its rendering
     log_ratios = [np.log(lasting_and_local(gaps[k][days]) / lasting_and_local(randomised[k][others])) for k in policies]
     return np.exp(np.mean(log_ratios, 0))
 

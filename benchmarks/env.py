@@ -23,11 +23,6 @@ TARGETS: dict[str, tuple[str, float]] = {
     "driver.success.right_turn": ("≥", 0.99),
     "audit.false_successes": ("≤", 0.0),
     "soak.growth_bytes": ("≤", 32 * 2**20),
-    "seen_touched.median_m": ("≤", 0.05),
-    "overlay.obstacle_psnr.sun": ("≥", 18.0),
-    "overlay.obstacle_psnr.overcast": ("≥", 18.0),
-    "overlay.obstacle_psnr.night": ("≥", 18.0),
-    "overlay.mask_iou": ("≥", 0.9),
     "gpu.steps_per_s": ("≥", 10_000.0),
 }
 """Figure → comparison and target."""

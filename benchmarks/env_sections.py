@@ -106,23 +106,6 @@ def trust(scene: Path, quick: bool) -> dict[str, Any]:
     return worker("trust", scene, cores=2)
 
 
-def overlay(scene: Path, quick: bool) -> dict[str, Any]:
-    """Compares obstacles in the twin's images with those in the true world (`overlay.py`); needs the truth."""
-    from overlay import KINDS, round_trip
-
-    return round_trip(scene, None, KINDS[:1] if quick else KINDS)
-
-
-def visual_vs_collision(scene: Path, quick: bool) -> dict[str, Any]:
-    """Compares visual with collision geometry (`twin.report.visual_vs_collision`), from the last build's report."""
-    from twin.loading import load_scene
-
-    found = load_scene(scene).report().get("seen_touched")
-    if not found:
-        return {"seen_touched.median_m": None}
-    return {f"seen_touched.{name}": value for name, value in found.items() if isinstance(value, int | float)}
-
-
 def gpu(scene: Path, quick: bool) -> dict[str, Any]:
     """Steps per second of 1024 environments on one GPU, with images that stay on it for torch."""
     import warp
@@ -144,8 +127,6 @@ SECTIONS: dict[str, Callable[[Path, bool], dict[str, Any]]] = {
     "audit": audit,
     "soak": soak,
     "trust": trust,
-    "overlay": overlay,
-    "seen_touched": visual_vs_collision,
     "host": host,
     "gpu": gpu,
 }

@@ -147,7 +147,8 @@ def _bake(bench: Bench, field: Any) -> tuple[Any, Figures, float]:
     pixels = TrainingPixels(cameras, points, config.nerf.max_width)
     wp.load_module("twin.nerf.kernels.bricks", device=field.device)
     began = time.perf_counter()
-    baked, report = run(field, pixels, config.seed, **bench.pick({}, {"steps": 5, "max_bricks": 1500}))
+    size = {"steps": config.nerf.bake_steps, "max_bricks": config.nerf.max_bricks}  # as a build, but for its detail
+    baked, report = run(field, pixels, config.seed, **bench.pick(size, {"steps": 5, "max_bricks": 1500}))
     seconds = time.perf_counter() - began
     folder = bench.work / "baked"
     folder.mkdir(exist_ok=True)

@@ -1,7 +1,10 @@
-"""Draws the picture of the Husky, `twin/assets/husky/husky.png`, with the ray caster of the environments.
+"""Draws the picture of the Husky with the ray caster of the environments.
 
-python benchmarks/husky_picture.py
+python benchmarks/husky_picture.py twin/assets/husky/husky.png
 """
+
+import argparse
+from pathlib import Path
 
 import cv2
 import mujoco
@@ -19,6 +22,9 @@ _EYE, _TARGET = (1.5, -1.25, 0.95), (0.0, 0.02, 0.2)  # [m]
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    out = parser.parse_args().out
     model = mujoco.MjModel.from_xml_path(str(HUSKY_SCENE_XML))
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 500)
@@ -34,7 +40,7 @@ def main() -> None:
     intrinsics = np.array([focal, focal, width / 2, height / 2])
     caster.set_rays(mujoco_rays(unproject(pixel_grid(width, height), intrinsics)))
     rgb = cv2.resize(caster.cast()[0].reshape(height, width, 3), _SIZE, interpolation=cv2.INTER_AREA)
-    write_image(HUSKY_SCENE_XML.with_name("husky.png"), np.rint(rgb).astype(np.uint8))
+    write_image(out, np.rint(rgb).astype(np.uint8))
 
 
 if __name__ == "__main__":

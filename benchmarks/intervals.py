@@ -19,10 +19,7 @@ An interval must contain its *estimand* in 90 % of the worlds. The estimands are
   other trainings, days and trials, at the same place or, if the shape has several places, at other places.
 - policy: a policy's rate on the road over all days of this kind; coverage is averaged over the policies. *policy,
   middling*: the same, only for policies whose rate is between 0.1 and 0.9.
-- setup: the rate on the road of a setup's finished policies, over all trainings and days of the kind. If the shape has
-  several places, the rate is also over all places, and the units of the interval are the places.
-- setup, these trainings: the rate over all days of the finished policies that drove (`rate_over_days`), at one place.
-- setups' difference: the difference of two setups' rates, from pairs of trainings at one place, or from several places.
+- setup over days: the rate over all days of the finished policies of a setup (`rate_over_days`), at one place.
 - twin: a policy's rate in the twin over all days of this kind.
 - predicted: the observed real rate of a policy, predicted from its rate in the twin and from the other trainings.
 - with `--better-by`: how much better the twin's log score of single days is than a baseline's, on average over worlds.
@@ -40,7 +37,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from place_intervals import mean_difference_interval, place_interval, rate_over_days
+from place_intervals import place_interval, rate_over_days
 from record import record_parser, save
 from scipy.special import expit
 from scipy.stats import norm
@@ -65,7 +62,6 @@ _BATCH = 250  # worlds simulated together
 _RATE_WORLDS = 250  # of `WORLDS`, in which rates are estimated for more than `_USERS_POLICIES` policies
 _USERS_POLICIES = 10
 _LEAST_DAYS = 3  # days below which `better_by` is not measured
-_MIN_SETUP_TRAININGS = 4  # trainings below which the rate of a training setup has no interval
 _QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)
 
 
@@ -211,12 +207,6 @@ def _rate(sharpness: float, quality: np.ndarray, std: float) -> np.ndarray:
     return out / len(_QUANTILES)
 
 
-def setup_rate(kind: Kind, shape: Shape, setup: int) -> float:
-    """True rate on the road of a setup's finished policies over all trainings, days and, if several, places."""
-    std = np.sqrt(kind.training**2 + kind.day**2 + kind.cell**2 + (kind.place**2 if shape.places > 1 else 0.0))
-    return float(_rate(kind.sharpness, np.array([kind.setups[setup]]), float(std))[0])
-
-
 # ---- coverage
 
 Hits = dict[str, np.ndarray]
@@ -260,7 +250,7 @@ def expected(kind: Kind, shape: Shape, rng: np.random.Generator) -> dict[str, fl
 def holds(worlds: Worlds, truth: dict[str, float]) -> Hits:
     several = worlds.shape.places > 1
     agreement = _over_places(worlds, truth) if several else _at_one_place(worlds, truth)
-    return agreement | _rates(worlds) | _setups(worlds) | ({} if several else _predicted(worlds))
+    return agreement | _rates(worlds) | _over_days(worlds) | ({} if several else _predicted(worlds))
 
 
 def _hit(ends: Callable[[], tuple[Any, ...]], aim: float | np.ndarray, count: int) -> np.ndarray:
@@ -316,40 +306,18 @@ def _mean_or_nan(values: np.ndarray) -> np.ndarray:
     return np.where(count > 0, np.nansum(values, -1) / np.maximum(count, 1), np.nan)
 
 
-def _setups(worlds: Worlds) -> Hits:
-    """Hits of the intervals for rates of setups, and for differences of two setups."""
+def _over_days(worlds: Worlds) -> Hits:
+    """Hits of `rate_over_days` for the finished policies of each setup, at one place."""
     shape, done = worlds.shape, worlds.finished
-    setups = worlds.setup[0, 0, done]
-    aims = [setup_rate(worlds.kind, shape, setup) for setup in range(3)]
-    rate, difference, own = np.full((3, len(worlds.real), 3), np.nan)
-    true = worlds.policy_rates()[:, :, done]
-    rows = [worlds.real[:, :, done][:, :, setups == setup] for setup in range(3)]  # (worlds, places, trainings, days)
-    count = rows[0].shape[1] * rows[0].shape[2]
-    if not shape.setups or count < _MIN_SETUP_TRAININGS:
-        return {"setup": rate.mean(1), "setup, these trainings": own.mean(1), "setups' difference": difference.mean(1)}
-    for i in range(_counted(worlds)):
-        mine = [row[i].reshape(count, shape.days) for row in rows]
-        units = [row[i].sum(1) if shape.places > 1 else row[i, 0] for row in rows]
-        trials = shape.trials * (rows[0].shape[2] if shape.places > 1 else 1)
-        for setup, won in enumerate(mine):
-            low, high = RateModel.fit(units[setup], np.full(units[setup].shape, trials)).mean_interval()
-            rate[i, setup] = low <= aims[setup] <= high
-            if shape.places == 1:
-                _, low, high = rate_over_days(won.mean(0) / shape.trials)
-                own[i, setup] = low <= true[i, 0, setups == setup].mean() <= high
-        for k, (one, other) in enumerate(((0, 1), (0, 2), (1, 2))):
-            each = ((mine[one] - mine[other]) / shape.trials).mean(-1)
-            each = each.reshape(shape.places, -1).mean(-1) if shape.places > 1 else each
-            try:
-                _, low, high = mean_difference_interval(each)
-            except UndefinedStatistic:
-                continue
-            difference[i, k] = low <= aims[one] - aims[other] <= high
-    return {
-        "setup": rate.mean(1),
-        "setup, these trainings": own.mean(1),
-        "setups' difference": _mean_or_nan(difference),
-    }
+    if not shape.setups or shape.places > 1:
+        return {"setup over days": np.full(len(worlds.real), np.nan)}
+    won, true, setups = worlds.real[:, 0, done], worlds.policy_rates()[:, 0, done], worlds.setup[0, 0, done]
+    hit = np.full((_counted(worlds), 3), np.nan)
+    for i in range(len(hit)):
+        for setup in range(3):
+            _, low, high = rate_over_days(won[i, setups == setup].mean(0) / shape.trials)
+            hit[i, setup] = low <= true[i, setups == setup].mean() <= high
+    return {"setup over days": hit.mean(1)}
 
 
 def _predicted(worlds: Worlds) -> Hits:

@@ -1,7 +1,8 @@
 """Records of benchmark figures: JSON files that are not overwritten by a record with fewer entries.
 
-Entries of a record are the members of its nested objects, and the items of lists of objects (runs, policies, rows). A
-number of `trials` must not decrease; other plain values may change. JSON has no NaN and no infinity: these become null.
+Entries of a record are the members of its nested objects, and the items of lists of objects (runs, policies, rows).
+Numbers of samples (`_SIZES`) must not decrease, and `quick` must not become true; other plain values may change. JSON
+has no NaN and no infinity: these become null. Numbers are rounded to 9 digits, more than libraries agree on.
 """
 
 import argparse
@@ -15,6 +16,8 @@ from twin.files import read_json, write_json
 
 _NAMES = ("id", "quantity", "task", "setup", "seed", "policy", "name")
 """Members that identify an object in a list."""
+_SIZES = ("trials", "worlds", "experiments", "pictures")
+"""Members that count samples."""
 _LISTED = 4
 """Number of missing entries that an error names."""
 
@@ -54,7 +57,8 @@ def _lost_member(old: dict[str, Any], new: dict[str, Any], key: str, where: str)
     name, before, now = f"{where}.{key}".lstrip("."), old[key], new.get(key)
     if key not in new or (now is None and before is not None):
         return [name]
-    if key == "trials" and isinstance(before, int) and isinstance(now, int) and now < before:
+    fewer = key in _SIZES and isinstance(before, int) and isinstance(now, int) and now < before
+    if fewer or (key == "quick" and now is True and before is False):
         return [f"{name} ({now} instead of {before})"]
     return lost(before, now, name)
 
@@ -135,4 +139,6 @@ def _finite(value: Any) -> Any:
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.9g}") if math.isfinite(value) else None

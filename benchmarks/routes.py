@@ -30,6 +30,7 @@ KINDS = (
 )
 _DENSE = 0.05  # [m] between points of a line
 _MAX_OFF, _MAX_STEP, _MAX_TURN = 0.3, 0.3, 120.0  # [m], [m], [°]
+_MIN_LENGTH = 0.9  # of the filmed line
 
 
 @dataclass(frozen=True)
@@ -218,6 +219,7 @@ def main() -> int:
             print(f"{number:6} {filming.kind:28} refused: {error}")
             continue
         wrong = row["off"] > _MAX_OFF or row["step"] > _MAX_STEP or row["turn"] > _MAX_TURN
+        wrong = wrong or row["length"] < _MIN_LENGTH
         bad += wrong
         figures = f"{row['off']:8.2f} {row['step']:9.2f} {row['turn']:9.0f} {row['length']:7.2f}"
         print(f"{number:6} {filming.kind:28} {figures}{'  WRONG' if wrong else ''}")

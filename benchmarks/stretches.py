@@ -57,7 +57,7 @@ def segment(stretch: int, route: float) -> tuple[float, float]:
     """Start and length [m] of a stretch on a route of this length [m]."""
     part, where = np.random.default_rng([FIRST, stretch]).random(2)
     length = min(LENGTHS[0] + part * (LENGTHS[1] - LENGTHS[0]), route)
-    return round(where * (route - length), 1), float(np.floor(length * 10) / 10)
+    return round(float(where * (route - length)), 1), float(np.floor(length * 10) / 10)
 
 
 def measure(stretch: int, work: Path) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from twin.geometry.images import write_image
 from twin.nerf.baked import BakedField
 from twin.nerf.evaluate import evaluate
 from twin.nerf.field import RadianceField
-from twin.reality.truth import Truth, align_poses, corridor, load_parts, matched_poses
+from twin.reality.truth import Truth, align_poses, intrudes, load_parts, matched_poses
 from twin.scene import SceneDir
 
 _GHOST_HEIGHT = 0.10  # [m] above the true ground
@@ -76,15 +76,8 @@ def ghosts(scene: SceneDir) -> dict[str, float]:
     inside = (station > truth.start) & (station < truth.start + truth.length) & (np.abs(lateral) < truth.half_width)
     ghost = inside & (height > _GHOST_HEIGHT) & (height < _HEAD_ROOM)
     cells = np.unique(np.floor(np.stack([station, lateral], 1)[ghost] / _CELL), axis=0)
-    floor = corridor(truth, truth.half_width, _CELL)
-    parts = sum(_stands_on(to_truth.points(v), floor) for v, _ in load_parts(scene.stage("mesh")))
+    parts = sum(intrudes(to_truth.points(v), f, truth) for v, f in load_parts(scene.stage("mesh")))
     return {"cells": len(cells), "height": float(height[ghost].max(initial=0.0)), "parts": parts}
-
-
-def _stands_on(part: np.ndarray, floor: np.ndarray) -> bool:
-    low, high = part.min(0), part.max(0)
-    under = floor[((floor[:, :2] >= low[:2]) & (floor[:, :2] <= high[:2])).all(1)]
-    return len(under) > 0 and bool((high[2] > under[:, 2].max() + _GHOST_HEIGHT) and low[2] < under[:, 2].max() + 1.5)
 
 
 def main() -> int:

@@ -156,7 +156,7 @@ def row(record: Record, days: int, experiments: int, seed: int = 0) -> dict[str,
 
 
 def picture(rows: dict[int, Any]) -> Figure:
-    """Plots of error and of correct choices against the number of real trials, for the middling policies."""
+    """Plots against the number of real trials: error of middling policies' rates, and choices of each task's best."""
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     labels = {
@@ -167,7 +167,8 @@ def picture(rows: dict[int, Any]) -> Figure:
     }
     for way, marker in (("alone", "o"), ("twin", "s"), ("mean", "D"), ("powered", "^")):
         for axes, name in ((left, "rmse"), (right, "best")):
-            values = [100 * rows[days]["middling"][way][name] for days in rows]
+            among = "all" if name == "best" else "middling"
+            values = [100 * rows[days][among][way][name] for days in rows]
             axes.plot([TRIALS * days for days in rows], values, marker=marker, ms=4, lw=1.4, label=labels[way])
     left.set(xlabel="real trials per policy", ylabel="error of a rate, rms [points]", ylim=(0, None))
     right.set(xlabel="real trials per policy", ylabel="best policy chosen [%]", ylim=(0, 104))
@@ -198,7 +199,8 @@ def main() -> int:
             print(f"| {TRIALS * days} on {days} days | {group} | {' | '.join(cells)} |", flush=True)
     if given.picture:
         picture(rows).savefig(given.picture, dpi=130)
-    return save(given.json, {"days": {str(days): value for days, value in rows.items()}}, given.replace_record)
+    found = {"experiments": given.experiments, "days": {str(days): value for days, value in rows.items()}}
+    return save(given.json, found, given.replace_record)
 
 
 if __name__ == "__main__":

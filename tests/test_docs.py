@@ -22,7 +22,8 @@ from twin.learn.policy_network import Architecture
 from twin.learn.train_config import TrainConfig
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([ROOT / "README.md", *(page for page in (ROOT / "docs").glob("*.md") if page.name != "benchmarks.md")])
+BENCHMARKS = ROOT / "docs" / "benchmarks.md"
+PAGES = sorted({ROOT / "README.md", *(ROOT / "docs").glob("*.md")} - {BENCHMARKS})
 _IN_THE_SCENE = {
     "--episodes 20": "--episodes 2",
     '"right_turn"': '"bend"',
@@ -109,13 +110,16 @@ def test_short_commands_run(demo, monkeypatch):
     assert len(ran) >= 2 and len(list((demo / "scenes" / "demo" / "films").glob("*.mp4"))) >= 2
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [*PAGES, BENCHMARKS], ids=lambda page: page.name)
 def test_commands_are_understood(page):
     for words in _commands(page):
         if words[0] == "twin":
             parser_of(words[1]).parse_args(words[2:])
         elif words[0] == "python" and words[1].startswith("benchmarks"):
-            assert (ROOT / words[1]).exists(), words
+            script = ROOT / words[1]
+            sources = [ROOT / "benchmarks" / "record.py", *([script] if script.is_file() else script.glob("*.py"))]
+            code = "".join(source.read_text(encoding="utf-8") for source in sources)
+            assert script.exists() and all(f'"{word}"' in code for word in words[2:] if word.startswith("--")), words
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if _blocks(page, "toml")], ids=lambda page: page.name)

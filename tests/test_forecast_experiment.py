@@ -343,6 +343,15 @@ def test_a_twin_that_says_nothing_is_not_better_than_a_baseline(forecast, tmp_pa
     assert found["days"][forecast.place_scores.MEAN]["gain"]["high"] < 0
 
 
+def test_a_twin_without_any_differences_has_no_rank_within_a_place(forecast, tmp_path):
+    protocol = forecast.protocol.read_protocol()
+    _records(forecast, protocol, tmp_path / "all", lambda *_: 0.0)
+    for name in (forecast.place_scores.TWIN, forecast.place_scores.HELD_OUT):
+        none = forecast.place_scores.score(protocol, tmp_path / "all")["ranking"][name]
+        assert none["ranked"] == 6 and none["spearman_within"]["value"] == 0.0
+        assert none["bias"]["value"] == pytest.approx(0.5)  # from ratios of counts: shrunk ones are not 0
+
+
 def test_baselines_do_not_look_at_the_twin_or_at_the_own_place(forecast, tmp_path):
     protocol = forecast.protocol.read_protocol()
     setup, mean = forecast.place_scores.SETUP, forecast.place_scores.MEAN

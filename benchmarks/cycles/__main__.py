@@ -134,6 +134,7 @@ def _repeat(protocol: Protocol, given: argparse.Namespace) -> None:
     """Repeats the drawn trials that are not yet recorded, a day at a time, `--jobs` days at once."""
     end = time.monotonic() + 60.0 * min(given.minutes, 1e6)
     for place in given.places or protocol.places:
+        protocol.check_has(place)
         record = given.results / protocol.name / f"place_{place}"
         if read_place(record, place, protocol) is None:  # a draw from a part of the trials would be another one
             raise InputError(f"{record} is not complete; first run benchmarks/forecast at place {place} to its end")

@@ -315,8 +315,7 @@ def _work(given: argparse.Namespace) -> None:
 def _run(protocol: Protocol, given: argparse.Namespace) -> None:
     places = given.places or protocol.places
     for place in places:
-        if place not in protocol.places:
-            raise InputError(f"--places {place}: the protocol has {', '.join(map(str, protocol.places))}")
+        protocol.check_has(place)
     commands = Commands(given.minutes)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, commands.stop)

@@ -15,6 +15,7 @@ places. Fewer than five places give no intervals.
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +80,7 @@ def _state(folder: Path, record: PlaceRecord | None) -> str:
 
 def _rates(one: PlaceRecord, i: int) -> dict[str, Any]:
     mean, low, high = rate_over_days(_real(one)[i])
-    twin = one.twin[i, :, 0].sum() / one.twin[i, :, 1].sum()
+    twin = (one.twin[i, :, 0] / one.twin[i, :, 1]).mean()  # days have equal weight, as on the road
     return {"real": mean, "low": low, "high": high, "twin": float(twin), "held_out": float(_held_out(one)[i])}
 
 
@@ -126,8 +127,9 @@ def _predicted(places: list[PlaceRecord], one: PlaceRecord, name: str) -> Array:
 
 
 def _cells(places: list[PlaceRecord], one: PlaceRecord, name: str) -> PairedCells:
-    """Predicted and real rates for the rankings. The twin's are ratios of counts, not shrunk as in `_twin`."""
-    predicted = one.twin[..., 0] / one.twin[..., 1] if name == TWIN else _predicted(places, one, name)
+    """Predicted and real rates for the rankings. The twin's are ratios of counts, not shrunk as in `_predicted`."""
+    counted = {TWIN: one.twin[..., 0] / one.twin[..., 1], HELD_OUT: _held_out(one)[:, None]}
+    predicted = np.broadcast_to(counted[name] if name in counted else _predicted(places, one, name), _real(one).shape)
     n, k = predicted.shape
     day = np.broadcast_to(np.arange(k), (n, k))
     return PairedCells(predicted, _real(one), np.ones((n, k)), np.arange(n), day, (np.arange(n),))
@@ -146,17 +148,24 @@ def _ranking(places: list[PlaceRecord], name: str) -> dict[str, Any]:
     if any(np.isnan(one.twin).any() for one in cells):
         return {}
     by_place = {str(one.place): _alone(data) for one, data in zip(places, cells, strict=True)}
-    ranked = [data for data in cells if np.ptp(data.rates()["real"]) > 0 and np.ptp(data.rates()["twin"]) > 0]
+    ranked = [data for data in cells if np.ptp(data.rates()["real"]) > 0]
     out: dict[str, Any] = {"by_place": by_place, "places": len(cells), "ranked": len(ranked)}
     for key, statistic, mine, pooled in (
-        ("spearman_within", "spearman", ranked, False),
-        ("mmrv", "mmrv", cells, False),
-        ("spearman_over_all", "spearman", cells, True),
-        ("bias", "bias", cells, True),
+        ("spearman_within", replace(STATISTICS["spearman"], of=_spearman_within), ranked, False),
+        ("mmrv", STATISTICS["mmrv"], cells, False),
+        ("spearman_over_all", STATISTICS["spearman"], cells, True),
+        ("bias", STATISTICS["bias"], cells, True),
     ):
-        out[key] = _over_places(STATISTICS[statistic], mine, pooled)
+        out[key] = _over_places(statistic, mine, pooled)
     out["regret"] = {"value": float(np.mean([one["regret"] for one in by_place.values()])), "low": None, "high": None}
     return out
+
+
+def _spearman_within(twin: Array, real: Array) -> Array:
+    """Spearman's correlation; 0 where the predictions do not differ but the rates on the road do."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        value = STATISTICS["spearman"].of(twin=twin, real=real)
+    return np.where(np.isnan(value) & (np.ptp(real, -1) > 0), 0.0, value)
 
 
 def _alone(data: PairedCells) -> dict[str, float | None]:

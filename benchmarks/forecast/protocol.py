@@ -33,6 +33,11 @@ class Protocol:
         """Name of the folder of results."""
         return f"version_{self.version}"
 
+    def check_has(self, place: int) -> None:
+        """Raises InputError: this is not a place of the protocol."""
+        if place not in self.places:
+            raise InputError(f"place {place}: the protocol has {', '.join(map(str, self.places))}; choose another one")
+
     def days_of(self, place: int) -> list[str]:
         """Names of the days of trials at a place."""
         return [f"day_{10 * place + k + 1}" for k in range(self.days)]

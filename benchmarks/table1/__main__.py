@@ -1,6 +1,6 @@
 """Replication of table 1 of DriveEnv-NeRF (arXiv 2403.15791) in the simulated reality (`twin reality`).
 
-    python benchmarks/table1 SCENE [--seeds 0 1] [--jobs 2] [--steps train validate photos real forecast]
+    python benchmarks/table1 SCENE [--seeds 0 1] [--jobs 2] [--steps train validate photos real]
 
 Steps, each a command of `twin` that resumes where it was interrupted:
 
@@ -10,20 +10,16 @@ Steps, each a command of `twin` that resumes where it was interrupted:
   policies also with nothing else randomized.
 - photos: drives every policy in the twin under a lighting from one photo of each test day.
 - real: drives every policy in the simulated reality under weather that was not filmed.
-- forecast: forecasts real success, once from held-out lightings, once from the photos.
 
 The defaults are the published plan; the same call with more seeds adds runs. `results.json` beside this file records
 every run. If the new record has fewer runs, policies, days or trials, this file is kept, the new record is written to
 `results.json.partial`, and the command ends with status 2. `--results` gives another file for the record. `plan.py`
-defines setups, sizes and checkpoints. After all steps the command prints the tables of `scores.py`, the paper's table
-and the forecasts. `scores.py` itself needs only `results.json`.
+defines setups, sizes and checkpoints. After all steps the command prints the tables of `scores.py` and the paper's
+table. `scores.py` itself needs only `results.json`.
 """
 
 import argparse
-import csv
-import json
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -31,17 +27,16 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from plan import EPISODES, LIGHTINGS, PHOTO_EPISODES, PHOTOS, SETUPS, STEPS, TASKS, TRIALS, Run, runs
-from results import HELD_OUT_FORECAST, collect, table
+from results import collect, table
 from scores import RESULTS, tables
 
 import twin
-from twin.config import Condition
 from twin.reality.lighting import WEATHER
 
 sys.path.append(str(Path(__file__).parents[1]))
 from record import save
 
-STAGES = ("train", "validate", "photos", "real", "forecast")
+STAGES = ("train", "validate", "photos", "real")
 
 
 def verb(*arguments: str | Path) -> None:
@@ -95,37 +90,6 @@ def real(scene: Path, run: Run) -> None:
     verb("twin.reality", "drive", "--policy", *_policies(scene, run), "--trials", str(TRIALS), *out)
 
 
-def forecast(scene: Path) -> None:
-    """Forecasts from held-out lightings for all policies, then from photos.
-
-    The second forecast has the policies that were validated under the photos' lightings. It replaces the first one, of
-    which `HELD_OUT_FORECAST` keeps a copy.
-    """
-    tables = sorted(path for path in (scene / "real").glob("*_*.csv") if path.stem.split("_")[0] in TASKS)
-    rows = [row for path in tables if not path.stem.endswith("_trials") for row in _rows(path)]
-    _forecast(scene, "results.csv", rows)
-    episodes = _rows(scene / "validation" / "episodes.csv")
-    validated = {(row["policy"], row["task"], row["lighting"]) for row in episodes}
-    by_photo = [row | {"twin_lighting": str(Condition(row["lighting"], True))} for row in rows]
-    by_photo = [row for row in by_photo if (row["policy"], row["task"], row["twin_lighting"]) in validated]
-    if by_photo:
-        shutil.copytree(scene / "forecast", scene / HELD_OUT_FORECAST, dirs_exist_ok=True)
-        _forecast(scene, "by_photo.csv", by_photo)
-
-
-def _forecast(scene: Path, name: str, rows: list[dict[str, str]]) -> None:
-    with (scene / "real" / name).open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    verb("twin.forecast", scene, "--real", scene / "real" / name)
-
-
-def _rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def _policies(scene: Path, run: Run) -> list[Path]:
     return [run.folder(scene), *run.checkpoints(scene)]
 
@@ -157,8 +121,6 @@ def main() -> int:
                 photos(given.scene, task, done, given.jobs)
         if "real" in given.steps:
             list(pool.map(lambda run: real(given.scene, run), done))
-    if "forecast" in given.steps:
-        forecast(given.scene)
     folders = [path for path in (given.scene / "runs").glob("*_*_[0-9]*") if path.is_dir()]
     seeds = sorted({int(path.name.rsplit("_", 1)[1]) for path in folders})
     results = collect(given.scene, runs(seeds, list(TASKS), list(SETUPS)))
@@ -167,10 +129,6 @@ def main() -> int:
         return status
     print(tables(results))
     print(f"\nThe paper's table, over all {len(WEATHER)} weathers\n\n{table(results)}")
-    print("\nForecasts over all weathers; benchmarks/intervals.py measures the coverage of their 90 % intervals")
-    for kind in ("forecast", "forecast_by_photo"):
-        for task, group in results[kind].items():
-            print(kind, task, json.dumps(group))
     return 0
 
 

@@ -15,11 +15,6 @@ from twin.files import read_json
 
 _EVALUATIONS = ("validate", "validate_randomised", "validate_by_photo", "real")
 _BY_DAY = ("validate_by_photo", "real")
-HELD_OUT_FORECAST = "forecast_held_out"
-"""Folder of the forecast from held-out lightings, if the folder `forecast` has the one from photos."""
-FORECAST = (
-    *("pearson", "spearman", "mmrv", "winner_agreement", "winner_regret", "bias", "coverage", "corrected_coverage"),
-)
 
 
 def collect(scene: Path, every: list[Run]) -> dict[str, Any]:
@@ -34,10 +29,7 @@ def collect(scene: Path, every: list[Run]) -> dict[str, Any]:
             | _training(run.folder(scene))
             | {"policies": [_evaluations(name, twin, real) for name in policies]}
         )
-    by_photo = scene / HELD_OUT_FORECAST  # exists if `forecast` is from photos
-    kinds = (by_photo, scene / "forecast") if by_photo.exists() else (scene / "forecast", by_photo)
-    held_out, photo = (_forecast(folder / "forecast.json") for folder in kinds)
-    return {"runs": rows, "forecast": held_out, "forecast_by_photo": photo}
+    return {"runs": rows}
 
 
 def table(results: dict[str, Any]) -> str:
@@ -79,7 +71,8 @@ def _training(folder: Path) -> dict[str, Any]:
     with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
         last = list(csv.DictReader(file))[-1]
     choice = read_json(folder / CHOICE_FILE) if (folder / CHOICE_FILE).exists() else None
-    # The chosen policy's test in the training's lighting; `choice["chosen"]` is its test under held-out lightings.
+    # The test that chose the policy, in the training's lighting, so it is biased upwards; `choice["chosen"]` is the
+    # final test, under held-out lightings.
     tests = {one["step"]: one for one in choice["candidates"]} if choice else {}
     return {
         "steps": int(last["step"]),
@@ -117,14 +110,3 @@ def _rate(successes: list[bool]) -> dict[str, Any]:
 
 def _trials(paths: list[Path]) -> list[Trial]:
     return [trial for path in paths if path.exists() for trial in read_trials(path)]
-
-
-def _forecast(path: Path) -> dict[str, Any]:
-    """Forecast statistics with their intervals, by task."""
-    if not path.exists():
-        return {}
-    return {
-        group["task"]: {"policies": group["policies"], "cells": group["cells"], "missing": group["missing"]}
-        | {name: group[name] for name in FORECAST}
-        for group in read_json(path)["groups"]
-    }

@@ -24,11 +24,10 @@ independent, and the product of their likelihoods is a *composite* likelihood. I
 this power, 90 % intervals from two days had coverages of 0.72 to 0.92. Besides, n − 1 other policies tell less about a
 policy's rate than as many independent ones: their likelihood is raised to the power 1 / (1 + 0.3 (n − 1)), as if the
 outcomes of two policies on one day had a correlation of 0.3. For eight policies on four days of a weather that affects
-all alike, this raises the coverage from 0.71 to 0.83. `sample` and `mean_interval` do not use this power.
+all alike, this raises the coverage from 0.71 to 0.83. `sample` does not use this power.
 
-The estimand of `interval` is the rate over the *population* of days like those driven, and that of `mean_interval` is
-the rate over the population of policies and days. `cell_means` estimates rates on the days that were driven. For the
-coverage of the intervals see `benchmarks/intervals.py`.
+The estimand of `interval` is the rate over the *population* of days like those driven. `cell_means` estimates rates on
+the days that were driven. For the coverage of the intervals see `benchmarks/intervals.py`.
 
 Policies are *ranked* by samples of their rates from the posterior. The probability of a policy's rank is the fraction
 of samples in which the policy has that rank. Results hold for the world, twin or road, in which the trials were driven:
@@ -74,8 +73,6 @@ class RateModel:
     """Likelihood of each policy's cells for each h and ρ, shape (n, h, r)."""
     weight: Array
     """Posterior mass of each h and ρ, shape (h, r)."""
-    means: Array
-    """μ of each h, shape (h,)."""
     correlations: Array
     """Prior mass of each ρ, up to a factor, shape (r,)."""
     power: float
@@ -117,7 +114,7 @@ class RateModel:
         weight = np.exp(log - log.max()) * correlations
         others = max(int((driven.sum(-1) > 0).sum()) - 1, 0)
         power = 1.0 / (1.0 + _SHARED * others) if shared_days else 1.0
-        return RateModel(won, driven, likelihood, prior, evidence, weight / weight.sum(), mean, correlations, power)
+        return RateModel(won, driven, likelihood, prior, evidence, weight / weight.sum(), correlations, power)
 
     def posterior(self) -> Array:
         """Mass of the grid's rates for each policy, shape (n, g)."""
@@ -140,11 +137,6 @@ class RateModel:
         """Ends of the shortest credible interval of each policy's rate over days, shapes (n,)."""
         ends = np.array([_shortest(mass, _EDGES) for mass in self.posterior()])
         return ends[:, 0], ends[:, 1]
-
-    def mean_interval(self) -> tuple[float, float]:
-        """Ends of the shortest credible interval of μ, the rate over the population of policies and days."""
-        mass = np.array([self.weight[self.means == mean].sum() for mean in _MEANS])
-        return _shortest(mass, np.sin(np.pi / 2 * np.arange(len(_MEANS) + 1) / len(_MEANS)) ** 2)
 
     def sample(self, rng: np.random.Generator, samples: int) -> Array:
         """Samples of the policies' rates over days, shape (samples, n), for a model without shared days."""
