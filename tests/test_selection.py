@@ -126,12 +126,12 @@ def test_a_run_ends_when_it_has_learnt_and_its_last_word_is_of_fresh_episodes(sc
     script |= {40: (8, 1.0), 80: (39, 2.0), 120: (40, 1.0)}
     choice = learn(scene, tmp_path, CONFIG)
     assert (choice["steps"], choice["why"], choice["reached"]) == (120, "reached", True)
-    assert [(one["step"], one["trials"]) for one in choice["candidates"]] == [(40, 16), (80, 40), (120, 40)]
+    assert [(one["step"], one["trials"]) for one in choice["candidates"]] == [(40, 20), (80, 40), (120, 40)]
     assert choice["chosen"]["step"] == 120 and choice["chosen"]["trials"] == FRESH_EPISODES
     tested = {seed for _, seeds, _ in asked[:-1] for seed in seeds}
     step, fresh, _ = asked[-1]
     assert step == 120 and len(tested) == 40 and len(fresh) == FRESH_EPISODES and not tested & set(fresh)
-    assert [len(seeds) for at, seeds, _ in asked if at == 40] == [8, 8]  # a test is broken off after three failures
+    assert [len(seeds) for at, seeds, _ in asked if at == 40] == [8, 12]  # a test is broken off after three failures
     for name in ("policy.json", "policy.safetensors", "policy.onnx"):
         assert (tmp_path / name).read_bytes() == (tmp_path / "checkpoints" / "000000120" / name).read_bytes()
     assert load_policy(tmp_path).trained["step"] == 120
@@ -148,18 +148,18 @@ def test_the_best_of_a_run_that_did_not_learn_is_kept(scene, tmp_path, scripted)
 
 
 def test_finalists_drive_only_what_they_have_not_driven(scene, tmp_path, scripted):
-    """Four policies go on to 16 episodes, two of them to 40; what the tests of the training drove counts."""
+    """Four policies go on to 20 episodes, two of them to 40; what the tests of the training drove counts."""
     script, asked = scripted
     script |= {32: (1, 0.0), 64: (5, 0.0), 96: (14, 0.0), 128: (12, 0.0), 160: (3, 0.0)}
     choice = learn(scene, tmp_path, replace(CONFIG, test_every=32))
     order = selection._seeds(CONFIG)
     rounds = [(at, seeds) for at, seeds, _ in asked if set(seeds) <= set(order[:40])]
     by_step = {step: [seed for at, seeds in rounds if at == step for seed in seeds] for step in script}
-    assert {step: len(seeds) for step, seeds in by_step.items()} == {32: 8, 64: 16, 96: 40, 128: 40, 160: 16}
+    assert {step: len(seeds) for step, seeds in by_step.items()} == {32: 8, 64: 20, 96: 40, 128: 40, 160: 20}
     assert all(seeds == list(order[: len(seeds)]) for seeds in by_step.values())
     assert choice["chosen"]["step"] == 96 and asked[-1][:2] == (96, order[40:])
     found = {one["step"]: (one["trials"], one["successes"], len(one["failures"])) for one in choice["candidates"]}
-    assert found == {32: (8, 1, 7), 64: (16, 5, 11), 96: (40, 14, 26), 128: (40, 12, 28), 160: (16, 3, 13)}
+    assert found == {32: (8, 1, 7), 64: (20, 5, 15), 96: (40, 14, 26), 128: (40, 12, 28), 160: (20, 3, 17)}
     assert choice["candidates"][2]["progress"] == pytest.approx(1.0 + 14 / 40, abs=2e-3)
 
 

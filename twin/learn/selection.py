@@ -47,9 +47,7 @@ PATIENCE = 4
 REACHED, NO_BETTER, ALL_STEPS = ENDS = ("reached", "no better", "steps")
 """Reasons to end a training."""
 
-# Numbers of episodes; a test may stop after each batch. Multiples of the default number of environments, since a batch
-# that leaves some idle at its end takes as long as one that does not.
-_BATCHES = (8, 8, 24)
+_BATCHES = (8, 12, 20)  # numbers of episodes; a test may stop after each batch
 _TEST_EPISODES = sum(_BATCHES)
 _BETTER = 0.02  # least improvement that counts: of the success rate (absolute), of the mean distance (relative)
 # Rounds of policies that reached too little: the number of the best ones, and how many episodes each has driven at the
