@@ -15,6 +15,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from twin.evaluation.trials import EPISODE_COLUMNS, Trial, csv_text
+from twin.files import write_json, write_text
 from twin.geometry.poses import look_at
 from twin.reality import lighting as lighting_module
 from twin.reality.filming import FilmingPlan
@@ -40,6 +42,62 @@ def test_steps_fill_a_budget_and_leave_a_margin(scripts):
     pace = Pace(overhead=20.0, step=0.1)
     assert pace.steps(60.0) == 370 and pace.overhead + 370 * pace.step == pytest.approx(57.0)
     assert pace.steps(10.0) == 1
+
+
+@pytest.mark.parametrize("route", [25.37, 47.0, 71.2])
+def test_stretches_lie_on_their_routes(scripts, route):
+    import stretches
+
+    found = [stretches.segment(k, route) for k in stretches.STRETCHES]
+    assert found == [stretches.segment(k, route) for k in stretches.STRETCHES] and len(found) == 10
+    for start, length in found:
+        assert start >= 0.0 and start + length <= route + 0.05 and min(30.0, 25.3) <= length <= 60.0
+    assert len(set(found)) == (1 if route < 30.0 else 10)
+
+
+def test_a_stretch_is_measured_once_and_a_failed_one_counts(scripts, monkeypatch, tmp_path, capsys):
+    import stretches
+    from tiny_twin import tiny_twin
+
+    ran, light = [], "held-out+randomised"
+
+    def scripted(verb, *rest):
+        ran.append(verb)
+        place = tmp_path / "work" / "place_71"
+        if "72" in map(str, rest) or "place_72" in str(rest):
+            raise stretches.Failed("twin reality ended with exit status 2")
+        if verb == "reality":
+            tiny_twin(place)
+        elif verb == "train":
+            chosen = {"step": 3000, "successes": 39, "trials": 40}
+            write_json(place / "runs" / "stretch" / "choice.json", {"steps": 5000, "why": "reached", "chosen": chosen})
+        elif verb == "validate":
+            rows = [
+                Trial("stretch", "stretch", name, k, "goal" if k else "collision", 3.0, 30)
+                for name in (light, "held-out")
+                for k in range(4)
+            ]
+            text = csv_text(EPISODE_COLUMNS, [row.row() for row in rows])
+            write_text(place / "validation" / "episodes.csv", text)
+
+    monkeypatch.setattr(stretches, "twin", scripted)
+    record = tmp_path / "stretches.json"
+    monkeypatch.setattr(
+        sys, "argv", ["stretches", str(tmp_path / "work"), "--stretches", "1", "2", "--json", str(record)]
+    )
+    assert stretches.main() == 0
+    first, second = json.loads(record.read_text())["stretches"]
+    assert (first["name"], first["successes"], first["trials"], first["steps"]) == ("place_71", 3, 4, 5000)
+    assert [one["cause"] for one in first["failures"]] == ["collision"] and first["minutes"] is not None
+    assert 'name = "stretch"' in (tmp_path / "work" / "place_71" / "scene.toml").read_text()
+    assert (second["name"], second["successes"], second["trials"]) == (
+        "place_72",
+        0,
+        100,
+    ) and "exit status 2" in second["error"]
+    assert "3 of 104" in capsys.readouterr().out
+    count = len(ran)
+    assert stretches.main() == 0 and len(ran) == count  # recorded stretches are not run again
 
 
 def test_a_score_over_its_budget_misses_its_target(scripts, monkeypatch):

@@ -153,6 +153,9 @@ def test_days_not_used_during_development_come_first_and_match_the_docs(scripts,
     assert len(everything) == 20
     assert scores.scores("rule without the twin", policies, everything).cells == pytest.approx(694 / 720)
     full = scores.scores("twin, by a photo of each day", policies, everything)
+    # As twin.forecast computed them from the same trials when they were driven.
+    assert (full.spearman, full.pearson) == pytest.approx((0.9176822780383173, 0.9868110006517439))
+    assert (full.mmrv, full.cells, full.regret) == pytest.approx((0.02791666666666667, 0.9375, 0.005))
     assert full.corrected == (32, 36)
     drawn = list(scores.GROUPS.values())[1]
     assert scores.finals(policies, "varied", "straight", drawn) == "1.00 [0.85, 1.00], 150/150"
