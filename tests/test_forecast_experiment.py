@@ -282,6 +282,13 @@ def test_a_record_never_loses_or_changes_a_row(forecast, filmed, tmp_path):
         read_trials(table)
 
 
+@pytest.mark.parametrize("script", [[str(FOLDER)], [str(FOLDER.parent / "cycles"), "trials"]])
+def test_a_place_that_the_protocol_lacks_is_refused(script, tmp_path):
+    command = [sys.executable, *script, str(tmp_path), "--places", "9", "--results", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.startswith("error: place 9: the protocol has 112, 113, 114")
+
+
 # ---- scores
 
 
