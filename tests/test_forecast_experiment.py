@@ -286,7 +286,7 @@ def test_a_record_never_loses_or_changes_a_row(forecast, filmed, tmp_path):
 def test_a_place_that_the_protocol_lacks_is_refused(script, tmp_path):
     command = [sys.executable, *script, str(tmp_path), "--places", "9", "--results", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)  # else it would film the place
-    assert done.returncode == 2 and done.stderr.startswith("error: place 9: the protocol has 112, 113, 114")
+    assert done.returncode == 2 and done.stderr.startswith("error: place 9: the protocol has 118, 119, 120")
 
 
 # ---- scores

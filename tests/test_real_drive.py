@@ -137,6 +137,9 @@ def test_tasks_are_the_twins():
         for field, value in vars(mine).items():
             same = value == theirs.name if field == "name" else np.allclose(getattr(theirs, field), value, atol=1e-3)
             assert same, (name, field)
+        # A policy may ask for more than the robot's top speed, and needs time all the same.
+        fast = parse_task(task_table(world, find_task(name, world), replace(options, speed=1.6)))
+        assert task_of_place(0, name, speed=1.6).time_limit == pytest.approx(fast.time_limit, abs=1e-3)
     assert {"straight", "right_turn"} < set(CAMPUS_TASKS)
     assert arc_lengths(line)[-1] == pytest.approx(60.0, abs=1.0)
     assert np.abs(campus_road.build().route.project(line[:, :2])[1]).max() < 0.35
@@ -292,7 +295,7 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
     ):
         real_test.run([left], "straight", ["rain"], 4, out, setup=Setup(robot=1))
     out.with_name("results_setup.json").unlink()
-    with pytest.raises(InputError, match="has trials of version 1 of the real test; this is version 3; give another"):
+    with pytest.raises(InputError, match="has trials of version 1 of the real test; this is version 4; give another"):
         real_test.run([left], "straight", ["rain"], 4, out)
 
 
@@ -321,6 +324,28 @@ def test_another_file_under_a_known_name_is_refused(gray, tmp_path):
     written(left, 0.5)
     with pytest.raises(InputError, match="another file under the name 'left'"):
         real_test.run([left], "straight", ["rain"], 2, tmp_path / "results.csv")
+
+
+def test_a_command_that_failed_before_its_first_trial_can_be_given_again_corrected(gray, tmp_path):
+    left, out = written(tmp_path / "left", 0.9), tmp_path / "results.csv"
+    with pytest.raises(InputError, match="place -3"):
+        Setup(place=-3)
+    with pytest.raises(InputError, match="task 'strait'"):
+        real_test.run([left], "strait", ["rain"], 1, out, setup=Setup(robot=1))
+    written(left, 0.5)
+    real_test.run([left], "straight", ["rain"], 1, out)
+    assert len(read_trials(out.with_name("results_trials.csv"))) == 1
+
+
+def test_a_weather_gets_one_rasterizer_for_all_policies(tmp_path, monkeypatch):
+    """To make one takes as long as a trial."""
+    made: list = []
+    real_test.rasterizer.cache_clear()
+    monkeypatch.setattr(real_test, "rasterizer_of", lambda place, light, *_: made.append(light) or Grey())
+    left, right = written(tmp_path / "left", 0.9), written(tmp_path / "right", -0.9)
+    real_test.run([left, right], "straight", ["rain", "haze"], 1, tmp_path / "results.csv")
+    real_test.rasterizer.cache_clear()
+    assert made == [weather("rain"), weather("haze")]
 
 
 def test_trials_of_another_task_of_the_same_name_are_refused(gray, tmp_path):
@@ -371,7 +396,7 @@ def test_the_table_has_the_numbers_of_its_setup(gray, tmp_path, capsys):
     record = json.loads((tmp_path / "results_setup.json").read_text())
     assert (record["place"], record["robot"], record["camera"]) == (3, 2, 5) and record[
         "version"
-    ] == REALITY_VERSION == 3
+    ] == REALITY_VERSION == 4
     assert record["robot_values"]["payload"] == pytest.approx(23.97, abs=0.01)
     assert read_results([out], [Cell("left", "whole", "held-out+randomised", 10, 5)])
     assert commands.main("reality", [*given, "--place", "3", "--robot", "-1"]) == 2

@@ -160,6 +160,15 @@ def test_without_commands_it_stops():
         assert 0.05 < one.pose[0] - before < 1.1
 
 
+def test_any_control_step_passes_its_time():
+    """The robot advances by steps of 2 ms."""
+    for period in (0.001, 0.003, 0.0333, 0.1):
+        one = on_plane(STILL)
+        for k in range(200):
+            one.step(period)
+            assert abs(one.time - (k + 1) * period) <= 0.0011, period
+
+
 def test_its_clocks_jitter_and_a_seed_repeats_them():
     late = replace(STILL, jitter=0.25)
     ends = [driven(on_plane(late, seed=seed), 0.8, 0.6, 3.0)[-1, :2] for seed in (1, 1, 2)]

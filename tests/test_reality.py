@@ -10,7 +10,7 @@ import trimesh
 
 from twin.assets.ground import Ground
 from twin.errors import InputError
-from twin.files import read_json
+from twin.files import read_json, write_json
 from twin.geometry.cameras import Cameras, pixel_grid, unproject
 from twin.geometry.mesh_rays import Surface
 from twin.geometry.poses import Similarity, umeyama
@@ -184,6 +184,12 @@ def test_a_truth_that_was_cut_off_is_one_line(truth, tmp_path):
     (tmp_path / "truth.json").write_text("{}")
     with pytest.raises(InputError, match=r"is damaged \(KeyError.*film again"):
         Truth.load(tmp_path)
+    truth.save(tmp_path)
+    whole = read_json(tmp_path / "truth.json")
+    for wrong, said in (([1.0], "another version of the place"), ("abc", "is damaged"), ({}, "is damaged")):
+        write_json(tmp_path / "truth.json", whole | {"fingerprint": wrong})
+        with pytest.raises(InputError, match=f"{said}.*film again"):
+            Truth.load(tmp_path)
 
 
 def fake_build(truth: Truth, root: Path, warp: Similarity, lift: float = 0.0) -> SceneDir:
@@ -333,7 +339,11 @@ def test_filming_that_was_stopped_begins_anew(tmp_path):
 def test_a_source_that_the_truth_does_not_have_is_refused(truth, tmp_path):
     cameras = Cameras.load(fake_build(truth, tmp_path, _IDENTITY).stage("metric"))
     other = replace(cameras, sources=("phone",) * len(cameras), lightings=("dusk",) * len(cameras))
-    with pytest.raises(InputError, match="source phone was filmed under dusk; the truth has only the films sun, night"):
+    with pytest.raises(InputError, match="source phone: the truth has only the films sun, night; leave this source"):
+        matched_poses(truth, other)
+    # Another film under a filmed lighting has other poses.
+    other = replace(cameras, sources=("phone",) * len(cameras))
+    with pytest.raises(InputError, match="source phone: the truth has only the films sun, night; leave this source"):
         matched_poses(truth, other)
 
 

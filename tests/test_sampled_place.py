@@ -18,6 +18,7 @@ from twin.reality.truth import TrueFilm, Truth, fingerprint
 
 NUMBERS = range(1, 201)  # descriptions alone
 BUILT = (2, 3, 5, 12)
+MOVING = (5, 12)  # with cars and small things
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +120,28 @@ def test_nothing_stands_in_the_way(places, number):
     assert CLEARANCE > 0.0 and len({obj.name for obj in place.objects}) == len(place.objects)
 
 
+@pytest.mark.parametrize("number", MOVING)
+def test_on_test_days_movable_things_have_moved_and_nothing_else(places, number):
+    """They stand up to 1.5 m along the road from where they were filmed, in nobody's way; nothing else changes."""
+    filmed, later = places[number], build(sample_place(number), displaced=True)
+    assert [obj.name for obj in filmed.objects] == [obj.name for obj in later.objects]
+    moved = []
+    for before, after in zip(filmed.objects, later.objects, strict=True):
+        if np.array_equal(before.part.vertices, after.part.vertices):
+            continue
+        moved.append(before.name)
+        ends = [filmed.route.project(obj.part.vertices[:, :2].mean(0)) for obj in (before, after)]
+        assert abs(ends[1][0] - ends[0][0]) < 1.6 and abs(ends[1][1] - ends[0][1]) < 0.1, before.name
+    movable = [obj.name for obj in filmed.objects if obj.name.startswith(("car_", "cone_", "bin_", "crate_"))]
+    assert moved == movable and any(name.startswith("car_") for name in moved) and len(moved) >= 3
+    solids = [(obj.name, solid) for obj in later.objects for solid in obj.solids if solid.kind == "box"]
+    for name, solid in solids:
+        if name.startswith("car_"):
+            others = [one for other, one in solids if other != name]
+            gaps = [np.hypot(*(one.center - solid.center)[:2]) - np.hypot(*one.half[:2]) for one in others]
+            assert min(gaps) > 0.0, name
+
+
 @pytest.mark.parametrize("number", BUILT)
 def test_the_ground_mesh_is_the_true_ground(places, number):
     """A ray straight down meets the mesh at the ground's stated height, on road and verge."""
@@ -154,6 +177,7 @@ def test_the_films_of_a_place_have_their_height_and_passes(places):
             facing = (poses[:, :2, 2] * ahead).sum(1)
             assert (facing < 0.0).all() if one.backwards else (facing > 0.0).all()
         text = scene_toml(plan, "x", spec)
+        assert text.startswith(f"# A generated place, filmed by twin reality film --place {number} --out THIS_FOLDER\n")
         assert ("PINHOLE" in text) == spec.film.calibrated
         assert text.count("[[source]]") == len(plan.passes) * len(plan.lightings)
         assert text.count("[[task]]") == len(tasks(spec.line))

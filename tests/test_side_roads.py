@@ -138,6 +138,19 @@ def test_what_stood_beside_the_driven_line_stands_there_still(place, spec):
     assert kept.mean() > 0.9 and kept[away > 12.0].mean() > 0.98 and len(now) > len(plain)
 
 
+def test_a_house_has_the_same_windows_with_and_without_side_roads(place):
+    """The real test shows the place without its side roads."""
+    plain, there = (
+        {obj.name: obj.part for obj in one.objects if obj.name.startswith("house_")}
+        for one in (build(sample_place(PLACE)), place)
+    )
+    both = plain.keys() & there.keys()
+    assert len(both) > 20 and len(both) > 0.8 * len(plain)
+    for name in both:  # the ground, and so the height, may differ beside a side road
+        assert np.array_equal(plain[name].vertices[:, :2], there[name].vertices[:, :2]), name
+        assert np.array_equal(plain[name].uv, there[name].uv), name
+
+
 def test_the_ground_mesh_is_the_true_ground(place, spec):
     """A ray straight down meets surface, curbs and verges of a side road at the ground's height."""
     parts = [obj.part for obj in place.objects if obj.kind == "ground"]

@@ -149,6 +149,9 @@ def test_the_truth_of_a_long_place_has_its_length(place, tmp_path):
     assert read_json(tmp_path / "truth" / "truth.json")["road_length"] == LENGTH
     back = Truth.load(tmp_path / "truth")
     assert back.route.length == back.road_length == LENGTH and back.length == LENGTH
+    short = replace(plan, length=12.0, lightings=plan.lightings[:1])
+    said = f"--place {PLACE} --length 160 --traffic --tiny --lightings {plan.lightings[0]} --out"
+    assert said in scene_toml(short, "x", sample_place(PLACE, LENGTH), back.road_length, (), True)
     assert f"--place {PLACE} --length 160 --out" in scene_toml(plan, "x", sample_place(PLACE, LENGTH), back.road_length)
     with pytest.raises(InputError, match="a road of 160 m, the given place a longer or shorter one; give --length 160"):
         scene_task("task.json", tmp_path, PLACE)

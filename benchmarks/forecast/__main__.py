@@ -1,6 +1,6 @@
 """Forecast experiment: how well the twin predicts success on simulated roads at places not used in development.
 
-    python benchmarks/forecast WORK [--minutes 150] [--jobs 2] [--places 112 113] [--ray ADDRESS]
+    python benchmarks/forecast WORK [--minutes 150] [--jobs 2] [--places 118 119] [--ray ADDRESS]
     python benchmarks/forecast --tables                     only scores the recorded results, in seconds
 
 `protocol.toml` fixes every number in advance. `place_record.py` keeps every episode and trial in `results/`.

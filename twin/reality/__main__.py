@@ -122,7 +122,7 @@ def film(
         {line.one.name: side_plan.length for line, side_plan in sides},
     )
     truth.save(out / "truth")
-    write_text(out / "scene.toml", scene_toml(plan, out.resolve().name, spec, truth.road_length, sides))
+    write_text(out / "scene.toml", scene_toml(plan, out.resolve().name, spec, truth.road_length, sides, traffic))
     return truth
 
 
@@ -159,16 +159,27 @@ def _within(spec: PlaceSpec, length: float) -> list[SideRoad]:
 
 
 def scene_toml(
-    plan: FilmingPlan, name: str, spec: PlaceSpec | None = None, road_length: float = 0.0, sides: _Sides = ()
+    plan: FilmingPlan,
+    name: str,
+    spec: PlaceSpec | None = None,
+    road_length: float = 0.0,
+    sides: _Sides = (),
+    traffic: bool = False,
 ) -> str:
-    """The contents of `scene.toml`, as a user would write them; `spec` is None for the campus road.
+    """The contents of `scene.toml`, as a user would write them, headed by the command that films it again.
 
-    `road_length` is `Truth.road_length` [m].
+    `spec` is None for the campus road; `road_length` is `Truth.road_length` [m].
     """
+    usual = FilmingPlan.of(spec) if spec else FilmingPlan()
+    tiny = plan.length < usual.length
+    lightings = usual.lightings[:2] if tiny else usual.lightings
     fx, fy, cx, cy = (round(float(v), 4) for v in plan.intrinsics)
     place = f" --place {spec.number}" if spec else ""
     place += f" --length {road_length:g}" if road_length else ""
     place += " --side-roads" if sides else ""
+    place += " --traffic" if traffic else ""
+    place += " --tiny" if tiny else ""
+    place += f" --lightings {' '.join(plan.lightings)}" if plan.lightings != lightings else ""
     place += f" --readout {plan.readout:g}" if plan.readout else ""
     place += f" --shake {plan.shake:g}" if plan.shake != (spec.film.shake if spec else FilmingPlan.shake) else ""
     height = f"camera_height = {plan.camera_height}  # [m]"
@@ -239,6 +250,7 @@ def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
     if options.command == "log":
         if options.out.suffix != ".csv" or options.out.is_dir():
             raise InputError(f"{options.out}: expected a .csv file to write, such as drive.csv")
+        options.out.parent.mkdir(parents=True, exist_ok=True)
         recordings.write_log(options.out, recordings.record_log(options.duration, setup))
     elif options.command == "onboard":
         recordings.write_film(options.out, setup)

@@ -407,8 +407,8 @@ _WALKING_SPEED, _CAR_SPEED = (1.1, 1.7), (4.0, 8.0)  # ranges [m/s]
 _MEETING_DISTANCE = (5.0, 12.0)  # [m] range of the distance ahead of the camera at which a walker crosses the road
 _CROSSING = 9.0  # [m] a walker crosses from this lateral to its opposite
 _OUT_OF_SIGHT = np.array([0.0, 0.0, -50.0])  # [m] foot of a mover that is not in the place
-_CAR_LATERAL = 2.3  # [m] lateral of moving cars to the left of the filmed line
-_PARKED_GAP = 1.6  # [m] from the center line to the nearer side of a parked car
+_CAR_LATERAL = 2.3  # [m] lateral of moving cars to the left of the filmed line; least distance from the camera's track
+_PARKED_GAP = 1.6  # [m] from the filmed line to the nearer side of a parked car, on the right
 _SKINS = ("red", "blue", "white", "dark", "green")
 
 
@@ -427,6 +427,7 @@ def movers(place: KnownPlace, film: str, times: Array, cameras: Array) -> list[M
     """The walkers and cars that move during a film, always the same for a place and a film.
 
     Every walker crosses the road in front of the camera. The first car is oncoming; the others overtake the camera.
+    Cars keep to the left of the line, or to the right of a camera in that lane.
 
     Args:
         film: Name of the film.
@@ -434,7 +435,9 @@ def movers(place: KnownPlace, film: str, times: Array, cameras: Array) -> list[M
         cameras: camera_to_world of the frames, shape (n, 4, 4).
     """
     rng = np.random.default_rng([SEED, 51, place.number, sum(map(ord, film))])
-    station = place.route.project(cameras[:, :2, 3])[0]
+    station, lateral = place.route.project(cameras[:, :2, 3])
+    beside = float(np.median(lateral))
+    lane = _CAR_LATERAL if beside < 0.5 else beside - _CAR_LATERAL
     forward = 1.0 if station[-1] >= station[0] else -1.0
     length = place.route.length
 
@@ -467,7 +470,7 @@ def movers(place: KnownPlace, film: str, times: Array, cameras: Array) -> list[M
         kind, skin = str(rng.choice(VEHICLES)), str(rng.choice(_SKINS))
 
         def drive(time: float, at: float = at, meeting: float = meeting, speed: float = speed) -> tuple[Array, float]:
-            return pose(at + speed * (time - meeting), forward * _CAR_LATERAL, 0.0 if speed > 0.0 else np.pi)
+            return pose(at + speed * (time - meeting), lane, 0.0 if speed > 0.0 else np.pi)
 
         found.append(Mover(f"moving_car_{k}", _vehicle(place, kind, skin), drive))
     return found
@@ -480,8 +483,7 @@ def parked_cars(place: KnownPlace, start: float, length: float) -> list[PlaceObj
     for k in range(_PARKED):
         kind, skin = str(rng.choice(VEHICLES)), str(rng.choice(_SKINS))
         station = start + (k + rng.uniform(0.35, 0.75)) / _PARKED * length
-        side = -1.0 if k % 2 else 1.0
-        add_vehicle(place, 100 + k, station, side * (_PARKED_GAP + vehicle_size(kind)[1] / 2), 0.0, kind, skin)
+        add_vehicle(place, 100 + k, station, -_PARKED_GAP - vehicle_size(kind)[1] / 2, 0.0, kind, skin)
     cars = place.objects[before:]
     del place.objects[before:]
     return cars

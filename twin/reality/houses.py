@@ -120,12 +120,12 @@ class House:
         return {"flat": 0.0, "shed": min(self.pitch, 0.25)}.get(self.roof, self.pitch)
 
 
-def add_house(place: KnownPlace, name: str, house: House, lit_windows: float) -> None:
-    """Adds a house with doors and windows; its textures are `<name>` (walls) and `<name>_roof`.
+def add_house(place: KnownPlace, k: int, house: House, lit_windows: float) -> str:
+    """Adds house k with doors and windows; returns its name. Its textures are `<name>` (walls) and `<name>_roof`.
 
     `lit_windows` is the fraction of windows that are lit after dark.
     """
-    rng = place.rng(1, len(place.objects))
+    rng, name = place.rng(1, k), f"house_{k}"
     w, d = house.width, house.depth
     turn = np.array([[np.cos(house.yaw), -np.sin(house.yaw)], [np.sin(house.yaw), np.cos(house.yaw)]])
     corners = house.center + 0.5 * np.array([[a * w, b * d] for a in (-1, 1) for b in (-1, 1)]) @ turn.T
@@ -161,6 +161,7 @@ def add_house(place: KnownPlace, name: str, house: House, lit_windows: float) ->
         dark = [place.cell(f"lit{k % 8}", part) for k, part in lit]
         place.objects.append(PlaceObject(f"{name}_day", "obstacle", put(primitives.join(day)), "windows_by_day"))
         place.objects.append(PlaceObject(f"{name}_lit", "obstacle", put(primitives.join(dark)), "windows_by_night"))
+    return name
 
 
 def _roof(house: House, top: float) -> tuple[list[MeshPart], float, list[MeshPart]]:

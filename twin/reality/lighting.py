@@ -387,6 +387,7 @@ def _lighting(light: LightSpec, spec: PlaceSpec) -> Lighting:
             lamps=lamps if lit else (0.0, 0.0, 0.0),
             exposure=1.8 if lit else 2.1,
             gain=gain,
+            visibility=light.haze,
         )
     azimuth = np.deg2rad(light.azimuth)
     day = daylight(light.name, light.elevation, azimuth, light.clouds, 0.2, light.haze, 0.0, light.warmth, 1.0)

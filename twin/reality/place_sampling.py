@@ -38,7 +38,7 @@ from twin.reality.side_roads import with_side_roads
 
 T = TypeVar("T")
 
-MAX_FRAMES = 420  # upper bound of the number of frames in all films of a place together
+MAX_FRAMES = 420  # wanted bound of the frames in all films of a place; whole frame rates exceed it by up to a quarter
 
 
 def check_length(number: int, length: float) -> None:

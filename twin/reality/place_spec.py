@@ -211,7 +211,7 @@ class BoundarySpec:
     kind: str
     """`none`, `hedge`, `picket`, `rails`, `mesh`, `wall`, `boards`, `bollards`."""
     height: float
-    """[m]"""
+    """[m]; hedges are about 1 m high whatever it is."""
     color: Rgb
     covered: float
     """Fraction of the length that has the boundary."""

@@ -216,6 +216,7 @@ class RealRobot:
         self._arrivals: deque[tuple[float, float, float]] = deque()
         self._newest = (-np.inf, 0.0, 0.0)
         self._steps = 0
+        self._due = 0.0
         self.time = 0.0
         """Time since `set_pose` [s]."""
         self._next_control = float(rng.uniform(0.0, r.controller_period))
@@ -234,8 +235,9 @@ class RealRobot:
         self._arrivals.append((self.time + self.robot.command_latency, v, yaw_rate))
 
     def step(self, period: float) -> None:
-        """Advances by `period` [s]."""
-        steps = round(period / _STEP)
+        """Advances by `period` [s]; a rest below half a step of 2 ms is made up for by the next call."""
+        self._due += period
+        steps = round(self._due / _STEP) - self._steps
         r = self.robot
         omega = 2.0 * pi * r.bounce_frequency
         spread = np.deg2rad(r.shake)

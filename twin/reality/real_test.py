@@ -29,7 +29,7 @@ from twin.learn.policy import JSON, Policy, load_policy
 from twin.reality import REALITY_VERSION
 from twin.reality.filming import FilmingPlan, write_video
 from twin.reality.lighting import day_number, weather, weather_index
-from twin.reality.place_sampling import check_length
+from twin.reality.place_sampling import check_length, sample_place
 from twin.reality.rasterizer import PlaceRenderer
 from twin.reality.real_camera import TRAINED as camera_ranges
 from twin.reality.real_camera import RealCamera, draw_camera, intrinsics_of
@@ -57,8 +57,10 @@ class Setup:
     """Length to which the place's road is lengthened [m], see `place_sampling.sample_place`."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: no such robot or camera, or a length below that of the place's road."""
+        """Raises InputError: no such place, robot or camera, or a length below that of the place's road."""
         draw_robot(self.robot), draw_camera(self.camera)
+        if self.place:
+            sample_place(self.place)
         if self.length and self.place:
             check_length(self.place, self.length)
 
@@ -95,7 +97,7 @@ def load_policy_file(path: Path) -> Policy:
     return load_policy(path)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=1)  # one needs 130 MB
 def rasterizer(
     lighting: str, intrinsics: tuple[float, ...], size: tuple[int, int], number: int, length: float = 0.0
 ) -> PlaceRenderer:
@@ -234,16 +236,20 @@ def run(
     loaded = [load_policy_file(path) for path in policies]
     with exclusive_lock(out.with_name(f".{out.stem}.lock"), f"{out} is being written"):
         _check_setup(setup, table, out.with_name(f"{out.stem}_setup.json"))
-        _check_policy_digests(loaded, policies, out.with_name(f"{out.stem}_policies.json"))
         done = read_real_trials(table, out)
+        driven = {one.policy for one in done}
+        _check_policy_digests(loaded, policies, driven, out.with_name(f"{out.stem}_policies.json"))
         known = {(one.policy, one.task, one.lighting, one.seed) for one in done}
-        for policy in {one.name: one for one in loaded}.values():
-            test = RealTest(task_for(policy, task, setup.place, setup.length), setup, policy.size)
-            _check_task(task, done, table, out.with_name(f"{out.stem}_tasks.json"))
-            for lighting in dict.fromkeys(lightings):
-                # Each weather has its own seeds: with shared ones, the starts in all weathers would be the same.
-                first = _FIRST_SEED + _SEEDS_PER_LIGHTING * weather_index(lighting)
-                seeds = [first + k for k in range(trials)]
+        by_name = {one.name: one for one in loaded}.values()
+        tests = [RealTest(task_for(one, task, setup.place, setup.length), setup, one.size) for one in by_name]
+        _check_task(task, done, table, out.with_name(f"{out.stem}_tasks.json"))
+        if films:
+            films.mkdir(parents=True, exist_ok=True)
+        for lighting in dict.fromkeys(lightings):
+            # Each weather has its own seeds: with shared ones, the starts in all weathers would be the same.
+            first = _FIRST_SEED + _SEEDS_PER_LIGHTING * weather_index(lighting)
+            seeds = [first + k for k in range(trials)]
+            for policy, test in zip(by_name, tests, strict=True):
                 missing = [seed for seed in seeds if (policy.name, test.task.name, lighting, seed) not in known]
                 with bar(f"{policy.name}, {test.task.name}, {lighting}", len(missing), "trial") as progress:
                     for seed in missing:
@@ -256,9 +262,12 @@ def run(
 
 
 def _check_setup(setup: Setup, table: Path, record: Path) -> None:
-    """Records the setup of a table. Raises InputError if the table has another setup or version of this world."""
+    """Records the setup of a table. Raises InputError if the table has another setup or version of this world.
+
+    A record without a table is that of a run which was stopped before its first trial.
+    """
     given = {**asdict(setup), "version": REALITY_VERSION}
-    if record.exists():
+    if record.exists() and table.exists():
         with wrap_read_errors(record, "give another --out"):
             found = {"length": 0.0, **read_json(record)}  # earlier records have no length
             known = {name: found[name] for name in given}
@@ -291,7 +300,6 @@ def _run_trial(test: RealTest, policy: Policy, lighting: str, seed: int, films: 
     frames: list[Image] = []
     trial = test.run_trial(policy, lighting, seed, frames.append if films else None)
     if films:
-        films.mkdir(parents=True, exist_ok=True)
         path = films / f"{trial.policy.replace('/', '_')}_{trial.task}_{lighting}_{seed}.mp4"
         width, height = (_FILM_SCALE * side for side in test.size)
         plan = FilmingPlan(width=width, height=height, fps=10, crf=23)
@@ -299,12 +307,12 @@ def _run_trial(test: RealTest, policy: Policy, lighting: str, seed: int, films: 
     return trial
 
 
-def _check_policy_digests(policies: Sequence[Policy], paths: Sequence[Path], record: Path) -> None:
-    """Records the digest of each policy's file. Raises InputError if a recorded name has another digest."""
+def _check_policy_digests(policies: Sequence[Policy], paths: Sequence[Path], driven: set[str], record: Path) -> None:
+    """Records the digest of each policy's file. Raises InputError if a name in `driven` has another digest."""
     sums: dict[str, str] = {}
     if record.exists():
         with wrap_read_errors(record, "give another --out"):
-            sums = dict(read_json(record))
+            sums = {name: digest for name, digest in read_json(record).items() if name in driven}
     for policy, path in zip(policies, paths, strict=True):
         folder = path.parent if path.name == JSON else path
         # policy.json contains the digest of the weights.

@@ -168,7 +168,6 @@ def record_log(duration: float, setup: Setup) -> dict[str, Array]:
 
 def write_log(path: Path, columns: dict[str, Array]) -> None:
     """Writes a log as CSV with six decimals, atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)

@@ -39,6 +39,7 @@ _HALF_WIDTH = 1.0  # [m]
 _BUMPER = 0.5  # [m] from the base to the front bumper
 _STUCK = (0.1, 5.0)  # [m], [s]
 _MAX_TILT = radians(60.0)
+_TOP_SPEED = 1.0  # [m/s] of the Husky
 _START_OFFSET, _START_HEADING = 0.3, radians(10.0)  # [m], [rad]
 _HEADING_WINDOW = 1.0  # [m]
 _LENGTH_TOLERANCE = 0.98  # least length of the route, as a fraction of the longest path
@@ -209,7 +210,7 @@ def task_of_place(
     end = min(start + length, float(np.hypot(*np.diff(line, axis=0).T).sum()))
     return RoadTask(
         *(name, line, _HALF_WIDTH, start, _START_OFFSET, _START_HEADING, end - _BUMPER),
-        time_limit=2.0 * (end - start) / speed,
+        time_limit=(end - start) * max(2.0 / speed, 1.5 / _TOP_SPEED),
         stuck=_STUCK,
         max_tilt=_MAX_TILT,
         speed=speed,

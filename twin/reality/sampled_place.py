@@ -8,6 +8,7 @@ touches the road, a side road, the corridor along a filmed line or an earlier fo
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import count
 from math import hypot
 
 import numpy as np
@@ -88,11 +89,14 @@ def build(spec: PlaceSpec, displaced: bool = False) -> KnownPlace:
         add_side_road(place, axis)
     for name, box in lands.items():
         add_land(place, road, name, box)
-    site = Site(road)
-    names.update(_furnish(place, _of_driven_line(spec), site, displaced))
+    site, movables = Site(road), list[_Movable]()
+    names.update(_furnish(place, _of_driven_line(spec), site, movables))
     for k, axis in enumerate(road.side_axes):
         there = replace(place, route=axis, seed=(*place.seed, 30 + k))  # shares the lists of objects and lamps
-        names.update(_furnish(there, _of_side_road(spec, axis, k), site, displaced))
+        names.update(_furnish(there, _of_side_road(spec, axis, k), site, movables))
+    rng = place.rng(20)
+    for one in movables:  # after all else, so that the rest of the place is the same on all days
+        one.add(*(_moved(rng, one, site) if displaced else one.at))
     return place
 
 
@@ -138,6 +142,18 @@ class Site:
                 return False
         self._taken.append((x, y, float(np.hypot(*half)), corners))
         return True
+
+    def move(self, start: Array, goal: Array, half: tuple[float, float], yaw: float) -> bool:
+        """Moves the footprint with its center at `start` to `goal`, if that is free; returns True if it was.
+
+        `half` and `yaw` are the footprint's at `goal`, as for `take`.
+        """
+        index = next(k for k, (x, y, *_) in enumerate(self._taken) if [x, y] == start.tolist())
+        own = self._taken.pop(index)
+        if self.take(goal, half, yaw):
+            return True
+        self._taken.insert(index, own)
+        return False
 
     def _off_road(self, center: Array, half: tuple[float, float], yaw: float, clear: float) -> bool:
         road, section = self._road, self._road.section
@@ -236,16 +252,31 @@ def _of_side_road(spec: PlaceSpec, axis: SideAxis, k: int) -> _Roadside:
 # ---- objects
 
 
+@dataclass(frozen=True)
+class _Movable:
+    """An object that may stand elsewhere on another day; its footprint is occupied, but it is not added yet."""
+
+    place: KnownPlace
+    at: tuple[float, float]
+    """Station and lateral in the films [m]."""
+    half: tuple[float, float]
+    """Half sizes of the footprint [m]."""
+    turn: float
+    """Direction of the footprint's first axis relative to the road [rad]."""
+    add: Callable[[float, float], None]
+    """Adds the object at a station and lateral [m]."""
+
+
 def _furnish(
-    place: KnownPlace, along: _Roadside, site: Site, displaced: bool
+    place: KnownPlace, along: _Roadside, site: Site, movables: list[_Movable]
 ) -> dict[str, tuple[House, str, Rgb, Rgb]]:
-    """Adds all objects along a road; returns its houses as `_add_houses` does."""
+    """Adds all objects along a road, the movable ones to `movables`; returns its houses as `_add_houses` does."""
     houses = _add_houses(place, along, site)
     _add_lamps(place, along, site)
     _add_boundaries(place, along, site)
     _add_poles(place, along, site)
-    _add_cars(place, along, site, place.rng(20) if displaced else None)
-    _add_furniture(place, along, site, place.rng(21) if displaced else None)
+    _add_cars(place, along, site, movables)
+    _add_furniture(place, along, site, movables)
     _add_trees(place, along, site)
     _add_tufts(place, along)
     return houses
@@ -259,6 +290,7 @@ def _add_houses(place: KnownPlace, along: _Roadside, site: Site) -> dict[str, tu
     if houses.density <= 0.05:
         return out
     most = max(16, int(0.14 * (along.last - along.first)))
+    plots = count()  # a house has the number of its plot, so that it is the same whether other plots are free or not
     for side in (1, -1):
         station = along.first + float(rng.uniform(0.0, 12.0))
         while station < along.last + 10.0:
@@ -273,9 +305,9 @@ def _add_houses(place: KnownPlace, along: _Roadside, site: Site) -> dict[str, tu
             house = House(
                 place.route.at(station, side * away), yaw, width, depth, storeys, roof, houses.pitch, houses.window
             )
+            plot = along.numbered(next(plots))
             if len(out) < most and site.take(house.center, (width / 2 + 0.3, depth / 2 + 0.3), yaw, 0.6, 0.6):
-                name = f"house_{along.numbered(len(out))}"
-                add_house(place, name, house, spec.lamps.lit_windows)
+                name = add_house(place, plot, house, spec.lamps.lit_windows)
                 out[name] = (house, wall, color, tiles)
             mean = 100.0 / houses.density
             station += max(width + 0.8, float(rng.uniform(0.7, 1.3)) * mean)
@@ -306,7 +338,7 @@ def _add_lamps(place: KnownPlace, along: _Roadside, site: Site) -> None:
 
 def _add_boundaries(place: KnownPlace, along: _Roadside, site: Site) -> None:
     rng, spec = along.stream("boundaries", 1), along.spec
-    for side, name, boundary in ((1, "left", spec.boundaries[0]), (-1, "right", spec.boundaries[1])):
+    for side, boundary in zip((1, -1), spec.boundaries, strict=True):
         if boundary.kind == "none":
             continue
         away = max(along.edge(side) + max(boundary.distance, 0.3), FREE_HALF_WIDTH + 0.6)
@@ -327,8 +359,7 @@ def _add_boundaries(place: KnownPlace, along: _Roadside, site: Site) -> None:
             elif runs[-1]:
                 runs.append([])
         for k, run in enumerate(runs):
-            skin = f"boundary_{name}"
-            add_boundary(place, f"{name}_{boundary.kind}_{along.numbered(k)}", boundary, skin, np.array(run), lateral)
+            add_boundary(place, along.numbered(k), boundary, np.array(run), lateral)
 
 
 def _add_poles(place: KnownPlace, along: _Roadside, site: Site) -> None:
@@ -358,18 +389,20 @@ def _scatter(
     return out
 
 
-def _moved(
-    other_day: np.random.Generator | None, place: KnownPlace, site: Site, at: tuple[float, float], radius: float
-) -> tuple[float, float]:
-    """Station and lateral [m] of a movable object: `at`, or, on another day, a free spot up to 1.5 m along the road."""
-    if other_day is None:
-        return at
-    moved = at[0] + float(other_day.uniform(-1.5, 1.5)), at[1]
-    free = site.take(place.route.at(*moved), (radius, radius), place.heading(moved[0]), gap=-0.9 * radius)
-    return moved if free else at
+def _moved(rng: np.random.Generator, one: _Movable, site: Site) -> tuple[float, float]:
+    """Station and lateral [m] of an object on another day: up to 1.5 m along the road from where it was filmed.
+
+    If none of ten spots is free, it has not moved.
+    """
+    route, (station, lateral) = one.place.route, one.at
+    for moved in (station + rng.uniform(-1.5, 1.5, 10)).tolist():
+        yaw = one.place.heading(moved) + one.turn
+        if site.move(route.at(station, lateral), route.at(moved, lateral), one.half, yaw):
+            return moved, lateral
+    return one.at
 
 
-def _add_cars(place: KnownPlace, along: _Roadside, site: Site, other_day: np.random.Generator | None) -> None:
+def _add_cars(place: KnownPlace, along: _Roadside, site: Site, movables: list[_Movable]) -> None:
     rng, spec = along.stream("cars", 1), along.spec
     for k, (station, lateral) in enumerate(_scatter(rng, along, spec.furniture.cars, 1.25, 3.2)):
         kinds = furniture.VEHICLES
@@ -379,20 +412,17 @@ def _add_cars(place: KnownPlace, along: _Roadside, site: Site, other_day: np.ran
         if rng.random() < 0.25:  # parked at right angles to the road
             turn, lateral = turn + np.pi / 2, float(lateral + np.sign(lateral) * 1.6)
         length, width = furniture.vehicle_size(kind)
-        yaw = place.heading(station) + turn
-        if site.take(place.route.at(station, lateral), (length / 2, width / 2), yaw):
-            if other_day is not None:
-                shifted = station + float(other_day.uniform(-1.5, 1.5))
-                if site.take(place.route.at(shifted, lateral), (length / 2, width / 2), yaw, gap=-1.7):
-                    station = shifted
-            furniture.add_vehicle(place, along.numbered(k), station, lateral, turn, kind, skin)
+        at, half = (station, lateral), (length / 2, width / 2)
+        if site.take(place.route.at(*at), half, place.heading(station) + turn):
+            add = partial(furniture.add_vehicle, place, along.numbered(k), turn=turn, kind=kind, skin=skin)
+            movables.append(_Movable(place, at, half, turn, add))
 
 
 _Adder = Callable[[int, tuple[float, float], np.random.Generator], None]
 """Adds object k at a station and lateral [m]; the generator samples its other properties."""
 
 
-def _add_furniture(place: KnownPlace, along: _Roadside, site: Site, other_day: np.random.Generator | None) -> None:
+def _add_furniture(place: KnownPlace, along: _Roadside, site: Site, movables: list[_Movable]) -> None:
     f = along.spec.furniture
 
     def each(index: int, amount: float, near: float, far: float, radius: float, add: _Adder) -> None:
@@ -407,17 +437,18 @@ def _add_furniture(place: KnownPlace, along: _Roadside, site: Site, other_day: n
         turn = float(rng.normal(0.0, 0.25)) + np.pi * (rng.random() < 0.25)
         furniture.add_sign(place, int(rng.integers(0, 6)) + 8 * k, *at, turn, (wide, low, high))
 
-    def small(kind: str) -> _Adder:
-        def add(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
-            at = _moved(other_day, place, site, at, 0.4)
-            if kind == "bin":
-                furniture.add_bin(place, k, *at, str(rng.choice(["green", "dark", "blue", "red", "zinc"])))
-            elif kind == "cone":
-                furniture.add_cone(place, k, *at)
-            else:
-                furniture.add_crate(place, k, *at, float(rng.uniform(0.7, 1.2)))
+    def movable(at: tuple[float, float], radius: float, add: Callable[[float, float], None]) -> None:
+        movables.append(_Movable(place, at, (radius, radius), 0.0, add))
 
-        return add
+    def waste_bin(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+        skin = str(rng.choice(["green", "dark", "blue", "red", "zinc"]))
+        movable(at, 0.35, partial(furniture.add_bin, place, k, skin=skin))
+
+    def cone(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+        movable(at, 0.3, partial(furniture.add_cone, place, k))
+
+    def crate(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
+        movable(at, 0.75, partial(furniture.add_crate, place, k, side=float(rng.uniform(0.7, 1.2))))
 
     def cabinet(k: int, at: tuple[float, float], rng: np.random.Generator) -> None:
         size = float(rng.uniform(0.5, 1.1)), float(rng.uniform(0.3, 0.5)), float(rng.uniform(0.8, 1.4))
@@ -430,11 +461,11 @@ def _add_furniture(place: KnownPlace, along: _Roadside, site: Site, other_day: n
         furniture.add_post(place, f"bollard_{k}", *at, float(rng.uniform(0.7, 1.1)), 0.07, "dark")
 
     each(0, f.signs, 0.25, 1.2, 0.35, sign)
-    each(1, f.bins, 0.5, 2.5, 0.35, small("bin"))
+    each(1, f.bins, 0.5, 2.5, 0.35, waste_bin)
     each(2, f.benches, 0.7, 2.8, 0.9, lambda k, at, rng: furniture.add_bench(place, k, *at))
     each(3, f.bollards, 0.2, 0.6, 0.12, bollard)
-    each(4, f.cones, 0.3, 1.2, 0.3, small("cone"))
-    each(5, f.crates, 1.0, 4.0, 0.75, small("crate"))
+    each(4, f.cones, 0.3, 1.2, 0.3, cone)
+    each(5, f.crates, 1.0, 4.0, 0.75, crate)
     each(6, f.cabinets, 0.6, 3.0, 0.6, cabinet)
     each(7, f.stones, 0.5, 6.0, 0.6, stone)
 

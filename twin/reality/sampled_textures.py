@@ -469,9 +469,9 @@ def _paint(
     for n, (name, (x0, x1, y0, y1)) in enumerate(layout.lands.items()):
         shape = (round((y1 - y0) / _LAND_PIXEL), round((x1 - x0) / _LAND_PIXEL))
         out[name] = to_uint8(land(rng(8, *((n,) if n else ())), surface, shape, _LAND_PIXEL, kind))
-    for k, (name, (house, cladding, color, tiles)) in enumerate(houses.items()):
+    for name, (house, cladding, color, tiles) in houses.items():
         size = (round((house.eaves + 0.5) / _WALL_PIXEL), round(2 * (house.width + house.depth) / _WALL_PIXEL))
-        paint = stream(spec.number, "houses", 2, k)
+        paint = stream(spec.number, "houses", 2, int(name.removeprefix("house_")))
         out[name] = to_uint8(wall(paint, cladding, color, size, _WALL_PIXEL))
         ridge, slope = house.roof_size
         tiled = (max(16, round(slope / 0.045)), round(ridge / 0.045))

@@ -310,20 +310,22 @@ THICKNESS = {"wall": 0.26, "hedge": 0.7, "picket": 0.06, "boards": 0.06, "rails"
 """Thickness of a boundary by its kind [m]."""
 
 
-def add_boundary(place: KnownPlace, name: str, spec: BoundarySpec, skin: str, stations: Array, lateral: float) -> None:
-    """Adds a boundary at a lateral [m]: pieces of length `BAY` that begin at the stations [m].
+def add_boundary(place: KnownPlace, k: int, spec: BoundarySpec, stations: Array, lateral: float) -> None:
+    """Adds part k of the boundary at a lateral [m]: pieces of length `BAY` that begin at the stations [m].
 
-    `skin` is the boundary's atlas cell. One bollard stands at each station.
+    One bollard stands at each station.
     """
     if not len(stations):
         return
+    side = "left" if lateral > 0.0 else "right"
+    name, skin = f"{side}_{spec.kind}_{k}", f"boundary_{side}"
     if spec.kind == "hedge":
         halves = np.sort(np.concatenate([stations, stations + 0.5 * BAY]))
-        add_hedge(place, len(place.objects), halves, lateral)
+        add_hedge(place, 2 * k + (side == "right"), halves, lateral)
         return
     if spec.kind == "bollards":
-        for k, station in enumerate(stations):
-            add_post(place, f"{name}_{k}", float(station), lateral, spec.height, 0.08, skin)
+        for number, station in enumerate(stations):
+            add_post(place, f"{name}_{number}", float(station), lateral, spec.height, 0.08, skin)
         return
     parts: list[MeshPart] = []
     solids: list[Solid] = []

@@ -133,7 +133,8 @@ class Truth:
                 side_roads,
             )
             _ = truth.lines  # a KeyError if this version of the place lacks one of the side roads
-        if not np.allclose(head["fingerprint"], fingerprint(truth.place), atol=1e-4):
+            filmed, now = np.array(head["fingerprint"], float), np.array(fingerprint(truth.place))
+        if filmed.shape != now.shape or not np.allclose(filmed, now, atol=1e-4):
             raise InputError(f"{folder}: filmed in another version of the place; film again: twin reality film")
         return truth
 
@@ -269,15 +270,13 @@ def matched_poses(truth: Truth, cameras: Cameras) -> Array:
     """True poses of a build's cameras, shape (n, 4, 4). Raises InputError for a source that the truth does not have."""
     out = np.empty((len(cameras), 4, 4))
     for source in sorted(set(cameras.sources)):
-        rows = np.array([s == source for s in cameras.sources])
-        lighting = next(light for light, row in zip(cameras.lightings, rows, strict=True) if row)
-        film = source if source in truth.films else lighting
-        if film not in truth.films:
+        if source not in truth.films:
             raise InputError(
-                f"source {source} was filmed under {lighting}; the truth has only the films {', '.join(truth.films)}; "
-                "leave this source out"
+                f"source {source}: the truth has only the films {', '.join(truth.films)}; leave this source out, or "
+                "give it the name of its film"
             )
-        out[rows] = truth.poses(film, cameras.times[rows])
+        rows = np.array([s == source for s in cameras.sources])
+        out[rows] = truth.poses(source, cameras.times[rows])
     return out
 
 
