@@ -17,10 +17,11 @@ def test_help_lists_every_verb(capsys):
 
 
 def test_an_unknown_verb_is_one_line(capsys):
-    assert main(["biuld"]) == 2
-    told = capsys.readouterr()
-    assert told.out == "" and told.err.startswith("error: no verb 'biuld'; expected one of new, build")
-    assert told.err.count("\n") == 1
+    for given, said in (("biuld", "did you mean 'build'?"), ("xyz", "expected one of new, build")):
+        assert main([given]) == 2
+        told = capsys.readouterr()
+        assert told.out == "" and told.err.startswith(f"error: no verb {given!r}; {said}")
+        assert told.err.count("\n") == 1
 
 
 def test_a_value_may_begin_with_a_minus():

@@ -447,12 +447,16 @@ def test_a_dataset_has_the_drives_that_are_filmed(scene, tmp_path, capsys):
         (["--lerobot", "drives", "--episodes", "0"], "--episodes 0: expected 1 or more"),
         (["--lerobot", "drives", "--out", "a.mp4"], "--out names a film"),
         (["--lerobot", "no/drives"], "there is no folder no"),
-        (["--obstacles", "²"], "--obstacles '²': expected a number"),
-        (["--obstacles", "-1"], "--obstacles '-1': expected a number"),
+        (["--obstacles", "²"], "--obstacles '²': expected 0 to 999999"),
+        (["--obstacles", "-1"], "--obstacles '-1': expected 0 to 999999"),
+        (["--task", "ahed"], "task 'ahed': unknown; did you mean 'ahead'?"),
+        (["--out", "a.mp4/b.mp4"], "a.mp4: cannot be written to"),
         (["--lighting", "day:night:30"], "share 30 is not from 0 to 1"),
     ],
 )
-def test_impossible_films_are_refused_in_one_line(scene, capsys, option, words):
+def test_impossible_films_are_refused_in_one_line(scene, tmp_path, monkeypatch, capsys, option, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.mp4").write_bytes(b"")
     assert commands.main("film", [str(scene.scene.root), "--task", "ahead", "--quiet", *option]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and words in error and error.count("\n") == 1

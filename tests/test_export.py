@@ -212,6 +212,8 @@ def test_a_task_file_has_the_scenes_line_and_rules(scene, out) -> None:
         (["--nerfstudio", "file"], "is there already"),
         (["--task-file", "a.json"], "--task and --task-file belong together"),
         (["--task-file", "folder", "--task", "ahead"], "is a folder; give a file"),
+        (["--nerfstudio", "new", "--colmap", "../{here}/new"], "new is given twice"),
+        (["--glb", "a.glb", "--task", "ahead", "--task-file", "a.glb"], "a.glb is given twice"),
     ],
 )
 def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, words) -> None:
@@ -219,7 +221,7 @@ def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, wor
     for name in ("folder", "folder.usd"):
         (tmp_path / name).mkdir()
     (tmp_path / "file").write_text("")
-    assert commands.main("export", ["nowhere", *arguments]) == 2
+    assert commands.main("export", ["nowhere", *(one.format(here=tmp_path.name) for one in arguments)]) == 2
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder", "folder.usd"]
@@ -228,6 +230,13 @@ def test_bad_arguments_are_refused(tmp_path, monkeypatch, capsys, arguments, wor
 def test_an_unknown_lighting_is_refused(scene, tmp_path, capsys) -> None:
     assert commands.main("export", [str(scene), "--ply", str(tmp_path / "a.ply"), "--lighting", "noon"]) == 2
     assert "noon" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_a_task_is_looked_up_before_anything_is_rendered(scene, tmp_path, capsys) -> None:
+    files = ["--glb", str(tmp_path / "a.glb"), "--task-file", str(tmp_path / "t.json")]
+    assert commands.main("export", [str(scene), *files, "--task", "ahed", "--quiet"]) == 2
+    assert capsys.readouterr().err == "error: task 'ahed': unknown; did you mean 'ahead'?\n"
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("package", "option", "name"), [("pxr", "usd", "a.usdz"), ("gsply", "spz", "a.spz")])

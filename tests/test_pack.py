@@ -257,7 +257,9 @@ def test_drive_films_a_pack_by_its_name(packed, tmp_path, monkeypatch, capsys):
     assert "leave out one of them" in capsys.readouterr().err
     for wrong in ("drive.avi", "."):
         assert main(["drive", "tiny", "--out", wrong]) == 2
-        assert f"--out {wrong}: expected the name of an .mp4 file" in capsys.readouterr().err
+        assert f"{wrong}: expected a file ending in .mp4" in capsys.readouterr().err
+    assert main(["drive", "tiny", "--port", "9000"]) == 2
+    assert "--port 9000: only the page has it" in capsys.readouterr().err
     assert main(["drive", "nowhere"]) == 2
     assert "no nowhere.twin here or in scenes/; give a path" in capsys.readouterr().err
     assert main(["drive", "tiy"]) == 2

@@ -213,7 +213,7 @@ def test_every_number_is_a_day_and_other_weathers_keep_their_seeds():
     assert weather("day_15") == WEATHER["day_15"] and weather("day_300") != weather("day_301")
     names = [*WEATHER, "day_16", "day_300"]
     assert [weather_index(name) for name in names] == [*range(len(WEATHER)), len(WEATHER), 304]
-    for name in ("day_0", "day_01", "day_x", "noon"):
+    for name in ("day_0", "day_01", "day_x", "day_1111111111", "snow"):
         with pytest.raises(InputError, match=f"no lighting '{name}' in the real test; expected one of dawn"):
             weather(name)
 
@@ -285,7 +285,11 @@ def test_results_are_the_sums_of_trials(gray, tmp_path):
     with exclusive_lock(out.with_name(".results.lock"), "x"), pytest.raises(InputError, match="is being written"):
         real_test.run([left], "straight", ["rain"], 3, out)
     third = max(t.seed for t in trials if t.lighting == "rain") + 1
-    real_test.run([left], "straight", ["rain"], 3, out, "sun", films=tmp_path / "films")
+    with pytest.raises(
+        InputError, match=r"are compared with 'held-out\+randomised', not with 'sun'; give --twin-light"
+    ):
+        real_test.run([left], "straight", ["rain"], 3, out, "sun")
+    real_test.run([left], "straight", ["rain"], 3, out, films=tmp_path / "films")
     assert {cell.twin_lighting for cell in read_results([out], twin)} == {"held-out+randomised"}  # as it was before
     assert [film.name for film in (tmp_path / "films").iterdir()] == [f"left_straight_rain_{third}.mp4"]
     after = out.with_name("results_trials.csv").read_text()
@@ -416,6 +420,29 @@ def test_a_task_of_another_control_step_is_refused():
         task_for(policy, task_of_place(0, "straight"), 0)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["photo", "--day", "-1"], "--day -1: expected 1 or more"),
+        (["bag", "--lighting", "dwan"], "no lighting 'dwan' in the real test; did you mean 'dawn'?"),
+        (
+            ["bag", "--lighting", "dawn", "--task", "strait"],
+            "task 'strait': place 0 has none of that name; did you mean",
+        ),
+        (["drive", "--policy", "lfet", "--task", "straight"], "lfet: no such policy file; did you mean 'left'?"),
+        (["drive", "--policy", "left", "--task", "straight", "--scene", "s"], "--scene s: only a task of a .json file"),
+        (["film", "--lightings", "sunn"], "no lighting 'sunn' in this place; did you mean 'sun'?"),
+    ],
+)
+def test_mistakes_are_one_line_and_write_nothing(tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "left", 0.9)
+    assert commands.main("reality", [*arguments, "--out", "out.png"]) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+    assert [one.name for one in tmp_path.iterdir()] == ["left"]
+
+
 @pytest.mark.parametrize("what", ["math:sqrt", "missing", "policy.zip", "policy.txt", "folder"])
 def test_only_a_policy_file_drives(what, tmp_path, capsys):
     given = what if ":" in what else str(tmp_path / what)
@@ -471,9 +498,9 @@ def test_a_photo_is_of_the_weather_asked_for(tmp_path, monkeypatch, capsys):
     assert lights == [WEATHER["haze"]] and read_image(path).shape == (*native_size()[::-1], 3)
     capsys.readouterr()
     assert commands.main("reality", ["photo", "--lighting", "haze", "--out", str(tmp_path / "haze.txt")]) == 2
-    assert "expected a .png or .jpg file" in capsys.readouterr().err
+    assert "expected a file ending in .png or .jpg" in capsys.readouterr().err
     assert commands.main("reality", ["onboard", "--out", str(tmp_path)]) == 2
-    assert "expected a .mp4 file" in capsys.readouterr().err
+    assert "expected a file ending in .mp4" in capsys.readouterr().err
 
 
 def test_the_log_is_what_alignment_reads(tmp_path, monkeypatch, capsys):
@@ -493,7 +520,7 @@ def test_the_log_is_what_alignment_reads(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(RealRobot, "step", lambda *given: pytest.fail("the robot drives before --out is checked"))
     for name in ("", "drive.txt", "drive"):
         assert commands.main("reality", ["log", "--out", str(tmp_path / name)]) == 2
-        assert "expected a .csv file" in capsys.readouterr().err
+        assert "expected a file ending in .csv" in capsys.readouterr().err
     for duration in (3.0, np.inf):
         with pytest.raises(InputError, match=f"duration = {duration:g} s; expected 10 to 36000"):
             recordings.record_log(duration, Setup())

@@ -329,7 +329,11 @@ def test_filming_that_was_stopped_begins_anew(tmp_path):
             compare(SceneDir(out))
         assert not (out / "scene.toml").exists() and not (out / "truth" / "truth.json").exists()
         film(plan, out, renderer_of=lambda lighting, place: shot)
-        assert Truth.load(out / "truth").length == 3.0 and (out / "scene.toml").exists()
+        assert Truth.load(out / "truth").length == 3.0 and not (out / "scene.old.toml").exists()
+    mine = (out / "scene.toml").read_text() + "# mine\n"
+    (out / "scene.toml").write_text(mine)
+    film(plan, out, renderer_of=lambda lighting, place: shot)
+    assert (out / "scene.old.toml").read_text() == mine != (out / "scene.toml").read_text()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").touch()
     with pytest.raises(InputError, match="has no truth/, so this command did not write it"):

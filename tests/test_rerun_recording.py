@@ -80,6 +80,7 @@ def test_a_recording_holds_the_drive(scene, tmp_path, capsys):
     ("options", "words"),
     [
         (["--rerun", "no/drive.rrd"], "there is no folder no"),
+        (["--rerun", "drive.mp4"], "drive.mp4: expected a file ending in .rrd"),
         (["--rerun", "drive.rrd", "--lerobot", "drives"], "--rerun records one drive"),
     ],
 )

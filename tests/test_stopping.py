@@ -33,6 +33,18 @@ _PATIENCE = 120.0  # [s] until a verb has started what it starts
 _WOULD_TAKE = {"validate": 900, "train": 100_000}  # episodes and steps; far more than a test waits for
 
 
+@pytest.fixture(autouse=True)
+def signals_as_in_a_terminal(monkeypatch):
+    """Background jobs and nohup ignore some, and so would the verbs."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM)}
+    for number, handler in before.items():
+        if handler is signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @dataclass(frozen=True)
 class Case:
     """A verb that starts processes."""

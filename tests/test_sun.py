@@ -411,7 +411,7 @@ def test_shadows_of_unfilmed_things_follow_the_known_sun(built):
     ("options", "words"),
     [
         (("120", None, None, None), "--sun 120: expected azimuth and elevation"),
-        (("120,95", None, None, None), "elevation from 0 to 90"),
+        (("120,95", None, None, None), "elevation above 0, up to 90"),
         (("120,35", "2026-06-01T17:30+02:00", None, None), "expected one of them"),
         ((None, None, "48,11", None), "need a time"),
         ((None, None, None, 90.0), "need a time"),

@@ -311,6 +311,14 @@ def test_the_verb_validates_and_refuses_bad_arguments(fresh, capsys):
         assert capsys.readouterr().err.count("\n") == 1
 
 
+def test_a_misspelt_lighting_is_refused_before_anything_is_driven_or_recorded(fresh, capsys):
+    common = [str(fresh), "--task", "ahead", "--episodes", "2", "--policy", "ahead", "--quiet"]
+    for names in (["day", "nigth"], ["nigth+randomised"]):
+        assert commands.main("validate", [*common, "--lightings", *names]) == 2
+        assert "'nigth'; did you mean 'night'?" in capsys.readouterr().err
+        assert not (fresh / "validation").exists()
+
+
 # ---- what is said of trials
 
 

@@ -305,7 +305,7 @@ def test_views_without_a_lighting_have_the_one_given(field, tmp_path):
     "given, said",
     [
         (["--path", "a.json"], "--path and --out belong together"),
-        (["--path", "none.json", "--out", "a.avi"], "expected an .mp4"),
+        (["--path", "none.json", "--out", "a.avi"], "expected a file ending in .mp4"),
         (["--path", "none.json", "--out", "a.mp4"], "none.json"),
         (["--path", "a", "--out", "a.mp4", "--size", "100x33"], "even sides"),
         (["--path", "a", "--out", "a.mp4", "--fps", "0"], "--fps 0"),

@@ -3,7 +3,7 @@
 import sys
 
 from twin import commands
-from twin.errors import print_error, short_repr
+from twin.errors import name_hint, print_error, short_repr
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -19,7 +19,8 @@ def main(arguments: list[str] | None = None) -> int:
 
         print(f"twin {metadata.version('twin')}")
     elif given[0] not in commands.VERBS:
-        return print_error(f"no verb {short_repr(given[0])}; expected one of {', '.join(commands.VERBS)}")
+        every = f"expected one of {', '.join(commands.VERBS)}"
+        return print_error(f"no verb {short_repr(given[0])}; {name_hint(given[0], commands.VERBS, every)}")
     else:
         return commands.main(given[0], given[1:])
     return 0

@@ -16,7 +16,6 @@ images. A ROS bag serves as a log or, with --camera, as a film.
 
 import argparse
 import sys
-import tempfile
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +29,7 @@ from twin import commands, runtime
 from twin.capture.bag import is_bag
 from twin.config_file import ROBOT_TOML, load_config, merge_robot, parse_table, read_robot
 from twin.errors import InputError
-from twin.files import digest_file, is_file, read_toml, write_json, write_text
+from twin.files import digest_file, is_file, read_toml, require_writable, write_json, write_text
 from twin.mjcf.husky import coulomb_track_ratio
 from twin.robot import WHEEL_RADIUS, HuskyParams
 from twin.scene import SceneDir
@@ -80,8 +79,8 @@ def align_to_log(
     runtime.log_line(f"{log}: {len(windows)} time windows, {int(windows.fitting.sum())} to fit, the others held out")
     check_log(windows, str(log))
     pictures = folder / RESULT_FOLDER
-    _check_writable(pictures)
-    _check_writable(folder)
+    for one in (pictures, folder):
+        require_writable(one, "give another folder with --out")
     result = identify(windows, params, runtime.log_line)
 
     write_plots(pictures, result.windows, result.fitted, result.baseline)
@@ -111,10 +110,10 @@ def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalib
 
     root = _scene_root(target)
     scene = SceneDir(root)
-    if not scene.config_file.exists():
-        raise InputError(f"{target}: a film needs a built scene to be localized in; give the scene's folder")
     if not film.is_file() and not is_bag(film):
         raise InputError(f"{film}: no such film")
+    if not scene.config_file.exists():
+        raise InputError(f"{target}: a film needs a built scene to be localized in; give the scene's folder")
     by_hand = _scene_robot_table(root)
     params = load_config(scene.config_file).robot
     given = {name: by_hand[name] for name in _INTRINSICS_FIELDS if name in by_hand}
@@ -126,7 +125,7 @@ def align_camera(target: str, film: Path, topic: str = "") -> "tuple[CameraCalib
     text = toml_text(f"The camera was fitted to {film.name}: {result.summary}.", kept, result.identified)
     robot = merge_robot(tomllib.loads(text), by_hand, str(scene.config_file))
     folder = root / RESULT_FOLDER
-    _check_writable(folder, "make it writable")
+    require_writable(folder, "make it writable")
     write_camera_comparison(folder, result, frames, scene, parse_table(HuskyParams, robot, str(scene.config_file)))
     write_text(root / ROBOT_TOML, text)
     figures = {"film": str(film), "film_sha256": digest_file(film) if film.is_file() else None} | result.figures()
@@ -151,16 +150,6 @@ def _robot(target: str) -> tuple[HuskyParams, dict[str, Any], Path | None]:
 def _scene_root(target: str) -> Path:
     path = Path(target)
     return path.parent if path.name == "scene.toml" else path
-
-
-def _check_writable(folder: Path, cure: str = "give another folder with --out") -> None:
-    """Creates a folder and checks that files can be written there."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written to: {error}; {cure}") from None
 
 
 def _scene_robot_table(folder: Path) -> dict[str, Any]:

@@ -427,7 +427,12 @@ def _reality(parser: argparse.ArgumentParser, add: _Add) -> None:
     _, add = command("film", "film the place into a scene folder")
     add("--out", type=Path, required=True, help="scene folder to write")
     place(add)
-    add("--lightings", nargs="+", metavar="NAME", help="default: sun overcast night; for a sampled place, its own")
+    add(
+        "--lightings",
+        nargs="+",
+        metavar="NAME",
+        help="of sun, overcast, night, dusk; default: the first three; for a sampled place, its own",
+    )
     add("--tiny", action="store_true", help="only 12 m in 320x180 px under two lightings, for tests")
     traffic = "walkers and cars move through the films, and parked cars have left in the last lighting"
     add("--traffic", action="store_true", help=traffic)
@@ -449,7 +454,8 @@ def _reality(parser: argparse.ArgumentParser, add: _Add) -> None:
     add("--day", type=int, nargs="+", metavar="NUMBER", help="numbers of random days, from 1")
     out = "real.csv, with a table of trials beside it; only one command at a time may write it"
     add("--out", type=Path, required=True, help=out)
-    add("--twin-lighting", default=str(Condition(HELD_OUT, True)), help="the twin's lighting to compare with")
+    compared = f"the twin's lighting to compare with; default: as before, or {Condition(HELD_OUT, True)}"
+    add("--twin-lighting", metavar="NAME", help=compared)
     add("--films", type=Path, help="folder for a film of every trial driven now, as the robot saw it")
     _, add = command("log", "a drive log of the place's Husky, for twin align")
     add("--out", type=Path, required=True, help="drive.csv")

@@ -11,6 +11,7 @@ from twin import commands
 from twin.config_file import load_config
 from twin.env.route_segments import scene_tasks
 from twin.errors import InputError, name_hint
+from twin.files import require_output
 from twin.film import film, film_options, summary
 from twin.learn.policy import JSON, find_policy, load_policy
 from twin.loading import Twin, load_scene
@@ -42,12 +43,16 @@ def command(given: argparse.Namespace) -> None:
         more = "; download scenes/demo.twin from twin's repository" if named == f"demo{SUFFIX}" else ""
         missing = f"{given.scene}: no folder, and no {named} here or in scenes/"
         raise InputError(missing + (more or f"; {name_hint(given.scene.name, place_names(), 'give a path')}"))
+    if given.view and given.out:
+        raise InputError("--out names a film, but --view records no film; leave out one of them")
+    if not given.view and given.port != commands.parser_of("drive").get_default("port"):
+        raise InputError(f"--port {given.port}: only the page has it; give --view, too")
+    if given.out:
+        require_output(given.out, (".mp4",), make=True)
     twin = load_scene(given.scene)
     policy = chosen_policy(twin, given.policy)
     task = chosen_task(twin, given.task, policy, given.trust)
     if given.view:
-        if given.out:
-            raise InputError("--out names a film, but --view records no film; leave out one of them")
         from twin.view.__main__ import serve
 
         view = {"task": task, "policy": policy, "host": "127.0.0.1", "port": given.port}

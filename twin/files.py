@@ -15,11 +15,12 @@ import re
 import shutil
 import stat
 import struct
+import tempfile
 import tokenize
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -339,6 +340,30 @@ def require_parent(path: Path) -> None:
     """Raises InputError if the parent folder of a path to be written is missing."""
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}; create it, or give another path")
+
+
+def require_output(path: Path, suffixes: Sequence[str] = (), make: bool = False) -> None:
+    """Raises InputError if a file cannot be written: another suffix than these, a folder, or an unusable parent folder.
+
+    With `make`, a missing parent folder is created.
+    """
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: expected a file ending in {' or '.join(suffixes)}")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; give a file")
+    if not make:
+        require_parent(path)
+    require_writable(path.parent)
+
+
+def require_writable(folder: Path, cure: str = "give another path") -> None:
+    """Raises InputError, with the cure, if no file can be written into a folder, which is created if it is missing."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written to: {error}; {cure}") from None
 
 
 def require_absent(path: Path) -> None:

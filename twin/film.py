@@ -24,7 +24,7 @@ from twin.env.drivers import Driver, PolicyDriver, RouteDriver
 from twin.env.env_factory import load
 from twin.env.episode import Episode, record_episode
 from twin.errors import InputError
-from twin.files import atomic_path, new_folder, require_absent, require_parent
+from twin.files import atomic_path, new_folder, require_absent, require_output, require_writable
 from twin.geometry.poses import inverse_pose
 from twin.learn.policy import find_policy, load_policy
 from twin.loading import Twin, load_scene
@@ -62,15 +62,18 @@ def film(
         options: See `twin.env.options.Options`; by default those of the policy.
 
     Raises:
-        InputError: the scene, task, policy or an option is unknown, the seed is negative, `out` is not an mp4, or
-            rerun-sdk is needed but not installed.
+        InputError: the scene, task, policy or an option is unknown, the seed is negative, a file cannot be written
+            or has another suffix than `.mp4` and `.rrd`, or rerun-sdk is needed but not installed.
     """
-    if out and (out.suffix.lower() != ".mp4" or out.is_dir()):
-        raise InputError(f"--out {out}: expected the name of an .mp4 file")
+    if out:
+        require_output(out, (".mp4",), make=True)
     if rerun:
         require_rerun()
-        require_parent(rerun)
+        require_output(rerun, (".rrd",))
     scene = load_scene(root)
+    in_cache = is_cached(scene.scene.root)
+    folder = out.parent if out else Path() if in_cache else scene.scene.root / "films"
+    require_writable(folder, "give another path with --out")
     driver, driver_name, options = _driver(scene, policy, seed, trust, options)
     environment = load(scene, task, seed, **options)
     images: list[np.ndarray] = []
@@ -90,9 +93,7 @@ def film(
     obstacles = options.get("obstacles")
     standing = [f"{obstacles}_obstacles"] if isinstance(obstacles, int) else []
     name = film_name(task, episode.lighting, *standing, driver_name, seed)
-    in_cache = is_cached(scene.scene.root)
-    path = out or (Path(f"{root.stem}_{name}") if in_cache else scene.scene.root / "films" / name)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = out or folder / (f"{root.stem}_{name}" if in_cache else name)
     driven, title = environment.task, f"{task.replace('_', ' ')}: {driver_name}"
     limits = driven.segment.start, driven.segment.end
     shown = driven.world, driven.half_width, limits, load_ground_and_parts(scene.scene)
@@ -186,7 +187,8 @@ def command(given: argparse.Namespace) -> None:
     obstacles = given.obstacles
     if obstacles != "scene":
         if not obstacles.isdecimal() or len(obstacles) > _MAX_DIGITS:  # isdigit accepts "²"
-            raise InputError(f"--obstacles {obstacles!r}: expected a number, or 'scene' for those of scene.toml")
+            most = 10**_MAX_DIGITS - 1
+            raise InputError(f"--obstacles {obstacles!r}: expected 0 to {most}, or 'scene' for those of scene.toml")
         obstacles = int(obstacles)
     options = {"lighting_drift": given.drift, "randomise": given.randomise, "obstacles": obstacles}
     options |= film_options(given.lighting)

@@ -32,7 +32,17 @@ from twin import commands, runtime, unpack
 from twin.capture.capture_data import Capture
 from twin.config_file import ROBOT_TOML
 from twin.errors import InputError, short_repr
-from twin.files import atomic_path, digest_json, json_bytes, load_tensors, read_bytes, read_json, read_toml, toml_value
+from twin.files import (
+    atomic_path,
+    digest_json,
+    json_bytes,
+    load_tensors,
+    read_bytes,
+    read_json,
+    read_toml,
+    require_output,
+    toml_value,
+)
 from twin.learn.policy import JSON, ONNX, WEIGHTS, find_policy, load_policy
 from twin.loading import Twin, load_scene
 from twin.nerf.baked_arrays import BAKED_FORMATS, BAKED_HEAD, BrickLayout, samples_read, section_file
@@ -98,8 +108,7 @@ def pack(
     scene = twin.scene
     name = scene.root.resolve().name
     out = out or Path(f"{name}{unpack.SUFFIX}")
-    if out.suffix != unpack.SUFFIX or not out.parent.is_dir():
-        raise InputError(f"-o {out}: expected a file NAME{unpack.SUFFIX} in a folder that exists")
+    require_output(out, (unpack.SUFFIX,))
     files: dict[str, bytes] = {"scene.toml": _scene_toml(scene, name)}
     if (scene.root / ROBOT_TOML).exists():
         files[ROBOT_TOML] = _toml(read_toml(scene.root / ROBOT_TOML))

@@ -212,7 +212,7 @@ def find_sun(
             "--sun", sun, f"azimuth and elevation in degrees, such as 120,35, or {SEARCH}"
         )
         if not 0.0 < elevation <= 90.0 or abs(azimuth) > 360.0:
-            raise InputError(f"--sun {sun}: expected an azimuth within ±360 and an elevation from 0 to 90 degrees")
+            raise InputError(f"--sun {sun}: expected an azimuth within ±360 and an elevation above 0, up to 90 degrees")
         return SunSource(direction(azimuth, elevation), "given")
     if time is None:
         return None

@@ -126,21 +126,21 @@ def stoppable() -> Iterator[None]:
     Later signals are ignored, so that cleanup can finish; only SIGINT ends the process at once. Signals that were
     ignored when the process started, for example because of nohup, stay ignored.
     """
-    stopping = False
+    stopping = 0
     again: list[threading.Timer] = []
     main = threading.current_thread() is threading.main_thread()
 
     def stop(number: int, _: Any) -> None:
         nonlocal stopping
         if not stopping:
-            stopping = True
+            stopping = number
             raise Stopped(number)
         if number == signal.SIGINT:
             os._exit(128 + number)
 
     def send_again(number: int) -> None:
         nonlocal stopping
-        stopping = False
+        stopping = 0
         os.kill(os.getpid(), number)
 
     def ignored(what: Any) -> None:
@@ -159,6 +159,10 @@ def stoppable() -> Iterator[None]:
     try:
         with _handled(stop):
             yield
+    except (ImportError, SystemError) as error:  # a module written in C, interrupted while it was imported
+        if stopping:
+            raise Stopped(stopping) from error
+        raise
     finally:
         if main:
             sys.unraisablehook = hook

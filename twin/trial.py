@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from twin import commands, runtime
 from twin.config import Condition
 from twin.env.env_factory import EnvFactory
+from twin.env.episode_lighting import check_lighting_names
 from twin.errors import InputError
 from twin.evaluation.trial_judge import JudgedTrial, TrialViews, judge, replay, view
-from twin.evaluation.trials import Trial, read_real_trials, recorded_twin_lighting, write_real_trials
+from twin.evaluation.trials import Trial, check_twin_lighting, read_real_trials, write_real_trials
 from twin.files import read_json, wrap_read_errors, write_json
 from twin.geometry.poses import wrap_angle
 from twin.learn.policy import Policy, find_policy, load_policy
@@ -68,8 +69,8 @@ def evaluate_trial(
         lighting: Name of the day or light in `real.csv`.
         out: Path of `real.csv`; by default in the scene's folder.
         twin_lighting: The lighting of the twin that the trial is counted under, by default that of the same cell in
-            `out`, or `lighting`. Pictures are compared with it or, if the field has none of that name, with the
-            lighting that matches them best.
+            `out`, or `lighting`. Pictures are compared with it or, if it is a set or the default is not the name of
+            a lighting of the field, with the lighting that matches them best.
         cause: The cause of the recording's end, as stated by the operator.
         frame: See `twin.sysid.trial_recording.PosesFrame`.
         topics: Topics of the bag; see `read_trial`.
@@ -80,21 +81,17 @@ def evaluate_trial(
     scene = load_writable(root)
     policy = load_policy(find_policy(root, policy_name))
     out = out or root / REAL_CSV
+    factory = EnvFactory.open(scene, task, policy.options())
+    if factory.field is None:
+        raise InputError(f"{root}: has no field to compare pictures with; build it")
+    if twin_lighting:
+        check_lighting_names(Condition.parse(twin_lighting).lighting, factory.field)
     with exclusive_lock(out.with_name(f".{out.stem}.lock"), f"{out} is being written"):
         recording = read_trial(bag, topics)
         table = out.with_name(f"{out.stem}_trials.csv")
         known = read_real_trials(table, out)
-        factory = EnvFactory.open(scene, task, policy.options())
-        if factory.field is None:
-            raise InputError(f"{root}: has no field to compare pictures with; build it")
         cell = policy.name, factory.segment.name, lighting
-        recorded = recorded_twin_lighting(out, cell)
-        if recorded and twin_lighting and recorded != twin_lighting:
-            raise InputError(
-                f"{out}: trials of {cell[0]} under {lighting} are compared with {recorded!r}, not with "
-                f"{twin_lighting!r}; give --twin-lighting {recorded}, or change the column twin_lighting of that row"
-            )
-        compared = recorded or twin_lighting or lighting
+        compared = check_twin_lighting(out, cell, twin_lighting) or lighting
         name = Condition.parse(compared).lighting
         chosen = name if name in factory.field.lightings else None
         own = policy.trained.get("camera") or factory.world.camera.resized(factory.options.size).intrinsics

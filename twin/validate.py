@@ -19,6 +19,7 @@ from twin.config import Condition
 from twin.config_file import load_config
 from twin.env.domain_randomization import condition_options, measured_parameters
 from twin.env.env_factory import fingerprint
+from twin.env.episode_lighting import check_lighting_names
 from twin.env.route_segments import find_task
 from twin.errors import InputError
 from twin.evaluation.training_curves import read_test_counts, training_summaries
@@ -130,6 +131,7 @@ def validate(
     folder = twin.scene.validation
     policies = _named(root, sources, trust)
     lightings = tuple(dict.fromkeys(lightings))
+    check_lighting_names([Condition.parse(one).lighting for one in lightings], twin.field())
     with exclusive_lock(folder.with_name(".validation.lock"), f"policies are being driven for {folder}"):
         _drop_partial_row(folder / "episodes.csv")
         _drop_partial_row(folder / "worst.csv")

@@ -12,7 +12,7 @@ import numpy as np
 
 from twin.config import TaskConfig
 from twin.config_file import MIN_TASK_LENGTH
-from twin.errors import InputError
+from twin.errors import InputError, name_hint
 from twin.mjcf.world import World, heading_at
 from twin.types import Array
 
@@ -60,6 +60,8 @@ def find_task(name: str, world: World, configured: tuple[TaskConfig, ...] = ()) 
     found = scene_tasks(world, configured)
     if name in found:
         return found[name]
+    if hint := name_hint(name, found, ""):
+        raise InputError(f"task {name!r}: unknown; {hint}")
     there = ", ".join(f"{s.name} ({s.length:.1f} m long, starts at {s.start:.1f} m)" for s in found.values())
     why = "unknown"
     if name in _STANDARD_SPECS:

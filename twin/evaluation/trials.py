@@ -161,6 +161,20 @@ def recorded_twin_lighting(out: Path, cell: tuple[str, str, str]) -> str | None:
     return row.get("twin_lighting") or row.get("lighting")
 
 
+def check_twin_lighting(out: Path, cell: tuple[str, str, str], wanted: str | None) -> str | None:
+    """Returns the twin's lighting with which the results table `out` compares a cell, or the wanted one for a new cell.
+
+    Raises InputError: the table has another one.
+    """
+    recorded = recorded_twin_lighting(out, cell)
+    if recorded and wanted and recorded != wanted:
+        raise InputError(
+            f"{out}: trials of {cell[0]} under {cell[2]} are compared with {recorded!r}, not with {wanted!r}; give "
+            f"--twin-lighting {recorded}, or change the column twin_lighting of that row"
+        )
+    return recorded or wanted
+
+
 def _recorded(out: Path) -> dict[tuple[str, str, str], tuple[str, dict[str, str]]]:
     """Location and fields of each row of a results table, by policy, task (empty if not given) and lighting.
 

@@ -26,7 +26,7 @@ from twin.env.task import task_table
 from twin.errors import InputError
 from twin.export import gltf
 from twin.export.camera_formats import write_colmap, write_nerfstudio
-from twin.files import load_arrays, require_absent, require_parent, write_bytes, write_json
+from twin.files import load_arrays, require_absent, require_output, write_bytes, write_json
 from twin.geometry.cameras import SparsePoints
 from twin.loading import Twin, load_scene
 from twin.mjcf.scene_xml import Parts
@@ -62,7 +62,7 @@ def export(
     Raises:
         InputError: nothing to write, the scene is not built, it is a pack and frames are wanted, the lighting or
             task is unknown, a lighting is given for files that have none, a file has another suffix than its format,
-            an output folder does not exist, or a folder to write exists already.
+            a path is given twice or cannot be written, or a folder to write exists already.
     """
     files, folders = [one for one in (usd_file, glb, ply, spz) if one], [one for one in (nerfstudio, colmap) if one]
     task_files = [task_file] if task_file else []
@@ -72,21 +72,23 @@ def export(
         raise InputError("--task and --task-file belong together; give both, such as --task straight --task-file FILE")
     if lighting and not files:
         raise InputError(f"--lighting {lighting}: only --usd, --glb, --ply and --spz have a lighting; leave it out")
-    for file, suffixes in zip((usd_file, glb, ply, spz), _SUFFIXES, strict=True):
-        if file is not None and file.suffix.lower() not in suffixes:
-            raise InputError(f"{file}: expected a file ending in {', '.join(suffixes)}")
-    for path in (*files, *task_files):
-        require_parent(path)
-        if path.is_dir():
-            raise InputError(f"{path} is a folder; give a file")
     for path in folders:
         require_absent(path)
+    for file, suffixes in zip((usd_file, glb, ply, spz, task_file), (*_SUFFIXES, ()), strict=True):
+        if file is not None:
+            require_output(file, suffixes)
+    outputs = [path.resolve() for path in (*files, *folders, *task_files)]
+    for path in outputs:
+        if outputs.count(path) > 1:
+            raise InputError(f"{path} is given twice; give each file and folder a name of its own")
     if usd_file is not None:
         _require_usd()
     if spz is not None:
         require_spz()
     twin = load_scene(scene)
-    lines = _field_files(twin, lighting, usd_file, glb, ply, spz) if files else []
+    if folders and (twin.scene.root / PACK_JSON).exists():
+        require_stage(twin.scene, "capture")  # raises InputError: a pack has no frames
+    lines = []
     if task_file and task:
         if not twin.scene.has_route:
             raise InputError(f"{twin.scene.root}: has no route, so no tasks; set mjcf.route = true and build it again")
@@ -94,9 +96,9 @@ def export(
         segment = find_task(task, world, load_config(twin.scene.config_file).task)
         write_json(task_file, task_table(world.along(segment.route), segment, Options()))
         lines.append(f"{task_file}: {task}, {segment.length:.1f} m long, starts {segment.start:.1f} m along the route")
+    if files:
+        lines += _field_files(twin, lighting, usd_file, glb, ply, spz)
     if folders:
-        if (twin.scene.root / PACK_JSON).exists():
-            require_stage(twin.scene, "capture")  # raises InputError: a pack has no frames
         cameras = twin.cameras()
         points = SparsePoints.load(require_stage(twin.scene, "metric"))
         for out, write in ((nerfstudio, write_nerfstudio), (colmap, write_colmap)):

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.config import RESERVED_LIGHTINGS
-from twin.errors import InputError
+from twin.errors import InputError, name_hint
 from twin.files import read_json, wrap_read_errors, write_json
 from twin.nerf.sun import Sun, Sunlight, mixed_sunlight
 from twin.scene import SceneDir, check_name, stage_result
@@ -235,7 +235,8 @@ class Lightings:
                 f"lighting {lighting!r}: fitted to another build of this field, or by an older twin; fit its photo "
                 f"again: twin relight SCENE PHOTO --name {lighting}"
             )
-        raise InputError(f"lighting {lighting!r}: unknown; the field has {', '.join(self.names)}")
+        every = f"the field has {', '.join(self.names)}"
+        raise InputError(f"lighting {lighting!r}: unknown; {name_hint(lighting, self.names, every)}")
 
     def fog(self, lighting: str) -> Fog | None:
         """Fog of an added lighting or of a mixture with one; None means no additional fog.

@@ -23,9 +23,9 @@ from pathlib import Path
 
 from twin import commands
 from twin.build import publish
-from twin.errors import InputError, short_repr
+from twin.errors import InputError, name_hint, short_repr
 from twin.evaluation.trials import cells_csv, tally
-from twin.files import toml_string, write_text
+from twin.files import require_output, toml_string, write_text
 from twin.geometry.cameras import Cameras
 from twin.loading import load_scene
 from twin.reality import campus_road, real_test, recordings
@@ -66,7 +66,8 @@ def film(
 ) -> Truth:
     """Films every pass of a plan under every lighting into the scene folder `out`, and saves the truth there.
 
-    The settings and the truth of an older film in this folder are deleted first.
+    The truth of an older film in this folder is deleted first; its settings are kept as `scene.old.toml` if they are
+    not the new ones.
 
     With `traffic`, walkers and cars move through every film, and the films of all lightings but the last show parked
     cars. The truth contains none of them. `renderer_of` returns the renderer for a lighting and a place; the default is
@@ -86,11 +87,14 @@ def film(
     spec = sample_place(number, length, side_roads) if number else None
     sides = _filmed_sides(spec, plan) if spec and side_roads else []
     # The folder of the truth exists from the start, so that filming can start again after an interruption. Settings and
-    # truth of an older film are deleted, since they would not fit the new films.
+    # truth of an older film would not fit the new films.
     (out / "truth").mkdir(parents=True, exist_ok=True)
     (out / "input").mkdir(exist_ok=True)
-    for old in (out / "scene.toml", out / "truth" / "truth.json", out / "truth" / "truth.npz"):
+    for old in (out / "truth" / "truth.json", out / "truth" / "truth.npz"):
         old.unlink(missing_ok=True)
+    settings, before = out / "scene.toml", out / "scene.old.toml"
+    if settings.exists():
+        settings.replace(before)
     place = build_number(number, length=length, side_roads=side_roads) if number else campus_road.build()
     assert isinstance(place.route, RoadLine | SampledRoad)
     lines: list[tuple[FilmingPlan, DrivenLine]] = [(plan, place.route)]
@@ -122,7 +126,9 @@ def film(
         {line.one.name: side_plan.length for line, side_plan in sides},
     )
     truth.save(out / "truth")
-    write_text(out / "scene.toml", scene_toml(plan, out.resolve().name, spec, truth.road_length, sides, traffic))
+    write_text(settings, scene_toml(plan, out.resolve().name, spec, truth.road_length, sides, traffic))
+    if before.exists() and before.read_bytes() == settings.read_bytes():
+        before.unlink()
     return truth
 
 
@@ -226,7 +232,7 @@ def command(options: argparse.Namespace) -> None:
         known = plan.lightings if options.place else tuple(LIGHTINGS)
         for name in options.lightings or []:
             if name not in known:
-                raise InputError(f"no lighting {short_repr(name)} in this place; expected one of {', '.join(known)}")
+                raise InputError(f"no lighting {short_repr(name)} in this place; {name_hint(name, known)}")
         plan = replace(plan, lightings=tuple(dict.fromkeys(options.lightings or plan.lightings)))
         if not 0.0 <= options.readout <= _MAX_READOUT:
             raise InputError(f"--readout {options.readout:g}: expected 0 to {_MAX_READOUT:g} s")
@@ -246,11 +252,13 @@ def command(options: argparse.Namespace) -> None:
 
 def _with_robot(options: argparse.Namespace, setup: Setup) -> None:
     """Runs a command that needs a robot: log, onboard, bag, photo or drive."""
-    days = [f"day_{number}" for number in getattr(options, "day", None) or []]
+    numbers = getattr(options, "day", None) or []
+    for number in numbers:
+        if number < 1:
+            raise InputError(f"--day {number}: expected 1 or more")
+    days = [f"day_{number}" for number in numbers]
     if options.command == "log":
-        if options.out.suffix != ".csv" or options.out.is_dir():
-            raise InputError(f"{options.out}: expected a .csv file to write, such as drive.csv")
-        options.out.parent.mkdir(parents=True, exist_ok=True)
+        require_output(options.out, (".csv",), make=True)
         recordings.write_log(options.out, recordings.record_log(options.duration, setup))
     elif options.command == "onboard":
         recordings.write_film(options.out, setup)
@@ -285,6 +293,8 @@ def scene_task(given: str, scene: Path | None, place: int, length: float = 0.0) 
         InputError: no scene, a scene without truth, or one of another place or length.
     """
     if not given.endswith(".json"):
+        if scene is not None:
+            raise InputError(f"--scene {scene}: only a task of a .json file is in a scene's frame; leave --scene out")
         return given
     if scene is None:
         raise InputError(f"{given} is in the frame of a scene; give --scene, the folder that it was exported from")

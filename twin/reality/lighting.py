@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.errors import InputError, short_repr
+from twin.errors import InputError, name_hint, short_repr
 from twin.reality import SEED
 from twin.reality.place_spec import LightSpec, PlaceSpec, Rgb, rgb
 
@@ -343,10 +343,11 @@ def weather(name: str) -> Lighting:
     if name in WEATHER:
         return WEATHER[name]
     _, _, number = name.partition("day_")
-    if name.startswith("day_") and number.isascii() and number.isdecimal() and str(int(number)) == number != "0":
+    if name.startswith("day_") and number.isascii() and number.isdecimal() and number[0] != "0" and len(number) < 10:
         return _day(int(number))
-    named = ", ".join(list(WEATHER)[: len(WEATHER) - _DAYS])
-    raise InputError(f"no lighting {short_repr(name)} in the real test; expected one of {named}, day_1, day_2, ...")
+    named = list(WEATHER)[: len(WEATHER) - _DAYS]
+    every = f"expected one of {', '.join(named)}, day_1, day_2, ..."
+    raise InputError(f"no lighting {short_repr(name)} in the real test; {name_hint(name, named, every)}")
 
 
 def weather_index(name: str) -> int:

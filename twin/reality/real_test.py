@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from twin.config import HELD_OUT, Condition
-from twin.errors import InputError
-from twin.evaluation.trials import Trial, read_real_trials, write_real_trials
+from twin.errors import InputError, name_hint
+from twin.evaluation.trials import Trial, check_twin_lighting, read_real_trials, write_real_trials
 from twin.files import digest_file, read_json, wrap_read_errors, write_json
 from twin.learn.policy import JSON, Policy, load_policy
 from twin.reality import REALITY_VERSION
@@ -93,7 +93,9 @@ def load_policy_file(path: Path) -> Policy:
         InputError: no such file, or a policy that could run code here, such as a Python callable.
     """
     if not path.exists():
-        raise InputError(f"{path}: no such policy file; the real test accepts only a policy folder or an .onnx file")
+        beside = [one.name for one in path.parent.iterdir()] if path.parent.is_dir() else []
+        hint = name_hint(path.name, beside, "the real test accepts only a policy folder or an .onnx file")
+        raise InputError(f"{path}: no such policy file; {hint}")
     return load_policy(path)
 
 
@@ -199,7 +201,7 @@ def run(
     lightings: Sequence[str],
     trials: int,
     out: Path,
-    twin_lighting: str = str(Condition(HELD_OUT, True)),
+    twin_lighting: str | None = None,
     films: Path | None = None,
     setup: Setup | None = None,
 ) -> list[Trial]:
@@ -213,7 +215,8 @@ def run(
         out: Results file as read by `twin.forecast`. `<name>_trials.csv` beside it has a row per trial,
             `<name>_policies.json` the digests of the policy files, `<name>_setup.json` place, robot and camera,
             `<name>_tasks.json` the numbers of the tasks.
-        twin_lighting: Value of the column of this name in new rows.
+        twin_lighting: Value of the column of this name in new rows; None: `held-out+randomised`. Other rows keep
+            theirs.
         films: Folder for a film of every trial that is driven now, from the robot's camera.
         setup: Place, robot and camera, the same in all rows of a table.
 
@@ -222,8 +225,8 @@ def run(
 
     Raises:
         InputError: unknown names, `out` is a folder, unusable policy files, a different file under a known policy name,
-            a table of another setup, or of another task of this name, results of trials that the table lacks, or
-            another process that writes the same table.
+            a table of another setup, of another task of this name or compared with another lighting, results of trials
+            that the table lacks, or another process that writes the same table.
     """
     setup = setup or Setup()
     for name in lightings:
@@ -243,6 +246,10 @@ def run(
         by_name = {one.name: one for one in loaded}.values()
         tests = [RealTest(task_for(one, task, setup.place, setup.length), setup, one.size) for one in by_name]
         _check_task(task, done, table, out.with_name(f"{out.stem}_tasks.json"))
+        name = task if isinstance(task, str) else task.name
+        for cell in ((one.name, name, lighting) for one in by_name for lighting in lightings if twin_lighting):
+            check_twin_lighting(out, cell, twin_lighting)
+        compared = twin_lighting or str(Condition(HELD_OUT, True))
         if films:
             films.mkdir(parents=True, exist_ok=True)
         for lighting in dict.fromkeys(lightings):
@@ -254,10 +261,10 @@ def run(
                 with bar(f"{policy.name}, {test.task.name}, {lighting}", len(missing), "trial") as progress:
                     for seed in missing:
                         done.append(_run_trial(test, policy, lighting, seed, films))
-                        write_real_trials(done, table, out, twin_lighting, setup.columns)
+                        write_real_trials(done, table, out, compared, setup.columns)
                         progress.set_postfix_str(f"{done[-1].cause} at {done[-1].progress:.1f} m")
                         progress.update()
-        write_real_trials(done, table, out, twin_lighting, setup.columns)
+        write_real_trials(done, table, out, compared, setup.columns)
     return done
 
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from twin.errors import InputError
 from twin.evaluation.trials import Trial
-from twin.files import atomic_path, remove
+from twin.files import atomic_path, remove, require_output
 from twin.geometry.images import write_image
 from twin.reality import SEED
 from twin.reality.filming import FilmingPlan, write_video
@@ -52,11 +52,9 @@ def write_film(path: Path, setup: Setup) -> None:
     Raises:
         InputError: `path` does not end in .mp4, or is a folder.
     """
-    if path.suffix != ".mp4" or path.is_dir():
-        raise InputError(f"{path}: expected a .mp4 file to write, such as robot.mp4")
+    require_output(path, (".mp4",), make=True)
     filmed = place_on_test_day(setup.place, setup.length).lightings
     robot, camera = robot_and_camera(setup, filmed.get(LIGHTING) or next(iter(filmed.values())))
-    path.parent.mkdir(parents=True, exist_ok=True)
     count = round((_STATIONS[1] - _STATIONS[0]) / _SPEED * _FPS)
     width, height = native_size()
     plan = replace(FilmingPlan(), width=width, height=height, fps=_FPS, crf=16)
@@ -71,10 +69,8 @@ def write_photo(lighting: str, path: Path, setup: Setup) -> None:
         InputError: unknown weather, or `path` is not a .png or .jpg file.
     """
     light = weather(lighting)
-    if path.suffix not in (".png", ".jpg") or path.is_dir():
-        raise InputError(f"{path}: expected a .png or .jpg file to write, such as dawn.png")
+    require_output(path, (".png", ".jpg"), make=True)
     robot, camera = robot_and_camera(setup, light)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_image(path, camera.capture(robot))
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.errors import InputError, short_repr
+from twin.errors import InputError, name_hint, short_repr
 from twin.files import read_json, wrap_read_errors
 from twin.geometry.passes import path_length, smooth_path
 from twin.geometry.poses import Similarity
@@ -204,7 +204,7 @@ def task_of_place(
     """
     offered = tasks(sample_place(number, road_length).line) if number else CAMPUS_TASKS
     if name not in offered:
-        raise InputError(f"task {name!r}: place {number} has {', '.join(offered)}")
+        raise InputError(f"task {name!r}: place {number} has none of that name; {name_hint(name, offered)}")
     start, length = offered[name]
     line = _filmed_line(number, road_length)
     end = min(start + length, float(np.hypot(*np.diff(line, axis=0).T).sum()))

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from twin import commands, runtime
 from twin.errors import InputError
+from twin.files import require_output
 from twin.loading import Twin, load_scene
 from twin.scene import require_stage
 
@@ -60,8 +61,7 @@ def film_path(
     width, height = parse_size(size)
     if not 1 <= fps <= _MAX_FPS:
         raise InputError(f"--fps {fps}: expected 1 to {_MAX_FPS}")
-    if out.suffix.lower() != ".mp4" or not out.parent.is_dir():
-        raise InputError(f"--out {out}: expected an .mp4 in a folder that exists")
+    require_output(out, (".mp4",))
     from twin.view.camera_path import CameraPath, path_frames, write_path_film
     from twin.view.scene_picture import ScenePicture
 
