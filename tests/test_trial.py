@@ -248,7 +248,7 @@ def test_a_trial_with_a_corrected_name_counts_once(place, tmp_path):
     _, figures, _ = trial.evaluate_trial(scene, bag, "ahead", "ahead", "monday", out, frame="scene")
     assert figures["twin_lighting"] == "day+randomised"
     before = out.read_bytes()
-    with pytest.raises(InputError, match="'dya'; did you mean 'day'"):  # before the bag is read
+    with pytest.raises(InputError, match="'dya': unknown; did you mean 'day'"):  # before the bag is read
         trial.evaluate_trial(scene, tmp_path / "none", "ahead", "ahead", "dusk", out, "dya", frame="scene")
     assert out.read_bytes() == before
 

@@ -315,7 +315,7 @@ def test_a_misspelt_lighting_is_refused_before_anything_is_driven_or_recorded(fr
     common = [str(fresh), "--task", "ahead", "--episodes", "2", "--policy", "ahead", "--quiet"]
     for names in (["day", "nigth"], ["nigth+randomised"]):
         assert commands.main("validate", [*common, "--lightings", *names]) == 2
-        assert "'nigth'; did you mean 'night'?" in capsys.readouterr().err
+        assert "'nigth': unknown; did you mean 'night'?" in capsys.readouterr().err
         assert not (fresh / "validation").exists()
 
 
